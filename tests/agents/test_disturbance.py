@@ -420,8 +420,8 @@ def test_a_scenario_says_plant_and_disturbance_and_every_report_repeats_them():
     plant = "`mass` 0.0294 for 0.028"
     wind = "constant `vy` 0.5; rms `velocity` 1; drawn every 0.2 s"
     text = " ".join(report(result).split())
-    assert f"Plant: {plant}; laws and gains know the model alone." in text
-    assert f"Disturbance: {wind}; no law is told of it." in text
+    assert f"Plant: {plant}; laws and gains use the model's values." in text
+    assert f"Disturbance: {wind}; unknown to the laws." in text
     told = json.loads(json.dumps(summary(result)))
     assert (told["plant"], told["disturbance"]) == (plant, wind)
     attributes = dataset(result).attrs

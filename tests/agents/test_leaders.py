@@ -75,7 +75,7 @@ def test_it_is_said_who_follows_whom(flown):
         "follower 3 hears leader 4; follower 5 hears leader 0 through 2; nobody hears leader 6"
     )
     assert who_hears_whom(GRAPH) == said
-    assert f"Who follows whom: {said}; goals are the nearest leader's." in " ".join(
+    assert f"Leaders: {said}; goals are relative to the nearest leader." in " ".join(
         ech.report(flown).split()
     )
     checked = ech.check(flown.parts, flown.settings)

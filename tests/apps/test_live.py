@@ -14,7 +14,7 @@ import echelon as ech
 from echelon.apps.live import server as served
 from echelon.apps.live import swarm as looked
 from echelon.apps.live.guarantee_status import GuaranteeStatus
-from echelon.apps.live.knobs import Panel
+from echelon.apps.live.panel import Panel
 from echelon.apps.live.promiser import badge_of, first_look
 from echelon.apps.live.server import live, serve_live
 from echelon.apps.live.session import Session
@@ -52,15 +52,15 @@ def panel():
 
 @pytest.fixture(scope="module")
 def swarm(panel):
-    return LiveLoop(*panel.built, panel)
+    return LiveLoop(*panel.experiment, panel.live)
 
 
 @pytest.fixture(scope="module")
 def native(panel):
     """The same loop by code for this machine."""
-    parts, settings = panel.built
-    made = LiveLoop(parts, settings._replace(engine="native"), panel)
-    assert (made.engine, LiveLoop(parts, settings, panel).engine) == ("native", "jax")
+    parts, settings = panel.experiment
+    made = LiveLoop(parts, settings._replace(engine="native"), panel.live)
+    assert (made.engine, LiveLoop(parts, settings, panel.live).engine) == ("native", "jax")
     return made
 
 
@@ -94,7 +94,7 @@ def test_a_live_loop_is_the_loop_of_a_run_and_tells_its_v(panel, swarm, native):
 def test_a_law_that_remembers_and_signals_is_live_too():
     own = ech.load_scenario("paper-global", ["simulation.horizon=0.4", "simulation.engine=jax"])
     found = Panel(own, build(own))
-    swarm, wanted = LiveLoop(*found.built, found), ech.run(own).states
+    swarm, wanted = LiveLoop(*found.experiment, found.live), ech.run(own).states
     shown = flown(swarm, 10)
     # Pictures are 8 steps apart, stored frames 10.
     np.testing.assert_allclose(shown[4], wanted[4], atol=1e-9)
@@ -117,9 +117,9 @@ KNOBS = {
 
 @pytest.mark.parametrize("name", KNOBS)
 def test_a_knob_does_what_its_key_in_the_scenario_does(panel, swarm, native, name):
-    """The scenario that `standing` writes is run by the engine from the live loop's start."""
+    """The scenario that `scenario_at` returns is run by the engine from the live loop's start."""
     knobs = panel.start._replace(**KNOBS[name])
-    parts, settings = build(panel.standing(knobs))
+    parts, settings = build(panel.scenario_at(knobs))
     wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
     for each in (swarm, native):
         each.turn(knobs)
@@ -155,7 +155,7 @@ def test_another_law_takes_over_where_the_agents_are_and_is_the_loop_of_a_run(se
     assert session.swarm.steps == swarm.steps and "coupling" not in session.panel.ranges
     session.ask({"name": "reset"})
     session.settle()
-    parts, settings = build(session.panel.standing(session.knobs))
+    parts, settings = build(session.panel.scenario_at(session.knobs))
     wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
     shown = np.stack([session.swarm.advance().states for _ in range(10)])
     np.testing.assert_allclose(shown, wanted.states[1:], atol=1e-11)
@@ -177,10 +177,10 @@ def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
     panel = Panel(own, build(own))
     # Few periods are foreseen at a time, so that the loop must look ahead again.
     monkeypatch.setattr(looked, "_AHEAD", 0.2)
-    swarm = LiveLoop(*panel.built, panel)
-    assert len(swarm.loop.switches.steps) == 10 and panel.slowest(panel.start) is None
+    swarm = LiveLoop(*panel.experiment, panel.live)
+    assert len(swarm.loop.switches.steps) == 10 and panel.live.slowest(panel.start) is None
     for knobs in (panel.start, panel.start._replace(cut=frozenset({2}))):
-        parts, settings = build(panel.standing(knobs))
+        parts, settings = build(panel.scenario_at(knobs))
         settings = settings._replace(horizon=1.2)
         wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
         swarm.turn(knobs)
@@ -238,11 +238,11 @@ def test_a_kick_moves_one_agent_and_all_ways_in_turn(session):
 
 def test_a_knob_is_clamped_and_nonsense_is_refused_in_a_sentence(session):
     assert session.ask({"name": "size", "value": 1e9}) == {"size": 3.0}
-    said = json.loads(session.words[-1][4:])["note"]
-    assert said == "`size` got 1e+09, and stands at 3, the end of its range."
+    said = json.loads(session.messages[-1][4:])["note"]
+    assert said == "`size` got 1e+09, must be from 0.3 to 3, and is now 3."
     assert session.ask({"name": "wind", "value": -1e300}) == {"wind": -3.0}
     for told, sentence in {
-        ("colour", 1.0): "there is no knob `colour`; this scenario has `coupling`",
+        ("colour", 1.0): "there is no control `colour`; this scenario has `coupling`",
         ("turn", "a lot"): "`turn` got `a lot`, and must be a number.",
         ("turn", float("nan")): "`turn` got `nan`, and must be a number.",
         ("turn", True): "`turn` got `True`, and must be a number.",
@@ -274,7 +274,7 @@ def test_what_was_done_is_saved_and_repeats_to_the_bit(session, swarm):
     ats = [0.08, 0.08, 0.16, 0.16, 0.24, 0.24, 0.24, 0.24, 0.28, 0.28, 0.32, 0.32]
     assert [event.at for event in again.live] == ats
     panel = Panel(again, build(again))
-    other = Session(again, panel, LiveLoop(*panel.built, panel))
+    other = Session(again, panel, LiveLoop(*panel.experiment, panel.live))
     for states in shown:
         other.settle()
         np.testing.assert_array_equal(other.swarm.advance().states, states)
@@ -306,10 +306,10 @@ def test_reset_begins_again_with_the_knobs_as_they_are(session, swarm):
 
 def test_the_promise_holds_stands_on_its_edge_or_is_lost_with_its_number(panel):
     strong = badge_of(panel, panel.start)
-    assert strong["state"] == "holds" and strong["short"].startswith("promised: ")
+    assert strong["state"] == "holds" and strong["short"].startswith("guaranteed: ")
     edge = strong["edge"]
     near = badge_of(panel, panel.start._replace(coupling=1.05 * edge))
-    assert near["state"] == "edge" and near["short"].endswith(", at its edge")
+    assert near["state"] == "edge" and near["short"].endswith(", near its edge")
     parted = badge_of(panel, panel.start._replace(cut=frozenset({0, 3})))
     assert parted["state"] == "lost" and "disconnected" in parted["causes"][0]
 
@@ -324,9 +324,9 @@ LOOKS = [
 @pytest.mark.parametrize("change", LOOKS)
 def test_the_first_look_is_the_slowest_mode_that_the_promise_then_tells(panel, change):
     knobs = panel.start._replace(**change)
-    found = ech.promise(*build(panel.standing(knobs)))
-    assert panel.slowest(knobs) == pytest.approx(found.slowest, rel=1e-9)
-    assert first_look(panel, knobs)["state"] == "asking"
+    found = ech.promise(*build(panel.scenario_at(knobs)))
+    assert panel.live.slowest(knobs) == pytest.approx(found.slowest, rel=1e-9)
+    assert first_look(panel, knobs)["state"] == "pending"
 
 
 def test_a_growing_mode_is_told_at_once(panel):
@@ -341,7 +341,7 @@ def test_a_growing_mode_is_told_at_once(panel):
     weak = own.start._replace(coupling=0.02 * own.start.coupling)
     look, found = first_look(own, weak), badge_of(own, weak)
     assert look["state"] == found["state"] == "lost"
-    assert look["short"] == found["short"] and "a mode grows, +" in look["short"]
+    assert look["short"] == found["short"] and "a mode grows at " in look["short"]
     assert any("raise `coupling`" in cause for cause in found["causes"])
 
 
@@ -351,16 +351,16 @@ HELD = {"state": "holds", "short": "promised", "whole": "Promised.", "rate": 1.0
 def badges_of(model, errors, pitch=None, begins=None):
     """What the badge tells over time (s) of errors, one a second, of a leader and a follower."""
     told, names = [], model.state_names
-    reach = GuaranteeStatus(model, ech.Graph.path(2), told.append)
-    reach.hear(HELD | {"beyond": ["what is promised does not reach this run: far"]})
+    status = GuaranteeStatus(model, ech.Graph.path(2), told.append)
+    status.update(HELD | {"beyond": ["the guarantee does not cover this run: far"]})
     for second, error in enumerate(errors):
         if second == begins:
-            reach.begin()
+            status.begin()
         states = np.zeros((2, len(names)))
         if pitch is not None:
             states[1, names.index("pitch")] = pitch[second]
         size, none = np.array([0.0, error]), np.zeros(2, bool)
-        reach.look(Picture(float(second), states, states, size, states, np.nan, none))
+        status.look(Picture(float(second), states, states, size, states, np.nan, none))
     return told
 
 
@@ -369,12 +369,12 @@ def test_the_badge_is_green_only_where_what_is_promised_reaches():
         ech.models.DoubleIntegrator(), [1.0, 1.5, 1.0, 2.9, 3.1, 4.0, 3.0, 2.1, 2.0, 1.0]
     )
     assert [each["state"] for each in grown] == ["holds", "lost", "holds"]
-    assert "does not reach this run" in grown[1]["causes"][0]
+    assert "does not cover this run" in grown[1]["causes"][0]
     out = badges_of(
         ech.models.Quadrotor(), [2.0, 8.0, 8.0, 5.0, 4.0], pitch=[0.0, 1.6, 0.0, 0.0, 0.0]
     )
     assert [each["state"] for each in out] == ["holds", "lost", "holds"]
-    assert "Agent 1 left the chart of its equations at t = 1.00 s: `pitch`" in out[1]["causes"][1]
+    assert "Agent 1 left the domain of its equations at t = 1.00 s: `pitch`" in out[1]["causes"][1]
 
 
 def test_a_first_swing_and_errors_of_no_size_take_no_promise_back():
@@ -505,7 +505,7 @@ def test_a_page_that_is_closed_ends_nothing_and_nobody_watching_stops_the_clock(
         ({"cut": [0, 2]}, "`live` at 1 s: `[0, 2]` is no link of the graph."),
         ({"law": "best"}, "`live` at 1 s: there is no law `best` here; there are `consensus`"),
         ({"shape": "star"}, "`live` at 1 s: there is no shape `star` here; there are"),
-        ({"law": "passive", "coupling": 2.0}, "`live` at 1 s: there is no knob `coupling`"),
+        ({"law": "passive", "coupling": 2.0}, "`live` at 1 s: there is no control `coupling`"),
         ({"kick": {4: [1.0, 0, 0, 0]}}, "`live` at 1 s: `kick` got agent 4 with 4 numbers"),
     ],
 )

@@ -126,7 +126,7 @@ def test_arrows_go_to_who_hears_and_a_graph_that_switches_has_the_links_of_the_t
             seek(page, round(50 * time))
             assert page.evaluate("echelon.links") == run.edges[run.linked(time)].tolist()
         seek(page, 275)
-        heard = [page.evaluate(f"echelon.player.view.heardBy({k})") for k in range(4)]
+        heard = [page.evaluate(f"echelon.player.view.sendersOf({k})") for k in range(4)]
         assert heard == [[], [], [1, 3], [2]]
         # The head of the arrow from 1 to 2 is wide where its line is not.
         first, second = (np.array(page.evaluate(f"echelon.whereOnScreen({k})")) for k in (1, 2))
@@ -166,8 +166,8 @@ def test_the_charts_tell_the_error_and_v_at_the_cursor(browser, run, file):
         told = page.evaluate("[...document.querySelectorAll('.chart')].map((c) => c.innerText)")
         assert [f"{errors[k]:.3g}" in told[0].replace("\n", " ") for k in (1, 2, 3)] == [True] * 3
         assert f"V {run.lyapunov[100]:.3g}" in told[1].replace("\n", " ")
-        assert "slope promised, \u22120.5 1/s" in told[0]
-        assert "slope promised, \u22121 1/s" in told[1]
+        assert "guaranteed slope, \u22120.5 1/s" in told[0]
+        assert "guaranteed slope, \u22121 1/s" in told[1]
 
 
 def test_a_click_on_an_agent_tells_its_place_its_error_and_whom_it_hears(browser, run, file):
@@ -178,7 +178,7 @@ def test_a_click_on_an_agent_tells_its_place_its_error_and_whom_it_hears(browser
         page.mouse.click(box["x"] + x, box["y"] + y)
         until(lambda: page.locator(".card").is_visible())
         card = page.locator(".card").inner_text()
-        assert card.startswith("follower 2\n") and "hears 0" in card
+        assert card.startswith("follower 2\n") and "receives from 0" in card
         error = run.formation_errors[60, 2]
         assert f"{error:.3g}"[:4] in card
 
@@ -204,7 +204,7 @@ def test_keys_the_slider_and_a_chart_move_the_time_and_play_lets_it_run(browser,
 
 def test_the_camera_follows_an_agent(browser, file):
     with opened(browser, file) as page:
-        page.get_by_label("what the camera follows").select_option("3")
+        page.get_by_label("target of the camera").select_option("3")
         places = []
         for frame in (0, 120):
             seek(page, frame)
@@ -266,7 +266,7 @@ def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_en
                 assert page.evaluate(f"echelon.position({agent})") == pytest.approx(place, abs=6e-5)
         seek(page, 120)
         chart = page.locator(".chart").nth(1).inner_text().replace("\n", " ")
-        assert f"V {run.lyapunov[120]:.3g}" in chart and "slope promised, −1 1/s" in chart
+        assert f"V {run.lyapunov[120]:.3g}" in chart and "guaranteed slope, −1 1/s" in chart
         with page.expect_navigation():
             growing.finish(run)
         # A time in between, so that the frame is rounded.
@@ -376,7 +376,7 @@ def test_agents_that_fly_away_spoil_neither_the_scale_nor_the_rest():
     space = space_of(gone)
     assert space.clipped and (space.high - space.low).max() < 20.0
     header, found = unpacked(replay_data(gone))
-    assert "stand still" in " ".join(header["notes"])
+    assert "drawn at that border" in " ".join(header["notes"])
     places = found["positions"].reshape(-1, 4, 3)
     np.testing.assert_allclose(places[:200], run.states[:200, :, :3], atol=1e-3)
 
@@ -439,7 +439,7 @@ def test_view_writes_one_file_and_replaces_none_unasked(echelon, stored):
 
 BAD = {
     "nothing": ("none", "`none` does not exist; give the folder of a run, or its `run.nc`."),
-    "no run": (".", "the folder `.` holds no `run.nc`, and so no run."),
+    "no run": (".", "the folder `.` holds no run: it has no `run.nc`."),
     "damaged": ("junk.nc", "`junk.nc` cannot be read as a run: it is damaged, or was not written"),
     "older": ("old.nc", "`old.nc`: the run was written in format 1 by echelon "),
 }
@@ -500,7 +500,7 @@ def test_the_badge_says_which_rate_it_has_and_is_not_green_over_a_run_that_was_l
     slow = promise_badge(told | {"rate": 0.5, "slowest_mode": -0.5})
     assert slow["whole"].endswith("0.5 1/s is that of the slowest mode.")
     turns = promise_badge(told | {"rate": 0.452, "slowest_mode": -1.32})
-    assert "0.452 1/s is kept whichever graph holds" in turns["whole"]
+    assert "0.452 1/s holds for all graphs" in turns["whole"]
     promise = dict(run.promise) | told | {"rate": 0.5, "slowest_mode": -0.5}
     for outcome, state in (("completed", "holds"), ("left_chart", "lost"), ("diverged", "lost")):
         ended = dict(run.attributes) | {"outcome": outcome, "message": "It ended so."}

@@ -227,7 +227,7 @@ class Yielding(ech.models.Pendulum):
         (Yielding(), ech.gains.RobustLQR({"angle": 0.5}), "Seen at samples, which is no", "Proved"),
         (Weakening(), ech.gains.RobustLQR({"angle": 0.2}), "small errors shrink", "any start"),
         (ech.models.Pendulum(), ech.gains.Riccati(), "how close is not known", "errors shrink"),
-        (ech.models.Pendulum(), ech.gains.Monotone({"angle": 0.5}), "V does not rise", "shrink"),
+        (ech.models.Pendulum(), ech.gains.Monotone({"angle": 0.5}), "V does not incr", "shrink"),
     ],
 )
 def test_the_promise_is_as_strong_as_its_argument(robust, model, method, told, untold):

@@ -85,10 +85,10 @@ def test_what_is_said_of_those_that_settle_is_said_to_be_of_them():
         row_of("b", 3.0, 6.0, 9e-3),
     )
     text = " ".join(verdict(Comparison("mine", rows, 5.0, 1.0, ())))
-    assert "Of those that settle, a asks the least of the inputs (5; next b, 6)." in text
-    assert "Of those that settle, a takes the least computing, b 4 times as much." in text
+    assert "Of those that settle, a has the smallest effort (5; next b, 6)." in text
+    assert "Of those that settle, a takes the least computing time, b 4 times as much." in text
     text = " ".join(verdict(Comparison("mine", rows[1:], 5.0, 1.0, ())))
-    assert "Of those" not in text and "a asks the least of the inputs (5; next b, 6)." in text
+    assert "Of those" not in text and "a has the smallest effort (5; next b, 6)." in text
 
 
 @pytest.mark.parametrize(

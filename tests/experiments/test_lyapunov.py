@@ -96,7 +96,7 @@ def test_the_printed_algorithm_is_caught_where_v_rises_against_theory():
     result = monotone(integrator="printed", dt=1.0)
     v = lyapunov(result)
     assert v.forbidden().sum() > 3
-    assert "Warning: V rises at " in ech.report(result)
+    assert "Warning: V increased at " in ech.report(result)
     assert "the step `dt` is too long" in " ".join(ech.report(result).split())
 
 

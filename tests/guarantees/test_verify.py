@@ -356,9 +356,9 @@ def test_combinations_lie_inside_and_points_beyond_a_corner_do_not(seed):
     ("summary", "sentence"),
     [
         ('{"promise": {', "`run/summary.json` cannot be read, or is damaged: "),
-        ("[1]", "`run/summary.json` is damaged: it holds no mapping."),
+        ("[1]", "`run/summary.json` is damaged: it must hold a mapping."),
         ('{"gain": {"coupling": 1.0}}', "`run` has lost its `gain.json`; `echelon run run --out"),
-        ('{"gain": null}', "the law of `run` left neither a gain nor a tube to verify."),
+        ('{"gain": null}', "the law in `run` has neither a gain nor a tube to verify."),
     ],
 )
 def test_a_run_without_what_it_promised_is_told_so(echelon, here, summary, sentence):

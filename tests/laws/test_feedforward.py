@@ -365,8 +365,8 @@ def test_the_report_promises_the_modes_that_parents_leave():
     )
     # s^2 + sqrt 3 s + 1 has its roots at -sqrt 3 / 2 +- i / 2.
     text = " ".join(report(run).split())
-    assert "slowest mode is -0.866 1/s at coupling 1; from 0.5 on every mode decays." in text
-    assert "Each follower is told: neighbours' states, its parent's input of the same step." in text
+    assert "decays at 0.866 1/s (coupling 1). Couplings above 0.5 are sufficient" in text
+    assert "follower: neighbours' states; its parent's input of the same step." in text
 
 
 def test_a_scenario_may_ask_for_it_and_is_told_where_it_cannot():

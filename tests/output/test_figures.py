@@ -63,12 +63,12 @@ def test_inputs_without_limits_have_their_names_and_units(run):
 def test_the_slope_that_is_promised_is_drawn_from_the_largest_error_on(run):
     worst = run.formation_errors.max(axis=1)
     (t0, first), (t1, last) = lines_of(figures(run, ["formation"])["formation"])[
-        "slope promised: \u22120.5 1/s"
+        "guaranteed slope: \u22120.5 1/s"
     ]
     assert first == worst.max() and t0 == run.times[worst.argmax()]
     assert np.log(last / first) == pytest.approx(-0.5 * (t1 - t0))
     (t0, first), (t1, last) = lines_of(figures(run, ["lyapunov"])["lyapunov"])[
-        "slope promised: \u22121 1/s"
+        "guaranteed slope: \u22121 1/s"
     ]
     assert np.log(last / first) == pytest.approx(-1.0 * (t1 - t0))
 
@@ -76,7 +76,7 @@ def test_the_slope_that_is_promised_is_drawn_from_the_largest_error_on(run):
 def test_nothing_is_drawn_of_a_promise_that_is_none(run):
     none = dataclasses.replace(run, promise=PROMISE | {"promised": False, "rate": None})
     for name in ("formation", "lyapunov"):
-        assert not [k for k in lines_of(figures(none, [name])[name]) if "promised" in k]
+        assert not [k for k in lines_of(figures(none, [name])[name]) if "guaranteed" in k]
 
 
 def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_so(run):
@@ -255,7 +255,7 @@ def test_links_past_the_palette_are_dashed_and_what_is_wanted_has_no_links_colou
         (named[f"{i} to {j}"].get_color(), named[f"{i} to {j}"].get_linestyle()) for i, j in edges
     }
     assert len(looks) == 7
-    assert named["wanted"].get_color() not in {colour for colour, _ in looks}
+    assert named["desired"].get_color() not in {colour for colour, _ in looks}
 
 
 def test_the_start_of_a_bound_stands_within_the_axes(run):
@@ -271,7 +271,7 @@ def test_axes_of_derivatives_say_when_v_rises_between_frames_that_fall(run):
         run, lyapunov=np.exp(run.times), lyapunov_rate=-np.ones(len(run.times))
     )
     below = figures(rising, ["lyapunov"])["lyapunov"].axes[1]
-    assert "V rises in between" in below.get_title(loc="right")
+    assert "V increases in between" in below.get_title(loc="right")
     assert not figures(run, ["lyapunov"])["lyapunov"].axes[1].get_title(loc="right")
 
 

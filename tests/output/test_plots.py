@@ -270,7 +270,7 @@ def test_v_and_its_derivative_are_drawn_as_given(runs):
     v = lyapunov(result)
     (above, below), lines = drawn(result, "lyapunov")
     np.testing.assert_array_equal(lines["V"], np.column_stack([result.times, v.value]))
-    falls, rises = (lines.get(name) for name in ("V falls", "V rises"))
+    falls, rises = (lines.get(name) for name in ("V decreases", "V increases"))
     np.testing.assert_array_equal(falls[:, 1], np.where(v.rate < 0.0, -v.rate, np.nan))
     assert (rises is None) == (v.rate <= 0.0).all()
     assert [ax.get_yscale() for ax in (above, below)] == ["log", "log"]
@@ -287,8 +287,8 @@ def test_a_rising_v_is_told_apart(runs):
     count = len(result.times)
     rate = np.linspace(-1.0, 2.0, count)
     lines = labelled(figures(with_v(result, np.ones(count), rate))["lyapunov"])
-    np.testing.assert_array_equal(lines["V falls"][:, 1], np.where(rate < 0.0, -rate, np.nan))
-    np.testing.assert_array_equal(lines["V rises"][:, 1], np.where(rate > 0.0, rate, np.nan))
+    np.testing.assert_array_equal(lines["V decreases"][:, 1], np.where(rate < 0.0, -rate, np.nan))
+    np.testing.assert_array_equal(lines["V increases"][:, 1], np.where(rate > 0.0, rate, np.nan))
 
 
 def test_without_v_there_is_no_figure_of_it_and_without_motion_no_panel(runs):
@@ -307,7 +307,7 @@ def test_many_followers_have_no_names_and_their_worst_has(runs):
     lines = labelled(made["formation"])
     worst = next(name for name in lines if name.startswith("worst: follower "))
     told = {worst, "median follower", "largest at each time", "1 cm"}
-    assert {name for name in lines if not name.startswith("slope promised")} == told
+    assert {name for name in lines if not name.startswith("guaranteed slope")} == told
     off = (result.states - result.formation.offsets)[:, :, :2]
     errors = np.linalg.norm(off[:, 1:] - off[:, :1], axis=2)
     np.testing.assert_allclose(lines["largest at each time"][:, 1], errors.max(axis=1), rtol=1e-12)

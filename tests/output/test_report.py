@@ -46,7 +46,7 @@ def test_the_lag_without_feed_forward_is_told():
     )
     assert "do not know the leader's motion and lag: 0.0" in text
     assert "`feedforward: relay` removes the lag" in text
-    assert "Each follower is told: neighbours' states." in text
+    assert "Information used by each follower: neighbours' states." in text
 
 
 def test_a_broken_symmetry_warns_and_names_the_agent():
@@ -113,7 +113,7 @@ def test_a_swarm_shows_best_median_and_worst():
 
 def test_the_unicycles_relay_is_told_to_the_reader():
     text = " ".join(ech.report(run("unicycle", "simulation.horizon=1")).split())
-    assert "Each follower is told: neighbours' states, the leader's input of the same step." in text
+    assert "follower: neighbours' states; the leader's input of the same step." in text
 
 
 @pytest.mark.parametrize("followers", [13, 14])
@@ -150,7 +150,7 @@ def test_a_horizon_shorter_than_the_slowest_mode_is_told():
 @pytest.mark.study
 def test_a_leader_that_a_heavier_plant_holds_off_its_path_is_told():
     found = told("plant.scale.mass=1.1", "simulation.horizon=20", scenario="planar-quadrotor")
-    [text] = [each for each in found if "the leader stays" in each]
+    [text] = [each for each in found if "the leader has a steady error" in each]
     assert "no law has integral action" in text and "`leader.gain`" in found[text]
 
 
@@ -167,5 +167,5 @@ def test_wind_is_not_blamed_where_the_loop_grows_by_itself():
         ech.report(ech.simulate(*ech.build(ech.load_scenario("integrators", [wind, *more]))))
         for more in ([], ["simulation.dt=1.0", "simulation.horizon=20"])
     ]
-    assert "the disturbance pushes it up" in told[0]
-    assert "the input is held over a `dt` too long" in told[1] and "pushes it up" not in told[1]
+    assert "as expected under a disturbance" in told[0]
+    assert "`dt` is too long for an input" in told[1] and "as expected" not in told[1]

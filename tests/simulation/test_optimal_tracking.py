@@ -159,7 +159,7 @@ def test_a_reference_that_is_too_fast_is_warned_of_with_the_ratio():
     # At rate w the lemniscate's acceleration grows as w^2, past the thrust to weight of 2.3.
     fast = ech.optimal.OptimalTracking(ech.references.Lemniscate(rate=3.0), horizon=2.0)
     (told,) = fast.warnings(QUADROTOR, TREE)
-    assert "is too fast for `Quadrotor`" in told and "times what the actuators leave" in told
+    assert "is too fast for `Quadrotor`" in told and "times the range of the actuators" in told
     assert LAW.warnings(QUADROTOR, TREE) == ()
     free = ech.optimal.OptimalTracking(
         ech.references.Lemniscate(rate=3.0), horizon=2.0, limits=False

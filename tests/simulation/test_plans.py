@@ -269,7 +269,7 @@ def test_a_replay_is_a_result_like_any_other(tmp_path):
     warned = simulate_plans(
         QUADROTOR, TREE, DRAWN, reference=fast, horizon=0.2, dt=0.01, start_error={}
     )
-    assert [w for w in warned.warnings if "times what the actuators leave" in w]
+    assert [w for w in warned.warnings if "times the range of the actuators" in w]
 
 
 @pytest.mark.study

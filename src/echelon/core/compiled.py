@@ -93,12 +93,12 @@ class CompiledFunction(Generic[_R]):
             # What cannot be read is made again.
             with contextlib.suppress(Exception):
                 return None if stored == _OTHER else _load(stored, len(call.arrays))
-        made, packed = _compile(self._function, call), _OTHER
+        compiled, packed = _compile(self._function, call), _OTHER
         # What cannot be written down is for JAX to keep from the next process on.
         with contextlib.suppress(Exception):
-            packed = _OTHER if made is None else _packed(made)
+            packed = _OTHER if compiled is None else _packed(compiled)
         disk_cache.write_if_unchanged(file, packed)
-        return made
+        return compiled
 
 
 def cached_jit(function: Callable[..., _R]) -> Callable[..., _R]:
@@ -143,11 +143,11 @@ def _compile(function: Callable[..., Any], call: _CallArguments) -> _Compiled | 
     def flat(*arrays: jax.Array) -> list[Any]:
         args, named = call.arguments(arrays)
         leaves, tree = jax.tree.flatten(function(*args, **named))
-        made = [leaf for leaf in leaves if eqx.is_array(leaf)]
-        places = map(_Place, range(len(made)))
+        outputs = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        places = map(_Place, range(len(outputs)))
         leaves = [next(places) if eqx.is_array(leaf) else leaf for leaf in leaves]
         trees.append(jax.tree.unflatten(tree, leaves))
-        return made
+        return outputs
 
     # What JAX has read from its own disk cache cannot be written down again: it lacks its code.
     # Under a name of its own it is not found there, nor is it kept there as well.
@@ -186,6 +186,6 @@ def _load(stored: bytes, given: int) -> _Compiled:
     """Return compiled code that takes so many arrays, from bytes."""
     from jax.experimental.serialize_executable import deserialize_and_load
 
-    code, made, tree = pickle.loads(stored)
+    code, count, tree = pickle.loads(stored)
     before = jax.tree.structure(((0,) * given, {}))
-    return _Compiled(deserialize_and_load(code, before, jax.tree.structure([0] * made)), tree)
+    return _Compiled(deserialize_and_load(code, before, jax.tree.structure([0] * count)), tree)

@@ -132,10 +132,10 @@ def _ground() -> bytes | None:
     if sources is None or jax.local_device_count() > 1 or jax.default_backend() != "cpu":
         return None
     below = (np, scipy, jax, jaxlib, equinox)
-    told = [*(module.__version__ for module in below), sys.version, _processor()]
+    parts = [*(module.__version__ for module in below), sys.version, _processor()]
     # JAX reads them once.
-    told += sorted(f"{key}={value}" for key, value in os.environ.items() if _sets(key.lower()))
-    return hashlib.sha256(sources + "\0".join(told).encode()).digest()
+    parts += sorted(f"{key}={value}" for key, value in os.environ.items() if _sets(key.lower()))
+    return hashlib.sha256(sources + "\0".join(parts).encode()).digest()
 
 
 def _sets(name: str) -> bool:
@@ -160,7 +160,7 @@ def _sources() -> bytes | None:
 
     So it is where one changed while this process ran, and where Python runs what was made of them.
     """
-    home, told = Path(__file__).parents[1], hashlib.sha256()
+    home, hasher = Path(__file__).parents[1], hashlib.sha256()
     try:
         files = [(file, file.stat(), file.read_bytes()) for file in sorted(home.rglob("*.py"))]
     except OSError:
@@ -170,8 +170,8 @@ def _sources() -> bytes | None:
     if late or Path(__file__) not in (file for file, *_ in files):
         return None
     for file, _, content in files:
-        told.update(f"{file.relative_to(home)}\0{len(content)}\0".encode() + content)
-    return told.digest()
+        hasher.update(f"{file.relative_to(home)}\0{len(content)}\0".encode() + content)
+    return hasher.digest()
 
 
 def _processor() -> str:

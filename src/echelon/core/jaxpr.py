@@ -93,12 +93,12 @@ def walk(
 
 def _used(jaxpr: Any) -> list[Any]:
     """Return the equations on which the results depend, as a trace keeps all that was written."""
-    wanted, found = {v for v in jaxpr.outvars if not hasattr(v, "val")}, []
+    needed, result = {v for v in jaxpr.outvars if not hasattr(v, "val")}, []
     for equation in reversed(jaxpr.eqns):
-        if wanted.intersection(equation.outvars):
-            wanted.update(v for v in equation.invars if not hasattr(v, "val"))
-            found.append(equation)
-    return found[::-1]
+        if needed.intersection(equation.outvars):
+            needed.update(v for v in equation.invars if not hasattr(v, "val"))
+            result.append(equation)
+    return result[::-1]
 
 
 def used_leaves(function: Callable[..., Any], *arguments: Any) -> list[bool]:
@@ -288,12 +288,12 @@ def _dot(zero: Any, params: Mapping[str, Any], a: np.ndarray, b: np.ndarray) -> 
     (contract_a, contract_b), (batch_a, batch_b) = params["dimension_numbers"]
     left, batch, rows = _matrix_form(a, batch_a, contract_a)
     right, _, columns = _matrix_form(b, batch_b, contract_b)
-    found = np.empty((left.shape[0], left.shape[1], right.shape[1]), object)
-    for i, j, k in np.ndindex(*found.shape):
+    result = np.empty((left.shape[0], left.shape[1], right.shape[1]), object)
+    for i, j, k in np.ndindex(*result.shape):
         products = (p * q for p, q in zip(left[i, j], right[i, k], strict=True))
         # A plain `sum` would begin at the integer 0, which an entry need not know how to add.
-        found[i, j, k] = sum(products, start=zero)
-    return found.reshape(batch + rows + columns)
+        result[i, j, k] = sum(products, start=zero)
+    return result.reshape(batch + rows + columns)
 
 
 def _matrix_form(
@@ -305,9 +305,9 @@ def _matrix_form(
     free_shape = tuple(x.shape[axis] for axis in free)
     inner = math.prod(x.shape[axis] for axis in contracted)
     # Sizes are spelled out, as NumPy cannot infer a -1 next to an axis of length zero.
-    moved = x.transpose([*batch, *free, *contracted])
+    permuted = x.transpose([*batch, *free, *contracted])
     return (
-        moved.reshape(math.prod(batch_shape), math.prod(free_shape), inner),
+        permuted.reshape(math.prod(batch_shape), math.prod(free_shape), inner),
         batch_shape,
         free_shape,
     )

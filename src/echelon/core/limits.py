@@ -44,12 +44,12 @@ def excess_states(states: int) -> str | None:
 def excess_runs(runs: int, numbers: int = 0) -> str | None:
     """Return why a sweep has too many runs, of each of which so many numbers are kept."""
     most = _most(runs, MOST_RUNS, "runs")
-    asked, room = 8 * _COPIES * runs * numbers, memory() // 2
-    if most is not None or asked <= room:
+    size, room = 8 * _COPIES * runs * numbers, memory() // 2
+    if most is not None or size <= room:
         return most
     return (
-        f"{runs} runs are asked for, whose findings need {_bytes(asked)} of memory, and "
-        f"{_bytes(room)} fit: {runs * room // asked} runs"
+        f"{runs} runs are asked for, whose findings need {_bytes(size)} of memory, and "
+        f"{_bytes(room)} fit: {runs * room // size} runs"
     )
 
 
@@ -78,20 +78,20 @@ def excess_frames(frames: int, numbers: int, every: int) -> str | None:
 
     Half of the machine's memory is for them.
     """
-    asked, room = 8 * _COPIES * frames * numbers, memory() // 2
-    if asked <= room:
+    size, room = 8 * _COPIES * frames * numbers, memory() // 2
+    if size <= room:
         return None
-    wanted = every * -(-asked // room)
+    spacing = every * -(-size // room)
     return (
-        f"stores {frames} frames, which need {_bytes(asked)} of memory, and {_bytes(room)} fit: "
-        f"a `store_every` of {wanted}, or a horizon {asked / room:.3g} times shorter"
+        f"stores {frames} frames, which need {_bytes(size)} of memory, and {_bytes(room)} fit: "
+        f"a `store_every` of {spacing}, or a horizon {size / room:.3g} times shorter"
     )
 
 
 def memory() -> int:
     """Return the bytes of memory that this process may have."""
-    found = [limit for limit in (_machine(), _group()) if limit is not None]
-    return min(found, default=_UNKNOWN)
+    result = [limit for limit in (_machine(), _group()) if limit is not None]
+    return min(result, default=_UNKNOWN)
 
 
 def _machine() -> int | None:

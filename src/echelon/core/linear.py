@@ -31,11 +31,11 @@ def discretize(
         # (Van Loan).
         block = np.zeros((*A.shape[:-2], n + m, n + m))
         block[..., :n, :n], block[..., :n, n:] = A, B
-        moved = scipy.linalg.expm(block * dt)[..., :n, :]
+        step_map = scipy.linalg.expm(block * dt)[..., :n, :]
     else:
         step = cast(Callable[..., np.ndarray], INTEGRATORS[integrator])
-        moved = step(lambda x, u: A @ x + B @ u, unit[:n], unit[n:], dt)
-    return moved[..., :n], moved[..., n:]
+        step_map = step(lambda x, u: A @ x + B @ u, unit[:n], unit[n:], dt)
+    return step_map[..., :n], step_map[..., n:]
 
 
 def matrix_exponential(X: np.ndarray) -> np.ndarray:
@@ -48,12 +48,12 @@ def matrix_exponential(X: np.ndarray) -> np.ndarray:
     # A loop that is lost has no flow, and what comes of it is no number either way.
     squarings = max(0, int(np.ceil(np.log2(size)))) if 0.0 < size < np.inf else 0
     X, one = X * 0.5**squarings, np.eye(X.shape[-1])
-    found = one + X / _DEGREE
+    result = one + X / _DEGREE
     for k in range(_DEGREE - 1, 0, -1):
-        found = one + X @ found / k
+        result = one + X @ result / k
     for _ in range(squarings):
-        found = found @ found
-    return found
+        result = result @ result
+    return result
 
 
 def sampled_radius(
@@ -123,15 +123,15 @@ def uncontrollable_modes(A: np.ndarray, B: np.ndarray) -> list[tuple[complex, np
     [s I - A, B] is below 1e-9 times the norm of the pair.
     """
     scale = max(1.0, float(np.linalg.norm(A, 2)), float(np.linalg.norm(B, 2)))
-    found = []
+    result = []
     for s in np.linalg.eigvals(A):
         pencil = np.hstack([s * np.eye(len(A)) - A, B])
         # u'[s I - A, B] = 0 for the last left singular vector u: a left eigenvector that B does not
         # see.
         left, singular, _ = np.linalg.svd(pencil)
         if singular[-1] <= 1e-9 * scale:
-            found.append((complex(s), left[:, -1].conj()))
-    return found
+            result.append((complex(s), left[:, -1].conj()))
+    return result
 
 
 def observability_rank(A: np.ndarray, C: np.ndarray) -> int:
@@ -163,8 +163,8 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
         # Part by part, so that what has nothing to do with each other is 0 and not rounding: it
         # then costs nothing in a step.
         for part in _uncoupled(A, B, Q, R):
-            own = np.ix_(part, part)
-            P[own] = _stabilizing(A[own], B[part], Q[own], R)
+            block = np.ix_(part, part)
+            P[block] = _stabilizing(A[block], B[part], Q[block], R)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise GainError(
             f"the Riccati equation has no stabilizing solution ({str(error).rstrip('.').lower()}); "

@@ -15,14 +15,14 @@ def versions() -> dict[str, str]:
 
     In a checkout there is `git` too, the commit.
     """
-    found = {"python": platform.python_version(), "echelon": __version__}
+    result = {"python": platform.python_version(), "echelon": __version__}
     for package in _PACKAGES:
         try:
-            found[package] = metadata.version(package)
+            result[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
-            found[package] = "unknown"
+            result[package] = "unknown"
     commit = _commit()
-    return {**found, "git": commit} if commit else found
+    return {**result, "git": commit} if commit else result
 
 
 def _commit() -> str | None:

@@ -95,8 +95,8 @@ def check_function(
     Raises:
         Exception: the one that `fault` makes, for the first fault found.
     """
-    found = checked_trace(fault, what, function, *arguments, advice=advice)
-    check_array(fault, what, found.result, shape)
+    value = checked_trace(fault, what, function, *arguments, advice=advice)
+    check_array(fault, what, value.result, shape)
 
 
 def check_array(
@@ -135,24 +135,24 @@ def checked_trace(
         Exception: the one that `fault` makes, for the first fault found.
     """
     try:
-        found = trace(function, *arguments)
+        result = trace(function, *arguments)
     # A sentence of our own, which says more than its place would.
     except EchelonError:
         raise
     # It is anyone's code: whatever it raises is its own fault, and stays attached as the cause.
     except Exception as error:
         raise fault(f"{what} fails with {error_summary(error)}; {advice}.") from error
-    if found.rounds:
+    if result.rounds:
         raise fault(
             f"{what} casts float64 numbers to fewer digits, and must keep the type of its "
             "argument, `x.dtype`."
         )
-    if found.frozen:
+    if result.frozen:
         raise fault(
             f"{what} differs from one call to the next, as a clock or a random number makes it, "
             "and must be a function of its arguments alone."
         )
-    return found
+    return result
 
 
 def error_summary(error: BaseException) -> str:

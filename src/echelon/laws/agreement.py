@@ -27,7 +27,7 @@ class Agreement(Law):
         return np.eye(len(model.state_names))
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Agreement":
-        """Refuse a model that is no single integrator."""
+        """Check that the model is a single integrator."""
         # u = -z gives differences of states as velocities, which suits xdot = u and no other.
         if not isinstance(model, SingleIntegrator):
             raise LawError(
@@ -38,5 +38,5 @@ class Agreement(Law):
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the velocity of one agent."""
-        # With f = 0 and g = I the consensus law at P = R = I and c = 1 is this: z has the brackets.
+        # The consensus law at f = 0, g = P = R = I and c = 1: z has the brackets.
         return -view.disagreement, memory

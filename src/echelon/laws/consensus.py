@@ -46,18 +46,16 @@ class Consensus(Law):
 
     Args:
         gain: P, R and c.
-        feedforward: what is sent of others' inputs of the same step, after their limits, `relay`
-            unless given: `none`; `relay`, the leader's normalized input; `relay-velocity`, the
-            velocity g S v that it makes, of which each follower takes the input nearest in P;
+        feedforward: what followers receive of others' inputs of the same step, after their limits,
+            `relay` by default: `none`; `relay`, the leader's normalized input; `relay-velocity`,
+            the velocity g S v of that input, of which each follower takes the input nearest in P;
             `parent`, on a tree, the normalized input of the neighbour nearer to the leader. The
-            paper's network gives none of this.
-        trim: whether the trim input u* is applied; the paper's printed law has none (literal:
-            False).
-        frame: `heading`, the gain turns with the heading that the leader follows, which is
-            forwarded to everybody, where the model states one; `world`, it does not, as the paper
-            has it.
-        turning: whether it does; found by `following`.
-        told: that heading, rad; given by `facing`.
+            paper's network has none of this.
+        trim: whether the trim input u* is applied; the paper's printed law has none (False).
+        frame: `heading`, the gain turns with the heading that the leader follows, which everybody
+            receives, if the model has one; `world`, it does not, as in the paper.
+        turning: whether the gain turns; set by `following`.
+        angle: that heading, rad; set by `facing`.
     """
 
     gain: Gain
@@ -68,10 +66,10 @@ class Consensus(Law):
     trim: bool = eqx.field(default=True, static=True)
     frame: Frame = eqx.field(default=Frame.HEADING, static=True, converter=_frame)
     turning: bool = eqx.field(default=False, static=True)
-    told: Scalar | None = None
+    angle: Scalar | None = None
 
     def __check_init__(self) -> None:
-        """Refuse what is no gain."""
+        """Check that the gain is one."""
         if not isinstance(self.gain, Gain):
             raise LawError(
                 f"`gain` of `Consensus` is {self.gain!r}, and must be a `Gain`, as `synthesize` "
@@ -80,17 +78,17 @@ class Consensus(Law):
 
     @property
     def information(self) -> tuple[str, ...]:
-        """Neighbours' states, what is fed forward, and the heading where the gain turns with it."""
-        sent = () if self.feedforward is Feedforward.NONE else (self.feedforward.value,)
+        """Neighbours' states, the feed-forward, and the heading if the gain turns with it."""
+        forward = () if self.feedforward is Feedforward.NONE else (self.feedforward.value,)
         return (
             "neighbours' states",
-            *sent,
+            *forward,
             *(("the heading that the leader follows",) * self.turning),
         )
 
     def facing(self, heading: Scalar) -> "Consensus":
         """Return the law with its gain in the axes of a heading (rad)."""
-        return eqx.tree_at(lambda law: law.told, self, heading, is_leaf=lambda part: part is None)
+        return eqx.tree_at(lambda law: law.angle, self, heading, is_leaf=lambda part: part is None)
 
     def metric(self, model: ControlAffine) -> Array:
         """Return the gain's P."""
@@ -105,13 +103,13 @@ class Consensus(Law):
         return self
 
     def following(self, leader: Law, model: ControlAffine) -> "Consensus":
-        """Let the gain turn if it can tell, and the leader is not known to keep its heading."""
+        """Let the gain turn if it changes with the heading, and the leader may change its own."""
         turning = self.frame is Frame.HEADING and self.gain.turns(model)
         turning = turning and not leader.keeps_heading(model)
         return self if turning is self.turning else dataclasses.replace(self, turning=turning)
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
-        """Tell by how much a branch amplifies, fed its parent's input or heard one way."""
+        """Warn of branches that amplify errors, under `parent` or with one-way edges."""
         alone = graph.directed and graph.schedule is None
         alone = alone and len(graph.edges) == len(graph.followers)
         if self.feedforward is not Feedforward.PARENT and not alone:
@@ -120,33 +118,33 @@ class Consensus(Law):
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the input of one agent."""
-        sent = view.feedforward
+        forward = view.feedforward
         if self.feedforward is Feedforward.RELAY_VELOCITY:
-            sent = _match_velocity(self, model, view.x, sent)
-        v = sent - self.gain.feedback(model, view.x, view.disagreement, self.told)
-        v = v + self.gain.inner_loop(model, view.x, self.told)
+            forward = _match_velocity(self, model, view.x, forward)
+        v = forward - self.gain.feedback(model, view.x, view.disagreement, self.angle)
+        v = v + self.gain.inner_loop(model, view.x, self.angle)
         return model.physical(v, trim=self.trim), memory
 
     def broadcast(self, model: ControlAffine, x: State, v: Input) -> Float[jax.Array, " k"]:
         """Return the input beyond the inner loop, v - kappa(x), or the velocity that it makes."""
-        # A follower closes its own loop about its own state, and adds this; with the whole v the
-        # loop would count twice wherever the two states differ.
-        beyond = v - self.gain.inner_loop(model, x, self.told)
+        # A follower closes its own inner loop and adds this; with the whole v the loop would count
+        # twice wherever the two states differ.
+        beyond = v - self.gain.inner_loop(model, x, self.angle)
         if self.feedforward is Feedforward.RELAY_VELOCITY:
             return model.normalized_input_map(x) @ beyond
         return beyond
 
     def drift(self, model: ControlAffine, x: State) -> State:
         """Return the drift with the inner loop closed."""
-        # What Assumption 5 must hold of under this law: the loop is there without any neighbour.
-        return model.velocity(x, model.physical(self.gain.inner_loop(model, x, self.told)))
+        # Assumption 5 is about this drift: the loop acts without any neighbour.
+        return model.velocity(x, model.physical(self.gain.inner_loop(model, x, self.angle)))
 
 
 def _match_velocity(law: Consensus, model: ControlAffine, x: State, velocity: State) -> Input:
     """Return the normalized input (m,) whose g(x) S v is nearest to a velocity in the metric P."""
     G, P = model.normalized_input_map(x), jnp.asarray(law.gain.P, x.dtype)
-    if law.told is not None:
-        turn, back = state_turn(model), -law.told
+    if law.angle is not None:
+        turn, back = state_turn(model), -law.angle
         G, velocity = jax.vmap(turn, (1, None), 1)(G, back), turn(velocity, back)
     # Least |G v - velocity|_P: G'P G v = G'P velocity. The second sum of V' has just this P, so
     # that what no input can match pushes V least.

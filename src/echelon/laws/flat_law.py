@@ -1,4 +1,4 @@
-"""What leaders and followers have in common under the law `stopping-point`."""
+"""The common base of leaders and followers under the law `stopping-point`."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -39,22 +39,22 @@ _LEAST = 1e-3
 """Of the push upward at the trim: what is left of it a thousandth of a radian from the border."""
 
 
-def plain_speeds(given: float | Sequence[float] | None) -> Speed | None:
+def plain_speeds(speeds: float | Sequence[float] | None) -> Speed | None:
     """Return speeds as plain numbers, which a compiled step takes for constants."""
-    return tuple(map(float, given)) if isinstance(given, Sequence | np.ndarray) else given
+    return tuple(map(float, speeds)) if isinstance(speeds, Sequence | np.ndarray) else speeds
 
 
 class FlatLaw(Law):
-    """An agent whose loop is closed in flat coordinates, and which speaks of zeta.
+    """A law with its loop closed in flat coordinates, whose agents exchange zeta.
 
     Args:
         roots: of q, 1/s, distinct and positive; one fewer than the longest chain of the model.
-        rate: the slowest root, from which the others are made, in place of `roots`.
+        rate: the slowest root, in place of `roots`; the others follow from it.
         coupling: c > 0.
-        speed: s, of all outputs or one each, in their units per second; infinite is linear. Left
-            out, what the model's bounds allow, found by `prepared`.
-        observer: whether what the model lacks is estimated and opposed.
-        loop: of the model; found by `prepared`.
+        speed: s, of all outputs or one each, in their units per second; infinite is linear. By
+            default what the model's bounds allow, computed by `prepared`.
+        observer: whether the acceleration that the model lacks is estimated and compensated.
+        loop: of the model; computed by `prepared`.
     """
 
     roots: tuple[float, ...] | None = eqx.field(default=None, static=True)
@@ -65,7 +65,7 @@ class FlatLaw(Law):
     loop: FlatLoop | None = None
 
     def __check_init__(self) -> None:
-        """Refuse roots that are not distinct and positive, and other numbers that are not."""
+        """Check that roots are distinct and positive, and other numbers positive."""
         if self.roots is not None and self.rate is not None:
             raise LawError("got `roots` and `rate`, allowed is one of them.")
         for name in ("rate", "coupling"):
@@ -122,7 +122,7 @@ class FlatLaw(Law):
         assert self.speed is not None, "`prepared` finds the speeds"
         return float(self.speed[output] if isinstance(self.speed, Sequence) else self.speed)
 
-    def found_loop(self, model: ControlAffine) -> FlatLoop:
+    def build_loop(self, model: ControlAffine) -> FlatLoop:
         """Return the inner loop for a model.
 
         Raises:
@@ -156,7 +156,7 @@ class FlatLaw(Law):
         links: int = 1,
         slowest: Callable[[FlatBound], float] = lambda _: 0.0,
     ) -> Speed:
-        """Return s as it is given, or what bounds allow of each link on the way from a leader.
+        """Return s as set by the user, or what bounds allow each link of the path from a leader.
 
         Args:
             model: the agent.
@@ -168,15 +168,15 @@ class FlatLaw(Law):
         """
         if self.speed is not None:
             return self.speed
-        each = most if links == 1 else min(most, max(most / links, _CHAINED))
-        found = dict.fromkeys(chains.outputs, each)
+        link = most if links == 1 else min(most, max(most / links, _CHAINED))
+        speeds = dict.fromkeys(chains.outputs, link)
         for bound in model.flat_bounds or ():
             degree = chains.degrees[chains.outputs.index(bound.outputs[0])]
             left = _left(self.roots_for(degree - 1), bound, slowest(bound))
             cap = most if links == 1 else math.inf
-            bounded = min(cap, share * left) / links if left > 0.0 else each
-            found |= dict.fromkeys(bound.outputs, bounded)
-        return tuple(found.values())
+            bounded = min(cap, share * left) / links if left > 0.0 else link
+            speeds |= dict.fromkeys(bound.outputs, bounded)
+        return tuple(speeds.values())
 
     def bounded(self, x: jax.Array) -> jax.Array:
         """Return sigma(x) = x / sqrt(1 + (x/s)^2): odd, increasing, of slope 1 at 0, below s."""
@@ -191,7 +191,7 @@ class FlatLaw(Law):
         return self.ready.begun(model, x, switch_on(model, self.ready.chains, x, ahead))
 
     def init(self) -> FlatMemory:
-        """Return a memory in its form."""
+        """Return a memory of zeros."""
         return self.ready.nothing()
 
     def signal(
@@ -207,7 +207,7 @@ class FlatLaw(Law):
     def settle(
         self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: FlatMemory
     ) -> FlatMemory:
-        """Return the memory with what the actuators made of the input."""
+        """Return the memory with the input that the actuators delivered."""
         return self.ready.settle(model, view.x, wanted, got, memory, view.period)
 
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
@@ -228,9 +228,9 @@ class FlatLaw(Law):
         def one(x: State) -> jax.Array:
             return flatten(model, chains, x, self.begin(model, x).chain).values
 
-        found = np.asarray(jax.vmap(one)(jnp.asarray(states)))[:, bound.derivative, places]
+        values = np.asarray(jax.vmap(one)(jnp.asarray(states)))[:, bound.derivative, places]
         names = listing(name + "'" * bound.derivative for name in bound.outputs)
-        for k in np.flatnonzero(~(np.linalg.norm(found, axis=1) > bound.above + _STILL)):
+        for k in np.flatnonzero(~(np.linalg.norm(values, axis=1) > bound.above + _STILL)):
             yield int(k), f"{names} are 0 there, and allowed is {bound.within}"
 
 
@@ -239,7 +239,7 @@ def _moves(speed: object) -> bool:
 
 
 def waits_for_path(model: ControlAffine) -> bool:
-    """Tell whether what speeds a model bears depends on the leader's path."""
+    """Tell whether the speeds that a model tolerates depend on the leader's path."""
     return any(len(bound.outputs) > 1 for bound in model.flat_bounds or ())
 
 

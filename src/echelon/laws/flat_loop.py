@@ -1,7 +1,7 @@
-"""What each agent does alone under the law `stopping-point`: an inner loop that feels no position.
+"""The inner loop of one agent under the law `stopping-point`, which uses no position.
 
 In flat coordinates q(D) y' = k0 zeta', where zeta = q(D) y / k0 is where the agent would come to
-rest if nobody spoke (theory page, T5). Integrators before inputs are part of the loop's memory.
+rest without messages (theory page, T5). Integrators before inputs are part of the loop's memory.
 """
 
 import math
@@ -17,7 +17,7 @@ from echelon.agents.models.chains import Chains, flat_output, flatten
 from echelon.agents.models.model import ControlAffine
 from echelon.core.types import Array, Input, Scalar, State
 
-_WATCH = (16.0, 64.0)
+_OBSERVER = (16.0, 64.0)
 """Of the observer, 1/s and 1/s^2: both its modes at 8 1/s, twice as fast as a quick inner loop."""
 
 
@@ -25,11 +25,11 @@ class FlatMemory(NamedTuple):
     """What an agent remembers.
 
     Attributes:
-        chain: what the integrators before inputs hold, normalized (k,).
-        rate: zeta' that it commands, (m,), which followers may be sent.
-        got: the normalized input (m,) that the actuators made in the step before.
-        base, push: of the observer (m,): the speed that the model expects but for the half step
-            at whose end it is asked, and the acceleration that the model lacks.
+        chain: the states of the integrators before inputs, normalized (k,).
+        rate: zeta' that it commands, (m,), which followers may receive.
+        got: the normalized input (m,) that the actuators delivered in the step before.
+        base, push: of the observer (m,): the speed that the model predicts but for the last half
+            step, and the acceleration that the model lacks.
         half: half of the step before, s; 0 at first.
     """
 
@@ -49,7 +49,7 @@ class FlatLoop(eqx.Module):
         chains: of the model.
         weights: (r, m) k_l / k0 of each output, zero beyond its q.
         stiffness: (m,) k0.
-        observer: whether what the model lacks is estimated and opposed.
+        observer: whether the acceleration that the model lacks is estimated and compensated.
     """
 
     chains: Chains = eqx.field(static=True)
@@ -70,15 +70,15 @@ class FlatLoop(eqx.Module):
     # ---- memory ----
 
     def nothing(self) -> FlatMemory:
-        """Return a memory in its form."""
+        """Return a memory of zeros."""
         zero = jnp.zeros(len(self.stiffness))
         return FlatMemory(jnp.zeros(self.chains.size), zero, zero, zero, zero, jnp.zeros(()))
 
     def begun(self, model: ControlAffine, x: State, chain: jax.Array) -> FlatMemory:
-        """Return the memory of an agent that begins at x, the model being right."""
+        """Return the memory of an agent that begins at x, with an exact model."""
         zero = jnp.zeros(len(self.stiffness), x.dtype)
         held = FlatMemory(chain, zero, zero, zero, zero, jnp.zeros((), x.dtype))
-        return held._replace(base=self._watched(model, x, held.got)[0])
+        return held._replace(base=self._observed(model, x, held.got)[0])
 
     # ---- coordinates ----
 
@@ -86,18 +86,18 @@ class FlatLoop(eqx.Module):
         """Return zeta less the offset, (m,): where the agent would come to rest."""
         outputs = self.chains.outputs
         shift = flat_output(model, outputs, offset) - flat_output(model, outputs, 0.0 * offset)
-        return self.stop(self._seen(model, x, held)) - shift
+        return self.stop(self._flat_values(model, x, held)) - shift
 
     def stop(self, values: jax.Array) -> jax.Array:
         """Return zeta (m,) of flat coordinates (r, m)."""
         return (jnp.asarray(self.weights, values.dtype) * values).sum(axis=0)
 
-    def _seen(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
-        """Return the flat coordinates (r, m), and what the model lacks in them."""
+    def _flat_values(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
+        """Return the flat coordinates (r, m), corrected by the observer."""
         values = flatten(model, self.chains, x, held.chain).values
         if not self.observer:
             return values
-        for order, more in zip((2, 3), (held.push, self._learned(model, x, held)), strict=True):
+        for order, more in zip((2, 3), (held.push, self._push_rate(model, x, held)), strict=True):
             inside = np.array(self.chains.degrees) > order
             if inside.any():
                 values = values.at[order].add(jnp.where(inside, more, 0.0))
@@ -114,10 +114,10 @@ class FlatLoop(eqx.Module):
         period: Scalar | float,
     ) -> tuple[Input, FlatMemory]:
         """Return the physical input that makes zeta move at a rate (m,), and the next memory."""
-        flat, values = flatten(model, self.chains, x, held.chain), self._seen(model, x, held)
+        flat, values = flatten(model, self.chains, x, held.chain), self._flat_values(model, x, held)
         degrees = np.array(self.chains.degrees)
-        known = np.arange(len(values))[:, None] < degrees - 1
-        k = jnp.where(known, jnp.asarray(self.weights, x.dtype), 0.0)
+        lower = np.arange(len(values))[:, None] < degrees - 1
+        k = jnp.where(lower, jnp.asarray(self.weights, x.dtype), 0.0)
         tops = rate - (k[:-1] * values[1:]).sum(axis=0)
         tops = jnp.asarray(self.stiffness, x.dtype) * tops
         if self.observer:
@@ -127,11 +127,11 @@ class FlatLoop(eqx.Module):
         return model.physical(mean), held._replace(chain=chain, rate=rate)
 
     def _integrate(self, e: jax.Array, w: Input, period: Scalar | float) -> tuple[jax.Array, Input]:
-        """Return the integrators after a hold, and the mean (m,) of what they give during it."""
+        """Return the integrators after a hold, and the mean (m,) of their outputs during it."""
         after, mean = list[jax.Array](), list[jax.Array]()
         for k, at in enumerate(self.chains.indices):
             tower = [*(e[i] for i in at), w[k]]
-            # Polynomials of time; the actuator holds one value, and their mean moves as far.
+            # Polynomials of time; the actuator holds their mean, which moves the agent as far.
             mean.append(_moved(tower, period, 1))
             after += [_moved(tower[start:], period, 0) for start in range(len(at))]
         return (jnp.stack(after) if after else e), jnp.stack(mean)
@@ -145,9 +145,9 @@ class FlatLoop(eqx.Module):
         held: FlatMemory,
         period: Scalar | float,
     ) -> FlatMemory:
-        """Return the memory once the actuators have made `got` of what was `wanted`."""
+        """Return the memory once the actuators have delivered `got` of the `wanted` input."""
         v = model.normalized(got)
-        # An integrator that goes on where an actuator stopped would wind up.
+        # An integrator that continues while an actuator is at its limit would wind up.
         missed = jnp.where(got == wanted, 0.0, v - model.normalized(wanted))
         first = [(at[0], k) for k, at in enumerate(self.chains.indices) if at]
         chain = held.chain
@@ -155,27 +155,27 @@ class FlatLoop(eqx.Module):
             chain = chain.at[place].add(missed[k])
         if not self.observer:
             return held._replace(chain=chain)
-        speed, pull = self._watched(model, x, v)
-        wrong = self._wrong(model, x, held)
+        speed, pull = self._observed(model, x, v)
+        error = self._speed_error(model, x, held)
         half = 0.5 * period
-        base = speed - wrong + half * pull + period * (held.push + _WATCH[0] * wrong)
-        push = held.push + period * _WATCH[1] * wrong
-        return FlatMemory(chain, held.rate, v, base, push, half + 0.0 * wrong[0])
+        base = speed - error + half * pull + period * (held.push + _OBSERVER[0] * error)
+        push = held.push + period * _OBSERVER[1] * error
+        return FlatMemory(chain, held.rate, v, base, push, half + 0.0 * error[0])
 
     # ---- the observer ----
 
-    def _wrong(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
-        """Return by how much the speed is off what the model and the estimate expect, (m,)."""
-        speed, pull = self._watched(model, x, held.got)
+    def _speed_error(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
+        """Return the speed less what the model and the estimate predict, (m,)."""
+        speed, pull = self._observed(model, x, held.got)
         # A trapezoid from the start of the hold to its end, in which the input is the same.
         return speed - (held.base + held.half * pull)
 
-    def _learned(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
+    def _push_rate(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
         """Return the rate of the estimated push, (m,)."""
-        return _WATCH[1] * self._wrong(model, x, held)
+        return _OBSERVER[1] * self._speed_error(model, x, held)
 
-    def _watched(self, model: ControlAffine, x: State, v: Input) -> tuple[jax.Array, jax.Array]:
-        """Return what is watched of each output, and its rate under a normalized input, (m,).
+    def _observed(self, model: ControlAffine, x: State, v: Input) -> tuple[jax.Array, jax.Array]:
+        """Return what the observer measures of each output, and its rate under an input v, (m,).
 
         It is the speed y', whose rate is y''; and of an output that an input moves at once, y.
         """
@@ -196,7 +196,7 @@ class FlatLoop(eqx.Module):
 
 
 def _moved(tower: Sequence[jax.Array], period: Scalar | float, more: int) -> jax.Array:
-    """Return sum_i y_i T^i / (i + more)!, after a time T; for more = 1 the mean until then."""
+    """Return sum_i y_i T^i / (i + more)!, the value after a time T; for more = 1 the mean."""
     total = jnp.zeros_like(tower[0])
     for i, y in enumerate(tower):
         total = total + y * (period**i / math.factorial(i + more))

@@ -1,4 +1,4 @@
-"""The interface of a control law, and all that one agent may know when it runs one."""
+"""The interface of a control law, and all that an agent may know when it runs one."""
 
 import abc
 from collections.abc import Iterator
@@ -31,14 +31,14 @@ class LocalView(eqx.Module):
         t: time, s.
         x: own state (n,).
         offset: own goal offset xi (n,).
-        disagreement: z = e + d (n,), from what the neighbours sent; of signals where the law has
+        disagreement: z = e + d (n,), from the neighbours' messages; of signals where the law has
             some.
         feedforward: what the agent's leader or parent sent, or zeros (m,): a normalized input (m,)
             unless the law's `message` says otherwise.
-        period: how long the input will be held, s; 0 where nobody says.
+        period: how long the input will be held, s; 0 where it is not known.
 
     Raises:
-        LawError: it is made of numbers where JAX computes in float32.
+        LawError: it is made of numbers while JAX computes in float32.
     """
 
     t: Scalar
@@ -49,8 +49,8 @@ class LocalView(eqx.Module):
     period: Scalar | float = 0.0
 
     def __check_init__(self) -> None:
-        """Refuse to lose digits without a word."""
-        # Verbs choose a precision, and trace. Who calls a law by hand has none that was chosen.
+        """Refuse to lose digits silently."""
+        # `simulate` and the like choose a precision; a caller of a law by hand has chosen none.
         traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self))
         if not traced and jnp.result_type(float) != np.float64:
             raise LawError(
@@ -67,9 +67,9 @@ class Law(eqx.Module):
     Attributes:
         feedforward: which feed-forward the law needs, none unless replaced by a field, an
             attribute or a property.
-        leaderward: whether followers hear those neighbours alone that are nearer to a leader.
+        leaderward: whether followers use messages of neighbours nearer to a leader alone.
         prover: the `Promise` of followers under the law, as `module:class`.
-        turning: whether a follower is told the heading that its leader follows.
+        turning: whether followers receive the heading that their leader follows.
     """
 
     feedforward = Feedforward.NONE
@@ -79,7 +79,7 @@ class Law(eqx.Module):
 
     @property
     def information(self) -> tuple[str, ...]:
-        """What the law must be sent by others, in words."""
+        """What the law must receive from others, in words."""
         return ()
 
     def start(self, model: ControlAffine) -> State:
@@ -113,7 +113,7 @@ class Law(eqx.Module):
         return self
 
     def following(self, leader: "Law", model: ControlAffine) -> "Law":
-        """Return a follower's prepared law, completed with what it must know of its leader's.
+        """Return a follower's prepared law, completed with what it needs of its leader's.
 
         Raises:
             LawError: it cannot follow a leader under that law.
@@ -121,20 +121,20 @@ class Law(eqx.Module):
         return self
 
     def facing(self, heading: Scalar) -> "Law":
-        """Return a follower's law in the axes of a heading (rad), which it is told every step.
+        """Return a follower's law in the axes of a heading (rad), which it receives every step.
 
-        Called where `turning` is so.
+        Called if `turning`.
         """
         return self
 
     def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar:
-        """Return how far the heading that a leader at x follows is turned from the trim's, rad.
+        """Return the heading that a leader at x follows, relative to the trim's, rad.
 
-        Without a reference it is the leader's own. Asked for where the model states a heading.
+        Without a reference it is the leader's own. Called if the model has a heading.
         """
         reference = reference_of(self)
-        now = x[heading_index(model)] if reference is None else reference.heading(model, t)
-        return now - rest_heading(model)
+        heading = x[heading_index(model)] if reference is None else reference.heading(model, t)
+        return heading - rest_heading(model)
 
     def keeps_heading(self, model: ControlAffine) -> bool:
         """Tell whether `heading` is known to be 0 at all times."""
@@ -152,34 +152,34 @@ class Law(eqx.Module):
     def signal(
         self, model: ControlAffine, x: State, offset: State, memory: Memory
     ) -> Float[jax.Array, " s"] | None:
-        """Return what neighbours hear of an agent, of which z is made; None for x - offset."""
+        """Return what an agent sends to its neighbours, for z; None for x - offset."""
         return None
 
     def settle(
         self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: Memory
     ) -> Memory:
-        """Return the memory once the actuators have made `got` of the `wanted` input (m,)."""
+        """Return the memory once the actuators have delivered `got` of the `wanted` input (m,)."""
         return memory
 
     def message(
         self, model: ControlAffine, x: State, v: Input, memory: Memory
     ) -> Float[jax.Array, " k"]:
-        """Return what followers under this law are sent, of an agent with its memory after a step.
+        """Return what an agent sends to followers under this law, with its memory after a step.
 
-        It is `broadcast` of the state and the input alone unless replaced.
+        Unless replaced, it is `broadcast` of the state and the input alone.
         """
         return self.broadcast(model, x, v)
 
     def broadcast(self, model: ControlAffine, x: State, v: Input) -> Float[jax.Array, " k"]:
-        """Return what followers under this law are sent of an agent at x with normalized input v.
+        """Return what an agent at x with normalized input v sends to followers under this law.
 
-        The input itself unless replaced: a law with an inner loop of its own needs what is applied
+        Unless replaced, it is the input: a law with an inner loop of its own needs what is applied
         beyond that loop.
         """
         return v
 
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
-        """Yield which of some starts (K, n) the law cannot take, by row, and why in words."""
+        """Yield the rows of starts (K, n) that the law cannot take, and why in words."""
         yield from ()
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
@@ -188,7 +188,7 @@ class Law(eqx.Module):
 
     def drift(self, model: ControlAffine, x: State) -> State:
         """Return xdot (n,) when the disagreement and the feed-forward are zero."""
-        # The trim input is no feedback: what is left about the trim is the drift f + g u*.
+        # The trim input is no feedback: about the trim the drift f + g u* remains.
         return model.normalized_drift(x)
 
     @abc.abstractmethod
@@ -199,10 +199,10 @@ class Law(eqx.Module):
 def check_gain_fits(
     law: Law, model: ControlAffine, P_shape: tuple[int, ...], R_shape: tuple[int, ...]
 ) -> None:
-    """Check that a gain was made for a model of this size.
+    """Check that a gain fits a model of this size.
 
     Raises:
-        LawError: it was not.
+        LawError: it does not.
     """
     n, m = len(model.state_names), len(model.input_names)
     if P_shape != (n, n) or R_shape != (m, m):
@@ -213,31 +213,30 @@ def check_gain_fits(
 
 
 def gain_of(law: Law) -> Gain | None:
-    """Return the gain that a law runs with, where it has one."""
-    # By name, since a law may be a user's own, and need not have one.
+    """Return the gain of a law; None where it has none."""
+    # By name, since a user's own law need not have one.
     gain = getattr(law, "gain", None)
     return gain if isinstance(gain, Gain) else None
 
 
 def reference_of(law: object) -> Guide | None:
-    """Return what a law follows, where it keeps it as echelon's own do, as its `reference`."""
+    """Return the `reference` of a law; None where it has none."""
     reference = getattr(law, "reference", None)
     return reference if isinstance(reference, Guide) else None
 
 
 def without_certificates(law: Law) -> Law:
-    """Return a law whose gains carry no certificate and a traced coupling.
+    """Return a law whose gains have no certificate and a traced coupling.
 
-    So another coupling or another graph of the same size compiles nothing again.
+    So another coupling, or another graph of the same size, compiles nothing again.
     """
 
     def strip(node: Any) -> Any:
         if not isinstance(node, Gain):
             return node
-        # `filter_jit` takes floats for constants: with this one, or those of a certificate, every
-        # other graph would be compiled anew.
+        # `filter_jit` takes floats for constants: every other graph would be compiled anew.
         parts = (np.asarray(node.coupling), None)
         return eqx.tree_at(lambda gain: (gain.coupling, gain.certificate), node, parts)
 
-    # A gain may stand anywhere in a user's own law, so that none is found by its name.
+    # A user's own law may have a gain anywhere, under any name.
     return jax.tree.map(strip, law, is_leaf=lambda node: isinstance(node, Gain))

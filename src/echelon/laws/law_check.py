@@ -1,4 +1,4 @@
-"""The checks that a law passes once, when it enters a run."""
+"""The checks of a law before its first run: what it returns, and whether it fits the model."""
 
 from typing import Any
 
@@ -23,25 +23,25 @@ def prepare_law(law: Law, model: ControlAffine, graph: Graph) -> Law:
     """Return a law completed for a checked model and a graph, after checking what it returns.
 
     Raises:
-        LawError: it does not fit the model, or returns something else than the interface says.
+        LawError: it does not fit the model, or returns something else than the interface requires.
     """
     with precision("float64"):
-        ready = law.prepared(model, graph)
-        if not isinstance(ready, Law):
+        complete = law.prepared(model, graph)
+        if not isinstance(complete, Law):
             raise LawError(
-                f"`prepared` of `{type(law).__name__}` returns a `{type(ready).__name__}`, and "
+                f"`prepared` of `{type(law).__name__}` returns a `{type(complete).__name__}`, and "
                 "must return the completed law."
             )
-        _check_law(ready, model)
-    return ready
+        _check_law(complete, model)
+    return complete
 
 
 def leader_warnings(
     law: Law, model: ControlAffine, horizon: float, limits: bool
 ) -> tuple[str, ...]:
-    """Return what of its reference a leader cannot do over a horizon (s), a sentence each."""
+    """Return what a leader cannot follow of its reference over a horizon (s), a sentence each."""
     reference = reference_of(law)
-    # By flatness it is an exact motion, and without limits there is nothing to look for.
+    # A flat reference is an exact motion, which only limits can make infeasible.
     exact = isinstance(reference, Reference) and not (limits and model.input_limits)
     if reference is None or exact:
         return ()
@@ -58,7 +58,7 @@ def _check_law(law: Law, model: ControlAffine) -> None:
             "`Feedforward`, such as `Feedforward.RELAY`."
         )
     memory = _memory(law)
-    found = checked_trace(
+    output = checked_trace(
         LawError,
         f"`update` of `{name}`",
         lambda view, memory: law.update(model, view, memory),
@@ -66,47 +66,47 @@ def _check_law(law: Law, model: ControlAffine) -> None:
         memory,
         advice=_ADVICE,
     ).result
-    if not isinstance(found, tuple) or len(found) != 2:
+    if not isinstance(output, tuple) or len(output) != 2:
         raise LawError(
             f"`update` of `{name}` returns one thing, and must return two, the input and the next "
             "memory: `return u, memory`."
         )
-    check_array(LawError, f"the input of `{name}`", found[0], (m,))
-    if _form(memory) != _form(found[1]):
+    check_array(LawError, f"the input of `{name}`", output[0], (m,))
+    if _form(memory) != _form(output[1]):
         raise LawError(
-            f"the memory of `{name}` is {_in_words(memory)} at first and {_in_words(found[1])} "
+            f"the memory of `{name}` is {_in_words(memory)} at first and {_in_words(output[1])} "
             "after a step, and must keep its form."
         )
 
 
 def _memory(law: Law) -> Any:
     """Return the memory of one agent at the beginning, arrays all."""
-    begun = law.init()
+    memory = law.init()
     try:
-        return jax.tree.map(jnp.asarray, begun)
+        return jax.tree.map(jnp.asarray, memory)
     except TypeError as error:
         raise LawError(
-            f"`init` of `{type(law).__name__}` returns {begun!r}, and must return arrays, numbers "
+            f"`init` of `{type(law).__name__}` returns {memory!r}, and must return arrays, numbers "
             "or nothing."
         ) from error
 
 
 def _view(law: Law, model: ControlAffine) -> LocalView:
-    """Return what an agent may know, zeros all, with what it is sent in the shape it is sent in."""
-    x, sent = jnp.zeros(len(model.state_names)), jnp.zeros(len(model.input_names))
+    """Return a view of zeros in the shapes that the law uses."""
+    x, forward = jnp.zeros(len(model.state_names)), jnp.zeros(len(model.input_names))
     signal = jax.eval_shape(lambda: law.signal(model, x, x, _memory(law)))
     z = x if signal is None else jnp.zeros(signal.shape)
     if law.feedforward is not Feedforward.NONE:
-        said = checked_trace(
+        message = checked_trace(
             LawError,
             f"`broadcast` of `{type(law).__name__}`",
             lambda x, v: law.message(model, x, v, _memory(law)),
             x,
-            sent,
+            forward,
             advice=_ADVICE,
         ).result
-        sent = jnp.zeros(said.shape)
-    return LocalView(jnp.zeros(()), x, x, z, sent)
+        forward = jnp.zeros(message.shape)
+    return LocalView(jnp.zeros(()), x, x, z, forward)
 
 
 def _form(memory: Any) -> Any:
@@ -115,6 +115,6 @@ def _form(memory: Any) -> Any:
 
 
 def _in_words(memory: Any) -> str:
-    """Return what a memory is made of, such as `float64 (3,), float64 ()`."""
+    """Return the types and shapes of a memory, such as `float64 (3,), float64 ()`."""
     leaves = jax.tree.leaves(memory)
     return ", ".join(f"{leaf.dtype} {leaf.shape}" for leaf in leaves) or "nothing"

@@ -1,7 +1,8 @@
 """The leader's law along any feasible path: linear-quadratic feedback that varies with time.
 
-The gain is swept backward along the path, on which alone the linearization is taken; so it leads
-models that nothing holds at their trim, such as a unicycle, and models without flat outputs.
+The gain is swept backward along the path, about which the model is linearized; so it also leads
+models that no feedback stabilizes at their trim, such as a unicycle, and models without flat
+outputs.
 """
 
 import math
@@ -24,7 +25,7 @@ from echelon.core.types import Array, Input, State
 from echelon.laws.law import Law, LocalView, Memory
 
 _SPAN = 0.02
-"""Between two gains, s; A and B are taken in the middle, which errs by the square of it."""
+"""Between two gains, s; A and B are taken in the middle, an error of second order in it."""
 _MOST = 50_000
 """Gains of a path; a longer one has them farther apart, so that a quadrotor's take 20 MB."""
 
@@ -52,7 +53,7 @@ class PathLQR(Law):
     decay: Array | None = None
 
     def __check_init__(self) -> None:
-        """Refuse what is no reference."""
+        """Check that the reference is one."""
         check_kind_of(self.reference)
 
     @property
@@ -64,7 +65,7 @@ class PathLQR(Law):
         """Sweep the gain, once.
 
         Raises:
-            LawError: the model cannot be led along the reference, or nothing holds it there.
+            LawError: the model cannot follow the reference, or no feedback stabilizes it there.
         """
         if self.gains is not None:
             return self
@@ -82,7 +83,7 @@ class PathLQR(Law):
         return followed_states(model, self.reference, times)
 
     def own_mode(self, model: ControlAffine) -> float | None:
-        """Return the slowest rate (1/s, below 0) at which e'P e promises errors to shrink."""
+        """Return the slowest rate (1/s, below 0) at which errors shrink, by e'P e."""
         return None if self.decay is None else float(self.decay)
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
@@ -95,7 +96,7 @@ class PathLQR(Law):
         place = jnp.clip(view.t * (last / self.horizon), 0.0, last)
         k = jnp.minimum(jnp.floor(place).astype(jnp.int32), last - 1)
         K = gains[k] + (place - k) * (gains[k + 1] - gains[k])
-        # With several leaders each follows the reference an offset of its own away.
+        # With several leaders each follows the reference at an offset of its own.
         v = K @ model.difference(view.x, state + view.offset)
         return u - model.physical(v, trim=False), memory
 
@@ -136,7 +137,7 @@ def _backward(flows: Array) -> Array:
     """Return P (N + 1, n, n) at the ends of N intervals, from their flows and that of the end."""
     n = flows.shape[-1] // 2
     P = [np.zeros((n, n))]
-    # What grows beyond all numbers is refused afterwards, by its NaN.
+    # What overflows is rejected afterwards, by its NaN.
     with np.errstate(all="ignore"):
         for _ in range(max(len(flows) - 1, _HELD)):
             P[0] = _before(P[0], flows[-1])

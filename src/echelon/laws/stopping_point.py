@@ -1,8 +1,8 @@
-"""Stopping-point consensus: agents tell each other where they would come to rest (T5).
+"""Stopping-point consensus: agents send each other where they would come to rest (T5).
 
-Each output of each agent is then one integrator, whatever the agent, so that the formation
-converges from anywhere, over any graph in which the leader reaches everybody, and what an agent
-goes through depends on its own start and on a speed alone.
+Each output of each agent is then one integrator, whatever the agent. So the formation converges
+from anywhere, over any graph in which the leader reaches everybody, and an agent's motion depends
+on its own start and on a speed alone.
 """
 
 import functools
@@ -38,7 +38,7 @@ from echelon.laws.law import Law, LocalView
 _INSTANT = 1e-9
 """s; a shorter period is none."""
 _SEEN = 60.0
-"""s of the leader's path, for default speeds; what is promised looks at the whole run."""
+"""s of the leader's path, for default speeds; guarantees use the whole run."""
 
 
 def _share(links: int) -> float:
@@ -48,14 +48,14 @@ def _share(links: int) -> float:
 
 @final
 class GraphDemand(eqx.Module):
-    """What the graph asks of the coupling.
+    """The properties of the graph that determine the coupling.
 
     Attributes:
         slowest: the smallest eigenvalue of the followers' Laplacian; of a graph that switches, of
             the mean over a period, or of the last one.
-        heaviest: d_max, the largest sum of weights that one follower hears.
-        links: how many speeds add up on the way from a leader.
-        waits: whether the speed is left out, and rests on the leader's path.
+        heaviest: d_max, the largest sum of a follower's weights.
+        links: how many speeds add up on the path from a leader.
+        waits: whether the speed is left out, and follows from the leader's path.
     """
 
     slowest: float
@@ -68,12 +68,13 @@ class GraphDemand(eqx.Module):
         """Return it of a graph.
 
         Raises:
-            LawError: heard leaderward, the leader does not reach somebody after the last switch.
+            LawError: with leaderward messages, the leader does not reach somebody after the last
+                switch.
         """
         whole, schedule = graph.stretches(leaderward), graph.schedule
         own = np.stack([L.diagonal() for L in whole])
         if schedule is None:
-            # Heard one way the Laplacian is triangular, and its eigenvalues are on its diagonal.
+            # With one-way edges the Laplacian is triangular: its eigenvalues are its diagonal.
             slowest = float(own.min()) if leaderward else graph.spectrum().low
             return cls(slowest, float(own.max()), links, waits)
         share = np.eye(len(own))[-1]
@@ -93,7 +94,7 @@ class GraphDemand(eqx.Module):
 class StoppingPoint(FlatLaw):
     """zeta_i' = zeta_0' - sigma(c z_i), z_i = sum_j A_ij ((zeta_i - xi_i) - (zeta_j - xi_j)).
 
-    zeta = q(D) y / q(0) is where an agent's flat outputs y would come to rest if nobody spoke, and
+    zeta = q(D) y / q(0) is where an agent's flat outputs y would come to rest without messages, and
     sigma(x) = x / sqrt(1 + (x/s)^2) bounds the speed that agreement asks for. Where `coupling` is
     left out, c is twice the slowest root over lambda_min, or what the step holds, a little below
     1 / (d_max dt), where that is less.
@@ -103,8 +104,8 @@ class StoppingPoint(FlatLaw):
             that each hears.
         hears: `all` neighbours, or `leaderward` those alone that are nearer to the leader; with
             `parent` it is that one.
-        reach: of the graph; found by `prepared`.
-        ahead: (r, m) how the leader's path begins; taken over by `following`.
+        reach: of the graph; computed by `prepared`.
+        ahead: (r, m) the beginning of the leader's path; set by `following`.
     """
 
     prover = "echelon.guarantees.stopping.stopping_promise:StoppingPromise"
@@ -118,7 +119,7 @@ class StoppingPoint(FlatLaw):
     ahead: Array | None = None
 
     def __check_init__(self) -> None:
-        """Refuse a feed-forward that tells no zeta'."""
+        """Check that the feed-forward sends zeta'."""
         allowed = (Feedforward.RELAY, Feedforward.PARENT)
         if self.feedforward not in allowed:
             raise LawError(
@@ -128,18 +129,18 @@ class StoppingPoint(FlatLaw):
 
     @property
     def leaderward(self) -> bool:
-        """Whether only neighbours nearer to the leader are heard."""
+        """Whether followers use messages of neighbours nearer to the leader alone."""
         return self.hears is NeighbourChoice.LEADERWARD or self.feedforward is Feedforward.PARENT
 
     @property
     def information(self) -> tuple[str, ...]:
-        """Neighbours' stopping points, and whose rate is told."""
+        """Neighbours' stopping points, and the rate of the leader or the parent."""
         parent = self.feedforward is Feedforward.PARENT
         whose = "its parent's" if parent else "the leader's, forwarded to everybody"
         return ("neighbours' stopping points zeta", f"zeta' of the same step, {whose}")
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "StoppingPoint":
-        """Find the model's chains, and what the graph asks of the coupling."""
+        """Find the model's chains, and the graph's properties for the coupling."""
         if self.loop is not None:
             return self
         links = 1
@@ -147,7 +148,7 @@ class StoppingPoint(FlatLaw):
             # Raises where the graph is no tree.
             graph.parents()
             links = int(graph.depths().max())
-        loop = self.found_loop(model)
+        loop = self.build_loop(model)
         waits = self.speed is None and waits_for_path(model)
         reach = GraphDemand.of(graph, self.leaderward, links, waits)
         speed = self.speeds_within(model, loop.chains, SPEED, _share(links), links)
@@ -159,7 +160,7 @@ class StoppingPoint(FlatLaw):
         )
 
     def following(self, leader: Law, model: ControlAffine) -> "StoppingPoint":
-        """Take over how the leader's path begins, which tells how high a thrust is level."""
+        """Take over the beginning of the leader's path, which sets the level thrust."""
         if not isinstance(leader, StoppingLeader) or self.loop is None:
             raise LawError(
                 "followers under `stopping-point` are sent the leader's zeta', which the law "
@@ -226,7 +227,7 @@ class StoppingLeader(FlatLaw):
         """Find the model's chains, and check that it can be led along the reference."""
         if self.loop is not None:
             return self
-        loop = self.found_loop(model)
+        loop = self.build_loop(model)
         if self.reference is not None:
             check_reference(self.reference)
             if not isinstance(self.reference, Reference):
@@ -257,7 +258,7 @@ class StoppingLeader(FlatLaw):
         return jnp.pad(place[None], ((0, len(loop.weights)), (0, 0)))
 
     def slowest_along(self, model: ControlAffine, bound: FlatBound) -> float:
-        """Return what the path takes a bounded length to, at least, of what is seen of it."""
+        """Return the least value of a bounded length on the beginning of the path."""
         if len(bound.outputs) == 1:
             return 0.0
         places = np.array([self.ready.chains.outputs.index(name) for name in bound.outputs])
@@ -307,8 +308,8 @@ class StoppingLeader(FlatLaw):
 
 @memoize
 def beginning_of(leader: StoppingLeader, model: ControlAffine) -> Array:
-    """Return where a leader's path begins, as `begins` does, read-only; once for both."""
+    """Return the beginning of a leader's path, as `begins` does, read-only."""
     with precision("float64"):
-        found = np.array(leader.begins(model))
-    found.setflags(write=False)
-    return found
+        beginning = np.array(leader.begins(model))
+    beginning.setflags(write=False)
+    return beginning

@@ -31,7 +31,7 @@ class Tracking(Law):
         reference: the path to follow.
         gain: the tracking gain, used with coupling 1; the model's Riccati gain when left out.
         reaction: the followers' gain, when the leader reacts to them.
-        turns: whether the gains turn with the reference's heading; found by `prepared`.
+        turns: whether the gains turn with the reference's heading; set by `prepared`.
     """
 
     reference: Guide
@@ -40,7 +40,7 @@ class Tracking(Law):
     turns: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self) -> None:
-        """Refuse what is no reference."""
+        """Check that the reference is one."""
         check_kind_of(self.reference)
 
     @property
@@ -49,20 +49,20 @@ class Tracking(Law):
         return ("the reference", *(("neighbours' states",) if self.reaction is not None else ()))
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Tracking":
-        """Complete the gain where it is not, and check that the model can follow a reference."""
+        """Complete the gain, and check that the model can follow the reference."""
         check_reference(self.reference)
         self.reference.fit(model)
         if self.reaction is not None:
             check_gain_fits(self, model, self.reaction.P.shape, self.reaction.R.shape)
         gain = tracking_gain(self, model, graph, self.gain)
-        # Refused here, since a run would only say that the leader diverged at once.
+        # Checked here, since a run would only say that the leader diverged at once.
         begin = follow_at(model, self.reference, np.zeros(1))
         if not all(np.isfinite(part).all() for part in begin):
             raise ReferenceError(
                 f"the reference `{type(self.reference).__name__}` cannot be followed by "
                 f"`{type(model).__name__}`: its flat state and input are not finite at t = 0 s."
             )
-        # A law that is complete stays itself, so that a result asks of what was asked before.
+        # A complete law stays the same object, so that what was computed of it is found again.
         turns = model.heading is not None and not self.keeps_heading(model)
         if gain is self.gain and turns is self.turns:
             return self
@@ -86,7 +86,7 @@ class Tracking(Law):
             raise LawError("`Tracking` has no gain yet; call `prepared(model, graph)` first.")
         state, u = self.target(model, view.t)
         heading = self.heading(model, view.t, view.x) if self.turns else None
-        # With several leaders each follows the reference an offset of its own away.
+        # With several leaders each follows the reference at an offset of its own.
         error = model.difference(view.x, state + view.offset)
         v = self.gain.feedback(model, view.x, error, heading)
         # Normalized inputs are added, and the trim once: it is in u already.
@@ -101,7 +101,7 @@ def tracking_gain(law: Law, model: ControlAffine, graph: Graph, gain: Gain | Non
     Raises:
         LawError: it does not fit the model.
     """
-    # The coupling makes up for lambda_min of a network, and a leader hears its reference directly.
+    # The coupling compensates lambda_min of a network; a leader knows its reference directly.
     if gain is None:
         gain = Riccati(coupling=1.0).solve(model, Spectrum(np.ones(1), 1, 1.0))
     check_gain_fits(law, model, gain.P.shape, gain.R.shape)

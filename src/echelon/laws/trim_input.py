@@ -6,9 +6,9 @@ from echelon.laws.law import Law, LocalView, Memory
 
 
 class TrimInput(Law):
-    """u = u* + S v_ff, with nothing sent and so v_ff = 0.
+    """u = u* + S v_ff, where v_ff = 0 since the law uses no feed-forward.
 
-    It leaves the agent to its own unforced motion about the trim.
+    The agent moves freely about its trim.
     """
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:

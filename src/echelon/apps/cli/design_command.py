@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +14,7 @@ from echelon.apps.cli.options import (
     ScenarioArgument,
     SetOption,
 )
+from echelon.core.types import JsonObject
 from echelon.output.archive.folder import claim_design, write_errors
 
 if TYPE_CHECKING:
@@ -48,8 +49,8 @@ def design(
     from echelon.synthesis.gains.gain_file import save_gain
 
     report = study(loaded, method)
-    sentence, best, own = report.because, report.recommended, report.law_design
-    summary: dict[str, Any] = {"recommended": None}
+    sentence, best, law_design = report.because, report.recommended, report.law_design
+    summary: JsonObject = {"recommended": None}
     if best is not None and best.gain is not None and best.parts is not None:
         summary = {"recommended": best.method, "because": sentence}
         if out is not None:
@@ -58,15 +59,15 @@ def design(
             radii = _draw(best.parts, report.settings, figures, slice_)
             sentence += f"\n{radii}" if radii else ""
             summary["radii"] = radii
-    if own is not None:
-        sentence += f"\n{own.sentence()}"
-        summary[own.name] = own.as_mapping()
+    if law_design is not None:
+        sentence += f"\n{law_design.sentence()}"
+        summary[law_design.name] = law_design.as_mapping()
     summary["methods"] = [tables.design_row(row) for row in report.designs]
     if as_json:
         print(json.dumps(summary, indent=2))
     else:
         tables.print_designs(summary["methods"], sentence)
-    raise typer.Exit(0 if best is not None or own is not None else 1)
+    raise typer.Exit(0 if best is not None or law_design is not None else 1)
 
 
 def _draw(parts: "Parts", settings: "Settings", folder: Path, states: str | None) -> str | None:

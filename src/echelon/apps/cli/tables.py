@@ -1,8 +1,10 @@
-"""What the command line prints: tables of checks, designs and facts."""
+"""Tables of checks, designs and facts on the terminal."""
 
 import sys
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from echelon.core.types import JsonObject
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -13,10 +15,10 @@ if TYPE_CHECKING:
 
 
 def console() -> "Console":
-    """Return a console that keeps tables whole where the output is no terminal."""
+    """Return a console that keeps each row on one line where the output is no terminal."""
     from rich.console import Console
 
-    # Wider than any table here: a row that is folded is none to `grep` or `awk`.
+    # Wider than any table here, since `grep` and `awk` read lines.
     return Console() if sys.stdout.isatty() else Console(width=200)
 
 
@@ -38,15 +40,15 @@ def print_table(table: "Table", sentence: str) -> None:
     out.print(sentence, highlight=False, markup=False, soft_wrap=not out.is_terminal)
 
 
-def design_row(design: "Design") -> dict[str, Any]:
-    """Return what is told of a design; what does not exist is None."""
-    row: dict[str, Any] = {"method": design.method, "reason": design.reason}
+def design_row(design: "Design") -> JsonObject:
+    """Return the numbers of a design; missing ones are None."""
+    row: JsonObject = {"method": design.method, "reason": design.reason}
     gain, promise = design.gain, design.promise
     if gain is None or promise is None:
         return {**row, "seconds": design.seconds}
     import numpy as np
 
-    found, theorem, factors = promise.certified, promise.theorem, design.factors
+    region, theorem, factors = promise.certified, promise.theorem, design.factors
     return {
         **row,
         "advice": design.advice,
@@ -62,14 +64,14 @@ def design_row(design: "Design") -> dict[str, Any]:
         "rate": promise.rate,
         "kind": str(promise.kind) if promise.promised else None,
         "theorem": None if theorem is None else str(theorem),
-        "radius": None if found is None else _finite(found.radius),
+        "radius": None if region is None else _finite(region.radius),
         "promise": promise.as_mapping(),
         "seconds": design.seconds,
     }
 
 
 def _finite(value: float | None) -> float | None:
-    """Return a number, or None for what JSON has no word for."""
+    """Return a number, or None for infinity, which JSON cannot express."""
     return None if value is None or value == float("inf") else value
 
 
@@ -83,20 +85,20 @@ _COLUMNS = {
     "condition": "cond(P)",
     "gain_margin": "gain\nmargin",
     "delay_margin": "delay\nmargin, s",
-    "rate": "promised,\n1/s",
+    "rate": "guaranteed,\n1/s",
     "kind": "by",
     "theorem": "theorem",
     "radius": "certified\nradius (2)",
     "seconds": "seconds",
 }
 _FOOTNOTES = (
-    "(1) the longest step with inputs held over it with which every mode looked at still decays.",
-    "(2) r of sum_i delta_i'P delta_i <= r^2, less the leader's excursion over the horizon.",
+    "(1) longest sampling period for which all checked modes remain stable.",
+    "(2) r in sum_i delta_i'P delta_i <= r^2, reduced by the leader's motion over the horizon.",
 )
 
 
-def print_designs(rows: list[dict[str, Any]], sentence: str) -> None:
-    """Print the methods side by side, why some have no gain, and what is recommended."""
+def print_designs(rows: list[JsonObject], sentence: str) -> None:
+    """Print the methods as a table, the reasons of those without a gain, and a recommendation."""
     from rich import box
     from rich.table import Table
 
@@ -107,10 +109,10 @@ def print_designs(rows: list[dict[str, Any]], sentence: str) -> None:
         table.add_row(*(_cell(row.get(key)) for key in _COLUMNS))
     out = console()
     out.print(table)
-    told = [*_FOOTNOTES] if any(row.get("coupling") for row in rows) else []
+    notes = [*_FOOTNOTES] if any(row.get("coupling") for row in rows) else []
     for row in rows:
-        told += [f"- {row['method']}: {row[key]}" for key in ("reason", "advice") if row.get(key)]
-    for text in (*told, sentence):
+        notes += [f"- {row['method']}: {row[key]}" for key in ("reason", "advice") if row.get(key)]
+    for text in (*notes, sentence):
         out.print(text, highlight=False, markup=False, soft_wrap=not out.is_terminal)
 
 
@@ -123,13 +125,15 @@ def _cell(value: object) -> str:
 
 
 def statements_table(lines: "Iterable[Statement]") -> "Table":
-    """Return the lines of a check as a table."""
+    """Return the statements of a check as a table."""
     rows = ((x.name, str(x.verdict), str(x.kind), x.number_text, x.explanation) for x in lines)
-    return plain_table(("statement", "verdict", "kind", "number", "why, or what to change"), rows)
+    return plain_table(
+        ("statement", "verdict", "kind", "number", "reason, or what to change"), rows
+    )
 
 
 def plain_table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> "Table":
-    """Return rows of plain text as a table with the titles of its columns."""
+    """Return rows of plain text as a table."""
     from rich import box
     from rich.table import Table
 

@@ -3,7 +3,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,7 @@ from echelon.apps.cli.options import (
     ScenarioArgument,
     SetOption,
 )
+from echelon.core.types import JsonObject
 from echelon.output.archive.folder import claim_design
 
 if TYPE_CHECKING:
@@ -71,10 +72,10 @@ def _save(tuned: "TuneResult", scenario: "Scenario", out: Path) -> None:
     save_gain(tuned.after.gain, parts.model, parts.graph, out)
 
 
-def _as_mapping(tuned: "TuneResult", names: list[str]) -> dict[str, Any]:
+def _as_mapping(tuned: "TuneResult", names: list[str]) -> JsonObject:
     import numpy as np
 
-    def row(trial: "TuneTrial", promise: "Promise") -> dict[str, Any]:
+    def row(trial: "TuneTrial", promise: "Promise") -> JsonObject:
         values = {name: np.asarray(trial.values[name]).tolist() for name in names}
         return {"cost": trial.cost, **values, "promise": promise.as_mapping()}
 
@@ -85,7 +86,7 @@ def _as_mapping(tuned: "TuneResult", names: list[str]) -> dict[str, Any]:
     }
 
 
-def _print(summary: dict[str, Any]) -> None:
+def _print(summary: JsonObject) -> None:
     from rich.table import Table
 
     table = Table("", "before", "after", box=None)

@@ -43,7 +43,7 @@ def verify(
         }
         print(json.dumps(text, indent=2))
     else:
-        titles = ("claim", "stored", "recomputed", "verdict", "how, or why not")
+        titles = ("claim", "stored", "recomputed", "verdict", "method or reason")
         table = tables.plain_table(titles, verification.findings)
         tables.print_table(table, verification.sentence)
     raise typer.Exit(_EXIT_CODES[verification.verdict])

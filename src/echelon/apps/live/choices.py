@@ -1,4 +1,4 @@
-"""What a person may choose while a loop runs: another law, another shape of the formation."""
+"""The lists of the live page: other laws for the followers, other shapes of the formation."""
 
 import copy
 
@@ -14,31 +14,31 @@ from echelon.experiments.scenario.scenario import Scenario, scenario_from_mappin
 from echelon.simulation.engine.parts import Parts
 
 AS_GIVEN = "scenario"
-"""A choice that stands for what the scenario says."""
+"""The choice that stands for the scenario's own."""
 
 
 def under(scenario: Scenario, law: str) -> tuple[Scenario, Experiment]:
-    """Return a scenario whose followers obey another law, and what it builds.
+    """Return a scenario with another follower law, and its experiment.
 
-    Its leaders keep their law where the followers' can do with it, or have the one by default.
+    Leaders keep their law if it fits the followers', and have the default law otherwise.
 
     Raises:
         ScenarioError: the law does not fit these agents.
     """
     # A leader law that goes with the followers' law replaces the scenario's.
     ways = (True, False) if registry.FOLLOWER_LAWS[law].leader is None else (False,)
-    for own in ways:
+    for keep_leader in ways:
         try:
-            made = _with(scenario, law, own)
-            return made, build(made)
+            changed = _with_law(scenario, law, keep_leader)
+            return changed, build(changed)
         except ScenarioError:
-            if own == ways[-1]:
+            if keep_leader == ways[-1]:
                 raise
     raise AssertionError
 
 
-def _with(scenario: Scenario, law: str, own: bool) -> Scenario:
-    """Return a scenario with another law, and what of the keys fits it; `own` leaves the leader."""
+def _with_law(scenario: Scenario, law: str, keep_leader: bool) -> Scenario:
+    """Return a scenario with another follower law and those of its keys that the law takes."""
     data = copy.deepcopy(scenario.data)
     data.pop("live", None)
     surplus = surplus_keys("follower", law)
@@ -47,7 +47,7 @@ def _with(scenario: Scenario, law: str, own: bool) -> Scenario:
     follower = data.get("follower") or {}
     data["follower"] = {"law": law} | {k: v for k, v in follower.items() if k not in dropped}
     leader = data.get("leader") or {}
-    if not own:
+    if not keep_leader:
         leader = {key: leader[key] for key in ("start_error",) if key in leader}
     if "gain" in surplus:
         # Only a gain makes a leader react.
@@ -56,19 +56,18 @@ def _with(scenario: Scenario, law: str, own: bool) -> Scenario:
 
 
 def shapes_of(parts: Parts) -> dict[str, Array]:
-    """Return offsets (N, n) by the name of each shape that these agents can take."""
-    spacing, found = _spacing(parts), dict[str, Array]()
+    """Return the offsets (N, n) of each shape that these agents can take, by its name."""
+    spacing, shapes = _spacing(parts), dict[str, Array]()
     for name in registry.FORMATIONS:
         try:
-            made = getattr(Formation, name)(parts.model, parts.graph, spacing)
+            shapes[name] = getattr(Formation, name)(parts.model, parts.graph, spacing).offsets
         except EchelonError:
             continue
-        found[name] = made.offsets
-    return found
+    return shapes
 
 
 def _spacing(parts: Parts) -> float:
-    """Return how far neighbours' goals are apart, in the middle; 1 where they are nowhere."""
+    """Return the median distance of neighbours' goals; 1 if all goals coincide."""
     axes = list(parts.model.position_indices())
     i, j = parts.graph.edges.T
     goals = parts.formation.offsets[:, axes]

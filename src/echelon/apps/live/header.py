@@ -1,28 +1,27 @@
-"""What the live page is told before the first picture."""
-
-from typing import Any
+"""The header of the live page: agents, space and controls, before the first picture."""
 
 import numpy as np
 
-from echelon.apps.live.knobs import Panel
+from echelon.apps.live.panel import Panel
 from echelon.apps.live.swarm import LiveLoop
+from echelon.core.types import JsonObject
 from echelon.experiments.results.foreseen import foreseen
-from echelon.experiments.results.recording import InputBounds, Recording
+from echelon.experiments.results.recording import InputBounds
 from echelon.output.plots.space import Space, space_of
 from echelon.output.viewer.replay import header, motor_loads
 from echelon.simulation.step.settings import Settings
 
 
-def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: dict[str, Any]) -> dict[str, Any]:
-    """Return what the page is told of a loop: agents, space, knobs."""
-    run = _foreseen(swarm, name, badge)
+def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: JsonObject) -> JsonObject:
+    """Return the header of a loop's page."""
+    run = foreseen(swarm.parts, swarm.settings, np.asarray(swarm.states), name)
     space = space_of(run)
     loads = motor_loads(run, space)
     return {
         **header(run, space),
         "promise": badge,
         "stream": True,
-        "knobs": panel.told(),
+        "knobs": panel.sliders(),
         "choices": panel.choices(),
         "lyapunov": swarm.potential is not None,
         "clock": {"start": 0.0, "step": swarm.span, "last": run.times[-1]},
@@ -35,19 +34,7 @@ def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: dict[str, Any])
     }
 
 
-def _foreseen(swarm: LiveLoop, name: str, badge: dict[str, Any]) -> Recording:
-    parts, states = swarm.parts, np.asarray(swarm.states)
-    return foreseen(parts, swarm.settings, states, name, _silent(badge))
-
-
-def _silent(badge: dict[str, Any]) -> dict[str, Any]:
-    """Return a promise of nothing, as what is promised stands in the badge."""
-    # How the coupling stands is told by its knob.
-    told = {"promised": False, "rate": None, "coupling": None, "theorem": None}
-    return {**told, "sentence": badge["whole"], "kind": "", "hypotheses": []}
-
-
-def drawn(swarm: LiveLoop, settings: Settings) -> tuple[Space, InputBounds | None]:
-    """Return where agents are drawn, and what limits their inputs."""
-    run = _foreseen(swarm, "", {"whole": ""})
+def scene(swarm: LiveLoop, settings: Settings) -> tuple[Space, InputBounds | None]:
+    """Return the space that agents are drawn in, and the bounds of their inputs."""
+    run = foreseen(swarm.parts, settings, np.asarray(swarm.states), "")
     return space_of(run), run.bounds if settings.limits else None

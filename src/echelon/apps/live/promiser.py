@@ -1,108 +1,111 @@
-"""What is promised of the knobs as they stand, found beside the loop that runs."""
+"""The guarantee of a live loop, computed in a thread while the loop runs."""
 
 import threading
 from collections.abc import Callable
-from typing import Any, final
+from typing import final
 
-from echelon.apps.live.knobs import Knobs, Panel
+from echelon.apps.live.knobs import Knobs
+from echelon.apps.live.panel import Panel
 from echelon.core.errors import EchelonError
+from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import build
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.output.reports.causes import beyond
 from echelon.output.viewer.replay import promise_badge
 
 _NEAR = 1.1
-"""Times the edge of the coupling, below which a promise is told to stand on it."""
+"""Below this multiple of the smallest guaranteed coupling the badge warns of the edge."""
 
 
 @final
 class Promiser:
-    """Finds what is promised in a thread of its own; of many questions only the last is answered.
+    """Computes guarantees in its own thread; of several requests only the last is answered.
 
     Args:
-        answer: called with what the page is told.
+        answer: called with the badge of the page.
     """
 
-    def __init__(self, answer: Callable[[dict[str, Any]], None]) -> None:
-        """Start the thread, which waits for a question."""
+    def __init__(self, answer: Callable[[JsonObject], None]) -> None:
+        """Start the thread, which waits for a request."""
         self.answer = answer
-        self.asked: tuple[Panel, Knobs] | None = None
-        self.woken, self.ended = threading.Condition(), False
+        self.request: tuple[Panel, Knobs] | None = None
+        self.changed, self.ended = threading.Condition(), False
         self.thread = threading.Thread(target=self._work, daemon=True)
         self.thread.start()
 
     def ask(self, panel: Panel, knobs: Knobs) -> None:
-        """Ask what is promised of the knobs of a panel."""
-        with self.woken:
-            self.asked = panel, knobs
-            self.woken.notify()
+        """Request the guarantee at a position of the knobs."""
+        with self.changed:
+            self.request = panel, knobs
+            self.changed.notify()
 
     def end(self) -> None:
-        """Ask nothing more."""
-        with self.woken:
+        """End the thread."""
+        with self.changed:
             self.ended = True
-            self.woken.notify()
+            self.changed.notify()
         # An interpreter that ends while XLA compiles in a thread is aborted by it.
         self.thread.join()
 
     def _work(self) -> None:
         while True:
-            with self.woken:
-                self.woken.wait_for(lambda: self.ended or self.asked is not None)
+            with self.changed:
+                self.changed.wait_for(lambda: self.ended or self.request is not None)
                 if self.ended:
                     return
-                asked, self.asked = self.asked, None
-            assert asked is not None
-            # At once what eigenvalues show, since a promise takes seconds to be found.
-            self.answer(first_look(*asked))
-            found = badge_of(*asked)
-            # A knob that was turned meanwhile has made it an answer to no question.
-            if self.asked is None and not self.ended:
-                self.answer(found)
+                request, self.request = self.request, None
+            assert request is not None
+            # The eigenvalues first, since a guarantee takes seconds.
+            self.answer(first_look(*request))
+            badge = badge_of(*request)
+            # After another change of the knobs the badge is out of date.
+            if self.request is None and not self.ended:
+                self.answer(badge)
 
 
-def badge_of(panel: Panel, knobs: Knobs) -> dict[str, Any]:
-    """Return what is promised of knobs: `holds`, at the `edge` or `lost`, why, and with what."""
+def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
+    """Return the badge at a position of the knobs: `holds`, `edge` or `lost`, with the causes."""
     try:
-        same = knobs == panel.start
-        found = promise(*(panel.built if same else build(panel.standing(knobs))))
+        unchanged = knobs == panel.start
+        guarantee = promise(*(panel.experiment if unchanged else build(panel.scenario_at(knobs))))
     except EchelonError as error:
-        # Whatever is refused as a scenario is promised nothing, such as a graph in two parts.
-        why = str(error).removeprefix("mapping: ")
-        return {"state": "lost", "short": "nothing promised", "whole": why, "causes": [why]}
-    badge: dict[str, Any] = promise_badge(found.as_mapping())
-    badge["causes"] = [each.sentence() for each in found.causes]
-    badge["edge"] = found.edge
-    badge["rate"], certified = found.rate, found.certified
+        # A scenario that is refused has no guarantee, such as one with a disconnected graph.
+        cause = str(error).removeprefix("mapping: ")
+        return {"state": "lost", "short": "no guarantee", "whole": cause, "causes": [cause]}
+    badge: JsonObject = promise_badge(guarantee.as_mapping())
+    badge["causes"] = [cause.sentence() for cause in guarantee.causes]
+    badge["edge"] = guarantee.edge
+    badge["rate"], certified = guarantee.rate, guarantee.certified
     badge["anywhere"] = certified is not None and certified.radius == float("inf")
-    # Told where the promise does not reach.
-    badge["beyond"] = [each.sentence() for each in beyond(0.0, found)]
-    if found.promised and _near(found, knobs):
-        badge |= {"state": "edge", "short": f"{badge['short']}, at its edge"}
-    elif not found.promised and found.slowest is not None and found.slowest >= 0.0:
-        badge["short"] = f"nothing promised: a mode grows, {found.slowest:+.3g} 1/s"
+    # Shown where the guarantee does not cover the state.
+    badge["beyond"] = [cause.sentence() for cause in beyond(0.0, guarantee)]
+    if guarantee.promised and _near_edge(guarantee, knobs):
+        badge |= {"state": "edge", "short": f"{badge['short']}, near its edge"}
+    elif not guarantee.promised and guarantee.slowest is not None and guarantee.slowest >= 0.0:
+        badge["short"] = _growth(guarantee.slowest)
     return badge
 
 
-def asking(short: str = "promise \u2026") -> dict[str, Any]:
-    """Return what is told while a promise is being found."""
-    whole = "What is promised of the loop as it stands is being found."
-    return {"state": "asking", "short": short, "whole": whole, "causes": []}
+def pending_badge(short: str = "guarantee \u2026") -> JsonObject:
+    """Return the badge while the guarantee is computed."""
+    whole = "The guarantee of the present loop is being computed."
+    return {"state": "pending", "short": short, "whole": whole, "causes": []}
 
 
-def first_look(panel: Panel, knobs: Knobs) -> dict[str, Any]:
-    """Return the slowest mode near the trim, which is no promise; a growing one breaks any."""
-    slowest = panel.slowest(knobs)
+def first_look(panel: Panel, knobs: Knobs) -> JsonObject:
+    """Return a badge with the slowest mode at the trim; a growing mode rules out a guarantee."""
+    slowest = panel.live.slowest(knobs)
     if slowest is None:
-        return asking()
+        return pending_badge()
     if slowest < 0.0:
-        return asking(f"slowest mode {slowest:.3g} 1/s; promise \u2026")
-    return asking() | {
-        "state": "lost",
-        "short": f"nothing promised: a mode grows, {slowest:+.3g} 1/s",
-    }
+        return pending_badge(f"slowest mode {slowest:.3g} 1/s; guarantee \u2026")
+    return pending_badge() | {"state": "lost", "short": _growth(slowest)}
 
 
-def _near(found: Promise, knobs: Knobs) -> bool:
-    edge = found.edge
+def _growth(slowest: float) -> str:
+    return f"no guarantee: a mode grows at {slowest:.3g} 1/s"
+
+
+def _near_edge(guarantee: Promise, knobs: Knobs) -> bool:
+    edge = guarantee.edge
     return edge is not None and knobs.coupling is not None and knobs.coupling < _NEAR * edge

@@ -12,7 +12,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.hearing import edges_of
 from echelon.agents.world.disturbance import Disturbance
-from echelon.apps.live.knobs import Knobs, Panel
+from echelon.apps.live.knobs import Knobs, LiveParts
 from echelon.apps.live.live_stepper import choose_stepper
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import GraphError
@@ -57,13 +57,13 @@ class LiveLoop:
     Args:
         parts: of a scenario.
         settings: of it.
-        panel: of its knobs.
+        panel: the numbers that its knobs set.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
 
-    def __init__(self, parts: Parts, settings: Settings, panel: Panel) -> None:
+    def __init__(self, parts: Parts, settings: Settings, panel: LiveParts) -> None:
         """Prepare what the steps need."""
         disturbance = parts.world.disturbance or Disturbance()
         world = dataclasses.replace(parts.world, disturbance=disturbance)

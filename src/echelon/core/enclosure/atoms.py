@@ -183,13 +183,13 @@ class Atoms:
             cosine, sine = circle(shift)
             return self.fresh(("cos", shift), cosine), self.fresh(("sin", shift), sine)
         # By the addition theorem, one angle after the other.
-        found = (constant(1), constant(0))
+        result = (constant(1), constant(0))
         for ((atom, _),), factor in linear.items():
             # The constant goes into the first angle, where it moves a range and adds no term.
             c, s = self._angle(atom, factor, shift)
-            found = found[0] * c - found[1] * s, found[1] * c + found[0] * s
+            result = result[0] * c - result[1] * s, result[1] * c + result[0] * s
             shift = Fraction(0)
-        return found
+        return result
 
     def _linear(self, p: Polynomial) -> dict[Monomial, Fraction]:
         """Return the constant and linear terms, with all else as one variable more."""
@@ -243,19 +243,19 @@ class Atoms:
 
     def corners(self, atom: int, used: Iterable[Exponent]) -> "Corners":
         """Return points whose hull holds the used powers or waves of an atom, jointly."""
-        wanted = list(used)
+        exponents = list(used)
         # A coordinate alone has a range, which no polygon around a curve is tighter than.
-        if len(wanted) == 1:
-            return _gather_points(self._ends(atom, wanted[0]))
-        powers = [e for e in wanted if isinstance(e, int)]
+        if len(exponents) == 1:
+            return _gather_points(self._ends(atom, exponents[0]))
+        powers = [e for e in exponents if isinstance(e, int)]
         if powers:
             return _gather_points([{**p} for p in power_points(self.known[atom].reach, powers)])
-        arc, found = self.known[atom].reach, [dict[Exponent, Fraction]()]
-        for group in _harmonics(e for e in wanted if isinstance(e, tuple)):
+        arc, result = self.known[atom].reach, [dict[Exponent, Fraction]()]
+        for group in _harmonics(e for e in exponents if isinstance(e, tuple)):
             around = _wave_corners(arc, group) if len(group) > 1 else self._ends(atom, group[0])
-            check_count(len(found) * len(around))
-            found = [{**p, **q} for p in found for q in around]
-        return _gather_points(found)
+            check_count(len(result) * len(around))
+            result = [{**p, **q} for p in result for q in around]
+        return _gather_points(result)
 
     def _ends(self, atom: int, exponent: Exponent) -> list[dict[Exponent, Fraction]]:
         reached = self.factor_range(atom, exponent)

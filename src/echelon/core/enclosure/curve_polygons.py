@@ -28,12 +28,12 @@ _FULL: list[Gaussian] = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0)]
 
 def power_points(interval: Interval, powers: Iterable[int]) -> list[dict[int, Fraction]]:
     """Return points whose hull holds (x^k for k in powers), x in the interval."""
-    wanted = sorted(powers)
-    if len(wanted) == 1:
+    exponents = sorted(powers)
+    if len(exponents) == 1:
         # A single power has a range, which is tighter than the control points of its curve.
-        reached = interval.power(wanted[0])
-        return [{wanted[0]: end} for end in (reached.lo, reached.hi)]
-    degree = wanted[-1]
+        reached = interval.power(exponents[0])
+        return [{exponents[0]: end} for end in (reached.lo, reached.hi)]
+    degree = exponents[-1]
     lo, hi = interval.lo, interval.hi
     return [
         {
@@ -47,7 +47,7 @@ def power_points(interval: Interval, powers: Iterable[int]) -> list[dict[int, Fr
                 ),
                 Fraction(0),
             )
-            for k in wanted
+            for k in exponents
         }
         for i in range(degree + 1)
     ]
@@ -55,9 +55,9 @@ def power_points(interval: Interval, powers: Iterable[int]) -> list[dict[int, Fr
 
 def common_unit(frequencies: Iterable[Fraction]) -> Fraction:
     """Return the largest rational of which all the frequencies are whole multiples."""
-    wanted = list(frequencies)
-    denominator = lcm(*(w.denominator for w in wanted))
-    return Fraction(gcd(*(int(w * denominator) for w in wanted)), denominator)
+    rationals = list(frequencies)
+    denominator = lcm(*(w.denominator for w in rationals))
+    return Fraction(gcd(*(int(w * denominator) for w in rationals)), denominator)
 
 
 def wave_points(arc: Interval, orders: Iterable[int]) -> list[dict[tuple[int, int], Fraction]]:
@@ -65,17 +65,17 @@ def wave_points(arc: Interval, orders: Iterable[int]) -> list[dict[tuple[int, in
 
     Keys are (k, 0) for cos and (k, 1) for sin.
     """
-    wanted = sorted(orders)
-    degree = wanted[-1]
+    degrees = sorted(orders)
+    degree = degrees[-1]
     cuts = _cuts(arc)
     closed = cuts == _FULL
-    found = []
+    result = []
     for number, (a, b) in enumerate(zip(cuts, cuts[1:], strict=False)):
         first = 0 if number == 0 and not closed else 1
         last = 2 * degree if number == len(cuts) - 2 and not closed else 2 * degree - 1
         # Where two pieces meet, the curve's tangent runs between the neighbouring control points.
-        found += [_control_point(a, b, degree, i, wanted) for i in range(first, last + 1)]
-    return found
+        result += [_control_point(a, b, degree, i, degrees) for i in range(first, last + 1)]
+    return result
 
 
 def _cuts(arc: Interval) -> list[Gaussian]:
@@ -135,8 +135,8 @@ def _control_point(
     """Return control point i of the waves on the arc from twice the angle of a to that of b."""
     weight = _form(a, b, degree, i, 0)[0]
     assert weight > 0, "an arc's piece must be shorter than 180 degrees"
-    found = {}
+    result = {}
     for k in orders:
         real, imaginary = _form(a, b, degree, i, k)
-        found[k, 0], found[k, 1] = real / weight, imaginary / weight
-    return found
+        result[k, 0], result[k, 1] = real / weight, imaginary / weight
+    return result

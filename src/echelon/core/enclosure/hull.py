@@ -151,8 +151,8 @@ def _sloped(x: np.ndarray) -> np.ndarray:
 
 def _evaluate(function: _Function, x: np.ndarray, v: np.ndarray, atoms: Atoms) -> np.ndarray:
     """Return the values of a function with their slopes."""
-    [found] = evaluate(function, [x, v], slopes_in(atoms))
-    return found if found.dtype == object else map_entries(number, found)
+    [result] = evaluate(function, [x, v], slopes_in(atoms))
+    return result if result.dtype == object else map_entries(number, result)
 
 
 def _slopes(values: np.ndarray, n: int, atoms: Atoms) -> np.ndarray:
@@ -173,10 +173,10 @@ def _variables(
     if len(called) != n + m:
         raise GainError(f"`names` has {len(called)} entries, and must have {n + m}.")
     bounds = [*zip(*states, strict=True), *zip(*inputs, strict=True)]
-    found = np.empty(n + m, object)
+    result = np.empty(n + m, object)
     for k, (low, high) in enumerate(bounds):
-        found[k] = atoms.variable(called[k], _interval(low, high))
-    return found[:n], found[n:]
+        result[k] = atoms.variable(called[k], _interval(low, high))
+    return result[:n], result[n:]
 
 
 def _interval(low: float | Fraction, high: float | Fraction) -> Interval | None:
@@ -251,11 +251,11 @@ def _describe_atoms(
     atoms: Atoms, used: dict[int, set[Any]], counts: dict[int, int]
 ) -> tuple[HullAtom, ...]:
     """Return what the hull is made of, in the order in which the model uses it."""
-    found = []
+    result = []
     for atom, count in counts.items():
-        known = atoms.known[atom]
+        source = atoms.known[atom]
         powers = [e for e in used[atom] if isinstance(e, int)]
         kind = "arc" if not powers else "interval" if powers == [1] else "powers"
-        low, high = float(known.reach.lo), float(known.reach.hi)
-        found.append(HullAtom(known.name, "constant" if count == 1 else kind, low, high, count))
-    return tuple(found)
+        low, high = float(source.reach.lo), float(source.reach.hi)
+        result.append(HullAtom(source.name, "constant" if count == 1 else kind, low, high, count))
+    return tuple(result)

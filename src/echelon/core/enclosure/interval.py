@@ -137,15 +137,15 @@ def wave(x: Interval, sine: bool) -> Interval:
     """Return the range of cos (or of sin) on an interval, to 2^-99."""
     if x.hi - x.lo >= 2 * pi().lo:
         return Interval(Fraction(-1), Fraction(1))
-    found = circle(x.lo)[sine].union(circle(x.hi)[sine])
+    result = circle(x.lo)[sine].union(circle(x.hi)[sine])
     # Extremes lie at k pi for cos and (k + 1/2) pi for sin; fewer than eight fit, rounding
     # included.
     first = math.floor(x.lo / pi().lo) - 2
     for k in range(first, first + 8):
         place = pi().scale(k + Fraction(int(sine), 2))
         if place.lo <= x.hi and place.hi >= x.lo:
-            found = found.union(point((-1) ** (k % 2)))
-    return found
+            result = result.union(point((-1) ** (k % 2)))
+    return result
 
 
 def _to_fixed_point(x: Fraction) -> int:
@@ -174,10 +174,10 @@ def _exp(x: Fraction) -> Interval:
     for k in range(40):
         total += term
         term = term * y // ((k + 1) * _ONE)
-    found = _within(total, Fraction(1, 1 << 190))
+    result = _within(total, Fraction(1, 1 << 190))
     for _ in range(halvings):
-        found = outward(found.lo**2, found.hi**2)
-    return found
+        result = outward(result.lo**2, result.hi**2)
+    return result
 
 
 def _log(x: Fraction) -> Interval:
@@ -231,8 +231,8 @@ def _asin(x: Fraction) -> Interval:
 
 def _tan(x: Fraction) -> Interval:
     cosine, sine = circle(x)
-    found = sine * inverse(cosine)
-    return outward(found.lo, found.hi)
+    result = sine * inverse(cosine)
+    return outward(result.lo, result.hi)
 
 
 def _sinh(x: Fraction) -> Interval:
@@ -246,8 +246,8 @@ def _logistic(x: Fraction) -> Interval:
 
 def _tanh(x: Fraction) -> Interval:
     # tanh x = 2 / (1 + e^(-2x)) - 1.
-    found = _logistic(2 * x)
-    return point(0) if x == 0 else outward(2 * found.lo - 1, 2 * found.hi - 1)
+    result = _logistic(2 * x)
+    return point(0) if x == 0 else outward(2 * result.lo - 1, 2 * result.hi - 1)
 
 
 def _cosh(x: Interval) -> Interval:

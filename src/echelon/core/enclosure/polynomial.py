@@ -39,26 +39,26 @@ def _wave_product(a: Wave, b: Wave) -> list[tuple[Fraction, Wave | None]]:
 
 def _monomial_product(a: Monomial, b: Monomial) -> list[tuple[Fraction, Monomial]]:
     """Return the product of two monomials as a sum of monomials."""
-    found: list[tuple[Fraction, dict[int, Exponent]]] = [(Fraction(1), dict(a))]
+    result: list[tuple[Fraction, dict[int, Exponent]]] = [(Fraction(1), dict(a))]
     # A monomial holds each atom once: shared ones merge, and a product of waves forks the sum.
     for atom, exponent in b:
-        held = dict(a).get(atom)
-        for _, factors in found:
+        present = dict(a).get(atom)
+        for _, factors in result:
             factors.pop(atom, None)
-        if held is None:
+        if present is None:
             options: list[tuple[Fraction, Exponent | None]] = [(Fraction(1), exponent)]
-        elif isinstance(held, int) and isinstance(exponent, int):
-            options = [(Fraction(1), held + exponent)]
+        elif isinstance(present, int) and isinstance(exponent, int):
+            options = [(Fraction(1), present + exponent)]
         else:
             # Angles are atoms of their own (`_angle`), so no atom bears both powers and waves.
-            assert isinstance(held, tuple) and isinstance(exponent, tuple)
-            options = [*_wave_product(held, exponent)]
-        found = [
+            assert isinstance(present, tuple) and isinstance(exponent, tuple)
+            options = [*_wave_product(present, exponent)]
+        result = [
             (c * k, factors if new is None else {**factors, atom: new})
-            for c, factors in found
+            for c, factors in result
             for k, new in options
         ]
-    return [(c, tuple(sorted(factors.items()))) for c, factors in found]
+    return [(c, tuple(sorted(factors.items()))) for c, factors in result]
 
 
 @final
@@ -92,10 +92,10 @@ class Polynomial:
 
     def power(self, k: int) -> "Polynomial":
         """Return the k-th power, k >= 0."""
-        found = constant(1)
+        result = constant(1)
         for _ in range(k):
-            found = found * self
-        return found
+            result = result * self
+        return result
 
     def key(self) -> frozenset[tuple[Monomial, Fraction]]:
         """Return what is equal exactly for equal polynomials."""
@@ -107,11 +107,11 @@ class Polynomial:
 
     def exponents(self) -> dict[int, set[Exponent]]:
         """Return which powers or waves of each atom occur."""
-        found: dict[int, set[Exponent]] = {}
+        result: dict[int, set[Exponent]] = {}
         for monomial in self.terms:
             for atom, exponent in monomial:
-                found.setdefault(atom, set()).add(exponent)
-        return found
+                result.setdefault(atom, set()).add(exponent)
+        return result
 
 
 def constant(x: Fraction | int | float) -> Polynomial:
@@ -147,10 +147,10 @@ def monomial_quotient(top: Monomial, lead: Monomial) -> Monomial | None:
     """Return the monomial that makes `top` of `lead`, or None."""
     left = dict(top)
     for atom, e in lead:
-        held = left.pop(atom, None)
-        if isinstance(held, int) and isinstance(e, int) and held >= e:
-            if held > e:
-                left[atom] = held - e
-        elif held != e:
+        power = left.pop(atom, None)
+        if isinstance(power, int) and isinstance(e, int) and power >= e:
+            if power > e:
+                left[atom] = power - e
+        elif power != e:
             return None
     return tuple(sorted(left.items()))

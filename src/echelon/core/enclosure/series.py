@@ -56,8 +56,8 @@ def enclose_derivatives(
         t = np.empty((), object)
         t[()] = Series(((_down(low), _up(high)), *[_whole(k == 1) for k in range(1, order + 1)]))
         with precision("float64"):
-            [found] = walk(closed.jaxpr, closed.consts, [t], _algebra(order))
-        rows = [_lifted(entry, order).parts for entry in found.ravel()]
+            [result] = walk(closed.jaxpr, closed.consts, [t], _algebra(order))
+        rows = [_lifted(entry, order).parts for entry in result.ravel()]
         return [[_scaled(row[k], math.factorial(k), 1) for row in rows] for k in range(order + 1)]
 
     for low, high in zip(times, times[1:], strict=False):
@@ -176,31 +176,31 @@ def _lifted(entry: Any, order: int) -> Series:
 
 def _reciprocal(x: Series) -> Series:
     """Return 1 / x: from x r = 1."""
-    first, found = _applied("reciprocal", x.parts[0]), list[_Ends]()
+    first, result = _applied("reciprocal", x.parts[0]), list[_Ends]()
     for k in range(x.order + 1):
-        rest = _product(x.parts, [*found, (0, 0)], k, first=1)
-        found.append(_minus(_times(first, rest)) if k else first)
-    return Series(found)
+        rest = _product(x.parts, [*result, (0, 0)], k, first=1)
+        result.append(_minus(_times(first, rest)) if k else first)
+    return Series(result)
 
 
 def _whole_power(x: Series, k: int) -> Series:
     if k < 0:
         return _reciprocal(_whole_power(x, -k))
-    found = number(1, x.order)
+    result = number(1, x.order)
     for _ in range(k):
-        found = found * x
+        result = result * x
     # A square is not negative, which a product of two intervals does not know.
-    value = _ends(_interval(x.parts[0]).power(k)) if k else found.parts[0]
-    return Series((value, *found.parts[1:]))
+    value = _ends(_interval(x.parts[0]).power(k)) if k else result.parts[0]
+    return Series((value, *result.parts[1:]))
 
 
 def _circle(x: Series) -> tuple[Series, Series]:
     """Return cos x and sin x: from c' = -s x' and s' = c x'."""
     c, s = ([_ends(wave(_interval(x.parts[0]), sine=sine))] for sine in (False, True))
     for k in range(1, x.order + 1):
-        turned = _minus(_integral(x, s, k))
+        rotated = _minus(_integral(x, s, k))
         s.append(_integral(x, c, k))
-        c.append(turned)
+        c.append(rotated)
     return Series(c), Series(s)
 
 
@@ -213,10 +213,10 @@ def _integral(x: Series, f: Sequence[_Ends], k: int) -> _Ends:
 
 
 def _exp(x: Series) -> Series:
-    found = [_applied("exp", x.parts[0])]
+    result = [_applied("exp", x.parts[0])]
     for k in range(1, x.order + 1):
-        found.append(_integral(x, found, k))
-    return Series(found)
+        result.append(_integral(x, result, k))
+    return Series(result)
 
 
 def _primitive(name: str, slope: Callable[[Series], Series]) -> Callable[[Series], Series]:
@@ -234,15 +234,15 @@ def _primitive(name: str, slope: Callable[[Series], Series]) -> Callable[[Series
 
 def _sqrt(x: Series) -> Series:
     """Return the root: from r r = x."""
-    found = [_applied("sqrt", x.parts[0])]
+    result = [_applied("sqrt", x.parts[0])]
     if not x.moves:
-        return Series((found[0], *x.parts[1:]))
-    half = _scaled(_applied("reciprocal", found[0]), 1, 2)
+        return Series((result[0], *x.parts[1:]))
+    half = _scaled(_applied("reciprocal", result[0]), 1, 2)
     for k in range(1, x.order + 1):
         # Without the two ends of the sum, which hold the coefficient that is sought.
-        rest = _product([*found, (0, 0)], [*found, (0, 0)], k, first=1)
-        found.append(_times(half, _sum(x.parts[k], _minus(rest))))
-    return Series(found)
+        rest = _product([*result, (0, 0)], [*result, (0, 0)], k, first=1)
+        result.append(_times(half, _sum(x.parts[k], _minus(rest))))
+    return Series(result)
 
 
 def _applied(name: str, ends: _Ends) -> _Ends:
@@ -251,12 +251,13 @@ def _applied(name: str, ends: _Ends) -> _Ends:
     Raises:
         GainError: it is not defined there.
     """
-    known, x = ELEMENTARY[name], _interval(ends)
-    if not known.defined(x):
+    elementary, x = ELEMENTARY[name], _interval(ends)
+    if not elementary.defined(x):
         raise GainError(
-            f"a path takes `{name}` of what may be anything in {x.text()}, and that {known.domain}."
+            f"a path takes `{name}` of what may be anything in {x.text()}, and that "
+            f"{elementary.domain}."
         )
-    return _ends(known.range(x))
+    return _ends(elementary.range(x))
 
 
 def _power(x: Series, exponent: Any) -> Series:
@@ -292,8 +293,8 @@ def _tangent(x: Series) -> Series:
 def _tanh(x: Series) -> Series:
     """Return 1 - 2 / (exp 2x + 1), within -1 and 1."""
     one, two = number(1, x.order), number(2, x.order)
-    found = one - two * _reciprocal(_exp(two * x) + one)
-    return Series((_applied("tanh", x.parts[0]), *found.parts[1:]))
+    result = one - two * _reciprocal(_exp(two * x) + one)
+    return Series((_applied("tanh", x.parts[0]), *result.parts[1:]))
 
 
 _FUNCTIONS: dict[str, Callable[[Series], Series]] = {
@@ -330,7 +331,7 @@ def _algebra(order: int) -> Algebra:
         )
 
     zero, one = number(0, order), number(1, order)
-    known: dict[str, Rule] = {
+    functions: dict[str, Rule] = {
         **{name: entrywise(function) for name, function in _FUNCTIONS.items()},
         "div": entrywise(lambda a, b: a * _reciprocal(b)),
         "integer_pow": lambda params, x: map_entries(lambda s: _whole_power(s, params["y"]), x),
@@ -340,7 +341,7 @@ def _algebra(order: int) -> Algebra:
         "reduce_sum": reduction(operator.add, zero),
         "reduce_prod": reduction(operator.mul, one),
     }
-    return Algebra(known, lambda x: number(x, order), lift, rules.outside, unknown)
+    return Algebra(functions, lambda x: number(x, order), lift, rules.outside, unknown)
 
 
 def _convert(params: Any, x: np.ndarray) -> np.ndarray:

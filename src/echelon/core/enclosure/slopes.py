@@ -62,8 +62,8 @@ def _lift(array: np.ndarray) -> np.ndarray:
 def _fold(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Return what an unknown primitive makes of parameters alone: parameters again."""
     plain = [map_entries(_parameter, a) if a.dtype == object else a for a in operands]
-    found = rules.fold(equation, plain)
-    return [map_entries(number, a) if a.dtype == object else a for a in found]
+    result = rules.fold(equation, plain)
+    return [map_entries(number, a) if a.dtype == object else a for a in result]
 
 
 def _parameter(entry: object) -> Polynomial | None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -21,13 +22,17 @@ _AHEAD, _PLACES = 60.0, 121
 _BLOCK = 32
 """Frames for which V is computed at once: a constant, so that it is compiled once."""
 
+_NO_PROMISE = MappingProxyType(
+    {"promised": False, "rate": None, "theorem": None, "sentence": "", "kind": "", "hypotheses": ()}
+)
+
 
 def foreseen(
     parts: Parts,
     settings: Settings,
     states: Float[Array, "N n"],
     name: str,
-    promise: Mapping[str, Any],
+    promise: Mapping[str, Any] = _NO_PROMISE,
 ) -> Recording:
     """Return a recording of agents that stay at their goals, by which the scene is sized.
 
@@ -36,7 +41,7 @@ def foreseen(
         settings: of the run.
         states: at the beginning.
         name: of the scenario.
-        promise: as `Promise.as_mapping` returns it.
+        promise: as `Promise.as_mapping` returns it; none by default.
     """
     model, graph = parts.model, parts.graph
     times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)

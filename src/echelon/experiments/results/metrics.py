@@ -84,7 +84,7 @@ class FollowerMetrics(NamedTuple):
     ]
     saturated: Annotated[
         float,
-        Quantity("fraction of steps in which a limit changed the input", "", "limited,\n% steps"),
+        Quantity("fraction of steps in which a limit changed the input", "", "saturated,\n% steps"),
     ]
 
 

@@ -50,9 +50,9 @@ def _checked(facts: Facts, model: ControlAffine) -> Iterator[Finding]:
         yield said("equations of the model", False, saved.path, name, "names differ")
         return
     # The law flies about the model's own trim, in the model's own units.
-    own = (*map(np.asarray, model.trim), np.asarray(model.input_scale))
-    told = (saved.state, saved.input, saved.scale)
-    fine = all(_alike(one, other) for one, other in zip(told, own, strict=True))
+    of_model = (*map(np.asarray, model.trim), np.asarray(model.input_scale))
+    of_file = (saved.state, saved.input, saved.scale)
+    fine = all(_alike(one, other) for one, other in zip(of_file, of_model, strict=True))
     yield said("trim and units of the inputs", fine, "", "", f"those of `{name}`")
     yield from _at_the_trim(facts, model)
     if facts.saved.region is not None:
@@ -68,19 +68,19 @@ def _at_the_trim(facts: Facts, model: ControlAffine) -> Iterator[Finding]:
     """Check that the trim is one, A and B there, and A by the differences of velocities too."""
     saved, n = facts.saved.model, len(facts.saved.P)
     sizes = np.multiply.outer(_STEPS, np.maximum(1.0, np.abs(saved.state)))
-    moved = saved.state + np.stack([sizes, -sizes])[..., None] * np.eye(n)
-    x = np.concatenate([saved.state[None], moved.reshape(-1, n)])
+    displaced = saved.state + np.stack([sizes, -sizes])[..., None] * np.eye(n)
+    x = np.concatenate([saved.state[None], displaced.reshape(-1, n)])
     at = evaluate(model, saved, x, np.zeros((len(x), len(saved.input))))
     rest, rounding = np.abs(at.velocities[0]), _LOST * at.sizes[0]
     fine = bool((rest <= _AT_REST + rounding).all())
     yield said("the trim is an equilibrium", fine, "at most 1e-09", float(rest.max()))
-    for name, stored, found in (
+    for name, stored, result in (
         ("A at the trim", saved.A, at.jacobians[0]),
         ("B at the trim", saved.B, at.maps[0]),
     ):
-        gap, size = float(np.abs(stored - found).max()), float(np.abs(found).max())
+        gap, size = float(np.abs(stored - result).max()), float(np.abs(result).max())
         yield said(name, gap <= TIGHT * size, "", f"{gap:.3g} apart")
-    gap = _quotients_off(saved, at, np.diagonal(moved - saved.state, axis1=2, axis2=3))
+    gap = _quotients_off(saved, at, np.diagonal(displaced - saved.state, axis1=2, axis2=3))
     text = "in parts of the quotients"
     yield said("A at the trim, by differences", gap <= _QUOTIENT, "", gap, text)
 
@@ -111,15 +111,15 @@ def _on_the_domain(facts: Facts, region: SavedRegion, model: ControlAffine) -> I
     saved = facts.saved
     yield said("the domain stays inside the chart", _charted(saved.model, region, model))
     some = points(saved, region)
-    found = evaluate(model, saved.model, saved.model.state + some.states, some.inputs)
-    count = f"{len(found.jacobians)} states"
-    weighted = found.maps @ np.linalg.solve(saved.R, found.maps.swapaxes(1, 2))
+    result = evaluate(model, saved.model, saved.model.state + some.states, some.inputs)
+    count = f"{len(result.jacobians)} states"
+    weighted = result.maps @ np.linalg.solve(saved.R, result.maps.swapaxes(1, 2))
     if needs_constant(facts, region):
-        gap = float(np.abs(found.maps - saved.model.B).max())
+        gap = float(np.abs(result.maps - saved.model.B).max())
         fine = gap <= ROUNDING * float(np.abs(saved.model.B).max())
         yield said(f"g is constant ({region.theorem})", fine, "", f"{gap:.3g} apart", count)
     # Under T2 the hull is of pairs, since A and g turn together.
-    both = [found.jacobians, weighted] if region.theorem == "T2" else [found.jacobians]
+    both = [result.jacobians, weighted] if region.theorem == "T2" else [result.jacobians]
     if region.kind == "samples":
         gap = enclosed.farthest_from_all(region.hull, np.dstack(both)[: some.corners])
         text = f"{some.corners} corners of the domain"
@@ -129,7 +129,7 @@ def _on_the_domain(facts: Facts, region: SavedRegion, model: ControlAffine) -> I
         text = f"of {count}, in ranges of the entries"
         yield said("Jacobians lie in the hull", outside <= TIGHT, "0", outside, text)
     yield _secants(facts, region, model, some)
-    rate, slack, decided = slowest(facts, region, found.jacobians, weighted)
+    rate, slack, decided = slowest(facts, region, result.jacobians, weighted)
     # Samples promise nothing between them, and new ones may be a little worse.
     slower = _SAMPLED * abs(region.rate) if region.kind == "samples" else 0.0
     least = region.rate * (1.0 - TIGHT) - slack - slower
@@ -158,8 +158,8 @@ def _secants(facts: Facts, region: SavedRegion, model: ControlAffine, some: Poin
     n, slope = len(saved.P), np.abs(region.hull[:, :, : len(saved.P)]).max(axis=0)
 
     def velocity(states: Array) -> tuple[Array, Array]:
-        found = evaluate(model, saved.model, states, at.inputs)
-        return found.velocities, _LOST * (found.sizes + np.abs(states) @ slope.T)
+        result = evaluate(model, saved.model, states, at.inputs)
+        return result.velocities, _LOST * (result.sizes + np.abs(states) @ slope.T)
 
     if region.kind == "samples":
         normals, claim = steps @ saved.P, "pairs come together as promised"
@@ -191,9 +191,11 @@ def _decay(facts: Facts, region: SavedRegion, steps: Array) -> enclosed.SupportB
     """
     saved, n = facts.saved, len(facts.saved.P)
     W = region.hull[:, :, n:] if region.theorem == "T2" else facts.weighted[None]
-    pulled, rate = steps @ saved.P, region.rate * (1.0 - _SAMPLED)
-    held = 0.5 * region.strength * np.einsum("kn,hnm,km->kh", pulled, W, pulled).max(axis=1)
-    size = np.einsum("kn,kn->k", pulled, steps)
+    metric_step, rate = steps @ saved.P, region.rate * (1.0 - _SAMPLED)
+    feedback = (
+        0.5 * region.strength * np.einsum("kn,hnm,km->kh", metric_step, W, metric_step).max(axis=1)
+    )
+    size = np.einsum("kn,kn->k", metric_step, steps)
     return enclosed.SupportBounds(
-        np.full(len(steps), -np.inf), held - rate * size, held + rate * size
+        np.full(len(steps), -np.inf), feedback - rate * size, feedback + rate * size
     )

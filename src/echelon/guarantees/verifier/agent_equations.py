@@ -83,9 +83,9 @@ def evaluate(model: ControlAffine, saved: SavedModel, x: Array, v: Array) -> Eva
         for k in range(0, len(x), _TOGETHER):
             some = x[k : k + _TOGETHER], v[k : k + _TOGETHER]
             # The last points once more, for one shape.
-            full = (np.resize(each, (_TOGETHER, each.shape[1])) for each in some)
-            found = _evaluate(model, u, S, *map(jnp.asarray, full))
-            parts.append([np.asarray(each)[: len(some[0])] for each in found])
+            full = (np.resize(item, (_TOGETHER, item.shape[1])) for item in some)
+            result = _evaluate(model, u, S, *map(jnp.asarray, full))
+            parts.append([np.asarray(item)[: len(some[0])] for item in result])
     return Evaluated(*map(np.concatenate, zip(*parts, strict=True)))
 
 

@@ -31,8 +31,8 @@ def grounded_rows(graph: SavedGraph, edges: Array) -> list[list[Fraction]]:
         rows[b][b] += w
         rows[a][b] -= w
         rows[b][a] -= w
-    kept = followers(graph)
-    return [[rows[i][j] for j in kept] for i in kept]
+    selection = followers(graph)
+    return [[rows[i][j] for j in selection] for i in selection]
 
 
 class CheckedSpectrum(NamedTuple):
@@ -44,10 +44,10 @@ class CheckedSpectrum(NamedTuple):
 
 def spectrum(graph: SavedGraph, edges: Array) -> CheckedSpectrum:
     """Return all eigenvalues of the grounded Laplacian; 0 first where an agent is not reached."""
-    (i, j), weights, kept = edges[:, :2].astype(int).T, edges[:, 2], followers(graph)
+    (i, j), weights, selection = edges[:, :2].astype(int).T, edges[:, 2], followers(graph)
     W = np.zeros((graph.agents, graph.agents))
     np.add.at(W, (np.append(i, j), np.append(j, i)), np.append(weights, weights))
-    apart, led = W[np.ix_(kept, kept)], W[np.ix_(kept, graph.leaders)].sum(axis=1)
+    apart, led = W[np.ix_(selection, selection)], W[np.ix_(selection, graph.leaders)].sum(axis=1)
     values = scipy.linalg.eigvalsh(np.diag(apart.sum(axis=1) + led) - apart)
     values[0], bound = _least(apart, led)
     return CheckedSpectrum(values, bound)
@@ -119,8 +119,8 @@ def rightmost(matrix: Array, doubt: Doubt = lambda y, x: 0.0) -> tuple[float, fl
     """Return the largest real part of an eigenvalue, and what rounding and a doubt make of it."""
     # Without the units of the states, which would inflate the bound of the rounding.
     balanced, (units, _) = scipy.linalg.matrix_balance(matrix, permute=False, separate=True)
-    found: Any = scipy.linalg.eig(balanced, left=True, right=True)
-    values, left, right = found
+    result: Any = scipy.linalg.eig(balanced, left=True, right=True)
+    values, left, right = result
     at = int(np.argmax(values.real))
     y, x = left[:, at], right[:, at]
     # A simple eigenvalue moves by the perturbation over the cosine of its two vectors (Wilkinson).
@@ -154,11 +154,11 @@ def growth(P: Array, As: Array, Ws: Array, strength: float) -> tuple[float, floa
     """
     # With P = L L' the determinant vanishes at the eigenvalues of L^-1 (...) L^-T.
     root = scipy.linalg.solve_triangular(np.linalg.cholesky(P), np.eye(len(P)), lower=True)
-    turned, held = P @ As, strength * P @ Ws @ P
-    slope = root @ (turned + turned.swapaxes(1, 2) - held) @ root.T
+    PA, feedback = P @ As, strength * P @ Ws @ P
+    slope = root @ (PA + PA.swapaxes(1, 2) - feedback) @ root.T
     values = np.linalg.eigvalsh(0.5 * (slope + slope.swapaxes(1, 2)))[:, -1]
     # Rounding is of the terms before they cancel, hence absolute values throughout.
-    parts = np.abs(P) @ np.abs(As) + 0.5 * np.abs(held)
+    parts = np.abs(P) @ np.abs(As) + 0.5 * np.abs(feedback)
     sizes = np.abs(root) @ (parts + parts.swapaxes(1, 2)) @ np.abs(root.T)
     whole = float(np.linalg.norm(sizes, axis=(1, 2)).max())
     return float(values.max()), 4.0 * _EPS * len(P) * whole

@@ -19,10 +19,10 @@ def directed_spectrum(graph: SavedGraph, edges: Array) -> tuple[Array, float, fl
 
     The smallest is 0 where an agent is not reached, and the bound where no sum is known.
     """
-    W, kept = np.zeros((graph.agents, graph.agents)), algebra.followers(graph)
+    W, selection = np.zeros((graph.agents, graph.agents)), algebra.followers(graph)
     # Of an arrow (i, j) j hears i.
     W[edges[:, 1].astype(int), edges[:, 0].astype(int)] = edges[:, 2]
-    apart, led = W[np.ix_(kept, kept)], W[np.ix_(kept, graph.leaders)].sum(axis=1)
+    apart, led = W[np.ix_(selection, selection)], W[np.ix_(selection, graph.leaders)].sum(axis=1)
     L = np.diag(apart.sum(axis=1) + led) - apart
     if not _reached(apart > 0.0, led > 0.0).all():
         return np.zeros(len(L), complex), 0.0, 0.0
@@ -49,12 +49,12 @@ def _circles(hears: Array) -> list[Array]:
     ways = np.eye(len(hears), dtype=bool) | hears
     for _ in range(max(1, int(np.ceil(np.log2(max(2, len(hears))))))):
         ways = (ways.astype(np.float32) @ ways.astype(np.float32)) > 0.0
-    both, seen, found = ways & ways.T, np.zeros(len(hears), bool), list[Array]()
+    both, visited, result = ways & ways.T, np.zeros(len(hears), bool), list[Array]()
     for k in range(len(hears)):
-        if not seen[k]:
-            found.append(np.flatnonzero(both[k]))
-            seen[found[-1]] = True
-    return found
+        if not visited[k]:
+            result.append(np.flatnonzero(both[k]))
+            visited[result[-1]] = True
+    return result
 
 
 def _least(inside: Array, outside: Array) -> float:
@@ -81,24 +81,24 @@ def _held(graph: SavedGraph, edges: Array, L: Array) -> float:
     if graph.sums is None:
         return 0.0
     root = np.sqrt(graph.sums)
-    turned = root[:, None] * L / root
-    symmetric = 0.5 * (turned + turned.T)
-    held = float(np.linalg.eigvalsh(symmetric)[0])
+    scaled = root[:, None] * L / root
+    symmetric = 0.5 * (scaled + scaled.T)
+    bound = float(np.linalg.eigvalsh(symmetric)[0])
     lost = 8.0 * len(L) * _EPS * float(np.abs(symmetric).sum(axis=1).max())
-    held = max(0.0, held - lost) * (1.0 - 1e-10)
-    return held if len(L) > _EXACT or _proved(graph, edges, held) else 0.0
+    bound = max(0.0, bound - lost) * (1.0 - 1e-10)
+    return bound if len(L) > _EXACT or _proved(graph, edges, bound) else 0.0
 
 
 def _proved(graph: SavedGraph, edges: Array, held: float) -> bool:
     """Tell whether W L + L'W - 2 s W is positive definite, by exact minors."""
     assert graph.sums is not None
-    size, kept = graph.agents, algebra.followers(graph)
+    size, selection = graph.agents, algebra.followers(graph)
     L = [[Fraction(0)] * size for _ in range(size)]
     for i, j, weight in edges:
         L[int(j)][int(j)] += Fraction(float(weight))
         L[int(j)][int(i)] -= Fraction(float(weight))
-    w = {agent: Fraction(float(x)) for agent, x in zip(kept, graph.sums, strict=True)}
-    rows = [[w[i] * L[i][j] + w[j] * L[j][i] for j in kept] for i in kept]
-    for k, agent in enumerate(kept):
+    w = {agent: Fraction(float(x)) for agent, x in zip(selection, graph.sums, strict=True)}
+    rows = [[w[i] * L[i][j] + w[j] * L[j][i] for j in selection] for i in selection]
+    for k, agent in enumerate(selection):
         rows[k][k] -= 2 * Fraction(held) * w[agent]
     return exact_minors.is_positive_definite(rows)

@@ -32,17 +32,17 @@ def farthest_outside(hull: Array, error: Array, samples: Array) -> float:
     """
     if not np.isfinite(samples).all():
         return np.inf
-    corners, wanted = hull.reshape(len(hull), -1), samples.reshape(len(samples), -1)
+    corners, target = hull.reshape(len(hull), -1), samples.reshape(len(samples), -1)
     low, spread = corners.min(axis=0), np.ptp(corners, axis=0)
     size = np.abs(corners).max(axis=0)
     # An entry that hardly varies is measured by its size, or rounding would look like distance.
     unit = np.where(size > 0.0, np.maximum(spread, 1e-3 * size), 1.0)
-    corners, wanted, allowed = (corners - low) / unit, (wanted - low) / unit, error.ravel() / unit
+    corners, target, allowed = (corners - low) / unit, (target - low) / unit, error.ravel() / unit
     moving = spread > 0.0
     # The row of ones asks for weights that add to one.
     system = np.vstack([corners[:, moving].T, np.ones(len(corners))])
-    worst = float((np.abs(wanted - corners[0]) - allowed)[:, ~moving].max(initial=0.0))
-    for sample in wanted[:, moving]:
+    worst = float((np.abs(target - corners[0]) - allowed)[:, ~moving].max(initial=0.0))
+    for sample in target[:, moving]:
         weights, _ = scipy.optimize.nnls(system, np.append(sample, 1.0), maxiter=100 * len(corners))
         mixed = weights @ corners[:, moving] / weights.sum() if weights.any() else np.inf
         worst = max(worst, float((np.abs(mixed - sample) - allowed[moving]).max(initial=0.0)))
@@ -65,9 +65,9 @@ def support(hull: Array, error: Array, normals: Array, steps: Array) -> SupportB
     spread = np.einsum("kn,nm,km->k", np.abs(normals), error, np.abs(steps))
     low, high = np.full(len(steps), np.inf), np.full(len(steps), -np.inf)
     for k in range(0, len(hull), _AT_ONCE):
-        found = np.einsum("km,hnm->khn", steps, hull[k : k + _AT_ONCE], optimize=True)
-        found = np.einsum("khn,kn->kh", found, normals)
-        low, high = np.minimum(low, found.min(axis=1)), np.maximum(high, found.max(axis=1))
+        result = np.einsum("km,hnm->khn", steps, hull[k : k + _AT_ONCE], optimize=True)
+        result = np.einsum("khn,kn->kh", result, normals)
+        low, high = np.minimum(low, result.min(axis=1)), np.maximum(high, result.max(axis=1))
     size = np.einsum("kn,nm,km->k", np.abs(normals), np.abs(hull).max(axis=0), np.abs(steps))
     return SupportBounds(low - spread, high + spread, size)
 
@@ -101,9 +101,9 @@ def steepest(
 
     for _ in range(_HALVINGS):
         lost = np.einsum("kn,kn->k", np.abs(normals), lost_x + lost_y) / part
-        found = (excess(at_x, at_y) - lost) / unit
+        result = (excess(at_x, at_y) - lost) / unit
         # What is not a number is outside of every bound.
-        worst = max(worst, float(np.where(np.isfinite(found), found, np.inf).max()))
+        worst = max(worst, float(np.where(np.isfinite(result), result, np.inf).max()))
         middle, part = 0.5 * (x + y), 0.5 * part
         at, lost_at = velocity(middle)
         first = (excess(at_x, at) >= excess(at, at_y))[:, None]

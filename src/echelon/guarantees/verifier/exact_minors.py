@@ -111,21 +111,21 @@ def first_unproved(
         strength: 2 c lambda_min, a lower bound of it.
         rate: 1/s.
     """
-    metric, moved = rows_of(P), rows_of(abs(error))
+    metric, change = rows_of(P), rows_of(abs(error))
     pull = product(metric, rows_of(B))
-    held = product(product(pull, inverse(rows_of(R))), transposed(pull))
+    feedback = product(product(pull, inverse(rows_of(R))), transposed(pull))
     # |P dA| <= |P| error for every dA within +- error.
-    spread = product(rows_of(abs(P)), moved)
+    spread = product(rows_of(abs(P)), change)
     fixed = [
-        [strength * held[i][j] - 2 * Fraction(rate) * metric[i][j] for j in range(len(metric))]
+        [strength * feedback[i][j] - 2 * Fraction(rate) * metric[i][j] for j in range(len(metric))]
         for i in range(len(metric))
     ]
     for i, row in enumerate(spread):
         fixed[i][i] -= sum(row) + sum(other[i] for other in spread)
     for number, corner in enumerate(hull):
-        turned = product(metric, rows_of(corner))
+        PA = product(metric, rows_of(corner))
         slope = [
-            [fixed[i][j] - turned[i][j] - turned[j][i] for j in range(len(fixed))]
+            [fixed[i][j] - PA[i][j] - PA[j][i] for j in range(len(fixed))]
             for i in range(len(fixed))
         ]
         if not is_positive_definite(slope):

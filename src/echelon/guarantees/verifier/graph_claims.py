@@ -42,19 +42,19 @@ def drawn(saved: SavedGain) -> Iterator[Finding]:
 def spanned(facts: Facts) -> Iterator[Finding]:
     """Check the spectrum that the file states."""
     saved, stored = facts.saved, facts.saved.graph.spectrum
-    found, claim = facts.eigenvalues, "graph spectrum"
-    found = found if saved.graph.directed else algebra.ends_of_many(found)
-    high = float(np.abs(found).max())
+    result, claim = facts.eigenvalues, "graph spectrum"
+    result = result if saved.graph.directed else algebra.ends_of_many(result)
+    high = float(np.abs(result).max())
     if saved.graph.switches:
         text = "the graph switches, and the file holds no edges of any one time"
         yield unchecked(claim, facts.low, text)
     elif saved.graph.directed and saved.graph.edges is not None:
-        yield _all_found(found, stored, high)
+        yield _all_found(result, stored, high)
     elif saved.graph.edges is None:
         text = "the file holds no edges of so large a graph"
         yield unchecked(claim, float(stored[0]), text)
     else:
-        gap = float(np.abs(found - stored).max())
+        gap = float(np.abs(result - stored).max())
         yield said(claim, gap <= TIGHT * high, "", f"{gap:.3g} apart", "grounded Laplacian")
     text = "every follower has a path to a leader"
     yield said("lambda_min is positive", facts.low > 0.0, found=facts.low, text=text)

@@ -22,12 +22,12 @@ def linearized(facts: Facts) -> Iterator[Finding]:
     """Check what the file says of the system near its trim."""
     saved = facts.saved
     yield said("kind of the slowest mode", saved.kind == "linearization", saved.kind)
-    found, slack = _slowest(facts, _looked_at(facts))
-    if saved.abscissa < 0.0 and slack > _MODE_DECIDED * abs(found):
+    result, slack = _slowest(facts, _looked_at(facts))
+    if saved.abscissa < 0.0 and slack > _MODE_DECIDED * abs(result):
         text = f"rounding of {slack:.2g} leaves it undecided"
-        yield said("slowest mode, 1/s", False, saved.abscissa, found, text)
+        yield said("slowest mode, 1/s", False, saved.abscissa, result, text)
     else:
-        yield same("slowest mode, 1/s", saved.abscissa, found, slack)
+        yield same("slowest mode, 1/s", saved.abscissa, result, slack)
     yield from _between(facts)
     yield from _edge(facts)
     rank = algebra.observable(facts.closed, saved.model.B.T @ saved.P)
@@ -43,8 +43,8 @@ def _between(facts: Facts) -> Iterator[Finding]:
     values = (
         values[1:-1] if len(values) > 2 else np.geomspace(values[0], values[-1], _BETWEEN)[1:-1]
     )
-    found, slack = _slowest(facts, values[1:-1])
-    yield said("all modes between decay", found + slack < 0.0, "", found)
+    result, slack = _slowest(facts, values[1:-1])
+    yield said("all modes between decay", result + slack < 0.0, "", result)
 
 
 def _looked_at(facts: Facts) -> Array:
@@ -59,13 +59,13 @@ def _slowest(facts: Facts, values: Array) -> tuple[float, float]:
     """Return the slowest mode, 1/s, and what rounding may make of it."""
     K = facts.saved.coupling * facts.feedback
     modes = np.linalg.eigvals(facts.closed - values[:, None, None] * K).real.max(axis=1)
-    found = [
+    result = [
         algebra.rightmost(facts.closed - x * K, _doubt(facts, K, abs(complex(x))))
         for x in values[np.argsort(modes)[-_LOOKED_AT:]]
     ]
-    slowest = max(value for value, _ in found)
+    slowest = max(value for value, _ in result)
     # Of modes that are equally slow, but for rounding, the worst conditioned sets the slack.
-    return slowest, max(slack for value, slack in found if value >= slowest - slack)
+    return slowest, max(slack for value, slack in result if value >= slowest - slack)
 
 
 def _doubt(facts: Facts, K: Array, value: float) -> algebra.Doubt:
@@ -86,9 +86,9 @@ def _doubt(facts: Facts, K: Array, value: float) -> algebra.Doubt:
 def _edge(facts: Facts) -> Iterator[Finding]:
     """Check the coupling from which the linearization is called stable, and that it is."""
     saved, claim = facts.saved, "edge of the coupling"
-    known = _EDGES.get(saved.method)
+    threshold = _EDGES.get(saved.method)
     if saved.edge is None:
-        silent = known is None and saved.method != "contraction"
+        silent = threshold is None and saved.method != "contraction"
         yield said(claim, silent, "none", text="" if silent else "this method has one")
         return
     if saved.method == "given":
@@ -96,8 +96,8 @@ def _edge(facts: Facts) -> Iterator[Finding]:
         return
     # The edge of `contraction` rests on the strength that it found, so only its inequality can be
     # checked.
-    if known is not None:
-        yield same(claim, saved.edge, known / facts.low)
+    if threshold is not None:
+        yield same(claim, saved.edge, threshold / facts.low)
     # The inequality is monotone in the coupling, so that at the edge speaks for all above it.
     strength = 2.0 * saved.edge * facts.low
     growth, slack = algebra.growth(saved.P, facts.closed[None], facts.weighted[None], strength)

@@ -27,8 +27,8 @@ _TIMES, _DRAWN = 24, 4000
 def motor_findings(told: Mapping[str, Any]) -> Iterator[Finding]:
     """Yield what is found of each claim of motors."""
     motion = _Motion.of(told)
-    asked = [_asked(motion, _sizes(start)) for start in told["starts"]]
-    ranges = [_range(told["airframe"], each) for each in asked]
+    demands = [_asked(motion, _sizes(start)) for start in told["starts"]]
+    ranges = [_range(told["airframe"], item) for item in demands]
     least, largest = (f(r[k] for r in ranges) for k, f in ((0, _least), (1, _most)))
     stored = float(told["least"])
     fine = 0.0 < stored <= least + _SLACK
@@ -38,7 +38,7 @@ def motor_findings(told: Mapping[str, Any]) -> Iterator[Finding]:
     yield said("largest thrust of a motor", fine, stored, largest, "followed over time")
     tilt = max(float(r[2].max()) for r in ranges)
     yield said("steepest tilt", told["tilt"] >= tilt - _SLACK, told["tilt"], tilt)
-    low, high = _drawn(told["airframe"], asked[0], ranges[0])
+    low, high = _drawn(told["airframe"], demands[0], ranges[0])
     fine = told["least"] <= low and high <= told["largest"]
     text = f"{_TIMES * _DRAWN} motions within the bounds"
     yield said("motors of drawn motions", fine, told["least"], low, text)
@@ -76,11 +76,11 @@ class _Motion(NamedTuple):
         """Return it of what is told."""
         rho = np.asarray(told["roots"], float)
         times = np.linspace(0.0, 30.0 / rho.min(), _CELLS)
-        (free, grown), (first, turned) = _responses(rho, times), _responses(rho[:1], times)
+        (free, grown), (first, rotated) = _responses(rho, times), _responses(rho[:1], times)
         path = np.asarray(told["path"], float)
         rows = path[np.searchsorted(path[:, 0], times, side="right") - 1, 1:].T
         led, speeds = told["leader"], np.add(told["speeds"], told["leader"]["speeds"])
-        base = _added(rows, speeds[:, None, None], grown, turned)
+        base = _added(rows, speeds[:, None, None], grown, rotated)
         return cls(free, first, base + _started(_sizes(led), free, first))
 
 

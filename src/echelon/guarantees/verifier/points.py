@@ -38,9 +38,9 @@ class _Box(NamedTuple):
         # Where one side is bounded, only the other goes on for ever.
         far = np.where(np.isfinite(self.low), self.low + np.abs(far), far)
         far = np.where(np.isfinite(self.high), self.high - np.abs(far), far)
-        found = np.where(np.isfinite(self.low) & np.isfinite(self.high), self.low, far)
-        found[:, self.used] = some
-        return found
+        result = np.where(np.isfinite(self.low) & np.isfinite(self.high), self.low, far)
+        result[:, self.used] = some
+        return result
 
 
 def _box(region: SavedRegion) -> _Box:
@@ -58,11 +58,11 @@ def points(saved: SavedGain, region: SavedRegion) -> Points:
     # Quarters of the ranges hold corners and middles, where symmetric functions are extreme.
     for fractions in (_lattice(box, random), random.uniform(size=(_EACH, len(box.used)))):
         parts.append(ends[0] + fractions * (ends[1] - ends[0]))
-    found, n = box.filled(np.concatenate(parts), random), len(saved.P)
+    result, n = box.filled(np.concatenate(parts), random), len(saved.P)
     # The trim, where many a slope is extreme.
-    found[-1] = 0.0
+    result[-1] = 0.0
     few = 2 ** len(box.used)
-    return Points(found[:, :n], found[:, n:], few if few <= _EACH else 0)
+    return Points(result[:, :n], result[:, n:], few if few <= _EACH else 0)
 
 
 def _lattice(box: _Box, random: np.random.Generator) -> Array:
@@ -100,6 +100,6 @@ def pairs(saved: SavedGain, region: SavedRegion, known: Points) -> StatePairs:
     centre[close & (np.arange(count) % 4 == 1)] = 0.0
     width = np.where(np.isfinite(region.upper - region.lower), region.upper - region.lower, 1.0)
     step = 10.0 ** random.uniform(_NEAR, 0.0, (count, 1)) * random.normal(size=(count, n)) * width
-    for found, sign in ((ones, 0.5), (others, -0.5)):
-        found[close] = np.clip(centre + sign * step, box.low[:n], box.high[:n])[close]
+    for result, sign in ((ones, 0.5), (others, -0.5)):
+        result[close] = np.clip(centre + sign * step, box.low[:n], box.high[:n])[close]
     return StatePairs(ones, others, known.inputs)

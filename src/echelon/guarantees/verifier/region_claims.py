@@ -40,8 +40,8 @@ def regional(facts: Facts) -> Iterator[Finding]:
         yield said("promise on a domain", False, text="none is known of a gain with an inner loop")
         return
     inside = (region.lower <= 0.0) & (region.upper >= 0.0)
-    held = (region.input_lower <= 0.0) & (region.input_upper >= 0.0)
-    yield said("the domain holds the trim", bool(inside.all() and held.all()))
+    inputs_inside = (region.input_lower <= 0.0) & (region.input_upper >= 0.0)
+    yield said("the domain holds the trim", bool(inside.all() and inputs_inside.all()))
     yield _radius(facts, region)
     yield from _rate(facts, region)
 
@@ -112,20 +112,20 @@ def _widest(P: Array, region: SavedRegion) -> float:
 
 def _rate(facts: Facts, region: SavedRegion) -> Iterator[Finding]:
     """Check the rate at every corner: by exact minors for a proof, else by eigenvalues."""
-    found, slack, decided = slowest(facts, region, *_split(facts, region.hull))
+    result, slack, decided = slowest(facts, region, *_split(facts, region.hull))
     claim = f"rate at {len(region.hull)} corners, 1/s"
     if region.kind == "proof":
-        yield said(claim, found >= region.rate, region.rate, found, "eigenvalues")
+        yield said(claim, result >= region.rate, region.rate, result, "eigenvalues")
         yield from _proof(facts, region)
         return
     if not decided:
         text = f"rounding of {slack:.2g} leaves it undecided"
-        yield said(claim, False, region.rate, found, text)
+        yield said(claim, False, region.rate, result, text)
     elif region.theorem == "A5":
-        fine = found >= region.rate - slack and region.rate == 0.0
-        yield said(claim, fine, region.rate, found, "the drift must not expand P")
+        fine = result >= region.rate - slack and region.rate == 0.0
+        yield said(claim, fine, region.rate, result, "the drift must not expand P")
     else:
-        yield same(claim, region.rate, found, slack, "eigenvalues")
+        yield same(claim, region.rate, result, slack, "eigenvalues")
     size, lost = np.abs(region.hull).max(axis=0), region.error
     # Samples are what they are; corners are rounded exact ones.
     allowed = ROUNDING * size.max() if region.kind == "vertices" else 0.0

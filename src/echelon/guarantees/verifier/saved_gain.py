@@ -90,11 +90,11 @@ class SavedGain(NamedTuple):
 class _Part:
     """A mapping of the file; each method returns an entry of one type, or refuses the file."""
 
-    def __init__(self, file: PathLike, told: object, name: str = "") -> None:
+    def __init__(self, file: PathLike, section: object, name: str = "") -> None:
         self.file, self.name = file, name
-        if not isinstance(told, dict):
+        if not isinstance(section, dict):
             raise self.fault(name, "must be a mapping")
-        self.told: dict[str, Any] = told
+        self.entries: dict[str, Any] = section
 
     def fault(self, name: str, must: str) -> GainError:
         return GainError(f"`{self.file}` is no gain that can be verified: `{name}` {must}.")
@@ -102,9 +102,9 @@ class _Part:
     def entry(self, key: str) -> tuple[Any, str]:
         """Return an entry and its full name."""
         name = f"{self.name}.{key}" if self.name else key
-        if key not in self.told:
+        if key not in self.entries:
             raise self.fault(name, "is missing")
-        return self.told[key], name
+        return self.entries[key], name
 
     def part(self, key: str) -> "_Part":
         value, name = self.entry(key)
@@ -146,16 +146,16 @@ class _Part:
     def array(self, key: str, *shape: int) -> Array:
         """Return finite numbers of a shape, in which -1 is any length."""
         value, name = self.entry(key)
-        found = _array(value)
-        fits = found is not None and found.ndim == len(shape)
+        result = _array(value)
+        fits = result is not None and result.ndim == len(shape)
         if (
-            found is None
+            result is None
             or not fits
-            or any(wanted not in (-1, got) for got, wanted in zip(found.shape, shape, strict=True))
+            or any(target not in (-1, got) for got, target in zip(result.shape, shape, strict=True))
         ):
-            wanted = " x ".join("any" if size < 0 else str(size) for size in shape)
-            raise self.fault(name, f"must be {wanted} finite numbers (to 1e50)")
-        return found
+            target = " x ".join("any" if size < 0 else str(size) for size in shape)
+            raise self.fault(name, f"must be {target} finite numbers (to 1e50)")
+        return result
 
     def bounds(self, key: str, size: int, absent: float) -> Array:
         """Return numbers, some of which may be None for an infinite bound."""
@@ -196,7 +196,7 @@ def read(file: PathLike) -> SavedGain:
     top = _Part(file, _json(file), "the file")
     # The whole needs a name where it is no mapping; the names of its entries need no prefix.
     top.name = ""
-    if top.told.get("format") != _FORMAT:
+    if top.entries.get("format") != _FORMAT:
         raise GainError(
             f"`{file}` is no gain file that can be verified; its `format` must be `{_FORMAT}`."
         )
@@ -235,97 +235,103 @@ def _json(file: PathLike) -> object:
 
 def _mapping(file: PathLike, pairs: list[tuple[str, object]]) -> dict[str, object]:
     """Return a mapping; of two equal keys one reader would take the first, another the last."""
-    told = dict(pairs)
-    if len(told) < len(pairs):
+    mapping = dict(pairs)
+    if len(mapping) < len(pairs):
         twice = next(key for k, (key, _) in enumerate(pairs) if key in dict(pairs[:k]))
         raise GainError(f"`{file}` is no gain that can be verified: `{twice}` stands there twice.")
-    return told
+    return mapping
 
 
-def _model(told: _Part) -> SavedModel:
-    states, inputs = told.names("state_names"), told.names("input_names")
+def _model(section: _Part) -> SavedModel:
+    states, inputs = section.names("state_names"), section.names("input_names")
     n, m = len(states), len(inputs)
-    trim, name = told.entry("trim")
+    trim, name = section.entry("trim")
     if not isinstance(trim, list) or len(trim) != 2:
-        raise told.fault(name, "must be a state and an input")
-    point = _Part(told.file, {"0": trim[0], "1": trim[1]}, name)
-    parameters = told.part("parameters").told if told.optional("parameters") else None
+        raise section.fault(name, "must be a state and an input")
+    point = _Part(section.file, {"0": trim[0], "1": trim[1]}, name)
+    parameters = section.part("parameters").entries if section.optional("parameters") else None
     return SavedModel(
-        path=told.text("class"),
+        path=section.text("class"),
         parameters=parameters,
         state_names=states,
         input_names=inputs,
         state=point.array("0", n),
         input=point.array("1", m),
-        scale=told.array("input_scale", m, m),
-        A=told.array("A", n, n),
-        B=told.array("B", n, m),
+        scale=section.array("input_scale", m, m),
+        A=section.array("A", n, n),
+        B=section.array("B", n, m),
     )
 
 
-def _graph(told: _Part) -> SavedGraph:
-    agents = told.whole("agents", 2)
-    leaders = told.array("leaders", -1)
-    edges = told.array("edges", -1, 3) if told.optional("edges") else None
+def _graph(section: _Part) -> SavedGraph:
+    agents = section.whole("agents", 2)
+    leaders = section.array("leaders", -1)
+    edges = section.array("edges", -1, 3) if section.optional("edges") else None
     if edges is not None and len(edges) > _MOST_EDGES:
-        raise told.fault("graph.edges", f"must be null for more than {_MOST_EDGES} edges")
+        raise section.fault("graph.edges", f"must be null for more than {_MOST_EDGES} edges")
     if edges is None and agents * (agents - 1) // 2 <= _MOST_EDGES:
-        raise told.fault("graph.edges", f"must be given: {agents} agents cannot have so many")
+        raise section.fault("graph.edges", f"must be given: {agents} agents cannot have so many")
     numbers = leaders if edges is None else np.append(leaders, edges[:, :2])
     if not len(leaders) or not all(x == int(x) and 0 <= x < agents for x in numbers):
-        raise told.fault("graph", f"must name agents from 0 to {agents - 1}, one leader at least")
-    spectrum = _spectrum(told)
+        raise section.fault(
+            "graph", f"must name agents from 0 to {agents - 1}, one leader at least"
+        )
+    spectrum = _spectrum(section)
     if not len(spectrum):
-        raise told.fault("graph.spectrum", "must hold a number")
+        raise section.fault("graph.spectrum", "must hold a number")
     led = tuple(sorted({int(x) for x in leaders}))
-    directed, switches = (told.told.get(key) is True for key in ("directed", "switches"))
-    sums = told.array("sums", agents - len(led)) if told.told.get("sums") is not None else None
+    directed, switches = (section.entries.get(key) is True for key in ("directed", "switches"))
+    sums = (
+        section.array("sums", agents - len(led))
+        if section.entries.get("sums") is not None
+        else None
+    )
     if sums is not None and not (sums > 0.0).all():
-        raise told.fault("graph.sums", "must be positive")
+        raise section.fault("graph.sums", "must be positive")
     return SavedGraph(agents, led, edges, spectrum, directed, switches, sums)
 
 
-def _spectrum(told: _Part) -> Array:
+def _spectrum(section: _Part) -> Array:
     """Return eigenvalues, of which complex ones stand as pairs."""
-    stored = told.entry("spectrum")[0]
+    stored = section.entry("spectrum")[0]
     if not (isinstance(stored, list) and stored and isinstance(stored[0], list)):
-        return told.array("spectrum", -1)
-    pairs = told.array("spectrum", -1, 2)
+        return section.array("spectrum", -1)
+    pairs = section.array("spectrum", -1, 2)
     return pairs[:, 0] + 1j * pairs[:, 1]
 
 
-def _region(told: _Part, n: int, m: int) -> SavedRegion:
-    domain, theorem = told.part("domain"), told.text("theorem", _THEOREMS)
+def _region(section: _Part, n: int, m: int) -> SavedRegion:
+    domain, theorem = section.part("domain"), section.text("theorem", _THEOREMS)
     # Each A with its g S R^-1 (g S)' to the right.
     wide = 2 * n if theorem == "T2" else n
     return SavedRegion(
         # A linearization says nothing of a domain.
-        kind=told.text("kind", _KINDS[:3]),
+        kind=section.text("kind", _KINDS[:3]),
         theorem=theorem,
-        rate=told.number("rate"),
-        radius=told.maybe("radius"),
-        strength=told.number("strength"),
+        rate=section.number("rate"),
+        radius=section.maybe("radius"),
+        strength=section.number("strength"),
         lower=domain.bounds("lower", n, -math.inf),
         upper=domain.bounds("upper", n, math.inf),
         input_lower=domain.array("input_lower", m),
         input_upper=domain.array("input_upper", m),
-        hull=_unpacked(told.part("hull"), n, wide),
-        error=told.array("error", n, wide),
+        hull=_unpacked(section.part("hull"), n, wide),
+        error=section.array("error", n, wide),
     )
 
 
-def _unpacked(told: _Part, n: int, wide: int) -> Array:
+def _unpacked(section: _Part, n: int, wide: int) -> Array:
     """Return the matrices of which the file holds one whole, and the changes of the others."""
-    base = told.array("base", n, wide)
+    base = section.array("base", n, wide)
     # One matrix only; an empty list has no second axis to check.
-    if told.entry("places")[0] == []:
+    if section.entry("places")[0] == []:
         return base[None]
-    places = told.array("places", -1, 2)
-    values = told.array("values", -1, len(places))
+    places = section.array("places", -1, 2)
+    values = section.array("values", -1, len(places))
     # Places are read as floats, and must be what indices can be.
     inside = (places == np.floor(places)) & (places >= 0) & (places < [n, wide])
     if not inside.all() or not len(values):
-        raise told.fault(f"{told.name}.places", f"must be entries of a {n} x {wide} matrix")
+        raise section.fault(f"{section.name}.places", f"must be entries of a {n} x {wide} matrix")
     matrices = np.repeat(base[None], len(values), axis=0)
     rows, columns = places.astype(int).T
     matrices[:, rows, columns] = values

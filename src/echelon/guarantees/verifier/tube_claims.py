@@ -28,11 +28,11 @@ _CELLS = 6000
 def read_tube(path: PathLike) -> Mapping[str, Any] | None:
     """Return the tube that a file tells of: a run's summary or a check's JSON; else None."""
     try:
-        told = json.loads(Path(path).read_text("utf-8"))
+        document = json.loads(Path(path).read_text("utf-8"))
     except (OSError, ValueError):
         # Who reads gains says it better.
         return None
-    promise = told.get("promise", told) if isinstance(told, dict) else {}
+    promise = document.get("promise", document) if isinstance(document, dict) else {}
     tube = promise.get("anywhere") if isinstance(promise, dict) else None
     return tube if isinstance(tube, dict) and tube.get("format") == FORMAT else None
 
@@ -43,8 +43,8 @@ def tube_findings(tube: Mapping[str, Any]) -> Iterator[Finding]:
         roots = _exact(border["roots"])
         name = ", ".join(f"`{output}`" for output in border["outputs"])
         for order, stored in enumerate(border["gains"]):
-            found = _gain(roots, order)
-            yield same(f"gain {order} of {name}", stored, found, 1e-8, "quadrature between roots")
+            result = _gain(roots, order)
+            yield same(f"gain {order} of {name}", stored, result, 1e-8, "quadrature between roots")
         yield from _room(border, roots, name)
     if tube.get("motors") is not None:
         yield from motor_findings(tube["motors"])
@@ -93,14 +93,14 @@ def _residues(roots: Sequence[Fraction]) -> Array:
 
 def _fall(roots: Sequence[Fraction], order: int, start: Array, speed: float) -> float:
     """Return how far v^(order) falls at most from a start under |w| <= speed, on a fine grid."""
-    free, moved = _followed(roots, order, start[None])
-    return float((speed * moved - free[0]).max())
+    free, driven = _followed(roots, order, start[None])
+    return float((speed * driven - free[0]).max())
 
 
 def _length(roots: Sequence[Fraction], order: int, starts: Array, speed: float) -> float:
     """Return how long v^(order) of some outputs gets, from a start (m, p) each."""
-    free, moved = _followed(roots, order, starts)
-    return float((speed * moved + np.linalg.norm(free, axis=0)).max())
+    free, driven = _followed(roots, order, starts)
+    return float((speed * driven + np.linalg.norm(free, axis=0)).max())
 
 
 def _followed(roots: Sequence[Fraction], order: int, starts: Array) -> tuple[Array, Array]:
@@ -137,15 +137,15 @@ def _gain(roots: Sequence[Fraction], order: int) -> float:
 
 def _modes(roots: Sequence[Fraction], order: int) -> list[Fraction]:
     """Return the coefficients of h^(order), exactly."""
-    k0, found = Fraction(1), list[Fraction]()
+    k0, result = Fraction(1), list[Fraction]()
     for root in roots:
         k0 *= root
     for root in roots:
         apart = Fraction(1)
         for other in roots:
             apart *= other - root if other != root else 1
-        found.append(k0 / apart * (-root) ** order)
-    return found
+        result.append(k0 / apart * (-root) ** order)
+    return result
 
 
 def _unit(roots: Sequence[Fraction]) -> Fraction:
@@ -167,18 +167,18 @@ def _sign_changes(p: Mapping[int, Fraction]) -> list[Fraction]:
     low = min(p)
     dense = [p.get(n, Fraction(0)) for n in range(low, max(p) + 1)]
     chain = _sturm(dense)
-    found, pieces = list[Fraction](), [(Fraction(0), Fraction(1))]
+    result, pieces = list[Fraction](), [(Fraction(0), Fraction(1))]
     while pieces:
         a, b = pieces.pop()
         count = _variations(chain, a) - _variations(chain, b)
         if not count:
             continue
         if b - a <= _FINE:
-            found.append((a + b) / 2)
+            result.append((a + b) / 2)
             continue
         middle = (a + b) / 2
         pieces += [(a, middle), (middle, b)]
-    return sorted(found)
+    return sorted(result)
 
 
 def _sturm(p: list[Fraction]) -> list[list[Fraction]]:

@@ -61,8 +61,8 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verification:
     if tube is not None:
         return _verdict(_gathered(tube_findings(tube)))
     saved = read(path)
-    found = _verdict(_gathered(_findings(saved, model)))
-    return found._replace(sentence=found.sentence + _without_decay(saved))
+    result = _verdict(_gathered(_findings(saved, model)))
+    return result._replace(sentence=result.sentence + _without_decay(saved))
 
 
 def _gathered(found: Iterator[Finding]) -> tuple[Finding, ...]:
@@ -83,20 +83,20 @@ def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[Finding
     first = [*_definite(saved), *drawn(saved)]
     yield from first
     # What follows rests on these.
-    if any(each.verdict == "refused" for each in first):
+    if any(item.verdict == "refused" for item in first):
         return
-    known = facts(saved)
-    first = [*spanned(known)]
+    recomputed = facts(saved)
+    first = [*spanned(recomputed)]
     yield from first
-    if all(each.verdict != "refused" for each in first):
-        yield from linearized(known)
-        yield from regional(known)
-        yield from equations(known, model)
+    if all(item.verdict != "refused" for item in first):
+        yield from linearized(recomputed)
+        yield from regional(recomputed)
+        yield from equations(recomputed, model)
 
 
 def _verdict(findings: tuple[Finding, ...]) -> Verification:
-    refused = [each.claim for each in findings if each.verdict == "refused"]
-    open_ = [each.claim for each in findings if each.verdict == "not checked"]
+    refused = [item.claim for item in findings if item.verdict == "refused"]
+    open_ = [item.claim for item in findings if item.verdict == "not checked"]
     count = f"{len(findings) - len(open_)} claims hold as stored"
     if refused:
         does = "does" if len(refused) == 1 else "do"

@@ -16,6 +16,7 @@ import numpy as np
 from echelon.core.errors import OutputError
 from echelon.core.files import write_atomic
 from echelon.core.provenance import versions
+from echelon.core.types import JsonObject
 from echelon.experiments.scenario.scenario import KEPT, Scenario
 from echelon.experiments.scenario.self_contained import self_contained
 from echelon.output.archive.folder import CHUNKS, INPUTS, write_errors
@@ -129,7 +130,7 @@ class Chunks:
         np.savez(content, allow_pickle=False, **arrays)
         write_atomic(self.place / f"{first}.npz", content.getvalue())
 
-    def stored(self, first: int) -> dict[str, Any] | None:
+    def stored(self, first: int) -> JsonObject | None:
         """Return the arrays under a number; None where they are missing or damaged."""
         try:
             # A pickle could run any code, and a folder may come from others.
@@ -170,7 +171,7 @@ class Chunks:
             self.folder.rmdir()
 
 
-def _arrays(stretch: Stretch) -> dict[str, Any]:
+def _arrays(stretch: Stretch) -> JsonObject:
     """Return a stretch as named arrays."""
     plain = {name: getattr(stretch, name) for name in _PLAIN}
     sums = {f"sums_{name}": value for name, value in stretch.sums._asdict().items()}
@@ -182,7 +183,7 @@ def _arrays(stretch: Stretch) -> dict[str, Any]:
 _PLAIN = ("done", "times", "states", "inputs", "seconds")
 
 
-def _stretch(first: int, stored: dict[str, Any]) -> Stretch:
+def _stretch(first: int, stored: JsonObject) -> Stretch:
     """Return the stretch of named arrays."""
     count = sum(name.startswith("moment_") for name in stored)
     stopped = stored.get("stopped")

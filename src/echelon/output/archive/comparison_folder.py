@@ -2,9 +2,10 @@
 
 import json
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 from echelon.core.files import write_atomic
+from echelon.core.types import JsonObject
 from echelon.experiments.results.dataset import save_dataset
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.output.archive.folder import RUNS, write_errors
@@ -47,7 +48,7 @@ class Flights:
 
 
 def write_comparison(
-    comparison: Comparison, summary: dict[str, Any], text: str, folder: Path, figures: bool = True
+    comparison: Comparison, summary: JsonObject, text: str, folder: Path, figures: bool = True
 ) -> None:
     """Write the numbers of a comparison, its text and the figures.
 

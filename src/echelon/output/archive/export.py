@@ -3,12 +3,13 @@
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from echelon.core.errors import MissingExtraError, OutputError, did_you_mean, listing
 from echelon.core.files import write_atomic
+from echelon.core.types import JsonObject
 from echelon.experiments.results.recording import Recording
 from echelon.output.archive.folder import write_errors
 
@@ -38,7 +39,7 @@ def table(run: Recording) -> "pd.DataFrame":
 
     frames, agents = run.states.shape[:2]
     leads = np.isin(np.arange(agents), run.leaders)
-    columns: dict[str, Any] = {
+    columns: JsonObject = {
         "time": np.repeat(run.times, agents),
         "agent": np.tile(np.arange(agents), frames),
         "leader": np.tile(leads, frames),
@@ -68,9 +69,9 @@ def _parquet(run: Recording) -> bytes:
     return content.getvalue()
 
 
-def _arrays(run: Recording) -> dict[str, Any]:
+def _arrays(run: Recording) -> JsonObject:
     """Return the arrays of a run by name."""
-    arrays: dict[str, Any] = {
+    arrays: JsonObject = {
         "time": run.times,
         "states": run.states,
         "inputs": run.inputs,

@@ -1,4 +1,4 @@
-"""A run as a notebook shows it: who is how far from its goal, and pictures of where all went."""
+"""The HTML of a result in a notebook: outcome, a table of agents, and pictures."""
 
 import base64
 import dataclasses
@@ -19,54 +19,53 @@ _PICTURES = ("trajectories", "formation")
 
 
 def result_page(result: Result) -> str:
-    """Return how a run ended and why, its agents as a table, and its pictures, as HTML.
+    """Return the outcome of a run, its causes, a table of its agents, and pictures, as HTML.
 
-    Of many agents the table has the best, the median and the worst, as the report has.
+    Of many agents the table has the best, the median and the worst, like the report.
     """
     title = result.provenance.get("scenario") or type(result.model).__name__
-    told = f"<b>{html.escape(title)}</b>: {html.escape(result.message)}"
-    return f"<p>{told}</p>{_causes(result)}{_table(result)}{_pictures(result)}"
+    head = f"<b>{html.escape(title)}</b>: {html.escape(result.message)}"
+    return f"<p>{head}</p>{_causes(result)}{_table(result)}{_pictures(result)}"
 
 
 def _causes(result: Result) -> str:
-    """Return why a run was lost, or ends farther from its goals than it began."""
-    # A promise takes seconds to be found, and a run that did well has nothing to explain.
+    """Return the causes of growing errors as a list."""
+    # A promise takes seconds to compute, so other runs do without.
     if not len(result.times) or not grows(result):
         return ""
-    found = causes(result, metrics(result), promise(result.parts, result.settings))
-    told = "".join(f"<li>{html.escape(each.sentence())}</li>" for each in found)
-    return f"<ul>{told}</ul>" if told else ""
+    guarantee = promise(result.parts, result.settings)
+    sentences = (cause.sentence() for cause in causes(result, metrics(result), guarantee))
+    items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences)
+    return f"<ul>{items}</ul>" if items else ""
 
 
 def _table(result: Result) -> str:
     unit = " (m)" if result.unit == "m" else ""
-    heads = ("agent", f"error at the start{unit}", f"at the end{unit}", "limited (% of steps)")
-    rows = "".join(_row(cells) for cells in _cells(result))
-    head = "".join(f"<th>{each}</th>" for each in heads)
+    heads = ("agent", f"error at the start{unit}", f"at the end{unit}", "saturated (% of steps)")
+    rows = "".join(
+        f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in cells)}</tr>"
+        for cells in _cells(result)
+    )
+    head = "".join(f"<th>{title}</th>" for title in heads)
     return f"<table><tr>{head}</tr>{rows}</table>"
 
 
 def _cells(result: Result) -> Iterator[tuple[str, ...]]:
-    """Yield the leaders and the followers as the report names them."""
+    """Yield the rows of leaders and followers, with the labels of the report."""
     numbers, errors = metrics(result), formation_errors(result)
-    for label, each in labelled("leader", numbers.leaders):
-        yield label, "", "", f"{100.0 * each.saturated:.3g}"
-    for label, each in labelled("follower", numbers.followers):
-        ends = errors[[0, -1], each.agent] if len(errors) else ()
-        shown = [f"{size:.3g}" for size in ends] or ["", ""]
-        yield label, *shown, f"{100.0 * each.saturated:.3g}"
-
-
-def _row(cells: tuple[str, ...]) -> str:
-    return f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in cells)}</tr>"
+    for label, row in labelled("leader", numbers.leaders):
+        yield label, "", "", f"{100.0 * row.saturated:.3g}"
+    for label, row in labelled("follower", numbers.followers):
+        ends = errors[[0, -1], row.agent] if len(errors) else ()
+        cells = [f"{size:.3g}" for size in ends] or ["", ""]
+        yield label, *cells, f"{100.0 * row.saturated:.3g}"
 
 
 def _recorded(result: Result) -> Recording:
-    """Return a run as it is drawn, but for its promise, which takes seconds to be found."""
-    silent = {"promised": False, "rate": None, "theorem": None, "kind": "", "hypotheses": []}
-    states, told = result.states, {**silent, "sentence": ""}
+    """Return the recording of a run without its promise, which takes seconds to compute."""
+    states = result.states
     return dataclasses.replace(
-        foreseen(result.parts, result.settings, states[0], "", told),
+        foreseen(result.parts, result.settings, states[0], ""),
         times=result.times,
         states=states,
         inputs=result.inputs,
@@ -76,10 +75,10 @@ def _recorded(result: Result) -> Recording:
 
 
 def _pictures(result: Result) -> str:
-    found = list[str]()
+    images = list[str]()
     for name, figure in figures(_recorded(result), _PICTURES).items() if len(result.times) else ():
         content = io.BytesIO()
         figure.savefig(content, format="png", dpi=80)
         data = base64.b64encode(content.getvalue()).decode("ascii")
-        found.append(f'<img alt="{name}" src="data:image/png;base64,{data}">')
-    return "".join(found)
+        images.append(f'<img alt="{name}" src="data:image/png;base64,{data}">')
+    return "".join(images)

@@ -2,10 +2,9 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 from echelon.core.errors import OutputError
-from echelon.core.types import PathLike
+from echelon.core.types import JsonObject, PathLike
 from echelon.experiments.results.recording import Recording, read_recording
 from echelon.guarantees.verifier.tube_claims import read_tube
 from echelon.output.archive.chunks import Chunks
@@ -63,7 +62,7 @@ def promise_file(place: PathLike) -> Path:
     return path / SUMMARY
 
 
-def _summary(file: Path) -> dict[str, Any]:
+def _summary(file: Path) -> JsonObject:
     """Return the summary in a file.
 
     Raises:

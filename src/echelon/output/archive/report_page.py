@@ -1,15 +1,14 @@
-"""A run as one HTML page for people: table and sentences, promise, figures, scenario, versions."""
+"""The HTML report of a run: guarantee, text report, figures, scenario, versions, citation."""
 
 import base64
 import io
 from html import escape
 from pathlib import Path
-from typing import Any
 
 from echelon import __version__
 from echelon.experiments.results.recording import Recording
 from echelon.experiments.scenario.scenario import KEPT
-from echelon.output.plots.run_figures import USUAL, figures
+from echelon.output.plots.run_figures import DEFAULT, figures
 
 _STYLE = """
 body { max-width: 62rem; margin: 2rem auto; padding: 0 1.2rem; color: #1c2128; background: #fff;
@@ -23,38 +22,39 @@ pre { background: #f7f8fa; padding: .9rem 1rem; overflow-x: auto; font-size: 12p
 figure { margin: 0 0 1.4rem; } img { max-width: 100%; height: auto; }
 figcaption { color: #5c6773; font-size: 13px; }
 table { border-collapse: collapse; } td { padding: .15rem 1.2rem .15rem 0; vertical-align: top; }
-.holds-not { color: #c8322b; }
+td.fails { color: #c8322b; }
 @media print { h2 { break-after: avoid; } figure { break-inside: avoid; } }
 """
 _CAPTIONS = {
-    "leader_3d": "The leaders and what they follow.",
-    "trajectories": "All agents, with the graph at a few times.",
-    "tracking": "What the leaders' outputs are off their references.",
-    "formation": "How far followers are from their goals, with what is promised.",
-    "inputs": "What actuators give, with their limits.",
-    "lyapunov": "V and its derivative.",
+    "leader_3d": "Paths of the leaders and their references.",
+    "trajectories": "Paths of all agents, with the graph at a few times.",
+    "tracking": "Tracking errors of the leaders.",
+    "formation": "Distances of the followers from their goals, with the guaranteed rate.",
+    "inputs": "Actuator loads and their limits.",
+    "lyapunov": "Lyapunov function V and its derivative.",
 }
 
 
 def report_page(run: Recording, folder: Path | None) -> str:
-    """Return the page; texts that lie in the run's folder go into it.
+    """Return the page, with the report and the scenario from the run's folder.
 
     Args:
-        run: what it shows.
-        folder: of the run; None where there is none, as for a dataset alone.
+        run: to report.
+        folder: of the run; None of a dataset without one.
     """
-    told = run.attributes
-    scenario = _text(folder, KEPT) or str(told.get("scenario_text", ""))
+    scenario = _text(folder, KEPT) or str(run.attributes.get("scenario_text", ""))
+    text = _text(folder, "report.txt") or str(run.attributes["message"])
+    facts = f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s; "
     parts = [
         f"<h1>{escape(run.name)}</h1>",
-        f'<p class="facts">{escape(_facts(run))}</p>',
+        f'<p class="facts">{escape(facts + run.attributes["message"])}</p>',
         _promise(run),
-        _section("What the run shows", _pre(_text(folder, "report.txt") or str(told["message"]))),
+        _section("Results", _pre(text)),
         _section("Figures", "".join(_figures(run))),
-        _section("What the promise rests on", _hypotheses(run)),
+        _section("Conditions of the guarantee", _hypotheses(run)),
         _section("Scenario", _pre(scenario)) if scenario else "",
-        _section("Made with", _versions(told)),
-        _section("How to cite", _pre(citation())),
+        _section("Versions", _versions(run)),
+        _section("Citation", _pre(citation())),
     ]
     head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{escape(run.name)}</title>'
     view = '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -62,7 +62,7 @@ def report_page(run: Recording, folder: Path | None) -> str:
 
 
 def citation() -> str:
-    """Return how to cite echelon and the paper that it builds on, as BibTeX."""
+    """Return the BibTeX entries of echelon and of the paper that it builds on."""
     return (
         "@software{echelon,\n"
         "  title = {echelon: leader-follower formation tracking for control-affine nonlinear "
@@ -74,13 +74,6 @@ def citation() -> str:
         "  author = {Enwerem, Clinton and Baras, John S.},\n"
         "  booktitle = {9th International Conference on Control, Decision and Information "
         "Technologies (CoDIT)},\n  year = {2023},\n  note = {arXiv:2309.09156}\n}"
-    )
-
-
-def _facts(run: Recording) -> str:
-    return (
-        f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s; "
-        f"{run.attributes['message']}"
     )
 
 
@@ -103,34 +96,31 @@ def _text(folder: Path | None, name: str) -> str:
 
 
 def _figures(run: Recording) -> list[str]:
-    found = []
-    for name, figure in figures(run, USUAL).items():
+    parts = []
+    for name, figure in figures(run, DEFAULT).items():
         content = io.BytesIO()
         figure.savefig(content, format="png", dpi=140)
         data = base64.b64encode(content.getvalue()).decode("ascii")
-        words = _CAPTIONS[name]
-        image = f'<img alt="{words}" src="data:image/png;base64,{data}">'
-        found.append(f"<figure>{image}<figcaption>{words}</figcaption></figure>")
-    return found
+        caption = _CAPTIONS[name]
+        image = f'<img alt="{caption}" src="data:image/png;base64,{data}">'
+        parts.append(f"<figure>{image}<figcaption>{caption}</figcaption></figure>")
+    return parts
 
 
 def _hypotheses(run: Recording) -> str:
     rows = [
-        f"<tr><td>{escape(each['statement'])}</td>"
-        f"<td{_marked(each)}>{escape(each['verdict'])}</td><td>{escape(each['text'])}</td></tr>"
-        for each in run.promise["hypotheses"]
+        f"<tr><td>{escape(row['statement'])}</td>"
+        f'<td class="{row["verdict"].replace(" ", "-")}">{escape(row["verdict"])}</td>'
+        f"<td>{escape(row['text'])}</td></tr>"
+        for row in run.promise["hypotheses"]
     ]
     return f"<table>{''.join(rows)}</table>"
 
 
-def _marked(each: dict[str, Any]) -> str:
-    return ' class="holds-not"' if each["verdict"] == "fails" else ""
-
-
-def _versions(told: Any) -> str:
+def _versions(run: Recording) -> str:
     rows = [
         f"<tr><td>{escape(key[8:])}</td><td>{escape(str(text))}</td></tr>"
-        for key, text in told.items()
+        for key, text in run.attributes.items()
         if str(key).startswith("version_")
     ]
     return f"<table>{''.join(rows)}</table>"

@@ -1,7 +1,7 @@
-"""What moves in a video: links, goals, trails and bodies, drawn again for each picture."""
+"""The moving parts of a video: links, goals, trails and bodies."""
 
 import abc
-from typing import Any, ClassVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import numpy as np
 
@@ -11,34 +11,37 @@ from echelon.output.plots.agent_style import pen_of
 from echelon.output.plots.camera import Camera
 from echelon.output.plots.space import Space, body_width
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _FEW = 60
-"""Agents that are drawn as vehicles; more are dots, each kind of them one stroke of the pen."""
+"""Agents that are drawn as vehicles; more are drawn as dots, all of a kind by one artist."""
 _LINK, _GOAL, _SHADOW = "#4f5b68", "#d99000", "#d3d9e0"
 
 
-def moving_of(ax: Any, run: Recording, space: Space, camera: Camera) -> "MovingScene":
-    """Return what draws the agents of a run on axes of pixels."""
+def moving_of(ax: "Axes", run: Recording, space: Space, camera: Camera) -> "MovingScene":
+    """Return the moving scene of a run, on axes of pixels."""
     return (_Vehicles if run.agents <= _FEW else _Dots)(ax, run, space, camera)
 
 
 class MovingScene(abc.ABC):
-    """Draws a moment.
+    """Draws the agents at a time.
 
     Attributes:
-        trail: seconds of a trail.
-        points: of it, at most.
-        artists: what is drawn, the first lowest.
+        trail: duration of a trail, s.
+        points: maximum number of points of a trail.
+        artists: of matplotlib, from back to front.
     """
 
     trail: ClassVar[float]
     points: ClassVar[int]
 
-    def __init__(self, ax: Any, run: Recording, space: Space, camera: Camera) -> None:
-        """Make the artists."""
+    def __init__(self, ax: "Axes", run: Recording, space: Space, camera: Camera) -> None:
+        """Create the artists."""
         from matplotlib.colors import to_rgba_array
 
         self.run, self.space, self.camera, self.ax = run, space, camera, ax
-        # As an array, which no picture need read anew.
+        # As an array, which matplotlib need not parse for each picture.
         self.colours: Any = to_rgba_array(
             [pen_of(run, agent)["color"] for agent in range(run.agents)]
         )
@@ -53,27 +56,27 @@ class MovingScene(abc.ABC):
 
     @abc.abstractmethod
     def prepare(self) -> None:
-        """Make artists of its own, between them the links."""
+        """Create the artists of this kind of scene, with the links among them."""
 
     @abc.abstractmethod
-    def draw(self, now: Array, passed: Array, goals: Array, angles: Array | None) -> None:
-        """Put agents (N, 3), their trails (K, N, 3) and goals (N, 3) where they are."""
+    def draw(self, now: Array, trail: Array, goals: Array, angles: Array | None) -> None:
+        """Move agents (N, 3), their trails (K, N, 3) and goals (N, 3)."""
 
-    def show(self, time: float, now: Array, passed: Array, angles: Array | None) -> None:
-        """Put everything where it is at a time."""
+    def show(self, time: float, now: Array, trail: Array, angles: Array | None) -> None:
+        """Move all artists to a time."""
         self.clock.set_text(f"{time:.2f} s")
-        there = self.run.linked(time)
-        _put(self.links, self.camera.project(now[self.run.edges[there]])[0])
+        links = self.run.linked(time)
+        _set_lines(self.links, self.camera.project(now[self.run.edges[links]])[0])
         if self.heads is not None:
-            self.heads.set_verts(self._heads(now, there))
+            self.heads.set_verts(self._heads(now, links))
         goals = now[self.run.nearest] + self.offsets - self.offsets[self.run.nearest]
         if self.space.kind == "time":
             goals[:, 0] = now[:, 0]
-        self.draw(now, passed, goals, angles)
+        self.draw(now, trail, goals, angles)
 
-    def _heads(self, now: Array, there: Array) -> list[Array]:
-        """Return the heads of arrows to those who alone hear along a link, off their bodies."""
-        arrows = self.run.arrows[there[self.run.heard.sum(axis=1) == 1]]
+    def _heads(self, now: Array, links: Array) -> list[Array]:
+        """Return the arrow heads of one-way links, at the edge of the receivers' bodies."""
+        arrows = self.run.arrows[links[self.run.heard.sum(axis=1) == 1]]
         first, second = (self.camera.project(now[ends])[0] for ends in arrows.T)
         beside = now[arrows[:, 1]] + 0.6 * self.size * self.camera.axes[0]
         body = np.linalg.norm(self.camera.project(beside)[0] - second, axis=1)
@@ -88,7 +91,7 @@ class MovingScene(abc.ABC):
 
 @final
 class _Vehicles(MovingScene):
-    """Agents few enough to be seen one by one."""
+    """Few agents, drawn as vehicles."""
 
     trail, points = 4.0, 60
 
@@ -108,13 +111,13 @@ class _Vehicles(MovingScene):
         ground = [self.shadows, self.falls] if self.space.kind == "space" else []
         self.artists = [*ground, self.trails, self.links, self.goals, self.arms, self.rotors]
 
-    def draw(self, now: Array, passed: Array, goals: Array, angles: Array | None) -> None:
+    def draw(self, now: Array, trail: Array, goals: Array, angles: Array | None) -> None:
         project = self.camera.project
-        self.trails.set_segments(list(project(passed.swapaxes(0, 1))[0]))
+        self.trails.set_segments(list(project(trail.swapaxes(0, 1))[0]))
         rings = goals[list(self.run.followers)][:, None] + 0.55 * self.size * self.ring
         self.goals.set_verts(list(project(rings)[0]))
         self._shade(now)
-        # Far ones first, so that near ones cover them.
+        # Far vehicles first, so that near ones cover them.
         order = np.argsort(-project(now)[1], kind="stable")
         if self.space.shape != "quadrotor" or angles is None:
             discs = project(now[:, None] + 0.3 * self.size * self._facing())[0]
@@ -124,7 +127,7 @@ class _Vehicles(MovingScene):
         self._quadrotors(now, angles, order)
 
     def _shade(self, now: Array) -> None:
-        """Put shadows under the agents: without them no height is told from a distance."""
+        """Draw shadows under the agents, which make heights visible."""
         project = self.camera.project
         below = now * (1.0, 1.0, 0.0) + (0.0, 0.0, self.space.low[2])
         self.shadows.set_verts(list(project(below[:, None] + 0.35 * self.size * self.ring)[0]))
@@ -151,13 +154,14 @@ class _Vehicles(MovingScene):
 
 @final
 class _Dots(MovingScene):
-    """So many agents that each is a dot, as large as it is near; leaders lie on top."""
+    """Many agents, drawn as dots whose size depends on the distance; leaders are on top."""
 
     trail, points = 1.0, 8
 
     def prepare(self) -> None:
-        self.led, self.leaders = list(self.run.followers), list(self.run.leaders)
-        self.groups = [(who, self.colours[who[0]]) for who in (self.led, self.leaders) if who]
+        self.followers, self.leaders = list(self.run.followers), list(self.run.leaders)
+        groups = (self.followers, self.leaders)
+        self.groups = [(agents, self.colours[agents[0]]) for agents in groups if agents]
         pens = [{"color": colour, "linewidth": 0.6, "alpha": 0.6} for _, colour in self.groups]
         self.trails = [_stroke(self.ax, **pen) for pen in pens]
         none: dict[str, Any] = {"s": 1.0, "linewidths": 0.5}
@@ -165,43 +169,43 @@ class _Dots(MovingScene):
         self.dots = [self.ax.scatter([], [], color=colour, **none) for _, colour in self.groups]
         self.artists = [*self.trails, self.links, self.goals, *self.dots]
 
-    def draw(self, now: Array, passed: Array, goals: Array, angles: Array | None) -> None:
+    def draw(self, now: Array, trail: Array, goals: Array, angles: Array | None) -> None:
         project = self.camera.project
-        self._spread(self.goals, goals[self.led], 0.45)
-        for (who, _), trail, dots in zip(self.groups, self.trails, self.dots, strict=True):
-            _put(trail, project(passed[:, who].swapaxes(0, 1))[0])
-            self._spread(dots, now[who], 0.25)
+        self._move_dots(self.goals, goals[self.followers], 0.45)
+        for (agents, _), lines, dots in zip(self.groups, self.trails, self.dots, strict=True):
+            _set_lines(lines, project(trail[:, agents].swapaxes(0, 1))[0])
+            self._move_dots(dots, now[agents], 0.25)
 
-    def _spread(self, dots: Any, places: Array, part: float) -> None:
-        """Put dots at places (K, 3), of a radius that is this part of a body."""
+    def _move_dots(self, dots: Any, places: Array, part: float) -> None:
+        """Move dots to places (K, 3), with a radius that is a part of a body's width."""
         middle = self.camera.project(places)[0]
         beside = self.camera.project(places + part * self.size * self.camera.axes[0])[0]
         points = 72.0 / self.ax.figure.dpi
         dots.set_offsets(middle)
-        # Of a marker the area of the square about it is told, in points.
+        # The size of a marker is the area of the square around it, in points.
         dots.set_sizes((2.0 * points * (beside - middle)[:, 0]) ** 2)
 
 
-def _heads_on(ax: Any) -> Any:
-    """Return what draws heads of arrows."""
+def _heads_on(ax: "Axes") -> Any:
+    """Return the artist of arrow heads."""
     from matplotlib.collections import PolyCollection
 
     return ax.add_collection(PolyCollection([], facecolors=_LINK, edgecolors="none", zorder=1.1))
 
 
-def _stroke(ax: Any, **pen: Any) -> Any:
-    """Return many lines of one look, drawn as one with gaps."""
+def _stroke(ax: "Axes", **pen: Any) -> Any:
+    """Return the artist of many lines, drawn as one with gaps."""
     return ax.plot([], [], **{"zorder": 1, **pen})[0]
 
 
-def _put(stroke: Any, lines: Array) -> None:
-    """Put lines (K, P, 2) where they are."""
+def _set_lines(stroke: Any, lines: Array) -> None:
+    """Set the points of lines (K, P, 2)."""
     gaps = np.full((len(lines), 1, 2), np.nan)
     stroke.set_data(*np.concatenate([lines, gaps], axis=1).reshape(-1, 2).T)
 
 
 def scene_offsets(run: Recording, space: Space) -> Array:
-    """Return offsets as they are drawn, (N, 3)."""
+    """Return the offsets of agents in the scene, (N, 3)."""
     offsets = np.zeros((run.agents, 3))
     columns = run.offsets[:, list(space.axes)]
     first = 1 if space.kind == "time" else 0

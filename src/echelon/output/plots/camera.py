@@ -1,4 +1,4 @@
-"""From places to pixels: an own perspective, a fifth of the time that mplot3d takes."""
+"""The perspective of a video: from places to pixels in a fifth of the time of mplot3d."""
 
 from typing import NamedTuple
 
@@ -8,20 +8,20 @@ from echelon.core.types import Array
 from echelon.output.plots.space import Space
 
 _BACK = (0.42, -0.78, 0.47)
-"""From where a space is looked at: from the front, the right and above."""
+"""The direction from a space to the camera: front, right and above."""
 _TALL = float(np.tan(np.deg2rad(16.0)))
-_ROOM = 0.9
+_FILL = 0.9
 
 
 class Camera(NamedTuple):
-    """Looks at a space from a place, or at a plane from above.
+    """A view of a space from a place, or of a plane from above.
 
     Attributes:
         eye: (3,).
         axes: (3, 3), right, up and forward as rows.
         focal: pixels for one unit at distance one; in a plane, pixels for one unit.
         middle: (2,) pixels of the picture's middle.
-        flat: whether distance counts for nothing.
+        flat: whether there is no perspective.
     """
 
     eye: Array
@@ -32,14 +32,14 @@ class Camera(NamedTuple):
 
     def project(self, places: Array) -> tuple[Array, Array]:
         """Return pixels (..., 2), upwards, and distances (...) of places (..., 3)."""
-        seen = (places - self.eye) @ self.axes.T
-        depth = seen[..., 2]
+        view = (places - self.eye) @ self.axes.T
+        depth = view[..., 2]
         scale = self.focal if self.flat else self.focal / np.maximum(depth, 1e-6)[..., None]
-        return self.middle + scale * seen[..., :2], depth
+        return self.middle + scale * view[..., :2], depth
 
 
 def camera_for(space: Space, width: int, height: int, left: int) -> Camera:
-    """Return a camera that shows the box of a space in so many pixels, from `left` on."""
+    """Return a camera that shows the box of a space in a rectangle of pixels."""
     middle = np.array([left + 0.5 * width, 0.5 * height])
     low, high = space.low, space.high
     centre = 0.5 * (low + high)
@@ -52,18 +52,18 @@ def camera_for(space: Space, width: int, height: int, left: int) -> Camera:
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(back, right), -back])
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3) - centre
-    x, y, away = _stand(corners, axes, _ROOM * _TALL * width / height, _ROOM * _TALL)
+    x, y, away = _position(corners, axes, _FILL * _TALL * width / height, _FILL * _TALL)
     eye = centre + x * axes[0] + y * axes[1] + away * back
     return Camera(eye, axes, 0.5 * height / _TALL, middle, False)
 
 
-def _stand(corners: Array, axes: Array, wide: float, tall: float) -> tuple[float, float, float]:
-    """Return by how much to go aside, up and back for corners (8, 3) to just fit."""
+def _position(corners: Array, axes: Array, wide: float, tall: float) -> tuple[float, float, float]:
+    """Return the distances sideways, up and back at which corners (8, 3) just fit."""
     across, up, near = (corners @ axis for axis in (axes[0], axes[1], -axes[2]))
     x = y = away = 0.0
-    # Where the picture's middle is depends on how far off it is seen from.
+    # The middle of the picture depends on the distance.
     for _ in range(8):
         away = float((np.maximum(np.abs(across - x) / wide, np.abs(up - y) / tall) + near).max())
-        seen = (across / (away - near), up / (away - near))
-        x, y = (away * 0.5 * float(each.max() + each.min()) for each in seen)
+        view = (across / (away - near), up / (away - near))
+        x, y = (away * 0.5 * float(line.max() + line.min()) for line in view)
     return x, y, away

@@ -1,13 +1,13 @@
-"""The figures of a comparison: one line a method."""
+"""Figures of a comparison, with one line per method."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from echelon.core.types import Array
 from echelon.experiments.results.metrics import SETTLED, formation_errors, output_errors
-from echelon.experiments.studies.compare import Comparison, ComparisonRow
+from echelon.experiments.studies.compare import Comparison
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import save
 from echelon.simulation.engine.result import Result
@@ -20,18 +20,22 @@ def comparison_figures(comparison: Comparison) -> "dict[str, Figure]":
     """Return the figures of a comparison, by name.
 
     `formation_error` is the worst follower's distance from its goal, `tracking_error` the leader's
-    from its reference, and `approach` one follower's way to its goal, all with one line a method.
+    from its reference, and `approach` the path of one follower to its goal.
     """
-    flown = [(k, row) for k, row in enumerate(comparison.rows) if _frames(row)]
-    if not flown:
+    runs = [
+        (k, row.label, row.flight.result)
+        for k, row in enumerate(comparison.rows)
+        if row.flight is not None and len(row.flight.result.times) > 1
+    ]
+    if not runs:
         return {}
     with draw.style():
-        made = {
-            "formation_error": _formation_error(flown),
-            "tracking_error": _tracking_error(flown),
-            "approach": _approach(flown),
+        drawings = {
+            "formation_error": _formation_error(runs),
+            "tracking_error": _tracking_error(runs),
+            "approach": _approach(runs),
         }
-    return {name: figure for name, figure in made.items() if figure is not None}
+    return {name: figure for name, figure in drawings.items() if figure is not None}
 
 
 def save_comparison_figures(comparison: Comparison, folder: Path) -> None:
@@ -43,90 +47,82 @@ def save_comparison_figures(comparison: Comparison, folder: Path) -> None:
     save(comparison_figures(comparison), folder / "figures")
 
 
-_Flown = list[tuple[int, ComparisonRow]]
+_Runs = list[tuple[int, str, Result]]
+"""Place among the methods, label and result of each."""
 
 
-def _frames(row: ComparisonRow) -> bool:
-    return row.flight is not None and len(row.flight.result.times) > 1
+def _formation_error(runs: _Runs) -> "Figure":
+    lines = {k: formation_errors(run).max(axis=1) for k, _, run in runs}
+    metric = runs[0][2].unit == "m"
+    return _over_time(runs, lines, draw.label("worst formation error", "m" if metric else ""))
 
 
-def _result(row: ComparisonRow) -> Result:
-    assert row.flight is not None
-    return row.flight.result
-
-
-def _formation_error(flown: _Flown) -> "Figure":
-    lines = {k: formation_errors(_result(row)).max(axis=1) for k, row in flown}
-    metric = _result(flown[0][1]).unit == "m"
-    return _over_time(flown, lines, draw.label("worst formation error", "m" if metric else ""))
-
-
-def _tracking_error(flown: _Flown) -> "Figure | None":
-    found = {k: output_errors(_result(row)) for k, row in flown}
-    # The outputs begin with the position, so that a yaw is not added to metres.
-    space = len(_result(flown[0][1]).measured)
+def _tracking_error(runs: _Runs) -> "Figure | None":
+    tracking = {k: output_errors(run) for k, _, run in runs}
+    # Only the position, with which the outputs begin, since a yaw is not in metres.
+    space = len(runs[0][2].measured)
     lines = {
         k: np.linalg.norm(errors[:, :space], axis=1)
-        for k, errors in found.items()
+        for k, errors in tracking.items()
         if errors is not None
     }
     if not lines:
         return None
-    metric = _result(flown[0][1]).unit == "m"
+    metric = runs[0][2].unit == "m"
     text = draw.label("leader's tracking error", "m" if metric else "")
-    return _over_time([(k, row) for k, row in flown if k in lines], lines, text)
+    return _over_time([run for run in runs if run[0] in lines], lines, text)
 
 
-def _count_alike(flown: _Flown, lines: dict[int, Array]) -> dict[int, int]:
-    """Return how many lines each stands for: laws that share a leader draw one over the other."""
-    stands: dict[int, int] = {}
-    for k, _ in flown:
-        # To the bit: laws that share a leader, who does not react to them, share its run.
-        same = [j for j in stands if np.array_equal(lines[j], lines[k])]
-        stands[same[0] if same else k] = stands.get(same[0], 0) + 1 if same else 1
-    return stands
+def _count_equal(runs: _Runs, lines: dict[int, Array]) -> dict[int, int]:
+    """Return the number of equal lines that each drawn line represents."""
+    counts: dict[int, int] = {}
+    for k, _, _ in runs:
+        # To the bit, as of laws with the same leader, which does not react to its followers.
+        same = [j for j in counts if np.array_equal(lines[j], lines[k])]
+        counts[same[0] if same else k] = counts.get(same[0], 0) + 1 if same else 1
+    return counts
 
 
-def _over_time(flown: _Flown, lines: dict[int, Array], text: str) -> "Figure":
+def _over_time(runs: _Runs, lines: dict[int, Array], text: str) -> "Figure":
     """Return errors on a logarithmic axis, with gaps where they are 0."""
-    stands = _count_alike(flown, lines)
-    # A run that ended early has fewer frames, and the axis is that of the others.
-    longest = max((_result(row) for _, row in flown), key=lambda result: result.times[-1])
+    counts = _count_equal(runs, lines)
+    # The time axis of the longest run, since others may have ended early.
+    longest = max((run for _, _, run in runs), key=lambda run: run.times[-1])
     figure, (ax,) = draw.panels(longest.times, longest.settings.horizon, 1, 3.4)
-    shown = []
-    for k, row in flown:
-        if k not in stands:
+    curves = []
+    for k, label, run in runs:
+        if k not in counts:
             continue
         values = draw.above_zero(lines[k])
         keep = draw.thin(len(values))
-        name = row.label if stands[k] == 1 else f"{row.label}, and {stands[k] - 1} alike"
+        name = label if counts[k] == 1 else f"{label} and {counts[k] - 1} equal"
         name = draw.say_zero(name, values)
-        draw.plot(ax, _result(row).times[keep], values[keep], label=name, **_pen(k))
-        shown.append(values)
+        draw.plot(ax, run.times[keep], values[keep], label=name, **_pen(k))
+        curves.append(values)
     ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
     ax.set_ylabel(text)
-    draw.logarithmic(ax, *shown, np.array([SETTLED]))
+    draw.logarithmic(ax, *curves, np.array([SETTLED]))
     return draw.finish(figure)
 
 
-def _approach(flown: _Flown) -> "Figure | None":
-    """Return how the follower that starts worst comes to its goal, seen from its leader."""
-    first = _result(flown[0][1])
+def _approach(runs: _Runs) -> "Figure | None":
+    """Return the path of the follower with the largest initial error, relative to its goal."""
+    first = runs[0][2]
     axes = list(first.model.position_indices()[:2])
     if len(axes) < 2:
         return None
-    # All methods begin from the same deviations, so that the first can choose.
+    # All methods have the same starts, so that the first gives the follower.
     follower = int(np.argmax(formation_errors(first)[0]))
     names, units = first.model.state_names, first.model.state_units
     figure, ax = draw.canvas([draw.label(f"{names[k]} error", units[k]) for k in axes])
     start, goal = first.errors[:1, follower][:, axes], np.zeros((1, 2))
     drawn, cut = [start, goal], False
-    for k, row in flown:
-        path, over = draw.drop_runaways(_result(row).errors[:, follower][:, axes], start, goal)
-        # One that leaves would shrink the others' ways to a dot.
+    for k, label, run in runs:
+        path, over = draw.drop_runaways(run.errors[:, follower][:, axes], start, goal)
+        # A path that leaves would shrink the others to a dot.
         inside = np.abs(path).max(axis=1) <= 1.3 * np.abs(start).max()
         path, over = np.where(inside[:, None], path, np.nan), over or not inside.all()
-        draw.plot(ax, path[draw.thin(len(path))], label=row.label, **_pen(k))
+        draw.plot(ax, path[draw.thin(len(path))], label=label, **_pen(k))
         drawn.append(path)
         cut |= over
     draw.plot(ax, start, label=f"start, F{follower}", **draw.dots("o", draw.LEADER, hollow=True))
@@ -135,6 +131,6 @@ def _approach(flown: _Flown) -> "Figure | None":
     return draw.finish(figure, cut)
 
 
-def _pen(k: int) -> dict[str, Any]:
+def _pen(k: int) -> draw.Style:
     dash = "-" if k < len(draw.COLOURS) else (0, (3, 1.2))
     return {"color": draw.COLOURS[k % len(draw.COLOURS)], "linestyle": dash}

@@ -1,7 +1,7 @@
-"""What a run does over time: errors, V, inputs, states, distances."""
+"""Figures of a run over time: errors, V, inputs, states, distances."""
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,35 +20,36 @@ from echelon.output.plots.agent_style import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_LINKS = 20_000  # of which the distances of many are taken, evenly spread
-_PANELS = 12  # what fits above each other on a page
+_LINKS = 20_000  # links whose distances are computed, evenly spread over all
+_PANELS = 12  # that fit on a page
 _START = 3.0
-"""Seconds of a run in which inputs are quick."""
-_WANTED = {"color": "0.4", "linewidth": 0.9, "linestyle": (0, (1.0, 1.5)), "zorder": 1}
+"""Seconds at the start in which inputs change quickly."""
+_DESIRED = {"color": "0.4", "linewidth": 0.9, "linestyle": (0, (1.0, 1.5)), "zorder": 1}
 _SLOPE = {"color": draw.EDGE, "linewidth": 1.0, "linestyle": (0, (5.0, 2.0)), "zorder": 2.2}
 
 
 def tracking(run: Recording) -> "Figure | None":
-    """Return the leaders' outputs minus their references', a panel for each unit."""
+    """Return the tracking errors of the leaders' outputs, a panel for each unit."""
     if run.tracking is None:
         return None
     errors, names, units = run.tracking
-    # More leaders than have names would be lines that nobody can tell apart.
-    shown = run.leaders if len(run.leaders) <= draw.NAMED else run.leaders[:1]
+    # Nobody can distinguish the lines of more leaders than have names.
+    leaders = run.leaders if len(run.leaders) <= draw.NAMED else run.leaders[:1]
     # Metres and radians share no axis; a dictionary keeps their order.
     kinds = list(dict.fromkeys(units))
     figure, panels = _panels(run, len(kinds), 1.7)
-    keep, cut = draw.thin(len(run.times), len(shown)), False
-    for place, leader in enumerate(shown):
+    keep, cut = draw.thin(len(run.times), len(leaders)), False
+    for place, leader in enumerate(leaders):
         look = draw.leader_pen(place, run.agents)
         for k, name in enumerate(names):
             error = errors[:, place, k, None]
             values, over = draw.drop_runaways(error[keep], error[:1])
-            own = {"color": draw.COLOURS[k % len(draw.COLOURS)], "linestyle": look["linestyle"]}
+            pen = {"color": draw.COLOURS[k % len(draw.COLOURS)], "linestyle": look["linestyle"]}
             text = name.replace("_", " ") + (f", leader {leader}" if len(run.leaders) > 1 else "")
-            draw.plot(panels[kinds.index(units[k])], run.times[keep], values, label=text, **own)
+            draw.plot(panels[kinds.index(units[k])], run.times[keep], values, label=text, **pen)
             cut |= over
     for ax, unit in zip(panels, kinds, strict=True):
         ax.set_ylabel(draw.label("tracking error", unit))
@@ -56,13 +57,13 @@ def tracking(run: Recording) -> "Figure | None":
     return draw.finish(figure, cut)
 
 
-# ---- what shrinks -----------------------------------------------------------------------------
+# ---- convergence ------------------------------------------------------------------------------
 
 
 def formation(run: Recording) -> "Figure":
-    """Return each follower's distance from its goal, on a logarithmic axis, and what is promised.
+    """Return each follower's distance from its goal on a logarithmic axis, with the guarantee.
 
-    Of a flock it is bands, the median and the worst.
+    Of a large swarm it shows quantiles, the median and the worst follower.
     """
     followers, many = list(run.followers), run.agents > draw.NAMED
     keep = draw.thin(len(run.times), len(followers))
@@ -84,74 +85,74 @@ def formation(run: Recording) -> "Figure":
         ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
     ax.set_ylabel(draw.label("formation error", run.unit))
     marks = [SETTLED] if run.unit else []
-    # The bound's end may lie far below all errors, its start is what is compared with theirs.
+    # The end of the bound may lie far below all errors, so only its start sets the axis.
     draw.logarithmic(ax, errors[keep], np.array(marks if bound is None else [*marks, bound[0]]))
     return draw.finish(figure)
 
 
-def _bands(ax: Any, times: Array, values: Array, of: str = "follower") -> None:
-    """Draw where nine in ten and half of a flock are, (T, N), and the median."""
+def _bands(ax: "Axes", times: Array, values: Array, of: str = "follower") -> None:
+    """Draw quantiles of values (T, N) and the median."""
     with np.errstate(invalid="ignore"):
-        # Where all agree to the bit there is nothing to draw, and nothing to warn of.
+        # At times at which all values are 0 there is nothing to draw, and no warning.
         some = np.isfinite(values).any(axis=1)
         ends = np.full((5, len(times)), np.nan)
         ends[:, some] = np.nanpercentile(values[some], [5, 25, 50, 75, 95], axis=1)
     look = {"color": draw.COLOURS[0], "linewidth": 0.0, "zorder": 1.5}
-    ax.fill_between(times, ends[0], ends[4], alpha=0.18, label="5 to 95 % of them", **look)
+    ax.fill_between(times, ends[0], ends[4], alpha=0.18, label="5 to 95 %", **look)
     ax.fill_between(times, ends[1], ends[3], alpha=0.35, label="25 to 75 %", **look)
     draw.plot(ax, times, ends[2], label=f"median {of}", color=draw.COLOURS[0])
 
 
-def _worst(ax: Any, run: Recording, times: Array, errors: Array, keep: Array) -> None:
-    """Draw the follower of the largest steady error, by name, and the largest at each time.
+def _worst(ax: "Axes", run: Recording, times: Array, errors: Array, keep: Array) -> None:
+    """Draw the follower with the largest steady error, and the largest error at each time.
 
-    Of a run that ended before its steady window it is the largest over all of it.
+    A run that ended before its steady window is evaluated as a whole.
     """
     window = float(run.attributes.get("steady_window", 0.2 * run.horizon))
     steady = run.times >= run.horizon - window
     with np.errstate(over="ignore", invalid="ignore"):
         place = int(np.argmax((errors[steady if steady.any() else ...] ** 2).sum(axis=0)))
     name = f"worst: follower {run.followers[place]}"
-    own = {"color": draw.COLOURS[1], "zorder": 3}
-    draw.plot(ax, times, draw.above_zero(errors[keep, place]), label=name, **own)
+    pen = {"color": draw.COLOURS[1], "zorder": 3}
+    draw.plot(ax, times, draw.above_zero(errors[keep, place]), label=name, **pen)
     largest = draw.above_zero(errors[keep].max(axis=1))
     dash = {"linestyle": (0, (1.0, 1.2)), "linewidth": 0.9}
-    draw.plot(ax, times, largest, label="largest at each time", **own, **dash)
+    draw.plot(ax, times, largest, label="largest at each time", **pen, **dash)
 
 
-def _slope(ax: Any, run: Recording, values: Array, times: float) -> None:
-    """Draw the slope that is promised, from where values (T,) are largest on."""
+def _slope(ax: "Axes", run: Recording, values: Array, times: float) -> None:
+    """Draw the guaranteed slope from the largest of values (T,) on."""
     rate, finite = run.rate, np.where(np.isfinite(values), values, 0.0)
     if rate is None or len(run.times) < 2 or finite.max() <= 0.0:
         return
     first = int(finite.argmax())
     t = np.array([run.times[first], run.times[-1]])
-    # A line that goes on below what is shown would be cut off without a look.
+    # A line that ends at 0 has no place on a logarithmic axis.
     with np.errstate(under="ignore"):
         line = finite[first] * np.exp(-times * rate * (t - t[0]))
     if line[1] <= 0.0:
         t[1] = t[0] + 600.0 / (times * rate)
         line[1] = finite[first] * np.exp(-600.0)
-    # Equal eigenvalues, as a chain of arrows has, make t^k e^(-rt): no slope holds from the start.
-    name = "slope promised in the long run" if _tells_one_way(run) else "slope promised"
+    # Equal eigenvalues, as of a directed chain, give t^k e^(-rt): the slope holds in the end only.
+    name = "guaranteed asymptotic slope" if _has_one_way_link(run) else "guaranteed slope"
     text = f"{name}: \u2212{times * rate:.3g} 1/s"
     draw.plot(ax, t, line, label=text, **_SLOPE)
 
 
-def _tells_one_way(run: Recording) -> bool:
-    """Tell whether a follower is heard by another one that it does not hear."""
+def _has_one_way_link(run: Recording) -> bool:
+    """Return whether a follower sends to another one and receives nothing from it."""
     inner = ~np.isin(run.edges, run.leaders).any(axis=1)
     return bool((run.heard[inner].sum(axis=1) == 1).any())
 
 
 def lyapunov(run: Recording) -> "Figure | None":
-    """Return V, and how fast it falls or rises, on logarithmic axes; None of a law without one."""
+    """Return V and its rate on logarithmic axes; None of a law without V."""
     if run.lyapunov is None or run.lyapunov_rate is None:
         return None
     keep = draw.thin(len(run.times))
     times, value, rate = run.times[keep], run.lyapunov[keep], run.lyapunov_rate[keep]
     value = draw.above_zero(value)
-    # V is a square, and what is smaller than that of a floor is its rounding, of both signs.
+    # V is a square, and rates below the square of the floor are rounding of either sign.
     moves = np.abs(rate) > draw.FLOOR**2
     figure, panels = _panels(run, 2 if moves.any() else 1, 2.0)
     draw.plot(panels[0], times, value, label=draw.say_zero("V", value), color=draw.LEADER)
@@ -160,38 +161,38 @@ def lyapunov(run: Recording) -> "Figure | None":
     draw.logarithmic(panels[0], value)
     for ax in panels[1:]:
         for name, speed, colour in zip(
-            ("falls", "rises"), (-rate, rate), draw.COLOURS, strict=False
+            ("decreases", "increases"), (-rate, rate), draw.COLOURS, strict=False
         ):
             shown = np.where(moves & (speed > 0.0), speed, np.nan)
             if not np.isnan(shown).all():
                 draw.plot(ax, times, shown, label=f"V {name}", color=colour, linewidth=0.8)
         ax.set_ylabel("|dV/dt| (1/s)")
         draw.logarithmic(ax, np.abs(rate[moves]))
-        if _rises_between(run):
-            text = f"at each frame; V rises in between, inputs held for dt = {run.dt:.3g} s"
+        if _increases_between(run):
+            text = f"at each frame; V increases in between, inputs held for dt = {run.dt:.3g} s"
             ax.set_title(text, size=draw.page().letters - 1.0, loc="right")
     return draw.finish(figure)
 
 
-def _rises_between(run: Recording) -> bool:
-    """Tell whether V rises between frames of which both say that it falls."""
+def _increases_between(run: Recording) -> bool:
+    """Return whether V increases between two frames with a negative rate."""
     assert run.lyapunov is not None and run.lyapunov_rate is not None
-    value, falls = run.lyapunov, run.lyapunov_rate < 0.0
-    # So far below the start V is nothing but rounding.
-    rises = np.diff(value) > 1e-9 * value[:-1] + 1e-20 * value[0]
-    return bool((rises & falls[:-1] & falls[1:]).any())
+    value, decreasing = run.lyapunov, run.lyapunov_rate < 0.0
+    # Far below its start V is only rounding.
+    increases = np.diff(value) > 1e-9 * value[:-1] + 1e-20 * value[0]
+    return bool((increases & decreasing[:-1] & decreasing[1:]).any())
 
 
-# ---- what is done -----------------------------------------------------------------------------
+# ---- inputs -----------------------------------------------------------------------------------
 
 
 def inputs(run: Recording) -> "Figure | None":
-    """Return what actuators give with their limits, in the beginning and over the whole run.
+    """Return the loads of actuators with their limits, at the start and over the whole run.
 
     Without limits it is each input in its unit.
     """
     loads = run.loads
-    rows = _loads(loads) if loads is not None else _plain(run)
+    rows = _loads(loads) if loads is not None else _inputs(run)
     parts = [run.times <= _START] if draw.page().narrow else [run.times <= _START, run.times >= 0]
     parts = [part for part in parts if part.sum() > 1][: 1 if run.times[-1] <= 2 * _START else 2]
     parts = parts or [run.times >= 0.0]
@@ -210,7 +211,7 @@ def inputs(run: Recording) -> "Figure | None":
 
 
 def _loads(loads: Array) -> dict[str, Array]:
-    """Return what is drawn of rows (T, N, k) in % of their limits: each, or the extreme ones."""
+    """Return loads (T, N, k) in % of their limits: the only one, or the largest and smallest."""
     percent = 100.0 * loads
     if percent.shape[2] == 1:
         return {"input\n(% of limit)": percent[:, :, 0]}
@@ -220,13 +221,13 @@ def _loads(loads: Array) -> dict[str, Array]:
     }
 
 
-def _plain(run: Recording) -> dict[str, Array]:
-    named = list(zip(run.input_names, run.input_units, strict=True))[:_PANELS]
-    return {draw.label(*pair): run.inputs[:, :, k] for k, pair in enumerate(named)}
+def _inputs(run: Recording) -> dict[str, Array]:
+    pairs = list(zip(run.input_names, run.input_units, strict=True))[:_PANELS]
+    return {draw.label(*pair): run.inputs[:, :, k] for k, pair in enumerate(pairs)}
 
 
-def _limits(ax: Any, values: Array) -> None:
-    """Draw the limits 0 and 100 %, and shade what is beyond."""
+def _limits(ax: "Axes", values: Array) -> None:
+    """Draw the limits 0 and 100 %, and shade the area beyond."""
     for value in (0.0, 100.0):
         look = {"color": draw.COLOURS[1], "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 2}
         ax.axhline(value, label="limit" if value else None, **look)
@@ -236,8 +237,8 @@ def _limits(ax: Any, values: Array) -> None:
     ax.set_ylim(low, high)
 
 
-def _agents_over(ax: Any, run: Recording, times: Array, values: Array) -> None:
-    """Draw a number of each agent (T, N): every line, or of a flock bands with the leader."""
+def _agents_over(ax: "Axes", run: Recording, times: Array, values: Array) -> None:
+    """Draw a number of each agent (T, N) as lines, or as quantiles of a large swarm."""
     if run.agents > draw.NAMED:
         keep = draw.thin(len(times), run.agents)
         _bands(ax, times[keep], values[keep][:, list(run.followers)])
@@ -254,25 +255,25 @@ def _agents_over(ax: Any, run: Recording, times: Array, values: Array) -> None:
 
 
 def states(run: Recording) -> "Figure":
-    """Return every state over time, twelve at most."""
+    """Return the states over time, twelve at most."""
     return states_over_time(run, drawn(run))
 
 
-def states_over_time(run: Recording, chosen: Iterable[int]) -> "Figure":
-    """Return a panel for each state, twelve at most, with a line for each of the agents."""
-    agents = list(leaders_first(run, chosen))
+def states_over_time(run: Recording, agents: Iterable[int]) -> "Figure":
+    """Return a panel for each state, twelve at most, with a line for each agent."""
+    agents = list(leaders_first(run, agents))
     keep, cut = draw.thin(len(run.times), len(agents)), False
-    times, wanted = run.times[keep], [reference_of(run, agent) for agent in agents]
-    # Behind followers too it would hide their lines.
-    guides = wanted if set(agents) <= {*run.leaders} else []
+    times, references = run.times[keep], [reference_of(run, agent) for agent in agents]
+    # With followers in the figure references would hide their lines.
+    guides = references if set(agents) <= {*run.leaders} else []
     count = min(len(run.state_names), _PANELS)
-    # On a narrow page panels beside each other would be all labels.
+    # On a narrow page columns of panels would have room for labels only.
     columns = 1 if draw.page().narrow or count <= 4 else 2 if count <= 6 else 3
     figure, panels = draw.panels(run.times, run.horizon, count, 1.4, columns)
     for k, ax in enumerate(panels):
         paths = run.states[:, agents, k, None]
-        known = [wanted[0][:, k, None]] if wanted[0] is not None else []
-        values, over = draw.drop_runaways(paths, paths[0], *known)
+        anchors = [references[0][:, k, None]] if references[0] is not None else []
+        values, over = draw.drop_runaways(paths, paths[0], *anchors)
         for name, guide in zip(["reference", *[None] * len(guides)], guides):
             if guide is not None:
                 draw.plot(ax, times, guide[keep, k], label=name, **REFERENCE)
@@ -285,54 +286,54 @@ def states_over_time(run: Recording, chosen: Iterable[int]) -> "Figure":
 
 
 def distances(run: Recording) -> "Figure | None":
-    """Return the distances of linked agents with those wanted, and the least of any two agents.
+    """Return the distances of linked agents and their desired values, and the smallest distance.
 
     None of agents without a position.
     """
     if not run.position:
         return None
     places, columns = run.states[:, :, list(run.position)], list(run.position)
-    chosen = slice(None, None, -(-len(run.edges) // _LINKS) or 1)
-    i, j = run.edges[chosen].T
+    links = slice(None, None, -(-len(run.edges) // _LINKS) or 1)
+    i, j = run.edges[links].T
     keep = draw.thin(len(run.times), max(1, len(i)))
     with np.errstate(over="ignore", invalid="ignore"):
         apart = np.linalg.norm(places[keep][:, i] - places[keep][:, j], axis=2)
-        wanted = np.linalg.norm(run.offsets[i][:, columns] - run.offsets[j][:, columns], axis=1)
-    apart[~np.stack([run.linked(t)[chosen] for t in run.times[keep]])] = np.nan
+        desired = np.linalg.norm(run.offsets[i][:, columns] - run.offsets[j][:, columns], axis=1)
+    apart[~np.stack([run.linked(t)[links] for t in run.times[keep]])] = np.nan
     figure, (linked, nearest) = _panels(run, 2, 1.9)
-    linked.set_ylabel(draw.label("between linked", "m"))
-    _edges(linked, run, run.times[keep], apart, wanted)
+    linked.set_ylabel(draw.label("linked agents", "m"))
+    _edges(linked, run, run.times[keep], apart, desired)
     few = draw.thin(len(run.times), run.agents)
     draw.plot(nearest, run.times[few], _least(places[few]), color=draw.LEADER, label="any two")
-    nearest.set_ylabel(draw.label("least distance", "m"))
+    nearest.set_ylabel(draw.label("smallest distance", "m"))
     nearest.set_ylim(bottom=0.0)
     return draw.finish(figure)
 
 
-def _edges(ax: Any, run: Recording, times: Array, apart: Array, wanted: Array) -> None:
-    """Draw the distance of each edge, or of many how far they are off."""
+def _edges(ax: "Axes", run: Recording, times: Array, apart: Array, desired: Array) -> None:
+    """Draw the distance of each edge, or quantiles of the errors of many."""
     if len(run.edges) > draw.NAMED:
-        off = np.abs(apart - wanted)
-        _bands(ax, times, draw.above_zero(off), "link")
-        ax.set_ylabel("links off wanted (m)")
-        draw.logarithmic(ax, off)
+        errors = np.abs(apart - desired)
+        _bands(ax, times, draw.above_zero(errors), "link")
+        ax.set_ylabel("distance error (m)")
+        draw.logarithmic(ax, errors)
         return
     for place, (i, j) in enumerate(run.edges):
         look = draw.pen(place, len(run.edges))
         line, _ = draw.drop_runaways(apart[:, place, None], apart[:1, place, None])
         draw.plot(ax, times, line, label=f"{i} to {j}", **look)
-        ax.axhline(wanted[place], **_WANTED | {"color": look["color"]})
-    # In the legend it is of no link's colour.
-    ax.plot([], [], label="wanted", **_WANTED)
+        ax.axhline(desired[place], **_DESIRED | {"color": look["color"]})
+    # In the legend it has no colour of a link.
+    ax.plot([], [], label="desired", **_DESIRED)
 
 
 def _least(places: Array) -> Array:
-    """Return the least distance of any two agents at each time, of places (T, N, k)."""
+    """Return the smallest distance of two agents at each time, of places (T, N, k)."""
     from scipy.spatial import KDTree
 
     finite = np.where(np.isfinite(places), places, 1e300)
-    return np.array([KDTree(each).query(each, k=2)[0][:, 1].min() for each in finite])
+    return np.array([KDTree(row).query(row, k=2)[0][:, 1].min() for row in finite])
 
 
-def _panels(run: Recording, rows: int, height: float) -> "tuple[Figure, list[Any]]":
+def _panels(run: Recording, rows: int, height: float) -> "tuple[Figure, list[Axes]]":
     return draw.panels(run.times, run.horizon, rows, height)

@@ -1,4 +1,4 @@
-"""Figures as files: PNG, PDF and SVG, whole or not at all."""
+"""Figures as PNG, PDF and SVG files, written completely or not at all."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,21 +17,21 @@ def save(
     kinds: Sequence[str] = ("png", "pdf"),
     dpi: int = 150,
 ) -> list[Path]:
-    """Write each figure as PNG and PDF into a folder, made if need be; return the paths.
+    """Write each figure as PNG and PDF into a folder, and return the paths.
 
     Raises:
         OSError: the folder or a file cannot be written.
     """
     paths = []
     folder.mkdir(parents=True, exist_ok=True)
-    # Without its date, the same run writes the same file.
+    # Without the date, so that the same run writes the same file.
     dates: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
     for name, figure in figures.items():
         for kind in kinds:
-            path, told = folder / f"{name}.{kind}", dates.get(kind)
+            path, metadata = folder / f"{name}.{kind}", dates.get(kind)
             with style():
                 make_atomic(
-                    path, lambda part: figure.savefig(part, format=kind, dpi=dpi, metadata=told)
+                    path, lambda part: figure.savefig(part, format=kind, dpi=dpi, metadata=metadata)
                 )
             paths.append(path)
     return paths

@@ -1,4 +1,4 @@
-"""Who hears whom, and the poles into which the disagreement splits."""
+"""Figures of the communication graph and of the closed-loop poles."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Any
@@ -8,32 +8,31 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.experiments.results.recording import LoopPoles, Recording
 from echelon.output.plots import style as draw
-from echelon.output.plots.agent_style import MOST, pen_of, told_of
+from echelon.output.plots.agent_style import MOST, count_title, pen_of
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _NUMBERED = 60
-"""With more agents than this, numbers would cover each other."""
+"""With more agents than this, their numbers would overlap."""
 _STRETCHES = 6
-"""Of a graph that switches, drawn beside each other."""
+"""Panels of a switching graph."""
 
 
 def modes(run: Recording) -> "Figure | None":
-    """Return the poles of every mode looked at; None where laws have no linearization."""
+    """Return the closed-loop poles; None where laws have no linearization."""
     return None if run.modes is None else poles(run.modes)
 
 
-def poles(found: LoopPoles) -> "Figure":
+def poles(loop: LoopPoles) -> "Figure":
     """Return poles in the complex plane, coloured by the eigenvalue of the graph."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
-    # Of complex ones the real part, which couplings are chosen by.
-    values, (real, imaginary) = (
-        np.real(found.eigenvalues),
-        (np.real(found.poles), np.imag(found.poles)),
-    )
+    # The real part of complex eigenvalues, by which couplings are chosen.
+    values = np.real(loop.eigenvalues)
+    real, imaginary = np.real(loop.poles), np.imag(loop.poles)
     width = draw.page().width
     figure = Figure((width, 0.6 * width), layout="constrained")
     ax = figure.add_subplot()
@@ -48,7 +47,7 @@ def poles(found: LoopPoles) -> "Figure":
     ax.set_xlabel("real part (1/s)")
     ax.set_ylabel("imaginary part (rad/s)")
     _name_slowest(ax, slowest)
-    # One eigenvalue has no scale.
+    # A single eigenvalue needs no colour scale.
     if len(np.unique(values)) > 1:
         bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
         bar.set_label("eigenvalue \u03bb of the graph")
@@ -56,19 +55,19 @@ def poles(found: LoopPoles) -> "Figure":
     return figure
 
 
-def _name_slowest(ax: Any, slowest: float) -> None:
+def _name_slowest(ax: "Axes", slowest: float) -> None:
     box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8}
-    near = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "bbox": box}
-    look = {"va": "bottom", "size": draw.page().letters - 1.0, "color": draw.COLOURS[1]}
-    # Above the poles and the axis, and within the paper on whichever side there is room.
+    near: draw.Style = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+    look: draw.Style = {"va": "bottom", "size": draw.page().letters - 1.0, "bbox": box}
+    # Above the axes, on the side with more room.
     place = float(ax.transAxes.inverted().transform(ax.transData.transform((slowest, 0.0)))[0])
-    side = {"ha": "right" if place > 0.5 else "left"}
+    look |= {"color": draw.COLOURS[1], "ha": "right" if place > 0.5 else "left"}
     text = f"slowest: {slowest:.3g} 1/s".replace("-", "\u2212")
-    ax.annotate(text, (slowest, 1.0), (0, 2), **look, **near, **side)
+    ax.annotate(text, (slowest, 1.0), (0, 2), **look, **near)
 
 
-def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
-    """Use scales that show slow and fast poles alike, and end a little right of the axis."""
+def _wide_axis(ax: "Axes", real: Array, imaginary: Array) -> None:
+    """Choose scales that show slow and fast poles, with a margin right of the imaginary axis."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
     sizes, heights = np.abs(real), np.abs(imaginary)
@@ -76,28 +75,28 @@ def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
     right = max(0.0, float(real.max()))
     if most > 30.0 * least:
         ax.set_xscale("symlog", linthresh=least, linscale=0.6)
-        told = FuncFormatter(lambda x, _: f"{x:g}".replace("-", "\u2212"))
-        ax.xaxis.set_major_formatter(told)
+        minus = FuncFormatter(lambda x, _: f"{x:g}".replace("-", "\u2212"))
+        ax.xaxis.set_major_formatter(minus)
         powers = 10.0 ** np.arange(np.floor(np.log10(least)), np.ceil(np.log10(most)) + 1.0)
-        # Nearer to 0 their numbers would cover each other.
+        # Closer to 0 their labels would overlap.
         powers = powers[powers > 0.5 * least]
         ax.xaxis.set_major_locator(FixedLocator([*-powers[::-1], 0.0]))
-        # Between the powers they show that the axis is no straight one.
+        # Minor ticks show that the axis is not linear.
         between = np.outer(powers, np.arange(2.0, 10.0)).ravel()
         ax.xaxis.set_minor_locator(FixedLocator([*-between[between < 1.6 * most]]))
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.set_xlim(-1.6 * most, 2.0 * right + 0.3 * least)
     else:
         ax.set_xlim(-1.08 * most, 1.1 * right + 0.08 * most)
-    turning = heights[heights > 1e-9 * most]
-    if turning.size and heights.max() > 30.0 * np.median(turning):
-        ax.set_yscale("symlog", linthresh=float(np.median(turning)))
-    if not turning.size:
+    oscillating = heights[heights > 1e-9 * most]
+    if oscillating.size and heights.max() > 30.0 * np.median(oscillating):
+        ax.set_yscale("symlog", linthresh=float(np.median(oscillating)))
+    if not oscillating.size:
         ax.set_ylim(-1.0, 1.0)
 
 
 def _label_bar(bar: Any, values: Array) -> None:
-    """Name each eigenvalue on the colour bar where they are few, else only powers of ten."""
+    """Label up to eight eigenvalues on the colour bar, else powers of ten."""
     from matplotlib.ticker import NullLocator
 
     if len(values) <= 8:
@@ -109,73 +108,73 @@ def _label_bar(bar: Any, values: Array) -> None:
 
 
 def network(run: Recording) -> "Figure":
-    """Return who hears whom: agents where the formation puts them, or around a circle.
+    """Return the communication graph, with agents at their places in the formation or on a circle.
 
-    An arrow goes to who hears; a line without one is heard both ways, a dotted one by nobody. A
-    graph that switches has a panel for each stretch of time, six at most; of a huge swarm it is
-    those about the leaders.
+    An arrow points to the receiver; a line without an arrow is bidirectional, a dotted line is
+    inactive. A switching graph has a panel for each of its first six graphs. Of a huge swarm the
+    figure shows the agents closest to the leaders.
     """
     from matplotlib.figure import Figure
 
-    whole, run = run, _about_leaders(run)
+    whole, run = run, _near_leaders(run)
     places, units = _places(run)
     stretches = _stretches(run)
     columns = min(len(stretches), 2 if draw.page().narrow else 3)
     rows = -(-len(stretches) // columns)
     width = draw.page().width
-    # A lone panel of a wide page would be needlessly high.
-    room = 0.85 * width / columns * (0.75 if columns == 1 and not draw.page().narrow else 1.0)
+    # A single panel on a wide page is flatter.
+    available = 0.85 * width / columns * (0.75 if columns == 1 and not draw.page().narrow else 1.0)
     size = np.ptp(places, axis=0)
-    least = _dot(run, columns) / 144.0 * max(size[0] / room, size[1] / (0.8 * room))
+    least = _dot(run, columns) / 144.0 * max(size[0] / available, size[1] / (0.8 * available))
     lines = curves_of(places, run.edges, least)
     size = np.ptp(np.concatenate([places, *lines]), axis=0)
     tall = float(np.clip(size[1] / max(size[0], 1e-9), 0.3, 0.8))
-    figure = Figure((width, rows * (0.75 + room * tall)), layout="constrained")
+    figure = Figure((width, rows * (0.75 + available * tall)), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax, (title, weights) in zip(panels, stretches, strict=False):
         _agents_and_links(ax, run, places, lines, weights, columns)
         _finish_network(ax, np.concatenate([places, *lines]), units)
-        told = ", ".join(filter(None, [title, told_of(whole, run.agents)]))
-        ax.set_title(told, size=draw.page().letters)
+        parts = [title, count_title(whole, run.agents)]
+        ax.set_title(", ".join(filter(None, parts)), size=draw.page().letters)
     for ax in panels[len(stretches) :]:
         ax.axis("off")
     return figure
 
 
-def _about_leaders(run: Recording) -> Recording:
-    """Return a recording of the agents that the fewest links part from a leader."""
+def _near_leaders(run: Recording) -> Recording:
+    """Return a recording of the agents with the fewest links to a leader."""
     if run.agents <= MOST:
         return run
     from scipy import sparse
 
     (i, j), ones = run.edges.T, np.ones(len(run.edges), np.int8)
-    links = sparse.csr_array(sparse.coo_array((ones, (i, j)), (run.agents, run.agents)))
+    adjacency = sparse.csr_array(sparse.coo_array((ones, (i, j)), (run.agents, run.agents)))
     far = sparse.csgraph.dijkstra(
-        links, directed=False, indices=run.leaders, unweighted=True, min_only=True
+        adjacency, directed=False, indices=run.leaders, unweighted=True, min_only=True
     )
-    kept = np.sort(np.argsort(far, kind="stable")[:MOST])
-    there = np.isin(run.edges, kept).all(axis=1)
-    schedule = run.schedule and run.schedule._replace(weights=run.schedule.weights[:, there])
+    agents = np.sort(np.argsort(far, kind="stable")[:MOST])
+    links = np.isin(run.edges, agents).all(axis=1)
+    schedule = run.schedule and run.schedule._replace(weights=run.schedule.weights[:, links])
     return dataclasses.replace(
         run,
-        **{name: getattr(run, name)[:, kept] for name in ("states", "inputs", "errors")},
-        **{name: getattr(run, name)[kept] for name in ("offsets", "saturated")},
-        leaders=tuple(np.flatnonzero(np.isin(kept, run.leaders)).tolist()),
-        nearest=np.zeros(len(kept), int),
-        edges=np.searchsorted(kept, run.edges[there]),
-        weights=run.weights[there],
-        heard=run.heard[there],
+        **{name: getattr(run, name)[:, agents] for name in ("states", "inputs", "errors")},
+        **{name: getattr(run, name)[agents] for name in ("offsets", "saturated")},
+        leaders=tuple(np.flatnonzero(np.isin(agents, run.leaders)).tolist()),
+        nearest=np.zeros(len(agents), int),
+        edges=np.searchsorted(agents, run.edges[links]),
+        weights=run.weights[links],
+        heard=run.heard[links],
         schedule=schedule,
     )
 
 
 def _stretches(run: Recording) -> list[tuple[str, Array]]:
-    """Return the weights (E,) of each stretch of time, with when that is."""
+    """Return the weights (E,) of each graph of a schedule, with its time span."""
     if run.schedule is None:
         return [("", run.weights)]
     spans = list(run.schedule.spans())[:_STRETCHES]
     if len(run.schedule.starts) > _STRETCHES:
-        spans[-1] += f", of {len(run.schedule.starts)} stretches"
+        spans[-1] += f", of {len(run.schedule.starts)} intervals"
     return list(zip(spans, run.schedule.weights, strict=False))
 
 
@@ -185,7 +184,7 @@ def _dot(run: Recording, columns: int) -> float:
 
 
 def _agents_and_links(
-    ax: Any, run: Recording, places: Array, lines: list[Array], weights: Array, columns: int
+    ax: "Axes", run: Recording, places: Array, lines: list[Array], weights: Array, columns: int
 ) -> None:
     small = _dot(run, columns) / 12.0
     _links(ax, run, places, lines, weights, small)
@@ -195,11 +194,11 @@ def _agents_and_links(
         draw.plot(ax, places[agent][None], **look)
     for agent in range(run.agents if run.agents <= _NUMBERED else 0):
         text = {"color": "white", "size": 7.0 * small**0.5, "zorder": 5}
-        ax.annotate(str(agent), places[agent], ha="center", va="center", **text)
+        ax.annotate(str(agent), tuple(places[agent]), ha="center", va="center", **text)
 
 
 def _places(run: Recording) -> tuple[Array, tuple[str, ...]]:
-    """Return where agents are drawn (N, 2), with the axes' texts where these are places."""
+    """Return the places of agents (N, 2), and the labels of the axes if these are offsets."""
     offsets = run.offsets[:, list(run.position)]
     spread = np.ptp(offsets, axis=0) if run.position else np.zeros(0)
     axes = np.argsort(-spread, kind="stable")[:2]
@@ -213,16 +212,16 @@ def _places(run: Recording) -> tuple[Array, tuple[str, ...]]:
 
 
 _BENDS = tuple(side * height for height in (0.16, 0.24, 0.1, 0.34) for side in (1.0, -1.0))
-"""How far a link may bend aside, in its lengths; those that look best first."""
+"""Sideways bends of a link, relative to its length, best first."""
 _ALONG = np.linspace(0.0, 1.0, 25)[:, None]
 
 
 def curves_of(places: Array, edges: Array, least: float) -> list[Array]:
-    """Return the line (K, 2) of each edge: straight, or bent where it would hide behind an agent.
+    """Return the line (K, 2) of each edge: straight, or bent around other agents.
 
-    A straight one passes no third of the places (N, 2) nearer than `least`; of a link that has to
-    bend it is the first bend that does so, or where none does the one that keeps the farthest off.
-    Of more agents than have numbers all are straight.
+    A line keeps a distance of `least` from all other places (N, 2): a straight one if possible,
+    then the first bend that does, or else the bend with the largest distance. With more agents than
+    have numbers all lines are straight.
     """
     straight = list(places[edges])
     if len(places) > _NUMBERED:
@@ -234,7 +233,7 @@ def curves_of(places: Array, edges: Array, least: float) -> list[Array]:
 
 
 def _bend(places: Array, edge: Array, least: float) -> Array:
-    # Links that begin at agents beside each other go to different sides.
+    # Links of adjacent agents bend to different sides.
     bends = [bend * (-1.0) ** int(edge.min()) for bend in _BENDS]
     lines = [_arc(places[edge[0]], places[edge[1]], bend) for bend in bends]
     gaps = [_gap(places, edge, line) for line in lines]
@@ -243,14 +242,14 @@ def _bend(places: Array, edge: Array, least: float) -> Array:
 
 
 def _arc(first: Array, second: Array, bend: float) -> Array:
-    """Return a parabola (K, 2) between two places, `bend` of their distance aside in its middle."""
+    """Return a parabola (K, 2) between two places; `bend` is its height relative to the length."""
     way = second - first
     aside = 4.0 * bend * _ALONG * (1.0 - _ALONG)
     return first + _ALONG * way + aside * np.array([-way[1], way[0]])
 
 
 def _gap(places: Array, edge: Array, line: Array) -> float:
-    """Return how near a line (K, 2) comes to a place (N, 2) of no end of its edge."""
+    """Return the distance of a line (K, 2) from all places (N, 2) but the ends of its edge."""
     others = np.delete(places, edge, axis=0)[:, None]
     if not len(others):
         return np.inf
@@ -261,20 +260,20 @@ def _gap(places: Array, edge: Array, line: Array) -> float:
 
 
 def _links(
-    ax: Any, run: Recording, places: Array, curves: list[Array], weights: Array, small: float
+    ax: "Axes", run: Recording, places: Array, curves: list[Array], weights: Array, small: float
 ) -> None:
-    """Draw the edges, thicker where they weigh more."""
+    """Draw the edges, with widths by their weights."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     wide = np.clip(1.6 * np.sqrt(weights / run.weights.max()), 0.3, 1.6) * small
-    there, unheard = weights > 0.0, ~run.heard.any(axis=1)
-    for kept, dash in ((there & ~unheard, "-"), (there & unheard, (0, (1.0, 2.0)))):
-        lines = [curves[k] for k in np.flatnonzero(kept)]
-        look = {"linewidths": wide[kept], "colors": "0.55", "linestyles": [dash], "zorder": 1}
+    present, inactive = weights > 0.0, ~run.heard.any(axis=1)
+    for mask, dash in ((present & ~inactive, "-"), (present & inactive, (0, (1.0, 2.0)))):
+        lines = [curves[k] for k in np.flatnonzero(mask)]
+        look = {"linewidths": wide[mask], "colors": "0.55", "linestyles": [dash], "zorder": 1}
         ax.add_collection(LineCollection(lines, **look))
     one = run.heard.sum(axis=1) == 1
-    arrows, pens = run.arrows[there[one]], wide[one & there]
-    ways = [curves[k] for k in np.flatnonzero(one & there)]
+    arrows, pens = run.arrows[present[one]], wide[one & present]
+    ways = [curves[k] for k in np.flatnonzero(one & present)]
     if run.agents > _NUMBERED:
         tall = 0.4 * float(np.sqrt(np.ptp(places, axis=0).prod() / run.agents))
         heads = PolyCollection(_heads(places[arrows], tall), facecolors="0.35", zorder=2)
@@ -283,22 +282,22 @@ def _links(
     for (first, second), line, way in zip(arrows, pens, ways, strict=True):
         arrow = {"arrowstyle": "-|>", "color": "0.35", "linewidth": line, "shrinkB": 8.0 * small}
         arrow["connectionstyle"] = f"arc3,rad={_bulge(places[first], places[second], way)}"
-        ax.annotate("", places[second], places[first], arrowprops=arrow, zorder=2)
+        ax.annotate("", tuple(places[second]), tuple(places[first]), arrowprops=arrow, zorder=2)
 
 
 def _bulge(first: Array, second: Array, line: Array) -> float:
-    """Return how far right of its way an arrow's middle handle stands, in lengths of the way."""
+    """Return the `rad` of matplotlib's arc3 for a bent line: its handle's offset by its length."""
     way, aside = second - first, line.mean(axis=0) - 0.5 * (first + second)
     whole = float(way @ way)
     if len(line) == 2 or whole <= 0.0:
         return 0.0
-    # Samples of 4 s (1 - s) have this mean, and the handle stands twice as far as the middle.
+    # Samples of 4 s (1 - s) have this mean, and the handle is twice as far off as the middle.
     mean = float((4.0 * _ALONG * (1.0 - _ALONG)).mean())
     return 2.0 * float(aside @ [way[1], -way[0]]) / (mean * whole)
 
 
 def _heads(ends: Array, tall: float) -> list[Array]:
-    """Return triangles on the way between ends (K, 2, 2), a little nearer to the second."""
+    """Return triangles between ends (K, 2, 2), closer to the second."""
     way = ends[:, 1] - ends[:, 0]
     whole = np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
     aside = np.stack([-way[:, 1], way[:, 0]], axis=1) / whole
@@ -308,10 +307,11 @@ def _heads(ends: Array, tall: float) -> list[Array]:
     return list(np.stack([tip, back + out, back - out], axis=1))
 
 
-def _finish_network(ax: Any, places: Array, units: tuple[str, ...]) -> None:
+def _finish_network(ax: "Axes", places: Array, units: tuple[str, ...]) -> None:
     low, high = places.min(axis=0), places.max(axis=0)
-    room = 0.08 * float((high - low).max()) or 1.0
-    ax.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
+    margin = 0.08 * float((high - low).max()) or 1.0
+    low, high = low - margin, high + margin
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_aspect("equal")
     if units:
         ax.set(xlabel=units[0], ylabel=units[1])

@@ -30,35 +30,36 @@ _MAKERS: "dict[str, Callable[[Recording], Figure | None]]" = {
 }
 NAMES = tuple(_MAKERS)
 """All figures of a run."""
-USUAL = ("leader_3d", "trajectories", "tracking", "formation", "inputs", "lyapunov")
-"""Those that a run leaves in its folder."""
+DEFAULT = ("leader_3d", "trajectories", "tracking", "formation", "inputs", "lyapunov")
+"""Figures that a run writes into its folder."""
 
 
 def figures(
-    run: Result | Recording, what: Sequence[str] = USUAL, page: draw.FigureSize = draw.SCREEN
+    run: Result | Recording, what: Sequence[str] = DEFAULT, page: draw.FigureSize = draw.SCREEN
 ) -> "dict[str, Figure]":
-    """Return the figures that make sense for a run, by name.
+    """Return figures of a run, by name; those that do not apply to it are missing.
 
-    `leader_3d` is the leaders with their references: in space or in the plane where the model has a
-    position, else in the phase plane or over time. `trajectories` are all agents, with the graph
-    drawn at a few times, and `top_view` the same from above. `tracking` is each output of the
-    leaders minus the reference's, and exists with a reference. `formation` is each follower's
-    distance from its goal, with gaps where it is 0, and with the slope and the bound that are
-    promised. `inputs` are what actuators give, with their limits. `states` are all of them over
-    time. `distances` are those of linked agents and the least of any two. `lyapunov` is V with its
-    derivative, and exists where the law has one. `modes` are the poles of the loop, and `network`
-    who hears whom.
+    - `leader_3d`: the leaders with their references, in space, in the plane, or over time
+    - `trajectories`: all agents, with the graph at a few times; `top_view`: the same from above
+    - `tracking`: each output of the leaders minus its reference
+    - `formation`: each follower's distance from its goal, with the guaranteed slope and bound
+    - `inputs`: actuator loads with their limits
+    - `states`: all states over time
+    - `distances`: those of linked agents, and the smallest of any two
+    - `lyapunov`: V with its derivative
+    - `modes`: the closed-loop poles
+    - `network`: the communication graph
 
-    A run without a stored frame has no figures. Where agents run a million times farther off
-    than their start and the reference reach, that is left out, and the figure says so.
+    A run without a stored frame has no figures. Parts of a diverging run a million times beyond its
+    start and reference are not drawn, and the figure says so.
 
     Args:
         run: a result, or a recording of one.
         what: names of figures.
-        page: where they will stand: `echelon.output.plots.style.ONE_COLUMN`, for one.
+        page: size of the figures, such as `echelon.output.plots.style.ONE_COLUMN`.
 
     Raises:
-        OutputError: there is no figure of a name.
+        OutputError: a name is unknown.
     """
     for name in what:
         if name not in _MAKERS:
@@ -68,24 +69,24 @@ def figures(
             )
     if not len(run.times):
         return {}
-    shown = recording_of(run) if isinstance(run, Result) else run
+    data = recording_of(run) if isinstance(run, Result) else run
     with draw.style(page):
-        made = {name: make(shown) for name, make in _MAKERS.items() if name in what}
-    return {name: figure for name, figure in made.items() if figure is not None}
+        drawings = {name: make(data) for name, make in _MAKERS.items() if name in what}
+    return {name: figure for name, figure in drawings.items() if figure is not None}
 
 
 def save_figures(
-    run: Result | Recording, folder: str | Path, what: Sequence[str] = USUAL
+    run: Result | Recording, folder: str | Path, what: Sequence[str] = DEFAULT
 ) -> list[Path]:
     """Write figures of a run as PNG (150 dpi) and PDF under `folder`/figures; return the paths.
 
     Args:
         run: a result, or a recording of one.
-        folder: where `figures` is made, unless it is there.
+        folder: that gets a folder `figures`.
         what: names of figures, as `figures` has them.
 
     Raises:
         OSError: the folder or a file cannot be written.
-        OutputError: there is no figure of a name.
+        OutputError: a name is unknown.
     """
     return save(figures(run, what), Path(folder) / "figures")

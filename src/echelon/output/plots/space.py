@@ -1,4 +1,4 @@
-"""Where agents are drawn, and as what: in space, from above, in a phase plane, or over time."""
+"""The axes and bodies with which agents are drawn: space, plane, phase plane or time."""
 
 from typing import NamedTuple
 
@@ -8,23 +8,23 @@ from echelon.core.types import Array
 from echelon.experiments.results.recording import Recording
 
 _FAR = 10.0
-"""Times the reach of leaders and goals, beyond which places are drawn at its border."""
+"""Places beyond this multiple of the extent of leaders and goals are drawn at its border."""
 _MARGIN = 0.06
 _ROLL, _PITCH, _TURN = ("roll", "phi"), ("pitch", "theta"), ("yaw", "psi", "heading", "theta")
 
 
 class Space(NamedTuple):
-    """What a picture's axes are.
+    """The axes of a picture.
 
     Attributes:
         kind: `space`, `plane`, `phase` (two states that are no position) or `time`.
-        axes: indices of the states that are drawn.
+        axes: indices of the states on them.
         names, units: of the axes as drawn, time before the state in `time`.
-        stretch: what the two axes of a picture are multiplied by, so that it is no sliver.
-        angles: indices of roll, pitch and yaw, or of the one angle of the plane; none of a point.
-        sign: of that angle, against the turn from the first axis to the second.
-        low, high: (3,) the box that holds all places and goals, stretched.
-        clipped: whether some places lie beyond what is drawn.
+        stretch: factors on the first two axes that give a picture of three to two.
+        angles: indices of roll, pitch and yaw, or of the angle in the plane; empty of a point.
+        sign: of that angle relative to the rotation from the first axis to the second.
+        low, high: (3,) corners of the box around all places and goals, stretched.
+        clipped: whether some places lie beyond the border.
     """
 
     kind: str
@@ -49,7 +49,7 @@ class Space(NamedTuple):
 
 
 def space_of(run: Recording) -> Space:
-    """Return where the agents of a run are drawn."""
+    """Return the space for the agents of a run."""
     axes, kind = _axes(run)
     names = tuple(run.state_names[k] for k in axes)
     units = tuple(run.state_units[k] for k in axes)
@@ -76,75 +76,77 @@ def _axes(run: Recording) -> tuple[tuple[int, ...], str]:
 
 
 def _angles(run: Recording, kind: str, names: tuple[str, ...]) -> tuple[tuple[int, ...], float]:
-    """Return the angles that turn a body, by the names that the field gives them."""
+    """Return the indices of the angles of a body, by their usual names, and their sign."""
 
-    def found(*groups: tuple[str, ...]) -> tuple[int, ...]:
-        known = run.state_names
-        each = (next((known.index(n) for n in group if n in known), None) for group in groups)
-        return tuple(k for k in each if k is not None)
+    def indices(*groups: tuple[str, ...]) -> tuple[int, ...]:
+        states = run.state_names
+        first = (next((states.index(n) for n in group if n in states), None) for group in groups)
+        return tuple(k for k in first if k is not None)
 
     if kind == "space":
-        three = found(_ROLL, _PITCH, _TURN[:2])
+        three = indices(_ROLL, _PITCH, _TURN[:2])
         return (three if len(three) == 3 else ()), 1.0
     if kind != "plane":
         return (), 1.0
     if names[1] != "z":
-        return found(_TURN)[:1], 1.0
-    # Seen along the axis that is not drawn: about x from y to z, but about y from z to x.
-    return (found(_ROLL), 1.0) if names[0] == "y" else (found(_PITCH), -1.0)
+        return indices(_TURN)[:1], 1.0
+    # A rotation about x goes from y to z, but one about y from z to x.
+    return (indices(_ROLL), 1.0) if names[0] == "y" else (indices(_PITCH), -1.0)
 
 
 def clipped_places(run: Recording, axes: tuple[int, ...]) -> tuple[Array, bool]:
-    """Return the places (T, N, k), none farther off than ten times what leaders and goals reach."""
+    """Return places (T, N, k) within ten times the extent of leaders and goals."""
     places, columns = run.states[:, :, list(axes)], list(axes)
     goals = places - run.errors[:, :, columns]
-    led = goals[:, list(run.leaders)].reshape(-1, len(axes))
-    known = np.concatenate([led, goals[0], places[0]])
-    low, high = known.min(axis=0), known.max(axis=0)
+    leaders = goals[:, list(run.leaders)].reshape(-1, len(axes))
+    points = np.concatenate([leaders, goals[0], places[0]])
+    low, high = points.min(axis=0), points.max(axis=0)
     reach = max(1.0, float((high - low).max()))
-    held = np.clip(places, low - _FAR * reach, high + _FAR * reach)
-    return held, bool((held != places).any())
+    clipped = np.clip(places, low - _FAR * reach, high + _FAR * reach)
+    return clipped, bool((clipped != places).any())
 
 
 def _box(run: Recording, kind: str, axes: tuple[int, ...], places: Array) -> tuple[Array, Array]:
-    """Return the box of goals and starts as drawn, with what lies a little farther off."""
+    """Return the corners of the box around goals and starts, with a margin."""
     low, high = np.zeros(3), np.zeros(3)
-    shown = slice(1, 2) if kind == "time" else slice(0, len(axes))
-    low[shown], high[shown] = _reached(run, axes, places)
+    drawn = slice(1, 2) if kind == "time" else slice(0, len(axes))
+    low[drawn], high[drawn] = _extent(run, axes, places)
     if kind == "time":
         low[0], high[0] = 0.0, max(run.times[-1], 1e-9)
     reach = float((high - low)[: 3 if kind == "space" else 2].max()) or 1.0
     if kind in ("space", "plane"):
-        low[shown], high[shown] = low[shown] - _MARGIN * reach, high[shown] + _MARGIN * reach
+        low[drawn], high[drawn] = low[drawn] - _MARGIN * reach, high[drawn] + _MARGIN * reach
     if kind == "space" and low[2] > 0.0 and low[2] < reach:
-        # What flies above the ground is shown above it.
+        # The box of vehicles above the ground begins at the ground.
         low[2] = 0.0
-    # A line or a plane still needs a box that can be looked at.
+    # A line or a plane needs a box of some thickness too.
     thin = (high - low) < 0.1 * reach
     thin[2] &= kind == "space"
     middle = 0.5 * (low + high)
     return np.where(thin, middle - 0.05 * reach, low), np.where(thin, middle + 0.05 * reach, high)
 
 
-def _reached(run: Recording, axes: tuple[int, ...], places: Array) -> tuple[Array, Array]:
-    """Return the ends of all places, but of a formation that flies apart those of goals."""
+def _extent(run: Recording, axes: tuple[int, ...], places: Array) -> tuple[Array, Array]:
+    """Return the corners of all places, limited to the goals of a formation that diverges."""
     goals = places[0] - run.errors[0][:, list(axes)]
-    led = places[:, list(run.leaders)]
-    known = np.concatenate([led.reshape(-1, len(axes)), goals, places[0]])
-    # Where the leaders carry the goals in the end.
-    moved = led[:, 0] - led[0, 0]
-    known = np.concatenate([known, goals + moved.min(axis=0), goals + moved.max(axis=0)])
-    low, high = known.min(axis=0), known.max(axis=0)
-    room = 0.15 * float((high - low).max()) or 1.0
-    every = places.reshape(-1, len(axes))
+    leaders = places[:, list(run.leaders)]
+    # Goals move with the leaders.
+    motion = leaders[:, 0] - leaders[0, 0]
+    points = np.concatenate(
+        [leaders.reshape(-1, len(axes)), goals, places[0]]
+        + [goals + motion.min(axis=0), goals + motion.max(axis=0)]
+    )
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.15 * float((high - low).max()) or 1.0
+    everything = places.reshape(-1, len(axes))
     return (
-        np.maximum(np.minimum(low, every.min(axis=0)), low - room),
-        np.minimum(np.maximum(high, every.max(axis=0)), high + room),
+        np.maximum(np.minimum(low, everything.min(axis=0)), low - margin),
+        np.minimum(np.maximum(high, everything.max(axis=0)), high + margin),
     )
 
 
 def body_width(run: Recording, space: Space) -> float:
-    """Return how wide bodies are drawn: a part of how far apart goals are, so that all are seen."""
+    """Return the width of drawn bodies, a fraction of the distance between goals."""
     from scipy.spatial import KDTree
 
     reach = float((space.high - space.low)[: 3 if space.kind == "space" else 2].max())

@@ -1,37 +1,42 @@
-"""How figures look, and the canvases and lines that they share: no pyplot, so no shared state."""
+"""The style of figures, and their canvases, axes and lines; without pyplot and its state."""
 
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
 from echelon.core.types import Array
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette, which colour-blind readers can distinguish; its black is the leader's,
-# and its yellow is too pale for a line on white.
+# Okabe and Ito's palette, which colour-blind readers can distinguish; without black, which is the
+# leader's, and yellow, which is too pale on white.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LEADER, REFERENCE, EDGE = "black", "0.7", "0.3"
 
 FLOOR = 1e-17
-"""Below the rounding of a metre in float64."""
+"""Below the rounding error of a metre in float64."""
 
 NAMED = 10
-"""With more agents than this, followers look alike and the legend names none of them."""
+"""With more agents than this, followers have one colour, and no name in the legend."""
 
-_TOP = 1e9  # A logarithmic axis that reached further would flatten what is of interest.
+_TOP = 1e9  # of a logarithmic axis; above it the interesting part would be flat
 _HIGHEST = 9.0  # inches: a page of a journal, less a caption
-_POINTS = 2000  # a line's, more than the pixels that it covers
+_POINTS = 2000  # of a line, more than the pixels that it covers
 _ALL_POINTS = 200_000  # of all lines of one figure
 
 
+Style: TypeAlias = dict[str, Any]
+"""Keywords of matplotlib."""
+
+
 class FigureSize(NamedTuple):
-    """Where a figure will stand: its width, what a space may fill of it (in), its letters (pt)."""
+    """The width of a figure and of a space in it (inches), and its font size (pt)."""
 
     width: float
     side: float
@@ -45,7 +50,7 @@ class FigureSize(NamedTuple):
 
 SCREEN = FigureSize(7.0, 4.3, 10.0)
 ONE_COLUMN, TWO_COLUMNS = FigureSize(3.5, 2.6, 8.0), FigureSize(7.16, 4.4, 8.0)
-"""Of a page of a journal."""
+"""Widths of a journal page."""
 
 _page: ContextVar[FigureSize] = ContextVar("page", default=SCREEN)
 _STYLE: dict[Any, Any] = {
@@ -63,22 +68,21 @@ _STYLE: dict[Any, Any] = {
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
     "pdf.fonttype": 42,  # Journals refuse fonts of type 3.
-    "svg.fonttype": "none",  # so that text can be searched, and takes the page's own font
-    "svg.hashsalt": "echelon",  # without it no two files are alike
+    "svg.fonttype": "none",  # so that text can be searched and takes the font of a page
+    "svg.hashsalt": "echelon",  # so that the same figure gives the same file
     "savefig.dpi": 150,
 }
 
 
 @contextmanager
 def style(page: FigureSize = SCREEN) -> Iterator[None]:
-    """Draw in echelon's style for a page, and put matplotlib's settings back."""
+    """Use echelon's style for a page, and restore matplotlib's settings."""
     import matplotlib
 
     large, small = ("font.size", "axes.labelsize"), ("xtick", "ytick")
-    letters: dict[Any, Any] = dict.fromkeys(large, page.letters) | {
-        "legend.fontsize": page.letters - 1.0
-    }
+    letters: dict[Any, Any] = dict.fromkeys(large, page.letters)
     letters |= {f"{axis}.labelsize": page.letters - 1.0 for axis in small}
+    letters["legend.fontsize"] = page.letters - 1.0
     token = _page.set(page)
     try:
         with matplotlib.rc_context(_STYLE | letters), np.errstate(over="ignore", invalid="ignore"):
@@ -88,7 +92,7 @@ def style(page: FigureSize = SCREEN) -> Iterator[None]:
 
 
 def page() -> FigureSize:
-    """Return the page that is drawn for."""
+    """Return the present page."""
     return _page.get()
 
 
@@ -96,23 +100,23 @@ def page() -> FigureSize:
 
 
 def crowding(agents: int) -> float:
-    """Return one for as many agents as a legend can name, and less for more."""
+    """Return 1 for as many agents as a legend can name, and less for more."""
     return min(1.0, NAMED / agents)
 
 
-# Of leaders, who share their colour, and of followers past the palette.
+# For leaders, who share a colour, and for followers beyond the palette.
 _DASHES = ("-", (0, (5.0, 1.5)), (0, (1.2, 1.2)), (0, (5.0, 1.5, 1.2, 1.5)))
 
 
-def leader_pen(place: int, agents: int) -> dict[str, Any]:
-    """Return the look of the line of a leader of some place among the leaders."""
+def leader_pen(place: int, agents: int) -> Style:
+    """Return the line style of a leader, by its place among the leaders."""
     order = 2.5 if crowding(agents) == 1.0 else 5.0
     dash = _DASHES[place % len(_DASHES)]
     return {"color": LEADER, "linewidth": 1.4, "zorder": order, "linestyle": dash}
 
 
-def pen(place: int, agents: int) -> dict[str, Any]:
-    """Return the look of the line of a follower of some place among the followers."""
+def pen(place: int, agents: int) -> Style:
+    """Return the line style of a follower, by its place among the followers."""
     if (crowd := crowding(agents)) < 1.0:
         look = {"linewidth": 1.1 * crowd**0.22, "alpha": crowd**0.35, "rasterized": agents > 100}
         return {"color": COLOURS[0]} | look
@@ -120,8 +124,8 @@ def pen(place: int, agents: int) -> dict[str, Any]:
     return {"color": COLOURS[hue], "linestyle": _DASHES[again % len(_DASHES)]}
 
 
-def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> dict[str, Any]:
-    """Return the look of points without a line."""
+def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> Style:
+    """Return the style of markers without a line."""
     return {
         "linestyle": "none",
         "marker": shape,
@@ -129,35 +133,35 @@ def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> di
         "markersize": size,
         "markerfacecolor": "white" if hollow else colour,
         "markeredgewidth": 0.2 * size,
-        # Above the lines, whose ends they mark.
+        # Above the lines whose ends they mark.
         "zorder": 4,
     }
 
 
-def plot(ax: Any, *columns: Array, **look: Any) -> None:
+def plot(ax: "Axes", *columns: Array, **look: Any) -> None:
     """Draw a line through points, given as arrays (T, k) of coordinates; one point as a dot."""
     points = np.column_stack(columns)
     if len(points) == 1 and "marker" not in look:
         look |= {"marker": "o", "markersize": 4.0}
-    # The box of a space leans out of its axes.
+    # The box of a space extends beyond its axes.
     ax.plot(*points.T, clip_on=ax.name != "3d", **look)
 
 
 def thin(frames: int, lines: int = 1) -> Array:
-    """Return the frames to draw: all of them, or evenly spread ones with the first and the last."""
-    # A swarm shares the points of a figure, but a line of fewer than 100 would show corners.
+    """Return the frames to draw: all, or evenly spread ones with the first and the last."""
+    # All lines share the points of a figure; a line of fewer than 100 would show corners.
     count = int(np.clip(_ALL_POINTS // max(lines, 1), 100, _POINTS))
     return np.unique(np.linspace(0, frames - 1, min(frames, count)).round().astype(int))
 
 
 def drop_runaways(values: Array, *anchors: Array) -> tuple[Array, bool]:
-    """Return values (..., k) with NaN where they have run away, and whether any has.
+    """Return values (..., k) with NaN where they diverge, and whether any does.
 
-    Some have when they are a million times farther off than the anchors (..., k) reach; what is
-    within ten times stays.
+    Values diverge if some are a million times farther away than the extent of the anchors (..., k);
+    those within ten times that extent are kept.
     """
-    known = np.concatenate([anchor.reshape(-1, values.shape[-1]) for anchor in anchors])
-    low, high = known.min(axis=0), known.max(axis=0)
+    points = np.concatenate([anchor.reshape(-1, values.shape[-1]) for anchor in anchors])
+    low, high = points.min(axis=0), points.max(axis=0)
     # Halved before they are added: a sum of two huge numbers may overflow.
     middle, reach = 0.5 * low + 0.5 * high, max(1.0, (0.5 * high - 0.5 * low).max())
     away = np.abs(values - middle).max(axis=-1)
@@ -170,29 +174,29 @@ def drop_runaways(values: Array, *anchors: Array) -> tuple[Array, bool]:
 
 
 def label(name: str, unit: str) -> str:
-    """Return the text of an axis: the name, with the unit where there is one."""
+    """Return the label of an axis: the name, with the unit if there is one."""
     name = name.replace("_", " ")
     return f"{name} ({raised(unit)})" if unit else name
 
 
 def raised(unit: str) -> str:
-    """Return a unit with its powers as print has them, m/s\u00b2 for m/s^2."""
+    """Return a unit with raised powers, m/s\u00b2 for m/s^2."""
     return unit.replace("^2", "\u00b2").replace("^3", "\u00b3")
 
 
 def panels(
     times: Array, horizon: float, count: int, height: float, columns: int = 1
-) -> "tuple[Figure, list[Any]]":
-    """Return panels row by row that share the axis of time, `height` inches each where they fit."""
+) -> "tuple[Figure, list[Axes]]":
+    """Return panels row by row with a common time axis, `height` inches each if they fit."""
     from matplotlib.figure import Figure
 
     rows = -(-count // columns)
-    # Smaller letters need less height too.
+    # Smaller letters need less height.
     height *= page().letters / 10.0 if page().narrow else 1.0
     tall = float(np.clip(height * rows, 2.3 if page().narrow else 3.2, _HIGHEST))
     figure = Figure((page().width, tall), layout="constrained")
     axes = list(figure.subplots(rows, columns, sharex=True, squeeze=False).ravel())
-    # A lone frame stands on no axis, where half of its dots would be cut off.
+    # A margin for a single frame, whose dot the axis would cut in half.
     axes[0].set_xlim((0.0, times[-1]) if len(times) > 1 else (-0.02 * horizon, horizon))
     for ax in axes[count:]:
         ax.remove()
@@ -202,8 +206,8 @@ def panels(
     return figure, axes[:count]
 
 
-def grid(rows: int, columns: int, height: float) -> "tuple[Figure, list[list[Any]]]":
-    """Return panels in rows that share their values and columns that share their times."""
+def grid(rows: int, columns: int, height: float) -> "tuple[Figure, list[list[Axes]]]":
+    """Return panels with a common value axis per row and a common time axis per column."""
     from matplotlib.figure import Figure
 
     height *= page().letters / 10.0 if page().narrow else 1.0
@@ -212,8 +216,8 @@ def grid(rows: int, columns: int, height: float) -> "tuple[Figure, list[list[Any
     return figure, [list(row) for row in axes]
 
 
-def canvas(labels: Sequence[str]) -> "tuple[Figure, Any]":
-    """Return one set of axes in the plane or in space, for two or three labels."""
+def canvas(labels: Sequence[str]) -> "tuple[Figure, Axes]":
+    """Return axes in the plane or in space, for two or three labels."""
     from matplotlib.figure import Figure
 
     if len(labels) == 2:
@@ -231,13 +235,13 @@ def canvas(labels: Sequence[str]) -> "tuple[Figure, Any]":
     return figure, ax
 
 
-def frame(ax: Any, points: Array, alike: bool = True) -> None:
-    """Fit axes around points (..., 2 or 3), where `alike` with one scale for all directions."""
+def frame(ax: "Axes", points: Array, alike: bool = True) -> None:
+    """Fit axes around points (..., 2 or 3), with one scale for all directions if `alike`."""
     points = points.reshape(-1, points.shape[-1])
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
     size = high - low
-    # A flat path still needs a box with some height; a lone point one of any size.
+    # A flat path needs a box of some height, a single point one of any size.
     least = np.full_like(size, 0.25 * size.max()) if alike else 0.05 * np.abs(high)
     half = 0.54 * np.maximum(size, np.where(least > 0.0, least, 1.0))
     for name, middle, reach in zip("xyz", 0.5 * low + 0.5 * high, half, strict=False):
@@ -246,32 +250,32 @@ def frame(ax: Any, points: Array, alike: bool = True) -> None:
         _fit_box(ax, half)
     elif alike:
         ax.set_aspect("equal")
-        wide = page().width / 1.4
-        ax.figure.set_figheight(np.clip(0.7 + wide * half[1] / half[0], 2.0, 1.04 * wide))
+        wide, figure = page().width / 1.4, cast("Figure", ax.figure)
+        figure.set_figheight(np.clip(0.7 + wide * half[1] / half[0], 2.0, 1.04 * wide))
 
 
 def _fit_box(ax: Any, half: Array) -> None:
-    """Let the box of a space fill the width or the height, and the figure be no higher than it."""
+    """Scale the box of a space to the width or height of the figure, and fit the figure to it."""
     width, side = page().width, page().side
-    room, left = np.array([side, side]), 0.07 * width
+    available, left = np.array([side, side]), 0.07 * width
     ax.set_position((0.0, 0.0, side / width, side / width))
     ax.set_box_aspect(half / half.max())
     zoom = 1.0
-    # Perspective makes the size not quite proportional to the zoom, so it is corrected once more.
+    # Under perspective the size is not quite proportional to the zoom, so it is corrected once.
     for _ in range(2):
         low, high = _box_on_paper(ax)
-        zoom *= (room / (high - low)).min()
+        zoom *= (available / (high - low)).min()
         ax.set_box_aspect(half / half.max(), zoom=zoom)
     low, high = _box_on_paper(ax)
     height = high[1] - low[1] + 0.75
-    corner = np.array([left + 0.5 * (room[0] - high[0] + low[0]), 0.45]) - low
+    corner = np.array([left + 0.5 * (available[0] - high[0] + low[0]), 0.45]) - low
     ax.figure.set_figheight(height)
     ax.set_position((corner[0] / width, corner[1] / height, side / width, side / height))
     _label_box(ax, half)
 
 
 def _label_box(ax: Any, half: Array) -> None:
-    """Choose the ticks of a box, and set their labels and the axes' off by the same on any box."""
+    """Choose the ticks of a box, with the same distance of labels for any box."""
     from matplotlib.ticker import MaxNLocator
 
     for k, name in enumerate("xyz"):
@@ -284,7 +288,7 @@ def _label_box(ax: Any, half: Array) -> None:
 
 
 def _box_on_paper(ax: Any) -> tuple[Array, Array]:
-    """Return the lower left and upper right of a space's box, in inches from the axes' corner."""
+    """Return the lower left and upper right corners of a space's box, in inches."""
     ax.apply_aspect()
     corners = list(itertools.product(ax.get_xlim(), ax.get_ylim(), ax.get_zlim(), [1.0]))
     x, y, _, scale = ax.get_proj() @ np.array(corners).T
@@ -294,21 +298,18 @@ def _box_on_paper(ax: Any) -> tuple[Array, Array]:
 
 
 def above_zero(values: Array) -> Array:
-    """Return values with gaps where they are 0, as of agents that agree to the bit.
-
-    A logarithm cannot show a 0, and a number in its place would stretch the axis to nothing.
-    """
+    """Return values with NaN where they are 0, which a logarithmic axis cannot show."""
     return np.where(values > 0.0, values, np.nan)
 
 
 def say_zero(name: str | None, values: Array) -> str | None:
-    """Return the name of a line, which says that there is nothing to see of one that is all 0."""
-    gone = name is not None and len(values) and np.isnan(values).all()
-    return f"{name} (always 0)" if gone else name
+    """Return the name of a line, with a remark if all its values are 0."""
+    empty = name is not None and len(values) and np.isnan(values).all()
+    return f"{name} (always 0)" if empty else name
 
 
-def logarithmic(ax: Any, *values: Array) -> None:
-    """Make the value axis logarithmic, with room for the finite values and a sensible top."""
+def logarithmic(ax: "Axes", *values: Array) -> None:
+    """Make the value axis logarithmic, with limits around the finite values."""
     from matplotlib.ticker import LogLocator, NullLocator
 
     finite = np.concatenate([np.ravel(value) for value in values])
@@ -316,7 +317,7 @@ def logarithmic(ax: Any, *values: Array) -> None:
     ends = np.log10([finite.min(), finite.max()]) if finite.size else np.array([-1.0, 0.0])
     low, high = np.minimum(ends, np.log10(_TOP))
     margin = 0.03 * (high - low)
-    # With less than two powers of ten between them, whole ones carry the labels.
+    # Over less than two decades the limits are whole powers of ten, which have labels.
     low, high = (low - margin, high + margin) if high - low > 2 else (np.floor(low), np.ceil(high))
     ax.set_autoscaley_on(False)
     ax.set(yscale="log", ylim=(10.0**low, 10.0 ** max(high, low + 1.0)))
@@ -325,42 +326,42 @@ def logarithmic(ax: Any, *values: Array) -> None:
 
 
 def finish(figure: "Figure", cut: bool = False, once: bool = False, corner: Any = None) -> "Figure":
-    """Add legends, only the first where `once`, or one at `corner`, and what is left out.
+    """Add legends (only the first if `once`, or one at `corner`) and a note on missing parts.
 
-    The layout is settled here, and not again for each format, which saves time.
+    The layout is computed here, once for all file formats.
     """
     first = figure.axes[:1] if corner is None or page().narrow else [corner]
     for ax in first if once else figure.axes:
         if ax.get_legend_handles_labels()[1]:
             _add_legend(figure, ax)
     if cut:
-        text = "The run grew beyond these axes; what lies farther is not drawn."
+        text = "The run diverged beyond these axes; the rest is not drawn."
         figure.suptitle(text, size=page().letters - 1.0, wrap=True)
     for ax in figure.axes:
-        # By the letters' size ticks are chosen: at that of a later style they would be others.
+        # Ticks are chosen by the font size, which a later style must not change.
         ax.tick_params(labelsize=page().letters - 1.0)
-        _tell_power(ax)
+        _label_power(ax)
     engine: Any = figure.get_layout_engine()
     if engine is not None:
         figure.align_ylabels()
         engine.set(w_pad=0.07, h_pad=0.07)
-        # Axes of equal scales change their shape, and so their labels' places, with each pass.
+        # Axes of equal scales change their shape, and so the places of labels, with each pass.
         for _ in range(1 if figure.axes[0].get_aspect() == "auto" else 4):
             engine.execute(figure)
         figure.set_layout_engine("none")
     return figure
 
 
-def _tell_power(ax: Any) -> None:
-    """Put the power of ten of a value axis into its label, since above it stands the legend."""
+def _label_power(ax: "Axes") -> None:
+    """Put the power of ten of a value axis into its label, since the legend is above the axis."""
     from matplotlib.ticker import ScalarFormatter
 
-    told = ax.yaxis.get_major_formatter()
-    if ax.name == "3d" or not isinstance(told, ScalarFormatter):
+    formatter = ax.yaxis.get_major_formatter()
+    if ax.name == "3d" or not isinstance(formatter, ScalarFormatter):
         return
-    told.set_useOffset(False)
-    told.set_locs(ax.get_yticks())
-    offset = told.get_offset().replace("\u2212", "-")
+    formatter.set_useOffset(False)
+    formatter.set_locs(list(ax.get_yticks()))
+    offset = formatter.get_offset().replace("\u2212", "-")
     if offset:
         ax.yaxis.get_offset_text().set_visible(False)
         name, _, unit = ax.get_ylabel().partition(" (")
@@ -368,28 +369,28 @@ def _tell_power(ax: Any) -> None:
         ax.set_ylabel(f"{name} ({power} {unit}" if unit else f"{name} ({power})")
 
 
-def _add_legend(figure: "Figure", ax: Any) -> None:
-    """Put a legend beside the axes, or above them where a page is narrow."""
+def _add_legend(figure: "Figure", ax: "Axes") -> None:
+    """Add a legend beside the axes, or above them on a narrow page."""
     narrow = page().narrow
     if not narrow and ax.name == "3d":
         figure.legend(loc="upper right", bbox_to_anchor=(0.995, 0.97))
     elif not narrow:
         ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0)
     elif ax.name == "3d":
-        _raise_roof(figure, ax)
+        _legend_above_space(figure, ax)
     else:
         look = {"handlelength": 1.4, "columnspacing": 1.0, "handletextpad": 0.5}
         ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=_columns(ax), **look)
 
 
-def _columns(ax: Any) -> int:
-    """Return how many entries of a legend fit beside each other in one column of a page."""
+def _columns(ax: "Axes") -> int:
+    """Return how many entries of a legend fit side by side in one column of a page."""
     longest = max(len(text) for text in ax.get_legend_handles_labels()[1])
     return max(1, min(4, int(66 / (longest + 6))))
 
 
-def _raise_roof(figure: "Figure", ax: Any) -> None:
-    """Make room above a space for its legend."""
+def _legend_above_space(figure: "Figure", ax: "Axes") -> None:
+    """Add a legend above a space, in a higher figure."""
     columns = _columns(ax)
     rows = -(-len(ax.get_legend_handles_labels()[1]) // columns)
     old, more = figure.get_figheight(), 0.17 * rows

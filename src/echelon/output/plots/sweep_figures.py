@@ -1,7 +1,7 @@
-"""The figures of a sweep: how often runs settle, and what follows from one or two keys."""
+"""Figures of a sweep: distributions of errors, and the share of runs that settle over keys."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from echelon.output.plots.figure_files import save
 
 if TYPE_CHECKING:
     import xarray as xr
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -26,12 +27,12 @@ def sweep_figures(data: "xr.Dataset") -> "dict[str, Figure]":
     """
     keys = [key for key in map(str, data["outcome"].dims) if key != SEED and _is_line(data, key)]
     with draw.style():
-        made = {"errors": _distributions(data)}
+        drawings = {"errors": _distributions(data)}
         if keys:
-            made["success"] = _success(data, keys)
+            drawings["success"] = _success(data, keys)
         if len(keys) > 1:
-            made["region"] = _region(data, keys[0], keys[1])
-    return made
+            drawings["region"] = _region(data, keys[0], keys[1])
+    return drawings
 
 
 def save_sweep_figures(data: "xr.Dataset", folder: Path) -> None:
@@ -44,11 +45,11 @@ def save_sweep_figures(data: "xr.Dataset", folder: Path) -> None:
 
 
 def _is_line(data: "xr.Dataset", key: str) -> bool:
-    """Tell whether a key has several numbers for values."""
+    """Return whether the values of a key are several numbers."""
     return data.sizes[key] > 1 and np.issubdtype(data[key].dtype, np.number)
 
 
-def _canvas(columns: int) -> "tuple[Figure, list[Any]]":
+def _canvas(columns: int) -> "tuple[Figure, list[Axes]]":
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.0, 2.8), layout="constrained")
@@ -66,7 +67,7 @@ def _distributions(data: "xr.Dataset") -> "Figure":
         ax.set_ylim(0.0, 1.02)
         if not values.size:
             continue
-        # Of all runs: those that have no such number are above any.
+        # A share of all runs: those without the number count as above any value.
         share = np.arange(1, len(values) + 1) / data["outcome"].size
         keep = draw.thin(len(values))
         ax.step(values[keep], share[keep], where="post", color=draw.COLOURS[0])
@@ -76,10 +77,10 @@ def _distributions(data: "xr.Dataset") -> "Figure":
 
 
 def _share(data: "xr.Dataset", keys: list[str]) -> "tuple[xr.DataArray, xr.DataArray]":
-    """Return how many runs settled over some keys, and of how many."""
+    """Return the numbers of settled runs and of all runs over some keys."""
     others = [dim for dim in data["outcome"].dims if dim not in keys]
-    there = data["outcome"] != data["outcome"].attrs["flag_values"][0]
-    return succeeded(data).sum(others), there.sum(others)
+    present = data["outcome"] != data["outcome"].attrs["flag_values"][0]
+    return succeeded(data).sum(others), present.sum(others)
 
 
 def _success(data: "xr.Dataset", keys: list[str]) -> "Figure":
@@ -99,22 +100,22 @@ def _success(data: "xr.Dataset", keys: list[str]) -> "Figure":
 
 
 def _region(data: "xr.Dataset", first: str, second: str) -> "Figure":
-    """Return the share of runs that settle as colours over two keys."""
+    """Return the share of settled runs as colours over two keys."""
     settled, runs = (part.sortby([first, second]) for part in _share(data, [first, second]))
     rate = (settled / runs.clip(min=1)).transpose(second, first)
     figure, (ax,) = _canvas(1)
     x, y = rate[first].values, rate[second].values
-    shown = ax.pcolormesh(x, y, rate.values, vmin=0.0, vmax=1.0, cmap="viridis", shading="nearest")
+    mesh = ax.pcolormesh(x, y, rate.values, vmin=0.0, vmax=1.0, cmap="viridis", shading="nearest")
     _scale(ax, "x", x)
     _scale(ax, "y", y)
     ax.grid(False)
     ax.set_xlabel(first)
     ax.set_ylabel(second)
-    figure.colorbar(shown, ax=ax, label="share of runs that settle")
+    figure.colorbar(mesh, ax=ax, label="share of runs that settle")
     return draw.finish(figure)
 
 
-def _scale(ax: Any, which: str, values: Array) -> None:
-    """Choose a logarithmic axis for values that are spread over decades."""
+def _scale(ax: "Axes", which: str, values: Array) -> None:
+    """Choose a logarithmic axis for values over more than a decade."""
     if values.min() > 0.0 and values.max() >= 30.0 * values.min():
         getattr(ax, f"set_{which}scale")("log")

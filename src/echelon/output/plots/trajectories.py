@@ -1,7 +1,7 @@
-"""Where agents go: in space, from above, in a phase plane."""
+"""Figures of paths: in space, from above, in a phase plane."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,11 +13,12 @@ from echelon.output.plots.agent_style import label, name_of, pen_of, reference_o
 from echelon.output.plots.curves import states_over_time
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_SNAPSHOTS = 6  # times at which the graph of a few agents is drawn
-_DENSE = 60  # With more edges than this, so many times would hide each other.
-_EDGES = 5000  # A graph with more edges than this would be a black patch.
+_SNAPSHOTS = 6  # times at which a small graph is drawn
+_DENSE = 60  # edges; of a larger graph so many snapshots would hide each other
+_EDGES = 5000  # a graph with more edges would be a black patch
 
 
 def leader(run: Recording) -> "Figure":
@@ -27,20 +28,19 @@ def leader(run: Recording) -> "Figure":
         return states_over_time(run, leaders)
     keep = draw.thin(len(run.times), 2 * len(leaders))
     paths = run.states[keep][:, leaders][..., axes].swapaxes(0, 1)
-    wanted = [reference_of(run, agent) for agent in leaders]
-    known = [states[keep][:, axes] for states in wanted if states is not None]
-    paths, cut = draw.drop_runaways(paths, paths[:, :1], *known)
+    states = [reference_of(run, agent) for agent in leaders]
+    references = [row[keep][:, axes] for row in states if row is not None]
+    paths, cut = draw.drop_runaways(paths, paths[:, :1], *references)
     figure, ax = _canvas(run, axes)
-    for name, path in zip(["reference", *[None] * len(known)], known):
+    for name, path in zip(["reference", *[None] * len(references)], references):
         draw.plot(ax, path, label=name, **agent_style.REFERENCE)
     for agent, path in zip(leaders, paths, strict=True):
         draw.plot(ax, path, label=name_of(run, agent, short=True), **pen_of(run, agent))
-    for path, named in zip(paths, [True, *[False] * len(leaders)]):
+    for path, first in zip(paths, [True, *[False] * len(leaders)]):
         for name, place, shape in (("start", path[:1], "o"), ("end", path[-1:], "s")):
             look = draw.dots(shape, draw.LEADER, hollow=name == "start")
-            draw.plot(ax, place, label=name if named else None, **look)
-    shown = np.concatenate([*paths, *known])
-    draw.frame(ax, shown, alike=len(run.position) > 1)
+            draw.plot(ax, place, label=name if first else None, **look)
+    draw.frame(ax, np.concatenate([*paths, *references]), alike=len(run.position) > 1)
     return draw.finish(figure, cut)
 
 
@@ -51,51 +51,52 @@ def trajectories(run: Recording) -> "Figure":
 
 
 def top_view(run: Recording) -> "Figure | None":
-    """Return the same from above; None where that is the same picture."""
+    """Return the paths from above; None if `trajectories` shows that."""
     axes = _space(run)
     return _paths(run, axes[:2]) if len(axes) > 2 else None
 
 
 def _paths(run: Recording, axes: list[int]) -> "Figure":
-    shown, wanted = agent_style.drawn(run), reference_of(run, run.leaders[0])
-    paths = run.states[:, shown][:, :, axes]
-    paths, cut = draw.drop_runaways(paths, paths[0], *([] if wanted is None else [wanted[:, axes]]))
+    agents, reference = agent_style.drawn(run), reference_of(run, run.leaders[0])
+    paths = run.states[:, agents][:, :, axes]
+    anchors = [] if reference is None else [reference[:, axes]]
+    paths, cut = draw.drop_runaways(paths, paths[0], *anchors)
     figure, ax = _canvas(run, axes)
-    keep = draw.thin(len(paths), len(shown))
-    for agent, path in zip(shown, paths[keep].swapaxes(0, 1), strict=True):
+    keep = draw.thin(len(paths), len(agents))
+    for agent, path in zip(agents, paths[keep].swapaxes(0, 1), strict=True):
         look = pen_of(run, agent)
         draw.plot(ax, path, label=name_of(run, agent, short=True), **look)
-    _snapshots(ax, run, shown, paths)
+    _snapshots(ax, run, agents, paths)
     draw.frame(ax, paths, alike=bool(run.position))
-    ax.set_title(agent_style.told_of(run, len(shown)), size=draw.page().letters)
+    ax.set_title(agent_style.count_title(run, len(agents)), size=draw.page().letters)
     return draw.finish(figure, cut)
 
 
-def _snapshots(ax: Any, run: Recording, shown: list[int], paths: Array) -> None:
+def _snapshots(ax: "Axes", run: Recording, agents: list[int], paths: Array) -> None:
     """Draw the graph at a few times, agents hollow at the start and square at the end."""
-    crowd, last = len(shown), len(paths) - 1
-    # More snapshots of a swarm would hide each other.
+    crowd, last = len(agents), len(paths) - 1
+    # More snapshots of a large swarm would hide each other.
     count = 2 if crowd > 50 or len(run.edges) > _DENSE else _SNAPSHOTS
     frames = np.unique(np.linspace(0, last, count).round().astype(int))
     if len(run.edges) <= _EDGES and crowd == run.agents:
-        _graph(ax, run, paths[frames][:, np.argsort(shown)], run.times[frames])
+        _graph(ax, run, paths[frames][:, np.argsort(agents)], run.times[frames])
     size = 4.5 * draw.crowding(crowd) ** 0.25
-    for colour, group in _colours(run, shown).items():
+    for colour, group in _colours(run, agents).items():
         places = paths[:, group]
         draw.plot(ax, _flatten(places[frames[1:-1]]), **draw.dots(".", colour, size))
         draw.plot(ax, places[0], **draw.dots("o", colour, size, hollow=True))
         draw.plot(ax, places[-1], **draw.dots("s", colour, size))
-    # The legend explains the shapes once, in a colour that is nobody's.
+    # The legend explains the markers once, in a colour of no agent.
     nowhere = np.full((1, paths.shape[2]), np.nan)
     for name, shape in (("start", "o"), ("end", "s")):
         look = draw.dots(shape, draw.EDGE, 4.5, hollow=name == "start")
         draw.plot(ax, nowhere, label=name, **look)
 
 
-def _graph(ax: Any, run: Recording, places: Array, times: Array) -> None:
+def _graph(ax: "Axes", run: Recording, places: Array, times: Array) -> None:
     """Draw the graph's edges between places (S, N, k) at S times, the later the darker."""
     ends = places[:, run.edges]
-    # NaN lifts the pen, so that all edges of a time are one line and not thousands.
+    # NaN interrupts a line, so that all edges of a time are one line instead of thousands.
     gaps = np.full_like(ends[:, :, :1], np.nan)
     links = np.concatenate([ends, gaps], axis=2)
     links[~np.stack([run.linked(t) for t in times])] = np.nan
@@ -112,21 +113,21 @@ def _flatten(points: Array) -> Array:
     return points.reshape(-1, points.shape[-1])
 
 
-def _colours(run: Recording, shown: list[int]) -> dict[str, list[int]]:
-    """Return the places in a list of the agents of each colour."""
+def _colours(run: Recording, agents: list[int]) -> dict[str, list[int]]:
+    """Return the indices of the agents of each colour."""
     groups: dict[str, list[int]] = {}
-    for place, agent in enumerate(shown):
+    for place, agent in enumerate(agents):
         groups.setdefault(pen_of(run, agent)["color"], []).append(place)
     return groups
 
 
 def _space(run: Recording) -> list[int]:
-    """Return the states that span the picture: the position's, or both of two; else none."""
+    """Return the states on the axes: the position's, or both of two; else none."""
     position = list(run.position[:3])
     if len(position) > 1:
         return position
     return [0, 1] if len(run.state_names) == 2 else []
 
 
-def _canvas(run: Recording, axes: Sequence[int]) -> "tuple[Figure, Any]":
+def _canvas(run: Recording, axes: Sequence[int]) -> "tuple[Figure, Axes]":
     return draw.canvas([label(run, k) for k in axes])

@@ -1,4 +1,4 @@
-"""A run as a video: matplotlib draws what moves onto a background that is kept."""
+"""A run as a video: moving parts drawn by matplotlib on a fixed background, encoded by ffmpeg."""
 
 import contextlib
 import shutil
@@ -20,11 +20,11 @@ from echelon.output.plots.camera import Camera, camera_for
 from echelon.output.plots.space import Space, clipped_places, space_of
 
 if TYPE_CHECKING:
-    pass
+    from matplotlib.axes import Axes
 
 _SIZE: Final = (960, 540)
 _SCENE: Final = 620
-"""Pixels of the width for the scene; the rest is for curves."""
+"""Width of the scene in pixels; the rest is for curves."""
 _RATE: Final = 25.0
 _PAPER, _GRID = "#f7f8fa", "#dde2e8"
 KINDS: Final = (".mp4", ".gif")
@@ -34,13 +34,13 @@ def save_video(run: Recording, file: Path, speed: float = 1.0) -> int:
     """Write a run as MP4 or GIF, by ffmpeg, and return the number of pictures.
 
     Raises:
-        OutputError: the run has no frames, the name ends otherwise, or ffmpeg fails.
+        OutputError: the run has no frames, the name has another ending, or ffmpeg fails.
         MissingExtraError: there is no ffmpeg.
     """
     if file.suffix.lower() not in KINDS:
         raise OutputError(f"`{file.name}` ends in `{file.suffix}`, and must end in .mp4 or .gif.")
     if len(run.times) < 2:
-        raise OutputError("the run has fewer than two stored frames, and so nothing that moves.")
+        raise OutputError("the run has fewer than two stored frames; a video needs at least two.")
     program, pictures = encoder(), times_of(run, speed)
     with draw.style():
         film = _Film(run)
@@ -56,14 +56,14 @@ def times_of(run: Recording, speed: float) -> Array:
 
 
 def encoder() -> str:
-    """Return the ffmpeg on the PATH, or that of the extra `video`.
+    """Return the path of ffmpeg: on the PATH, or from the extra `video`.
 
     Raises:
         MissingExtraError: there is none.
     """
-    found = shutil.which("ffmpeg")
-    if found is not None:
-        return found
+    program = shutil.which("ffmpeg")
+    if program is not None:
+        return program
     try:
         import imageio_ffmpeg
 
@@ -79,24 +79,25 @@ def _encode(program: str, film: "_Film", times: Array, part: Path, kind: str) ->
     size, rate = f"{_SIZE[0]}x{_SIZE[1]}", f"{_RATE:g}"
     raw = ["-f", "rawvideo", "-pix_fmt", "rgba", "-s", size, "-r", rate, "-i", "-"]
     small = "fps=12.5,scale=640:-1:flags=lanczos,split[a][b];[a]palettegen=max_colors=96[p];"
-    how = {
-        # A third of the time of the usual preset, for a tenth more bytes.
+    options = {
+        # A third of the time of the default preset, and a tenth more bytes.
         ".mp4": ["-c:v", "libx264", "-preset", "veryfast", "-pix_fmt", "yuv420p", "-crf", "20"]
         + ["-f", "mp4", "-movflags", "+faststart"],
         ".gif": ["-filter_complex", f"{small}[b][p]paletteuse=dither=none", "-f", "gif"],
     }[kind]
-    command = [program, "-loglevel", "error", "-y", *raw, *how, str(part)]
+    command = [program, "-loglevel", "error", "-y", *raw, *options, str(part)]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, **pipes) as process:
         assert process.stdin is not None and process.stderr is not None
         _feed(process.stdin, film, times)
-        said = process.stderr.read().decode(errors="replace").strip()
+        message = process.stderr.read().decode(errors="replace").strip()
     if process.returncode:
-        raise OutputError(f"ffmpeg failed: {said.splitlines()[-1] if said else 'it said nothing'}.")
+        reason = message.splitlines()[-1] if message else "without a message"
+        raise OutputError(f"ffmpeg failed: {reason}.")
 
 
 def _feed(pipe: IO[bytes], film: "_Film", times: Array) -> None:
-    # Where ffmpeg ends early, its own words say why.
+    # If ffmpeg ends early, its message says why.
     with contextlib.suppress(BrokenPipeError), pipe:
         for picture in film.pictures(times):
             pipe.write(picture)
@@ -104,7 +105,7 @@ def _feed(pipe: IO[bytes], film: "_Film", times: Array) -> None:
 
 @final
 class _Film:
-    """The figure, what stands still in it, and what moves."""
+    """The figure of a video, its background and its moving parts."""
 
     def __init__(self, run: Recording) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -127,9 +128,9 @@ class _Film:
         for part in (*self.moving.artists, *self.cursors):
             part.set_animated(True)
         self.canvas.draw()
-        kept = self.canvas.copy_from_bbox(self.figure.bbox)
+        background = self.canvas.copy_from_bbox(self.figure.bbox)
         for time in times:
-            self.canvas.restore_region(kept)
+            self.canvas.restore_region(background)
             self.moving.show(time, *self.between(time))
             for part in self.moving.artists:
                 self.ax.draw_artist(part)
@@ -157,25 +158,25 @@ class _Film:
 
 
 def scene_places(run: Recording, space: Space) -> Array:
-    """Return where agents are drawn, (T, N, 3)."""
-    held, places = clipped_places(run, space.axes)[0], np.zeros((len(run.times), run.agents, 3))
+    """Return the places of agents in the scene, (T, N, 3)."""
+    clipped, places = clipped_places(run, space.axes)[0], np.zeros((len(run.times), run.agents, 3))
     if space.kind == "time":
-        places[:, :, 0], places[:, :, 1] = run.times[:, None], held[:, :, 0]
+        places[:, :, 0], places[:, :, 1] = run.times[:, None], clipped[:, :, 0]
     else:
-        places[:, :, : held.shape[2]] = held
+        places[:, :, : clipped.shape[2]] = clipped
     places[:, :, :2] *= space.stretch
     return places
 
 
-def draw_floor(ax: Any, camera: Camera, space: Space) -> None:
-    """Draw a grid under the agents, with its step said."""
+def draw_floor(ax: "Axes", camera: Camera, space: Space) -> None:
+    """Draw a grid under the agents, with its step as a text."""
     from matplotlib.collections import LineCollection
 
     low, high, stretch = space.low, space.high, (*space.stretch, 1.0)
-    lines, said = [], []
+    lines, steps = [], []
     for k in (0, 1):
         step = _nice((high[k] - low[k]) / stretch[k] / 10.0)
-        said.append(f"{step:g}{f' {space.units[k]}' if space.units[k] else ''}")
+        steps.append(f"{step:g}{f' {space.units[k]}' if space.units[k] else ''}")
         ends = np.array([low, high])
         ends[:, 2] = low[2]
         first = np.ceil(low[k] / stretch[k] / step)
@@ -184,7 +185,7 @@ def draw_floor(ax: Any, camera: Camera, space: Space) -> None:
             line[:, k] = value * step * stretch[k]
             lines.append(camera.project(line)[0])
     ax.add_collection(LineCollection(lines, colors=_GRID, linewidths=0.9))
-    names = " and ".join(dict.fromkeys(said))
+    names = " and ".join(dict.fromkeys(steps))
     words = (
         f"grid {names}"
         if space.kind == "space"
@@ -194,7 +195,7 @@ def draw_floor(ax: Any, camera: Camera, space: Space) -> None:
 
 
 def _nice(value: float) -> float:
-    """Return the least of 1, 2 and 5 times a power of ten that is no less."""
+    """Return the smallest of 1, 2 and 5 times a power of ten that is not below a value."""
     power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
     return float(next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= value * 0.999))
 
@@ -207,9 +208,9 @@ def _curves(figure: Any, run: Recording) -> list[Any]:
     keep, followers = draw.thin(len(run.times)), list(run.followers)
     values = draw.above_zero(run.formation_errors[keep][:, followers])
     if run.agents > draw.NAMED:
-        shown = {"worst": values.max(axis=1), "median": np.median(values, axis=1)}
+        lines = {"worst": values.max(axis=1), "median": np.median(values, axis=1)}
         for name, colour in (("worst", 1), ("median", 0)):
-            errors.plot(run.times[keep], shown[name], color=draw.COLOURS[colour], label=name)
+            errors.plot(run.times[keep], lines[name], color=draw.COLOURS[colour], label=name)
         errors.legend(loc="upper right", fontsize=8)
     else:
         for agent, line in zip(followers, values.T, strict=True):
@@ -222,7 +223,7 @@ def _curves(figure: Any, run: Recording) -> list[Any]:
     )
     inputs.plot(run.times[keep], sizes if loads is None else sizes.max(axis=1), color=draw.LEADER)
     inputs.set_title(
-        "largest input" if loads is None else "largest input, % of its limit", size=9, loc="left"
+        "largest input" if loads is None else "largest input, % of limit", size=9, loc="left"
     )
     inputs.set_xlabel("time (s)", size=9)
     for ax in (errors, inputs):

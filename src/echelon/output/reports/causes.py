@@ -1,4 +1,4 @@
-"""Why a run was not as it should be, each cause with what to do about it."""
+"""Causes of a poor run, each with a remedy."""
 
 from collections.abc import Iterator
 
@@ -12,64 +12,71 @@ from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED
 
 _LAG = 1e-6
-"""A steady error above this, in the result's unit, is told as a lag."""
+"""A steady error above this, in the result's unit, is reported as a lag."""
 _SETTLES = float(np.log(100.0))
-"""Time constants of the slowest mode in which a metre becomes a centimetre."""
+"""Time constants in which an error of 1 m decays to 1 cm."""
 _CHATTERS = 20
-"""Alternations of an input between its limits above which it is told: a start has a few."""
+"""Alternations of an input between its limits that are reported; a start has a few."""
 
 
-def causes(result: Result, numbers: Metrics, found: Promise) -> Iterator[Cause]:
-    """Yield why a run was not as it should be, each with what to do about it."""
+def causes(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[Cause]:
+    """Yield the causes of large errors, each with a remedy."""
     if len(result.times):
-        settled = all(each.settling_time is not None for each in numbers.followers)
+        settled = all(follower.settling_time is not None for follower in numbers.followers)
         lost = grows(result)
         if lost or not settled:
-            yield from found.causes
-        yield from beyond(float(result.saturated.max()), found) if lost else ()
-        yield from () if lost or settled else _slow(result, found)
-        yield from () if lost else _lag(result, numbers, found)
-    yield from _offset(result, numbers, found)
-    yield from _outside(result)
-    yield from _chatter(result, found)
-
-
-def beyond(limited: float, found: Promise) -> Iterator[Cause]:
-    """Name what a promise leaves out, where there is one and the errors grow.
-
-    A limit acted in this fraction of the steps of whom it acted on most.
-    """
-    if not found.promised:
-        return
-    remedy = "start nearer to the goals"
-    left = "the starts were not near enough to the goals"
-    if found.without:
-        left, remedy = found.without, "leave it out to see what it costs"
-    if limited:
-        left = f"{left}; a limit acted in {100.0 * limited:.3g} % of the steps"
-        remedy = f"{remedy}, or slow the reference"
-    yield Cause(f"what is promised does not reach this run: {left}", remedy)
-
-
-def _slow(result: Result, found: Promise) -> Iterator[Cause]:
-    """Tell that the horizon is too short for the slowest mode."""
-    what = "what is promised" if found.slowest is None else "the slowest mode"
-    rate = found.rate if found.slowest is None else -found.slowest
-    if found.promised and rate and result.settings.horizon * rate < _SETTLES:
+            yield from guarantee.causes
+        if lost:
+            yield from beyond(float(result.saturated.max()), guarantee)
+        else:
+            yield from () if settled else _slow(result, guarantee)
+            yield from _lag(result, numbers, guarantee)
+    yield from _offset(result, numbers, guarantee)
+    if result.outcome is Outcome.LEFT_CHART:
         yield Cause(
-            f"{what} takes {_SETTLES / rate:.3g} s to make a metre a centimetre, and the "
-            f"horizon is {result.settings.horizon:g} s",
-            "lengthen `simulation.horizon`, or let `echelon design` find a faster gain or edge",
+            "beyond that bound the angles of the equations are no coordinates, and the gain is "
+            "that of the trim",
+            "start closer to the trim, or slow the reference",
+        )
+    yield from _chatter(result)
+
+
+def beyond(saturated: float, guarantee: Promise) -> Iterator[Cause]:
+    """Yield why a guarantee does not cover a run whose errors grow.
+
+    `saturated` is the largest fraction of steps in which an agent's input was at a limit.
+    """
+    if not guarantee.promised:
+        return
+    reason, remedy = "the starts were too far from the goals", "start closer to the goals"
+    if guarantee.without:
+        reason, remedy = guarantee.without, "remove it to see its effect"
+    if saturated:
+        reason = f"{reason}; inputs were at a limit in {100.0 * saturated:.3g} % of the steps"
+        remedy = f"{remedy}, or slow the reference"
+    yield Cause(f"the guarantee does not cover this run: {reason}", remedy)
+
+
+def _slow(result: Result, guarantee: Promise) -> Iterator[Cause]:
+    """Yield that the horizon is too short for the slowest mode."""
+    known = guarantee.slowest is not None
+    rate = -guarantee.slowest if guarantee.slowest is not None else guarantee.rate
+    if guarantee.promised and rate and result.settings.horizon * rate < _SETTLES:
+        yield Cause(
+            f"{'the slowest mode' if known else 'the guaranteed rate'} takes "
+            f"{_SETTLES / rate:.3g} s from 1 m to 1 cm, and the horizon is "
+            f"{result.settings.horizon:g} s",
+            "lengthen `simulation.horizon`, or let `echelon design` find a faster gain",
         )
 
 
-def _lag(result: Result, numbers: Metrics, found: Promise) -> Iterator[Cause]:
-    """Tell how far followers stay behind a leader whose input they are not sent."""
-    worst, matched = numbers.worst_steady, found.hypotheses[Hypothesis.MATCHED_MOTION]
+def _lag(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[Cause]:
+    """Yield the lag of followers that do not receive the leader's input."""
+    worst, matched = numbers.worst_steady, guarantee.hypotheses[Hypothesis.MATCHED_MOTION]
     if worst is None or worst <= _LAG or not matched.fails or result.reference is None:
         return
     unit = "" if result.unit == "state" else f" {result.unit}"
-    # Behind a leader at rest nobody lags; what is left then has another cause.
+    # Nobody lags behind a leader at rest, so that a steady error has another cause there.
     if np.ptp(result.reference, axis=0).max() > 0.0:
         yield Cause(
             "without feed-forward the followers do not know the leader's motion and lag: "
@@ -78,57 +85,46 @@ def _lag(result: Result, numbers: Metrics, found: Promise) -> Iterator[Cause]:
         )
 
 
-def _offset(result: Result, numbers: Metrics, found: Promise) -> Iterator[Cause]:
-    """Tell why a leader stays off its reference."""
+def _offset(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[Cause]:
+    """Yield why a leader keeps an error from its reference."""
     steady = numbers.leader.steady_rmse
     unknown = result.world.plant is not None or result.world.disturbance is not None
     if steady is None or steady <= SETTLED or _falls(result, steady):
         return
-    if not (found.promised or unknown):
+    if not (guarantee.promised or unknown):
         return
     unit = "" if result.unit == "state" else f" {result.unit}"
-    text = f"the leader stays {steady:.3g}{unit} off its reference"
+    text = f"the leader has a steady error of {steady:.3g}{unit} from its reference"
+    saturated = 100.0 * result.saturated[result.graph.leaders[0]]
     if unknown:
-        text += ": no law has integral action against what it does not know"
+        text += ", since no law has integral action against an unknown disturbance or plant"
         remedy = "give the model the plant's parameters, or the leader a stronger `leader.gain`"
-    elif result.saturated[result.graph.leaders[0]] > 0.0:
-        text += f": a limit acts in {100.0 * result.saturated[result.graph.leaders[0]]:.3g} % of "
-        text, remedy = f"{text}its steps", "make the reference slower or smaller"
+    elif saturated > 0.0:
+        text += f", with its inputs at a limit in {saturated:.3g} % of the steps"
+        remedy = "make the reference slower or smaller"
     else:
-        remedy = "give `leader.gain` another method or weights, or the reference a slower path"
+        remedy = "choose another method or weights for `leader.gain`, or a slower reference"
     yield Cause(text, remedy)
 
 
 def _falls(result: Result, steady: float) -> bool:
-    """Tell whether the first leader was still on its way to the reference at the end."""
+    """Return whether the first leader was still approaching its reference at the end."""
     assert result.reference is not None
     first = result.graph.leaders[0]
     away = result.states[-1, first] - result.formation.offsets[first] - result.reference[-1]
     return float(np.linalg.norm(away[list(result.measured)])) < 0.5 * steady
 
 
-def _outside(result: Result) -> Iterator[Cause]:
-    if result.outcome is Outcome.LEFT_CHART:
-        yield Cause(
-            "the equations turn by angles that are no coordinates beyond that bound, and the gain "
-            "is one of the trim",
-            "start nearer to the trim, or slow the reference",
-        )
-
-
-def _chatter(result: Result, found: Promise) -> Iterator[Cause]:
-    """Tell of inputs that a step too long throws from limit to limit."""
+def _chatter(result: Result) -> Iterator[Cause]:
+    """Yield that a step is so long that inputs alternate between their limits."""
     agent = int(result.chatter.argmax())
     if result.chatter[agent] > _CHATTERS:
         yield Cause(
-            f"the inputs of agent {agent} went from beyond one limit to beyond the other "
-            f"{result.chatter[agent]:.0f} times from a step to the next: the gain is too strong "
-            f"for the step `dt` = {result.settings.dt:g} s where the agents go",
-            "halve `simulation.dt`, or weigh the inputs more (`R`) or the coupling less",
+            f"the inputs of agent {agent} jumped from one limit to the other "
+            f"{result.chatter[agent]:.0f} times between two steps, since the gain is too strong "
+            f"for the step `dt` = {result.settings.dt:g} s",
+            "halve `simulation.dt`, increase the input weight `R`, or reduce the coupling",
         )
-
-
-# ---- how a run did ------------------------------------------------------------------------------
 
 
 def sizes(result: Result) -> tuple[float, float]:
@@ -140,10 +136,10 @@ def sizes(result: Result) -> tuple[float, float]:
 
 
 def grows(result: Result) -> bool:
-    """Tell whether a run was lost, or ends farther from its goals than it began."""
+    """Return whether a run diverged, or ends farther from its goals than it began."""
     if result.outcome is Outcome.DIVERGED:
         return True
     first, last = sizes(result)
-    # Twice, since a last frame may catch an overshoot; and a start on the goals has rounding alone
-    # to grow from.
+    # Twice, since the last frame may be an overshoot; and after a start at the goals rounding
+    # errors grow.
     return last > 2.0 * first + 1e-9

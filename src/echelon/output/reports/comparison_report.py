@@ -1,10 +1,11 @@
-"""A comparison as a table and a paragraph, made from its numbers."""
+"""The report of a comparison: tables of errors and costs, and a paragraph on who wins."""
 
 import io
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from echelon.core.errors import Outcome
+from echelon.core.types import JsonObject
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.guarantees.promises.promise import Promise
 from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
@@ -16,12 +17,12 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 _NAMED = 4
-"""With more followers than this the table shows the worst one alone."""
+"""With more followers than this the table shows only the worst one."""
 _ROUNDING_LEVEL = 1e-12
-"""Steady errors below this are rounding, and none of them is better than another."""
+"""Steady errors below this are rounding errors, and count as equal."""
 
 _ALIKE = 1.5
-"""Computing times within this factor are told as alike: they are measured on a shared machine."""
+"""Computing times within this factor count as equal: the machine is shared."""
 
 
 def comparison_report(comparison: Comparison, width: int = 200) -> str:
@@ -35,7 +36,7 @@ def comparison_report(comparison: Comparison, width: int = 200) -> str:
 
 
 def print_comparison(console: "Console", comparison: Comparison) -> None:
-    """Print a comparison on a rich console: two tables, then what they show."""
+    """Print a comparison on a rich console: two tables, remarks, and the verdict."""
     printed = _is_papers(comparison)
     console.print(_errors_table(comparison, printed))
     console.print(_costs_table(comparison))
@@ -48,9 +49,9 @@ def print_comparison(console: "Console", comparison: Comparison) -> None:
 
 
 def _is_papers(comparison: Comparison) -> bool:
-    flown = [row.flight.result for row in comparison.rows if row.flight is not None]
-    return bool(flown) and is_papers_experiment(
-        comparison.scenario, type(flown[0].model).__name__, flown[0].graph.agents
+    runs = [row.flight.result for row in comparison.rows if row.flight is not None]
+    return bool(runs) and is_papers_experiment(
+        comparison.scenario, type(runs[0].model).__name__, runs[0].graph.agents
     )
 
 
@@ -58,7 +59,7 @@ def _is_papers(comparison: Comparison) -> bool:
 
 
 def _errors_table(comparison: Comparison, printed: bool) -> "Table":
-    """Return the errors, a row a method: the paper's Table II with a steady part."""
+    """Return the errors, one row per method: the paper's Table II and the steady errors."""
     followers = _followers(comparison)
     whole, last = f"{comparison.horizon:.3g} s", f"last {comparison.steady_window:.3g} s"
     heads = ["leader", *(f"F{k}" for k in followers)] if followers else ["leader", "worst F"]
@@ -78,8 +79,8 @@ def _errors_table(comparison: Comparison, printed: bool) -> "Table":
 
 
 def _followers(comparison: Comparison) -> Sequence[int]:
-    flown = [row.flight.result.graph for row in comparison.rows if row.flight is not None]
-    return flown[0].followers if flown and len(flown[0].followers) <= _NAMED else ()
+    graphs = [row.flight.result.graph for row in comparison.rows if row.flight is not None]
+    return graphs[0].followers if graphs and len(graphs[0].followers) <= _NAMED else ()
 
 
 def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
@@ -95,12 +96,12 @@ def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
 
 
 def _costs_table(comparison: Comparison) -> "Table":
-    """Return what each method asks for, a row a method."""
+    """Return the costs, one row per method: effort, computing, information."""
     table = _table(
-        "what it takes",
+        "costs",
         [
-            *("effort", "limited,\n% steps", "least\ndistance", "computing,\nms per agent s"),
-            *("promised,\n1/s", "told"),
+            *("effort", "saturated,\n% steps", "smallest\ndistance", "computing,\nms per agent s"),
+            *("guaranteed,\n1/s", "information"),
         ],
     )
     table.columns[-1].justify = "left"
@@ -115,14 +116,14 @@ def _costs_table(comparison: Comparison) -> "Table":
             f"{100.0 * row.numbers.saturation_fraction:.3g}",
             _number(row.numbers.minimum_distance),
             f"{1e3 * row.flight.computing:.3g}",
-            _promised(row.flight.promise),
-            ", ".join(row.flight.told) or "nothing",
+            _guaranteed(row.flight.promise),
+            ", ".join(row.flight.told) or "none",
         )
     return table
 
 
 def _table(title: str, columns: Sequence[str]) -> "Table":
-    """Return a table whose row labels are never cut, however narrow the terminal is."""
+    """Return a table whose row labels are not truncated on a narrow terminal."""
     from rich import box
     from rich.table import Table
 
@@ -134,12 +135,12 @@ def _table(title: str, columns: Sequence[str]) -> "Table":
     return table
 
 
-def _promised(promise: Promise) -> str:
-    """Return the rate that is promised, with its theorem if there is one."""
+def _guaranteed(promise: Promise) -> str:
+    """Return the guaranteed rate, with its theorem if there is one."""
     if promise.rate is None:
-        return "nothing"
-    by = "" if promise.theorem is None else f" ({promise.kind}, {promise.theorem})"
-    return f"{promise.rate:.3g}{by}"
+        return "none"
+    source = "" if promise.theorem is None else f" ({promise.kind}, {promise.theorem})"
+    return f"{promise.rate:.3g}{source}"
 
 
 def _number(value: float | None) -> str:
@@ -147,7 +148,7 @@ def _number(value: float | None) -> str:
 
 
 def _remarks(row: ComparisonRow) -> Iterator[str]:
-    """Yield what a row's numbers cannot say: why it did not fly, how it ended, its solver."""
+    """Yield why a method did not run, how its run ended, its solver times, and warnings."""
     if row.flight is None:
         yield row.reason
         return
@@ -155,14 +156,13 @@ def _remarks(row: ComparisonRow) -> Iterator[str]:
     if result.outcome is not Outcome.COMPLETED:
         yield result.message
     if row.flight.solver is not None:
-        yield _solving(row.flight.solver)
+        yield _solver_times(row.flight.solver)
     yield from row.flight.result.warnings
 
 
-def _solving(figures: SolverStats) -> str:
-    """Return what solving took, in a sentence."""
+def _solver_times(figures: SolverStats) -> str:
     return (
-        f"{figures.solver} made {figures.solves} plans with {figures.failures} failures, in "
+        f"{figures.solver} computed {figures.solves} plans with {figures.failures} failures, in "
         f"{figures.median_ms:.3g} ms (median; 99th percentile {figures.p99_ms:.3g}, worst "
         f"{figures.worst_ms:.3g}) each; iterations: median {figures.iterations_median:.3g}, worst "
         f"{figures.iterations_worst}."
@@ -173,97 +173,98 @@ def _solving(figures: SolverStats) -> str:
 
 
 def verdict(comparison: Comparison) -> tuple[str, ...]:
-    """Return who wins where, a sentence each, from the numbers alone."""
-    flown = [row for row in comparison.rows if row.flight is not None and row.numbers is not None]
-    stayed = [row for row in flown if row.converged]
-    some = 0 < len(stayed) < len(flown)
+    """Return which method wins by which number, one sentence each."""
+    runs = [row for row in comparison.rows if row.flight is not None and row.numbers is not None]
+    settled = [row for row in runs if row.converged]
+    some = 0 < len(settled) < len(runs)
     return tuple(
         sentence
         for sentence in (
-            _lost(flown, stayed),
-            _of_those(some, _closest(stayed or flown)),
-            _best(stayed, "settles first", lambda row: row.settled, "s"),
-            _best(flown, "has the smallest error over the whole run", lambda row: row.whole, "m"),
-            _leader(flown),
-            _of_those(some, _best(stayed, "asks the least of the inputs", _effort, "")),
-            _of_those(some, _cheapest(stayed)),
+            _unsettled(runs, settled),
+            _among_settled(some, _closest(settled or runs)),
+            _best(settled, "settles first", lambda row: row.settled, "s"),
+            _best(runs, "has the smallest error over the whole run", lambda row: row.whole, "m"),
+            _leader(runs),
+            _among_settled(
+                some, _best(settled, "has the smallest effort", lambda row: row.effort, "")
+            ),
+            _among_settled(some, _cheapest(settled)),
         )
         if sentence
     )
 
 
-def _of_those(some: bool, sentence: str) -> str:
-    """Say of a sentence on those that settle that it is, where others do not."""
+def _among_settled(some: bool, sentence: str) -> str:
+    """Return a sentence on methods that settle, which says so if others do not."""
     if not some or not sentence:
         return sentence
     return f"Of those that settle, {sentence.replace('All ', 'all ', 1)}"
 
 
-def _effort(row: ComparisonRow) -> float | None:
-    return row.effort
-
-
-def _lost(flown: Sequence[ComparisonRow], stayed: Sequence[ComparisonRow]) -> str:
-    lost = [row.label for row in flown if row not in stayed]
-    if not lost:
-        return f"All {len(flown)} methods bring every follower within 1 cm."
-    verb = "does" if len(lost) == 1 else "do"
-    return f"{_listed(lost)} {verb} not bring every follower within 1 cm."
+def _unsettled(runs: Sequence[ComparisonRow], settled: Sequence[ComparisonRow]) -> str:
+    labels = [row.label for row in runs if row not in settled]
+    if not labels:
+        return f"All {len(runs)} methods bring every follower within 1 cm."
+    verb = "does" if len(labels) == 1 else "do"
+    return f"{_listed(labels)} {verb} not bring every follower within 1 cm."
 
 
 def _closest(rows: Sequence[ComparisonRow]) -> str:
-    """Tell who ends closest; errors at the level of rounding are a tie."""
-    known = {row.label: row.steady for row in rows if row.steady is not None}
-    if not known:
+    """Return which method ends closest; errors at the level of rounding are a tie."""
+    errors = {row.label: row.steady for row in rows if row.steady is not None}
+    if not errors:
         return ""
-    tied = [label for label, value in known.items() if value <= _ROUNDING_LEVEL]
+    tied = [label for label, value in errors.items() if value <= _ROUNDING_LEVEL]
     if len(tied) > 1:
-        return f"{_listed(tied)} end at the level of rounding."
+        return f"{_listed(tied)} end at the level of rounding errors."
     return _best(rows, "ends closest", lambda row: row.steady, "m")
 
 
 def _best(
-    rows: Sequence[ComparisonRow], what: str, of: Callable[[ComparisonRow], float | None], unit: str
+    rows: Sequence[ComparisonRow],
+    claim: str,
+    of: Callable[[ComparisonRow], float | None],
+    unit: str,
 ) -> str:
-    """Tell who has the least of a number, and how far the next is behind."""
-    # Of NaN `>=` says no, and it would break the order.
-    known = sorted(
+    """Return which method has the smallest of a number, and the next one."""
+    # The comparison excludes NaN, which would break the order.
+    ranking = sorted(
         (value, row.label) for row in rows if (value := of(row)) is not None and value >= 0.0
     )
-    if not known:
+    if not ranking:
         return ""
-    (least, label), *others = known
-    text = f"{label} {what} ({least:.3g}{' ' + unit if unit else ''}"
+    (least, label), *others = ranking
+    text = f"{label} {claim} ({least:.3g}{' ' + unit if unit else ''}"
     if others:
         text += f"; next {others[0][1]}, {others[0][0]:.3g}"
     return text + ")."
 
 
 def _leader(rows: Sequence[ComparisonRow]) -> str:
-    known = {row.label: row.numbers.leader.rmse for row in rows if row.numbers is not None}
-    values = {label: value for label, value in known.items() if value is not None}
+    errors = {row.label: row.numbers.leader.rmse for row in rows if row.numbers is not None}
+    values = {label: value for label, value in errors.items() if value is not None}
     if not values:
         return ""
     least, most = min(values, key=values.__getitem__), max(values, key=values.__getitem__)
-    # Most methods leave the leader's law as it is, and then rounding alone parts its runs.
+    # Most methods share the leader's law, so that its runs differ by rounding only.
     if values[most] <= 1.001 * values[least]:
-        return f"The leader does alike under all, {values[least]:.3g} m."
+        return f"The leader's error is the same under all methods, {values[least]:.3g} m."
     return (
-        f"The leader does best under {least}, {values[least]:.3g} m against {values[most]:.3g} m "
-        f"under {most}."
+        f"The leader's error is smallest under {least}, {values[least]:.3g} m against "
+        f"{values[most]:.3g} m under {most}."
     )
 
 
 def _cheapest(rows: Sequence[ComparisonRow]) -> str:
-    known = {row.label: row.flight.computing for row in rows if row.flight is not None}
-    if len(known) < 2:
+    times = {row.label: row.flight.computing for row in rows if row.flight is not None}
+    if len(times) < 2:
         return ""
-    least, most = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
-    # A run of one chunk is all compilation to the watch, and its computing time is 0.
-    ratio = known[most] / max(known[least], 1e-12)
+    least, most = min(times, key=times.__getitem__), max(times, key=times.__getitem__)
+    # A run of one chunk is counted as compilation, and its computing time is 0.
+    ratio = times[most] / max(times[least], 1e-12)
     if ratio < _ALIKE:
-        return "All take about as long to compute."
-    return f"{least} takes the least computing, {most} {ratio:.0f} times as much."
+        return "All take about the same computing time."
+    return f"{least} takes the least computing time, {most} {ratio:.0f} times as much."
 
 
 def _listed(labels: Sequence[str]) -> str:
@@ -273,8 +274,8 @@ def _listed(labels: Sequence[str]) -> str:
 # ---- data ---------------------------------------------------------------------------------------
 
 
-def comparison_mapping(comparison: Comparison) -> dict[str, Any]:
-    """Return a comparison ready for JSON; what does not exist is None."""
+def comparison_mapping(comparison: Comparison) -> JsonObject:
+    """Return a comparison ready for JSON; missing numbers are None."""
     return {
         "scenario": comparison.scenario,
         "horizon_s": comparison.horizon,
@@ -288,7 +289,7 @@ def comparison_mapping(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _row_mapping(row: ComparisonRow) -> dict[str, Any]:
+def _row_mapping(row: ComparisonRow) -> JsonObject:
     if row.flight is None or row.numbers is None:
         return {"reason": row.reason}
     result, numbers = row.flight.result, row.numbers

@@ -1,4 +1,4 @@
-"""What a run shows and why, in sentences made from its numbers and its promise."""
+"""The text of a run's report: what happened, why, and what is guaranteed."""
 
 from collections.abc import Iterator
 
@@ -16,19 +16,18 @@ from echelon.simulation.engine.result import Result
 
 
 def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
-    """Return what happened, why, and what to be wary of, a sentence each."""
-    found = promise(result.parts, result.settings)
+    """Return the sentences of a report: outcome, causes, world, guarantee, Lyapunov function."""
+    guarantee = promise(result.parts, result.settings)
     return (
-        *_story(result, numbers, found),
-        *(each.sentence() for each in causes(result, numbers, found)),
-        *_imperfections(result),
-        *_promises(result, found),
-        *_lyapunov_story(result, found),
+        *_outcome(result, numbers),
+        *(cause.sentence() for cause in causes(result, numbers, guarantee)),
+        *_world(result),
+        *_guarantee(result, guarantee),
+        *_lyapunov_trend(result, guarantee),
     )
 
 
-def _story(result: Result, numbers: Metrics, found: Promise) -> Iterator[str]:
-    """Tell the outcome and how the formation did."""
+def _outcome(result: Result, numbers: Metrics) -> Iterator[str]:
     yield result.message
     if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
         return
@@ -40,78 +39,79 @@ def _story(result: Result, numbers: Metrics, found: Promise) -> Iterator[str]:
             f"{last:.4g}{unit} at {result.times[-1]:g} s."
         )
         return
-    times = [each.settling_time for each in numbers.followers]
-    known = [time for time in times if time is not None]
-    if len(known) == len(times):
+    times = [follower.settling_time for follower in numbers.followers]
+    settled = [time for time in times if time is not None]
+    if len(settled) == len(times):
         yield (
             f"All {len(times)} followers stay within 0.01{unit} of their goals "
-            f"from {max(known):.3g} s on."
+            f"from {max(settled):.3g} s on."
         )
     else:
         yield (
-            f"{len(times) - len(known)} of {len(times)} followers have not settled to 0.01{unit} "
+            f"{len(times) - len(settled)} of {len(times)} followers have not settled to 0.01{unit} "
             f"by {result.times[-1]:g} s."
         )
 
 
-def _imperfections(result: Result) -> Iterator[str]:
-    """Tell what the laws did not know."""
-    told = result.world.describe(result.model)
-    if told["plant"]:
-        yield f"Plant: {told['plant']}; laws and gains know the model alone."
-    if told["disturbance"]:
-        yield f"Disturbance: {told['disturbance']}; no law is told of it."
+def _world(result: Result) -> Iterator[str]:
+    """Yield what the laws and gains do not know."""
+    world = result.world.describe(result.model)
+    if world["plant"]:
+        yield f"Plant: {world['plant']}; laws and gains use the model's values."
+    if world["disturbance"]:
+        yield f"Disturbance: {world['disturbance']}; unknown to the laws."
 
 
-def _promises(result: Result, found: Promise) -> Iterator[str]:
-    """Say what is promised, whether this run is covered, and what the law needs to be told."""
-    yield found.sentence()
-    if result.drive.gain is not None and found.slowest is not None:
-        edge = "" if found.edge is None else f"; from {found.edge:.4g} on every mode decays"
-        yield (
-            f"Near the trim the slowest mode is {found.slowest:.3g} 1/s at coupling "
-            f"{found.loop.closed.coupling:.4g}{edge}."
-        )
-    yield from coverage(result, found)
+def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
+    """Yield the guarantee, whether it covers this run, and the information that the law uses."""
+    yield guarantee.sentence()
+    slowest, coupling = guarantee.slowest, guarantee.loop.closed.coupling
+    if result.drive.gain is not None and slowest is not None:
+        mode = "the slowest mode decays" if slowest < 0.0 else "a mode grows"
+        text = f"{mode} at {abs(slowest):.3g} 1/s (coupling {coupling:.4g})"
+        edge = guarantee.edge
+        bound = "" if edge is None else f" Couplings above {edge:.4g} are sufficient for stability."
+        yield f"Linearized at the trim, {text}.{bound}"
+    yield from coverage(result, guarantee)
     if len(result.graph.leaders) > 1:
-        yield f"Who follows whom: {who_hears_whom(result.graph)}; goals are the nearest leader's."
-    needs = ", ".join(result.drive.information.follower) or "nothing from others"
-    yield f"Each follower is told: {needs}."
+        yield f"Leaders: {who_hears_whom(result.graph)}; goals are relative to the nearest leader."
+    information = "; ".join(result.drive.information.follower) or "nothing from others"
+    yield f"Information used by each follower: {information}."
 
 
-def _lyapunov_story(result: Result, found: Promise) -> Iterator[str]:
-    """Tell whether V fell, and warn where it rose although theory says that it may not."""
+def _lyapunov_trend(result: Result, guarantee: Promise) -> Iterator[str]:
+    """Yield whether V decreased, with a warning where theory forbids its increase."""
     v = lyapunov(result)
     if v is None or len(v.value) < 2 or not np.isfinite(v.value).all():
         return
-    rises, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
-    # V' <= 0 is proved of the undisturbed loop that decays, and forbids nothing to others.
-    excused = result.world.disturbance or found.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails
-    if forbidden and not excused:
+    increases, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
+    # V' <= 0 is proved for the undisturbed loop that decays only.
+    unstable = guarantee.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails
+    if forbidden and not (result.world.disturbance or unstable):
         when = result.times[int(np.argmax(v.forbidden()))]
         yield (
-            f"Warning: V rises at {forbidden} of {len(v.value)} stored steps (first at {when:.4g} "
-            "s) although V' <= 0 where they begin; the step `dt` is too long: halve it."
+            f"Warning: V increased at {forbidden} of {len(v.value)} stored steps (first at "
+            f"{when:.4g} s) although V' <= 0 there. The step `dt` is too long; halve it."
         )
-    elif rises:
-        grows = found.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails
-        # Of a loop that grows by itself nobody can tell what part the wind has.
-        excuse = "the loop grows by itself" if grows else "the disturbance pushes it up"
-        if found.hypotheses[Hypothesis.SAMPLING].fails:
-            excuse = "the input is held over a `dt` too long, and V' is that of one that follows"
+    elif increases:
+        # Of an unstable loop nobody can tell the effect of the wind.
+        reason = "since the loop is unstable" if unstable else "as expected under a disturbance"
+        if guarantee.hypotheses[Hypothesis.SAMPLING].fails:
+            reason = "since `dt` is too long for an input that is held between steps"
         elif result.world.disturbance is None:
-            excuse = f"theory allows it, since {_excuse(v, found)}"
-        yield f"V rises at {rises} of {len(v.value) - 1} frames; {excuse}."
+            reason = f"as theory allows: {_exception(v, guarantee)}"
+        yield f"V increased in {increases} of {len(v.value) - 1} frames, {reason}."
     else:
-        yield f"V never rises: {v.value[0]:.3g} at the start, {v.value[-1]:.3g} at the end."
+        yield f"V never increased: {v.value[0]:.3g} at the start, {v.value[-1]:.3g} at the end."
 
 
-def _excuse(v: Lyapunov, found: Promise) -> str:
-    coupled = found.hypotheses[Hypothesis.COUPLING]
-    if coupled.fails:
-        return coupled.text
-    # Drifts cancel within V', so that rounding leaves some 1e-16 of its largest value.
-    broken = float(np.mean(v.drift > 1e-9 * np.abs(v.rate).max()))
-    if broken:
-        return f"Assumption 5 fails on {100.0 * broken:.0f} % of the frames"
-    return "the leader's input is not matched or a limit acts"
+def _exception(v: Lyapunov, guarantee: Promise) -> str:
+    """Return the hypothesis of V' <= 0 that fails."""
+    coupling = guarantee.hypotheses[Hypothesis.COUPLING]
+    if coupling.fails:
+        return coupling.text
+    # Drifts cancel within V', and rounding leaves about 1e-16 of its largest value.
+    share = float(np.mean(v.drift > 1e-9 * np.abs(v.rate).max()))
+    if share:
+        return f"Assumption 5 fails in {100.0 * share:.0f} % of the frames"
+    return "the leader's input is not matched, or a motor is at its limit"

@@ -1,4 +1,4 @@
-"""The glossary of the documentation, term by term, for the terminal."""
+"""The glossary of the documentation for `echelon explain`."""
 
 import re
 from pathlib import Path
@@ -14,16 +14,16 @@ _LINK: Final = re.compile(r"\[([^\]]*)\]\([^)]*\)")
 
 
 def glossary() -> dict[str, str]:
-    """Return every term with what it means.
+    """Return every term with its definition.
 
     Raises:
-        OutputError: the glossary is not there, as in a copy without `docs/`.
+        OutputError: the glossary is missing, as in a copy without `docs/`.
     """
-    found = next((place for place in _PLACES if place.is_file()), None)
-    if found is None:
-        raise OutputError("this copy of echelon has no glossary; it stands in `docs/glossary.md`.")
+    file = next((place for place in _PLACES if place.is_file()), None)
+    if file is None:
+        raise OutputError("this copy of echelon has no `docs/glossary.md`; install echelon again.")
     terms: dict[str, str] = {}
-    for block in re.split(r"^- (?=\*\*)", found.read_text("utf-8"), flags=re.MULTILINE)[1:]:
+    for block in re.split(r"^- (?=\*\*)", file.read_text("utf-8"), flags=re.MULTILINE)[1:]:
         # A term ends where its paragraph does, before a heading or another list.
         name, _, text = block.split("\n\n")[0].partition("**: ")
         plain = _LINK.sub(r"\1", " ".join(text.split()))
@@ -31,19 +31,18 @@ def glossary() -> dict[str, str]:
     return terms
 
 
-def explain_term(asked: str) -> dict[str, str]:
-    """Return the terms that are meant, each with what it means.
+def explain_term(term: str) -> dict[str, str]:
+    """Return the definitions of a term, or of all terms that contain it.
 
     Raises:
         OutputError: there is none.
     """
-    terms, wanted = glossary(), asked.strip().lower()
-    exact = {name: text for name, text in terms.items() if name.lower() == wanted}
-    part = {name: text for name, text in terms.items() if wanted and wanted in name.lower()}
-    found = exact or part
-    if not found:
-        close = did_you_mean(wanted, [name.lower() for name in terms])
+    terms, key = glossary(), term.strip().lower()
+    exact = {name: text for name, text in terms.items() if name.lower() == key}
+    matches = exact or {k: text for k, text in terms.items() if key and key in k.lower()}
+    if not matches:
+        close = did_you_mean(key, [name.lower() for name in terms])
         raise OutputError(
-            f"`{asked}` is no term of the glossary{close}; `echelon explain` lists them."
+            f"the glossary has no term `{term}`{close}; `echelon explain` lists all terms."
         )
-    return found
+    return matches

@@ -1,4 +1,4 @@
-"""The numbers that the paper prints, to stand beside ours (arXiv 2309.09156, Table II)."""
+"""The numbers of the paper's Table II (arXiv 2309.09156), for comparison."""
 
 from collections.abc import Mapping
 
@@ -9,13 +9,16 @@ PRINTED: Mapping[str, tuple[float, ...]] = {
 """RMSE in m of leader and followers 1, 2, 3, per method, over 10 s."""
 
 ROUNDING = (
-    "Printed is the paper's Table II (10 s). Its followers' 1e-17 m is the rounding "
-    "of constant offsets (all its samples are multiples of 2^-53, and start there), not the error "
-    "of a closed loop; compare it with the steady RMSE from random starts above."
+    "The printed values are the paper's Table II (10 s). Its followers' errors of 1e-17 m are "
+    "rounding errors of constant offsets (all its samples are multiples of 2^-53), not errors of a "
+    "closed loop; compare them with the steady RMSE from random starts above."
 )
 
 
 def is_papers_experiment(scenario: str, model: str, agents: int) -> bool:
-    """Tell whether the printed values belong beside a scenario: `paper`, its variants, 4 agents."""
-    flown = model == "Quadrotor" and agents == 4
-    return flown and (scenario == "paper" or scenario.startswith("paper-"))
+    """Return whether a scenario is comparable: `paper` or a variant, with 4 quadrotors."""
+    return (
+        model == "Quadrotor"
+        and agents == 4
+        and (scenario == "paper" or scenario.startswith("paper-"))
+    )

@@ -1,7 +1,4 @@
-"""The report of a run on the screen.
-
-A table like the paper's Table II, and what it shows, in sentences.
-"""
+"""The report of a run: a table like the paper's Table II, and sentences that explain it."""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -24,7 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-# Above this many of a role the table shows the best, the median and the worst instead of all.
+# With more agents of a role the table shows the best, the median and the worst.
 _MANY = 12
 _COLUMNS = quantities(FollowerMetrics)
 
@@ -34,7 +31,7 @@ def report(result: Result) -> str:
     from rich.console import Console
 
     text = io.StringIO()
-    # Called a terminal so that sentences wrap; without colours it is plain text all the same.
+    # A forced terminal, so that sentences wrap; without colours the text stays plain.
     console = Console(file=text, width=100, color_system=None, force_terminal=True)
     print_report(console, result, metrics(result))
     return text.getvalue().rstrip("\n")
@@ -64,10 +61,12 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
         "window": numbers.steady_window,
         "settled": "1 cm" if result.unit == "m" else "0.01",
     }
-    columns = ["agent", *(each.label.format(**texts) for each in _COLUMNS.values())]
+    columns = ["agent", *(quantity.label.format(**texts) for quantity in _COLUMNS.values())]
     if printed:
         columns += ["printed,\nconsensus", "printed,\noptimiz."]
-    title = f"{_title(result)}, {_length(result)}, seed {result.settings.seed}"
+    agents = f"{result.graph.agents} x {type(result.model).__name__}"
+    name = result.provenance.get("scenario") or agents
+    title = f"{name}, {_length(result)}, seed {result.settings.seed}"
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
     for column in columns:
         table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
@@ -77,25 +76,18 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
 
 
 def _length(result: Result) -> str:
-    """Return how long the run was, and how long it should have been where that is not the same."""
+    """Return the duration of the run, and the horizon if the run did not reach it."""
     horizon = f"{result.settings.horizon:g} s"
     if result.outcome.reached:
         return horizon
     return f"{result.times[-1] if len(result.times) else 0.0:g} s of {horizon}"
 
 
-def _title(result: Result) -> str:
-    return (
-        result.provenance.get("scenario")
-        or f"{result.graph.agents} x {type(result.model).__name__}"
-    )
-
-
 def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
     leaders, followers = numbers.leaders, numbers.followers
-    # One leader needs no number, and has its name from the paper's table.
-    alone = ["leader"] if len(leaders) == 1 else None
-    agents = [*labelled("leader", leaders, alone), *labelled("follower", followers)]
+    # A single leader needs no number, as in the paper's table.
+    names = ["leader"] if len(leaders) == 1 else None
+    agents = [*labelled("leader", leaders, names), *labelled("follower", followers)]
     rows = [[label, *(_cell(numbers, name) for name in _COLUMNS)] for label, numbers in agents]
     if printed:
         for k, row in enumerate(rows):
@@ -107,19 +99,19 @@ _Row = TypeVar("_Row", LeaderMetrics, FollowerMetrics)
 
 
 def labelled(
-    role: str, each: Sequence[_Row], labels: list[str] | None = None
+    role: str, agents: Sequence[_Row], labels: list[str] | None = None
 ) -> Iterator[tuple[str, _Row]]:
-    """Yield all of a role, or of many the best, the median and the worst, each with its label."""
-    kinds, chosen = [""] * len(each), each
-    if len(each) > _MANY:
-        kinds, chosen = ["best ", "median ", "worst "], representatives(each, steady_error)
-    names = labels or [f"{role} {one.agent}" for one in chosen]
-    for kind, name, one in zip(kinds, names, chosen, strict=True):
-        yield (f"{kind}({name})" if kind else name), one
+    """Yield all agents of a role, or the best, the median and the worst, with their labels."""
+    kinds, rows = [""] * len(agents), agents
+    if len(agents) > _MANY:
+        kinds, rows = ["best ", "median ", "worst "], representatives(agents, steady_error)
+    names = labels or [f"{role} {row.agent}" for row in rows]
+    for kind, name, row in zip(kinds, names, rows, strict=True):
+        yield (f"{kind}({name})" if kind else name), row
 
 
 def _cell(agent: LeaderMetrics | FollowerMetrics, name: str) -> str:
-    """Return a number of an agent as the table has it; empty where its role has none."""
+    """Return a cell of the table; empty if the agent's role has no such number."""
     if name == "saturated":
         return f"{100.0 * agent.saturated:.3g}"
     if not hasattr(agent, name):

@@ -1,10 +1,10 @@
-"""The curves beside the scene: formation error, V and inputs over time."""
+"""The charts of the page: formation error, V and inputs over time."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.metrics import SETTLED
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
@@ -12,23 +12,23 @@ from echelon.output.plots.style import FLOOR
 from echelon.output.viewer.pack import Group
 
 NAMED = 6
-"""With more followers than this, curves are of the worst and the median."""
+"""With more followers than this, a chart shows the worst and the median."""
 _POINTS = 1200
 
 
 class Charts(NamedTuple):
-    """Curves: what the header tells of them, their times (P,), and the numbers (P, C)."""
+    """Charts: their descriptions in the header, times (P,), and curves (P, C)."""
 
-    told: list[dict[str, Any]]
+    descriptions: list[JsonObject]
     times: list[float]
     group: Group
 
 
 class _Sheet:
-    """Collects curves, each a column."""
+    """Collects curves as columns."""
 
     def __init__(self, run: Recording) -> None:
-        self.keep = _frames(run)
+        self.frames = _frames(run)
         self.columns: list[Array] = []
 
     def line(
@@ -38,32 +38,32 @@ class _Sheet:
         colour: int | str,
         log: bool,
         floor: float = FLOOR,
-    ) -> dict[str, Any]:
-        shown = np.asarray(values, np.float64)[self.keep]
+    ) -> JsonObject:
+        curve = np.asarray(values, np.float64)[self.frames]
         if log:
-            # A logarithm has no 0, and below rounding there is nothing to see.
-            shown = np.log10(np.where(shown > floor, shown, np.nan))
-        self.columns.append(np.where(np.isfinite(shown), shown, np.nan))
+            # A logarithm has no 0, and values below the floor are rounding errors.
+            curve = np.log10(np.where(curve > floor, curve, np.nan))
+        self.columns.append(np.where(np.isfinite(curve), curve, np.nan))
         return {"name": name, "colour": colour, "series": len(self.columns) - 1}
 
 
 def charts_of(run: Recording) -> Charts:
-    """Return the curves of a run."""
+    """Return the charts of a run."""
     sheet = _Sheet(run)
-    told = [_errors(run, sheet), *_lyapunov(run, sheet), _inputs(run, sheet)]
-    times = [float(f"{t:.6g}") for t in run.times[sheet.keep]]
-    return Charts(told, times, Group(np.stack(sheet.columns, axis=1), gaps=True))
+    descriptions = [_errors(run, sheet), *_lyapunov(run, sheet), _inputs(run, sheet)]
+    times = [float(f"{t:.6g}") for t in run.times[sheet.frames]]
+    return Charts(descriptions, times, Group(np.stack(sheet.columns, axis=1), gaps=True))
 
 
 def _frames(run: Recording) -> Array:
-    """Return the frames that curves go through: denser in the beginning, where inputs are quick."""
+    """Return the frames of curves: denser at the start, where inputs change quickly."""
     last = len(run.times) - 1
     even = np.linspace(0.0, last, _POINTS * 2 // 3)
     early = np.linspace(0.0, 0.1 * last, _POINTS // 3)
     return np.unique(np.concatenate([even, early]).round().astype(int))
 
 
-def _errors(run: Recording, sheet: _Sheet) -> dict[str, Any]:
+def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
     errors, followers = run.formation_errors, list(run.followers)
     if 0 < len(followers) <= NAMED:
         lines = [
@@ -71,39 +71,39 @@ def _errors(run: Recording, sheet: _Sheet) -> dict[str, Any]:
             for place, agent in enumerate(followers)
         ]
     else:
-        each = errors[:, followers] if followers else errors
+        rows = errors[:, followers] if followers else errors
         lines = [
-            sheet.line("worst", each.max(axis=1), 1, True),
-            sheet.line("median", np.median(each, axis=1), 0, True),
+            sheet.line("worst", rows.max(axis=1), 1, True),
+            sheet.line("median", np.median(rows, axis=1), 0, True),
         ]
     lines += _slope(run, errors[0].max(), 1.0)
     marks = [{"value": SETTLED, "name": "1 cm" if run.unit else "0.01"}]
     return _chart("formation error", run.unit, True, lines, marks)
 
 
-def _slope(run: Recording, begin: float, times: float) -> list[dict[str, Any]]:
-    """Return the line of the promised rate from the first value on, where one is promised."""
+def _slope(run: Recording, begin: float, times: float) -> list[JsonObject]:
+    """Return the line of the guaranteed rate from the first value on, if there is one."""
     rate = run.promise["rate"] if run.promise["promised"] else None
     if not rate or begin <= 0.0 or not np.isfinite(begin):
         return []
     slope = -times * rate / float(np.log(10.0))
     ends = [float(np.log10(begin)), slope]
-    name = f"slope promised, \u2212{times * rate:.3g} 1/s"
+    name = f"guaranteed slope, \u2212{times * rate:.3g} 1/s"
     return [
         {"name": name, "colour": "faint", "ends": ends, "dash": True, "mute": True, "bound": True}
     ]
 
 
-def _lyapunov(run: Recording, sheet: _Sheet) -> list[dict[str, Any]]:
+def _lyapunov(run: Recording, sheet: _Sheet) -> list[JsonObject]:
     if run.lyapunov is None:
         return []
-    # V is a square, and so is what is its rounding.
+    # V is a square, and so are its rounding errors.
     lines = [sheet.line("V", run.lyapunov, 0, True, FLOOR**2)]
     lines += _slope(run, float(run.lyapunov[0]), 2.0)
     return [_chart("Lyapunov function V", "", True, lines, [])]
 
 
-def _inputs(run: Recording, sheet: _Sheet) -> dict[str, Any]:
+def _inputs(run: Recording, sheet: _Sheet) -> JsonObject:
     loads = run.loads
     if loads is not None:
         percent = 100.0 * loads.reshape(len(loads), -1)
@@ -113,12 +113,12 @@ def _inputs(run: Recording, sheet: _Sheet) -> dict[str, Any]:
             sheet.line("smallest", percent.min(axis=1), 0, False),
         ]
         marks = [{"value": 100.0, "name": "limit", "below": True}, {"value": 0.0, "name": "limit"}]
-        what = "motors" if loads.shape[2] in (2, 4) else "inputs"
-        return _chart(what, "% of the limit", False, lines, marks)
+        title = "motors" if loads.shape[2] in (2, 4) else "inputs"
+        return _chart(title, "% of limit", False, lines, marks)
     sizes = np.abs(run.inputs).max(axis=1)
     units = {*run.input_units}
     lines = [
-        sheet.line(_named(run, k, len(units) > 1), sizes[:, k], place, False)
+        sheet.line(_input_name(run, k, len(units) > 1), sizes[:, k], place, False)
         for place, k in enumerate(range(min(NAMED, sizes.shape[1])))
     ]
     return _chart(
@@ -126,12 +126,12 @@ def _inputs(run: Recording, sheet: _Sheet) -> dict[str, Any]:
     )
 
 
-def _named(run: Recording, k: int, mixed: bool) -> str:
+def _input_name(run: Recording, k: int, mixed: bool) -> str:
     name, unit = run.input_names[k].replace("_", " "), run.input_units[k]
     return draw.label(name, unit) if mixed else name
 
 
 def _chart(
-    title: str, unit: str, log: bool, lines: list[dict[str, Any]], marks: list[dict[str, Any]]
-) -> dict[str, Any]:
+    title: str, unit: str, log: bool, lines: list[JsonObject], marks: list[JsonObject]
+) -> JsonObject:
     return {"title": title, "unit": unit, "log": log, "lines": lines, "marks": marks}

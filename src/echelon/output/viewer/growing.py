@@ -1,11 +1,8 @@
-"""The page of a run that is still being computed: it is fed as stretches of it come."""
+"""The page of a run that is still being computed, which loads each part as it arrives."""
 
 import contextlib
 import dataclasses
-import json
-import struct
 import threading
-import zlib
 from http.server import ThreadingHTTPServer
 from typing import Final, final
 
@@ -13,33 +10,33 @@ import numpy as np
 
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots.space import space_of
+from echelon.output.viewer.pack import pack
 from echelon.output.viewer.page import page
 from echelon.output.viewer.replay import header, replay_data, replay_page
 from echelon.output.viewer.serve import Handler, serve
 
 _PATIENCE: Final = 10.0
-"""Seconds after which a page that waits is told that there is nothing yet."""
+"""Seconds after which a waiting page gets an empty answer."""
 
 
 @final
 class Growing:
-    """What there is of a run so far, for any number of pages; none of them is waited for.
+    """The parts of a run so far, for any number of pages.
 
     Args:
-        run: as it was foreseen.
+        run: its recording before the first frame.
     """
 
     def __init__(self, run: Recording) -> None:
-        """Make the page that waits."""
-        told = {**header(run, space_of(run)), "growing": True, "horizon": run.horizon, "groups": {}}
-        text = json.dumps(told, allow_nan=False).encode()
-        self.html = page(run.name, zlib.compress(struct.pack("<I", len(text)) + text, 9)).encode()
+        """Create the page without frames."""
+        more = {"growing": True, "horizon": run.horizon}
+        self.html = page(run.name, pack(header(run, space_of(run)) | more, {})).encode()
         self.blocks, self.done = list[bytes](), False
         self.changed = threading.Condition()
         self.last: Recording | None = None
 
     def add(self, stretch: Recording) -> None:
-        """Add a stretch, which begins where the one before ended.
+        """Add a part, which begins where the previous one ended.
 
         Raises:
             OutputError: it is too large for a page.
@@ -53,7 +50,7 @@ class Growing:
             self.changed.notify_all()
 
     def finish(self, run: Recording) -> None:
-        """Take the whole run in the place of its stretches; every page then shows it.
+        """Replace the parts by the complete run, which all pages then load.
 
         Raises:
             OutputError: it is too large for a page.
@@ -64,7 +61,7 @@ class Growing:
             self.changed.notify_all()
 
     def block(self, number: int) -> bytes | None:
-        """Return a stretch once it is there; nothing where a page waited long, None at the end."""
+        """Return a part; b"" if it is not there in time, None once the run is complete."""
         with self.changed:
             self.changed.wait_for(lambda: self.done or len(self.blocks) > number, _PATIENCE)
             if self.done:
@@ -73,7 +70,7 @@ class Growing:
 
 
 def _joined(before: Recording, stretch: Recording) -> Recording:
-    """Return a stretch after the last frame of the one before, so that a page draws between."""
+    """Return a part with the last frame of the previous one, for interpolation."""
     names = ("times", "states", "inputs", "errors", "lyapunov")
     parts = {
         name: np.concatenate([getattr(before, name)[-1:], getattr(stretch, name)])
@@ -91,11 +88,11 @@ def serve_growing(run: Growing, port: int | None) -> ThreadingHTTPServer:
     """
 
     class GrowingRun(Handler):
-        """The page of this run, and its stretches by number."""
+        """The handler of this run: its page, and its parts by number."""
 
         def do_GET(self) -> None:
-            """Send the page, or the stretch that it asks for."""
-            # The page is another one at the end.
+            """Send the page or a part."""
+            # The page changes when the run is complete.
             type(self).page = run.html
             if not self.path.startswith("/stretch/"):
                 super().do_GET()
@@ -104,11 +101,11 @@ def serve_growing(run: Growing, port: int | None) -> ThreadingHTTPServer:
 
         def _send_stretch(self, number: str) -> None:
             if not (number.isascii() and number.isdigit()) or len(number) > 9:
-                self.send(b"there is nothing here.\n", "text/plain", 404)
+                self.send(b"not found\n", "text/plain", 404)
                 return
             block = run.block(int(number))
             with contextlib.suppress(ConnectionError):
-                # 205, the page is to be loaded anew; 204, nothing yet.
+                # 205: reload the page; 204: no part yet.
                 code = 205 if block is None else 200 if block else 204
                 self.send(block or b"", "application/octet-stream", code)
 

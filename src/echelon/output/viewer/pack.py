@@ -1,29 +1,29 @@
-"""Numbers as the page takes them: 16 bits between extremes, differences in time, deflated.
+"""Compressed numbers for the page: 16 bits per value, as differences in time.
 
-Each channel is rounded to a 65535th of its own range, so that a flock of 20 m is stored to 0.3 mm.
+Each channel is rounded to a 65535th of its range: 0.3 mm of 20 m.
 """
 
 import json
 import struct
 import zlib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 
 FINE, COARSE, BYTE = 65535, 1023, 255
 GAP = 65535
-"""What stands for a missing number in a series, which takes one level less."""
+"""The code of a missing number in a series, which has one level less."""
 
 
 class Group(NamedTuple):
-    """Channels that are packed alike.
+    """Channels with a common format.
 
     Attributes:
         values: (T, C).
         levels: between the extremes of a channel; 255 or less takes one byte.
-        limits: the extremes, where they are not the channel's own.
+        limits: the extremes; None for each channel's own.
         gaps: whether a number may be missing (NaN).
     """
 
@@ -33,24 +33,26 @@ class Group(NamedTuple):
     gaps: bool = False
 
 
-def pack(header: dict[str, Any], groups: dict[str, Group]) -> bytes:
-    """Return header and groups as one deflated block: the header's length, its JSON, the numbers.
+def pack(header: JsonObject, groups: dict[str, Group]) -> bytes:
+    """Return a compressed block: the header's length, its JSON, and the numbers.
 
-    The header gets `groups`: for each, by name, extremes, steps, frames and bytes a number.
+    The header gets the key `groups`: by name, extremes, steps, frames and bytes per number.
     """
-    blocks, told = [], {}
+    blocks, formats = [], {}
     for name, group in groups.items():
-        block, told[name] = _pack_group(group)
+        block, formats[name] = _pack_group(group)
         blocks.append(block)
-    text = json.dumps({**header, "groups": told}, allow_nan=False, separators=(",", ":")).encode()
+    text = json.dumps(
+        {**header, "groups": formats}, allow_nan=False, separators=(",", ":")
+    ).encode()
     return zlib.compress(b"".join([struct.pack("<I", len(text)), text, *blocks]), 9)
 
 
-def _pack_group(group: Group) -> tuple[bytes, dict[str, Any]]:
+def _pack_group(group: Group) -> tuple[bytes, JsonObject]:
     values = np.asarray(group.values, np.float64)
     low, high = _extremes(values, group.limits)
     levels = group.levels - 1 if group.gaps else group.levels
-    # Rounded first, so that page and Python use the same numbers.
+    # Rounded before use, so that page and Python compute with the same numbers.
     low = np.array([float(f"{value:.9g}") for value in low])
     step = np.array([float(f"{value:.9g}") for value in np.maximum((high - low) / levels, 0.0)])
     safe = np.where(step > 0.0, step, 1.0)
@@ -58,21 +60,21 @@ def _pack_group(group: Group) -> tuple[bytes, dict[str, Any]]:
     q = np.where(np.isnan(scaled), GAP, np.clip(np.nan_to_num(scaled), 0, levels)).astype(np.int64)
     differences = np.diff(q.T, axis=1, prepend=0)
     wide = group.levels > BYTE
-    # Modulo 2^16 or 2^8: the page adds them up in as many bits.
+    # Modulo 2^16 or 2^8, as the page adds them up.
     d = (differences & (0xFFFF if wide else 0xFF)).astype(np.uint16)
     block = (d & 255).astype(np.uint8).tobytes()
     if wide:
         block += (d >> 8).astype(np.uint8).tobytes()
-    told = {"low": low.tolist(), "step": step.tolist()}
-    return block, {**told, "frames": len(values), "bytes": 2 if wide else 1}
+    ranges = {"low": low.tolist(), "step": step.tolist()}
+    return block, {**ranges, "frames": len(values), "bytes": 2 if wide else 1}
 
 
 def _extremes(values: Array, limits: tuple[float, float] | None) -> tuple[Array, Array]:
     channels = values.shape[1]
     if limits is not None:
         return np.full(channels, limits[0]), np.full(channels, limits[1])
-    known = np.isfinite(values)
-    low = np.where(known, values, np.inf).min(axis=0, initial=np.inf)
-    high = np.where(known, values, -np.inf).max(axis=0, initial=-np.inf)
-    some = known.any(axis=0)
+    finite = np.isfinite(values)
+    low = np.where(finite, values, np.inf).min(axis=0, initial=np.inf)
+    high = np.where(finite, values, -np.inf).max(axis=0, initial=-np.inf)
+    some = finite.any(axis=0)
     return np.where(some, low, 0.0), np.where(some, high, 0.0)

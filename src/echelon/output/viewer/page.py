@@ -1,4 +1,4 @@
-"""The page: one HTML file with its code and its data inside, deflated."""
+"""One self-contained HTML page, with its code and data compressed inside."""
 
 import base64
 import zlib
@@ -26,7 +26,7 @@ _SCRIPTS = (
 
 
 def page(title: str, data: bytes) -> str:
-    """Return a page that draws deflated data, such as `pack` makes.
+    """Return the page of compressed data, as `pack` returns it.
 
     Raises:
         MissingExtraError: three.js is not built, as in a fresh clone.
@@ -41,15 +41,15 @@ def page(title: str, data: bytes) -> str:
 
 
 def check_page() -> None:
-    """Check that pages can be made.
+    """Check that the page is complete.
 
     Raises:
         MissingExtraError: three.js is not built, as in a fresh clone.
     """
     if not (_HERE / _BUNDLE).is_file():
         raise MissingExtraError(
-            "the page's three.js is not built in this copy of echelon; `python3 dev.py setup` in "
-            "its folder builds it, and installed wheels hold it."
+            "the page's three.js is not built in this copy of echelon; run `python3 dev.py setup` "
+            "in its folder, or install a wheel, which contains it."
         )
 
 

@@ -1,4 +1,4 @@
-"""A run as the page takes it: where everybody is at every frame, and what to say of it."""
+"""The data of a replay page: places, angles and motors at each frame, charts, and texts."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from echelon.core.errors import OutputError
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
 from echelon.output.plots.style import raised
@@ -15,15 +15,15 @@ from echelon.output.viewer.pack import BYTE, COARSE, Group, pack
 from echelon.output.viewer.page import page
 
 FLOCK = 200
-"""With more agents than this, bodies are flat, and what is stored of motors is a byte."""
+"""With more agents than this, bodies are flat, and a motor load takes one byte."""
 _RATE, _FLOCK_RATE = 50.0, 25.0
-"""Frames per second that are stored; the page draws between them."""
+"""Stored frames per second; the page interpolates."""
 _MOST = 20_000_000
-"""Places, angles and motors in one file: some 25 MB of it."""
+"""Numbers in one file, which take some 25 MB."""
 
 
 def replay_page(run: Recording) -> str:
-    """Return a run as one HTML page that needs no other file and no network.
+    """Return a run as one self-contained HTML page.
 
     Raises:
         OutputError: the run has no frame or is too large, or the page's three.js is not built.
@@ -38,52 +38,49 @@ def replay_data(run: Recording) -> bytes:
         OutputError: it has no frame, or is too large.
     """
     if not len(run.times):
-        raise OutputError("the run has no stored frame, and so nothing to show.")
+        raise OutputError("the run has no stored frame; a page needs at least one.")
     space, charts = space_of(run), charts_of(run)
     frames = frames_of(run)
     groups = {"positions": Group(_flat(clipped_places(run, space.axes)[0][frames]))}
     if space.angles:
-        groups["angles"] = Group(_flat(_turns(run, space)[frames]))
+        # Without jumps, so that the page can interpolate.
+        angles = space.sign * np.unwrap(run.states[:, :, list(space.angles)], axis=0)
+        groups["angles"] = Group(_flat(angles[frames]))
     loads, many = motor_loads(run, space), run.agents > FLOCK
     if loads is not None:
         groups["motors"] = Group(_flat(loads[frames]), BYTE if many else COARSE, (0.0, 1.0))
     _check_size(run, groups, len(frames))
-    told = {
+    description = {
         **header(run, space),
         "frames": len(frames),
         "clock": _clock(run, frames),
         "thrust": loads is not None,
-        "charts": charts.told,
+        "charts": charts.descriptions,
         "chartTimes": charts.times,
     }
-    return pack(told, {**groups, "series": charts.group})
+    return pack(description, {**groups, "series": charts.group})
 
 
 def frames_of(run: Recording) -> Array:
-    """Return the stored frames that are shown: evenly apart, and the last."""
+    """Return the frames of the page: evenly spaced, and the last."""
     times, last = run.times, len(run.times) - 1
     if last < 1:
         return np.array([0])
     rate = _RATE if run.agents <= FLOCK else _FLOCK_RATE
-    # Half a frame of slack, since times are multiples of a step that no float is.
+    # Half a frame of tolerance, since times are rounded multiples of the step.
     stride = max(1, int(1.0 / (rate * (times[1] - times[0])) + 0.5))
     return np.unique([*range(0, last, stride), last])
 
 
 def _clock(run: Recording, frames: Array) -> dict[str, float]:
-    """Return when frames are: evenly apart but for the last."""
+    """Return the times of frames: evenly spaced except for the last."""
     times = run.times[frames]
     step = float(times[1] - times[0]) if len(times) > 1 else 1.0
     return {"start": float(times[0]), "step": step, "last": float(times[-1])}
 
 
-def _turns(run: Recording, space: Space) -> Array:
-    """Return the angles (T, N, 1 or 3) of bodies, without jumps, so that one can go between."""
-    return space.sign * np.unwrap(run.states[:, :, list(space.angles)], axis=0)
-
-
 def motor_loads(run: Recording, space: Space) -> Array | None:
-    """Return what motors give as parts of their limits, (T, N, k), of bodies that have k motors."""
+    """Return motor loads as fractions of their limits, (T, N, k), of bodies with k motors."""
     motors = {"quadrotor": 4, "birotor": 2}.get(space.shape)
     loads = run.loads
     return None if loads is None or loads.shape[2] != motors else np.clip(loads, 0.0, 1.0)
@@ -98,17 +95,17 @@ def _check_size(run: Recording, groups: Mapping[str, Group], frames: int) -> Non
     if numbers > _MOST:
         fits = max(1, int(frames * _MOST / numbers))
         raise OutputError(
-            f"{run.agents} agents at {frames} times are too many for one page, which takes about "
-            f"{fits} times of them; store fewer with `simulation.store_every`."
+            f"{run.agents} agents at {frames} times are too many for one page; store at most about "
+            f"{fits} times with `simulation.store_every`."
         )
 
 
-# ---- what the page is told ----------------------------------------------------------------------
+# ---- texts and space ----------------------------------------------------------------------------
 
 
-def header(run: Recording, space: Space) -> dict[str, Any]:
-    """Return what replay and live page are told of a run, apart from its frames."""
-    size, drawn = _size(run, space)
+def header(run: Recording, space: Space) -> JsonObject:
+    """Return the header of the replay and live pages: all of a run but its frames."""
+    size, note = _size(run, space)
     return {
         "title": run.name,
         "facts": facts(run),
@@ -130,19 +127,19 @@ def header(run: Recording, space: Space) -> dict[str, Any]:
         "box": {"low": space.low.tolist(), "high": space.high.tolist()},
         "shape": space.shape,
         "size": size,
-        "drawn": drawn,
+        "drawn": note,
         "thrust": False,
         "duration": float(run.times[-1]) if len(run.times) else run.horizon,
     }
 
 
 def heard_by(heard: Array) -> list[int]:
-    """Return who hears along each edge: 1 its second end, 2 its first, 3 both, 0 nobody."""
+    """Return the receivers of each edge: 1 its second end, 2 its first, 3 both, 0 none."""
     return (heard @ (2, 1)).tolist()
 
 
-def _schedule(run: Recording) -> dict[str, Any] | None:
-    """Return when which edges are there, each stretch as a text of 1 and 0."""
+def _schedule(run: Recording) -> JsonObject | None:
+    """Return the schedule of edges, each graph as a text of 1 and 0."""
     if run.schedule is None:
         return None
     starts, weights, period = run.schedule
@@ -151,13 +148,13 @@ def _schedule(run: Recording) -> dict[str, Any] | None:
 
 
 def facts(run: Recording) -> list[str]:
-    """Return what stands beside the title."""
+    """Return the texts beside the title."""
     leaders = len(run.leaders)
-    told = [f"{run.agents} agents", _spaced(run.model)]
-    told += [f"{leaders} leaders"] if leaders > 1 else []
+    texts = [f"{run.agents} agents", _spaced(run.model)]
+    texts += [f"{leaders} leaders"] if leaders > 1 else []
     if "coupling" in run.promise and run.promise["coupling"] is not None:
-        told.append(f"coupling {run.promise['coupling']:.3g}")
-    return told
+        texts.append(f"coupling {run.promise['coupling']:.3g}")
+    return texts
 
 
 def _spaced(name: str) -> str:
@@ -167,49 +164,49 @@ def _spaced(name: str) -> str:
 
 
 def _notes(run: Recording, space: Space) -> list[str]:
-    told = [] if run.attributes.get("outcome") == "completed" else [str(run.attributes["message"])]
+    notes = [] if run.attributes.get("outcome") == "completed" else [str(run.attributes["message"])]
     if space.clipped:
-        told.append("Agents farther off than ten times what the formation reaches stand still.")
-    return told
+        notes.append("Agents farther away than ten times the formation are drawn at that border.")
+    return notes
 
 
 def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
-    """Return a promise in a few words, whole, and as a state: `holds` or `lost`."""
+    """Return the badge of a promise: its state `holds` or `lost`, a short and a whole text."""
     if not promise["promised"]:
-        return {"state": "lost", "short": "nothing promised", "whole": promise["sentence"]}
+        return {"state": "lost", "short": "no guarantee", "whole": promise["sentence"]}
     rate, kind = promise["rate"], promise["kind"]
-    by = promise["theorem"] or kind
-    short = f"promised: {rate:.3g} 1/s, {by}" if rate else f"promised: V does not rise, {by}"
+    source = promise["theorem"] or kind
+    short = f"guaranteed: {f'{rate:.3g} 1/s' if rate else 'V does not rise'}, {source}"
     whole = f"{promise['sentence']} {_rate_in_words(promise)}".rstrip()
     return {"state": "holds", "short": short, "whole": whole}
 
 
 def _rate_in_words(promise: Mapping[str, Any]) -> str:
-    """Return which rate stands in the badge; nothing where it stands in the promise's sentence."""
+    """Return a sentence on the rate in the badge; empty if the promise's sentence states it."""
     rate, slowest = promise["rate"], promise.get("slowest_mode")
     if not rate or promise["theorem"]:
         return ""
     if slowest is None or abs(rate + slowest) <= 1e-6 * rate:
-        return f"The rate {rate:.3g} 1/s is that of the slowest mode."
+        return f"The rate of {rate:.3g} 1/s is that of the slowest mode."
     return (
-        f"The rate {rate:.3g} 1/s is kept whichever graph holds and turn is flown; the slowest "
-        f"mode by itself is {slowest:.3g} 1/s."
+        f"The rate of {rate:.3g} 1/s holds for all graphs and turns of the scenario; the slowest "
+        f"mode alone decays at {-slowest:.3g} 1/s."
     )
 
 
 def _badge_of_run(run: Recording) -> dict[str, str]:
-    """Return the badge of a run, in red where what was promised did not reach it."""
-    badge, ended = promise_badge(run.promise), run.attributes.get("outcome")
-    if badge["state"] != "holds" or ended not in ("left_chart", "diverged"):
+    """Return the badge of a run, withdrawn if the guarantee does not cover the run."""
+    badge, outcome = promise_badge(run.promise), run.attributes.get("outcome")
+    if badge["state"] != "holds" or outcome not in ("left_chart", "diverged"):
         return badge
-    short, whole = "what is promised does not reach this run", badge["whole"]
+    short, whole = "the guarantee does not cover this run", badge["whole"]
     return {"state": "lost", "short": short, "whole": f"{run.attributes['message']} {whole}"}
 
 
 def _size(run: Recording, space: Space) -> tuple[float, str]:
-    """Return by what bodies are drawn larger than 1, and how that is said."""
-    wide = body_width(run, space)
-    across = {"quadrotor": 1.15, "birotor": 1.35, "car": 0.9, "ball": 0.52, "dot": 0.5}
+    """Return the scale of bodies, and a note on it."""
+    width = body_width(run, space)
+    spans = {"quadrotor": 1.15, "birotor": 1.35, "car": 0.9, "ball": 0.52, "dot": 0.5}
     if space.kind in ("phase", "time"):
-        return wide / across["dot"], ""
-    return wide / across[space.shape], f"vehicles drawn {wide:.2g} m wide, not to scale"
+        return width / spans["dot"], ""
+    return width / spans[space.shape], f"vehicles drawn {width:.2g} m wide, not to scale"

@@ -1,4 +1,4 @@
-"""A page served to this machine alone, and the browser that shows it."""
+"""A web server for pages on this machine only, and the browser that shows them."""
 
 import abc
 import contextlib
@@ -18,10 +18,10 @@ _NAMES: Final = (HOST, "localhost", "[::1]")
 
 
 class Handler(BaseHTTPRequestHandler, abc.ABC):
-    """Answers requests for `page` that come from this machine's own pages; others get a 403.
+    """Answers requests of its own pages on this machine; others get a 403.
 
-    Any page that a person has open can send requests to 127.0.0.1, and a name of another's may be
-    made to mean it. So both headers that tell of that must be ours.
+    Any website that a person has open can send requests to 127.0.0.1, or let its own name point
+    there. So the headers `Host` and `Origin` must both name this server.
     """
 
     protocol_version = "HTTP/1.1"
@@ -32,22 +32,22 @@ class Handler(BaseHTTPRequestHandler, abc.ABC):
         if self.allowed() and self.path.split("?")[0] in ("/", "/index.html"):
             self.send(self.page, "text/html; charset=utf-8")
         elif self.allowed():
-            self.send(b"there is nothing here.\n", "text/plain", 404)
+            self.send(b"not found\n", "text/plain", 404)
 
     def allowed(self) -> bool:
-        """Tell whether a request is ours, and refuse it where it is not."""
+        """Return whether a request is from this server's pages; refuse it otherwise."""
         port = self.connection.getsockname()[1]
-        ours = {f"{name}:{port}" for name in _NAMES}
+        hosts = {f"{name}:{port}" for name in _NAMES}
         origin = self.headers.get("Origin")
-        if self.headers.get("Host") in ours and origin in {None, *(f"http://{x}" for x in ours)}:
+        if self.headers.get("Host") in hosts and origin in {None, *(f"http://{x}" for x in hosts)}:
             return True
         if not self.wfile.closed and not getattr(self, "refused", False):
             self.refused = True
-            self.send(b"only pages of this server may ask.\n", "text/plain", 403)
+            self.send(b"forbidden: not a page of this server\n", "text/plain", 403)
         return False
 
     def send(self, content: bytes, kind: str, code: int = 200) -> None:
-        """Send a whole answer."""
+        """Send a complete answer."""
         self.send_response(code)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
@@ -57,7 +57,7 @@ class Handler(BaseHTTPRequestHandler, abc.ABC):
             self.wfile.write(content)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing of requests."""
+        """Log no requests."""
 
 
 class _Server(ThreadingHTTPServer):
@@ -66,11 +66,11 @@ class _Server(ThreadingHTTPServer):
     allow_reuse_address = False
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of a page that was closed while it was being sent."""
+        """Ignore a page that was closed while it was sent."""
 
 
 def serve(handler: type[BaseHTTPRequestHandler], port: int | None = None) -> ThreadingHTTPServer:
-    """Return a server on 127.0.0.1, on the asked port or the first free one after it.
+    """Return a server on 127.0.0.1, on a port or the first free one after it.
 
     Raises:
         OutputError: none of the next 50 is free.
@@ -83,13 +83,13 @@ def serve(handler: type[BaseHTTPRequestHandler], port: int | None = None) -> Thr
             return _Server((HOST, number), handler)
         except OSError as error:
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
-                raise OutputError(f"no page can be served: {error.strerror}.") from error
-    raise OutputError(f"all ports from {first} to {first + _TRIES - 1} are in use; name another.")
+                raise OutputError(f"the page cannot be served: {error.strerror}.") from error
+    raise OutputError(f"ports {first} to {first + _TRIES - 1} are in use; give another `--port`.")
 
 
 @contextlib.contextmanager
 def serving(server: ThreadingHTTPServer) -> Iterator[str]:
-    """Serve in a thread as long as this lasts, and yield the address."""
+    """Serve in a thread inside this context, and yield the address."""
     thread = threading.Thread(target=server.serve_forever, args=(0.1,), daemon=True)
     thread.start()
     try:
@@ -101,7 +101,7 @@ def serving(server: ThreadingHTTPServer) -> Iterator[str]:
 
 
 def open_browser(address: str) -> bool:
-    """Open an address in the person's browser, and tell whether there is one."""
+    """Open an address in a browser, and return whether there is one."""
     try:
         return webbrowser.open(address)
     except webbrowser.Error:

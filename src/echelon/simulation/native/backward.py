@@ -12,6 +12,7 @@ from typing import NamedTuple, final
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from echelon.core.memoize import BoundedCache
 from echelon.core.types import Array
@@ -135,13 +136,13 @@ class CostSlopes(NamedTuple):
 
     Attributes:
         leaves: along the leaves of the loop that have varying numbers.
-        states: along the initial states (N, n).
-        offsets: along the goals' offsets (N, n).
+        states: along the initial states.
+        offsets: along the goals' offsets.
     """
 
     leaves: list[Array]
-    states: Array
-    offsets: Array
+    states: Float[Array, "N n"]
+    offsets: Float[Array, "N n"]
 
 
 @final
@@ -150,8 +151,8 @@ class Backward:
 
     Args:
         varying: the loop, and its numbers with respect to which to differentiate.
-        states: (N, n) at the beginning.
-        reference: (steps, n) what the leaders follow, or None.
+        states: at the beginning.
+        reference: what the leaders follow at each step, or None.
         steps: of the run.
         needs: what more is needed than slopes along gains and starts.
 
@@ -162,8 +163,8 @@ class Backward:
     def __init__(
         self,
         varying: VaryingNumbers,
-        states: Array,
-        reference: Array | None,
+        states: Float[Array, "N n"],
+        reference: Float[Array, "k n"] | None,
         steps: int,
         needs: SlopeNeeds,
     ) -> None:

@@ -5,14 +5,15 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from echelon.core.types import Array
 from echelon.simulation.step.loop import Loop, Moment
 from echelon.simulation.step.sequence import signals
 
 
-def offsets_of(loops: Sequence[Loop], dtype: np.dtype) -> Array:
-    """Return the goals' offsets of all agents (N, n), loop by loop."""
+def offsets_of(loops: Sequence[Loop], dtype: np.dtype) -> Float[Array, "N n"]:
+    """Return the goals' offsets of all agents, loop by loop."""
     # Runs that differ only in their initial states share one loop, and are often thousands.
     distinct = {id(loop): loop for loop in loops}
     offsets = {k: np.asarray(loop.offsets, dtype) for k, loop in distinct.items()}
@@ -22,15 +23,19 @@ def offsets_of(loops: Sequence[Loop], dtype: np.dtype) -> Array:
 
 
 def mirror_values(
-    loops: Sequence[Loop], now: Moment, x: Array, offsets: Array, with_signals: bool
-) -> Array:
-    """Return what neighbours read of all agents (N, s).
+    loops: Sequence[Loop],
+    now: Moment,
+    x: Float[Array, "N n"],
+    offsets: Float[Array, "N n"],
+    with_signals: bool,
+) -> Float[Array, "N k"]:
+    """Return what neighbours read of all agents.
 
     Args:
         loops: of formations one after the other, with the same number of agents each.
         now: the moment.
-        x: the states at that moment (N, n).
-        offsets: of their goals (N, n).
+        x: the states at that moment.
+        offsets: of their goals.
         with_signals: whether they also send signals.
     """
     relative = x - offsets

@@ -7,6 +7,7 @@ from typing import Any, final
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from echelon.core.types import Array
 from echelon.simulation.codegen import aligned, stride
@@ -54,7 +55,7 @@ class NativeStepper(Stepper):
 
     Args:
         loops: of the run, or of each formation.
-        states: (N, n) at its beginning, formation by formation.
+        states: at its beginning, formation by formation.
         bits: 64 or 32, the precision.
         fallback: continues if a state is beyond the range of the kernels' sines; None if the caller
             checks the range.
@@ -72,7 +73,7 @@ class NativeStepper(Stepper):
     def __init__(
         self,
         loops: Sequence[Loop],
-        states: Array,
+        states: Float[Array, "N n"],
         bits: int,
         fallback: Stepper | None,
         pool: Executor | None = None,
@@ -94,9 +95,8 @@ class NativeStepper(Stepper):
         first = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (first + self.loop.leaders).reshape(-1)
         self.followers = (first + self.loop.followers).reshape(-1)
-        kernel = (make or KERNELS.of)(
-            self.varying, bits, batched, self.places.row_major, variant is not None
-        )
+        row_major, weights_change = self.places.row_major, variant is not None
+        kernel = (make or KERNELS.of)(self.varying, bits, batched, row_major, weights_change)
         self.code, self.rows, self.plan, self.uniform_count = kernel
         self._signals = signal_size(self.loop)
         # Once, because to call a law takes as long as many small steps.
@@ -122,11 +122,10 @@ class NativeStepper(Stepper):
         if plan.leaders_ahead:
             assert isinstance(places, SwarmBlocks)
             near = self.neighbourhood
-            parts = (self.blocks, *self.mirrors, near.neighbours, near.weights)
-            parts += (near.edges, near.edge_ends)
-            bytes_ = sum(part.nbytes for part in parts) // places.blocks
+            arrays = near.neighbours, near.weights, near.edges, near.edge_ends
+            bytes_ = sum(part.nbytes for part in (self.blocks, *self.mirrors, *arrays))
             far = 1 if plan.row_major else stride(plan.width, plan.lanes)
-            places.measure_reach(self.neighbourhood, far, bytes_)
+            places.measure_reach(near, far, bytes_ // places.blocks)
         self.edges, self.edge_weights = self.neighbourhood.edges, self.neighbourhood.weights
 
     def _read(self, rows: range, out: Array) -> Array:
@@ -187,12 +186,11 @@ class NativeStepper(Stepper):
         if self.fallback is None or not any_beyond(chunk.states, self.bits):
             return chunk
         self._moment = None
-        if self._fallback_step < 0:
-            self._fallback_step = int(now.step)
+        self._fallback_step = int(now.step) if self._fallback_step < 0 else self._fallback_step
         return self.fallback.advance(now, counts, reference)
 
     def turn(self, loop: Loop) -> None:
-        """Go on in a loop of one formation that is like the one before, but for its numbers."""
+        """Continue with a loop of one formation that differs from this one only in numbers."""
         self.loop, self.loops = loop, [loop]
         self.varying.turn(loop)
         self.edge_weights[:] = neighbour_slots(loop, self.places)[2]
@@ -288,12 +286,12 @@ class NativeStepper(Stepper):
         values |= {"first_step": step, "steps": steps, "input_step": input_step}
         values |= {"leader_blocks": self.leader_blocks, "row_stride": places.row_stride}
         values |= {"blocks": int(places.segments[-1]), "edge_blocks": places.edge_blocks}
-        values |= {"first_steady": int(self.loop.meter.first_steady)}
+        values["first_steady"] = int(self.loop.meter.first_steady)
         if self._tape is not None:
             tape = self._tape[step - self._tape_start]
             values |= {"tape": tape.ctypes.data, "tape_step": tape.size}
-        firsts = {"rows": self.blocks, "mirror": self.mirrors[0], "next_mirror": self.mirrors[1]}
-        firsts["edges"] = self.edges
+        names = "rows", "mirror", "next_mirror", "edges"
+        firsts = dict(zip(names, (self.blocks, *self.mirrors, self.edges), strict=True))
         uniform_values = np.empty(steps * self.uniform_count, self.dtype)
         self.threads.run(self.code, values, firsts, uniform_values)
         if steps % 2:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, final
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from echelon.core.types import Array
 from echelon.simulation.codegen import Body, from_tape, stride
@@ -76,8 +77,8 @@ def disagreement_size(loop: Loop) -> int:
     return signal_size(loop) or len(loop.model.state_names)
 
 
-def imbalance(loop: Loop) -> Array:
-    """Return the weight by which each agent receives more than it sends, (stretches, N)."""
+def imbalance(loop: Loop) -> Float[Array, "k N"]:
+    """Return the weight by which each agent receives more than it sends, for each stretch."""
     exchange, agents = loop.exchange, len(loop.offsets)
 
     def sums(ends: Array, weights: Array) -> Array:

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from echelon.agents.network.exchange import Exchange
 from echelon.core.types import Array
@@ -93,13 +94,8 @@ def transposed_arrays(
     )
 
 
-def transposed_disagreement(loop: Loop, cotangents: Array) -> Array:
-    """Return the cotangents of what agents send (N, s) at the first step.
-
-    Args:
-        loop: of the run.
-        cotangents: of the disagreements, (N, s).
-    """
+def transposed_disagreement(loop: Loop, cotangents: Float[Array, "N k"]) -> Float[Array, "N k"]:
+    """Return the cotangents of what agents send at the first step from those of disagreements."""
     exchange, sent = loop.exchange, np.zeros_like(cotangents)
     weights = np.atleast_2d(np.asarray(exchange.weights))[stretch_at(loop, 0)[0]]
     along = weights[:, None] * cotangents[exchange.receivers]

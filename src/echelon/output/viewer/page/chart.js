@@ -1,10 +1,10 @@
-// Curves over time on a canvas that is drawn once; the cursor is an element that moves over it.
+// A chart over time on a canvas; the cursor is an element that moves over it.
 
 const RAISED = "\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079";
 const raise = (k) => "10" + (k < 0 ? "\u207b" : "") + [...String(Math.abs(k))].map((digit) => RAISED[digit]).join("");
 const MARGIN = { left: 46, right: 14, top: 6, bottom: 20 };
 
-// A number in three digits, as a person writes it.
+// A number with three digits.
 function brief(value) {
   if (!Number.isFinite(value)) return "\u2013";
   const size = Math.abs(value);
@@ -13,14 +13,14 @@ function brief(value) {
     const power = Math.floor(Math.log10(size));
     return `${(value / 10 ** power).toFixed(1)}\u00b7${raise(power)}`.replace("-", "\u2212");
   }
-  // Three digits are too few before the point of a thousand.
+  // From 1000 on all digits before the point are shown.
   return (size >= 1e3 ? value.toFixed(0) : value.toPrecision(3)).replace("-", "\u2212");
 }
 
 class Chart {
-  // What is told of a chart: title, unit, log, lines, marks; what is done when a time is chosen.
-  constructor(element, told, seek) {
-    Object.assign(this, told);
+  // The chart has title, unit, log, lines and marks; `seek` is called with a selected time.
+  constructor(element, chart, seek) {
+    Object.assign(this, chart);
     this.element = document.createElement("figure");
     this.element.className = "chart";
     this.element.innerHTML = `<figcaption><b></b><span class="legend"></span></figcaption>
@@ -71,7 +71,7 @@ class Chart {
     return times.length > 1 ? [times[0], times[times.length - 1]] : [0, 1];
   }
 
-  // The values between which the axis goes; of a logarithmic one the exponents.
+  // The limits of the value axis; of a logarithmic one as exponents.
   reach() {
     let [low, high] = [Infinity, -Infinity];
     const take = (y) => Number.isFinite(y) && ((low = Math.min(low, y)), (high = Math.max(high, y)));
@@ -79,8 +79,8 @@ class Chart {
     for (const mark of this.marks) take(this.log ? Math.log10(mark.value) : mark.value);
     if (!(low <= high)) return this.log ? [-1, 0] : [0, 1];
     if (this.log) return high - low > 2 ? [low - 0.15, high + 0.25] : [Math.floor(low - 0.05), Math.ceil(high + 0.05)];
-    const room = 0.06 * (high - low) || Math.max(1e-6, 0.1 * Math.abs(high));
-    return [low - room, high + room];
+    const margin = 0.06 * (high - low) || Math.max(1e-6, 0.1 * Math.abs(high));
+    return [low - margin, high + margin];
   }
 
   draw() {
@@ -114,12 +114,12 @@ class Chart {
       pen.moveTo(MARGIN.left, y);
       pen.lineTo(w - MARGIN.right, y);
       pen.stroke();
-      pen.fillText(this.log ? raise(Math.round(value)) : shown(value, step), MARGIN.left - 6, y);
+      pen.fillText(this.log ? raise(Math.round(value)) : format(value, step), MARGIN.left - 6, y);
     }
     Object.assign(pen, { textAlign: "center", textBaseline: "bottom" });
     const marks = ticks(first, last, across);
     marks.forEach((t, k) => {
-      const words = shown(t, across) + (k === marks.length - 1 ? " s" : "");
+      const words = format(t, across) + (k === marks.length - 1 ? " s" : "");
       pen.fillText(words, Math.min(this.x(t), w - 1 - pen.measureText(words).width / 2), h - 1);
     });
   }
@@ -137,7 +137,7 @@ class Chart {
     }
   }
 
-  // Names over the curves, which would strike them through.
+  // After the curves, which would cross the names.
   nameMarks(pen, w) {
     for (const mark of this.marks) {
       const y = this.y(this.log ? Math.log10(mark.value) : mark.value);
@@ -165,13 +165,13 @@ class Chart {
     pen.setLineDash([]);
   }
 
-  // Put the cursor at a time, and tell the values there.
+  // Moves the cursor to a time, and shows the values there.
   point(time) {
     this.now = time;
     if (!this.x) return;
     this.cursor.style.transform = `translateX(${this.x(time).toFixed(1)}px)`;
     const k = Math.max(0, Math.min(this.times.length - 1, upper(this.times, time) - 1));
-    // What is nothing beside the axis is rounding.
+    // Values far below the axis are rounding errors.
     const most = Math.max(...this.reach().map(Math.abs));
     this.lines.forEach((line, place) => {
       const value = line.values[k];

@@ -1,4 +1,4 @@
-// What replay and live page share: the frame of the page, view buttons, the card of an agent.
+// Shared by the replay and live pages: header, view buttons, and the card of an agent.
 
 const $ = (selector) => document.querySelector(selector);
 
@@ -9,7 +9,7 @@ function make(tag, attributes = {}, ...children) {
   return element;
 }
 
-// Words of which those between back-ticks are code.
+// Text with code between back-ticks.
 function prose(words) {
   return words.split("`").map((part, k) => (k % 2 ? make("code", {}, part) : part));
 }
@@ -23,24 +23,24 @@ function icon(name) {
   return svg;
 }
 
-function tellPromise({ state, short, whole }) {
+function showGuarantee({ state, short, whole }) {
   const badge = $(".promise");
-  badge.classList.remove("holds", "edge", "lost", "asking");
+  badge.classList.remove("holds", "edge", "lost", "pending");
   badge.classList.add(state);
   badge.querySelector("b").textContent = short;
   badge.querySelector(".whole").replaceChildren(...prose(whole));
 }
 
-function dress(run) {
+function showHeader(run) {
   $("h1").textContent = run.title;
   $(".facts").textContent = run.facts.join(" \u00b7 ");
   $(".notes").replaceChildren(...prose(run.notes.join(" ")));
-  if (run.promise) tellPromise(run.promise);
+  if (run.promise) showGuarantee(run.promise);
   else $(".promise").hidden = true;
-  const key = $(".key"), say = (look, words) => key.append(make("span", {}, look, words));
-  if (run.thrust) say(make("i"), ""), key.lastChild.append("motor thrust 0", make("i", { class: "thrust" }), "limit");
-  if (run.agents > run.leaders.length) say(make("i", { class: "ring" }), "goal");
-  if (run.heard.some((who) => who === 1 || who === 2)) say(make("i", { class: run.agents > 200 ? "taper" : "arrow" }), "from who is heard to who hears");
+  const key = $(".key"), add = (look, words) => key.append(make("span", {}, look, words));
+  if (run.thrust) add(make("i"), ""), key.lastChild.append("motor thrust 0", make("i", { class: "thrust" }), "limit");
+  if (run.agents > run.leaders.length) add(make("i", { class: "ring" }), "goal");
+  if (run.heard.some((who) => who === 1 || who === 2)) add(make("i", { class: run.agents > 200 ? "taper" : "arrow" }), "from sender to receiver");
   key.append(make("span", {}, run.drawn));
 }
 
@@ -48,15 +48,15 @@ function setDark(dark) {
   document.documentElement.classList.toggle("dark", dark);
 }
 
-// The buttons of the view, and what follows from them.
+// The buttons of the view.
 class ViewControls {
   constructor(view, charts, show) {
     this.view = view;
     this.show = show;
-    this.whom = null;
+    this.target = null;
     this.box = make("div", { class: "toggles" });
     for (const name of ["links", "goals", "trails"]) this.toggle(name, (on) => (view.shared[name].value = on ? shares(view.run)[name] : 0));
-    if (view.labels.all.length) this.toggle("names", (on) => (view.labels.shown = on));
+    if (view.labels.all.length) this.toggle("names", (on) => (view.labels.visible = on));
     this.makeFollow();
     const home = make("button", { title: "show all (h)" }, "show all");
     home.addEventListener("click", () => this.home());
@@ -68,21 +68,21 @@ class ViewControls {
       view.setTheme();
       for (const chart of charts()) chart.draw();
     });
-    this.listen();
+    this.handleClicks();
   }
 
   home() {
-    this.whom = null;
+    this.target = null;
     this.select.value = "";
     this.view.home();
   }
 
-  toggle(name, act) {
+  toggle(name, action) {
     const button = make("button", { class: "toggle", "aria-pressed": "true" }, name);
     button.addEventListener("click", () => {
       const on = button.getAttribute("aria-pressed") !== "true";
       button.setAttribute("aria-pressed", on);
-      act(on);
+      action(on);
       this.view.draw();
     });
     this.box.append(button);
@@ -90,22 +90,22 @@ class ViewControls {
 
   makeFollow() {
     const { run } = this.view, leads = new Set(run.leaders);
-    this.select = make("select", { title: "what the camera follows", "aria-label": "what the camera follows" });
+    this.select = make("select", { title: "target of the camera", "aria-label": "target of the camera" });
     const option = (value, words) => this.select.append(make("option", { value }, words));
-    option("", "camera at rest");
+    option("", "fixed camera");
     option("all", "follow all");
     for (const i of run.agents <= 30 ? Array(run.agents).keys() : run.leaders.slice(0, 12)) option(i, leads.has(i) ? `follow leader ${i}` : `follow ${i}`);
     this.select.addEventListener("change", () => {
       const { value } = this.select;
-      this.whom = value === "" ? null : value === "all" ? "all" : Number(value);
+      this.target = value === "" ? null : value === "all" ? "all" : Number(value);
       this.view.moved = null;
       this.show();
     });
     this.box.append(this.select);
   }
 
-  // A click chooses the agent under it; a drag turns the camera.
-  listen() {
+  // A click selects the agent or link under it; a drag moves the camera.
+  handleClicks() {
     const { view } = this, canvas = view.renderer.domElement;
     let from = null;
     canvas.addEventListener("pointerdown", (event) => (from = [event.clientX, event.clientY]));
@@ -119,20 +119,20 @@ class ViewControls {
     });
   }
 
-  // After each moment: the camera and the card of who is selected.
+  // Updates the camera and the card of the selected agent.
   update(moment) {
-    this.view.follow(moment, this.whom);
+    this.view.follow(moment, this.target);
     const card = $(".card"), { run, selected } = this.view;
     card.hidden = selected < 0;
     if (selected < 0) return;
     const leads = run.leaders.includes(selected), p = moment.position, g = moment.goal, at = 3 * selected;
     const away = Math.hypot(...[0, 1, 2].map((k) => (p[at + k] - g[at + k]) / [...run.space.stretch, 1][k]));
-    const others = this.view.heardBy(selected);
-    const hears = others.length ? `hears ${others.slice(0, 8).join(", ")}${others.length > 8 ? " \u2026" : ""}` : "hears nobody";
+    const senders = this.view.sendersOf(selected);
+    const information = senders.length ? `receives from ${senders.slice(0, 8).join(", ")}${senders.length > 8 ? " \u2026" : ""}` : "receives from nobody";
     const place = run.space.kind === "time" ? [p[at + 1] / run.space.stretch[1]] : [0, 1, 2].slice(0, run.space.names.length).map((k) => p[at + k] / [...run.space.stretch, 1][k]);
     const unit = run.space.units[run.space.kind === "time" ? 1 : 0];
     card.replaceChildren(make("b", {}, `${leads ? "leader" : "follower"} ${selected}`), make("span", {}, `at ${place.map((v) => v.toFixed(2)).join(", ")} ${unit}`), make("br"));
     if (!leads) card.append(make("span", {}, `${brief(away)} ${unit} from its goal`), make("br"));
-    card.append(make("span", {}, hears));
+    card.append(make("span", {}, information));
   }
 }

@@ -1,5 +1,4 @@
-// A run that is still being computed: replays one after the other, each beginning where the one
-// before ended, behind what a player asks of one.
+// A run that is still being computed: a sequence of replays with the interface of one replay.
 
 class Growing {
   constructor(header) {
@@ -33,49 +32,49 @@ class Growing {
       const { ends, values } = this.charts[k].lines[n] ?? {};
       if (!values) return;
       const times = part.chartTimes.slice(from);
-      // What is promised begins where the run began.
+      // The guaranteed slope starts where the run started.
       values.push(...(ends ? times.map((t) => ends[0] + ends[1] * t) : line.values.slice(from)));
     }));
   }
 
-  partOf(found) {
+  lastPart(matches) {
     let k = this.parts.length - 1;
-    while (k > 0 && !found(k)) k--;
+    while (k > 0 && !matches(k)) k--;
     return k;
   }
 
   timeOf(frame) {
-    const k = this.partOf((k) => this.starts[k] <= frame);
+    const k = this.lastPart((k) => this.starts[k] <= frame);
     return this.parts[k].timeOf(frame - this.starts[k]);
   }
 
   frameOf(time) {
     if (!this.parts.length) return 0;
-    const k = this.partOf((k) => this.parts[k].timeOf(0) <= time);
+    const k = this.lastPart((k) => this.parts[k].timeOf(0) <= time);
     return this.starts[k] + this.parts[k].frameOf(time);
   }
 
   at(frame) {
     if (!this.parts.length) return this.moment;
-    const k = this.partOf((k) => this.starts[k] <= frame);
+    const k = this.lastPart((k) => this.starts[k] <= frame);
     return this.parts[k].at(frame - this.starts[k]);
   }
 }
 
-// Asks for one stretch after the other, and for the whole run at the end.
-async function feed(run, player) {
+// Loads one part after the other, and the complete run at the end.
+async function loadParts(run, player) {
   for (;;) {
-    let answer;
+    let response;
     try {
-      answer = await fetch(`/stretch/${run.parts.length}`);
+      response = await fetch(`/stretch/${run.parts.length}`);
     } catch {
-      return void player.tell("The run has ended, or its server: what came is kept here.");
+      return void player.showNote("The connection has ended; the page keeps the part that it received.");
     }
-    if (answer.status === 205) return void player.reload();
-    if (answer.status === 204) continue;
-    // Who looks at the newest frame goes on to look at it.
+    if (response.status === 205) return void player.reload();
+    if (response.status === 204) continue;
+    // A person at the newest frame stays at the newest frame.
     const newest = player.frame >= run.frames - 1.5 && !player.playing;
-    const raw = answer.body.pipeThrough(new DecompressionStream("deflate"));
+    const raw = response.body.pipeThrough(new DecompressionStream("deflate"));
     run.add(await new Response(raw).arrayBuffer());
     player.grow(newest);
   }

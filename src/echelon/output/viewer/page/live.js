@@ -1,8 +1,8 @@
-// The live page: the same scene and charts, fed by a stream, and the knobs.
+// The live page: scene and charts of a stream, and the controls of the loop.
 
-const SHOWN_SECONDS = 30;
+const CHART_SECONDS = 30;
 
-// Reads blocks from a stream: each has its length before it.
+// Reads blocks from a stream; each follows its length.
 async function* blocksOf(response) {
   const reader = response.body.getReader();
   let rest = new Uint8Array(0);
@@ -27,7 +27,7 @@ class Live {
     Object.assign(this, { run: { ...header, offsets: expand(header.offsets, header.agents, header.space) }, paused: false, pictures: 0 });
     const { run } = this;
     document.body.classList.toggle("flat", run.space.kind !== "space");
-    dress(run);
+    showHeader(run);
     this.moment = new Moment(run.agents);
     this.panel = make("div", { class: "panel" });
     $("#side").append(this.panel);
@@ -35,25 +35,25 @@ class Live {
     this.makeCharts();
     this.views = new ViewControls(this.view, () => this.charts, () => this.show());
     this.views.onlink = (edge) => this.ask(this.view.cut[edge] ? "restore" : "cut", run.edges[edge]);
-    this.makeKnobs(run.knobs, run.choices);
+    this.makeControls(run.knobs, run.choices);
     this.makeFooter();
-    this.chosenAgent = run.agents > 1 ? [...Array(run.agents).keys()].find((i) => !run.leaders.includes(i)) : 0;
+    this.firstFollower = run.agents > 1 ? [...Array(run.agents).keys()].find((i) => !run.leaders.includes(i)) : 0;
     this.listen();
   }
 
-  // ---- what is shown ----
+  // ---- pictures ----
 
   makeCharts() {
     const { run } = this, line = (name, colour) => ({ name, colour, values: [] });
-    const told = [{ title: "formation error", unit: run.unit, log: true, lines: [line("worst", 1), line("median", 0)], marks: [{ value: 0.01, name: run.unit ? "1 cm" : "0.01" }] }];
-    if (run.limited) told.push({ title: run.loads ? "motors" : "inputs", unit: "% of the limit", log: false, lines: [line("largest", 1), line("smallest", 0)], marks: [{ value: 100, name: "limit", below: true }, { value: 0, name: "limit" }] });
-    if (run.lyapunov) told.splice(1, 0, { title: "Lyapunov function V", unit: "", log: true, lines: [line("V", 0)], marks: [] });
-    this.charts = told.map((each) => new Chart($("#side"), { ...each, times: [] }));
+    const charts = [{ title: "formation error", unit: run.unit, log: true, lines: [line("worst", 1), line("median", 0)], marks: [{ value: 0.01, name: run.unit ? "1 cm" : "0.01" }] }];
+    if (run.limited) charts.push({ title: run.loads ? "motors" : "inputs", unit: "% of limit", log: false, lines: [line("largest", 1), line("smallest", 0)], marks: [{ value: 100, name: "limit", below: true }, { value: 0, name: "limit" }] });
+    if (run.lyapunov) charts.splice(1, 0, { title: "Lyapunov function V", unit: "", log: true, lines: [line("V", 0)], marks: [] });
+    this.charts = charts.map((chart) => new Chart($("#side"), { ...chart, times: [] }));
   }
 
   take(block) {
     const data = new DataView(block.buffer, block.byteOffset, block.length);
-    if (data.getUint32(0, true) === 1) return void this.hear(JSON.parse(new TextDecoder().decode(block.subarray(4))));
+    if (data.getUint32(0, true) === 1) return void this.receive(JSON.parse(new TextDecoder().decode(block.subarray(4))));
     const numbers = new Float32Array(block.buffer.slice(block.byteOffset + 16, block.byteOffset + block.length));
     this.fill(data.getFloat64(8, true), numbers);
   }
@@ -68,13 +68,13 @@ class Live {
       if (turns === 3) moment.setAngles(i, numbers[at], numbers[at + 1], numbers[at + 2]);
       else if (turns) moment.setAngles(i, 0, 0, numbers[at]);
     for (let i = 0; i < agents; i++, at += loads) for (let k = 0; k < loads; k++) moment.motors[4 * i + k] = numbers[at + k];
-    if (this.pictures++ && time < moment.time) this.view.trail.forget();
+    if (this.pictures++ && time < moment.time) this.view.trail.clear();
     this.view.trail.push(moment.position, time);
     moment.time = time;
     this.numbers = { worst, median, lyapunov, factor, wind };
-    // A logarithm has no 0, and below rounding there is nothing to see.
+    // A logarithm has no 0, and values below the floor are rounding errors.
     const log = (value, floor = 1e-17) => (value > floor ? Math.log10(value) : NaN);
-    // V is of the second order in errors.
+    // V is a square of errors.
     this.chart(time, [[log(worst), log(median)], ...(run.lyapunov ? [[log(lyapunov, 1e-34)]] : []), [100 * most, 100 * least]]);
     this.clock.innerHTML = `<b>${time.toFixed(1)}</b> s${factor < 0.95 ? ` \u00b7 ${factor.toFixed(2)} \u00d7 real time` : ""}`;
     this.show();
@@ -101,79 +101,78 @@ class Live {
       if (chart.times.length && time <= chart.times[chart.times.length - 1]) (chart.times.length = 0), chart.lines.forEach((line) => (line.values.length = 0));
       chart.times.push(time);
       chart.lines.forEach((line, k) => line.values.push(rows[place][k]));
-      while (chart.times[0] < time - SHOWN_SECONDS) (chart.times.shift(), chart.lines.forEach((line) => line.values.shift()));
+      while (chart.times[0] < time - CHART_SECONDS) (chart.times.shift(), chart.lines.forEach((line) => line.values.shift()));
     });
-    // Curves are drawn a few times a second, which leaves the pictures to the scene.
+    // Charts are drawn a few times a second, which leaves time for the scene.
     const now = performance.now();
-    if (now - (this.charted ?? 0) < 180) return;
-    this.charted = now;
+    if (now - (this.chartTime ?? 0) < 180) return;
+    this.chartTime = now;
     for (const chart of this.charts) (chart.draw(), chart.point(time));
   }
 
-  hear(told) {
-    if (told.promise) this.tellPromise(told.promise);
-    if (told.note !== undefined) this.note = told.note;
-    if (told.reset) this.view.trail.forget();
-    if (told.panel) (this.makeKnobs(told.panel, told.choices), this.view.setHeard(told.heard));
-    if (told.knobs) this.stand(told);
-    this.tellNotes();
+  receive(message) {
+    if (message.promise) this.showGuarantee(message.promise);
+    if (message.note !== undefined) this.note = message.note;
+    if (message.reset) this.view.trail.clear();
+    if (message.panel) (this.makeControls(message.panel, message.choices), this.view.setReceivers(message.heard));
+    if (message.knobs) this.setState(message);
+    this.showNotes();
   }
 
-  tellPromise(badge) {
-    tellPromise(badge);
+  showGuarantee(badge) {
+    showGuarantee(badge);
     this.promise = badge;
     this.causes = badge.causes ?? [];
-    const knob = this.knobs.coupling;
-    if (knob && badge.edge) knob.mark(badge.edge);
+    const coupling = this.controls.coupling;
+    if (coupling && badge.edge) coupling.mark(badge.edge);
   }
 
-  tellNotes() {
+  showNotes() {
     $(".notes").replaceChildren(...[this.note, ...(this.causes ?? []).slice(0, 3)].filter(Boolean).map((words) => make("p", {}, ...prose(words))));
   }
 
-  stand(told) {
-    for (const [name, value] of Object.entries({ ...told.knobs, ...told.chosen })) this.knobs[name]?.set(value);
-    const cut = new Set(told.cut.map(([i, j]) => `${i} ${j}`));
+  setState(state) {
+    for (const [name, value] of Object.entries({ ...state.knobs, ...state.chosen })) this.controls[name]?.set(value);
+    const cut = new Set(state.cut.map(([i, j]) => `${i} ${j}`));
     this.run.edges.forEach(([i, j], edge) => this.view.cutLink(edge, cut.has(`${i} ${j}`)));
-    this.stood = told;
-    this.chosen = told.chosen;
-    this.paused = told.paused;
+    this.state = state;
+    this.paused = state.paused;
     this.pauseButton.replaceChildren(icon(this.paused ? "play" : "pause"));
   }
 
-  // ---- what is asked ----
+  // ---- requests ----
 
   async ask(name, value) {
     try {
-      const answer = await fetch("/knob", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name, value }) });
-      const told = await answer.json();
-      if (told.fault) this.refuse(told.fault);
-      return told;
+      const response = await fetch("/knob", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name, value }) });
+      const answer = await response.json();
+      if (answer.fault) this.showFault(answer.fault);
+      return answer;
     } catch {
-      this.note = "The server has ended.";
-      this.tellNotes();
+      this.note = "The server has stopped.";
+      this.showNotes();
       return {};
     }
   }
 
-  // What was refused is said for a while, and knobs go back to where they stand.
-  refuse(words) {
+  // Shows the reason of a refused request for a while, and restores the controls.
+  showFault(words) {
     this.note = words;
-    this.tellNotes();
-    setTimeout(() => this.note === words && ((this.note = ""), this.tellNotes()), 12000);
-    for (const knob of Object.values(this.knobs)) knob.held = -1e9;
-    if (this.stood) this.stand(this.stood);
+    this.showNotes();
+    setTimeout(() => this.note === words && ((this.note = ""), this.showNotes()), 12000);
+    for (const control of Object.values(this.controls)) control.touched = -1e9;
+    if (this.state) this.setState(this.state);
   }
 
-  // Knobs and choices of the law that runs.
-  makeKnobs(knobs, choices) {
-    this.knobs = {};
+  // The controls of the present law.
+  makeControls(sliders, choices) {
+    this.controls = {};
     this.panel.replaceChildren();
-    for (const told of knobs) {
-      const turned = (value) => this.ask(told.name, value);
-      const knob = told.name === "feedforward" ? new Switch(told, turned) : new Knob(told, turned);
-      this.knobs[told.name] = knob;
-      this.panel.append(knob.element);
+    for (const slider of sliders) {
+      const request = (value) => this.ask(slider.name, value);
+      const control = slider.name === "feedforward" ? new Switch(slider, request) : new Slider(slider, request);
+      this.controls[slider.name] = control;
+      this.panel.append(control.element);
     }
     const words = { law: "law", method: "gain method", shape: "shape" };
     const rows = Object.entries(choices).filter(([, names]) => names.length > 1);
@@ -182,29 +181,29 @@ class Live {
   }
 
   makeButtons() {
-    const button = (words, title, act) => {
-      const made = make("button", { title }, words);
-      made.addEventListener("click", act);
-      return made;
+    const button = (words, title, action) => {
+      const element = make("button", { title }, words);
+      element.addEventListener("click", action);
+      return element;
     };
     this.panel.append(make("div", { class: "buttons" },
-      button("kick", "push the chosen agent, or the first follower", () => this.ask("kick", this.view.selected >= 0 ? this.view.selected : this.chosenAgent)),
-      button("reset", "begin again, the knobs as they are", () => this.ask("reset")),
-      button("save as scenario", "a file that repeats what was done", () => this.save())));
-    this.panel.append(make("p", { class: "hint" }, "click a link to cut or restore it, an agent to choose it"));
+      button("kick", "push the selected agent (default: the first follower)", () => this.ask("kick", this.view.selected >= 0 ? this.view.selected : this.firstFollower)),
+      button("reset", "restart with the present controls", () => this.ask("reset")),
+      button("save as scenario", "download a scenario file that repeats this session", () => this.save())));
+    this.panel.append(make("p", { class: "hint" }, "click a link to cut or restore it, or an agent to select it"));
   }
 
-  // A list to choose from, of which one stands for what the scenario says.
+  // A list of options; `scenario` stands for the scenario's own.
   makeChoice(name, words, names) {
     const select = make("select", { "aria-label": words });
-    for (const each of names) select.append(make("option", { value: each }, each === "scenario" ? "the scenario's" : each));
+    for (const option of names) select.append(make("option", { value: option }, option === "scenario" ? "as in the scenario" : option));
     const set = (value) => (select.value = value ?? "scenario");
-    // What is refused leaves the choice as it was.
+    // A refused choice is undone.
     select.addEventListener("change", async () => {
-      const told = await this.ask(name, select.value);
-      if (told.fault) set(this.chosen?.[name]);
+      const answer = await this.ask(name, select.value);
+      if (answer.fault) set(this.state?.chosen[name]);
     });
-    this.knobs[name] = { set };
+    this.controls[name] = { set };
     return make("label", { class: "choice" }, make("span", {}, words), select);
   }
 
@@ -217,7 +216,7 @@ class Live {
   }
 
   makeFooter() {
-    this.pauseButton = make("button", { id: "play", title: "pause or go on (space)", "aria-label": "pause or go on" }, icon("pause"));
+    this.pauseButton = make("button", { id: "play", title: "pause or continue (space)", "aria-label": "pause or continue" }, icon("pause"));
     this.pauseButton.addEventListener("click", () => this.ask("pause", !this.paused));
     this.clock = make("span", { class: "time" });
     $("footer").append(this.pauseButton, this.clock, make("span", { class: "gap" }), this.views.box);
@@ -231,34 +230,34 @@ class Live {
   async listen() {
     try {
       for await (const block of blocksOf(await fetch("/stream"))) this.take(block);
-      this.note = "The loop has ended.";
+      this.note = "The loop has stopped.";
     } catch (fault) {
-      this.note = "The server has ended.";
-      this.tellNotes();
-      // A stream that breaks is a TypeError, and anything else is a fault of the page.
+      this.note = "The server has stopped.";
+      this.showNotes();
+      // A broken stream is a TypeError; any other error is a fault of the page.
       if (!(fault instanceof TypeError)) throw fault;
     }
-    this.tellNotes();
+    this.showNotes();
   }
 }
 
-// A slider with its value; on a logarithmic scale where its range is.
-class Knob {
-  constructor(told, turned) {
-    Object.assign(this, told);
-    this.input = make("input", { type: "range", min: 0, max: 1000, step: 1, "aria-label": told.text });
+// A slider with its value, linear or logarithmic.
+class Slider {
+  constructor(slider, request) {
+    Object.assign(this, slider);
+    this.input = make("input", { type: "range", min: 0, max: 1000, step: 1, "aria-label": slider.text });
     this.output = make("output");
     this.edge = make("i", { class: "mark", hidden: "" });
-    this.element = make("label", { class: "knob" }, make("span", {}, told.text), this.output, make("span", { class: "track" }, this.input, this.edge));
-    this.set(told.value);
-    let waiting = null;
+    this.element = make("label", { class: "knob" }, make("span", {}, slider.text), this.output, make("span", { class: "track" }, this.input, this.edge));
+    this.set(slider.value);
+    let timer = null;
     this.input.addEventListener("input", () => {
-      this.tell(this.valueAt(Number(this.input.value) / 1000));
-      this.held = performance.now();
-      // One question a picture is enough.
-      waiting ??= setTimeout(() => ((waiting = null), turned(this.value)), 30);
+      this.show(this.valueAt(Number(this.input.value) / 1000));
+      this.touched = performance.now();
+      // One request per picture is enough.
+      timer ??= setTimeout(() => ((timer = null), request(this.value)), 30);
     });
-    this.input.addEventListener("dblclick", () => turned(told.value));
+    this.input.addEventListener("dblclick", () => request(slider.value));
   }
 
   partOf(value) {
@@ -271,32 +270,32 @@ class Knob {
     return !this.log && Math.abs(value) < 0.004 * (this.high - this.low) ? 0 : value;
   }
 
-  tell(value) {
+  show(value) {
     this.value = value;
     this.output.textContent = `${this.log ? value.toPrecision(3) : value.toFixed(this.high > 50 ? 0 : 2)} ${this.unit}`.replace("-", "\u2212");
     this.input.setAttribute("aria-valuetext", this.output.textContent);
   }
 
-  // What the server says, unless a hand is on the slider.
+  // Takes the server's value, unless the person is moving the slider.
   set(value) {
-    if (performance.now() - (this.held ?? -1e9) < 400) return;
-    this.tell(value);
+    if (performance.now() - (this.touched ?? -1e9) < 400) return;
+    this.show(value);
     this.input.value = 1000 * this.partOf(value);
   }
 
   mark(value) {
     this.edge.hidden = false;
-    this.edge.title = `edge of the promise: ${value.toPrecision(3)}`;
+    this.edge.title = `guaranteed above ${value.toPrecision(3)}`;
     this.edge.style.left = `calc(8px + ${this.partOf(value)} * (100% - 16px))`;
   }
 }
 
 class Switch {
-  constructor(told, turned) {
-    this.input = make("input", { type: "checkbox", "aria-label": told.text });
-    this.element = make("label", { class: "knob switch" }, make("span", {}, told.text), this.input);
-    this.set(told.value);
-    this.input.addEventListener("change", () => turned(this.input.checked ? 1 : 0));
+  constructor(slider, request) {
+    this.input = make("input", { type: "checkbox", "aria-label": slider.text });
+    this.element = make("label", { class: "knob switch" }, make("span", {}, slider.text), this.input);
+    this.set(slider.value);
+    this.input.addEventListener("change", () => request(this.input.checked ? 1 : 0));
   }
 
   set(value) {

@@ -1,4 +1,4 @@
-// The replay: play, pause, scrub, and charts with a cursor in step.
+// The replay page: play, pause and scrub, with charts whose cursors follow.
 
 class Player {
   constructor(run) {
@@ -7,7 +7,7 @@ class Player {
     this.speed = 1;
     this.playing = false;
     document.body.classList.toggle("flat", run.space.kind !== "space");
-    dress(run);
+    showHeader(run);
     this.view = new View($("#scene"), run);
     this.makeCharts(run.growing ? run.charts : readCharts(run));
     this.views = new ViewControls(this.view, () => this.charts, () => this.seek(this.frame));
@@ -16,25 +16,25 @@ class Player {
     this.seek(0);
   }
 
-  makeCharts(told) {
-    this.charts = told.map((each) => new Chart($("#side"), each, (time) => this.seek(this.run.frameOf(time))));
+  makeCharts(charts) {
+    this.charts = charts.map((chart) => new Chart($("#side"), chart, (time) => this.seek(this.run.frameOf(time))));
   }
 
-  // A run that is being computed has more frames.
+  // Takes more frames of a run that is being computed.
   grow(newest) {
     const { run } = this;
     if (!this.charts.length) this.makeCharts(run.charts);
     this.scrub.max = run.frames - 1;
-    this.tell(`Computed until ${run.reached.toFixed(1)} of ${run.horizon} s.`);
+    this.showNote(`Computed until ${run.reached.toFixed(1)} of ${run.horizon} s.`);
     this.seek(newest ? run.frames - 1 : this.frame);
     for (const chart of this.charts) chart.draw();
   }
 
-  tell(words) {
+  showNote(words) {
     $(".notes").textContent = words;
   }
 
-  // The whole run takes the place of what came of it, at the same time.
+  // Loads the complete run instead of its parts, at the same time.
   reload() {
     sessionStorage.setItem("echelon", JSON.stringify([this.run.title, this.run.at(this.frame).time]));
     location.reload();
@@ -94,7 +94,7 @@ class Player {
     if (on) requestAnimationFrame((now) => this.tick(now, now));
   }
 
-  // Time goes by the clock, however few pictures there are.
+  // Advances by the clock, at any frame rate.
   tick(now, before) {
     if (!this.playing) return;
     const { run } = this, time = run.at(this.frame).time + (this.speed * Math.min(250, now - before)) / 1000;
@@ -104,7 +104,7 @@ class Player {
   }
 }
 
-// Charts with their curves, of which the highest number of 16 bits is a gap.
+// Charts with their curves; the largest 16-bit number stands for a gap.
 function readCharts(run) {
   if (!run.series) return [];
   const { values, low, step, frames } = run.series;
@@ -125,9 +125,9 @@ export async function start(data) {
   if (header.stream) return startLive(header);
   const run = header.growing ? new Growing(header) : new Replay(header, new Uint8Array(data, 4 + length));
   const player = new Player(run);
-  if (header.growing) player.tell("The first stretch is being computed."), feed(run, player);
-  else goOn(player);
-  // What the tests ask the page for.
+  if (header.growing) player.showNote("Computing the first part."), loadParts(run, player);
+  else restoreTime(player);
+  // For the tests of the page.
   globalThis.echelon = {
     run, player,
     seek: (frame) => player.seek(frame),
@@ -142,14 +142,14 @@ export async function start(data) {
   };
 }
 
-// A page that was loaded anew goes on where it was.
-function goOn(player) {
+// Continues at the time before the page was reloaded.
+function restoreTime(player) {
   let before = null;
   try {
     before = JSON.parse(sessionStorage.getItem("echelon"));
     sessionStorage.removeItem("echelon");
   } catch {
-    // A file may be allowed no storage.
+    // A local file may have no storage.
   }
   if (before && before[0] === player.run.title) player.seek(player.run.frameOf(before[1]));
 }

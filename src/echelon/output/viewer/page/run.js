@@ -1,6 +1,6 @@
-// A run as the page holds it: numbers of 16 bits as they were packed, and the state at any time.
+// A run in the page: packed 16-bit numbers, and the state at any time.
 
-// One array of bytes from base64 of a zlib stream.
+// The bytes of a zlib stream in base64.
 async function inflate(text) {
   const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
@@ -28,7 +28,7 @@ function valueOf(group, c, k, part) {
   return group.low[c] + group.step[c] * value;
 }
 
-// Everything that the scene draws of one moment; a replay and a stream fill it alike.
+// The state at one time, filled by a replay or a stream and drawn by the scene.
 class Moment {
   constructor(agents) {
     this.time = 0;
@@ -50,7 +50,7 @@ class Moment {
     q[at + 3] = cr * cp * cy + sr * sp * sy;
   }
 
-  // Goals are where the offsets put an agent beside its nearest leader.
+  // The goal of an agent is its offset from its nearest leader.
   setGoals(run) {
     const { position: p, goal } = this, { nearest, offsets } = run;
     for (let i = 0; i < run.agents; i++)
@@ -85,7 +85,7 @@ class Replay {
     return k + Math.max(0, Math.min(1, (time - this.timeOf(k)) / (this.timeOf(k + 1) - this.timeOf(k))));
   }
 
-  // Fill and return the moment at a frame, which may lie between two.
+  // Fills and returns the state at a frame, which may be fractional.
   at(frame) {
     const now = this.moment, k = Math.min(Math.floor(frame), this.frames - 1), part = frame - k;
     now.time = this.timeOf(k) + (part > 0 ? part * (this.timeOf(k + 1) - this.timeOf(k)) : 0);

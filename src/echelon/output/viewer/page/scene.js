@@ -1,11 +1,11 @@
-// The scene: vehicles, links, goals and trails, drawn when something has changed and only then.
+// The scene: vehicles, links, goals and trails, drawn only after a change.
 
 const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"];
 
-// Whether the graphics card is a program on the processor.
+// Whether graphics are rendered in software.
 function isSoftware() {
   const gl = document.createElement("canvas").getContext("webgl2");
-  if (!gl) throw new Error("this browser draws no WebGL 2");
+  if (!gl) throw new Error("this browser has no WebGL 2");
   const info = gl.getExtension("WEBGL_debug_renderer_info");
   const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
   gl.getExtension("WEBGL_lose_context")?.loseContext();
@@ -22,8 +22,8 @@ function themeColour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
-// How opaque things are: a thousand lines are a haze.
-function shares(run) {
+// Opacities, lower for large swarms.
+function opacities(run) {
   return run.agents > 200 ? { links: 0.3, goals: 1, trails: 0.5 } : { links: 1, goals: 1, trails: 0.95 };
 }
 
@@ -37,7 +37,7 @@ class View {
     this.backdrop = new Backdrop(this);
     element.prepend(this.backdrop.canvas, this.renderer.domElement);
     this.scene = new THREE.Scene();
-    this.sharpness = this.wanted = 1;
+    this.sharpness = this.targetSharpness = 1;
     this.makeState();
     this.makeUniforms();
     this.makeMeshes();
@@ -49,7 +49,7 @@ class View {
     this.resize();
   }
 
-  // ---- what is drawn ----
+  // ---- geometry ----
 
   makeState() {
     const { agents } = this.run, rows = Math.ceil(agents / COLUMNS);
@@ -64,10 +64,10 @@ class View {
       size: value([1, 1]),
       pixels: value(1.6),
       floor_: value(this.run.box.low[2]),
-      links: value(shares(this.run).links),
+      links: value(opacities(this.run).links),
       tapered: value(this.run.agents > 200 ? 1 : 0),
       goals: value(1),
-      trails: value(shares(this.run).trails),
+      trails: value(opacities(this.run).trails),
       now: value(0),
       window: value(1),
     };
@@ -101,16 +101,16 @@ class View {
     this.alive = this.run.edges.map(() => true);
   }
 
-  // Ribbons of all edges, then heads of those that are heard one way, then lines to goals and floor.
+  // Ribbons of all edges, then arrow heads of one-way links, then lines to goals and floor.
   linkGeometry() {
     const { run } = this, few = run.agents <= 60;
-    // From who speaks to who hears; between two that hear each other the order is nothing.
+    // From sender to receiver; bidirectional links have no direction.
     const ends = run.edges.map(([i, j], edge) => (run.heard[edge] === 2 ? [j, i] : [i, j]));
-    const kinds = run.heard.map((who) => (who === 3 ? 0 : who ? 1 : 2));
+    const kinds = run.heard.map((receivers) => (receivers === 3 ? 0 : receivers ? 1 : 2));
     this.heads = new Map();
-    // In a flock thick and thin ends say the same at no cost.
-    if (run.agents <= 200) run.heard.forEach((who, edge) => {
-      if (who === 1 || who === 2) (this.heads.set(edge, ends.length), ends.push(ends[edge]), kinds.push(3));
+    // Large swarms show the direction by tapered links instead.
+    if (run.agents <= 200) run.heard.forEach((receivers, edge) => {
+      if (receivers === 1 || receivers === 2) (this.heads.set(edge, ends.length), ends.push(ends[edge]), kinds.push(3));
     });
     if (few) for (let i = 0; i < run.agents; i++) {
       if (run.nearest[i] !== i) (ends.push([i, i]), kinds.push(4));
@@ -123,9 +123,9 @@ class View {
     });
   }
 
-  // Another law may hear others.
-  setHeard(heard) {
-    this.run.heard = heard;
+  // Another law may use other links.
+  setReceivers(receivers) {
+    this.run.heard = receivers;
     this.links.geometry.dispose();
     this.links.geometry = this.linkGeometry();
     this.run.edges.forEach((_, edge) => this.markLink(edge));
@@ -145,16 +145,16 @@ class View {
     this.draw();
   }
 
-  // Let a link be seen as it is: there, cut, or not there now.
+  // Shows a link as present, cut, or absent in the present graph.
   markLink(edge) {
-    const there = !this.row || this.row[edge] === "1", part = this.links.geometry.getAttribute("alive");
-    this.alive[edge] = there && !this.cut[edge];
+    const present = !this.row || this.row[edge] === "1", part = this.links.geometry.getAttribute("alive");
+    this.alive[edge] = present && !this.cut[edge];
     for (const at of [edge, this.heads.get(edge)])
-      if (at !== undefined) part.array.fill(this.cut[edge] ? 0 : there ? 1 : -1, 4 * at, 4 * at + 4);
+      if (at !== undefined) part.array.fill(this.cut[edge] ? 0 : present ? 1 : -1, 4 * at, 4 * at + 4);
     part.needsUpdate = true;
   }
 
-  // A graph that switches has the links of a time alone.
+  // Shows the links of a switching graph at a time.
   switchLinks(time) {
     const { schedule, edges } = this.run;
     if (!schedule) return;
@@ -165,8 +165,8 @@ class View {
     edges.forEach((_, edge) => this.markLink(edge));
   }
 
-  // Whom an agent hears now.
-  heardBy(agent) {
+  // The agents from which an agent receives now.
+  sendersOf(agent) {
     const { edges, heard } = this.run;
     return edges.flatMap(([i, j], k) => (!this.alive[k] ? [] : j === agent && heard[k] & 1 ? [i] : i === agent && heard[k] & 2 ? [j] : []));
   }
@@ -190,7 +190,7 @@ class View {
     this.home();
   }
 
-  // What is drawn, and whoever has left it meanwhile.
+  // The box of the run, extended to all agents.
   everything() {
     const { low, high } = this.run.box, p = this.moment?.position ?? [];
     const ends = [[...low], [...high]];
@@ -216,36 +216,36 @@ class View {
       this.camera.zoom = 0.86 * Math.min(w / (high[0] - low[0]), h / (high[1] - low[1]));
       this.camera.updateProjectionMatrix();
     } else {
-      this.stand(w / h, low, high, middle);
+      this.fit(w / h, low, high, middle);
     }
     this.orbit.update();
     this.draw();
   }
 
-  // Stand so near that the box just fits, its middle in the middle of the picture.
-  stand(aspect, low, top, center) {
+  // Places the camera so that the box just fits, centered in the picture.
+  fit(aspect, low, top, center) {
     const back = new THREE.Vector3(0.42, -0.78, 0.47).normalize(), up = new THREE.Vector3(0, 0, 1);
     const right = up.clone().cross(back).normalize(), high = back.clone().cross(right);
     const tall = Math.tan((this.camera.fov * Math.PI) / 360) * 0.87, wide = tall * aspect;
     const corners = [];
     for (let k = 0; k < 8; k++) corners.push(new THREE.Vector3(...[0, 1, 2].map((axis) => ((k >> axis) & 1 ? top : low)[axis])).sub(center));
     let [x, y, away] = [0, 0, 0];
-    // Where the picture's middle is depends on how far off it is seen from.
+    // The middle of the picture depends on the distance.
     for (let round = 0; round < 8; round++) {
       away = Math.max(...corners.map((c) => Math.max(Math.abs(c.dot(right) - x) / wide, Math.abs(c.dot(high) - y) / tall) + c.dot(back)));
-      const seen = (axis) => corners.map((c) => c.dot(axis) / (away - c.dot(back)));
+      const view = (axis) => corners.map((c) => c.dot(axis) / (away - c.dot(back)));
       const middle = (values) => (Math.max(...values) + Math.min(...values)) / 2;
-      [x, y] = [away * middle(seen(right)), away * middle(seen(high))];
+      [x, y] = [away * middle(view(right)), away * middle(view(high))];
     }
     this.orbit.target.add(right.multiplyScalar(x)).add(high.multiplyScalar(y));
     this.camera.position.copy(this.orbit.target).add(back.multiplyScalar(away));
   }
 
-  // Keep an agent, or the middle of all, where it is on the screen; null lets go.
-  follow(moment, whom) {
-    if (whom === null) return void (this.moved = null);
+  // Keeps an agent, or the mean of all, at its place on the screen; null stops.
+  follow(moment, target) {
+    if (target === null) return void (this.moved = null);
     const p = moment.position, at = new THREE.Vector3();
-    const { agents } = this.run, chosen = whom === "all" ? [...Array(agents).keys()] : [whom];
+    const { agents } = this.run, chosen = target === "all" ? [...Array(agents).keys()] : [target];
     for (const i of chosen) at.add(new THREE.Vector3(p[3 * i], p[3 * i + 1], p[3 * i + 2]));
     at.divideScalar(chosen.length);
     const shift = at.clone().sub(this.moved ?? this.orbit.target);
@@ -265,9 +265,9 @@ class View {
     } else this.camera.aspect = w / h;
     this.camera.updateProjectionMatrix();
     this.backdrop.resize(w, h);
-    this.setSharpness(this.wanted = 1);
-    if (!this.sized) this.home();
-    this.sized = true;
+    this.setSharpness(this.targetSharpness = 1);
+    if (!this.hasSize) this.home();
+    this.hasSize = true;
     this.draw();
   }
 
@@ -313,9 +313,9 @@ class View {
     this.texture.needsUpdate = true;
     this.halo.visible = this.selected >= 0;
     if (this.halo.visible) {
-      const whose = this.halo.geometry.getAttribute("agent");
-      whose.array.fill(this.selected);
-      whose.needsUpdate = true;
+      const agent = this.halo.geometry.getAttribute("agent");
+      agent.array.fill(this.selected);
+      agent.needsUpdate = true;
     }
     this.switchLinks(moment.time);
     this.shared.now.value = moment.time;
@@ -325,33 +325,33 @@ class View {
   }
 
   draw() {
-    if (this.asked) return;
-    this.asked = true;
+    if (this.scheduled) return;
+    this.scheduled = true;
     requestAnimationFrame(() => this.render());
   }
 
   render() {
-    const began = performance.now();
-    this.asked = false;
-    if (this.wanted !== this.sharpness) this.setSharpness(this.wanted);
+    const start = performance.now();
+    this.scheduled = false;
+    if (this.targetSharpness !== this.sharpness) this.setSharpness(this.targetSharpness);
     this.backdrop.draw();
     this.renderer.render(this.scene, this.camera);
     this.labels.place();
-    this.adapt(performance.now() - began, began);
+    this.adapt(performance.now() - start, start);
   }
 
-  // Fewer pixels while pictures follow each other too slowly, all of them again at rest.
-  adapt(took, now) {
+  // Fewer pixels while drawing is too slow, all pixels again when nothing moves.
+  adapt(duration, now) {
     const between = now - (this.last ?? 0);
     this.last = now;
     clearTimeout(this.rest);
-    const busy = between < 400 && Math.max(between, took) > 45;
+    const busy = between < 400 && Math.max(between, duration) > 45;
     this.slow = busy ? (this.slow ?? 0) + 1 : 0;
-    if (this.slow > 3 && this.sharpness > 0.5) (this.wanted = Math.max(0.5, 0.8 * this.sharpness)), (this.slow = 0);
-    if (this.wanted < 1) this.rest = setTimeout(() => ((this.wanted = 1), this.draw()), 400);
+    if (this.slow > 3 && this.sharpness > 0.5) (this.targetSharpness = Math.max(0.5, 0.8 * this.sharpness)), (this.slow = 0);
+    if (this.targetSharpness < 1) this.rest = setTimeout(() => ((this.targetSharpness = 1), this.draw()), 400);
   }
 
-  // Where a place of the scene is on the screen, in pixels; null behind the camera.
+  // The pixel of a place in the scene; null behind the camera.
   project(x, y, z) {
     const v = new THREE.Vector3(x, y, z).project(this.camera);
     if (v.z > 1 && !this.flat) return null;
@@ -363,20 +363,20 @@ class View {
     return this.project(p[3 * i], p[3 * i + 1], p[3 * i + 2]);
   }
 
-  // The agent nearest to a place on the screen, or -1.
+  // The agent closest to a pixel, or -1.
   agentAt(x, y) {
-    let found = -1, least = 24;
+    let closest = -1, least = 24;
     for (let i = 0; i < this.run.agents; i++) {
       const at = this.projectAgent(i);
       const away = at ? Math.hypot(at[0] - x, at[1] - y) : Infinity;
-      if (away < least) (found = i), (least = away);
+      if (away < least) (closest = i), (least = away);
     }
-    return found;
+    return closest;
   }
 
-  // The link nearest to a place on the screen, or -1.
+  // The link closest to a pixel, or -1.
   linkAt(x, y) {
-    let found = -1, least = 9;
+    let closest = -1, least = 9;
     this.run.edges.forEach(([i, j], edge) => {
       if (!this.alive[edge] && !this.cut[edge]) return;
       const [a, b] = [this.projectAgent(i), this.projectAgent(j)];
@@ -384,8 +384,8 @@ class View {
       const [u, v] = [b[0] - a[0], b[1] - a[1]], length = u * u + v * v || 1;
       const t = Math.max(0, Math.min(1, ((x - a[0]) * u + (y - a[1]) * v) / length));
       const away = Math.hypot(a[0] + t * u - x, a[1] + t * v - y);
-      if (away < least) (found = edge), (least = away);
+      if (away < least) (closest = edge), (least = away);
     });
-    return found;
+    return closest;
   }
 }

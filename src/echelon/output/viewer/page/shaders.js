@@ -1,5 +1,5 @@
-// What the graphics card computes. The state of all agents is one texture, five texels an agent:
-// 0 place and mark, 1 attitude, 2 motors, 3 colour and size, 4 goal and whether it is shown.
+// Shaders. The state of all agents is one texture with five texels per agent:
+// 0 place and mark, 1 attitude, 2 motors, 3 colour and size, 4 goal and its visibility.
 
 const COLUMNS = 64, TEXELS = 5;
 
@@ -10,7 +10,7 @@ vec4 texel(float agent, int k) {
   return texelFetch(state, ivec2((i % ${COLUMNS}) * ${TEXELS} + k, i / ${COLUMNS}), 0);
 }`;
 
-// Blue over green and yellow to red, apart in lightness too, so that few colours need to be told.
+// Blue over green and yellow to red, with different lightness for colour-blind readers.
 const THRUST = `
 vec3 thrust(float s) {
   vec3 a = vec3(0.13, 0.29, 0.53), b = vec3(0.11, 0.60, 0.62), c = vec3(0.95, 0.77, 0.25), d = vec3(0.84, 0.27, 0.05);
@@ -18,7 +18,7 @@ vec3 thrust(float s) {
   return s < 1.0 ? mix(a, b, s) : s < 2.0 ? mix(b, c, s - 1.0) : mix(c, d, s - 2.0);
 }`;
 
-// kind: 0 body, 1 to 4 a rotor, 5 shadow, 6 ring of the goal, 7 ring of who is selected, 8 dark part.
+// kind: 0 body, 1 to 4 a rotor, 5 shadow, 6 ring of the goal, 7 ring of selection, 8 dark part.
 const VEHICLE = {
   vertexShader: `${FETCH}${THRUST}
 in float agent, kind;
@@ -56,7 +56,7 @@ void main() {
   fragmentShader: `in vec3 shade; out vec4 colour; void main() { colour = vec4(shade, 1.0); }`,
 };
 
-// A line of so many pixels between two points: four corners, moved aside on the screen.
+// A line of a width in pixels between two points: four corners, moved on the screen.
 const RIBBON = `
 uniform vec2 size;
 uniform float pixels;
@@ -73,7 +73,7 @@ vec4 ribbon(vec3 first, vec3 second, vec2 corner, float wide) {
   return end;
 }`;
 
-// A head of an arrow on the way to an agent, whose tip stays off its body: a triangle in pixels.
+// An arrow head towards an agent, whose tip ends at the body: a triangle in pixels.
 const HEAD = `
 vec4 head(vec3 first, vec3 second, vec2 corner, float body) {
   vec4 a = projectionMatrix * modelViewMatrix * vec4(first, 1.0);
@@ -90,8 +90,8 @@ vec4 head(vec3 first, vec3 second, vec2 corner, float body) {
   return vec4(at.xy + aside / (size * 0.5), at.z, 1.0);
 }`;
 
-// kind of a link: 0 heard both ways, 1 by the second alone, 2 by nobody; 3 a head of an arrow,
-// 4 to the goal of an agent, 5 down to the floor. alive: 1 there, 0 cut, -1 not now.
+// kind of a link: 0 bidirectional, 1 from the first to the second, 2 inactive; 3 an arrow head,
+// 4 to the goal of an agent, 5 down to the floor. alive: 1 present, 0 cut, -1 absent.
 const LINK = {
   vertexShader: `${FETCH}${RIBBON}${HEAD}
 in vec2 ends, corner;
@@ -122,7 +122,7 @@ void main() {
 void main() { if (along > 0.0 && fract(along * 14.0) > 0.5) discard; colour = shade; }`,
 };
 
-// Where an agent has been: the older, the paler.
+// The path of an agent, paler with age.
 const TRAIL = {
   vertexShader: `${FETCH}${RIBBON}
 in vec3 first, second;
@@ -133,8 +133,8 @@ uniform float now, window, trails;
 void main() {
   float age = (now - when) / window;
   shade = vec4(texel(agent, 3).rgb, trails * (1.0 - 0.85 * age));
-  bool shown = trails > 0.0 && age >= 0.0 && age <= 1.0;
-  gl_Position = shown ? ribbon(first, second, corner, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
+  bool visible = trails > 0.0 && age >= 0.0 && age <= 1.0;
+  gl_Position = visible ? ribbon(first, second, corner, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
 }`,
   fragmentShader: `in vec4 shade; out vec4 colour; void main() { colour = shade; }`,
 };

@@ -1,6 +1,6 @@
-// The bodies of vehicles, all agents in one mesh: software draws instances one by one, and slowly.
+// The bodies of vehicles in one mesh, since software rendering is slow at instances.
 
-// Triangles of one agent: positions, normals and what each belongs to.
+// Triangles of one agent: positions, normals and kinds.
 class Body {
   constructor() {
     this.position = [];
@@ -21,7 +21,7 @@ class Body {
     this.triangle(kind, normal, a, c, d);
   }
 
-  // A flat disc, or a ring where there is an inner radius.
+  // A flat disc, or a ring with an inner radius.
   disc(kind, [x, y, z], radius, corners, inner = 0, lift = 1) {
     for (let k = 0; k < corners; k++) {
       const [a, b] = [k, k + 1].map((j) => (2 * Math.PI * j) / corners + Math.PI / corners);
@@ -112,7 +112,7 @@ function swarm(shape, agents, space) {
   return repeated(body, agents);
 }
 
-// A ring around who is selected, whoever that is.
+// A ring around the selected agent.
 function halo(flat) {
   const body = new Body();
   body.disc(7, [0, 0, flat ? 0.03 : 0], 0.8, 40, 0.72);
@@ -135,7 +135,7 @@ function repeated(body, agents) {
 
 const CORNERS = [[0, -1], [1, -1], [1, 1], [0, 1]];
 
-// Four corners for each of so many ribbons: numbers by ribbon, and indices in their order.
+// Four corners per ribbon, with its numbers and indices.
 function ribbons(count, numbers) {
   const geometry = new THREE.BufferGeometry(), corner = new Float32Array(8 * count);
   const index = new Uint32Array(6 * count);

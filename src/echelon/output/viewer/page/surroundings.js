@@ -1,4 +1,4 @@
-// What stands around the agents: trails, the grid with its numbers, names.
+// Around the agents: trails, the grid with its numbers, and names.
 
 // Trails: segments lie in the index buffer by time, so that the last seconds are one range of it.
 class Trail {
@@ -6,7 +6,7 @@ class Trail {
     const few = run.agents <= 12;
     this.agents = run.agents;
     this.live = !run.positions;
-    // A flock's are short: a thousand long ones would hide each other.
+    // Short in a large swarm, where long ones would hide each other.
     this.overTime = run.space.kind === "time";
     this.seconds = this.overTime ? (this.live ? run.duration : 1e9) : few ? Math.min(8, 0.4 * run.duration) : run.agents > 200 ? 1 : 3;
     if (run.space.kind === "phase") this.seconds = Math.max(this.seconds, 0.3 * run.duration);
@@ -48,11 +48,11 @@ class Trail {
     });
   }
 
-  // In a stream the newest segments take the place of the oldest, once they are long enough.
+  // In a stream the newest segments replace the oldest.
   push(now, time) {
     const { before } = this;
     if (!(time < this.last + this.apart - 1e-6)) {
-      // Over time the picture begins again at its left.
+      // A picture over time starts again at its left edge.
       if (time > this.last && !(this.overTime && now[0] < before[0])) this.pushSegments(before, now, time);
       before.set(now);
       this.last = time;
@@ -68,7 +68,7 @@ class Trail {
     for (const part of parts) (part.addUpdateRange(base * part.itemSize, 4 * this.agents * part.itemSize), (part.needsUpdate = true));
   }
 
-  forget() {
+  clear() {
     const when = this.geometry.getAttribute("when");
     when.array.fill(-1e9);
     when.needsUpdate = true;
@@ -83,7 +83,7 @@ class Trail {
   }
 }
 
-// How many of sorted numbers are at most a value.
+// The number of sorted values up to a limit.
 function upper(sorted, value) {
   let [low, high] = [0, sorted.length];
   while (low < high) {
@@ -94,7 +94,7 @@ function upper(sorted, value) {
   return low;
 }
 
-// A step of 1, 2 or 5 times a power of ten, of which about so many fit.
+// A step of 1, 2 or 5 times a power of ten that gives about a number of ticks.
 function niceStep(range, count) {
   const power = 10 ** Math.floor(Math.log10(range / count));
   return power * [1, 2, 5, 10].find((m) => m * power * count >= range * 0.999);
@@ -106,7 +106,7 @@ function ticks(low, high, step) {
   return out;
 }
 
-function shown(value, step) {
+function format(value, step) {
   const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
   return (Math.abs(value) < step / 2 ? 0 : value).toFixed(digits).replace("-", "\u2212");
 }
@@ -156,28 +156,28 @@ class Backdrop {
     this.pen.fillText(words, x, y);
   }
 
-  // Lines right through the view, with numbers at the left and below.
+  // Lines through the whole view, with numbers at the left and at the bottom.
   drawFlat() {
     const { view, w, h } = this, { space } = view.run, [sx, sy] = space.stretch;
     const half = [w, h].map((size) => size / 2 / view.camera.zoom), at = view.camera.position;
     const range = [[at.x - half[0], at.x + half[0], sx], [at.y - half[1], at.y + half[1], sy]];
     const even = niceStep(2 * half[0] / sx, w / 90);
     const [xs, ys] = range.map(([low, high, s], k) => {
-      // One step for both, where both have one scale.
+      // One step for both axes if they have the same scale.
       const step = sx === sy ? even : niceStep((high - low) / s, [w / 90, h / 60][k]);
       return ticks(low / s, high / s, step).map((value) => [value, s * value, step]);
     });
     for (const [value, x] of xs) this.line([view.project(x, 0, 0)[0], 0], [view.project(x, 0, 0)[0], h], !value);
     for (const [value, y] of ys) this.line([0, view.project(0, y, 0)[1]], [w, view.project(0, y, 0)[1]], !value);
-    for (const [value, x, step] of xs) this.text(shown(value, step), view.project(x, 0, 0)[0] + 4, h - 12, "left");
-    for (const [value, y, step] of ys) this.text(shown(value, step), 8, view.project(0, y, 0)[1] - 8, "left");
+    for (const [value, x, step] of xs) this.text(format(value, step), view.project(x, 0, 0)[0] + 4, h - 12, "left");
+    for (const [value, y, step] of ys) this.text(format(value, step), 8, view.project(0, y, 0)[1] - 8, "left");
     this.pen.fillStyle = themeColour("--ink");
     const name = (k) => space.names[k].replaceAll("_", " ") + (space.units[k] ? `, ${space.units[k]}` : "");
     this.text(name(0), w - 10, h - 28, "right");
     this.text(name(1), 40, 14, "left");
   }
 
-  // A floor somewhat larger than the box, numbered along the two sides that face the camera.
+  // A floor larger than the box, with numbers along the two sides that face the camera.
   drawFloor() {
     const { view } = this, { low, high } = view.run.box, floor = low[2], at = view.camera.position;
     const size = Math.max(high[0] - low[0], high[1] - low[1]), step = niceStep(size, 8);
@@ -188,8 +188,8 @@ class Backdrop {
     const front = at.y < view.middle.y ? y[0] : y[1], side = at.x < view.middle.x ? x[0] : x[1];
     const out = 0.35 * step, beyond = (edge, [a, b]) => edge + (edge === a ? -out : out);
     const write = (words, place) => place && this.text(words, ...place, "center");
-    for (const value of ticks(...x, 2 * step)) write(shown(value, step), put(value, beyond(front, y)));
-    for (const value of ticks(...y, 2 * step)) write(shown(value, step), put(beyond(side, x), value));
+    for (const value of ticks(...x, 2 * step)) write(format(value, step), put(value, beyond(front, y)));
+    for (const value of ticks(...y, 2 * step)) write(format(value, step), put(beyond(side, x), value));
     this.pen.fillStyle = themeColour("--ink");
     const { names, units } = view.run.space, unit = (k) => (units[k] ? `, ${units[k]}` : "");
     write(names[0] + unit(0), put((x[0] + x[1]) / 2 + step / 2, beyond(beyond(front, y), y)));
@@ -197,7 +197,7 @@ class Backdrop {
     this.drawHeight(step, front === y[0] ? y[1] : y[0], side, floor);
   }
 
-  // The height, up from the corner beside the camera's view.
+  // The height axis, at a corner at the edge of the view.
   drawHeight(step, y, x, floor) {
     const { view } = this, top = Math.max(view.run.box.high[2], floor + step);
     const apart = niceStep(top - floor, 3), { names, units } = view.run.space;
@@ -206,23 +206,23 @@ class Backdrop {
     this.pen.fillStyle = themeColour("--faint");
     for (const value of ticks(floor + apart / 2, last, apart)) {
       const at = view.project(x, y, value);
-      if (at) (this.line(at, [at[0] - 5, at[1]], true), this.text(shown(value, apart), at[0] - 8, at[1], "right"));
+      if (at) (this.line(at, [at[0] - 5, at[1]], true), this.text(format(value, apart), at[0] - 8, at[1], "right"));
     }
     this.pen.fillStyle = themeColour("--ink");
     const at = view.project(x, y, last);
     const name = names[2] + (units[2] ? `, ${units[2]}` : ""), half = this.pen.measureText(name).width / 2 + 4;
-    // At the top of the picture it stands beside the highest number, and not above it.
+    // At the top of the picture the name is beside the highest number instead of above it.
     if (at && at[1] < 18) this.text(name, at[0] - 26, Math.max(8, at[1]), "right");
     else if (at) this.text(name, Math.min(this.w - half, at[0]), at[1] - 10, "center");
   }
 }
 
-// Names beside agents: of all where they are few, of leaders where names fit.
+// Names of all agents, or of the leaders of a large swarm.
 class Labels {
   constructor(view) {
     const { run } = view, leads = new Set(run.leaders);
     this.view = view;
-    this.shown = true;
+    this.visible = true;
     const named = run.agents <= 12 ? [...Array(run.agents).keys()] : run.agents <= 60 ? run.leaders.slice(0, 12) : [];
     this.all = named.map((agent) => {
       const label = document.createElement("span");
@@ -239,7 +239,7 @@ class Labels {
     for (const [agent, label] of this.all) {
       const up = view.flat ? [0, 0.3 * view.run.size, 0] : [0, 0, 0.4 * view.run.size];
       const at = view.project(...up.map((value, k) => p[3 * agent + k] + value));
-      label.hidden = !at || !this.shown;
+      label.hidden = !at || !this.visible;
       if (at) label.style.transform = `translate(${at[0].toFixed(1)}px, ${at[1].toFixed(1)}px) translate(-50%, -110%)`;
     }
   }

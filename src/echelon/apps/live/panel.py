@@ -1,0 +1,287 @@
+"""The controls of the live page, each with its range, label, unit and scenario keys."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, final
+
+import numpy as np
+
+from echelon.apps.live.choices import AS_GIVEN
+from echelon.apps.live.knobs import Knobs, LiveParts
+from echelon.core.errors import SimulationError, did_you_mean, listing
+from echelon.core.types import JsonObject
+from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.build import Experiment
+from echelon.experiments.scenario.override import named_files
+from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
+from echelon.experiments.scenario.yaml import dump_yaml
+from echelon.synthesis.gains.fixed import FixedGain
+from echelon.synthesis.gains.inner_loop import InnerLoop
+from echelon.synthesis.gains.riccati import Riccati
+
+_METHODS = (Riccati.name, InnerLoop.name)
+"""Gain methods that take less than a picture's time, and need no parameters."""
+
+
+class Range(NamedTuple):
+    """The values of a slider, whose scale may be logarithmic."""
+
+    low: float
+    high: float
+    logarithmic: bool = False
+
+
+class Slider(NamedTuple):
+    """A control of one number.
+
+    Attributes:
+        label: on the page.
+        unit: of the number; of the wind that of its state's rate.
+        range: None if the parts have no such number.
+        write: writes the scenario keys that have the effect of the knobs.
+    """
+
+    label: str
+    unit: str
+    range: Callable[[LiveParts], Range | None]
+    write: Callable[[LiveParts, Knobs, JsonObject], None]
+
+
+def _coupling_range(live: LiveParts) -> Range | None:
+    c = live.start.coupling
+    return None if c is None else Range(0.02 * c, 8.0 * c, True)
+
+
+def _write_coupling(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
+    # On another graph a method would choose another coupling, so it is written there too.
+    if knobs.coupling is None or (not knobs.cut and knobs.coupling == live.start.coupling):
+        return
+    follower, gain = data.setdefault("follower", {}), live.parts.drive.gain
+    if gain is None:
+        follower["coupling"] = knobs.coupling
+        return
+    section = follower.setdefault("gain", {})
+    if "file" in section:
+        section = {"method": FixedGain.name, "P": gain.P.tolist(), "R": gain.R.tolist()}
+    follower["gain"] = section | {"coupling": knobs.coupling}
+
+
+def _weight_range(live: LiveParts) -> Range | None:
+    gain, section = live.parts.drive.gain, (live.data().get("follower") or {}).get("gain") or {}
+    computed = gain is not None and gain.method == Riccati.name and "file" not in section
+    return Range(0.02, 50.0, True) if computed else None
+
+
+def _write_weight(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
+    gain = live.unweighted_gain(knobs)
+    if knobs.weight != 1.0 and gain is not None:
+        section = data.setdefault("follower", {}).setdefault("gain", {})
+        section |= {"method": Riccati.name, "R": (knobs.weight * gain.R).tolist()}
+
+
+def _feedforward_range(live: LiveParts) -> Range | None:
+    return Range(0.0, 1.0) if str(live.parts.drive.feedforward.name) != "NONE" else None
+
+
+def _write_feedforward(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
+    if not knobs.feedforward:
+        data.setdefault("follower", {})["feedforward"] = "none"
+
+
+def _size_range(live: LiveParts) -> Range | None:
+    apart = bool(live.axes) and live.parts.formation.offsets[:, live.axes].any()
+    return Range(0.3, 3.0, True) if live.shapes or apart else None
+
+
+def _turn_range(live: LiveParts) -> Range | None:
+    in_plane = len(live.axes) > 1 and _size_range(live) is not None
+    return Range(-180.0, 180.0) if in_plane else None
+
+
+def _write_formation(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
+    if (knobs.size, knobs.turn, knobs.shape) != (1.0, 0.0, None):
+        offsets = live.offsets(knobs)
+        agents = np.flatnonzero(offsets.any(axis=1))
+        data["formation"] = {"offsets": {i: offsets[i, live.axes].tolist() for i in agents}}
+
+
+def _wind_range(live: LiveParts) -> Range | None:
+    return None if live.wind_state is None else Range(-3.0, 3.0)
+
+
+def _write_wind(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
+    if knobs.wind and live.wind_state is not None:
+        name = live.parts.model.state_names[live.wind_state]
+        constant = data.setdefault("disturbance", {}).setdefault("constant", {})
+        constant[name] = constant.get(name, 0.0) + knobs.wind
+
+
+SLIDERS = {
+    "coupling": Slider("coupling c", "", _coupling_range, _write_coupling),
+    "weight": Slider("input weight R", "\u00d7", _weight_range, _write_weight),
+    "feedforward": Slider("feed-forward", "", _feedforward_range, _write_feedforward),
+    "size": Slider("formation size", "\u00d7", _size_range, _write_formation),
+    "turn": Slider("formation turn", "\u00b0", _turn_range, _write_formation),
+    "wind": Slider("wind", "{rate}", _wind_range, _write_wind),
+}
+
+
+@final
+class Panel:
+    """The controls that a scenario has, and the scenario at any position of the knobs.
+
+    Args:
+        scenario: without knobs.
+        experiment: that it describes.
+    """
+
+    def __init__(self, scenario: Scenario, experiment: Experiment) -> None:
+        """Collect the controls."""
+        self.scenario, self.experiment = scenario, experiment
+        self.live = LiveParts(scenario, experiment)
+        self.start = self.live.start
+        ranges = {name: slider.range(self.live) for name, slider in SLIDERS.items()}
+        self.ranges = {name: span for name, span in ranges.items() if span is not None}
+        self.options = {
+            "method": _METHODS if experiment.parts.drive.gain is not None else (),
+            "shape": tuple(self.live.shapes),
+        }
+
+    @property
+    def law(self) -> str:
+        """The name of the followers' law; `scenario` for a user's own."""
+        law = self.scenario.follower.law
+        return law if isinstance(law, str) else AS_GIVEN
+
+    @property
+    def laws(self) -> tuple[str, ...]:
+        """The laws to choose from, this one first."""
+        return tuple(dict.fromkeys((self.law, *registry.FOLLOWER_LAWS)))
+
+    def choices(self) -> dict[str, list[str]]:
+        """Return the lists to choose from, as the page reads them."""
+        lists = {k: [AS_GIVEN, *names] if names else [] for k, names in self.options.items()}
+        return {"law": list(self.laws), **lists}
+
+    def sliders(self) -> list[JsonObject]:
+        """Return the sliders as the page reads them."""
+        state = self.live.wind_state
+        unit = "" if state is None else self.live.parts.model.state_units[state]
+        rate = f"{unit}/s".replace("m/s/s", "m/s\u00b2") if unit else ""
+        return [
+            {
+                "name": name,
+                "text": SLIDERS[name].label,
+                "unit": SLIDERS[name].unit.format(rate=rate),
+                "low": span.low,
+                "high": span.high,
+                "log": span.logarithmic,
+                "value": getattr(self.start, name),
+            }
+            for name, span in self.ranges.items()
+        ]
+
+    def change(self, knobs: Knobs, name: str, value: Any) -> Knobs:
+        """Return the knobs after a change of one control; numbers are clamped.
+
+        Raises:
+            SimulationError: there is no such control, or the value is not allowed.
+            ScenarioError: the chosen method finds no gain for these agents.
+        """
+        if name in ("cut", "restore"):
+            edge = {self.edge(value)}
+            return knobs._replace(cut=knobs.cut | edge if name == "cut" else knobs.cut - edge)
+        if name in self.options:
+            return self._choose(knobs, name, value)
+        if name not in self.ranges:
+            raise SimulationError(
+                f"there is no control `{name}`{did_you_mean(name, self.ranges)}; this scenario has "
+                f"{listing(self.ranges)}."
+            )
+        if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
+            raise SimulationError(f"`{name}` got `{value}`, and must be a number.")
+        gain = self.live.unweighted_gain(knobs)
+        if name == "weight" and gain is not None and gain.method != Riccati.name:
+            raise SimulationError(
+                f"`weight` is a weight of a Riccati equation, and the gain is by `{gain.method}`; "
+                f"choose the method `{AS_GIVEN}` or `{Riccati.name}` first."
+            )
+        clamped = float(np.clip(value, self.ranges[name].low, self.ranges[name].high))
+        return knobs._replace(**{name: round(clamped, 9)})
+
+    def _choose(self, knobs: Knobs, name: str, value: Any) -> Knobs:
+        choice = None if value == AS_GIVEN else str(value)
+        if choice is not None:
+            check_choice(name, value, self.options[name])
+        changed = knobs._replace(**{name: choice})
+        if name == "shape":
+            return changed
+        # Each method chooses the coupling of its own gain.
+        gain = None if choice is None else self.live.unweighted_gain(changed)
+        coupling = self.start.coupling if gain is None else round(gain.coupling, 9)
+        return changed._replace(weight=1.0, coupling=coupling)
+
+    def edge(self, pair: Any) -> int:
+        """Return the index of the edge between two agents.
+
+        Raises:
+            SimulationError: there is none.
+        """
+        graph = self.live.parts.graph
+        for index, edge in enumerate(graph.edges.tolist()):
+            pairs = [edge] if graph.directed else [edge, edge[::-1]]
+            if isinstance(pair, list | tuple) and list(pair) in pairs:
+                return index
+        # As a file writes it; a checked scenario holds a tuple.
+        text = list(pair) if isinstance(pair, tuple) else pair
+        raise SimulationError(f"`{text}` is no link of the graph.")
+
+    def scenario_at(self, knobs: Knobs) -> Scenario:
+        """Return the scenario that describes the loop at a position of the knobs.
+
+        Raises:
+            ScenarioError: it is refused, as where cut links disconnect the graph.
+        """
+        data = self.live.data()
+        if knobs.method is not None:
+            data.setdefault("follower", {})["gain"] = {"method": knobs.method}
+        for slider in SLIDERS.values():
+            slider.write(self.live, knobs, data)
+        if knobs.cut:
+            data["graph"] = self._graph(knobs)
+        return scenario_from_mapping(data, self.scenario.folder)
+
+    def _graph(self, knobs: Knobs) -> JsonObject:
+        """Return the graph without the cut edges as a scenario states it."""
+        graph, schedule = self.live.parts.graph, self.live.parts.graph.schedule
+        section: JsonObject = {"leaders": list(graph.leaders), "agents": graph.agents}
+        section |= {"directed": True} if graph.directed else {}
+        weights = [graph.weights] if schedule is None else schedule.weights
+        edges = [self.live.edges(knobs, row) for row in weights]
+        if schedule is not None:
+            later = zip(schedule.starts[1:].tolist(), edges[1:], strict=True)
+            section["schedule"] = [{"at": at, "edges": row} for at, row in later]
+            section |= {} if schedule.period is None else {"period": schedule.period}
+        return {"edges": edges[0], **section}
+
+    def saved(self, events: Sequence[Mapping[str, Any]]) -> str:
+        """Return the YAML of the scenario with live events, which it repeats."""
+        data = self.live.data()
+        # With absolute paths, since it may be saved in another folder.
+        for path, file, rest in list(named_files(data, ())):
+            place: Any = data
+            for key in path[:-1]:
+                place = place[key]
+            place[path[-1]] = f"{(self.scenario.folder / file).resolve()}{rest}"
+        return dump_yaml({**data, "live": [dict(event) for event in events]})
+
+
+def check_choice(control: str, value: object, options: Iterable[str]) -> None:
+    """Check that a value is among the options of a control.
+
+    Raises:
+        SimulationError: it is not.
+    """
+    names = list(options)
+    if value not in names:
+        allowed = f"there are {listing(names)}" if names else "none can be chosen"
+        raise SimulationError(f"there is no {control} `{value}` here; {allowed}.")
