@@ -35,7 +35,7 @@ FIRST = ("start", "agents", "graphs", "formations", "promises", "laws", "runs", 
 # What is read one after the other, in one folder.
 JOURNEYS = [
     pytest.param(("README",), id="README"),
-    pytest.param(("extending",), id="extending"),
+    slow("extending"),
     slow(*FIRST, "troubleshooting"),
     slow("recipes", "sweeps", "comparing"),
 ]
