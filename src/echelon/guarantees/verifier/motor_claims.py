@@ -5,8 +5,8 @@ moments in floats, and then motions are drawn within the bounds and flown backwa
 model's own equations, to see that none asks for more. Nothing of the certificate is used.
 """
 
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import numpy as np
 
 from echelon.agents.models.quadrotor import Quadrotor
 from echelon.core.numerics import precision
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 from echelon.guarantees.verifier.findings import Finding, said
 
 _CELLS = 6000
@@ -24,7 +24,7 @@ _TIMES, _DRAWN = 24, 4000
 """Moments at which motions are drawn, the hardest of stretches of time, and how many in each."""
 
 
-def motor_findings(told: Mapping[str, Any]) -> Iterator[Finding]:
+def motor_findings(told: JsonObject) -> Iterator[Finding]:
     """Yield what is found of each claim of motors."""
     motion = _Motion.of(told)
     demands = [_asked(motion, _sizes(start)) for start in told["starts"]]
@@ -53,7 +53,7 @@ def _most(values: Iterator[Array]) -> float:
     return max(float(v.max()) for v in values)
 
 
-def _sizes(start: Mapping[str, Any]) -> Array:
+def _sizes(start: JsonObject) -> Array:
     """Return (3, 3): of v, v', v'' along the ground, upward, and of the yaw's rate."""
     rows = [start["sideways"], start["upward"], start["turn"]]
     return np.stack([np.pad(np.asarray(row, float), (0, 3 - len(row))) for row in rows])
@@ -72,7 +72,7 @@ class _Motion(NamedTuple):
     base: Array
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> "_Motion":
+    def of(cls, told: JsonObject) -> "_Motion":
         """Return it of what is told."""
         rho = np.asarray(told["roots"], float)
         times = np.linspace(0.0, 30.0 / rho.min(), _CELLS)
@@ -123,7 +123,7 @@ def _asked(motion: _Motion, start: Array) -> Array:
     return motion.base + _started(start, motion.free, motion.first)
 
 
-def _range(frame: Mapping[str, Any], asked: Array) -> tuple[Array, Array, Array]:
+def _range(frame: JsonObject, asked: Array) -> tuple[Array, Array, Array]:
     """Return the least and the largest motor, and the tilt, at all times (T,)."""
     a, j, s, low, high, jz, sz, turn, turning = asked
     g, mass, arm, drag = (frame[k] for k in ("gravity", "mass", "arm", "torque_per_thrust"))
@@ -148,7 +148,7 @@ def _range(frame: Mapping[str, Any], asked: Array) -> tuple[Array, Array, Array]
 
 
 def _drawn(
-    frame: Mapping[str, Any], asked: Array, ranges: tuple[Array, Array, Array]
+    frame: JsonObject, asked: Array, ranges: tuple[Array, Array, Array]
 ) -> tuple[float, float]:
     """Return the least and the largest motor of motions within the bounds, at the hardest times."""
     cells = np.array_split(np.arange(asked.shape[1]), _TIMES)
@@ -173,7 +173,7 @@ def _drawn(
     return float(thrusts.min()), float(thrusts.max())
 
 
-def _alone(told: Mapping[str, Any], motion: _Motion) -> Iterator[Finding]:
+def _alone(told: JsonObject, motion: _Motion) -> Iterator[Finding]:
     """Yield whether the motors suffice from the other starts that are claimed."""
     alone, ahead, most = told["alone"], told["ahead"], float(told["most"])
     if alone is None:

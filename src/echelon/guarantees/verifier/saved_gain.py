@@ -2,15 +2,14 @@
 
 import json
 import math
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, TypeGuard, final
 
 import numpy as np
 
 from echelon.core.errors import GainError, listing
-from echelon.core.types import Array, PathLike
+from echelon.core.types import Array, JsonObject, PathLike
 
 _FORMAT = "echelon gain 2"
 _KINDS = ("proof", "vertices", "samples", "linearization")
@@ -24,7 +23,7 @@ class SavedModel(NamedTuple):
     """The agents: `parameters` is None where the file could not hold them."""
 
     path: str
-    parameters: Mapping[str, Any] | None
+    parameters: JsonObject | None
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     state: Array
@@ -94,12 +93,12 @@ class _Part:
         self.file, self.name = file, name
         if not isinstance(section, dict):
             raise self.fault(name, "must be a mapping")
-        self.entries: dict[str, Any] = section
+        self.entries: JsonObject = section
 
     def fault(self, name: str, must: str) -> GainError:
         return GainError(f"`{self.file}` is no gain that can be verified: `{name}` {must}.")
 
-    def entry(self, key: str) -> tuple[Any, str]:
+    def entry(self, key: str) -> tuple[object, str]:
         """Return an entry and its full name."""
         name = f"{self.name}.{key}" if self.name else key
         if key not in self.entries:
@@ -161,14 +160,13 @@ class _Part:
         """Return numbers, some of which may be None for an infinite bound."""
         value, name = self.entry(key)
         # JSON has no infinity, so a bound that is absent is null.
-        numbers = [absent if x is None else x for x in value] if isinstance(value, list) else []
-        fine = all(x is None or _is_number(x) for x in value) if len(numbers) == size else False
-        if not fine:
+        fine = isinstance(value, list) and len(value) == size
+        if not fine or not all(x is None or _is_number(x) for x in value):
             raise self.fault(name, f"must be {size} finite numbers or null")
-        return np.array(numbers, float)
+        return np.array([absent if x is None else x for x in value], float)
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: object) -> TypeGuard[float]:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     # Python's JSON reads NaN and Infinity too, and neither passes.

@@ -10,11 +10,10 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from echelon.core.types import Array, PathLike
+from echelon.core.types import Array, JsonObject, PathLike
 from echelon.guarantees.verifier.findings import Finding, said, same
 from echelon.guarantees.verifier.motor_claims import motor_findings
 
@@ -25,7 +24,7 @@ _CELLS = 6000
 """Of the time in which the slowest mode falls by e^-30."""
 
 
-def read_tube(path: PathLike) -> Mapping[str, Any] | None:
+def read_tube(path: PathLike) -> JsonObject | None:
     """Return the tube that a file tells of: a run's summary or a check's JSON; else None."""
     try:
         document = json.loads(Path(path).read_text("utf-8"))
@@ -37,7 +36,7 @@ def read_tube(path: PathLike) -> Mapping[str, Any] | None:
     return tube if isinstance(tube, dict) and tube.get("format") == FORMAT else None
 
 
-def tube_findings(tube: Mapping[str, Any]) -> Iterator[Finding]:
+def tube_findings(tube: JsonObject) -> Iterator[Finding]:
     """Yield what is found of each claim of a tube."""
     for border in tube["borders"]:
         roots = _exact(border["roots"])
@@ -50,7 +49,7 @@ def tube_findings(tube: Mapping[str, Any]) -> Iterator[Finding]:
         yield from motor_findings(tube["motors"])
 
 
-def _room(border: Mapping[str, Any], roots: Sequence[Fraction], name: str) -> Iterator[Finding]:
+def _room(border: JsonObject, roots: Sequence[Fraction], name: str) -> Iterator[Finding]:
     """Yield whether what is left to a border is left, and a start as steep as is claimed fits."""
     order = int(border["derivative"]) - 1
     allowed = float(border["path"]) - float(border["above"])
