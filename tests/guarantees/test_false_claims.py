@@ -182,8 +182,8 @@ def test_the_set_of_a_drift_shrinks_where_inputs_act_unlike(said, tmp_path):
 @pytest.mark.parametrize("name", ["proof", "vertices"])
 def test_a_rate_that_is_a_little_too_fast_is_refused_at_the_corners(files, said, name):
     told = edited(files[name], "certificate.region.rate", lambda x: 1.05 * x)
-    corners = [claim for claim in said(told) if "corners" in claim]
-    assert corners == ["rate at 2 vertices, 1/s"] + ["rate at the vertices, proved"] * (
+    vertices = [claim for claim in said(told) if "vertices" in claim]
+    assert vertices == ["rate at 2 vertices, 1/s"] + ["rate at the vertices, proved"] * (
         name == "proof"
     )
 

@@ -40,7 +40,7 @@ def motor_findings(claims: JsonObject) -> Iterator[Finding]:
     yield decide("steepest tilt", claims["tilt"] >= tilt - _SLACK, claims["tilt"], tilt)
     low, high = _random_motions(claims["airframe"], demands[0], ranges[0])
     fine = claims["least"] <= low and high <= claims["largest"]
-    text = f"{_TIMES * _DRAWN} motions within the bounds"
+    text = f"{_TIMES * _MOTIONS} motions within the bounds"
     yield decide("motors in random motions", fine, claims["least"], low, text)
     yield from _check_single_starts(claims, motion)
 

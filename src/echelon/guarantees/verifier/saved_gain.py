@@ -160,10 +160,10 @@ class _Part:
         """Return bounds; null in the file is an infinite bound."""
         value, name = self.entry(key)
         # JSON has no infinity, so an absent bound is null.
-        fine = isinstance(value, list) and len(value) == size
-        if not fine or not all(x is None or _is_number(x) for x in value):
+        entries = value if isinstance(value, list) else []
+        if len(entries) != size or not all(x is None or _is_number(x) for x in entries):
             raise self.fault(name, f"must be {size} finite numbers or null")
-        return np.array([absent if x is None else x for x in value], float)
+        return np.array([absent if x is None else x for x in entries], float)
 
 
 def _is_number(value: object) -> TypeGuard[float]:
