@@ -1,1 +1,1 @@
-"""Words and numbers that know no agent: errors, types, integrators, linear systems."""
+"""Foundations without agent models: errors, types, integrators, linear systems, caching."""

@@ -1,4 +1,4 @@
-"""Functions that JAX compiles; the command line finds them compiled by the run before."""
+"""JIT-compiled functions whose machine code is cached on disk by the command line."""
 
 import contextlib
 import functools
@@ -19,55 +19,55 @@ from echelon.core.types import PyTree
 
 _R = TypeVar("_R")
 _LEAST, _NEVER = "jax_persistent_cache_min_compile_time_secs", 1e9
-"""Of compiling, s, from which on JAX keeps what it compiles."""
+"""Option and value (compile time, s) that keep a program out of the disk cache of JAX."""
 _MOST: Final = 256
-"""Compiled programs held of each function."""
+"""Compiled programs cached per function."""
 _COMPILING: Final = threading.Lock()
 _OTHER: Final = b""
-"""Is kept where a program is left to JAX."""
+"""Stored for a program that JAX compiles itself."""
 
 
 class _Place(NamedTuple):
-    """Stands in a tree for one of some arrays."""
+    """Placeholder in a tree for one array of a list."""
 
     number: int
 
 
 class _Compiled(NamedTuple):
-    """What runs on arrays, and the tree of what comes back."""
+    """A compiled program and the tree of its results."""
 
     run: Callable[..., Sequence[jax.Array]]
     tree: PyTree
 
 
 class _CallArguments(NamedTuple):
-    """The arguments of a call: their arrays, and the tree in which these stand."""
+    """The arguments of a call: their arrays, and the tree with placeholders for them."""
 
     arrays: Sequence[jax.Array]
     leaves: tuple[object, ...]
     tree: PyTree
 
     def digest(self) -> bytes | None:
-        """Return what is equal for calls of one program; None where JAX alone can tell."""
-        # Places stand for what is traced; other arrays are known by their numbers.
+        """Return a digest that is equal for calls of one program; None if there is none."""
+        # Arrays are traced, so only their shape and type matter; other leaves count by value.
         arguments = jax.tree.unflatten(self.tree, self.leaves)
         return digest((arguments, tuple(map(_form, self.arrays)), disk_cache.jax_settings()))
 
     def arguments(self, arrays: Sequence[jax.Array]) -> PyTree:
-        """Return the arguments with other arrays in the places of theirs."""
+        """Return the arguments with other arrays in place of their own."""
         return _filled(jax.tree.unflatten(self.tree, self.leaves), arrays)
 
 
 @final
 class CompiledFunction(Generic[_R]):
-    """A function that is compiled once for all arguments of the same shapes, as by `filter_jit`.
+    """A function compiled once per shapes of its arguments, like `filter_jit`.
 
-    Where compiled code is kept, neither is it traced again in the next process for arguments of
-    echelon's own classes.
+    With the disk cache open, later processes neither trace nor compile it again if all arguments
+    are of echelon's own classes.
     """
 
     def __init__(self, function: Callable[..., _R]) -> None:
-        """Wrap a function of a module."""
+        """Wrap a module-level function."""
         functools.update_wrapper(self, function)
         self._function, self._plain = function, eqx.filter_jit(function)
         self._programs = BoundedCache[_Compiled | None](_MOST)
@@ -84,18 +84,18 @@ class CompiledFunction(Generic[_R]):
         return _filled(compiled.tree, compiled.run(*call.arrays))
 
     def _load_or_compile(self, call: _CallArguments, key: bytes) -> _Compiled | None:
-        """Return what is stored for a call, or compile and store it; None where JAX is to do it."""
+        """Return what is stored for a call, or compile and store it; None if JAX compiles it."""
         name = f"{self._function.__module__}.{self._function.__qualname__}"
         file = disk_cache.file_for(name, key)
         if file is None:
             return None
         stored = disk_cache.read(file)
         if stored is not None:
-            # What cannot be read is made again.
+            # An unreadable entry is compiled again.
             with contextlib.suppress(Exception):
                 return None if stored == _OTHER else _load(stored, len(call.arrays))
         compiled, packed = _compile(self._function, call), _OTHER
-        # What cannot be written down is for JAX to keep from the next process on.
+        # A program that cannot be serialized is left to JAX from the next process on.
         with contextlib.suppress(Exception):
             packed = _OTHER if compiled is None else _packed(compiled)
         disk_cache.write_if_unchanged(file, packed)
@@ -103,12 +103,12 @@ class CompiledFunction(Generic[_R]):
 
 
 def cached_jit(function: Callable[..., _R]) -> Callable[..., _R]:
-    """Return a function that JAX compiles, of arrays of JAX's or of NumPy's."""
+    """Return a function compiled by JAX; its arrays may be of JAX or NumPy."""
     return CompiledFunction(function)
 
 
 def _call_of(arguments: PyTree) -> _CallArguments | None:
-    """Return a call as its arrays and their places; None within a trace, of which it is a part."""
+    """Return a call as arrays and placeholders; None inside a trace, which includes the call."""
     leaves, tree = jax.tree.flatten(arguments)
     if any(isinstance(leaf, Tracer) for leaf in leaves):
         return None
@@ -120,7 +120,7 @@ def _call_of(arguments: PyTree) -> _CallArguments | None:
 
 
 def _filled(tree: PyTree, arrays: Sequence[jax.Array]) -> PyTree:
-    """Return a tree with arrays in their places."""
+    """Return a tree with its placeholders replaced by arrays."""
 
     def at(leaf: object) -> object:
         return arrays[leaf.number] if isinstance(leaf, _Place) else leaf
@@ -129,7 +129,7 @@ def _filled(tree: PyTree, arrays: Sequence[jax.Array]) -> PyTree:
 
 
 def _form(array: jax.Array) -> tuple[tuple[int, ...], str, bool]:
-    """Return the shape and type of an array, as JAX takes it in the precision that is on."""
+    """Return the shape and type of an array as JAX reads it in the current precision."""
     kind = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
     return array.shape, str(kind), getattr(array, "weak_type", False)
 
@@ -138,7 +138,7 @@ def _form(array: jax.Array) -> tuple[tuple[int, ...], str, bool]:
 
 
 def _compile(function: Callable[..., PyTree], call: _CallArguments) -> _Compiled | None:
-    """Return a function compiled for a call; None where it calls what is not JAX's, as LAPACK."""
+    """Return a function compiled for a call; None if it calls foreign code such as LAPACK."""
     trees = list[PyTree]()
 
     def flat(*arrays: jax.Array) -> list[jax.Array]:
@@ -150,13 +150,13 @@ def _compile(function: Callable[..., PyTree], call: _CallArguments) -> _Compiled
         trees.append(jax.tree.unflatten(tree, leaves))
         return outputs
 
-    # What JAX has read from its own disk cache cannot be written down again: it lacks its code.
-    # Under a name of its own it is not found there, nor is it kept there as well.
+    # A program that JAX loads from its own disk cache cannot be serialized again. A unique name
+    # prevents such a load.
     flat.__name__ = f"{function.__name__}_{os.urandom(8).hex()}"
     lowered = jax.jit(flat, keep_unused=True).lower(*call.arrays)
     if "custom_call" in lowered.as_text():
         return None
-    # The setting is that of all threads.
+    # The option is shared by all threads.
     with _COMPILING:
         least = jax.config.values[_LEAST]
         jax.config.update(_LEAST, _NEVER)
@@ -171,20 +171,20 @@ def _packed(made: _Compiled) -> bytes:
     """Return compiled code and its tree as bytes.
 
     Raises:
-        ValueError: it calls what is in the process only where JAX has made it anew.
+        ValueError: the code calls functions that exist only in the process that compiled it.
     """
-    # Here, since the library as such keeps nothing.
+    # Imported here, since only the command line stores programs.
     from jax.experimental.serialize_executable import serialize
 
-    # Such as LAPACK: without it the process would end.
+    # Such as LAPACK: the loaded program would crash the process.
     if "custom-call" in made.run.as_text():  # type: ignore[attr-defined]
-        raise ValueError("got a call of other code, allowed is none.")
+        raise ValueError("the program calls foreign code, which cannot be stored.")
     code, _, back = serialize(made.run)  # type: ignore[arg-type]
     return pickle.dumps((code, back.num_leaves, made.tree))
 
 
 def _load(stored: bytes, given: int) -> _Compiled:
-    """Return compiled code that takes so many arrays, from bytes."""
+    """Return compiled code that takes `given` arrays, from bytes."""
     from jax.experimental.serialize_executable import deserialize_and_load
 
     code, count, tree = pickle.loads(stored)

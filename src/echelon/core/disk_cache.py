@@ -1,9 +1,9 @@
-"""What took long to make, kept on disk between processes of the command line.
+"""Disk cache of expensive results, shared by processes of the command line.
 
-What is kept is found by all that it was made from: echelon's own source, the versions below it, the
-machine, what is set, and the values that it was made for. Where one of them is of a class that is
-not echelon's, nothing is kept, since nobody knows what such a class reads. So nothing is found that
-these sources would not make.
+A key covers everything that determines a result: echelon's source, the versions of its
+dependencies, the machine, the settings of JAX and the arguments. Nothing is cached for a value
+of a foreign class, since such a class may read anything. A cached result is therefore what the
+current sources would compute.
 """
 
 import contextlib
@@ -22,18 +22,18 @@ from pathlib import Path
 from echelon.core.identity import digest
 
 _SETTINGS, _IDLE = ("xla_", "jax_"), ("cache", "log")
-"""What the names of settings begin with that may change what JAX makes, and hold if they do not."""
+"""Prefixes of settings that may change compiled code; words in names of settings that do not."""
 _BEGAN = time.time() - 1.0
-"""When this process began, s, or before: a file's clock is coarser, and some were loaded first."""
+"""Start of this process, s, less a margin: file clocks are coarse, some modules load earlier."""
 _folder: Path | None = None
 _closed = threading.Event()
 
 
 @contextlib.contextmanager
 def use_folder(folder: Path | None) -> Iterator[None]:
-    """Keep all in a folder, or nothing, while the context lasts and in this process alone.
+    """Cache in a folder, or not at all, within the context and in this process only.
 
-    The command line opens one: who imports the library may change what its classes do.
+    Only the command line opens one: a program that imports echelon may modify its classes.
     """
     global _folder
     before, _folder = _folder, folder
@@ -44,21 +44,21 @@ def use_folder(folder: Path | None) -> Iterator[None]:
 
 
 def is_open() -> bool:
-    """Tell whether anything is kept in this process."""
+    """Return whether the cache is open in this process."""
     return not _closed.is_set() and _folder is not None
 
 
 def close() -> None:
-    """Keep and find nothing from here on, since a user's file may have changed what runs."""
+    """Stop reading and writing, since a user's file may have changed the code that runs."""
     _closed.set()
 
 
 def file_for(what: str, *values: object) -> Path | None:
-    """Return the file for what is made of some values; None where nothing may be kept.
+    """Return the file for a result of some values; None if it may not be cached.
 
     Args:
-        what: is made, by whom.
-        values: trees of numbers, arrays, words and echelon's own classes.
+        what: name of the function that computes it.
+        values: trees of numbers, arrays, strings and echelon's own classes.
     """
     folder, ground = _folder, _ground() if is_open() else None
     if folder is None or ground is None:
@@ -70,22 +70,22 @@ def file_for(what: str, *values: object) -> Path | None:
 
 
 def jax_settings() -> tuple[str, ...]:
-    """Return what is set, in this thread, that may change what JAX makes."""
-    # Here, since the command line opens the store before it needs JAX.
+    """Return the settings of this thread that may change what JAX compiles."""
+    # Imported here, since the command line opens the cache before it needs JAX.
     import jax
 
-    # Of some, JAX knows but the value that all threads have.
+    # Some settings have no value per thread.
     of_all = jax.config.values
     return tuple(f"{name}={getattr(jax.config, name, of_all[name])}" for name in _switches())
 
 
 def read(file: Path) -> bytes | None:
-    """Return what a file keeps; None where it is not there, or not whole."""
+    """Return the content of a file; None if it is missing or damaged."""
     try:
         stored = file.read_bytes()
     except OSError:
         return None
-    # What is half-written or damaged would end the process and not only the run.
+    # Damaged machine code would crash the process.
     if hashlib.sha256(stored[32:]).digest() == stored[:32]:
         with contextlib.suppress(zlib.error):
             return zlib.decompress(stored[32:])
@@ -93,18 +93,18 @@ def read(file: Path) -> bytes | None:
 
 
 def write_if_unchanged(file: Path, made: bytes) -> None:
-    """Write what was made by echelon's sources to a file of `file_for`."""
-    # A source that is loaded late may have changed since all were told.
+    """Write a result to a file of `file_for`, unless a source changed since the start."""
+    # A module that is imported late may have changed since the digest was taken.
     if _sources() == _loaded():
         write(file, made)
 
 
 def write(file: Path, made: bytes) -> None:
-    """Write a file that `read` reads, beside it first; a folder without room keeps nothing."""
+    """Write a file for `read` atomically; a full disk is ignored."""
     packed = zlib.compress(made, 1)
     with contextlib.suppress(OSError):
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # By a name that goes with the oldest, should this process be killed before it has another.
+        # The suffix lets the cleanup find the file if this process is killed before the rename.
         with tempfile.NamedTemporaryFile(dir=file.parent, suffix="-cache", delete=False) as beside:
             try:
                 beside.write(hashlib.sha256(packed).digest() + packed)
@@ -120,8 +120,8 @@ def write(file: Path, made: bytes) -> None:
 
 @functools.cache
 def _ground() -> bytes | None:
-    """Return what all depends on for as long as a process lasts: sources, versions, machine."""
-    # Here, since the command line opens the store before it needs any of them.
+    """Return a digest of what is constant in a process: sources, versions, machine."""
+    # Imported here, since the command line opens the cache before it needs any of them.
     import equinox
     import jax
     import jaxlib
@@ -133,7 +133,7 @@ def _ground() -> bytes | None:
         return None
     below = (np, scipy, jax, jaxlib, equinox)
     parts = [*(module.__version__ for module in below), sys.version, _processor()]
-    # JAX reads them once.
+    # JAX reads environment variables once, at import.
     parts += sorted(f"{key}={value}" for key, value in os.environ.items() if _sets(key.lower()))
     return hashlib.sha256(sources + "\0".join(parts).encode()).digest()
 
@@ -151,21 +151,21 @@ def _switches() -> tuple[str, ...]:
 
 @functools.cache
 def _loaded() -> bytes | None:
-    """Return the sources as they were at the first look."""
+    """Return the digest of the sources at the first call."""
     return _sources()
 
 
 def _sources() -> bytes | None:
-    """Return what echelon's own files hold, in short; None where they may not be what was loaded.
+    """Return a digest of echelon's source files; None if the loaded code may differ.
 
-    So it is where one changed while this process ran, and where Python runs what was made of them.
+    That is so if a file changed while this process ran, or if Python runs compiled files only.
     """
     home, hasher = Path(__file__).parents[1], hashlib.sha256()
     try:
         files = [(file, file.stat(), file.read_bytes()) for file in sorted(home.rglob("*.py"))]
     except OSError:
         return None
-    # A file that was put there with an old date changed when it was put there.
+    # A file copied with an old date counts by its change time.
     late = any(max(status.st_mtime, status.st_ctime) >= _BEGAN for _, status, _ in files)
     if late or Path(__file__) not in (file for file, *_ in files):
         return None
@@ -175,7 +175,7 @@ def _sources() -> bytes | None:
 
 
 def _processor() -> str:
-    """Return what tells processors apart for which machine code is made."""
+    """Return the processor features that compiled code depends on."""
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
         named = ("model name", "flags", "CPU part", "Features")

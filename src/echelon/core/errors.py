@@ -1,8 +1,7 @@
-"""What can go wrong, and how it is reported: errors for bad input, outcomes for runs.
+"""Errors for invalid input, and outcomes of simulation runs.
 
-Bad input raises at once; its message is one sentence that says what was got and what is allowed. A
-numerical event during a run is not an exception but an `Outcome`, kept with the data that was
-computed.
+Invalid input raises at once, with one sentence: what was received and what is allowed. A numerical
+event during a run is not an exception but an `Outcome`, stored with the computed data.
 """
 
 import difflib
@@ -35,7 +34,7 @@ class FormationError(EchelonError):
 
 
 class ReferenceError(EchelonError):
-    """A reference is malformed or cannot be followed by the model."""
+    """A reference is malformed, or the model cannot track it."""
 
 
 class GainError(EchelonError):
@@ -51,11 +50,11 @@ class SimulationError(EchelonError):
 
 
 class PlanError(EchelonError):
-    """An optimal control problem is malformed, or is given data that does not fit it."""
+    """An optimal control problem is malformed, or its data does not fit."""
 
 
 class ScenarioError(EchelonError):
-    """A scenario file has faults; the message holds one line for each of them."""
+    """A scenario file is invalid; the message has one line per fault."""
 
 
 class OutputError(EchelonError):
@@ -80,7 +79,7 @@ class Outcome(enum.Enum):
     @property
     def exit_code(self) -> int:
         """Exit code of the command line for a run that ended so."""
-        # 130 is 128 + SIGINT, what shells report of a program that was interrupted.
+        # 130 is 128 + SIGINT, the exit code by which shells report an interrupted program.
         return {Outcome.COMPLETED: 0, Outcome.LEFT_CHART: 1, Outcome.DIVERGED: 3}.get(self, 130)
 
     @property
@@ -90,7 +89,7 @@ class Outcome(enum.Enum):
 
 
 def did_you_mean(got: object, allowed: Iterable[str]) -> str:
-    """Return `` (did you mean `name`?)`` where an allowed name is close to `got`, else nothing."""
+    """Return `` (did you mean `name`?)`` if an allowed name is close to `got`, otherwise ""."""
     close = difflib.get_close_matches(str(got), list(allowed), n=1, cutoff=0.6)
     return f" (did you mean `{close[0]}`?)" if close else ""
 

@@ -1,15 +1,15 @@
-"""Files that are whole or not there: written beside their name, and renamed when complete."""
+"""Atomic writing of files: written under a temporary name, renamed when complete."""
 
 import os
 from collections.abc import Callable
 from pathlib import Path
 
 PART = ".part"
-"""What the names of unfinished files end in."""
+"""Suffix of unfinished files."""
 
 
 def write_atomic(path: Path, content: bytes | str) -> None:
-    """Write a file that has all of the content or, where that fails, what it had before.
+    """Write a file completely; if that fails, its previous content remains.
 
     Raises:
         OSError: it cannot be written.
@@ -19,18 +19,18 @@ def write_atomic(path: Path, content: bytes | str) -> None:
 
 
 def make_atomic(path: Path, make: Callable[[Path], object]) -> None:
-    """Let `make` write a file under another name, and give it its own when it is complete.
+    """Let `make` write a temporary file, and rename it when it is complete.
 
     Raises:
         OSError: it cannot be written.
     """
     if path.exists() and not path.is_file():
-        # A pipe or a device, which nothing can take the place of.
+        # A pipe or a device cannot be replaced by a rename.
         make(path)
         return
-    # What a link leads to is written, and the link stays.
+    # Resolved, so that a symbolic link stays and its target is written.
     path = path.resolve()
-    # By the process too: two that write the same file must not write into each other's.
+    # With the process id: two processes may write the same file.
     part = path.with_name(f".{path.name}.{os.getpid()}{PART}")
     try:
         make(part)
@@ -44,5 +44,5 @@ def _write(path: Path, data: bytes) -> None:
     with path.open("wb") as file:
         file.write(data)
         file.flush()
-        # Without it a power cut may leave the name with nothing in it.
+        # Without it, a power failure may leave an empty file under the final name.
         os.fsync(file.fileno())

@@ -1,8 +1,8 @@
-"""What identifies a value: one digest of the classes and the bits of all that it is made of.
+"""Identity of values: a digest of the classes and bits of all their parts.
 
-Values whose bits are equal are the same value, in whatever process; arrays may be changed in place,
-so that who they are says nothing. A class that is not echelon's may be defined anew, or read what
-changes, as long as a process runs: what holds one has no digest, only a key for this process.
+Values with equal bits are the same in every process; object identity is useless, since arrays can
+be changed in place. A foreign class may be redefined or read changing data while a process runs:
+a value that contains one has no digest, only a key for this process.
 """
 
 import dataclasses
@@ -15,15 +15,15 @@ from types import FunctionType
 from typing import Any, Final, final
 
 _LARGE: Final = 4096
-"""Bytes of an array that is hashed where it is, and not copied beside the rest first."""
+"""Arrays of at least this many bytes are hashed in place and not copied."""
 _TRUSTED: Final = {"echelon", "builtins", "numpy", "jax"}
 _PLAIN: Final = (bool, int, float, complex, str, bytes, type(None))
 
 
 def digest(value: object) -> bytes | None:
-    """Return what is equal for values of the same classes and bits alone, in every process.
+    """Return a digest, equal only for values of the same classes and bits, in every process.
 
-    None where a part is of a class or function that is not echelon's own or below it.
+    None if a part is of a class or function outside echelon and its dependencies.
     """
     walk = _Walk()
     walk.visit(value)
@@ -31,10 +31,10 @@ def digest(value: object) -> bytes | None:
 
 
 def process_key(value: object) -> Hashable | None:
-    """Return what is equal for values of the same classes and bits alone, in this process.
+    """Return a key, equal only for values of the same classes and bits, in this process.
 
-    A user's class is the same as long as it is the same object; an object of no known kind is equal
-    where it says so itself. None where such an object has no hash.
+    A user's class is compared by identity, an object of unknown kind by its own equality. None if
+    such an object has no hash.
     """
     walk = _Walk()
     walk.visit(value)
@@ -52,28 +52,27 @@ def array_bits(array: object) -> bytes:
     """Return the bits of an array of NumPy or JAX; of a large one, such as a graph's, a digest.
 
     Raises:
-        ValueError: its entries are objects, whose bits are addresses; or it is traced, and has
-            none.
+        ValueError: its entries are objects, whose bits are addresses; or it is traced.
     """
-    # Here, since the command line opens its cache before it needs them.
+    # Imported here, since the command line opens its cache before it needs them.
     import numpy as np
 
     numbers = array if isinstance(array, np.ndarray) else np.asarray(_untraced(array))
     if numbers.dtype.hasobject:
-        raise ValueError("got an array of objects or a traced one, allowed are numbers.")
+        raise ValueError("the array contains objects or is traced, and must contain numbers.")
     if numbers.nbytes < _LARGE:
         return numbers.tobytes()
     return hashlib.sha256(np.ascontiguousarray(numbers).data).digest()
 
 
 def _untraced(array: object) -> object:
-    """Return what NumPy can take of an array of JAX; None of a traced one."""
+    """Return an array of JAX as NumPy can read it; None if it is traced."""
     import jax
     from jax.core import Tracer
 
     if isinstance(array, Tracer):
         return None
-    # Keys of random numbers are no numbers of NumPy's.
+    # Random keys have a type that NumPy cannot read.
     if isinstance(array, jax.Array) and jax.numpy.issubdtype(array.dtype, jax.dtypes.extended):
         return jax.random.key_data(array)
     return array
@@ -89,7 +88,7 @@ def _fields(kind: type) -> tuple[str, ...] | None:
 
 @final
 class _Walk:
-    """One walk through a tree of values, which collects its bits and what is foreign in it."""
+    """A walk through a tree of values that collects its bits and its foreign parts."""
 
     def __init__(self) -> None:
         self.foreign: list[Hashable] = []
@@ -97,20 +96,20 @@ class _Walk:
 
     def digest(self) -> bytes:
         """Return a digest of all bits."""
-        # Each with its length, so that no two trees make one row of bytes.
+        # Each with its length, so that different trees cannot give the same bytes.
         framed = [b"%d:" % len(part) + part for part in self._bits]
         return hashlib.sha256(b"".join(framed)).digest()
 
     def visit(self, value: object) -> None:
-        """Collect what a value is made of, each part with its class."""
+        """Collect the parts of a value, each with its class."""
         kind = type(value)
         if kind in _PLAIN:
-            # `repr` of a float has all its digits, and the sign of 0.
+            # `repr` of a float keeps all digits and the sign of 0.
             self._bits.append(f"{kind.__name__} {value!r}".encode())
             return
         names = _fields(kind)
         if names is not None:
-            # Equinox leaves out what is an attribute of the class.
+            # By attribute: Equinox may store a field on the class only.
             self._inner(kind, [getattr(value, name) for name in names])
         elif isinstance(value, tuple | list):
             self._inner(kind, value)
@@ -150,13 +149,13 @@ class _Walk:
         place: object = sys.modules.get(home)
         for part in name.split("."):
             place = getattr(place, part, None)
-        # What cannot be found by its name, as a class that is made in a function, is nobody's.
+        # A class that cannot be found by its name (defined in a function) counts as foreign.
         if home.partition(".")[0] in _TRUSTED and place is named:
             self._bits.append(f"{home}.{name}".encode())
         else:
             self._unknown(named)
 
     def _unknown(self, value: object) -> None:
-        # The class too, since numbers of two classes may say that they are equal.
+        # With the class, since numbers of different classes may compare equal.
         self.foreign.append((type(value), value))
         self._bits.append(b"foreign")

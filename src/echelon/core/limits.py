@@ -1,7 +1,7 @@
-"""How large an experiment may be: reckoned here, and here alone, before anything is allocated.
+"""Size limits of experiments, checked before anything is allocated.
 
-Each function returns why something is too large, with what would fit, or None where it is not. The
-sentence has no subject and no full stop; who asks knows what it speaks of.
+Each function returns why something is too large and what would fit, or None. The caller adds the
+subject and the full stop.
 """
 
 import math
@@ -10,20 +10,20 @@ from pathlib import Path
 from typing import Final
 
 MOST_STEPS: Final = 2**31 - 1
-"""The number of a step is an integer of 32 bits in the compiled loop."""
+"""The compiled loop counts steps in 32-bit integers."""
 MOST_AGENTS: Final = 1_000_000
 MOST_EDGES: Final = 10_000_000
 MOST_RUNS: Final = 10_000_000
-"""Of a sweep."""
+"""Runs of a sweep."""
 MOST_STATES: Final = 300
-"""Of one agent: a gain takes the cube of it, and a formation of some has the square in P."""
+"""States of one agent: time grows with the cube, memory with the square of them."""
 
 _ROUNDING: Final = 1e-6
-"""Part of a step: 2^31 steps are rounded to less, and no horizon is meant to end so near one."""
+"""Fraction of a step: rounding of 2^31 steps is smaller."""
 _COPIES: Final = 6
-"""Of what is stored: as it comes, joined, as errors, in the dataset, and twice in its file."""
+"""Copies in memory: chunks, joined, errors, dataset, and two while its file is written."""
 _UNKNOWN: Final = 8 * 2**30
-"""Bytes of memory where the system does not say."""
+"""Memory in bytes if the system does not report it."""
 
 
 def excess_agents(agents: int) -> str | None:
@@ -42,7 +42,7 @@ def excess_states(states: int) -> str | None:
 
 
 def excess_runs(runs: int, numbers: int = 0) -> str | None:
-    """Return why a sweep has too many runs, of each of which so many numbers are kept."""
+    """Return why a sweep has too many runs, each with `numbers` stored numbers."""
     most = _most(runs, MOST_RUNS, "runs")
     size, room = 8 * _COPIES * runs * numbers, memory() // 2
     if most is not None or size <= room:
@@ -56,17 +56,17 @@ def excess_runs(runs: int, numbers: int = 0) -> str | None:
 def horizon_fault(horizon: float, dt: float) -> str | None:
     """Return what is wrong with a horizon (s) for steps of dt (s), both positive and finite.
 
-    None where the horizon is a whole number of steps, and not too many of them.
+    None if the horizon is a whole number of steps within the limit.
     """
     if horizon < dt:
         return f"must be at least one step `dt` = {dt:g} s"
-    # A quotient may be beyond all numbers.
+    # The quotient may overflow.
     steps = horizon / dt if horizon / 1e300 < dt else math.inf
     if steps > MOST_STEPS + _ROUNDING:
         size = math.log10(horizon) - math.log10(dt)
         shown = f"1e{size:+.0f}" if steps == math.inf else f"{steps:.3g}"
         return f"has {shown} steps of {dt:g} s, and must be at most {MOST_STEPS * dt:.6g} s"
-    # 0.3 / 0.1 is a little less than 3: rounding is no part of a step.
+    # 0.3 / 0.1 is slightly less than 3: rounding must not count as a part of a step.
     if abs(steps - round(steps)) <= _ROUNDING:
         return None
     near = " or ".join(f"{k * dt:.12g}" for k in (math.floor(steps), math.ceil(steps)))
@@ -74,9 +74,9 @@ def horizon_fault(horizon: float, dt: float) -> str | None:
 
 
 def excess_frames(frames: int, numbers: int, every: int) -> str | None:
-    """Return why so many frames of so many numbers, one every so many steps, are too many.
+    """Return why the frames, each of `numbers` numbers, do not fit in memory.
 
-    Half of the machine's memory is for them.
+    They may use half of the memory. `every` is the number of steps per frame.
     """
     size, room = 8 * _COPIES * frames * numbers, memory() // 2
     if size <= room:
@@ -89,7 +89,7 @@ def excess_frames(frames: int, numbers: int, every: int) -> str | None:
 
 
 def memory() -> int:
-    """Return the bytes of memory that this process may have."""
+    """Return the memory in bytes that this process may use."""
     result = [limit for limit in (_machine(), _group()) if limit is not None]
     return min(result, default=_UNKNOWN)
 
@@ -102,7 +102,7 @@ def _machine() -> int | None:
 
 
 def _group() -> int | None:
-    """Return the limit that a container has under Linux."""
+    """Return the memory limit of a container under Linux."""
     try:
         return int(Path("/sys/fs/cgroup/memory.max").read_text())
     except (OSError, ValueError):  # no container, or `max`
@@ -110,7 +110,7 @@ def _group() -> int | None:
 
 
 def _most(asked: float, most: int, what: str) -> str | None:
-    # A number of a hundred digits is told by its size.
+    # Shortened, since a user may enter a number of a hundred digits.
     shown = str(asked) if isinstance(asked, int) and asked < 10**12 else f"{asked:.3g}"
     return None if asked <= most else f"{shown} {what} are asked for, and {most} fit"
 

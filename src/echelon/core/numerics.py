@@ -1,6 +1,6 @@
-"""Numerical building blocks that know nothing of agents.
+"""Precision, integrators and time derivatives.
 
-Precision, integrators and linear systems theory.
+None of them depends on an agent model.
 """
 
 import contextlib

@@ -1,9 +1,9 @@
-"""How a value shows itself in a notebook, by code of a room above that is loaded when asked."""
+"""HTML pages of values in notebooks, made by an output module that is imported on demand."""
 
 import importlib
 from typing import Final
 
-# By name, since what a notebook shows is drawn high above where values are made.
+# By name, since the output layer is above this one and must not be imported from here.
 _PAGES: Final = {"result": "echelon.output.archive.notebook:result_page"}
 
 

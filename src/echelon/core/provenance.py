@@ -1,4 +1,4 @@
-"""Where a number comes from: versions of what computed it, and the state of the source."""
+"""Provenance of results: package versions and the commit of the source."""
 
 import platform
 import subprocess
@@ -13,7 +13,7 @@ _PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy", "llvmlite")
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that compute.
 
-    In a checkout there is `git` too, the commit.
+    In a checkout, `git` is the commit.
     """
     result = {"python": platform.python_version(), "echelon": __version__}
     for package in _PACKAGES:
@@ -33,7 +33,7 @@ def _commit() -> str | None:
         return None
     try:
         command = ["git", "-C", str(home), "describe", "--always", "--dirty=+", "--abbrev=12"]
-        # A slow disk must not hold up a run for its footnote, hence the timeout.
+        # With a timeout: a slow disk must not delay a run for this detail.
         return subprocess.run(
             command, capture_output=True, text=True, timeout=5, check=True
         ).stdout.strip()

@@ -1,6 +1,6 @@
 """Bounds in exact rational arithmetic: rounding in a stated direction, roots, and bisection.
 
-The verifier has its own, since it shares nothing with what it checks.
+The verifier has its own implementation, to be independent of the synthesis.
 """
 
 import math
@@ -33,12 +33,12 @@ def round_up(x: Fraction) -> Fraction:
 
 
 def root_bounds(x: Fraction | int) -> tuple[Fraction, Fraction]:
-    """Return short rationals below and above the root of x >= 0; both are it where it is short."""
+    """Return short rationals below and above the root of x >= 0; both are equal if it is short."""
     x = Fraction(x)
     bits = x.denominator.bit_length() // 2 - x.numerator.bit_length() // 2
     shift = max(0, _ROOT_BITS + bits)
     square = x * (1 << (2 * shift))
-    # The root of a number lies between that of its floor, rounded down, and one more.
+    # isqrt(floor(s)) <= sqrt(s) < isqrt(floor(s)) + 1.
     low = math.isqrt(math.floor(square))
     high = low if low * low == square else low + 1
     return Fraction(low, 1 << shift), Fraction(high, 1 << shift)
@@ -52,12 +52,12 @@ def norm_above(first: Fraction, *others: Fraction) -> Fraction:
 
 
 def bisect(holds: Callable[[_Real], bool], low: _Real, high: _Real, halvings: int) -> _Real:
-    """Return a number at which a condition holds, close to where it stops holding.
+    """Return a number at which a condition holds, close to the border where it fails.
 
     Args:
         holds: the condition, assumed at `low`.
-        low: where the search begins.
-        high: beyond the number that is sought, above or below `low`.
+        low: start of the search.
+        high: beyond the border, above or below `low`.
         halvings: of the interval; the result is within its 2^-halvings of the border.
     """
     for _ in range(halvings):

@@ -1,1 +1,1 @@
-"""All values of a function on a box, exactly: intervals, curves, polynomials, hulls."""
+"""Rigorous enclosures of functions on a box: intervals, curves, polynomials, hulls."""

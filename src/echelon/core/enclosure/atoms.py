@@ -1,7 +1,7 @@
-"""What polynomials are made of: box variables, angles, and what is known by its range alone.
+"""Atoms of polynomials: box variables, angles, and unknowns given only by their range.
 
-An atom has a range, and its powers or waves lie in a polygon; what is no polynomial becomes an atom
-of its own.
+An atom has a range, and its powers or waves lie in a polygon. An expression that is not polynomial
+becomes a new atom.
 """
 
 import itertools
@@ -28,7 +28,7 @@ from echelon.core.errors import GainError, listing
 
 _HALF = Fraction(1, 2)
 MOST_VERTICES = 16384
-"""A hull with more vertices is refused; no solver could use it."""
+"""Largest number of vertices of a hull; no solver could use more."""
 
 _MOST_ORDER = 16  # of the waves that share a polygon
 _FEW = 64  # a range is sharpened at the corners where there are no more than these
@@ -37,9 +37,9 @@ _THIN = Fraction(1, 1 << 64)  # relative width of what is a number in all but na
 
 @dataclass(frozen=True)
 class Atom:
-    """A variable or an angle: its range, what it is called, and the box variables behind it.
+    """A variable or an angle: its name, its range and the box variables it depends on.
 
-    A variable that the box leaves open has no range.
+    A variable without bounds has no range.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Atom:
         """Return the range.
 
         Raises:
-            OpenError: there is none.
+            OpenError: the atom has none.
         """
         if self.interval is None:
             raise OpenError(self.name)
@@ -60,7 +60,7 @@ class Atom:
 
 
 class OpenError(GainError):
-    """What is asked needs the range of a variable that the box leaves open."""
+    """The range of a variable is needed, but the box leaves it unbounded."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -68,7 +68,7 @@ class OpenError(GainError):
 
 
 class Atoms:
-    """Everything that polynomials are made of: numbered variables and angles, and their ranges."""
+    """The numbered variables and angles of polynomials, with their ranges."""
 
     def __init__(self) -> None:
         self.known: list[Atom] = []
@@ -82,18 +82,18 @@ class Atoms:
         return self._numbers[key]
 
     def variable(self, name: str, interval: Interval | None) -> Polynomial:
-        """Return a new box variable, open where it has no range, or the number it is fixed at."""
+        """Return a new box variable (open without a range), or a constant if it is fixed."""
         if interval is not None and interval.lo == interval.hi:
             return constant(interval.lo)
         atom = self._add(("box", len(self.known)), Atom(name, interval, frozenset([name])))
         return Polynomial({((atom, 1),): Fraction(1)})
 
     def fresh(self, key: object, interval: Interval, *behind: Polynomial) -> Polynomial:
-        """Return a variable for a value that is known by its range alone.
+        """Return a variable for a value of which only the range is known.
 
         The same `key` gives the same variable; a range of one point gives a number.
         """
-        # A number keeps polynomials short, and doubles no corners of a hull.
+        # A constant keeps polynomials short and does not double the vertices of a hull.
         if interval.lo == interval.hi:
             return constant(interval.lo)
         sources = frozenset().union(*(self.sources(p) for p in behind))
@@ -102,13 +102,13 @@ class Atoms:
         return Polynomial({((atom, 1),): Fraction(1)})
 
     def side(self, border: Polynomial) -> Polynomial:
-        """Return an unknown that is 1 where a border is positive and 0 where it is negative.
+        """Return an unknown that is 1 where `border` > 0 and 0 where `border` < 0.
 
-        The same for each positive multiple of a border, and what is left of 1 for each negative
-        one: where the border is 0, it may be anything between.
+        Positive multiples of a border share it, negative ones have its complement to 1. Where
+        the border is 0, it is anything between 0 and 1.
         """
-        # Scaled by one coefficient, all multiples of a border are one polynomial and have one
-        # unknown: that is how two `max` of one pair are known to bend together.
+        # Normalized by one coefficient, multiples of a border have one unknown, so that two `max`
+        # of one pair switch together.
         lead = border.terms[max(border.terms, key=order)]
         if lead < 0:
             return constant(1) - self.side(-border)
@@ -119,9 +119,9 @@ class Atoms:
         return Polynomial({((atom, 1),): Fraction(1)})
 
     def settle(self, p: Polynomial) -> Polynomial:
-        """Return a polynomial with what its sides imply: s d is (d + |d|) / 2, and s s is s.
+        """Return a polynomial simplified by the identities of sides: s d = (d + |d|) / 2, s s = s.
 
-        So the slope of x |x|, which is found as |x| + (2 s - 1) x, becomes 2 |x|.
+        For example the slope of x |x|, computed as |x| + (2 s - 1) x, becomes 2 |x|.
         """
         for atom in p.exponents():
             border = self.known[atom].border
@@ -131,11 +131,10 @@ class Atoms:
 
     def _settle(self, p: Polynomial, side: int, border: Polynomial) -> Polynomial:
         chosen, lead = Polynomial({((side, 1),): Fraction(1)}), max(border.terms, key=order)
-        # The lead times s is s d, which is settled, less s times the rest of d.
+        # lead * s = s d - s (d - lead), of which s d is simplified.
         rest = chosen * (border - Polynomial({lead: Fraction(1)}))
         settled = constant(_HALF) * (border + self.elementary("abs", border)) - rest
-        # What is put in place of a term holds the side beside smaller monomials alone, so this
-        # ends.
+        # Each replacement multiplies the side by smaller monomials only, so the loop ends.
         done, left = constant(0), p
         while left.terms:
             top = max(left.terms, key=order)
@@ -175,7 +174,7 @@ class Atoms:
         return self.fresh((name, p.key()), function.range(interval), p)
 
     def circle(self, p: Polynomial) -> tuple[Polynomial, Polynomial]:
-        """Return cos p and sin p, with the angles of a sum taken apart."""
+        """Return cos p and sin p, expanded by the addition theorems."""
         linear = self._linear(p)
         shift = linear.pop((), Fraction(0))
         # The cosine of a number is irrational: an interval 2^-99 wide, and hence a variable.
@@ -185,14 +184,14 @@ class Atoms:
         # By the addition theorem, one angle after the other.
         result = (constant(1), constant(0))
         for ((atom, _),), factor in linear.items():
-            # The constant goes into the first angle, where it moves a range and adds no term.
+            # The constant is added to the first angle, where it shifts a range and adds no term.
             c, s = self._angle(atom, factor, shift)
             result = result[0] * c - result[1] * s, result[1] * c + result[0] * s
             shift = Fraction(0)
         return result
 
     def _linear(self, p: Polynomial) -> dict[Monomial, Fraction]:
-        """Return the constant and linear terms, with all else as one variable more."""
+        """Return the constant and linear terms; all other terms become one new variable."""
         bent = {m: c for m, c in p.terms.items() if m and not (len(m) == 1 and m[0][1] == 1)}
         if not bent:
             return dict(p.terms)
@@ -223,17 +222,17 @@ class Atoms:
         return self._ranges[key]
 
     def range(self, p: Polynomial) -> Interval:
-        """Return an interval that holds every value of a polynomial on the box."""
+        """Return an interval that contains every value of a polynomial on the box."""
         total = point(0)
         for monomial, c in p.terms.items():
             product = point(c)
             for atom, exponent in monomial:
                 product = product * self.factor_range(atom, exponent)
             total = total + product
-        # A monomial holds each atom once, so corners would sharpen nothing.
+        # A monomial contains each atom once, so its interval product is already exact.
         if len(p.terms) < 2:
             return total
-        # Terms that share atoms do not vary freely, which their common corners know.
+        # Terms that share atoms are dependent; evaluation at common corners uses that.
         corners = {atom: self.corners(atom, used) for atom, used in p.exponents().items()}
         if math.prod(len(c.points) for c in corners.values()) > _FEW:
             return total
@@ -242,9 +241,9 @@ class Atoms:
         return total.intersect(Interval(low - values.slack, high + values.slack))
 
     def corners(self, atom: int, used: Iterable[Exponent]) -> "Corners":
-        """Return points whose hull holds the used powers or waves of an atom, jointly."""
+        """Return points whose hull contains the used powers or waves of an atom jointly."""
         exponents = list(used)
-        # A coordinate alone has a range, which no polygon around a curve is tighter than.
+        # For a single coordinate the range is the tightest enclosure.
         if len(exponents) == 1:
             return _gather_points(self._ends(atom, exponents[0]))
         powers = [e for e in exponents if isinstance(e, int)]
@@ -263,10 +262,11 @@ class Atoms:
 
 
 def _harmonics(waves: Iterable[Wave]) -> list[list[Wave]]:
-    """Return waves in groups that are low multiples of one frequency each.
+    """Return waves in groups, each of low multiples of one frequency.
 
-    A group gets one polygon, whose corners grow with the highest multiple: 0.7 and 1.3 as floats
-    are multiples of 2^-53. Groups are enclosed apart, and the products of their corners hold all.
+    A group has one polygon, whose corners increase with the highest multiple (as floats, 0.7 and
+    1.3 are multiples of 2^-53).
+    Groups are enclosed separately; products of their corners enclose all.
     """
     groups = list[list[Wave]]()
     for w in sorted(waves):
@@ -279,7 +279,7 @@ def _harmonics(waves: Iterable[Wave]) -> list[list[Wave]]:
 
 
 def _wave_corners(arc: Interval, waves: list[Wave]) -> list[dict[Exponent, Fraction]]:
-    """Return points around the waves of a group, jointly."""
+    """Return points whose hull contains the waves of a group jointly."""
     unit = common_unit(w for w, _ in waves)
     orders = {w: int(w / unit) for w, _ in waves}
     around = wave_points(arc.scale(unit), set(orders.values()))
@@ -287,7 +287,7 @@ def _wave_corners(arc: Interval, waves: list[Wave]) -> list[dict[Exponent, Fract
 
 
 def check_count(count: int) -> None:
-    """Refuse a hull of too many vertices.
+    """Check the number of vertices of a hull.
 
     Raises:
         GainError: there are more than `MOST_VERTICES`.
@@ -300,7 +300,7 @@ def check_count(count: int) -> None:
 
 
 class Corners(NamedTuple):
-    """Points around an atom's powers or waves; or one, each coordinate within `radius` of it."""
+    """Points whose hull, widened by `radius`, contains an atom's powers or waves."""
 
     points: list[dict[Exponent, Fraction]]
     radius: dict[Exponent, Fraction]
@@ -311,9 +311,9 @@ class Corners(NamedTuple):
 
 
 def _gather_points(points: list[dict[Exponent, Fraction]]) -> Corners:
-    """Return points without repetition, or their middle where they all but agree."""
+    """Return distinct points, or their midpoint if they are nearly equal."""
     ends = {e: (min(p[e] for p in points), max(p[e] for p in points)) for e in points[0]}
-    # Two corners for the cosine of a number would double the hull for nothing but rounding.
+    # Two corners for the cosine of a constant would double the hull only for rounding.
     if all(hi - lo <= _THIN * max(1, abs(hi)) for lo, hi in ends.values()):
         middle = {e: (lo + hi) / 2 for e, (lo, hi) in ends.items()}
         return Corners([middle], {e: (hi - lo) / 2 for e, (lo, hi) in ends.items()})
@@ -322,7 +322,7 @@ def _gather_points(points: list[dict[Exponent, Fraction]]) -> Corners:
 
 
 class CornerValues(NamedTuple):
-    """A polynomial at the products of corners: one axis for each atom; off by at most `slack`."""
+    """Values of a polynomial at all products of corners, one axis per atom, within `slack`."""
 
     atoms: list[int]
     array: np.ndarray
@@ -332,7 +332,7 @@ class CornerValues(NamedTuple):
 def corner_values(p: Polynomial, corners: Mapping[int, Corners]) -> CornerValues:
     """Return the values of a polynomial at all products of its atoms' corners.
 
-    It is affine in the coordinates of each atom, so their hull (and the slack) holds its values.
+    It is affine in the coordinates of each atom, so their hull and the slack contain its values.
     """
     atoms = sorted(p.exponents())
     array = np.empty([len(corners[atom].points) for atom in atoms], object)
@@ -345,7 +345,7 @@ def corner_values(p: Polynomial, corners: Mapping[int, Corners]) -> CornerValues
 
 
 def _slack(p: Polynomial, corners: Mapping[int, Corners]) -> Fraction:
-    """Bound what the radii of corners change: each factor's radius times the others' bounds."""
+    """Bound the effect of the radii: each factor's radius times the bounds of the others."""
     return sum(
         (
             abs(c) * corners[a].radius[e] * math.prod(corners[b].bound(d) for b, d in m if b != a)

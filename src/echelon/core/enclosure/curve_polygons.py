@@ -18,16 +18,16 @@ from echelon.core.enclosure.interval import Interval, circle, pi
 Gaussian: TypeAlias = tuple[int, int]
 """A direction in the plane, as a complex integer."""
 
-# Directions are rounded to 2^-64, and an arc's ends turned outward by 2^-60, which is more.
+# Ends of an arc are turned outward by 2^-60, more than the rounding of 2^-64 of a direction.
 _UNIT = 1 << 64
 _TILT = 1 << 60
-_FAR = 1 << 199  # rad; beyond it `circle` no longer tells where on the circle an angle lies
+_FAR = 1 << 199  # rad; beyond it `circle` cannot locate an angle
 # At half the angles a full turn is half a turn, here in four pieces.
 _FULL: list[Gaussian] = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0)]
 
 
 def power_points(interval: Interval, powers: Iterable[int]) -> list[dict[int, Fraction]]:
-    """Return points whose hull holds (x^k for k in powers), x in the interval."""
+    """Return points whose hull contains (x^k for k in powers), x in the interval."""
     exponents = sorted(powers)
     if len(exponents) == 1:
         # A single power has a range, which is tighter than the control points of its curve.
@@ -54,14 +54,14 @@ def power_points(interval: Interval, powers: Iterable[int]) -> list[dict[int, Fr
 
 
 def common_unit(frequencies: Iterable[Fraction]) -> Fraction:
-    """Return the largest rational of which all the frequencies are whole multiples."""
+    """Return the largest rational of which all frequencies are integer multiples."""
     rationals = list(frequencies)
     denominator = lcm(*(w.denominator for w in rationals))
     return Fraction(gcd(*(int(w * denominator) for w in rationals)), denominator)
 
 
 def wave_points(arc: Interval, orders: Iterable[int]) -> list[dict[tuple[int, int], Fraction]]:
-    """Return points whose hull holds (cos k t, sin k t for k in orders), t in the arc (rad).
+    """Return points whose hull contains (cos k t, sin k t for k in orders), t in the arc (rad).
 
     Keys are (k, 0) for cos and (k, 1) for sin.
     """
@@ -79,14 +79,14 @@ def wave_points(arc: Interval, orders: Iterable[int]) -> list[dict[tuple[int, in
 
 
 def _cuts(arc: Interval) -> list[Gaussian]:
-    """Return directions at half the angles where an arc begins, is cut and ends.
+    """Return directions at half the angles of the start, the cuts and the end of an arc.
 
-    Two pieces below 180 degrees, four above, and the full circle where the ends all but meet.
+    Two pieces below 180 degrees, four above; the full circle if the ends nearly meet.
     """
     start, end = arc.lo / 2, arc.hi / 2
     if end - start >= pi().lo - Fraction(1, 1 << 40) or max(abs(start), abs(end)) > _FAR:
         return _FULL
-    # So each is below 90 degrees; towards 180 the tangents at its ends meet ever farther away.
+    # Each piece is below 90 degrees: towards 180 the end tangents intersect ever farther away.
     pieces = 2 if end - start < pi().lo / 2 else 4
     between = [start + (end - start) * Fraction(k, pieces) for k in range(1, pieces)]
     return [_direction(start, -1), *(_direction(a, 0) for a in between), _direction(end, 1)]
@@ -97,7 +97,7 @@ def _direction(angle: Fraction, turn: int) -> Gaussian:
 
     Rounding moves the direction by less than 2^-63, the turn by arctan 2^-60.
     """
-    # Exact, and no long fraction.
+    # Exact, with short fractions.
     if angle == 0:
         return 1, 0
     cosine, sine = circle(angle)

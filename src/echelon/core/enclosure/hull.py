@@ -1,4 +1,4 @@
-"""A polytope of matrices that provably contains all values, or slopes, of a function on a box.
+"""Polytopes of matrices that provably contain all values or slopes of a function on a box.
 
 The function is traced and evaluated in exact polynomial arithmetic (`rules`, `sloped`, `slopes`).
 Each entry is affine in the coordinates of every atom (a variable's powers, an angle's waves), and
@@ -29,10 +29,9 @@ _Function: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 class Box(NamedTuple):
-    """Bounds (k,) of k entries, each taken exactly; infinite where an entry is open.
+    """Exact bounds (k,) of k entries; infinite if an entry is open.
 
-    Nothing is known of an open entry. A function may be linear in it, and its slopes must not
-    depend on it.
+    A function may be linear in an open entry, but its slopes must not depend on it.
     """
 
     lower: Bounds
@@ -40,11 +39,11 @@ class Box(NamedTuple):
 
 
 class HullAtom(NamedTuple):
-    """What the vertices are products of.
+    """An atom of a hull; the vertices are products of the points of all atoms.
 
     `name` is the box variable (or the expression), `kind` is `interval`, `powers`, `arc` or
-    `constant`; its range is (lower, upper), angles in rad; `vertices` is how many points stand
-    around it.
+    `constant`; its range is (lower, upper), angles in rad; `vertices` is its number of
+    points.
     """
 
     name: str
@@ -67,11 +66,11 @@ class Hull(NamedTuple):
 
 
 def value_hull(function: _Function, states: Box, inputs: Box, names: Sequence[str] = ()) -> Hull:
-    """Return matrices whose hull holds function(x, v) for every x and v of a box.
+    """Return matrices whose hull contains function(x, v) for all x and v of a box.
 
-    It is sound for the function over the reals, float constants taken exactly; what a primitive
-    without a rule makes of constants alone (an inverse of the inertia, say) is a constant too, the
-    float64 that the program computes.
+    It is rigorous for the function over the reals, with float constants taken exactly. A primitive
+    without a rule may act on constants (an inverse of the inertia, for example); its float64 result
+    is then a constant.
 
     Args:
         function: (x (n,), v (m,)) -> (k, l), traceable by JAX.
@@ -85,7 +84,7 @@ def value_hull(function: _Function, states: Box, inputs: Box, names: Sequence[st
             (the primitive is named), or there are more than `MOST_VERTICES` vertices.
     """
     atoms = Atoms()
-    # Nothing is a variable that slopes are taken in, so that the function may jump.
+    # No entry is a slope variable, so the function may be discontinuous.
     x, v = (map_entries(number, some) for some in _variables(atoms, states, inputs, names))
     return _hull_of(map_entries(_value, _evaluate(function, x, v, atoms)), atoms)
 
@@ -97,40 +96,40 @@ def slope_hull(
     names: Sequence[str] = (),
     weight: _Function | None = None,
 ) -> Hull:
-    """Return matrices whose hull H holds every slope in x of a function on a box.
+    """Return matrices whose hull H contains every slope in x of a function on a box.
 
     For any x, y and v of the box function(x, v) - function(y, v) is a matrix of H times x - y,
-    whether the function is smooth or only bends. No derivative is taken from JAX.
+    for smooth and for piecewise smooth functions. Derivatives of JAX are not used.
 
     Args:
         function: (x (n,), v (m,)) -> (k,), traceable by JAX.
         states: bounds of x, (n,) each.
         inputs: bounds of v, (m,) each.
         names: of the entries of x and v.
-        weight: (x, v) -> (k, l), whose values stand to the right of the slopes, enclosed together.
+        weight: (x, v) -> (k, l), whose values are appended to the slopes and enclosed jointly.
 
     Raises:
         OpenError: the slopes depend on an entry that the box leaves open.
-        GainError: as in `value_hull`; or the function or the weight jumps inside the box.
+        GainError: as in `value_hull`; or the function or the weight is discontinuous on the box.
     """
     atoms = Atoms()
     x, v = _variables(atoms, states, inputs, names)
     x, v = _sloped(x), map_entries(number, v)
     matrix = _slopes(_evaluate(function, x, v, atoms), len(x), atoms)
     if weight is not None:
-        # Its slopes are evaluated too, so that one that jumps is refused.
+        # Its slopes are evaluated too, so that a discontinuous weight is refused.
         values = map_entries(_value, _evaluate(weight, x, v, atoms))
         matrix = np.concatenate([matrix, values], axis=1)
     return _hull_of(matrix, atoms)
 
 
 def slope_columns(function: _Function, states: Box, inputs: Box) -> tuple[int, ...]:
-    """Return in which entries of x a function (x, v) -> (k,) has the slope 0 all over a box.
+    """Return the entries of x in which a function (x, v) -> (k,) has slope 0 on the whole box.
 
-    Nothing is multiplied out, so that slopes elsewhere may be as many as they like.
+    No vertices are built, so the number of other slopes does not matter.
 
     Raises:
-        OpenError: the function bends with an entry that the box leaves open.
+        OpenError: the slopes depend on an entry that the box leaves open.
         GainError: as in `slope_hull`.
     """
     atoms = Atoms()
@@ -145,7 +144,7 @@ def _value(entry: Sloped) -> Polynomial:
 
 
 def _sloped(x: np.ndarray) -> np.ndarray:
-    """Return polynomials (n,) as variables that slopes are taken in."""
+    """Return polynomials (n,) as slope variables."""
     return map_entries(variable, np.arange(len(x)), x)
 
 
@@ -180,7 +179,7 @@ def _variables(
 
 
 def _interval(low: float | Fraction, high: float | Fraction) -> Interval | None:
-    """Return a range, nothing rounded: a float is a fraction with a power of two below."""
+    """Return an exact range: every float is a rational number."""
     if math.isinf(low) or math.isinf(high):
         return None
     ends = (x if isinstance(x, Fraction) else Fraction(float(x)) for x in (low, high))
@@ -206,7 +205,7 @@ def _count_bounds(box: Box, name: str) -> int:
 
 def _hull_of(entries: np.ndarray, atoms: Atoms) -> Hull:
     """Return the hull of a matrix of polynomials."""
-    # Over all entries together: corners for each entry alone would lose that they share angles.
+    # Common corners for all entries: separate ones would lose that entries share angles.
     used: dict[int, set[Exponent]] = {}
     for p in entries.flat:
         for atom, exponents in p.exponents().items():
@@ -218,7 +217,7 @@ def _hull_of(entries: np.ndarray, atoms: Atoms) -> Hull:
     parts = [_round_values(p, corners) for p in entries.flat]
     spread = [_expand_values(values, array, counts) for values, array, _ in parts]
     error = np.array([bound for _, _, bound in parts]).reshape(entries.shape)
-    # Entries may not tell all products apart, and each vertex is a constraint for a solver.
+    # Different products may give equal matrices, and each vertex is a constraint for a solver.
     vertices = np.unique(np.stack(spread, axis=-1), axis=0)
     return Hull(vertices.reshape(-1, *entries.shape), error, _describe_atoms(atoms, used, counts))
 
@@ -232,7 +231,7 @@ def _round_values(
     worst = Fraction(0)
     for place, exact in np.ndenumerate(values.array):
         try:
-            # To the nearest float; what that moves is measured exactly and becomes part of `error`.
+            # Rounded to the nearest float; the exact difference becomes part of `error`.
             rounded[place] = float(exact)
         except OverflowError as fault:
             raise GainError("an entry of the hull exceeds float64 on the domain.") from fault
@@ -250,7 +249,7 @@ def _expand_values(values: CornerValues, array: np.ndarray, counts: dict[int, in
 def _describe_atoms(
     atoms: Atoms, used: dict[int, set[Exponent]], counts: dict[int, int]
 ) -> tuple[HullAtom, ...]:
-    """Return what the hull is made of, in the order in which the model uses it."""
+    """Return the atoms of the hull in the order in which the model uses them."""
     result = []
     for atom, count in counts.items():
         source = atoms.known[atom]

@@ -1,7 +1,7 @@
-"""Intervals with rational ends, and enclosures of the elementary functions that nobody rounds.
+"""Interval arithmetic with rational ends, and rigorous enclosures of elementary functions.
 
-Sums and products of rationals are exact. What is not rational (a cosine, a logarithm, a root) is
-enclosed by a series with a bound on its remainder, so that no statement rests on the accuracy of a
+Sums and products of rationals are exact. Irrational values (a cosine, a logarithm, a root) are
+enclosed by a series with a bound on its remainder, so no result depends on the accuracy of a
 mathematical library.
 """
 
@@ -29,7 +29,7 @@ class Interval:
         return Interval(self.lo + other.lo, self.hi + other.hi)
 
     def __mul__(self, other: "Interval") -> "Interval":
-        # A product is linear in each factor, so its extremes lie at ends.
+        # A product is linear in each factor, so its extremes are attained at ends.
         ends = [a * b for a in (self.lo, self.hi) for b in (other.lo, other.hi)]
         return Interval(min(ends), max(ends))
 
@@ -44,11 +44,11 @@ class Interval:
         return Interval(Fraction(0) if crosses else ends[0], ends[1])
 
     def holds(self, x: Fraction | int) -> bool:
-        """Say whether x lies in the interval."""
+        """Return whether x lies in the interval."""
         return self.lo <= x <= self.hi
 
     def union(self, other: "Interval") -> "Interval":
-        """Return the smallest interval that holds both."""
+        """Return the smallest interval that contains both."""
         return Interval(min(self.lo, other.lo), max(self.hi, other.hi))
 
     def intersect(self, other: "Interval") -> "Interval":
@@ -56,7 +56,7 @@ class Interval:
         return Interval(max(self.lo, other.lo), min(self.hi, other.hi))
 
     def text(self) -> str:
-        """Return the ends as a person reads them."""
+        """Return the ends as decimal text."""
         return f"[{_decimal(self.lo)}, {_decimal(self.hi)}]"
 
 
@@ -68,12 +68,12 @@ def _decimal(x: Fraction) -> str:
 
 
 def point(x: Fraction | int) -> Interval:
-    """Return the interval that holds x alone."""
+    """Return the interval [x, x]."""
     return Interval(Fraction(x), Fraction(x))
 
 
 def _round_end(x: Fraction, up: bool) -> Fraction:
-    """Return x moved down (or up) to `_BITS` significant bits, x itself where that is exact."""
+    """Return x rounded down (or up) to `_BITS` significant bits."""
     # Exact fractions would double their length with each operation.
     shift = _BITS - abs(x.numerator).bit_length() + x.denominator.bit_length()
     scale = Fraction(2) ** shift
@@ -115,7 +115,7 @@ def circle(x: Fraction) -> tuple[Interval, Interval]:
     """
     if x == 0:
         return point(1), point(0)
-    # The 2^-319 of pi, times as many turns, must stay far below the margin.
+    # The error 2^-319 of pi times the number of turns must stay far below the margin.
     turns = round(x / (2 * pi().lo))
     if abs(turns) >> 200:
         return Interval(Fraction(-1), Fraction(1)), Interval(Fraction(-1), Fraction(1))
@@ -154,18 +154,18 @@ def _to_fixed_point(x: Fraction) -> int:
 
 
 def _within(total: int, margin: Fraction) -> Interval:
-    """Return what a sum in fixed point may stand for when it is off by at most `margin`."""
+    """Return an interval around a fixed-point sum whose error is at most `margin`."""
     return outward(Fraction(total, _ONE) - margin, Fraction(total, _ONE) + margin)
 
 
 def _exp(x: Fraction) -> Interval:
     """Enclose exp x: a series of 40 terms for |y| <= 1/2, then squarings.
 
-    What follows the series is below 2^-197, and each term is off by at most 3 units.
+    The remainder is below 2^-197, and the error of each term at most 3 units.
     """
     if x == 0:
         return point(1)
-    # The lower end would be a fraction of endless length, and 0 is as good.
+    # 0 is a valid lower bound; the exact one would be an extremely long fraction.
     if x < -4096:
         return Interval(Fraction(0), _exp(Fraction(-4096)).hi)
     # exp x = exp(x / 2^k)^(2^k).
@@ -192,7 +192,7 @@ def _log(x: Fraction) -> Interval:
 def _twice_artanh(z: Fraction) -> Interval:
     """Enclose 2 artanh z for |z| <= 1/3.
 
-    What follows 80 terms is below 3^-160, and each term is off by at most 6 units.
+    The remainder is below 3^-160, and the error of each term at most 6 units.
     """
     if z == 0:
         return point(0)
@@ -206,7 +206,7 @@ def _twice_artanh(z: Fraction) -> Interval:
 def _atan(x: Fraction) -> Interval:
     """Enclose arctan x by Euler's series, whose terms at least halve for |x| <= 1.
 
-    What follows 160 terms is below 2^-159, and each term is off by at most 6 units.
+    The remainder is below 2^-159, and the error of each term at most 6 units.
     """
     if x == 0:
         return point(0)
@@ -267,7 +267,7 @@ def _sign(x: Interval) -> Interval:
 
 
 def _monotone_range(at: Callable[[Fraction], Interval]) -> Callable[[Interval], Interval]:
-    """Return the range of a function that rises everywhere on its domain."""
+    """Return the range of an increasing function."""
     return lambda x: Interval(at(x.lo).lo, at(x.hi).hi)
 
 
@@ -281,13 +281,13 @@ def _acos(x: Interval) -> Interval:
 
 
 def _is_clear(x: Interval) -> bool:
-    """Say whether x keeps away from 0: float64's pi/2 is below 90 degrees, and means them."""
+    """Return whether x is bounded away from 0 (float64's pi/2 counts as 90 degrees)."""
     sizes = (abs(x.lo), abs(x.hi))
     return not x.holds(0) and min(sizes) * (1 << 40) >= max(sizes)
 
 
 class Elementary(NamedTuple):
-    """A function of one real: its range on an interval, and where that is defined, in words too."""
+    """A real function: its range on an interval, and its domain as a test and as text."""
 
     range: Callable[[Interval], Interval]
     defined: Callable[[Interval], bool] = lambda x: True
@@ -295,7 +295,7 @@ class Elementary(NamedTuple):
 
 
 _POSITIVE = (lambda x: x.lo > 0, "must be positive")
-# float64 overflows at exp(710), so nothing of use lies beyond 2048.
+# exp(710) overflows float64, so arguments beyond 2048 are useless.
 _SHORT = (lambda x: x.hi <= 2048, "must be at most 2048")
 _BOTH = (lambda x: -2048 <= x.lo and x.hi <= 2048, "must lie between -2048 and 2048")
 _COSINES = (lambda x: -1 <= x.lo and x.hi <= 1, "must lie between -1 and 1")
@@ -303,7 +303,7 @@ _COSINES = (lambda x: -1 <= x.lo and x.hi <= 1, "must lie between -1 and 1")
 ELEMENTARY: dict[str, Elementary] = {
     "reciprocal": Elementary(inverse, _is_clear, "must keep well away from 0"),
     "exp": Elementary(_monotone_range(_exp), *_SHORT),
-    # Nothing is rounded before the subtraction, so it cancels no digits.
+    # Arithmetic is exact before the subtraction, so there is no cancellation.
     "expm1": Elementary(lambda x: _monotone_range(_exp)(x) + point(-1), *_SHORT),
     "log": Elementary(_monotone_range(_log), *_POSITIVE),
     "log1p": Elementary(
@@ -313,7 +313,7 @@ ELEMENTARY: dict[str, Elementary] = {
     "rsqrt": Elementary(lambda x: inverse(_sqrt(x)), *_POSITIVE),
     "tan": Elementary(
         _monotone_range(_tan),
-        # Between two poles tan rises and cos has no zero: a cos that keeps clear of 0 says both.
+        # tan is increasing between two poles, which are the zeros of cos.
         lambda x: _is_clear(wave(x, sine=False)),
         "must keep well between two odd multiples of 90 degrees",
     ),

@@ -1,8 +1,8 @@
 """Polynomials in box variables and in sines and cosines of them, with rational coefficients.
 
-A monomial holds each variable once, as a power x^k, and each angle once, as cos(w theta) or
-sin(w theta): products of waves become sums of waves at once, so that c^2 + s^2 is 1 and a
-difference of equal terms is nothing.
+A monomial contains each variable once, as a power x^k, and each angle once, as cos(w theta) or
+sin(w theta). Products of waves are expanded to sums of waves at once, so c^2 + s^2 is 1 and equal
+terms cancel.
 """
 
 from fractions import Fraction
@@ -13,7 +13,7 @@ Wave: TypeAlias = tuple[Fraction, int]
 
 Exponent: TypeAlias = int | Wave
 Monomial: TypeAlias = tuple[tuple[int, Exponent], ...]
-"""Numbers of atoms, rising, each with its power or its wave."""
+"""Indices of atoms, ascending, each with its power or its wave."""
 
 _HALF = Fraction(1, 2)
 _MOST_TERMS = 256  # of a quotient
@@ -40,7 +40,7 @@ def _wave_product(a: Wave, b: Wave) -> list[tuple[Fraction, Wave | None]]:
 def _monomial_product(a: Monomial, b: Monomial) -> list[tuple[Fraction, Monomial]]:
     """Return the product of two monomials as a sum of monomials."""
     result: list[tuple[Fraction, dict[int, Exponent]]] = [(Fraction(1), dict(a))]
-    # A monomial holds each atom once: shared ones merge, and a product of waves forks the sum.
+    # A monomial contains each atom once: powers are merged, products of waves become two terms.
     for atom, exponent in b:
         present = dict(a).get(atom)
         for _, factors in result:
@@ -50,7 +50,7 @@ def _monomial_product(a: Monomial, b: Monomial) -> list[tuple[Fraction, Monomial
         elif isinstance(present, int) and isinstance(exponent, int):
             options = [(Fraction(1), present + exponent)]
         else:
-            # Angles are atoms of their own (`_angle`), so no atom bears both powers and waves.
+            # Angles are atoms of their own (`_angle`), so no atom has both powers and waves.
             assert isinstance(present, tuple) and isinstance(exponent, tuple)
             options = [*_wave_product(present, exponent)]
         result = [
@@ -63,7 +63,7 @@ def _monomial_product(a: Monomial, b: Monomial) -> list[tuple[Fraction, Monomial
 
 @final
 class Polynomial:
-    """A sum of monomials with rational coefficients, none of them zero; never changed."""
+    """An immutable sum of monomials with nonzero rational coefficients."""
 
     __slots__ = ("terms",)
 
@@ -98,11 +98,11 @@ class Polynomial:
         return result
 
     def key(self) -> frozenset[tuple[Monomial, Fraction]]:
-        """Return what is equal exactly for equal polynomials."""
+        """Return a hashable key, equal only for equal polynomials."""
         return frozenset(self.terms.items())
 
     def value(self) -> Fraction | None:
-        """Return the number that a polynomial without variables is, else None."""
+        """Return the value of a constant polynomial, otherwise None."""
         return self.terms.get((), Fraction(0)) if set(self.terms) <= {()} else None
 
     def exponents(self) -> dict[int, set[Exponent]]:
@@ -115,18 +115,18 @@ class Polynomial:
 
 
 def constant(x: Fraction | int | float) -> Polynomial:
-    """Return the polynomial that is the number x, taken exactly."""
+    """Return the constant polynomial x, exactly."""
     return Polynomial({(): Fraction(x)})
 
 
 def divides(divisor: Polynomial, p: Polynomial) -> bool:
-    """Tell whether p is a polynomial times the divisor, and so 0 wherever the divisor is."""
+    """Return whether p is a multiple of the divisor, and hence 0 wherever the divisor is 0."""
     lead = max(divisor.terms, key=order)
     quotient, rest = constant(0), p
-    # By one divisor, a remainder is 0 if and only if each of its leading terms can be divided.
+    # With one divisor, the remainder is 0 if and only if every leading term is divisible.
     for _ in range(_MOST_TERMS):
         if not rest.terms:
-            # A wave times a wave is no monomial, and so the product is made again.
+            # A product of waves is not a monomial, so the result is verified by multiplication.
             return (quotient * divisor - p).terms == {}
         top = max(rest.terms, key=order)
         factor = monomial_quotient(top, lead)
@@ -138,13 +138,13 @@ def divides(divisor: Polynomial, p: Polynomial) -> bool:
 
 
 def order(monomial: Monomial) -> list[tuple[int, int, str]]:
-    """Return what sorts monomials lexicographically, atoms of low numbers first."""
+    """Return the key of the lexicographic order of monomials, low atom indices first."""
     # An atom that is missing has the power 0, which sorts below any other: hence the minus.
     return [(-atom, e, "") if isinstance(e, int) else (-atom, 1, repr(e)) for atom, e in monomial]
 
 
 def monomial_quotient(top: Monomial, lead: Monomial) -> Monomial | None:
-    """Return the monomial that makes `top` of `lead`, or None."""
+    """Return the monomial top / lead, or None if `lead` does not divide `top`."""
     left = dict(top)
     for atom, e in lead:
         power = left.pop(atom, None)

@@ -1,4 +1,4 @@
-"""What constants and primitives of JAX mean for polynomials, before any slope is taken."""
+"""Rules that evaluate constants and primitives of JAX for polynomials."""
 
 from fractions import Fraction
 
@@ -13,7 +13,7 @@ from echelon.core.jaxpr import compute, map_entries
 
 
 def lift(array: np.ndarray) -> np.ndarray:
-    """Return floats as constant polynomials, each taken exactly, and anything else as it is."""
+    """Return floats as exact constant polynomials, and integers and booleans unchanged."""
     if array.dtype.kind in "biu":
         return array
     if array.dtype.kind == "c":
@@ -25,12 +25,12 @@ def lift(array: np.ndarray) -> np.ndarray:
 
 
 def outside() -> object:
-    """Refuse what stands outside of an array, of which nothing is known."""
+    """Raise an error for a read outside of an array, whose value is unknown."""
     raise GainError("the model reads outside of an array.")
 
 
 def fold(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
-    """Return what an unknown primitive makes of parameters alone, in float64: parameters again."""
+    """Return the float64 results of an unknown primitive whose operands are all constants."""
     values = [map_entries(number, a) if a.dtype == object else a for a in operands]
     if any(v is None for a in values for v in a.flat):
         raise GainError(
@@ -38,29 +38,29 @@ def fold(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
             "Jacobians does not know; allowed are arithmetic, powers, trigonometric and hyperbolic "
             "functions, exponentials, logarithms, absolute values and choices by `where`."
         )
-    # In float64, since that is what the program itself computes of its constants.
+    # In float64, as the program itself computes with its constants.
     numbers = [np.asarray(a, np.float64) if a.dtype == object else a for a in values]
     return [lift(a) for a in compute(equation, numbers)]
 
 
 def number(p: object) -> Fraction | None:
-    """Return the number that an entry is, else None."""
+    """Return the value of a constant entry, otherwise None."""
     return p.value() if isinstance(p, Polynomial) else None
 
 
 def reciprocal(atoms: Atoms, p: Polynomial) -> Polynomial:
-    """Return 1 / p, exactly where p is a number."""
+    """Return 1 / p, exact if p is a constant."""
     value = p.value()
     return constant(1 / value) if value else atoms.elementary("reciprocal", p)
 
 
 def whole_power(atoms: Atoms, p: Polynomial, k: int) -> Polynomial:
-    """Return p to the power of a whole number, which may be negative."""
+    """Return p to an integer power, which may be negative."""
     return p.power(k) if k >= 0 else reciprocal(atoms, p).power(-k)
 
 
 def power(atoms: Atoms, p: Polynomial, exponent: Polynomial | int) -> Polynomial:
-    """Return p to a constant power: whole, a half, or exp(k log p)."""
+    """Return p to a constant power: integer, 1/2, or exp(k log p)."""
     k = exponent.value() if isinstance(exponent, Polynomial) else Fraction(int(exponent))
     if k is None:
         raise GainError(
@@ -69,7 +69,7 @@ def power(atoms: Atoms, p: Polynomial, exponent: Polynomial | int) -> Polynomial
         )
     if k.denominator == 1:
         return whole_power(atoms, p, int(k))
-    # A root has an enclosure of its own, which holds at 0 too, where a logarithm has none.
+    # A root has its own enclosure, valid at 0, where the logarithm has none.
     if abs(k) == Fraction(1, 2):
         return atoms.elementary("sqrt" if k > 0 else "rsqrt", p)
     return atoms.elementary("exp", constant(k) * atoms.elementary("log", p))
@@ -87,12 +87,12 @@ def atan2(atoms: Atoms, y: Polynomial, x: Polynomial) -> Polynomial:
             "the model takes `atan2` with a second argument that may be anything "
             f"in {reached.text()} on the domain, and must be positive; make the domain smaller."
         )
-    # atan2(y, x) = atan(y / x) for x > 0; elsewhere it jumps, and a hull over the jump says little.
+    # atan2(y, x) = atan(y / x) for x > 0. Elsewhere it is discontinuous.
     return atoms.elementary("atan", y * reciprocal(atoms, x))
 
 
 def absolute(atoms: Atoms, p: Polynomial) -> Polynomial:
-    """Return |p|, p itself or -p where its sign is certain."""
+    """Return |p|; this is p or -p if the sign is certain."""
     reached = atoms.range(p)
     if reached.lo >= 0:
         return p
@@ -102,7 +102,7 @@ def absolute(atoms: Atoms, p: Polynomial) -> Polynomial:
 def larger(atoms: Atoms, a: Polynomial, b: Polynomial) -> Polynomial:
     """Return max(a, b)."""
     left, right = atoms.range(a), atoms.range(b)
-    # Equal terms cancel in a - b, so its sign may be certain where the ranges overlap.
+    # Equal terms cancel in a - b, so its sign may be certain even if the ranges overlap.
     difference = atoms.range(a - b)
     if difference.lo >= 0 or difference.hi <= 0:
         return a if difference.lo >= 0 else b

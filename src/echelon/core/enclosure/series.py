@@ -1,9 +1,8 @@
-"""What a function of time and its derivatives may be on an interval, by series of intervals.
+"""Enclosures of a function of time and its derivatives, by interval Taylor series.
 
-Each entry of a trace is a truncated Taylor series whose coefficients hold those at every time of
-the interval (Moore, Interval Analysis, 1966). So no derivative is taken from JAX, and the cost
-grows with the square of the order. Ends are whole numbers of units of 2^-90, moved outward by every
-product.
+Each entry of a trace is a truncated Taylor series whose coefficients enclose those at every time of
+the interval (Moore, Interval Analysis, 1966). Derivatives of JAX are not used, and the cost is
+quadratic in the order. Ends are integer multiples of 2^-90, rounded outward by every product.
 """
 
 import functools
@@ -28,16 +27,16 @@ _BITS = 90
 _UNIT = 1 << _BITS
 
 _Ends: TypeAlias = tuple[int, int]
-"""Of an interval, in units of 2^-90."""
+"""Ends of an interval in units of 2^-90."""
 
 
 def enclose_derivatives(
     function: Callable[[jax.Array], jax.Array], times: Sequence[Fraction], order: int
 ) -> Iterator[list[list[Interval]]]:
-    """Yield all values of a function of time and of its derivatives, between each two times.
+    """Yield enclosures of a function of time and its derivatives between consecutive times.
 
-    They are near what they are in the middle by the mean value theorem: half the width times what
-    the next derivative may be.
+    By the mean value theorem, a value differs from that at the midpoint by at most half the width
+    times the range of the next derivative.
 
     Args:
         function: t () -> (k,), traceable by JAX.
@@ -71,7 +70,7 @@ def enclose_derivatives(
 
 
 def _near(middle: _Ends, all_over: _Ends, slope: _Ends, half: int) -> Interval:
-    """Return the values on an interval by those in its middle, of which they are no farther."""
+    """Return the values on an interval from those at its midpoint (mean value theorem)."""
     low, high = _sum(middle, _times((-half, half), slope))
     return _interval((max(low, all_over[0]), min(high, all_over[1])))
 
@@ -108,7 +107,7 @@ def _minus(a: _Ends) -> _Ends:
 
 
 def _scaled(a: _Ends, numerator: int, denominator: int) -> _Ends:
-    """Return a positive share of an interval."""
+    """Return an interval times a positive fraction."""
     return a[0] * numerator // denominator, -(-a[1] * numerator // denominator)
 
 
@@ -123,7 +122,7 @@ def _times(a: _Ends, b: _Ends) -> _Ends:
 
 @final
 class Series:
-    """Taylor's coefficients of a function of time, each an interval; the first is its value."""
+    """Taylor coefficients of a function of time, as intervals; the first is its value."""
 
     __slots__ = ("parts",)
 
@@ -132,12 +131,12 @@ class Series:
 
     @property
     def order(self) -> int:
-        """Of the highest coefficient."""
+        """Order of the highest coefficient."""
         return len(self.parts) - 1
 
     @property
     def moves(self) -> bool:
-        """Whether it is no constant."""
+        """Whether the function varies with time."""
         return any(low or high for low, high in self.parts[1:])
 
     def __add__(self, other: "Series") -> "Series":
@@ -176,7 +175,7 @@ def _lifted(entry: Series | float, order: int) -> Series:
 
 
 def _reciprocal(x: Series) -> Series:
-    """Return 1 / x: from x r = 1."""
+    """Return r = 1 / x, from x r = 1."""
     first, result = _applied("reciprocal", x.parts[0]), list[_Ends]()
     for k in range(x.order + 1):
         rest = _product(x.parts, [*result, (0, 0)], k, first=1)
@@ -190,13 +189,13 @@ def _whole_power(x: Series, k: int) -> Series:
     result = number(1, x.order)
     for _ in range(k):
         result = result * x
-    # A square is not negative, which a product of two intervals does not know.
+    # Even powers are nonnegative, which interval products do not use.
     value = _ends(_interval(x.parts[0]).power(k)) if k else result.parts[0]
     return Series((value, *result.parts[1:]))
 
 
 def _circle(x: Series) -> tuple[Series, Series]:
-    """Return cos x and sin x: from c' = -s x' and s' = c x'."""
+    """Return c = cos x and s = sin x, from c' = -s x' and s' = c x'."""
     c, s = ([_ends(wave(_interval(x.parts[0]), sine=sine))] for sine in (False, True))
     for k in range(1, x.order + 1):
         rotated = _minus(_integral(x, s, k))
@@ -206,7 +205,7 @@ def _circle(x: Series) -> tuple[Series, Series]:
 
 
 def _integral(x: Series, f: Sequence[_Ends], k: int) -> _Ends:
-    """Return coefficient k of the integral of f x', of which the first k of f are known."""
+    """Return coefficient k of the integral of f x', from the first k coefficients of f."""
     total = 0, 0
     for i in range(1, k + 1):
         total = _sum(total, _scaled(_times(x.parts[i], f[k - i]), i, k))
@@ -221,7 +220,7 @@ def _exp(x: Series) -> Series:
 
 
 def _primitive(name: str, slope: Callable[[Series], Series]) -> Callable[[Series], Series]:
-    """Return a function with a slope of its own: its derivative is slope(x) x'."""
+    """Return a function whose derivative is slope(x) x'."""
 
     def function(x: Series) -> Series:
         first = _applied(name, x.parts[0])
@@ -234,13 +233,13 @@ def _primitive(name: str, slope: Callable[[Series], Series]) -> Callable[[Series
 
 
 def _sqrt(x: Series) -> Series:
-    """Return the root: from r r = x."""
+    """Return r = sqrt x, from r r = x."""
     result = [_applied("sqrt", x.parts[0])]
     if not x.moves:
         return Series((result[0], *x.parts[1:]))
     half = _scaled(_applied("reciprocal", result[0]), 1, 2)
     for k in range(1, x.order + 1):
-        # Without the two ends of the sum, which hold the coefficient that is sought.
+        # Without the first and last term of the sum, which contain the unknown coefficient.
         rest = _product([*result, (0, 0)], [*result, (0, 0)], k, first=1)
         result.append(_times(half, _sum(x.parts[k], _minus(rest))))
     return Series(result)
@@ -255,8 +254,7 @@ def _applied(name: str, ends: _Ends) -> _Ends:
     elementary, x = ELEMENTARY[name], _interval(ends)
     if not elementary.defined(x):
         raise GainError(
-            f"a path takes `{name}` of what may be anything in {x.text()}, and that "
-            f"{elementary.domain}."
+            f"a path takes `{name}` of an expression in {x.text()}, which {elementary.domain}."
         )
     return _ends(elementary.range(x))
 
@@ -264,7 +262,7 @@ def _applied(name: str, ends: _Ends) -> _Ends:
 def _power(x: Series, exponent: Series | int) -> Series:
     k = exponent if isinstance(exponent, Series) else number(int(exponent), x.order)
     if k.moves:
-        raise GainError("a path raises to a power that varies, which has no enclosure.")
+        raise GainError("a path has an exponent that varies in time, which has no enclosure.")
     low, high = k.parts[0]
     if low == high and not low % _UNIT:
         return _whole_power(x, low >> _BITS)
@@ -323,12 +321,12 @@ def _algebra(order: int) -> Algebra:
         lifted = rules.lift(array)
         if lifted.dtype != object:
             return lifted
-        # Constants are polynomials of no variable.
+        # `rules.lift` returns constants as polynomials.
         return map_entries(lambda p: number(p.value() or 0.0, order), lifted)
 
     def unknown(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
         raise GainError(
-            f"a path uses `{equation.primitive.name}`, of which there is no enclosure over time."
+            f"a path uses `{equation.primitive.name}`, which has no enclosure over time."
         )
 
     zero, one = number(0, order), number(1, order)
@@ -347,5 +345,5 @@ def _algebra(order: int) -> Algebra:
 
 def _convert(params: Params, x: np.ndarray) -> np.ndarray:
     if np.dtype(params["new_dtype"]).kind in "biu":
-        raise GainError("a path turns time into a whole number, of which there is no enclosure.")
+        raise GainError("a path converts time to a whole number, which has no enclosure.")
     return x

@@ -1,6 +1,6 @@
-"""Values with their slopes, and what smooth functions do to both.
+"""Values with slopes, and the rules of smooth functions for both.
 
-A slope of a function is what its values differ by, over what its argument differs by.
+A slope of a function is the difference of two values divided by that of the arguments.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,7 +14,7 @@ from echelon.core.enclosure.polynomial import Polynomial, constant
 
 @final
 class Sloped:
-    """A value, and its slopes by the number of the variable; a slope left out is 0."""
+    """A value and its slopes by variable; a missing slope is 0."""
 
     __slots__ = ("slopes", "value")
 
@@ -36,7 +36,7 @@ class Sloped:
 
 
 def chain(value: Polynomial, *parts: tuple[Sloped, Polynomial]) -> Sloped:
-    """Return a value whose slopes are those of its parts, each times the slope in that part."""
+    """Return a value whose slopes follow from its parts by the chain rule."""
     total: dict[int, Polynomial] = {}
     for part, factor in parts:
         for k, slope in part.slopes.items():
@@ -45,48 +45,48 @@ def chain(value: Polynomial, *parts: tuple[Sloped, Polynomial]) -> Sloped:
 
 
 def number(x: float | Polynomial) -> Sloped:
-    """Return a number, taken exactly, or what depends on no variable."""
+    """Return an entry without slopes: an exact number or a polynomial."""
     return Sloped(x if isinstance(x, Polynomial) else constant(x), {})
 
 
 def variable(k: int, value: Polynomial) -> Sloped:
-    """Return variable k of those that slopes are taken in."""
+    """Return slope variable k."""
     return Sloped(value, {k: constant(1)})
 
 
-# ---- functions without a bend --------------------------------------------------------------------
+# ---- smooth functions ----------------------------------------------------------------------------
 
-_Made: TypeAlias = Callable[[str, Polynomial], Polynomial]
+_Apply: TypeAlias = Callable[[str, Polynomial], Polynomial]
 _ONE = constant(1)
 
-DERIVATIVES: dict[str, Callable[[_Made, Polynomial], Polynomial]] = {
-    "reciprocal": lambda made, p: -made("reciprocal", p).power(2),
-    # Slopes are written in the function itself where they can be: its value is an unknown already,
-    # and a second one would widen the hull.
-    "exp": lambda made, p: made("exp", p),
-    "expm1": lambda made, p: made("exp", p),
-    "log": lambda made, p: made("reciprocal", p),
-    "log1p": lambda made, p: made("reciprocal", p + _ONE),
-    # A root has no slope at 0, which its reciprocal refuses.
-    "sqrt": lambda made, p: constant(Fraction(1, 2)) * made("rsqrt", p),
-    "rsqrt": lambda made, p: constant(Fraction(-1, 2)) * made("rsqrt", p).power(3),
-    "tan": lambda made, p: _ONE + made("tan", p).power(2),
-    # At the ends of their range these have no slope, which `rsqrt` refuses.
-    "asin": lambda made, p: made("rsqrt", _ONE - p * p),
-    "acos": lambda made, p: -made("rsqrt", _ONE - p * p),
-    "atan": lambda made, p: made("reciprocal", _ONE + p * p),
-    "sinh": lambda made, p: made("cosh", p),
-    "cosh": lambda made, p: made("sinh", p),
-    "tanh": lambda made, p: _ONE - made("tanh", p).power(2),
-    "logistic": lambda made, p: made("logistic", p) * (_ONE - made("logistic", p)),
+DERIVATIVES: dict[str, Callable[[_Apply, Polynomial], Polynomial]] = {
+    "reciprocal": lambda apply, p: -apply("reciprocal", p).power(2),
+    # Written with the function itself if possible: its value is already an unknown, and a second
+    # one would widen the hull.
+    "exp": lambda apply, p: apply("exp", p),
+    "expm1": lambda apply, p: apply("exp", p),
+    "log": lambda apply, p: apply("reciprocal", p),
+    "log1p": lambda apply, p: apply("reciprocal", p + _ONE),
+    # sqrt has no slope at 0; `rsqrt` refuses this.
+    "sqrt": lambda apply, p: constant(Fraction(1, 2)) * apply("rsqrt", p),
+    "rsqrt": lambda apply, p: constant(Fraction(-1, 2)) * apply("rsqrt", p).power(3),
+    "tan": lambda apply, p: _ONE + apply("tan", p).power(2),
+    # No slope at the ends of the range; `rsqrt` refuses these.
+    "asin": lambda apply, p: apply("rsqrt", _ONE - p * p),
+    "acos": lambda apply, p: -apply("rsqrt", _ONE - p * p),
+    "atan": lambda apply, p: apply("reciprocal", _ONE + p * p),
+    "sinh": lambda apply, p: apply("cosh", p),
+    "cosh": lambda apply, p: apply("sinh", p),
+    "tanh": lambda apply, p: _ONE - apply("tanh", p).power(2),
+    "logistic": lambda apply, p: apply("logistic", p) * (_ONE - apply("logistic", p)),
 }
-"""The derivatives of the functions of `ELEMENTARY`, but for those that bend or jump."""
+"""Derivatives of the smooth functions of `ELEMENTARY`."""
 
 
 def elementary(atoms: Atoms, name: str, p: Sloped) -> Sloped:
     """Return a function of `ELEMENTARY` of p."""
     value = atoms.elementary(name, p.value)
-    # Of a parameter no slope is wanted, and it may have none.
+    # A constant needs no slope, and the derivative may not exist there.
     return (
         chain(value, (p, DERIVATIVES[name](atoms.elementary, p.value)))
         if p.slopes
@@ -96,7 +96,7 @@ def elementary(atoms: Atoms, name: str, p: Sloped) -> Sloped:
 
 def quotient(atoms: Atoms, a: Sloped, b: Sloped) -> Sloped:
     """Return a / b."""
-    # So all that is divided by b shares one unknown 1/b, and their ratios are not lost.
+    # All quotients by b share one unknown 1/b, which preserves their ratios.
     return a * _reciprocal(atoms, b)
 
 
@@ -106,8 +106,8 @@ def _reciprocal(atoms: Atoms, p: Sloped) -> Sloped:
 
 
 def whole_power(atoms: Atoms, p: Sloped, k: int) -> Sloped:
-    """Return p to the power of a whole number, which may be negative."""
-    # Without the case 0 x^-1 would refuse a box that holds 0.
+    """Return p to an integer power, which may be negative."""
+    # k = 0 separately: 0 x^-1 would refuse a box that contains 0.
     slope = constant(k) * rules.whole_power(atoms, p.value, k - 1) if k else constant(0)
     return chain(rules.whole_power(atoms, p.value, k), (p, slope))
 
@@ -136,7 +136,7 @@ def cosine(atoms: Atoms, p: Sloped) -> Sloped:
 def atan2(atoms: Atoms, y: Sloped, x: Sloped) -> Sloped:
     """Return the angle of the point (x, y) for x > 0."""
     value = rules.atan2(atoms, y.value, x.value)
-    # Of numbers no slope is wanted, and none may exist.
+    # Constants need no slope, and the derivative may not exist there.
     if not (y.slopes or x.slopes):
         return number(value)
     r = rules.reciprocal(atoms, x.value * x.value + y.value * y.value)

@@ -1,10 +1,10 @@
-"""The slopes of a function on a box, found in exact arithmetic and not taken from JAX.
+"""Slopes of a function on a box in exact arithmetic, independent of derivatives of JAX.
 
-Each entry is a value with its slopes, and each primitive says what it does to both. So a derivative
-that is none (`stop_gradient`, a rule written by hand) is never seen, and what has no slope is
-refused: a step, or a choice whose cases differ where it switches. Where a function only bends (as
-`max`, `abs`, `clip` and a continuous `where` do), its slope is an unknown mixture of those on
-either side, the same one wherever the same switch decides.
+Each entry is a value with its slopes, and each primitive has a rule for both. Wrong derivatives
+(`stop_gradient`, a handwritten rule) therefore have no effect, and discontinuous functions are
+refused: a step, or a choice whose cases differ where it switches. At a kink (`max`, `abs`, `clip`,
+a continuous `where`) the slope is an unknown convex combination of both sides, the same one for all
+uses of one switch.
 """
 
 import dataclasses
@@ -30,12 +30,12 @@ from echelon.core.jaxpr import Algebra, Params, Rule, dot, map_entries, reductio
 @final
 @dataclasses.dataclass(frozen=True)
 class Switch:
-    """An answer that the box does not decide.
+    """A comparison whose result varies on the box.
 
     Attributes:
-        chosen: 1 where it is yes and 0 where it is no, but for points where a border is 0.
-        borders: polynomials, one of which is 0 wherever the answer changes.
-        moves: whether a border has a slope; else the answer is the same at both ends of a secant.
+        chosen: 1 where it is true and 0 where it is false, except where a border is 0.
+        borders: polynomials, one of which is 0 wherever the result changes.
+        moves: whether a border has a slope; otherwise both ends of a secant have one result.
     """
 
     chosen: Polynomial
@@ -63,14 +63,14 @@ def _lift(array: np.ndarray) -> np.ndarray:
 
 
 def _fold(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
-    """Return what an unknown primitive makes of parameters alone: parameters again."""
+    """Return the results of an unknown primitive whose operands are all constants."""
     plain = [map_entries(_parameter, a) if a.dtype == object else a for a in operands]
     result = rules.fold(equation, plain)
     return [map_entries(number, a) if a.dtype == object else a for a in result]
 
 
 def _parameter(entry: object) -> Polynomial | None:
-    """Return an entry that depends on no variable, else None."""
+    """Return the value of an entry without slopes, otherwise None."""
     return entry.value if isinstance(entry, Sloped) and not entry.slopes else None
 
 
@@ -78,7 +78,7 @@ def _function(function: Callable[..., object]) -> Rule:
     return lambda atoms, params, *arrays: map_entries(functools.partial(function, atoms), *arrays)
 
 
-# ---- functions that bend -------------------------------------------------------------------------
+# ---- functions with a kink -----------------------------------------------------------------------
 
 
 def _mixture(value: Polynomial, side: Polynomial, one: Sloped, other: Sloped) -> Sloped:
@@ -96,7 +96,7 @@ def _larger(atoms: Atoms, a: Sloped, b: Sloped) -> Sloped:
 
 
 def _smaller(atoms: Atoms, a: Sloped, b: Sloped) -> Sloped:
-    # Not a rule of its own: so the min of a pair has the same unknown side as its max.
+    # By `_larger`, so that min and max of a pair share one unknown side.
     return -_larger(atoms, -a, -b)
 
 
@@ -111,11 +111,11 @@ def _absolute(atoms: Atoms, p: Sloped) -> Sloped:
     return _mixture(rules.absolute(atoms, p.value), atoms.side(p.value), p, -p)
 
 
-# ---- answers, and what depends on them -----------------------------------------------------------
+# ---- comparisons and choices ---------------------------------------------------------------------
 
 
 class JumpError(GainError):
-    """A function is not shown to be continuous on the box, and so has no slopes there."""
+    """A function may be discontinuous on the box, so it has no slopes there."""
 
 
 def _jump(atoms: Atoms, what: str, *borders: Polynomial) -> JumpError:
@@ -136,7 +136,7 @@ def _sign(atoms: Atoms, p: Sloped) -> Sloped:
 
 
 def _comparison(name: str) -> Rule:
-    """Return the rule of a comparison, by where the difference of its operands may lie."""
+    """Return the rule of a comparison, by the range of the difference of its operands."""
     certain, never, chosen = _COMPARED[name]
 
     def compare(atoms: Atoms, a: object, b: object) -> bool | Switch:
@@ -160,7 +160,7 @@ _COMPARED: dict[str, tuple[Callable[..., bool], Callable[..., bool], Callable[..
     "eq": (lambda d: d.lo == d.hi == 0, lambda d: not d.holds(0), lambda side, d: constant(0)),
     "ne": (lambda d: not d.holds(0), lambda d: d.lo == d.hi == 0, lambda side, d: constant(1)),
 }
-"""Where a comparison holds for certain, where it never does, and which side of its border else."""
+"""Per comparison: when it is certainly true, when certainly false, and otherwise its side."""
 
 
 def _not(atoms: Atoms, a: bool | Switch) -> bool | Switch:
@@ -176,12 +176,12 @@ def _and(atoms: Atoms, a: bool | Switch, b: bool | Switch) -> bool | Switch:
 
 
 def _or(atoms: Atoms, a: bool | Switch, b: bool | Switch) -> bool | Switch:
-    # By De Morgan, so that one rule alone says what two undecided answers make.
+    # De Morgan: a single rule combines two undecided results.
     return _not(atoms, _and(atoms, _not(atoms, a), _not(atoms, b)))
 
 
 def _choose(atoms: Atoms, which: bool | Switch, *cases: _Entry) -> _Entry:
-    """Return the case that is chosen, or what bends from one to the other."""
+    """Return the chosen case, or an enclosure of both if the choice is undecided."""
     if not isinstance(which, Switch):
         return cases[int(which)]
     no, yes = cases
@@ -189,14 +189,14 @@ def _choose(atoms: Atoms, which: bool | Switch, *cases: _Entry) -> _Entry:
         return _bend(atoms, which, no, yes)
     if not (isinstance(no, _ANSWERS) and isinstance(yes, _ANSWERS)):
         raise _jump(atoms, "a comparison picks a whole number", *which.borders)
-    # Answers that agree need no decision.
+    # Equal results need no decision.
     if not any(isinstance(case, Switch) for case in cases) and no == yes:
         return yes
     return _or(atoms, _and(atoms, which, yes), _and(atoms, _not(atoms, which), no))
 
 
 def _bend(atoms: Atoms, which: Switch, no: Sloped, yes: Sloped) -> Sloped:
-    """Return a choice of cases that agree wherever the answer changes between two points."""
+    """Return a choice between cases that agree wherever the choice switches."""
     difference = yes.value - no.value
     if not all(divides(border, difference) for border in which.borders):
         if not which.moves:
@@ -214,9 +214,9 @@ def _bend(atoms: Atoms, which: Switch, no: Sloped, yes: Sloped) -> Sloped:
 
 
 def _either(atoms: Atoms, which: Switch, no: Sloped, yes: Sloped) -> Sloped:
-    """Return what may be either case, the same one at both ends of every secant."""
+    """Return an enclosure of either case, the same at both ends of every secant."""
     reached = atoms.range(no.value).union(atoms.range(yes.value))
-    # Unknowns of their own: at a border another choice between the same cases may fall otherwise.
+    # New unknowns: at a border, another choice between the same cases may differ.
     value = atoms.fresh(("choice", object()), reached, no.value, yes.value, *which.borders)
     return _mixture(value, _undecided(atoms), yes, no)
 
@@ -227,7 +227,7 @@ def _undecided(atoms: Atoms) -> Polynomial:
 
 
 def _convert(atoms: Atoms, params: Params, x: np.ndarray) -> np.ndarray:
-    """Return entries under another type; a change of float precision is none to the reals."""
+    """Return entries converted to a type; float precision does not matter for reals."""
     kind = np.dtype(params["new_dtype"]).kind
     if kind not in "biu":
         return map_entries(functools.partial(_as_number, atoms), x)
@@ -247,7 +247,7 @@ def _as_number(atoms: Atoms, entry: _Entry) -> Sloped:
 
 
 def _as_integer(atoms: Atoms, kind: str, entry: _Entry) -> bool | int | Switch:
-    """Return an entry as a boolean or as a whole number, which is cut towards 0."""
+    """Return an entry as a boolean or as an integer, truncated towards 0."""
     if isinstance(entry, Switch):
         if kind == "b":
             return entry
@@ -289,7 +289,7 @@ _RULES: dict[str, Rule] = {
     "clamp": _function(_clamp),
     "sign": _function(_sign),
     **{name: _comparison(name) for name in _COMPARED},
-    # Reals are finite; what has no value on the box was refused by its own rule.
+    # Reals are finite; undefined values were refused by their own rule.
     "is_finite": lambda atoms, params, x: np.ones(x.shape, bool),
     "and": _function(_and),
     "or": _function(_or),
@@ -299,7 +299,7 @@ _RULES: dict[str, Rule] = {
     "reduce_max": _reduction(_larger),
     "reduce_min": _reduction(_smaller),
 }
-"""What each primitive of JAX does to values and slopes, beyond what the walk itself knows."""
+"""Rules of the primitives of JAX for values and slopes, besides `COMMON`."""
 
 _SUMS = {
     "dot_general": dot(number(0)),
