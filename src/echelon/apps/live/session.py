@@ -297,7 +297,7 @@ class Session:
         if knobs != self.knobs:
             self.knobs = knobs
             self.status.begin()
-            self.swarm.turn(knobs)
+            self.swarm.apply(knobs)
             self.promiser.ask(self.panel, knobs)
             self.send(self.state())
 

@@ -92,7 +92,7 @@ class HostStepper(Stepper):
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps, until a pilot stops or a state is not finite."""
-        chunk = _HeldChunk(now, self.loop.meter.nothing(), reference)
+        chunk = _HeldChunk(now, self.loop.meter.zero_sums(), reference)
         try:
             for count in counts:
                 self._frame(chunk, int(count))

@@ -100,7 +100,7 @@ class Recorder:
     ) -> None:
         """Begin after the stretches that were computed before."""
         self.problems, self.grid, self.stretches = problems, grid, list(before)
-        nothing = on_host(problems[0].meter.nothing(np))
+        nothing = on_host(problems[0].meter.zero_sums(np))
         sums = [stretch.sums for stretch in before[-1:]] or [nothing] * len(problems)
         self.sums = Sums(*map(np.stack, zip(*sums, strict=True)))
         self.frames = sum(len(stretch.times) for stretch in before)

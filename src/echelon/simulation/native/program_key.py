@@ -9,6 +9,7 @@ import numpy as np
 
 from echelon.core.identity import process_key
 from echelon.core.memoize import BoundedCache
+from echelon.core.types import PyTree
 from echelon.simulation.native.varying import bare, is_number
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.settings import Settings
@@ -43,11 +44,11 @@ class ProgramKeys:
         return id(loop) if kind is None or numbers is None else (kind, numbers)
 
 
-def _fixed(leaves: Sequence[Any], tree: Any) -> list[bool]:
+def _fixed(leaves: Sequence[object], tree: Any) -> list[bool]:
     """Return which leaves must be equal in all loops."""
     numbers = [k for k, leaf in enumerate(leaves) if is_number(leaf)]
 
-    def outside(values: list[jax.Array]) -> tuple[Any, ...]:
+    def outside(values: list[jax.Array]) -> PyTree:
         replaced = list(leaves)
         for k, value in zip(numbers, values, strict=True):
             replaced[k] = value
