@@ -156,9 +156,14 @@ class Law(eqx.Module):
         return None
 
     def settle(
-        self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: Memory
+        self,
+        model: ControlAffine,
+        view: LocalView,
+        desired: Input,
+        delivered: Input,
+        memory: Memory,
     ) -> Memory:
-        """Return the memory once the actuators have delivered `got` of the `wanted` input (m,)."""
+        """Return the memory after a step, given the desired and the delivered input (m,)."""
         return memory
 
     def message(

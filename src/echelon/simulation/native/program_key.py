@@ -67,6 +67,8 @@ def _fixed(leaves: Sequence[object], tree: Any) -> list[bool]:
     except Exception:
         # A user's code may need concrete numbers: such loops share no program.
         return [True] * len(leaves)
-    read = {id(v) for each in traced.eqns for v in each.invars} | {id(v) for v in traced.outvars}
+    read = {id(v) for equation in traced.eqns for v in equation.invars} | {
+        id(v) for v in traced.outvars
+    }
     free = {k for k, v in zip(numbers, traced.invars, strict=True) if id(v) not in read}
     return [k not in free for k in range(len(leaves))]

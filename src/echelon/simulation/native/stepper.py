@@ -290,8 +290,8 @@ class NativeStepper(Stepper):
         if self._tape is not None:
             tape = self._tape[step - self._tape_start]
             values |= {"tape": tape.ctypes.data, "tape_step": tape.size}
-        names: tuple[str, ...] = "rows", "mirror", "next_mirror", "edges"
-        firsts = dict(zip(names, (self.blocks, *self.mirrors, self.edges), strict=True))
+        now, after = self.mirrors
+        firsts = {"rows": self.blocks, "mirror": now, "next_mirror": after, "edges": self.edges}
         uniform_values = np.empty(steps * self.uniform_count, self.dtype)
         self.threads.run(self.code, values, firsts, uniform_values)
         if steps % 2:

@@ -132,7 +132,7 @@ class VaryingNumbers:
 
 def alike(loop: Loop, other: Loop) -> bool:
     """Tell whether two loops are equal except for the numbers in their leaves."""
-    return operator.eq(*(_forms(*jax.tree.flatten(bare(each))) for each in (loop, other)))
+    return operator.eq(*(_forms(*jax.tree.flatten(bare(one))) for one in (loop, other)))
 
 
 def _forms(leaves: Sequence[object], tree: Any) -> tuple[object, ...]:
