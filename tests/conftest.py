@@ -89,7 +89,8 @@ def pytest_runtest_call(item):
     spent = processor_time() - begin
     item.user_properties.append(("processor_time", spent))
     load = os.getloadavg()[0] / os.cpu_count() if hasattr(os, "getloadavg") else 1.0
-    if spent > LIMIT * max(1.0, load) and not is_long(item):
+    watched = sys.gettrace() or sys.getprofile()  # a debugger, coverage, or `dev.py mutate`
+    if spent > LIMIT * max(1.0, load) and not is_long(item) and not watched:
         pytest.fail(f"took {spent:.1f} s of a processor; make it quicker or mark it `slow`")
     return result
 

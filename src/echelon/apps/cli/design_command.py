@@ -14,10 +14,10 @@ from echelon.apps.cli.options import (
     ScenarioArgument,
     SetOption,
 )
-from echelon.core.types import JsonObject
 from echelon.output.archive.folder import claim_design, write_errors
 
 if TYPE_CHECKING:
+    from echelon.core.types import JsonObject
     from echelon.simulation.engine.parts import Parts
     from echelon.simulation.step.settings import Settings
 

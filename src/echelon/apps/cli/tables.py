@@ -4,13 +4,12 @@ import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from echelon.core.types import JsonObject
-
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
     from echelon.core.statement import Statement
+    from echelon.core.types import JsonObject
     from echelon.experiments.studies.design import Design
 
 
@@ -40,7 +39,7 @@ def print_table(table: "Table", sentence: str) -> None:
     out.print(sentence, highlight=False, markup=False, soft_wrap=not out.is_terminal)
 
 
-def design_row(design: "Design") -> JsonObject:
+def design_row(design: "Design") -> "JsonObject":
     """Return the numbers of a design; missing ones are None."""
     row: JsonObject = {"method": design.method, "reason": design.reason}
     gain, promise = design.gain, design.promise
@@ -97,7 +96,7 @@ _FOOTNOTES = (
 )
 
 
-def print_designs(rows: list[JsonObject], sentence: str) -> None:
+def print_designs(rows: "list[JsonObject]", sentence: str) -> None:
     """Print the methods as a table, the reasons of those without a gain, and a recommendation."""
     from rich import box
     from rich.table import Table

@@ -15,10 +15,10 @@ from echelon.apps.cli.options import (
     ScenarioArgument,
     SetOption,
 )
-from echelon.core.types import JsonObject
 from echelon.output.archive.folder import claim_design
 
 if TYPE_CHECKING:
+    from echelon.core.types import JsonObject
     from echelon.experiments.scenario.scenario import Scenario
     from echelon.experiments.studies.tune import TuneResult, TuneTrial
     from echelon.guarantees.promises.promise import Promise
@@ -72,10 +72,10 @@ def _save(tuned: "TuneResult", scenario: "Scenario", out: Path) -> None:
     save_gain(tuned.after.gain, parts.model, parts.graph, out)
 
 
-def _as_mapping(tuned: "TuneResult", names: list[str]) -> JsonObject:
+def _as_mapping(tuned: "TuneResult", names: list[str]) -> "JsonObject":
     import numpy as np
 
-    def row(trial: "TuneTrial", promise: "Promise") -> JsonObject:
+    def row(trial: "TuneTrial", promise: "Promise") -> "JsonObject":
         values = {name: np.asarray(trial.values[name]).tolist() for name in names}
         return {"cost": trial.cost, **values, "promise": promise.as_mapping()}
 
@@ -86,7 +86,7 @@ def _as_mapping(tuned: "TuneResult", names: list[str]) -> JsonObject:
     }
 
 
-def _print(summary: JsonObject) -> None:
+def _print(summary: "JsonObject") -> None:
     from rich.table import Table
 
     table = Table("", "before", "after", box=None)

@@ -30,7 +30,6 @@ _HIGHEST = 9.0  # inches: a page of a journal, less a caption
 _POINTS = 2000  # of a line, more than the pixels that it covers
 _ALL_POINTS = 200_000  # of all lines of one figure
 
-
 Style: TypeAlias = dict[str, Any]
 """Keywords of matplotlib."""
 
