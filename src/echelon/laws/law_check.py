@@ -70,6 +70,7 @@ def _check_law(law: Law, model: ControlAffine) -> None:
             "memory: `return u, memory`."
         )
     check_array(LawError, f"the input of `{name}`", output[0], (m,))
+    # A compiled loop carries the memory, whose shapes and types cannot change.
     if _form(memory) != _form(output[1]):
         raise LawError(
             f"the memory of `{name}` is {_in_words(memory)} at first and {_in_words(output[1])} "

@@ -107,6 +107,7 @@ class Code:
         except RuntimeError as error:
             raise Unsupported(f"code that LLVM rejects ({error_summary(error)})") from error
         options = binding.create_pipeline_tuning_options(speed_level=2)
+        # The text consists of vectors already, a lane for each agent.
         options.loop_vectorization = options.slp_vectorization = False
         passes = binding.create_pass_builder(self._machine, options)
         passes.getModulePassManager().run(module, passes)
@@ -119,6 +120,7 @@ def _cache_file(text: str, binding: ModuleType, folder: Path | None) -> Path | N
         return None
     import llvmlite
 
+    # All that the code depends on: another processor or LLVM compiles anew.
     parts = [text, _MODEL, features(), binding.get_host_cpu_name(), llvmlite.__version__]
     parts += [platform.system(), platform.machine()]
     return folder / f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}-native-cache"

@@ -42,6 +42,7 @@ def copied(tree: _T) -> _T:
     """Return a copy of a tree and its arrays, since the caller may write to the original."""
 
     def alone(leaf: object) -> object:
+        # A formation is a leaf to JAX, although it contains an array.
         if isinstance(leaf, Formation):
             return Formation(leaf.offsets)
         return leaf.copy() if isinstance(leaf, np.ndarray) else leaf

@@ -155,6 +155,7 @@ def _stack(loops: Sequence[Loop]) -> tuple[Loop, PyTree]:
     flat, tree = [jax.tree.leaves(loop) for loop in loops], jax.tree.structure(loops[0])
     stacked, axes = list[object](), list[int | None]()
     for leaves in zip(*flat, strict=True):
+        # By identity first, since most leaves are shared and a comparison reads all their bytes.
         rows = any(leaf is not leaves[0] for leaf in leaves) and _differ(leaves)
         stacked.append(jnp.stack([jnp.asarray(leaf) for leaf in leaves]) if rows else leaves[0])
         axes.append(0 if rows else None)
@@ -164,4 +165,5 @@ def _stack(loops: Sequence[Loop]) -> tuple[Loop, PyTree]:
 def _differ(leaves: Sequence[object]) -> bool:
     if not is_number(leaves[0]) and not isinstance(leaves[0], np.ndarray):
         return False
+    # By their bits: NaN equals itself there, and -0 differs from 0.
     return any(np.asarray(leaf).tobytes() != np.asarray(leaves[0]).tobytes() for leaf in leaves)

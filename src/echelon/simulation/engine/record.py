@@ -170,7 +170,7 @@ class Recorder:
             np.ascontiguousarray(self._by_formation(part).swapaxes(0, 1))
             for part in (whole.states, whole.inputs)
         )
-        completed = self._completed(whole, states)
+        inside = self._inside(whole, states)
         steps = np.rint(whole.times / self.problems[0].settings.dt).astype(int)
         # There are points besides frames if a formation diverged between two frames.
         frames = self.grid.stored(steps)
@@ -178,7 +178,7 @@ class Recorder:
             mine = whole._replace(states=states[k], inputs=inputs[k], sums=self.sums.of(k))
             rows = frames if self._finite[k] else frames | ~_finite(mine).all(axis=1)
             mine = mine if rows.all() else mine.rows(rows)
-            if completed[k]:
+            if inside[k]:
                 yield mine.record(Outcome.COMPLETED, Outcome.COMPLETED.value)
             else:
                 yield self._closed(problem, mine, unfinished)
@@ -188,7 +188,7 @@ class Recorder:
         count = len(self.problems)
         return rows.reshape(len(rows), count, rows.shape[1] // count, rows.shape[2])
 
-    def _completed(
+    def _inside(
         self, whole: Stretch, states: Float[np.ndarray, "F T N n"]
     ) -> Bool[np.ndarray, " F"]:
         """Return which formations reached the horizon, finite and in their chart."""

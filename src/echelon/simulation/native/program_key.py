@@ -41,6 +41,7 @@ class ProgramKeys:
             leaves, self._fixed.get_or_make(kind, lambda: _fixed(leaves, tree)), strict=True
         )
         numbers = process_key([leaf for leaf, fixed in pairs if fixed])
+        # A loop without a digest shares its program with no other one.
         return id(loop) if kind is None or numbers is None else (kind, numbers)
 
 

@@ -210,6 +210,7 @@ class Transpose:
             return jax.vjp(difference, x, y)[1](w)
 
         slopes = [nodes(self.graph, part) for part in lower(transposed, self.graph, values)]
+        # The backward pass gathers plain differences, which is the transpose for these slopes only.
         if slopes != [list(values[2]), [-node for node in values[2]]]:
             raise Unsupported("a `difference` of states that is not x - y up to whole turns")
 

@@ -125,6 +125,7 @@ class VaryingNumbers:
             return self.loop
         new_leaves, pairs = iter(leaves), zip(self._flat, self._masks, strict=True)
         new = self._tree.unflatten([next(new_leaves) if m.any() else leaf for leaf, m in pairs])
+        # None is an empty tree to JAX, and could not be replaced without `is_leaf`.
         return eqx.tree_at(
             _separate_parts, new, _separate_parts(self.loop), is_leaf=lambda x: x is None
         )
@@ -142,6 +143,7 @@ def _forms(leaves: Sequence[object], tree: Any) -> tuple[object, ...]:
 
 def _differing(leaves: Sequence[Any]) -> Array:
     """Return which entries of a leaf are not equal in all loops."""
+    # All other leaves are equal already: they are in the key of the program.
     if not is_number(leaves[0]) or len(leaves) == 1:
         return np.zeros(np.shape(leaves[0]), bool)
     stacked = np.stack([np.asarray(leaf, float) for leaf in leaves])

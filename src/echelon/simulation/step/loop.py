@@ -157,6 +157,7 @@ def _levels(graph: Graph) -> Array:
 
 def begin_forgetful(loop: Loop, states: Any) -> Moment:
     """Return it for laws without memory, without JAX: one of its calls costs many steps."""
+    # `Any`, since NumPy's arrays are where a moment has JAX's until the first step.
     cut: Any = np.zeros((len(states), len(loop.model.input_names)), np.int8)
     step: Any = np.zeros((), np.int32)
     return Moment(step, states, loop.leader.init(), loop.follower.init(), cut)

@@ -79,6 +79,7 @@ class Sums(NamedTuple):
 
     def where(self, which: Bool[np.ndarray, " F"], others: "Sums") -> "Sums":
         """Return these sums of some formations, and other ones of the rest."""
+        # The parts have different ranks, and the mask broadcasts from the front.
         shapes = (which.reshape(-1, *[1] * (np.ndim(part) - 1)) for part in self)
         return Sums(*(np.where(w, a, b) for w, a, b in zip(shapes, self, others, strict=True)))
 
@@ -87,6 +88,7 @@ class Sums(NamedTuple):
 
         Of one swarm of them all; its steps are those of each.
         """
+        # These have their axis of two in front of that of the agents.
         pairs = ("errors", "tracking")
         parts = {
             name: part.reshape(2, count, -1).swapaxes(0, 1)
