@@ -111,19 +111,19 @@ def edited(told, path, value):
 # ---- each false number is refused by its own claim ----
 
 CLAIM_OF = {
-    "modes looked at": ("certificate.modes", lambda x: x + 1),
+    "number of modes": ("certificate.modes", lambda x: x + 1),
     "graph": ("graph.edges.0", [1, 1, 1.0]),
     "lambda_min": ("certificate.lambda_min", lambda x: x * (1.0 + 1e-8)),
     "lambda_max": ("certificate.lambda_max", lambda x: x * (1.0 + 1e-8)),
     "kind of the slowest mode": ("certificate.kind", "samples"),
     "slowest mode, 1/s": ("certificate.abscissa", lambda x: x * (1.0 + 1e-6)),
-    "rank of what the input sees": ("certificate.observable", 1),
+    "observability rank": ("certificate.observable", 1),
     "the coupling is positive": ("coupling", 0.0),
     "strength": ("certificate.region.strength", lambda x: x * (1.0 + 1e-8)),
-    "the rate is one of decay": ("certificate.region.rate", -5.0),
+    "the rate is positive": ("certificate.region.rate", -5.0),
     "radius": ("certificate.region.radius", lambda x: x * (1.0 + 1e-8)),
     "the trim is an equilibrium": ("model.trim.1.0", 1e-6),
-    "trim and units of the inputs": ("model.input_scale.0.0", 2.0),
+    "trim and input units": ("model.input_scale.0.0", 2.0),
     "R is symmetric and positive definite": ("R.0.0", 0.0),
 }
 
@@ -139,31 +139,31 @@ def test_a_metric_is_symmetric_to_rounding_and_for_a_proof_to_the_bit(files, sai
         for name, wanted in (("proof", proof), ("vertices", vertices)):
             units = np.sqrt(np.prod(np.diag(files[name]["P"])))
             found = said(edited(files[name], "P.0.1", lambda x, s=size * units: x + s))
-            assert found == (["rate at the corners, proved"] if wanted is None else wanted)
+            assert found == (["rate at the vertices, proved"] if wanted is None else wanted)
 
 
 def test_a_domain_that_leaves_out_the_trim_is_refused(files, said):
     told = edited(files["vertices"], "certificate.region.domain.lower.0", 0.01)
-    assert "the domain holds the trim" in said(told)
+    assert "the trim lies in the domain" in said(told)
     told = edited(files["vertices"], "certificate.region.domain.input_lower.0", 0.01)
-    assert "the domain holds the trim" in said(told)
+    assert "the trim lies in the domain" in said(told)
 
 
 def test_of_what_errors_shrink_by_nothing_is_promised_but_of_the_drift(files, said):
     told = edited(files["proof"], "certificate.region.rate", 0.0)
-    assert "the rate is one of decay" in said(told)
+    assert "the rate is positive" in said(told)
     assert files["drift"]["certificate"]["region"]["rate"] == 0.0
     assert said(files["drift"]) == []
 
 
 def test_a_drift_that_expands_its_metric_is_refused_at_the_corners(files, said):
     told = edited(files["drift"], "P.0.0", lambda x: 1.5 * x)
-    assert "rate at 2 corners, 1/s" in said(told)
+    assert "rate at 2 vertices, 1/s" in said(told)
     # Nor is it promised to contract, even where it does.
     told = edited(files["plain"], "certificate.region.theorem", "A5")
     told = edited(told, "certificate.region.kind", "vertices")
-    assert "rate at 1 corners, 1/s" in said(edited(told, "certificate.region.rate", 0.5))
-    assert "rate at 1 corners, 1/s" not in said(edited(told, "certificate.region.rate", 0.0))
+    assert "rate at 1 vertices, 1/s" in said(edited(told, "certificate.region.rate", 0.5))
+    assert "rate at 1 vertices, 1/s" not in said(edited(told, "certificate.region.rate", 0.0))
 
 
 def test_the_set_of_a_drift_shrinks_where_inputs_act_unlike(said, tmp_path):
@@ -182,8 +182,8 @@ def test_the_set_of_a_drift_shrinks_where_inputs_act_unlike(said, tmp_path):
 @pytest.mark.parametrize("name", ["proof", "vertices"])
 def test_a_rate_that_is_a_little_too_fast_is_refused_at_the_corners(files, said, name):
     told = edited(files[name], "certificate.region.rate", lambda x: 1.05 * x)
-    corners = [claim for claim in said(told) if "corners" in claim]
-    assert corners == ["rate at 2 corners, 1/s"] + ["rate at the corners, proved"] * (
+    vertices = [claim for claim in said(told) if "vertices" in claim]
+    assert vertices == ["rate at 2 vertices, 1/s"] + ["rate at the vertices, proved"] * (
         name == "proof"
     )
 
@@ -191,10 +191,10 @@ def test_a_rate_that_is_a_little_too_fast_is_refused_at_the_corners(files, said,
 def test_a_proof_for_the_drift_alone_may_not_need_the_coupling(files, said):
     told = files["proof"]
     told = edited(edited(told, "certificate.region.theorem", "A5"), "certificate.region.rate", 0.0)
-    assert "rate at the corners, proved" in said(edited(told, "certificate.region.strength", 0.0))
+    assert "rate at the vertices, proved" in said(edited(told, "certificate.region.strength", 0.0))
     # With the strength left standing, the corners hold by eigenvalues and the proof does not.
     found = said(told)
-    assert "rate at the corners, proved" in found and "strength" in found
+    assert "rate at the vertices, proved" in found and "strength" in found
 
 
 def test_an_error_in_one_column_of_the_corners_is_carried_by_a_proof(files, said):
@@ -202,9 +202,9 @@ def test_an_error_in_one_column_of_the_corners_is_carried_by_a_proof(files, said
     assert said(edited(told, "certificate.region.error.0.1", 1e-9)) == []
     for place in ("0.0", "0.1", "1.0", "1.1"):
         found = said(edited(told, f"certificate.region.error.{place}", 10.0))
-        assert found == ["rate at the corners, proved"]
+        assert found == ["rate at the vertices, proved"]
         found = said(edited(told, f"certificate.region.error.{place}", -1e-9))
-        assert "rate at the corners, proved" in found
+        assert "rate at the vertices, proved" in found
 
 
 # ---- what could not be checked is not verified ----
@@ -263,7 +263,7 @@ def test_a_small_graph_has_edges(files, said):
     for key in ("lambda_min", "lambda_max"):
         told["certificate"][key] *= 1000.0
     told["graph"]["spectrum"] = [1000.0 * x for x in told["graph"]["spectrum"]]
-    assert "`graph.edges` must be given: 4 agents cannot have so many." in said(told)
+    assert "`graph.edges` must not be null: 4 agents have fewer edges than the limit." in said(told)
 
 
 def test_every_edge_has_a_weight(files, said):
@@ -281,9 +281,9 @@ def test_no_graph_has_more_than_a_thousand_million_agents(files, said):
 def test_of_two_equal_keys_none_is_read(files, said):
     text = json.dumps(files["riccati"])
     twice = text[:-1] + ', "coupling": 1e-9}'
-    assert said(twice).endswith("is no gain that can be verified: `coupling` stands there twice.")
+    assert said(twice).endswith("is not a gain file that can be verified: `coupling` occurs twice.")
     inner = text.replace('"lambda_min":', '"lambda_min": 1e3, "lambda_min":')
-    assert said(inner).endswith("`lambda_min` stands there twice.")
+    assert said(inner).endswith("`lambda_min` occurs twice.")
 
 
 # ---- rounding is no credit ----
@@ -306,9 +306,9 @@ def test_a_rate_that_rounding_leaves_open_is_refused(files, said):
         "error": [[0, 0], [0, 0]],
     }
     STUDY.abscissa_put_right(told)
-    assert {"rate at 1 corners, 1/s", "rate at 260 states, 1/s"} <= set(said(told))
+    assert {"rate at 1 vertices, 1/s", "rate at 260 states, 1/s"} <= set(said(told))
     told["certificate"]["region"] |= {"theorem": "A5", "rate": 0.0, "strength": 0.0}
-    assert {"rate at 1 corners, 1/s", "rate at 260 states, 1/s"} <= set(said(told))
+    assert {"rate at 1 vertices, 1/s", "rate at 260 states, 1/s"} <= set(said(told))
 
 
 def test_the_sign_of_a_mode_that_rounding_leaves_open_is_refused(said, tmp_path):
@@ -445,7 +445,7 @@ def test_a_drift_that_its_derivatives_do_not_tell_of_leaves_the_hull(files, said
     if name != "a small one":  # which leaves the rate of pairs within what samples promise
         told = edited(told, "certificate.region.kind", "samples")
         told = edited(told, "certificate.region.error", [[0.0]])
-        assert "pairs come together as promised" in said(told, model)
+        assert "pairs converge at the rate" in said(told, model)
 
 
 AT_THE_TRIM = {
@@ -459,7 +459,7 @@ AT_THE_TRIM = {
 @pytest.mark.parametrize("name", AT_THE_TRIM)
 def test_a_slope_at_the_trim_that_is_none_is_refused(files, said, name):
     model = agent(lambda x: -x + AT_THE_TRIM[name](x))
-    assert said(files["plain riccati"], model) == ["A at the trim, by differences"]
+    assert said(files["plain riccati"], model) == ["A at the trim, by difference quotients"]
 
 
 @pytest.mark.parametrize(("slower", "fine"), [(0.015, True), (0.025, False)])
@@ -474,7 +474,7 @@ def test_samples_promise_a_rate_to_two_parts_in_a_hundred(said, tmp_path, slower
     # Its slope is -4 at the trim and at the corners, and -4 + height between them.
     turn = 2.0 * np.pi
     model = agent(lambda x: -4.0 * x + height * (x / 2 - jnp.sin(turn * x) / (2 * turn)))
-    wanted = [] if fine else ["pairs come together as promised", "rate at 258 states, 1/s"]
+    wanted = [] if fine else ["pairs converge at the rate", "rate at 258 states, 1/s"]
     assert said(told, model) == wanted
 
 
@@ -553,12 +553,12 @@ def test_a_gain_about_another_equilibrium_or_in_other_units_is_not_that_of_the_m
     told["model"]["input_scale"] = [[10.0]]
     told["model"]["B"] = [[10.0 * x for x in row] for row in told["model"]["B"]]
     told["R"] = [[100.0 * x for x in row] for row in told["R"]]
-    assert said(told) == ["trim and units of the inputs"]
+    assert said(told) == ["trim and input units"]
 
     class Upturned(type(ech.models.Pendulum())):
         trim = ((np.pi, 0.0), (0.0,))
 
-    assert "trim and units of the inputs" in said(files["riccati"], Upturned())
+    assert "trim and input units" in said(files["riccati"], Upturned())
 
 
 @pytest.mark.parametrize(
@@ -567,7 +567,7 @@ def test_a_gain_about_another_equilibrium_or_in_other_units_is_not_that_of_the_m
 def test_a_domain_stays_where_the_equations_hold(files, said, chart, refused):
     model = agent(lambda x: -x)
     type(model).chart = {"x0": chart}
-    assert said(files["plain"], model) == ["the domain stays inside the chart"] * refused
+    assert said(files["plain"], model) == ["the domain lies inside the chart"] * refused
 
 
 # ---- where promises are doubted ----

@@ -261,7 +261,7 @@ def test_the_command_prints_a_table_and_exits_by_what_holds(files, echelon, tmp_
     ]
     file.write_text("no JSON")
     code, out, err = echelon("verify", file)
-    assert (code, out) == (2, "") and "is no JSON" in err and err.count("\n") == 1
+    assert (code, out) == (2, "") and "is not valid JSON" in err and err.count("\n") == 1
     code, _, err = echelon("verify", tmp_path / "nothing.json")
     assert code == 2 and "cannot be read" in err
 

@@ -6,7 +6,7 @@ import os
 import pickle
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Generic, NamedTuple, TypeVar, final
+from typing import Final, Generic, NamedTuple, TypeVar, final
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ from jax.core import Tracer
 from echelon.core import disk_cache
 from echelon.core.identity import digest
 from echelon.core.memoize import BoundedCache
+from echelon.core.types import PyTree
 
 _R = TypeVar("_R")
 _LEAST, _NEVER = "jax_persistent_cache_min_compile_time_secs", 1e9
@@ -36,15 +37,15 @@ class _Compiled(NamedTuple):
     """What runs on arrays, and the tree of what comes back."""
 
     run: Callable[..., Sequence[jax.Array]]
-    tree: Any
+    tree: PyTree
 
 
 class _CallArguments(NamedTuple):
     """The arguments of a call: their arrays, and the tree in which these stand."""
 
-    arrays: Sequence[Any]
-    leaves: tuple[Any, ...]
-    tree: Any
+    arrays: Sequence[jax.Array]
+    leaves: tuple[object, ...]
+    tree: PyTree
 
     def digest(self) -> bytes | None:
         """Return what is equal for calls of one program; None where JAX alone can tell."""
@@ -52,7 +53,7 @@ class _CallArguments(NamedTuple):
         arguments = jax.tree.unflatten(self.tree, self.leaves)
         return digest((arguments, tuple(map(_form, self.arrays)), disk_cache.jax_settings()))
 
-    def arguments(self, arrays: Sequence[Any]) -> Any:
+    def arguments(self, arrays: Sequence[jax.Array]) -> PyTree:
         """Return the arguments with other arrays in the places of theirs."""
         return _filled(jax.tree.unflatten(self.tree, self.leaves), arrays)
 
@@ -71,7 +72,7 @@ class CompiledFunction(Generic[_R]):
         self._function, self._plain = function, eqx.filter_jit(function)
         self._programs = BoundedCache[_Compiled | None](_MOST)
 
-    def __call__(self, *args: Any, **named: Any) -> _R:
+    def __call__(self, *args: object, **named: object) -> _R:
         """Return what the function returns."""
         call = _call_of((args, named)) if disk_cache.is_open() else None
         key = None if call is None else call.digest()
@@ -106,7 +107,7 @@ def cached_jit(function: Callable[..., _R]) -> Callable[..., _R]:
     return CompiledFunction(function)
 
 
-def _call_of(arguments: Any) -> _CallArguments | None:
+def _call_of(arguments: PyTree) -> _CallArguments | None:
     """Return a call as its arrays and their places; None within a trace, of which it is a part."""
     leaves, tree = jax.tree.flatten(arguments)
     if any(isinstance(leaf, Tracer) for leaf in leaves):
@@ -118,16 +119,16 @@ def _call_of(arguments: Any) -> _CallArguments | None:
     )
 
 
-def _filled(tree: Any, arrays: Sequence[Any]) -> Any:
+def _filled(tree: PyTree, arrays: Sequence[jax.Array]) -> PyTree:
     """Return a tree with arrays in their places."""
 
-    def at(leaf: Any) -> Any:
+    def at(leaf: object) -> object:
         return arrays[leaf.number] if isinstance(leaf, _Place) else leaf
 
     return jax.tree.map(at, tree, is_leaf=lambda leaf: isinstance(leaf, _Place))
 
 
-def _form(array: Any) -> tuple[tuple[int, ...], str, bool]:
+def _form(array: jax.Array) -> tuple[tuple[int, ...], str, bool]:
     """Return the shape and type of an array, as JAX takes it in the precision that is on."""
     kind = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
     return array.shape, str(kind), getattr(array, "weak_type", False)
@@ -136,11 +137,11 @@ def _form(array: Any) -> tuple[tuple[int, ...], str, bool]:
 # ---- compiled code -------------------------------------------------------------------------------
 
 
-def _compile(function: Callable[..., Any], call: _CallArguments) -> _Compiled | None:
+def _compile(function: Callable[..., PyTree], call: _CallArguments) -> _Compiled | None:
     """Return a function compiled for a call; None where it calls what is not JAX's, as LAPACK."""
-    trees = list[Any]()
+    trees = list[PyTree]()
 
-    def flat(*arrays: jax.Array) -> list[Any]:
+    def flat(*arrays: jax.Array) -> list[jax.Array]:
         args, named = call.arguments(arrays)
         leaves, tree = jax.tree.flatten(function(*args, **named))
         outputs = [leaf for leaf in leaves if eqx.is_array(leaf)]

@@ -48,7 +48,7 @@ def process_key(value: object) -> Hashable | None:
     return key
 
 
-def array_bits(array: Any) -> bytes:
+def array_bits(array: object) -> bytes:
     """Return the bits of an array of NumPy or JAX; of a large one, such as a graph's, a digest.
 
     Raises:
@@ -66,7 +66,7 @@ def array_bits(array: Any) -> bytes:
     return hashlib.sha256(np.ascontiguousarray(numbers).data).digest()
 
 
-def _untraced(array: Any) -> Any:
+def _untraced(array: object) -> object:
     """Return what NumPy can take of an array of JAX; None of a traced one."""
     import jax
     from jax.core import Tracer
@@ -74,8 +74,9 @@ def _untraced(array: Any) -> Any:
     if isinstance(array, Tracer):
         return None
     # Keys of random numbers are no numbers of NumPy's.
-    keys = isinstance(array, jax.Array) and jax.numpy.issubdtype(array.dtype, jax.dtypes.extended)
-    return jax.random.key_data(array) if keys else array
+    if isinstance(array, jax.Array) and jax.numpy.issubdtype(array.dtype, jax.dtypes.extended):
+        return jax.random.key_data(array)
+    return array
 
 
 @functools.lru_cache(1024)
@@ -100,7 +101,7 @@ class _Walk:
         framed = [b"%d:" % len(part) + part for part in self._bits]
         return hashlib.sha256(b"".join(framed)).digest()
 
-    def visit(self, value: Any) -> None:
+    def visit(self, value: object) -> None:
         """Collect what a value is made of, each part with its class."""
         kind = type(value)
         if kind in _PLAIN:
@@ -118,13 +119,13 @@ class _Walk:
         else:
             self._leaf(value, kind)
 
-    def _inner(self, kind: type, parts: Sequence[Any]) -> None:
+    def _inner(self, kind: type, parts: Sequence[object]) -> None:
         self._name(kind)
         self._bits.append(b"%d" % len(parts))
         for part in parts:
             self.visit(part)
 
-    def _leaf(self, value: Any, kind: type) -> None:
+    def _leaf(self, value: object, kind: type) -> None:
         if isinstance(value, type | FunctionType):
             self._name(value)
         elif hasattr(value, "dtype") and hasattr(value, "shape"):
@@ -143,10 +144,10 @@ class _Walk:
             return
         self._bits += [f"{type(array).__name__} {array.dtype}{array.shape}".encode(), bits]
 
-    def _name(self, named: Any) -> None:
+    def _name(self, named: type | FunctionType) -> None:
         """Collect a class or function by the name under which echelon or a library has it."""
         home, name = named.__module__, named.__qualname__
-        place: Any = sys.modules.get(home)
+        place: object = sys.modules.get(home)
         for part in name.split("."):
             place = getattr(place, part, None)
         # What cannot be found by its name, as a class that is made in a function, is nobody's.
@@ -155,7 +156,7 @@ class _Walk:
         else:
             self._unknown(named)
 
-    def _unknown(self, value: Any) -> None:
+    def _unknown(self, value: object) -> None:
         # The class too, since numbers of two classes may say that they are equal.
         self.foreign.append((type(value), value))
         self._bits.append(b"foreign")

@@ -16,8 +16,16 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
 from echelon.core.numerics import precision
+from echelon.core.types import PyTree
+
+Entry: TypeAlias = Any
+"""An entry of an algebra: a number, a polynomial, a symbol; it adds and multiplies."""
+
+Params: TypeAlias = Mapping[str, Any]
+"""The parameters of a primitive; each primitive has its own names and types."""
 
 Rule: TypeAlias = Callable[..., np.ndarray]
 """(parameters of the primitive, operands) -> result, of which operands may be plain numbers."""
@@ -39,15 +47,15 @@ class Algebra(NamedTuple):
     """
 
     rules: Mapping[str, Rule]
-    constant: Callable[[float], Any]
+    constant: Callable[[float], Entry]
     lift: Callable[[np.ndarray], np.ndarray]
-    outside: Callable[[], Any]
-    unknown: Callable[[Any, list[np.ndarray]], list[np.ndarray]]
-    within: Callable[[Any], contextlib.AbstractContextManager[object]] = contextlib.nullcontext
+    outside: Callable[[], Entry]
+    unknown: Callable[[JaxprEqn, list[np.ndarray]], list[np.ndarray]]
+    within: Callable[[JaxprEqn], contextlib.AbstractContextManager[object]] = contextlib.nullcontext
 
 
 def evaluate(
-    function: Callable[..., Any], arguments: Sequence[np.ndarray], algebra: Algebra
+    function: Callable[..., PyTree], arguments: Sequence[np.ndarray], algebra: Algebra
 ) -> list[np.ndarray]:
     """Return the results of a function for JAX, traced in float64, for arrays of entries.
 
@@ -64,7 +72,7 @@ def evaluate(
 
 
 def walk(
-    jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray], algebra: Algebra
+    jaxpr: Jaxpr, consts: Sequence[object], arguments: Sequence[np.ndarray], algebra: Algebra
 ) -> list[np.ndarray]:
     """Return the results of a jaxpr, each of its equations evaluated in an algebra.
 
@@ -79,9 +87,9 @@ def walk(
     values = dict(zip(jaxpr.constvars, (algebra.lift(np.asarray(c)) for c in consts), strict=True))
     values |= dict(zip(jaxpr.invars, arguments, strict=True))
 
-    def read(variable: Any) -> np.ndarray:
+    def read(variable: Var | Literal) -> np.ndarray:
         # A literal stands in the equation itself and bears its value.
-        literal = hasattr(variable, "val")
+        literal = isinstance(variable, Literal)
         return algebra.lift(np.asarray(variable.val)) if literal else values[variable]
 
     # Equations stand in order and assign once, so one pass binds every variable before its use.
@@ -91,31 +99,32 @@ def walk(
     return [read(v) for v in jaxpr.outvars]
 
 
-def _used(jaxpr: Any) -> list[Any]:
+def _used(jaxpr: Jaxpr) -> list[JaxprEqn]:
     """Return the equations on which the results depend, as a trace keeps all that was written."""
-    needed, result = {v for v in jaxpr.outvars if not hasattr(v, "val")}, []
+    needed, result = {v for v in jaxpr.outvars if not isinstance(v, Literal)}, []
     for equation in reversed(jaxpr.eqns):
         if needed.intersection(equation.outvars):
-            needed.update(v for v in equation.invars if not hasattr(v, "val"))
+            needed.update(v for v in equation.invars if not isinstance(v, Literal))
             result.append(equation)
     return result[::-1]
 
 
-def used_leaves(function: Callable[..., Any], *arguments: Any) -> list[bool]:
+def used_leaves(function: Callable[..., PyTree], *arguments: PyTree) -> list[bool]:
     """Return which leaves of the arguments the results of a function for JAX may rest on."""
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
-    read = {v for equation in _used(jaxpr) for v in equation.invars if not hasattr(v, "val")}
-    read.update(v for v in jaxpr.outvars if not hasattr(v, "val"))
+    read = {v for equation in _used(jaxpr) for v in equation.invars if not isinstance(v, Literal)}
+    read.update(v for v in jaxpr.outvars if not isinstance(v, Literal))
     return [v in read for v in jaxpr.invars]
 
 
-def apply(equation: Any, operands: list[np.ndarray], algebra: Algebra) -> list[np.ndarray]:
+def apply(equation: JaxprEqn, operands: list[np.ndarray], algebra: Algebra) -> list[np.ndarray]:
     """Return the results of one equation for arrays of entries or of numbers."""
     name = equation.primitive.name
     if name in INLINED:
         inner = _inner_jaxpr(equation)
-        # What `checkpoint` calls is a jaxpr without constants of its own.
-        jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+        # `checkpoint` calls an open jaxpr, which has no constants of its own.
+        closed = isinstance(inner, ClosedJaxpr)
+        jaxpr, consts = (inner.jaxpr, inner.consts) if closed else (inner, ())
         with algebra.within(equation):
             return walk(jaxpr, consts, operands, algebra)
     # What numbers alone make is folded, so that rules see constants and not what made them.
@@ -179,14 +188,14 @@ _INDICES: dict[str, tuple[int, int | None]] = {
 """Which operands say where: from the first number to before the second."""
 
 
-def _inner_jaxpr(equation: Any) -> Any:
+def _inner_jaxpr(equation: JaxprEqn) -> Jaxpr | ClosedJaxpr:
     """Return the jaxpr, closed or not, that an equation of an `INLINED` primitive calls."""
     return next(
         equation.params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in equation.params
     )
 
 
-def _is_open(equation: Any, operands: list[np.ndarray]) -> bool:
+def _is_open(equation: JaxprEqn, operands: list[np.ndarray]) -> bool:
     """Tell whether an index is an entry, so that where it points is not known."""
     first = _INDICES.get(equation.primitive.name)
     return first is not None and any(a.dtype == object for a in operands[first[0] : first[1]])
@@ -198,7 +207,7 @@ def map_entries(function: Callable[..., object], *arrays: np.ndarray) -> np.ndar
     return np.asarray(np.frompyfunc(function, len(arrays), 1)(*arrays), dtype=object)
 
 
-def compute(equation: Any, operands: Sequence[Any]) -> list[np.ndarray]:
+def compute(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the results of an equation for plain numbers."""
     rule = _NUMERIC.get(equation.primitive.name)
     if rule is not None:
@@ -208,12 +217,12 @@ def compute(equation: Any, operands: Sequence[Any]) -> list[np.ndarray]:
 
 
 def _place(
-    equation: Any, operands: Sequence[np.ndarray], outside: Callable[[], Any]
+    equation: JaxprEqn, operands: Sequence[np.ndarray], outside: Callable[[], Entry]
 ) -> list[np.ndarray]:
     """Return the results of a primitive that copies entries: JAX moves their places about."""
     pool, places = _label_entries(operands)
 
-    def entry(place: float) -> Any:
+    def entry(place: float) -> Entry:
         # `gather` fills what it reads from outside with NaN, which no comparison holds for.
         return pool[int(place)] if 0.0 <= place < len(pool) else outside()
 
@@ -221,7 +230,7 @@ def _place(
 
 
 def _add(
-    equation: Any, operands: Sequence[np.ndarray], constant: Callable[[float], Any]
+    equation: JaxprEqn, operands: Sequence[np.ndarray], constant: Callable[[float], Entry]
 ) -> np.ndarray:
     """Return the result of a primitive that adds entries, by what it does to unit vectors."""
     pool, places = _label_entries(operands)
@@ -240,9 +249,9 @@ def _add(
     return total
 
 
-def _label_entries(operands: Sequence[np.ndarray]) -> tuple[list[Any], list[np.ndarray]]:
+def _label_entries(operands: Sequence[np.ndarray]) -> tuple[list[Entry], list[np.ndarray]]:
     """Return all data entries in a row, and the operands with each entry's place in that row."""
-    pool: list[Any] = []
+    pool: list[Entry] = []
     places = []
     for a in operands:
         # Integers are indices: they say where, not what.
@@ -260,7 +269,7 @@ def entrywise(function: Callable[..., object]) -> Rule:
     return lambda params, *arrays: map_entries(function, *arrays)
 
 
-def reduction(join: Callable[[Any, Any], Any], of_none: Any) -> Rule:
+def reduction(join: Callable[[Entry, Entry], Entry], of_none: Entry) -> Rule:
     """Return the rule that joins entries along axes two by two, the last axis first.
 
     `of_none`, what no entries make, takes no part where there are some: a solver would carry it
@@ -268,7 +277,7 @@ def reduction(join: Callable[[Any, Any], Any], of_none: Any) -> Rule:
     """
     joined = np.frompyfunc(join, 2, 1)
 
-    def reduce(params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+    def reduce(params: Params, x: np.ndarray) -> np.ndarray:
         # From the last one on, so that the numbers of the axes to come still hold.
         for axis in sorted(params["axes"], reverse=True):
             begin = {} if x.shape[axis] else {"initial": of_none}
@@ -278,12 +287,12 @@ def reduction(join: Callable[[Any, Any], Any], of_none: Any) -> Rule:
     return reduce
 
 
-def dot(zero: Any) -> Rule:
+def dot(zero: Entry) -> Rule:
     """Return the rule of `dot_general`, sums of products that begin at `zero`."""
     return functools.partial(_dot, zero)
 
 
-def _dot(zero: Any, params: Mapping[str, Any], a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _dot(zero: Entry, params: Params, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the sum of products over contracted axes, batch axes first."""
     (contract_a, contract_b), (batch_a, batch_b) = params["dimension_numbers"]
     left, batch, rows = _matrix_form(a, batch_a, contract_a)
@@ -313,14 +322,14 @@ def _matrix_form(
     )
 
 
-def _broadcast(params: Mapping[str, Any], x: np.ndarray, *_: Any) -> np.ndarray:
+def _broadcast(params: Params, x: np.ndarray, *_: np.ndarray) -> np.ndarray:
     shape = [1] * len(params["shape"])
     for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
         shape[axis] = size
     return np.broadcast_to(x.reshape(shape), params["shape"])
 
 
-def _slice(params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+def _slice(params: Params, x: np.ndarray) -> np.ndarray:
     starts, ends = params["start_indices"], params["limit_indices"]
     # JAX leaves strides out where all of them are 1.
     steps = params["strides"] or [1] * x.ndim

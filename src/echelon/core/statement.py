@@ -1,7 +1,7 @@
 """One statement that was looked at: its verdict, by which kind of argument, and what would help."""
 
 import dataclasses
-from typing import Any, NamedTuple, TypeAlias, final
+from typing import NamedTuple, TypeAlias, final
 
 from echelon.core.words import Kind, Verdict, Word
 
@@ -121,7 +121,7 @@ class Statement:
         """What was found and what would be needed."""
         return f"{self.text}; {self.remedy}" if self.remedy else self.text
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> dict[str, str | float | None]:
         """Return it ready for JSON, where a number that is not finite is None."""
         finite = self.number is not None and abs(self.number) < float("inf")
         return {

@@ -1,13 +1,15 @@
 """What a trace of somebody's function shows before it runs: shapes, types, casts, frozen values."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from echelon.core.errors import EchelonError
 from echelon.core.identity import array_bits
+from echelon.core.types import PyTree
 
 
 class Trace(NamedTuple):
@@ -19,19 +21,19 @@ class Trace(NamedTuple):
         frozen: whether a second trace differs, as a clock or a random number makes it.
     """
 
-    result: Any
+    result: PyTree
     rounds: bool
     frozen: bool
 
 
-def trace(function: Callable[..., Any], *arguments: Any) -> Trace:
+def trace(function: Callable[..., PyTree], *arguments: PyTree) -> Trace:
     """Trace a function twice at arguments of these shapes; nothing is compiled or computed.
 
     Raises:
         Exception: whatever the function raises.
     """
 
-    def once() -> tuple[Any, Any]:
+    def once() -> tuple[ClosedJaxpr, PyTree]:
         # Under a name of its own, since JAX would hand out the first trace of one function again.
         return jax.make_jaxpr(lambda *a: function(*a), return_shape=True)(*arguments)
 
@@ -44,18 +46,18 @@ def trace(function: Callable[..., Any], *arguments: Any) -> Trace:
     )
 
 
-def _steps(jaxpr: Any) -> Iterator[tuple[str, list[bytes], bool]]:
+def _steps(jaxpr: Jaxpr | ClosedJaxpr) -> Iterator[tuple[str, list[bytes], bool]]:
     """Yield all equations, inner ones too: name, the numbers in it, and whether it rounds."""
     yield "constants", [array_bits(value) for value in getattr(jaxpr, "consts", ())], False
     for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
         name = equation.primitive.name
-        numbers = [array_bits(v.val) for v in equation.invars if hasattr(v, "val")]
+        numbers = [array_bits(v.val) for v in equation.invars if isinstance(v, Literal)]
         yield name, numbers, name == "convert_element_type" and _shortens(equation)
         for inner in _inner(equation.params.values()):
             yield from _steps(inner)
 
 
-def _inner(values: Any) -> Iterator[Any]:
+def _inner(values: Iterable[object]) -> Iterator[Any]:
     """Yield the jaxprs among parameters of an equation, those in tuples too."""
     for value in values:
         if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
@@ -77,8 +79,8 @@ def _shortens(equation: Any) -> bool:
 def check_function(
     fault: Callable[[str], Exception],
     what: str,
-    function: Callable[..., Any],
-    *arguments: Any,
+    function: Callable[..., PyTree],
+    *arguments: PyTree,
     shape: tuple[int, ...],
     advice: str,
 ) -> None:
@@ -125,8 +127,8 @@ def check_array(
 def checked_trace(
     fault: Callable[[str], Exception],
     what: str,
-    function: Callable[..., Any],
-    *arguments: Any,
+    function: Callable[..., PyTree],
+    *arguments: PyTree,
     advice: str,
 ) -> Trace:
     """Return the trace of somebody's function, which must neither fail nor round nor change.

@@ -39,7 +39,7 @@ def verify(
             "verdict": verification.verdict,
             "holds": verification.holds,
             "sentence": verification.sentence,
-            "findings": [finding._asdict() for finding in verification.findings],
+            "findings": [finding.as_mapping() for finding in verification.findings],
         }
         print(json.dumps(text, indent=2))
     else:

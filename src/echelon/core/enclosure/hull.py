@@ -9,14 +9,14 @@ vertices hold every value.
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import numpy as np
 
 from echelon.core.enclosure.atoms import Atoms, Corners, CornerValues, check_count, corner_values
 from echelon.core.enclosure.interval import Interval
-from echelon.core.enclosure.polynomial import Polynomial, constant
+from echelon.core.enclosure.polynomial import Exponent, Polynomial, constant
 from echelon.core.enclosure.sloped import Sloped, number, variable
 from echelon.core.enclosure.slopes import slopes_in
 from echelon.core.errors import GainError
@@ -207,7 +207,7 @@ def _count_bounds(box: Box, name: str) -> int:
 def _hull_of(entries: np.ndarray, atoms: Atoms) -> Hull:
     """Return the hull of a matrix of polynomials."""
     # Over all entries together: corners for each entry alone would lose that they share angles.
-    used: dict[int, set[Any]] = {}
+    used: dict[int, set[Exponent]] = {}
     for p in entries.flat:
         for atom, exponents in p.exponents().items():
             used.setdefault(atom, set()).update(exponents)
@@ -248,7 +248,7 @@ def _expand_values(values: CornerValues, array: np.ndarray, counts: dict[int, in
 
 
 def _describe_atoms(
-    atoms: Atoms, used: dict[int, set[Any]], counts: dict[int, int]
+    atoms: Atoms, used: dict[int, set[Exponent]], counts: dict[int, int]
 ) -> tuple[HullAtom, ...]:
     """Return what the hull is made of, in the order in which the model uses it."""
     result = []

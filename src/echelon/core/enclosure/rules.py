@@ -1,9 +1,9 @@
 """What constants and primitives of JAX mean for polynomials, before any slope is taken."""
 
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from echelon.core.enclosure.atoms import Atoms
 from echelon.core.enclosure.interval import Interval
@@ -29,7 +29,7 @@ def outside() -> object:
     raise GainError("the model reads outside of an array.")
 
 
-def fold(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
+def fold(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Return what an unknown primitive makes of parameters alone, in float64: parameters again."""
     values = [map_entries(number, a) if a.dtype == object else a for a in operands]
     if any(v is None for a in values for v in a.flat):
@@ -59,7 +59,7 @@ def whole_power(atoms: Atoms, p: Polynomial, k: int) -> Polynomial:
     return p.power(k) if k >= 0 else reciprocal(atoms, p).power(-k)
 
 
-def power(atoms: Atoms, p: Polynomial, exponent: Any) -> Polynomial:
+def power(atoms: Atoms, p: Polynomial, exponent: Polynomial | int) -> Polynomial:
     """Return p to a constant power: whole, a half, or exp(k log p)."""
     k = exponent.value() if isinstance(exponent, Polynomial) else Fraction(int(exponent))
     if k is None:

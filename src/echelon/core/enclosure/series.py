@@ -11,16 +11,17 @@ import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
-from typing import Any, TypeAlias, final
+from typing import TypeAlias, final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from echelon.core.enclosure import rules
 from echelon.core.enclosure.interval import ELEMENTARY, Interval, wave
 from echelon.core.errors import GainError
-from echelon.core.jaxpr import Algebra, Rule, dot, entrywise, map_entries, reduction, walk
+from echelon.core.jaxpr import Algebra, Params, Rule, dot, entrywise, map_entries, reduction, walk
 from echelon.core.numerics import precision
 
 _BITS = 90
@@ -167,7 +168,7 @@ def number(x: float | Fraction, order: int) -> Series:
     return Series(((_down(x), _up(x)), *[(0, 0)] * order))
 
 
-def _lifted(entry: Any, order: int) -> Series:
+def _lifted(entry: Series | float, order: int) -> Series:
     return entry if isinstance(entry, Series) else number(float(entry), order)
 
 
@@ -260,7 +261,7 @@ def _applied(name: str, ends: _Ends) -> _Ends:
     return _ends(elementary.range(x))
 
 
-def _power(x: Series, exponent: Any) -> Series:
+def _power(x: Series, exponent: Series | int) -> Series:
     k = exponent if isinstance(exponent, Series) else number(int(exponent), x.order)
     if k.moves:
         raise GainError("a path raises to a power that varies, which has no enclosure.")
@@ -325,7 +326,7 @@ def _algebra(order: int) -> Algebra:
         # Constants are polynomials of no variable.
         return map_entries(lambda p: number(p.value() or 0.0, order), lifted)
 
-    def unknown(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
+    def unknown(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
         raise GainError(
             f"a path uses `{equation.primitive.name}`, of which there is no enclosure over time."
         )
@@ -344,7 +345,7 @@ def _algebra(order: int) -> Algebra:
     return Algebra(functions, lambda x: number(x, order), lift, rules.outside, unknown)
 
 
-def _convert(params: Any, x: np.ndarray) -> np.ndarray:
+def _convert(params: Params, x: np.ndarray) -> np.ndarray:
     if np.dtype(params["new_dtype"]).kind in "biu":
         raise GainError("a path turns time into a whole number, of which there is no enclosure.")
     return x

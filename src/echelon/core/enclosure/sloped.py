@@ -5,7 +5,7 @@ A slope of a function is what its values differ by, over what its argument diffe
 
 from collections.abc import Callable, Mapping
 from fractions import Fraction
-from typing import Any, TypeAlias, final
+from typing import TypeAlias, final
 
 from echelon.core.enclosure import rules
 from echelon.core.enclosure.atoms import Atoms
@@ -112,7 +112,7 @@ def whole_power(atoms: Atoms, p: Sloped, k: int) -> Sloped:
     return chain(rules.whole_power(atoms, p.value, k), (p, slope))
 
 
-def power(atoms: Atoms, p: Sloped, exponent: Any) -> Sloped:
+def power(atoms: Atoms, p: Sloped, exponent: Sloped | int) -> Sloped:
     """Return p to a constant power."""
     k = exponent.value if isinstance(exponent, Sloped) else constant(int(exponent))
     value = rules.power(atoms, p.value, k)

@@ -11,11 +11,12 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from fractions import Fraction
-from typing import Any, TypeAlias, final
+from typing import TypeAlias, final
 
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from echelon.core.enclosure import rules, sloped
 from echelon.core.enclosure.atoms import Atoms
@@ -23,10 +24,7 @@ from echelon.core.enclosure.interval import Interval
 from echelon.core.enclosure.polynomial import Polynomial, constant, divides
 from echelon.core.enclosure.sloped import Sloped, chain, number
 from echelon.core.errors import GainError, listing
-from echelon.core.jaxpr import Algebra, dot, map_entries, reduction
-
-Rule: TypeAlias = Callable[..., np.ndarray]
-"""(parameters of the primitive, operands) -> result."""
+from echelon.core.jaxpr import Algebra, Params, Rule, dot, map_entries, reduction
 
 
 @final
@@ -45,6 +43,11 @@ class Switch:
     moves: bool
 
 
+_Entry: TypeAlias = Sloped | Switch | bool | int
+"""What an array in this algebra holds: values, or answers to comparisons."""
+_ANSWERS = bool | np.bool_ | Switch
+
+
 def slopes_in(atoms: Atoms) -> Algebra:
     """Return the algebra of values with their slopes.
 
@@ -59,7 +62,7 @@ def _lift(array: np.ndarray) -> np.ndarray:
     return map_entries(number, lifted) if lifted.dtype == object else lifted
 
 
-def _fold(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
+def _fold(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Return what an unknown primitive makes of parameters alone: parameters again."""
     plain = [map_entries(_parameter, a) if a.dtype == object else a for a in operands]
     result = rules.fold(equation, plain)
@@ -177,14 +180,14 @@ def _or(atoms: Atoms, a: bool | Switch, b: bool | Switch) -> bool | Switch:
     return _not(atoms, _and(atoms, _not(atoms, a), _not(atoms, b)))
 
 
-def _choose(atoms: Atoms, which: Any, *cases: Any) -> Any:
+def _choose(atoms: Atoms, which: bool | Switch, *cases: _Entry) -> _Entry:
     """Return the case that is chosen, or what bends from one to the other."""
     if not isinstance(which, Switch):
         return cases[int(which)]
     no, yes = cases
-    if all(isinstance(case, Sloped) for case in cases):
+    if isinstance(no, Sloped) and isinstance(yes, Sloped):
         return _bend(atoms, which, no, yes)
-    if not all(isinstance(case, bool | np.bool_ | Switch) for case in cases):
+    if not (isinstance(no, _ANSWERS) and isinstance(yes, _ANSWERS)):
         raise _jump(atoms, "a comparison picks a whole number", *which.borders)
     # Answers that agree need no decision.
     if not any(isinstance(case, Switch) for case in cases) and no == yes:
@@ -223,7 +226,7 @@ def _undecided(atoms: Atoms) -> Polynomial:
     return atoms.fresh(("undecided", object()), Interval(Fraction(0), Fraction(1)))
 
 
-def _convert(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+def _convert(atoms: Atoms, params: Params, x: np.ndarray) -> np.ndarray:
     """Return entries under another type; a change of float precision is none to the reals."""
     kind = np.dtype(params["new_dtype"]).kind
     if kind not in "biu":
@@ -233,7 +236,7 @@ def _convert(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray) -> np.ndarr
     return answers.astype(params["new_dtype"]) if decided else answers
 
 
-def _as_number(atoms: Atoms, entry: Any) -> Sloped:
+def _as_number(atoms: Atoms, entry: _Entry) -> Sloped:
     if isinstance(entry, Sloped):
         return entry
     if not isinstance(entry, Switch):
@@ -243,7 +246,7 @@ def _as_number(atoms: Atoms, entry: Any) -> Sloped:
     return number(_undecided(atoms))
 
 
-def _as_integer(atoms: Atoms, kind: str, entry: Any) -> bool | int | Switch:
+def _as_integer(atoms: Atoms, kind: str, entry: _Entry) -> bool | int | Switch:
     """Return an entry as a boolean or as a whole number, which is cut towards 0."""
     if isinstance(entry, Switch):
         if kind == "b":

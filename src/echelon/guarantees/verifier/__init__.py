@@ -1,1 +1,1 @@
-"""A second opinion on a gain file, which shares nothing with what made it but the models."""
+"""Independent verification of saved gains and tubes; only the agent models are shared."""

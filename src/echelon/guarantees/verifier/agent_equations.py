@@ -1,4 +1,4 @@
-"""A saved gain's agents, made again from their equations."""
+"""Agent models of a saved gain, rebuilt from its parameters and evaluated."""
 
 import importlib
 from typing import NamedTuple
@@ -15,17 +15,17 @@ from echelon.core.types import Array
 from echelon.guarantees.verifier.saved_gain import SavedModel
 
 _TOGETHER = 384
-"""States at which a model is evaluated at once, so that it is compiled once."""
+"""States evaluated at once; a fixed number, so that a model is compiled once."""
 _MOST_DIMENSIONS = 1000
-"""A whole number above it counts no dimensions, and is made a float."""
+"""A larger integer cannot be a dimension and is converted to a float."""
 
 
 class Evaluated(NamedTuple):
-    """What a model is at each of K points, in deviations x and normalized inputs v.
+    """A model evaluated at K states x and normalized inputs v.
 
     Attributes:
         velocities: f + g (u* + S v), (K, n).
-        sizes: the same with absolute values, which is what rounding is of, (K, n).
+        sizes: the sum of the absolute values of its terms, which bounds rounding, (K, n).
         jacobians: by reverse differentiation, (K, n, n).
         maps: g S, (K, n, m).
     """
@@ -37,42 +37,42 @@ class Evaluated(NamedTuple):
 
 
 class NoModel(NamedTuple):
-    """Why there is no model; `broken` where the file promised one that cannot be made."""
+    """Why there is no model; `broken` if the file names a bundled model that cannot be built."""
 
     reason: str
     broken: bool
 
 
 def model_of(saved: SavedModel) -> ControlAffine | NoModel:
-    """Return the bundled model of a file.
+    """Return the bundled model named in a file.
 
-    A class of any other module is not imported: reading a file must not run what it names.
+    No other module is imported: reading a file must not execute code that it names.
     """
     module, _, name = saved.path.partition(":")
-    # With the dot, since other packages may begin with the same letters. Files of version 0.2 name
-    # the module of a model, later ones its public name.
+    # With the dot, since other packages may have the same prefix. Files of version 0.2 store the
+    # module of a model, later ones its public name.
     if not (module + ".").startswith(("echelon.models.", "echelon.agents.models.")):
         return NoModel(
-            f"`{name}` is not bundled; `--scenario`, or `verify(path, model)`, takes its own", False
+            f"`{name}` is not bundled; pass it by `--scenario` or `verify(path, model)`", False
         )
     if saved.parameters is None:
         return NoModel(f"the file holds no parameters of `{name}`", False)
     try:
         cls = getattr(models, name, None) or getattr(importlib.import_module(module), name)
-        # Asked before it is called: a module has other names than those of models.
+        # Checked before the call: a module also contains other names.
         if not (isinstance(cls, type) and issubclass(cls, ControlAffine)):
-            return NoModel(f"`{saved.path}` is no model", True)
-        return cls(**{key: _frozen(value) for key, value in saved.parameters.items()})
-    # Parameters of a false file can break a class in any way.
+            return NoModel(f"`{saved.path}` is not a model", True)
+        return cls(**{key: _to_parameter(value) for key, value in saved.parameters.items()})
+    # False parameters can raise any exception in a class.
     except Exception as error:
-        return NoModel(f"`{saved.path}` cannot be made: {error}", True)
+        return NoModel(f"`{saved.path}` cannot be built: {error}", True)
 
 
-def _frozen(value: object) -> object:
-    # As a dimension it would be a model too large to hold; as a parameter its float is the same.
+def _to_parameter(value: object) -> object:
+    # As a dimension it would exhaust the memory; as a parameter a float is equivalent.
     if isinstance(value, int) and abs(value) > _MOST_DIMENSIONS:
         return float(value)
-    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+    return tuple(map(_to_parameter, value)) if isinstance(value, list) else value
 
 
 def evaluate(model: ControlAffine, saved: SavedModel, x: Array, v: Array) -> Evaluated:
@@ -82,7 +82,7 @@ def evaluate(model: ControlAffine, saved: SavedModel, x: Array, v: Array) -> Eva
         u, S = jnp.asarray(saved.input), jnp.asarray(saved.scale)
         for k in range(0, len(x), _TOGETHER):
             some = x[k : k + _TOGETHER], v[k : k + _TOGETHER]
-            # The last points once more, for one shape.
+            # Padded to one shape, since another one would be compiled again.
             full = (np.resize(item, (_TOGETHER, item.shape[1])) for item in some)
             result = _evaluate(model, u, S, *map(jnp.asarray, full))
             parts.append([np.asarray(item)[: len(some[0])] for item in result])
@@ -99,7 +99,7 @@ def _evaluate(
     def all_of(x: jax.Array, v: jax.Array) -> tuple[jax.Array, ...]:
         f, g = model.drift(x), model.input_map(x)
         size = jnp.abs(f) + jnp.abs(g) @ (jnp.abs(u) + jnp.abs(S @ v))
-        # The synthesis differentiates forwards: a fault of either mode would show.
+        # Reverse mode, while the synthesis uses forward mode: an error in either is detected.
         return f + g @ (u + S @ v), size, jax.jacrev(velocity)(x, v), g @ S
 
     return jax.vmap(all_of)(states, inputs)

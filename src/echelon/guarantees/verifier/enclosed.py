@@ -1,4 +1,4 @@
-"""Whether matrices, and what velocities differ by, lie in the hull that a file holds."""
+"""Tests whether Jacobians and secants of a model lie in the stored hull."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,13 +9,13 @@ import scipy.optimize
 from echelon.core.types import Array
 
 _HALVINGS = 16
-"""After so many a pair of states is as close as 10^-5 of what it was."""
+"""Halvings of a pair of states; its distance shrinks to 2^-16, about 1e-5."""
 _AT_ONCE = 256
-"""Corners whose products with all pairs are held in memory together."""
+"""Hull vertices processed at once; bounds the memory."""
 
 
 def farthest_from_all(known: Array, samples: Array) -> float:
-    """Return how far the worst sample is from the nearest of the known matrices, relative."""
+    """Return the largest relative distance of a sample to its nearest known matrix."""
     size = max(float(np.abs(known).max()), 1e-300)
     if not np.isfinite(samples).all():
         return np.inf
@@ -24,22 +24,22 @@ def farthest_from_all(known: Array, samples: Array) -> float:
 
 
 def farthest_outside(hull: Array, error: Array, samples: Array) -> float:
-    """Return how far the worst sample is from every convex combination of the corners.
+    """Return the largest distance of a sample to the convex hull of the corners.
 
-    Each entry is measured beyond `error`, in units of its range over the corners, or of a
-    thousandth of its size where that is larger. Least squares with weights that are not negative
-    decide (Lawson and Hanson); the weights are made to add to one before anything is measured.
+    Distances are measured entry by entry beyond `error`, relative to the range of the entry over
+    the corners (at least 1e-3 of its absolute value). The convex combination is found by
+    nonnegative least squares (Lawson and Hanson) and normalized before the distance is measured.
     """
     if not np.isfinite(samples).all():
         return np.inf
     corners, target = hull.reshape(len(hull), -1), samples.reshape(len(samples), -1)
     low, spread = corners.min(axis=0), np.ptp(corners, axis=0)
     size = np.abs(corners).max(axis=0)
-    # An entry that hardly varies is measured by its size, or rounding would look like distance.
+    # Entries that hardly vary are scaled by their absolute value; else rounding would count.
     unit = np.where(size > 0.0, np.maximum(spread, 1e-3 * size), 1.0)
     corners, target, allowed = (corners - low) / unit, (target - low) / unit, error.ravel() / unit
     moving = spread > 0.0
-    # The row of ones asks for weights that add to one.
+    # The row of ones makes the weights of a convex combination sum to one.
     system = np.vstack([corners[:, moving].T, np.ones(len(corners))])
     worst = float((np.abs(target - corners[0]) - allowed)[:, ~moving].max(initial=0.0))
     for sample in target[:, moving]:
@@ -50,7 +50,7 @@ def farthest_outside(hull: Array, error: Array, samples: Array) -> float:
 
 
 class SupportBounds(NamedTuple):
-    """What p'(v(x) - v(y)) may be at K pairs: from `low` to `high`, (K,); `size` of its terms."""
+    """Bounds (K,) of p'(v(x) - v(y)) at K pairs; `size` is the magnitude of its terms."""
 
     low: Array
     high: Array
@@ -79,17 +79,17 @@ def steepest(
     normals: Array,
     bounds: SupportBounds,
 ) -> float:
-    """Return how far p'(v(x) - v(y)) leaves its bounds at the worst pair, in parts of its size.
+    """Return the largest relative violation of the bounds of p'(v(x) - v(y)).
 
-    Each pair is halved again and again, and the half kept that is steeper: at a jump the slope
-    grows twofold each time. What rounding can make is taken off.
+    Each pair is bisected repeatedly, and the steeper half is continued: at a jump the slope doubles
+    each time. Rounding is subtracted.
 
     Args:
-        velocity: states (K, n) to velocities (K, n) and what their rounding is, (K, n).
+        velocity: maps states (K, n) to velocities (K, n) and their rounding (K, n).
         x: states (K, n).
         y: states (K, n).
         normals: p (K, n).
-        bounds: those of x - y.
+        bounds: for the pairs x, y.
     """
     unit = np.where(bounds.size > 0.0, bounds.size, 1.0)
     (at_x, lost_x), (at_y, lost_y) = velocity(x), velocity(y)
@@ -102,7 +102,7 @@ def steepest(
     for _ in range(_HALVINGS):
         lost = np.einsum("kn,kn->k", np.abs(normals), lost_x + lost_y) / part
         result = (excess(at_x, at_y) - lost) / unit
-        # What is not a number is outside of every bound.
+        # NaN counts as a violation of every bound.
         worst = max(worst, float(np.where(np.isfinite(result), result, np.inf).max()))
         middle, part = 0.5 * (x + y), 0.5 * part
         at, lost_at = velocity(middle)

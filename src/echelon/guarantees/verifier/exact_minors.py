@@ -1,8 +1,8 @@
-"""Signs of leading minors in exact arithmetic, and the inequality of a rate proved with them.
+"""Exact leading minors, and the proof of a convergence rate with them.
 
 By Sylvester's criterion a symmetric matrix is positive definite exactly when its leading minors
-are positive. Every float is a fraction; rows are cleared of denominators, and the minors of whole
-numbers are found without fractions (Bareiss).
+are positive. Every float is a fraction; rows are multiplied by their denominators, and the minors
+of integer matrices are computed without fractions (Bareiss).
 """
 
 import math
@@ -33,7 +33,7 @@ def is_positive_definite(matrix: Rows) -> bool:
         (pivot, *tail), *below = rest
         if pivot <= 0:
             return False
-        # Bareiss: what is left are minors, which the pivot before divides without a remainder.
+        # Bareiss: the remaining entries are minors, divisible by the previous pivot.
         rest = [
             [(pivot * x - row[0] * y) // last for x, y in zip(row[1:], tail, strict=True)]
             for row in below
@@ -54,11 +54,11 @@ def product(left: Rows, right: Rows) -> Rows:
 
 
 def _dot(row: Iterable[Fraction], column: Iterable[Fraction]) -> Fraction:
-    # Fractions are slow, and most entries of these matrices zero.
+    # Fractions are slow, and most entries of these matrices are zero.
     return sum((x * y for x, y in zip(row, column, strict=True) if x and y), Fraction(0))
 
 
-def transposed(matrix: Rows) -> Rows:
+def transpose(matrix: Rows) -> Rows:
     """Return the transpose."""
     return [list(column) for column in zip(*matrix, strict=True)]
 
@@ -78,12 +78,12 @@ def inverse(matrix: Rows) -> Rows:
 
 def weighted(B: Array, R: Array, P: Array) -> tuple[Array, Array, Array]:
     """Return R^-1 B' (m, n), B R^-1 B' (n, n) and B R^-1 B'P (n, n), each rounded once."""
-    pull = product(inverse(rows_of(R)), transposed(rows_of(B)))
+    pull = product(inverse(rows_of(R)), transpose(rows_of(B)))
     both = product(rows_of(B), pull)
-    return _rounded(pull), _rounded(both), _rounded(product(both, rows_of(P)))
+    return _to_floats(pull), _to_floats(both), _to_floats(product(both, rows_of(P)))
 
 
-def _rounded(matrix: Rows) -> Array:
+def _to_floats(matrix: Rows) -> Array:
     return np.array([[float(x) for x in row] for row in matrix])
 
 
@@ -96,11 +96,11 @@ def first_unproved(
     strength: Fraction,
     rate: float,
 ) -> int | None:
-    """Return the first corner A at which the rate is not proved, or None where all hold.
+    """Return the first vertex A at which the rate is not proved, or None if all are.
 
-    Proved is P A + A'P - strength P B R^-1 B'P + 2 rate P < 0, and the same for every matrix within
-    +- error of A. Such a change adds at most |P| error + its transpose, entry by entry, and the
-    row sums of that on the diagonal outweigh it whatever its signs (Gershgorin).
+    The inequality is P A + A'P - strength P B R^-1 B'P + 2 rate P < 0, also for every matrix
+    within +- error of A. Such a change adds at most |P| error + its transpose, entry by entry; its
+    row sums on the diagonal dominate it for any signs (Gershgorin).
 
     Args:
         P: (n, n), symmetric to the bit and positive definite.
@@ -108,12 +108,12 @@ def first_unproved(
         R: (m, m), symmetric positive definite.
         hull: (K, n, n).
         error: (n, n).
-        strength: 2 c lambda_min, a lower bound of it.
+        strength: a lower bound of 2 c lambda_min.
         rate: 1/s.
     """
     metric, change = rows_of(P), rows_of(abs(error))
     pull = product(metric, rows_of(B))
-    feedback = product(product(pull, inverse(rows_of(R))), transposed(pull))
+    feedback = product(product(pull, inverse(rows_of(R))), transpose(pull))
     # |P dA| <= |P| error for every dA within +- error.
     spread = product(rows_of(abs(P)), change)
     fixed = [

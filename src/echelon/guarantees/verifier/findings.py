@@ -1,4 +1,4 @@
-"""What a check finds of a claim, and what was recomputed that claims rest on."""
+"""Findings of the verifier, and the recomputed quantities that several claims use."""
 
 from typing import NamedTuple
 
@@ -10,57 +10,64 @@ from echelon.guarantees.verifier.directed_spectra import directed_spectrum
 from echelon.guarantees.verifier.saved_gain import SavedGain
 
 TIGHT = 1e-9
-"""A number that was recomputed may differ by this part of itself, and by rounding."""
+"""Relative difference allowed between a stored and a recomputed number, besides rounding."""
 ROUNDING = 1e-12
-"""Rounding of eigenvalues, as a part of the largest of them."""
+"""Rounding of eigenvalues relative to the largest one."""
 DECIDED = 1e-6
-"""Rounding beyond this part of a rate leaves the rate undecided, and is no credit."""
+"""A rate is undecided if its rounding exceeds this fraction of it."""
 
 
 class Finding(NamedTuple):
-    """A claim of the file, what was found, and `holds`, `refused` or `not checked`."""
+    """A claim of the file with its stored and recomputed value.
+
+    The verdict is `holds`, `refused` or `not checked`.
+    """
 
     claim: str
     stored: str
-    found: str
+    value: str
     verdict: str
     text: str
 
+    def as_mapping(self) -> dict[str, str]:
+        """Return the finding for JSON, where the recomputed value has the key `found`."""
+        return {"found" if key == "value" else key: x for key, x in self._asdict().items()}
 
-def said(
-    claim: str, fine: bool, stored: object = "", found: object = "", text: str = ""
+
+def decide(
+    claim: str, fine: bool, stored: object = "", value: object = "", text: str = ""
 ) -> Finding:
-    """Return a finding that holds or is refused."""
-    return Finding(claim, _shown(stored), _shown(found), "holds" if fine else "refused", text)
+    """Return a finding with the verdict `holds` or `refused`."""
+    return Finding(claim, _text(stored), _text(value), "holds" if fine else "refused", text)
 
 
 def unchecked(claim: str, stored: object, text: str) -> Finding:
-    """Return a finding of what could not be checked."""
-    return Finding(claim, _shown(stored), "", "not checked", text)
+    """Return a finding for a claim that could not be checked."""
+    return Finding(claim, _text(stored), "", "not checked", text)
 
 
-def _shown(value: object) -> str:
+def _text(value: object) -> str:
     return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
-def same(claim: str, stored: float, found: float, slack: float = 0.0, text: str = "") -> Finding:
-    """Compare two numbers, to a billionth of themselves and the slack of their rounding."""
-    fine = abs(stored - found) <= TIGHT * max(abs(stored), abs(found)) + slack
-    return said(claim, fine, stored, found, text)
+def compare(claim: str, stored: float, value: float, slack: float = 0.0, text: str = "") -> Finding:
+    """Compare two numbers with the relative tolerance `TIGHT` plus their rounding `slack`."""
+    fine = abs(stored - value) <= TIGHT * max(abs(stored), abs(value)) + slack
+    return decide(claim, fine, stored, value, text)
 
 
 class Facts(NamedTuple):
-    """What was recomputed and later claims rest on.
+    """Recomputed quantities that several claims use.
 
     Attributes:
-        saved: the file.
-        eigenvalues: all of the grounded Laplacian, or those that a file without edges holds.
-        bound: lambda_min is no less; of a directed graph, what its sum of squares is held by.
+        saved: the content of the file.
+        eigenvalues: of the grounded Laplacian; the stored ones if the file has no edges.
+        bound: a lower bound of lambda_min; for a directed graph, of the decay of its weighted sum.
         pull: R^-1 B' (m, n), rounded once.
-        weighted: B R^-1 B' (n, n), the same.
-        feedback: B R^-1 B'P (n, n), the same.
-        closed: A of the drift, its inner loop closed (n, n).
-        speed: the size of its entries in units that make it small, 1/s.
+        weighted: B R^-1 B' (n, n), rounded once.
+        feedback: B R^-1 B'P (n, n), rounded once.
+        closed: A with the inner loop closed, (n, n).
+        speed: the norm of `closed` after balancing, 1/s.
         least: lambda_min.
     """
 
@@ -81,16 +88,16 @@ class Facts(NamedTuple):
 
     @property
     def high(self) -> float:
-        """Return lambda_max, the largest size of an eigenvalue."""
+        """Return lambda_max, the largest absolute value of an eigenvalue."""
         return float(np.abs(self.eigenvalues).max())
 
 
 def facts(saved: SavedGain) -> Facts:
-    """Recompute what claims rest on."""
+    """Recompute the quantities that several claims use."""
     graph, B = saved.graph, saved.model.B
     edges = None if graph.switches else graph.edges
-    # What stands in the file, where nothing says otherwise; of graphs that take turns lambda_min is
-    # none of their eigenvalues.
+    # Stored values are used if there are no edges. For switching graphs lambda_min is a bound over
+    # all graphs and no eigenvalue of the union.
     low = saved.lambda_min if graph.switches else float(np.real(graph.spectrum[0]))
     values, bound = graph.spectrum, low
     if edges is not None and graph.directed:

@@ -1,12 +1,12 @@
-"""A second opinion on what motors give under the law `stopping-point`, from what a run tells (T5).
+"""Independent check of the motor thrusts guaranteed under the law `stopping-point` (T5).
 
-The certificate goes by slices of time in rationals. Here responses are followed at thousands of
-moments in floats, and then motions are drawn within the bounds and flown backwards through the
-model's own equations, to see that none asks for more. Nothing of the certificate is used.
+The certificate encloses time slices in rational arithmetic. Here responses are evaluated at
+thousands of times in floats; then random motions within the bounds are inverted with the equations
+of the model, and none may need more thrust. No code of the certificate is used.
 """
 
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,35 +14,35 @@ import numpy as np
 
 from echelon.agents.models.quadrotor import Quadrotor
 from echelon.core.numerics import precision
-from echelon.core.types import Array
-from echelon.guarantees.verifier.findings import Finding, said
+from echelon.core.types import Array, JsonObject
+from echelon.guarantees.verifier.findings import Finding, decide
 
 _CELLS = 6000
 _SLACK = 2e-8
-"""N and rad: what quadrature leaves where a response changes its sign within a cell."""
-_TIMES, _DRAWN = 24, 4000
-"""Moments at which motions are drawn, the hardest of stretches of time, and how many in each."""
+"""N and rad: quadrature error in a cell in which a response changes its sign."""
+_TIMES, _MOTIONS = 24, 4000
+"""Times of random motions (the least thrust of each interval), and motions per time."""
 
 
-def motor_findings(told: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield what is found of each claim of motors."""
-    motion = _Motion.of(told)
-    demands = [_asked(motion, _sizes(start)) for start in told["starts"]]
-    ranges = [_range(told["airframe"], item) for item in demands]
+def motor_findings(claims: JsonObject) -> Iterator[Finding]:
+    """Yield a finding for each claim about the motors."""
+    motion = _Motion.of(claims)
+    demands = [_demands(motion, _start_bounds(start)) for start in claims["starts"]]
+    ranges = [_range(claims["airframe"], item) for item in demands]
     least, largest = (f(r[k] for r in ranges) for k, f in ((0, _least), (1, _most)))
-    stored = float(told["least"])
+    stored = float(claims["least"])
     fine = 0.0 < stored <= least + _SLACK
-    yield said("least thrust of a motor", fine, stored, least, "followed over time")
-    stored = float(told["largest"])
-    fine = largest - _SLACK <= stored < float(told["most"])
-    yield said("largest thrust of a motor", fine, stored, largest, "followed over time")
+    yield decide("least thrust of a motor", fine, stored, least, "evaluated over time")
+    stored = float(claims["largest"])
+    fine = largest - _SLACK <= stored < float(claims["most"])
+    yield decide("largest thrust of a motor", fine, stored, largest, "evaluated over time")
     tilt = max(float(r[2].max()) for r in ranges)
-    yield said("steepest tilt", told["tilt"] >= tilt - _SLACK, told["tilt"], tilt)
-    low, high = _drawn(told["airframe"], demands[0], ranges[0])
-    fine = told["least"] <= low and high <= told["largest"]
-    text = f"{_TIMES * _DRAWN} motions within the bounds"
-    yield said("motors of drawn motions", fine, told["least"], low, text)
-    yield from _alone(told, motion)
+    yield decide("steepest tilt", claims["tilt"] >= tilt - _SLACK, claims["tilt"], tilt)
+    low, high = _random_motions(claims["airframe"], demands[0], ranges[0])
+    fine = claims["least"] <= low and high <= claims["largest"]
+    text = f"{_TIMES * _MOTIONS} motions within the bounds"
+    yield decide("motors in random motions", fine, claims["least"], low, text)
+    yield from _check_single_starts(claims, motion)
 
 
 def _least(values: Iterator[Array]) -> float:
@@ -53,18 +53,19 @@ def _most(values: Iterator[Array]) -> float:
     return max(float(v.max()) for v in values)
 
 
-def _sizes(start: Mapping[str, Any]) -> Array:
-    """Return (3, 3): of v, v', v'' along the ground, upward, and of the yaw's rate."""
+def _start_bounds(start: JsonObject) -> Array:
+    """Return bounds (3, 3) of v, v', v'': horizontal, vertical, and of the yaw rate."""
     rows = [start["sideways"], start["upward"], start["turn"]]
     return np.stack([np.pad(np.asarray(row, float), (0, 3 - len(row))) for row in rows])
 
 
 class _Motion(NamedTuple):
-    """What agents do that start as their leader, at T times.
+    """Bounds at T times on agents that start like their leader.
 
     Attributes:
-        free, first: (orders, starts, T) of the chain with all roots, and with the first.
-        base: (9, T) sideways a, j, s, least and largest upward a, upward j, s, turn and turning.
+        free, first: responses (orders, starts, T) with all roots, and with the first root only.
+        base: (9, T) horizontal acceleration, jerk, snap; least and largest vertical
+            acceleration; vertical jerk, snap; yaw rate and yaw acceleration.
     """
 
     free: Array
@@ -72,60 +73,69 @@ class _Motion(NamedTuple):
     base: Array
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> "_Motion":
-        """Return it of what is told."""
-        rho = np.asarray(told["roots"], float)
+    def of(cls, claims: JsonObject) -> "_Motion":
+        """Return the bounds for the stored claims."""
+        rho = np.asarray(claims["roots"], float)
         times = np.linspace(0.0, 30.0 / rho.min(), _CELLS)
-        (free, grown), (first, rotated) = _responses(rho, times), _responses(rho[:1], times)
-        path = np.asarray(told["path"], float)
+        (free, integrals), (first, turn_integral) = (
+            _responses(rho, times),
+            _responses(rho[:1], times),
+        )
+        path = np.asarray(claims["path"], float)
         rows = path[np.searchsorted(path[:, 0], times, side="right") - 1, 1:].T
-        led, speeds = told["leader"], np.add(told["speeds"], told["leader"]["speeds"])
-        base = _added(rows, speeds[:, None, None], grown, rotated)
-        return cls(free, first, base + _started(_sizes(led), free, first))
+        leader, speeds = claims["leader"], np.add(claims["speeds"], claims["leader"]["speeds"])
+        base = _path_demands(rows, speeds[:, None, None], integrals, turn_integral)
+        return cls(free, first, base + _start_demands(_start_bounds(leader), free, first))
 
 
 def _responses(rho: Array, times: Array) -> tuple[Array, Array]:
-    """Return |v^(l)| of unit starts (p + 1, p, T), and integrals of |h^(l)| so far (p + 1, T)."""
+    """Return |v^(l)| from unit starts (p + 1, p, T) and integrals of |h^(l)| up to t (p + 1, T)."""
     p = len(rho)
     orders = np.arange(p + 1)
     modes = np.linalg.inv(np.vander(-rho, increasing=True).T)
-    falls = np.exp(-np.outer(rho, times))
+    decays = np.exp(-np.outer(rho, times))
     powers = (-rho) ** orders[:, None]
-    free = np.abs(np.einsum("lr,rk,rt->lkt", powers, modes, falls))
-    apart = [np.prod([b - a for j, b in enumerate(rho) if j != i]) for i, a in enumerate(rho)]
-    kernel = powers * np.prod(rho) / np.array(apart)
+    free = np.abs(np.einsum("lr,rk,rt->lkt", powers, modes, decays))
+    differences = [np.prod([b - a for j, b in enumerate(rho) if j != i]) for i, a in enumerate(rho)]
+    kernel = powers * np.prod(rho) / np.array(differences)
     step = times[1]
-    ends = np.abs(kernel @ falls)
+    ends = np.abs(kernel @ decays)
     middles = np.abs(kernel @ np.exp(-np.outer(rho, times[:-1] + 0.5 * step)))
     cells = step / 6.0 * (ends[:, :-1] + 4.0 * middles + ends[:, 1:])
-    grown = np.concatenate([np.zeros((p + 1, 1)), np.cumsum(cells, axis=1)], axis=1)
-    grown[p] += np.prod(rho)
-    return free, grown
+    integrals = np.concatenate([np.zeros((p + 1, 1)), np.cumsum(cells, axis=1)], axis=1)
+    integrals[p] += np.prod(rho)
+    return free, integrals
 
 
-def _added(rows: Array, speeds: Array, grown: Array, turned: Array) -> Array:
-    """Return what a path (9, T) asks of agents that are driven at speeds."""
+def _path_demands(rows: Array, speeds: Array, integrals: Array, turn_integral: Array) -> Array:
+    """Return the bounds (9, T) for a path and agents driven at `speeds`."""
     along, up, around = speeds[:, 0, 0]
-    upward = up * grown[1]
+    upward = up * integrals[1]
     return rows + np.stack(
-        [*(along * grown[1:]), -upward, upward, *(up * grown[2:]), *(around * turned)]
+        [
+            *(along * integrals[1:]),
+            -upward,
+            upward,
+            *(up * integrals[2:]),
+            *(around * turn_integral),
+        ]
     )
 
 
-def _started(sizes: Array, free: Array, first: Array) -> Array:
-    """Return what starts (3, 3) add, (9, T)."""
+def _start_demands(sizes: Array, free: Array, first: Array) -> Array:
+    """Return the contribution (9, T) of starts (3, 3)."""
     along, up = (np.einsum("k,lkt->lt", sizes[k], free)[1:] for k in (0, 1))
     around = sizes[2, 0] * first[:, 0]
     return np.stack([*along, -up[0], up[0], *up[1:], *around])
 
 
-def _asked(motion: _Motion, start: Array) -> Array:
-    return motion.base + _started(start, motion.free, motion.first)
+def _demands(motion: _Motion, start: Array) -> Array:
+    return motion.base + _start_demands(start, motion.free, motion.first)
 
 
-def _range(frame: Mapping[str, Any], asked: Array) -> tuple[Array, Array, Array]:
-    """Return the least and the largest motor, and the tilt, at all times (T,)."""
-    a, j, s, low, high, jz, sz, turn, turning = asked
+def _range(frame: JsonObject, demands: Array) -> tuple[Array, Array, Array]:
+    """Return the least and largest motor thrust and the tilt at all times, (T,) each."""
+    a, j, s, low, high, jz, sz, turn, turning = demands
     g, mass, arm, drag = (frame[k] for k in ("gravity", "mass", "arm", "torque_per_thrust"))
     Jx, Jy, Jz = frame["inertia"]
     least, most = g + low, np.hypot(g + high, a)
@@ -147,16 +157,16 @@ def _range(frame: Mapping[str, Any], asked: Array) -> tuple[Array, Array, Array]
     return lowest, np.where(bad, np.inf, quarter * most + more), tilt
 
 
-def _drawn(
-    frame: Mapping[str, Any], asked: Array, ranges: tuple[Array, Array, Array]
+def _random_motions(
+    frame: JsonObject, demands: Array, ranges: tuple[Array, Array, Array]
 ) -> tuple[float, float]:
-    """Return the least and the largest motor of motions within the bounds, at the hardest times."""
-    cells = np.array_split(np.arange(asked.shape[1]), _TIMES)
+    """Return the least and largest motor thrust of random motions at the hardest times."""
+    cells = np.array_split(np.arange(demands.shape[1]), _TIMES)
     hardest = [cell[ranges[0][cell].argmin()] for cell in cells]
     draw = np.random.default_rng(0)
-    bounds = np.repeat(asked[:, hardest], _DRAWN, axis=1)
+    bounds = np.repeat(demands[:, hardest], _MOTIONS, axis=1)
     paths = np.zeros((bounds.shape[1], 5, 4))
-    # On the border of each bound: that is where motors give most.
+    # On the boundary of each bound, since thrusts are largest there.
     angles = draw.uniform(-np.pi, np.pi, (3, bounds.shape[1]))
     for k in range(3):
         paths[:, k + 2, 0] = bounds[k] * np.cos(angles[k])
@@ -173,9 +183,9 @@ def _drawn(
     return float(thrusts.min()), float(thrusts.max())
 
 
-def _alone(told: Mapping[str, Any], motion: _Motion) -> Iterator[Finding]:
-    """Yield whether the motors suffice from the other starts that are claimed."""
-    alone, ahead, most = told["alone"], told["ahead"], float(told["most"])
+def _check_single_starts(claims: JsonObject, motion: _Motion) -> Iterator[Finding]:
+    """Yield a finding for each other start from which the motors are claimed to suffice."""
+    alone, ahead, most = claims["alone"], claims["ahead"], float(claims["most"])
     if alone is None:
         return
     v, a, j, rise, turn = (float(ahead[k]) for k in ("speed", "push", "jerk", "rise", "turn"))
@@ -191,6 +201,6 @@ def _alone(told: Mapping[str, Any], motion: _Motion) -> Iterator[Finding]:
         starts["rest"] = ([v, a, j], rise)
     for name, (sideways, upward) in starts.items():
         start = np.array([sideways, [upward, 0.0, 0.0], [turn, 0.0, 0.0]])
-        low, high, _ = _range(told["airframe"], _asked(motion, start))
+        low, high, _ = _range(claims["airframe"], _demands(motion, start))
         fine = bool(low.min() > -_SLACK and high.max() < most + _SLACK)
-        yield said(f"motors from the start `{name}`", fine, alone[name], float(low.min()), "N")
+        yield decide(f"motors from the start `{name}`", fine, alone[name], float(low.min()), "N")

@@ -1,30 +1,29 @@
-"""A saved gain as a checker reads it: nothing is believed, and every shape is asked for."""
+"""Reader of gain files for the verifier: every entry, type and shape is checked."""
 
 import json
 import math
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, TypeGuard, final
 
 import numpy as np
 
 from echelon.core.errors import GainError, listing
-from echelon.core.types import Array, PathLike
+from echelon.core.types import Array, JsonObject, PathLike
 
 _FORMAT = "echelon gain 2"
 _KINDS = ("proof", "vertices", "samples", "linearization")
 _LARGEST = 1e50
-"""Larger numbers are no part of a gain, and their products no numbers."""
+"""Largest number in a gain file; products of larger ones may overflow."""
 _MOST_EDGES = 2000
 _THEOREMS = ("T1", "T2", "A5")
 
 
 class SavedModel(NamedTuple):
-    """The agents: `parameters` is None where the file could not hold them."""
+    """The agents' model; `parameters` is None if they could not be stored."""
 
     path: str
-    parameters: Mapping[str, Any] | None
+    parameters: JsonObject | None
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     state: Array
@@ -35,10 +34,10 @@ class SavedModel(NamedTuple):
 
 
 class SavedGraph(NamedTuple):
-    """The graph: `edges` (E, 3) of i, j and weight, or None where they were too many.
+    """The graph: `edges` (E, 3) are i, j and weight, or None if there were too many.
 
-    Of a directed one j hears i, and its spectrum may be complex; `sums` are the followers' weights
-    in the sum that falls. One that `switches` has more edges than it has at any time.
+    On a directed edge j receives from i, and the spectrum may be complex; `sums` are the followers'
+    weights in the decreasing sum. If the graph `switches`, the edges are those of all its graphs.
     """
 
     agents: int
@@ -51,7 +50,7 @@ class SavedGraph(NamedTuple):
 
 
 class SavedRegion(NamedTuple):
-    """The promise on a domain; `hull` (K, n, p) and `error` (n, p), p = 2n where g varies."""
+    """The guarantee on a domain; `hull` (K, n, p) and `error` (n, p), p = 2n where g varies."""
 
     kind: str
     theorem: str
@@ -67,7 +66,7 @@ class SavedRegion(NamedTuple):
 
 
 class SavedGain(NamedTuple):
-    """All that a gain file says."""
+    """The content of a gain file."""
 
     method: str
     coupling: float
@@ -88,18 +87,18 @@ class SavedGain(NamedTuple):
 
 @final
 class _Part:
-    """A mapping of the file; each method returns an entry of one type, or refuses the file."""
+    """A mapping of the file; each method returns an entry of one type or raises an error."""
 
     def __init__(self, file: PathLike, section: object, name: str = "") -> None:
         self.file, self.name = file, name
         if not isinstance(section, dict):
             raise self.fault(name, "must be a mapping")
-        self.entries: dict[str, Any] = section
+        self.entries: JsonObject = section
 
     def fault(self, name: str, must: str) -> GainError:
-        return GainError(f"`{self.file}` is no gain that can be verified: `{name}` {must}.")
+        return GainError(f"`{self.file}` is not a gain file that can be verified: `{name}` {must}.")
 
-    def entry(self, key: str) -> tuple[Any, str]:
+    def entry(self, key: str) -> tuple[object, str]:
         """Return an entry and its full name."""
         name = f"{self.name}.{key}" if self.name else key
         if key not in self.entries:
@@ -111,7 +110,7 @@ class _Part:
         return _Part(self.file, value, name)
 
     def optional(self, key: str) -> bool:
-        """Tell whether there is something to read."""
+        """Return whether an entry is not null."""
         return self.entry(key)[0] is not None
 
     def number(self, key: str) -> float:
@@ -125,7 +124,7 @@ class _Part:
 
     def whole(self, key: str, least: int = 0) -> int:
         value, name = self.entry(key)
-        # JSON's true is an integer to Python.
+        # In Python `true` of JSON is an integer.
         if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 10**9:
             raise self.fault(name, f"must be a whole number from {least} on (to 1e9)")
         return value
@@ -144,7 +143,7 @@ class _Part:
         return tuple(value)
 
     def array(self, key: str, *shape: int) -> Array:
-        """Return finite numbers of a shape, in which -1 is any length."""
+        """Return finite numbers of a shape; -1 allows any length."""
         value, name = self.entry(key)
         result = _array(value)
         fits = result is not None and result.ndim == len(shape)
@@ -158,25 +157,24 @@ class _Part:
         return result
 
     def bounds(self, key: str, size: int, absent: float) -> Array:
-        """Return numbers, some of which may be None for an infinite bound."""
+        """Return bounds; null in the file is an infinite bound."""
         value, name = self.entry(key)
-        # JSON has no infinity, so a bound that is absent is null.
-        numbers = [absent if x is None else x for x in value] if isinstance(value, list) else []
-        fine = all(x is None or _is_number(x) for x in value) if len(numbers) == size else False
-        if not fine:
+        # JSON has no infinity, so an absent bound is null.
+        entries = value if isinstance(value, list) else []
+        if len(entries) != size or not all(x is None or _is_number(x) for x in entries):
             raise self.fault(name, f"must be {size} finite numbers or null")
-        return np.array(numbers, float)
+        return np.array([absent if x is None else x for x in entries], float)
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: object) -> TypeGuard[float]:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
-    # Python's JSON reads NaN and Infinity too, and neither passes.
+    # Python's JSON also reads NaN and Infinity; both fail this comparison.
     return -_LARGEST <= value <= _LARGEST
 
 
 def _array(value: object) -> Array | None:
-    """Return nested lists of finite numbers as an array, or None where they are anything else."""
+    """Return nested lists of finite numbers as an array, otherwise None."""
 
     def plain(x: object) -> bool:
         return all(map(plain, x)) if isinstance(x, list) else _is_number(x)
@@ -188,17 +186,17 @@ def _array(value: object) -> Array | None:
 
 
 def read(file: PathLike) -> SavedGain:
-    """Return what a gain file says.
+    """Return the content of a gain file.
 
     Raises:
-        GainError: it cannot be read, is no JSON, no gain, or lacks a part; the part is named.
+        GainError: it cannot be read, is not JSON or not a gain, or a part is missing (named).
     """
     top = _Part(file, _json(file), "the file")
-    # The whole needs a name where it is no mapping; the names of its entries need no prefix.
+    # The name serves the error for a file that is no mapping; entries need no prefix.
     top.name = ""
     if top.entries.get("format") != _FORMAT:
         raise GainError(
-            f"`{file}` is no gain file that can be verified; its `format` must be `{_FORMAT}`."
+            f"`{file}` is not a gain file that can be verified; its `format` must be `{_FORMAT}`."
         )
     model = _model(top.part("model"))
     n, m = len(model.state_names), len(model.input_names)
@@ -230,15 +228,17 @@ def _json(file: PathLike) -> object:
     except OSError as error:
         raise GainError(f"the gain file `{file}` cannot be read: {error.strerror}.") from error
     except (ValueError, RecursionError) as error:
-        raise GainError(f"the gain file `{file}` is no JSON: {error}.") from error
+        raise GainError(f"the gain file `{file}` is not valid JSON: {error}.") from error
 
 
 def _mapping(file: PathLike, pairs: list[tuple[str, object]]) -> dict[str, object]:
-    """Return a mapping; of two equal keys one reader would take the first, another the last."""
+    """Return a mapping; repeated keys are refused, since readers differ in which one they use."""
     mapping = dict(pairs)
     if len(mapping) < len(pairs):
         twice = next(key for k, (key, _) in enumerate(pairs) if key in dict(pairs[:k]))
-        raise GainError(f"`{file}` is no gain that can be verified: `{twice}` stands there twice.")
+        raise GainError(
+            f"`{file}` is not a gain file that can be verified: `{twice}` occurs twice."
+        )
     return mapping
 
 
@@ -270,29 +270,31 @@ def _graph(section: _Part) -> SavedGraph:
     if edges is not None and len(edges) > _MOST_EDGES:
         raise section.fault("graph.edges", f"must be null for more than {_MOST_EDGES} edges")
     if edges is None and agents * (agents - 1) // 2 <= _MOST_EDGES:
-        raise section.fault("graph.edges", f"must be given: {agents} agents cannot have so many")
+        raise section.fault(
+            "graph.edges", f"must not be null: {agents} agents have fewer edges than the limit"
+        )
     numbers = leaders if edges is None else np.append(leaders, edges[:, :2])
     if not len(leaders) or not all(x == int(x) and 0 <= x < agents for x in numbers):
         raise section.fault(
-            "graph", f"must name agents from 0 to {agents - 1}, one leader at least"
+            "graph", f"must name agents from 0 to {agents - 1}, with at least one leader"
         )
     spectrum = _spectrum(section)
     if not len(spectrum):
-        raise section.fault("graph.spectrum", "must hold a number")
-    led = tuple(sorted({int(x) for x in leaders}))
+        raise section.fault("graph.spectrum", "must contain a number")
+    leader_set = tuple(sorted({int(x) for x in leaders}))
     directed, switches = (section.entries.get(key) is True for key in ("directed", "switches"))
     sums = (
-        section.array("sums", agents - len(led))
+        section.array("sums", agents - len(leader_set))
         if section.entries.get("sums") is not None
         else None
     )
     if sums is not None and not (sums > 0.0).all():
         raise section.fault("graph.sums", "must be positive")
-    return SavedGraph(agents, led, edges, spectrum, directed, switches, sums)
+    return SavedGraph(agents, leader_set, edges, spectrum, directed, switches, sums)
 
 
 def _spectrum(section: _Part) -> Array:
-    """Return eigenvalues, of which complex ones stand as pairs."""
+    """Return eigenvalues; complex ones are stored as pairs."""
     stored = section.entry("spectrum")[0]
     if not (isinstance(stored, list) and stored and isinstance(stored[0], list)):
         return section.array("spectrum", -1)
@@ -302,10 +304,10 @@ def _spectrum(section: _Part) -> Array:
 
 def _region(section: _Part, n: int, m: int) -> SavedRegion:
     domain, theorem = section.part("domain"), section.text("theorem", _THEOREMS)
-    # Each A with its g S R^-1 (g S)' to the right.
+    # Under T2, each A has its g S R^-1 (g S)' to the right.
     wide = 2 * n if theorem == "T2" else n
     return SavedRegion(
-        # A linearization says nothing of a domain.
+        # A linearization cannot certify a domain.
         kind=section.text("kind", _KINDS[:3]),
         theorem=theorem,
         rate=section.number("rate"),
@@ -315,20 +317,20 @@ def _region(section: _Part, n: int, m: int) -> SavedRegion:
         upper=domain.bounds("upper", n, math.inf),
         input_lower=domain.array("input_lower", m),
         input_upper=domain.array("input_upper", m),
-        hull=_unpacked(section.part("hull"), n, wide),
+        hull=_unpack_hull(section.part("hull"), n, wide),
         error=section.array("error", n, wide),
     )
 
 
-def _unpacked(section: _Part, n: int, wide: int) -> Array:
-    """Return the matrices of which the file holds one whole, and the changes of the others."""
+def _unpack_hull(section: _Part, n: int, wide: int) -> Array:
+    """Return the matrices; the file stores the first one, and the changed entries of the others."""
     base = section.array("base", n, wide)
-    # One matrix only; an empty list has no second axis to check.
+    # A single matrix: an empty list has no second axis to check.
     if section.entry("places")[0] == []:
         return base[None]
     places = section.array("places", -1, 2)
     values = section.array("values", -1, len(places))
-    # Places are read as floats, and must be what indices can be.
+    # Places are read as floats and must be valid indices.
     inside = (places == np.floor(places)) & (places >= 0) & (places < [n, wide])
     if not inside.all() or not len(values):
         raise section.fault(f"{section.name}.places", f"must be entries of a {n} x {wide} matrix")

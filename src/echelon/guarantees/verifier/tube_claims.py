@@ -1,8 +1,8 @@
-"""A second opinion on a tube of T5, from what a run or a check has written of it.
+"""Independent check of a tube of T5 stored by a run or a check.
 
-The certificate encloses polynomials by Bernstein's coefficients. Here sign changes are counted by
-Sturm's sequences, and between them everything is integrated by Gauss's quadrature; what a start and
-a bounded push do together is followed over time. Nothing of the certificate is used.
+The certificate encloses polynomials by Bernstein coefficients. Here sign changes are isolated by
+Sturm sequences and the integrals between them computed by Gauss quadrature; the response to a start
+and a bounded disturbance is evaluated over time. No code of the certificate is used.
 """
 
 import itertools
@@ -10,48 +10,49 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from echelon.core.types import Array, PathLike
-from echelon.guarantees.verifier.findings import Finding, said, same
+from echelon.core.types import Array, JsonObject, PathLike
+from echelon.guarantees.verifier.findings import Finding, compare, decide
 from echelon.guarantees.verifier.motor_claims import motor_findings
 
 FORMAT = "echelon tube 1"
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 _FINE = Fraction(1, 2**50)
 _CELLS = 6000
-"""Of the time in which the slowest mode falls by e^-30."""
+"""Cells of the time grid, which ends where the slowest mode has decayed by e^-30."""
 
 
-def read_tube(path: PathLike) -> Mapping[str, Any] | None:
-    """Return the tube that a file tells of: a run's summary or a check's JSON; else None."""
+def read_tube(path: PathLike) -> JsonObject | None:
+    """Return the tube in a run's summary or a check's JSON, or None if there is none."""
     try:
         document = json.loads(Path(path).read_text("utf-8"))
     except (OSError, ValueError):
-        # Who reads gains says it better.
+        # The reader of gain files reports an unreadable file with more detail.
         return None
     promise = document.get("promise", document) if isinstance(document, dict) else {}
     tube = promise.get("anywhere") if isinstance(promise, dict) else None
     return tube if isinstance(tube, dict) and tube.get("format") == FORMAT else None
 
 
-def tube_findings(tube: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield what is found of each claim of a tube."""
+def tube_findings(tube: JsonObject) -> Iterator[Finding]:
+    """Yield a finding for each claim of a tube."""
     for border in tube["borders"]:
-        roots = _exact(border["roots"])
+        roots = _as_fractions(border["roots"])
         name = ", ".join(f"`{output}`" for output in border["outputs"])
         for order, stored in enumerate(border["gains"]):
             result = _gain(roots, order)
-            yield same(f"gain {order} of {name}", stored, result, 1e-8, "quadrature between roots")
-        yield from _room(border, roots, name)
+            yield compare(
+                f"gain {order} of {name}", stored, result, 1e-8, "quadrature between roots"
+            )
+        yield from _check_margin(border, roots, name)
     if tube.get("motors") is not None:
         yield from motor_findings(tube["motors"])
 
 
-def _room(border: Mapping[str, Any], roots: Sequence[Fraction], name: str) -> Iterator[Finding]:
-    """Yield whether what is left to a border is left, and a start as steep as is claimed fits."""
+def _check_margin(border: JsonObject, roots: Sequence[Fraction], name: str) -> Iterator[Finding]:
+    """Yield findings on the margin to a border and on the steepest admissible start."""
     order = int(border["derivative"]) - 1
     allowed = float(border["path"]) - float(border["above"])
     total = float(border["speed"]) + float(border["leader_speed"])
@@ -59,25 +60,25 @@ def _room(border: Mapping[str, Any], roots: Sequence[Fraction], name: str) -> It
         left = min(allowed - _length(roots, order, np.array(s), total) for s in border["starts"])
     else:
         pairs = itertools.product(border["leader_starts"], border["starts"])
-        both = [np.add(_padded(a, len(roots)), _padded(b, len(roots))) for a, b in pairs]
+        both = [np.add(_pad_start(a, len(roots)), _pad_start(b, len(roots))) for a, b in pairs]
         left = min(allowed - _fall(roots, order, start, total) for start in both)
     stored = float(border["left"])
     fine = 0.0 < stored <= left + 1e-9
-    yield said(f"room left to {name}", fine, stored, left, "followed over time")
+    yield decide(f"margin to {name}", fine, stored, left, "evaluated over time")
     steep = np.eye(len(roots))[0] * float(border["steepest"])
     worst = min(
         allowed - _fall(roots, order, sign * steep, float(border["speed"])) for sign in (-1.0, 1.0)
     )
-    text = "what is left to a start so steep"
-    yield said(f"steepest start of {name}", worst >= -1e-9, border["steepest"], worst, text)
+    text = "margin from this start"
+    yield decide(f"steepest start of {name}", worst >= -1e-9, border["steepest"], worst, text)
 
 
-def _exact(roots: Sequence[float]) -> list[Fraction]:
+def _as_fractions(roots: Sequence[float]) -> list[Fraction]:
     return [Fraction(str(root)) for root in roots]
 
 
-def _padded(start: Sequence[float], size: int) -> Array:
-    """Return a start as long as the roots; one that is left out is zero."""
+def _pad_start(start: Sequence[float], size: int) -> Array:
+    """Return a start padded with zeros to one entry per root."""
     return np.pad(np.asarray(start, float), (0, size - len(start)))
 
 
@@ -87,30 +88,30 @@ def _padded(start: Sequence[float], size: int) -> Array:
 def _residues(roots: Sequence[Fraction]) -> Array:
     """Return c with h = sum c_i exp(-rho_i t) for k0 / q(s)."""
     rho = np.array([float(root) for root in roots])
-    apart = [np.prod([b - a for j, b in enumerate(rho) if j != i]) for i, a in enumerate(rho)]
-    return np.prod(rho) / np.array(apart)
+    differences = [np.prod([b - a for j, b in enumerate(rho) if j != i]) for i, a in enumerate(rho)]
+    return np.prod(rho) / np.array(differences)
 
 
 def _fall(roots: Sequence[Fraction], order: int, start: Array, speed: float) -> float:
-    """Return how far v^(order) falls at most from a start under |w| <= speed, on a fine grid."""
-    free, driven = _followed(roots, order, start[None])
+    """Return the largest decrease of v^(order) from a start under |w| <= speed, on a fine grid."""
+    free, driven = _simulate_response(roots, order, start[None])
     return float((speed * driven - free[0]).max())
 
 
 def _length(roots: Sequence[Fraction], order: int, starts: Array, speed: float) -> float:
-    """Return how long v^(order) of some outputs gets, from a start (m, p) each."""
-    free, driven = _followed(roots, order, starts)
+    """Return the largest norm of v^(order) of m outputs from starts (m, p)."""
+    free, driven = _simulate_response(roots, order, starts)
     return float((speed * driven + np.linalg.norm(free, axis=0)).max())
 
 
-def _followed(roots: Sequence[Fraction], order: int, starts: Array) -> tuple[Array, Array]:
-    """Return what starts (m, p) leave of v^(order) on a fine grid, and int |h^(order)| until it."""
+def _simulate_response(roots: Sequence[Fraction], order: int, starts: Array) -> tuple[Array, Array]:
+    """Return the free response v^(order) from starts (m, p) and int_0^t |h^(order)| on a grid."""
     rho = np.array([float(root) for root in roots])
     times = np.linspace(0.0, 30.0 / rho.min(), _CELLS)
     modes = np.linalg.solve(np.vander(-rho, increasing=True).T, starts.T).T
     free = (modes * (-rho) ** order) @ np.exp(-np.outer(rho, times))
     kernel = _residues(roots) * (-rho) ** order
-    # Cells with their middle and ends (Simpson's rule).
+    # Simpson's rule: its error in smooth cells is far below `left + 1e-9`.
     step = times[1]
     ends = np.abs(kernel @ np.exp(-np.outer(rho, times)))
     middles = np.abs(kernel @ np.exp(-np.outer(rho, times[:-1] + 0.5 * step)))
@@ -119,7 +120,7 @@ def _followed(roots: Sequence[Fraction], order: int, starts: Array) -> tuple[Arr
 
 
 def _gain(roots: Sequence[Fraction], order: int) -> float:
-    """Return the integral of |h^(order)| over all time, and k0 more at the highest order."""
+    """Return the integral of |h^(order)| over all time, plus k0 at the highest order."""
     rho, c = np.array([float(root) for root in roots]), _residues(roots)
     kernel = c * (-rho) ** order
     # In s = exp(-unit t): dt = -ds / (unit s), and the powers are whole numbers.
@@ -136,20 +137,20 @@ def _gain(roots: Sequence[Fraction], order: int) -> float:
 
 
 def _modes(roots: Sequence[Fraction], order: int) -> list[Fraction]:
-    """Return the coefficients of h^(order), exactly."""
+    """Return the exact coefficients of h^(order) in the modes exp(-root t)."""
     k0, result = Fraction(1), list[Fraction]()
     for root in roots:
         k0 *= root
     for root in roots:
-        apart = Fraction(1)
+        differences = Fraction(1)
         for other in roots:
-            apart *= other - root if other != root else 1
-        result.append(k0 / apart * (-root) ** order)
+            differences *= other - root if other != root else 1
+        result.append(k0 / differences * (-root) ** order)
     return result
 
 
 def _unit(roots: Sequence[Fraction]) -> Fraction:
-    """Return the largest number of which all roots are multiples (Euclid)."""
+    """Return the greatest common divisor of the roots (Euclid)."""
     unit = roots[0]
     for root in roots[1:]:
         a, b = unit, root
@@ -163,7 +164,7 @@ def _unit(roots: Sequence[Fraction]) -> Fraction:
 
 
 def _sign_changes(p: Mapping[int, Fraction]) -> list[Fraction]:
-    """Return where a polynomial has roots in (0, 1), each to 2^-50."""
+    """Return the roots of a polynomial in (0, 1), each to 2^-50 (Sturm's theorem)."""
     low = min(p)
     dense = [p.get(n, Fraction(0)) for n in range(low, max(p) + 1)]
     chain = _sturm(dense)
@@ -182,7 +183,7 @@ def _sign_changes(p: Mapping[int, Fraction]) -> list[Fraction]:
 
 
 def _sturm(p: list[Fraction]) -> list[list[Fraction]]:
-    """Return Sturm's sequence of a polynomial by its coefficients, the lowest first."""
+    """Return the Sturm sequence of a polynomial; coefficients start at the lowest power."""
     chain = [p, [n * c for n, c in enumerate(p)][1:]]
     while len(chain[-1]) > 1:
         rest = [-c for c in _remainder(chain[-2], chain[-1])]
@@ -205,7 +206,7 @@ def _remainder(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
 
 
 def _variations(chain: list[list[Fraction]], x: Fraction) -> int:
-    """Return how often the signs of the sequence change at a place."""
+    """Return the number of sign changes of the sequence at x."""
     signs = []
     for part in chain:
         total = Fraction(0)

@@ -1,7 +1,7 @@
-"""An independent check of a saved gain: every promise is recomputed from the file alone.
+"""Independent verification of a saved gain: every claim is recomputed from the file alone.
 
-Nothing of the synthesis is used here: neither its matrices' algebra nor its exact arithmetic, its
-hull or its graphs. What is shared is what both speak of, the equations of the bundled models.
+No code of the synthesis is used: neither its matrix algebra nor its exact arithmetic, hulls or
+graphs. The equations of the bundled models are the only shared part.
 """
 
 import warnings
@@ -13,26 +13,26 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.core.types import PathLike
 from echelon.guarantees.verifier import exact_minors
-from echelon.guarantees.verifier.agent_claims import equations
-from echelon.guarantees.verifier.findings import Finding, facts, said
-from echelon.guarantees.verifier.graph_claims import drawn, spanned
-from echelon.guarantees.verifier.mode_claims import linearized
-from echelon.guarantees.verifier.region_claims import regional
+from echelon.guarantees.verifier.agent_claims import check_equations
+from echelon.guarantees.verifier.findings import Finding, decide, facts
+from echelon.guarantees.verifier.graph_claims import check_graph, check_spectrum
+from echelon.guarantees.verifier.mode_claims import check_linearization
+from echelon.guarantees.verifier.region_claims import check_region
 from echelon.guarantees.verifier.saved_gain import SavedGain, read
 from echelon.guarantees.verifier.tube_claims import read_tube, tube_findings
 
-# Rounding in the last digits of P, in units in which its diagonal is one.
+# Allowed asymmetry of P after scaling its diagonal to one: rounding of its last digits.
 _SKEW = 1e-12
 
 
 class Verification(NamedTuple):
-    """All findings, what they come to, and that in a sentence.
+    """All findings with their overall verdict.
 
     Attributes:
-        findings: one a claim.
-        verdict: `refused` where a claim does not hold, `incomplete` where all that could be checked
-            holds and something could not, else `verified`.
-        sentence: the same for a person.
+        findings: one per claim.
+        verdict: `refused` if a claim does not hold, `incomplete` if all checked claims hold and
+            some could not be checked, otherwise `verified`.
+        sentence: the verdict as text.
     """
 
     findings: tuple[Finding, ...]
@@ -46,52 +46,52 @@ class Verification(NamedTuple):
 
 
 def verify(path: PathLike, model: ControlAffine | None = None) -> Verification:
-    """Recompute what a saved gain, or a run under the law `stopping-point`, promises.
+    """Recompute all claims of a saved gain, or of a run under the law `stopping-point`.
 
     Args:
-        path: a file that `save_gain` wrote; or the `summary.json` of a run, or what `check --json`
-            printed, of which the tube of T5 is recomputed.
-        model: the agents, where they are no bundled model; without them what rests on their
-            equations is not checked, and the verdict is `incomplete`.
+        path: a file written by `save_gain`; or the `summary.json` of a run or the output of
+            `check --json`, of which the tube of T5 is recomputed.
+        model: the agents' model if it is not bundled. Without it, claims about its equations are
+            not checked and the verdict is `incomplete`.
 
     Raises:
-        GainError: the file is no gain, or lacks a part.
+        GainError: the file is not a gain file, or a part is missing.
     """
     tube = read_tube(path)
     if tube is not None:
-        return _verdict(_gathered(tube_findings(tube)))
+        return _verdict(_collect(tube_findings(tube)))
     saved = read(path)
-    result = _verdict(_gathered(_findings(saved, model)))
-    return result._replace(sentence=result.sentence + _without_decay(saved))
+    result = _verdict(_collect(_findings(saved, model)))
+    return result._replace(sentence=result.sentence + _no_decay_sentence(saved))
 
 
-def _gathered(found: Iterator[Finding]) -> tuple[Finding, ...]:
+def _collect(checks: Iterator[Finding]) -> tuple[Finding, ...]:
     findings = list[Finding]()
-    # Numbers of a false file may overflow: what is not finite fails the comparisons that follow.
+    # Numbers of a false file may overflow; comparisons with non-finite numbers then fail.
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            for finding in found:
+            for finding in checks:
                 findings.append(finding)
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-            # Numbers at which an algorithm gives up are no certificate.
-            findings.append(said("all of it can be computed", False, text=str(error)))
+            # A claim is refused if its computation fails: nothing was shown.
+            findings.append(decide("all of it can be computed", False, text=str(error)))
     return tuple(findings)
 
 
 def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[Finding]:
-    first = [*_definite(saved), *drawn(saved)]
+    first = [*_check_definite(saved), *check_graph(saved)]
     yield from first
-    # What follows rests on these.
+    # All later claims assume a valid graph and positive definite matrices.
     if any(item.verdict == "refused" for item in first):
         return
     recomputed = facts(saved)
-    first = [*spanned(recomputed)]
+    first = [*check_spectrum(recomputed)]
     yield from first
     if all(item.verdict != "refused" for item in first):
-        yield from linearized(recomputed)
-        yield from regional(recomputed)
-        yield from equations(recomputed, model)
+        yield from check_linearization(recomputed)
+        yield from check_region(recomputed)
+        yield from check_equations(recomputed, model)
 
 
 def _verdict(findings: tuple[Finding, ...]) -> Verification:
@@ -108,19 +108,19 @@ def _verdict(findings: tuple[Finding, ...]) -> Verification:
     return Verification(findings, "verified", f"Verified: {count}.")
 
 
-def _without_decay(saved: SavedGain) -> str:
-    """Return what a file that tells the truth about a gain that promises nothing is told."""
+def _no_decay_sentence(saved: SavedGain) -> str:
+    """Return the sentence that is added for a correct file whose gain is not stabilizing."""
     if saved.abscissa < 0.0:
         return ""
-    return f" By them nothing decays: the slowest mode is {saved.abscissa:.3g} 1/s."
+    return f" The gain guarantees no decay: the slowest mode is {saved.abscissa:.3g} 1/s."
 
 
-def _definite(saved: SavedGain) -> Iterator[Finding]:
+def _check_definite(saved: SavedGain) -> Iterator[Finding]:
     for name, matrix in (("P", saved.P), ("R", saved.R)):
         units = np.sqrt(np.abs(np.diag(matrix)))
         even = (np.abs(matrix - matrix.T) <= _SKEW * np.outer(units, units)).all()
         fine = bool(even) and exact_minors.is_positive_definite(
             exact_minors.rows_of(0.5 * (matrix + matrix.T))
         )
-        yield said(f"{name} is symmetric and positive definite", fine, text="exact minors")
-    yield said("the coupling is positive", saved.coupling > 0.0, saved.coupling)
+        yield decide(f"{name} is symmetric and positive definite", fine, text="exact minors")
+    yield decide("the coupling is positive", saved.coupling > 0.0, saved.coupling)
