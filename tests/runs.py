@@ -83,7 +83,7 @@ def made_up(
 def metered(meter, states, inputs, reference=None):
     """Return the sums over the steps that begin at all frames but the last."""
     with precision("float64"):
-        sums, limited = on_host(meter.nothing()), jnp.zeros(states.shape[1], bool)
+        sums, limited = on_host(meter.zero_sums()), jnp.zeros(states.shape[1], bool)
         for k in range(len(states) - 1):
             followed = None if reference is None else jnp.asarray(reference[k])
             x, u = jnp.asarray(states[k]), jnp.asarray(inputs[k])

@@ -309,7 +309,7 @@ def test_the_delay_that_is_left_is_that_of_the_delayed_network(graph):
     spread = lines[Topic.EIGENVALUE_RATIO]
     ratio = np.abs(np.linalg.eigvals(L)).max() / np.linalg.eigvals(L).real.min()
     assert spread.number == pytest.approx(ratio) and spread.fails and ratio > 4.0
-    assert f"{1e3 * delay:.3g} ms old" in spread.text
+    assert f"{1e3 * delay:.3g} ms;" in spread.text
 
 
 def test_agreement_bears_the_delay_that_is_told():

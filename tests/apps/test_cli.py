@@ -119,7 +119,7 @@ def test_a_users_own_agent_runs_as_from_python(here, echelon):
     ("change", "sentence"),
     [
         (("pendulum.py:Pendulum", "pendulum.py:Pendulun"), "did you mean `Pendulum`?"),
-        (("pendulum.py:Pendulum", "pendulum.py:NotAModel"), "is no `ControlAffine` class"),
+        (("pendulum.py:Pendulum", "pendulum.py:NotAModel"), "is not a `ControlAffine` class"),
         (("pendulum.py:Pendulum", "missing.py:Pendulum"), "does not exist"),
         (("pendulum.py:Pendulum", "pendulum.py:Wrong"), "has shape (1,), and must have shape (2,)"),
         (("damping: 0.5", "dampin: 0.5"), "did you mean `damping`?"),

@@ -66,7 +66,7 @@ def native(panel):
 
 @pytest.fixture
 def session(panel, swarm):
-    swarm.turn(panel.start)
+    swarm.apply(panel.start)
     swarm.restart()
     made = Session(panel.scenario, panel, swarm)
     yield made
@@ -85,7 +85,7 @@ def flown(swarm, pictures=10):
 def test_a_live_loop_is_the_loop_of_a_run_and_tells_its_v(panel, swarm, native):
     whole = ech.run(panel.scenario)
     for each in (swarm, native):
-        each.turn(panel.start)
+        each.apply(panel.start)
         np.testing.assert_allclose(flown(each), whole.states[1:], atol=1e-12)
     assert swarm.advance(still=True).lyapunov == pytest.approx(lyapunov(whole).value[-1], rel=1e-9)
 
@@ -122,7 +122,7 @@ def test_a_knob_does_what_its_key_in_the_scenario_does(panel, swarm, native, nam
     parts, settings = build(panel.scenario_at(knobs))
     wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
     for each in (swarm, native):
-        each.turn(knobs)
+        each.apply(knobs)
         np.testing.assert_allclose(flown(each), wanted.states[1:], atol=1e-11)
     V = swarm.advance(still=True).lyapunov
     assert V == pytest.approx(lyapunov(wanted).value[-1], rel=1e-9)
@@ -131,13 +131,13 @@ def test_a_knob_does_what_its_key_in_the_scenario_does(panel, swarm, native, nam
 
 def test_no_knob_compiles_anything_again(panel, swarm, native, monkeypatch):
     for each in (swarm, native):
-        each.turn(panel.start)
+        each.apply(panel.start)
         each.advance()
         traced = []
         monkeypatch.setattr(sequence, "control", lambda *_: traced.append(1))
         monkeypatch.setattr(kernel_cache, "program", lambda *_: traced.append(1))
         for change in KNOBS.values():
-            each.turn(panel.start._replace(**change))
+            each.apply(panel.start._replace(**change))
             each.advance()
         each.kick(1, np.ones(4))
         each.advance(still=True)
@@ -183,7 +183,7 @@ def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
         parts, settings = build(panel.scenario_at(knobs))
         settings = settings._replace(horizon=1.2)
         wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
-        swarm.turn(knobs)
+        swarm.apply(knobs)
         np.testing.assert_allclose(flown(swarm, 30), wanted.states[1:], atol=1e-11)
 
 
@@ -215,7 +215,7 @@ def test_another_method_brings_its_gain_and_its_coupling(session):
 
 def test_the_error_is_the_distance_from_the_goal_of_the_turned_formation(panel, swarm):
     knobs = panel.start._replace(size=2.0, turn=90.0)
-    swarm.turn(knobs)
+    swarm.apply(knobs)
     swarm.restart()
     picture = swarm.advance()
     # Twice as large and a quarter to the left: (1, 0) goes to (0, 2), (1, 1) to (-2, 2).

@@ -165,7 +165,7 @@ def test_two_scenarios_get_a_folder_each(tmp_path, capsys):
     arguments = ["compare", "integrators", "van-der-pol", "--horizon", "0.1", "--no-figures"]
     app([*arguments, "--method", "riccati", "--out", str(out)], standalone_mode=False)
     assert sorted(path.name for path in out.iterdir()) == ["integrators", "van-der-pol"]
-    assert "what it takes" in capsys.readouterr().out
+    assert "costs" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

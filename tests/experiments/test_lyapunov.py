@@ -97,7 +97,7 @@ def test_the_printed_algorithm_is_caught_where_v_rises_against_theory():
     v = lyapunov(result)
     assert v.forbidden().sum() > 3
     assert "Warning: V increased at " in ech.report(result)
-    assert "the step `dt` is too long" in " ".join(ech.report(result).split())
+    assert "The step `dt` is too long; halve it." in " ".join(ech.report(result).split())
 
 
 def test_laws_without_a_metric_have_no_v():

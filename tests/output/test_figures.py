@@ -18,6 +18,7 @@ CERTIFIED = PROMISE | {
     "certified_set": {"radius": 9.0, "kind": "proof", "why": ""},
     "hypotheses": [{"statement": "starts in the certified set", "verdict": "holds"}],
 }
+WINDY = {"statement": "Assumption 3, exact states", "verdict": "fails"}
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +110,7 @@ def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_s
         {"promise": CERTIFIED | {"theorem": "T2"}},
         {"promise": CERTIFIED | {"hypotheses": []}},
         {"promise": CERTIFIED | {"promised": False}},
-        {"promise": CERTIFIED | {"sentence": "The guarantee ignores that wind acts."}},
+        {"promise": CERTIFIED | {"hypotheses": [*CERTIFIED["hypotheses"], WINDY]}},
     ],
 )
 def test_no_bound_is_drawn_that_is_not_promised_of_the_run(run, spoiled):

@@ -160,7 +160,7 @@ def test_a_run_is_taken_back_in_stretches_as_in_one(monkeypatch):
     once = ech.gradient(parts, settings, with_distances, WRT)
     monkeypatch.setattr(backward, "_TAPE", 1)
     # The run that is ready has a tape already.
-    monkeypatch.setattr(gradients, "_ready", ready_runs())
+    monkeypatch.setattr(gradients, "_cache", ready_runs())
     again = ech.gradient(parts, settings, with_distances, WRT)
     for name in WRT:
         np.testing.assert_array_equal(once.slopes[name], again.slopes[name])
@@ -181,7 +181,7 @@ def test_a_run_that_is_ready_is_differentiated_anew_for_each_gain(monkeypatch, e
     gains = ((1.5, 0.8, 2.0), (1.2, 0.9, 2.0), (1.5, 0.8, 2.0), (1.5, 0.8, 1.0))
     ready = [ech.gradient(regained(parts, *gain), settings, squares, wrt) for gain in gains]
     for gain, found in zip(gains, ready, strict=True):
-        monkeypatch.setattr(gradients, "_ready", ready_runs())
+        monkeypatch.setattr(gradients, "_cache", ready_runs())
         alone = ech.gradient(regained(parts, *gain), settings, squares, wrt)
         assert found.value == alone.value and found.engine == engine
         for name in wrt:
@@ -217,7 +217,7 @@ class Waning(ech.models.SingleIntegrator):
 
 
 def test_a_run_of_a_user_s_class_is_made_anew(monkeypatch):
-    monkeypatch.setattr(gradients, "_ready", ready_runs())
+    monkeypatch.setattr(gradients, "_cache", ready_runs())
     parts = integrators(0.5).replace(model=Waning(1))
     settings = ech.Settings(0.2, 0.1, integrator="euler", engine="native")
 
@@ -227,11 +227,11 @@ def test_a_run_of_a_user_s_class_is_made_anew(monkeypatch):
     assert value() == pytest.approx(0.7**2 * (1.0 + 0.85**2))
     monkeypatch.setitem(globals(), "RATE", 5.0)
     assert value() == pytest.approx(0.7**2 * (1.0 + 0.45**2))
-    assert not gradients._ready
+    assert not gradients._cache
 
 
 def test_offsets_written_to_are_another_formation_and_equal_ones_the_same(monkeypatch):
-    monkeypatch.setattr(gradients, "_ready", ready_runs())
+    monkeypatch.setattr(gradients, "_cache", ready_runs())
     parts, settings = integrators(0.5), ech.Settings(0.2, 0.1, integrator="euler", engine="jax")
 
     def value(offsets):
@@ -240,16 +240,16 @@ def test_offsets_written_to_are_another_formation_and_equal_ones_the_same(monkey
 
     goals = ech.Formation(np.array([[0.0], [0.0]]))
     first = value(goals)
-    assert value(ech.Formation(np.zeros((2, 1)))) == first and len(gradients._ready) == 1
+    assert value(ech.Formation(np.zeros((2, 1)))) == first and len(gradients._cache) == 1
     goals.offsets.setflags(write=True)
     goals.offsets[1] = 0.7
     # Of a follower on its goal nothing is left to sum.
     assert value(goals) == 0.0 < first == value(ech.Formation(np.zeros((2, 1))))
-    assert len(gradients._ready) == 2
+    assert len(gradients._cache) == 2
 
 
 def test_what_is_kept_has_a_bound_in_bytes_and_holds_no_moments(monkeypatch):
-    monkeypatch.setattr(gradients, "_ready", ready_runs())
+    monkeypatch.setattr(gradients, "_cache", ready_runs())
     settings = ech.Settings(0.2, 0.1, engine="native")
 
     def differentiate(start):
@@ -257,17 +257,17 @@ def test_what_is_kept_has_a_bound_in_bytes_and_holds_no_moments(monkeypatch):
         ech.gradient(parts, settings, squares, ("coupling",))
         return content_of(parts, settings, ("coupling",))
 
-    ready = gradients._ready.pop(differentiate(0.7))
-    assert not any(way.moments for way in ready._native._ways.values())
-    way = next(iter(ready._native._ways.values()))
+    ready = gradients._cache.pop(differentiate(0.7))
+    assert not any(way.moments for way in ready._native._passes.values())
+    way = next(iter(ready._native._passes.values()))
     assert ready.size > way.tape.nbytes + way.cotangents.nbytes
-    monkeypatch.setattr(gradients, "_ready", ready_runs(2 * ready.size))
+    monkeypatch.setattr(gradients, "_cache", ready_runs(2 * ready.size))
     for start in (0.8, 0.9, 0.6):
         differentiate(start)
-    assert 1 <= len(gradients._ready) <= 2
-    monkeypatch.setattr(gradients, "_ready", ready_runs(10))
+    assert 1 <= len(gradients._cache) <= 2
+    monkeypatch.setattr(gradients, "_cache", ready_runs(10))
     differentiate(0.7)
-    assert not gradients._ready
+    assert not gradients._cache
 
 
 class Stretched(ech.models.SingleIntegrator):
@@ -286,7 +286,7 @@ def test_what_cannot_be_taken_back_natively_is_by_jax_and_says_so(monkeypatch):
     monkeypatch.setattr(gradients, "_WORTH", 1)
     found = ech.gradient(parts, settings, squares, ("P",))
     assert found.engine == "jax"
-    assert found.warnings[0].startswith(f"JAX takes the steps back, since {told}")
+    assert found.warnings[0].startswith(f"JAX differentiates the steps, since {told}")
 
 
 def test_where_two_agents_meet_the_distance_between_them_takes_no_slope_away():

@@ -241,7 +241,7 @@ def test_an_infeasible_problem_names_what_must_be_missed_and_by_how_much():
     assert missed.amount == pytest.approx(4.75, abs=1e-5)
     assert found.message == (
         "ipopt failed to solve the problem: it found that the constraints contradict each other "
-        "nearby; what is missed at least: `arrival` by 4.75 at 1 s."
+        "nearby; smallest possible violations: `arrival` by 4.75 at 1 s."
     )
 
 
@@ -273,7 +273,7 @@ def test_a_solver_that_stops_early_says_so_and_what_its_plan_misses():
     )
     assert found.states == pytest.approx(states) and found.inputs == pytest.approx(inputs)
     assert not found.solved and found.iterations == 0
-    start = "ipopt failed to solve the problem: it used up its iterations; what is missed most: "
+    start = "ipopt failed to solve the problem: it used up its iterations; largest violations: "
     assert found.message.startswith(start)
 
     def worst(amounts, times):

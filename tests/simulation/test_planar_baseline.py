@@ -189,7 +189,7 @@ def test_a_follower_of_two_neighbours_must_turn_with_them_which_its_torque_does_
     [missed] = third.violations
     assert missed.name == "squared distance"
     assert missed.amount == pytest.approx(0.0029, abs=2e-4)
-    assert "what is missed at least: `squared distance` by 0.00" in third.message
+    assert "smallest possible violations: `squared distance` by 0.00" in third.message
     # A penalty finds the compromise.
     plans = PlanarBaseline.repaired(separation="penalty").plans(triangle, offsets)
     assert all(plan.solved for plan in plans)

@@ -32,8 +32,8 @@ this is hardly ever reached."""
 CHAIN_SHARE = 0.96
 """Of all links together, of a bounded output: a leader is then to start on its path there."""
 _SPREAD = 0.125
-"""Roots of a rate r are r, 1.125 r, 1.25 r, ..: apart, as the certificate wants them."""
-_STILL = 1e-9
+"""Roots of a rate r are r, 1.125 r, 1.25 r, ..: distinct, as the certificate requires."""
+_REST = 1e-9
 """Of a bounded length: what floats leave of 0."""
 _LEAST = 1e-3
 """Of the push upward at the trim: what is left of it a thousandth of a radian from the border."""
@@ -186,13 +186,13 @@ class FlatLaw(Law):
 
     # ---- what any agent does ----
 
-    def begun(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
-        """Return the memory of an agent that begins at x and follows what has these derivatives."""
-        return self.ready.begun(model, x, switch_on(model, self.ready.chains, x, ahead))
+    def initial_memory(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
+        """Return the memory of an agent that begins at x, with the derivatives of its reference."""
+        return self.ready.initial_memory(model, x, switch_on(model, self.ready.chains, x, ahead))
 
     def init(self) -> FlatMemory:
         """Return a memory of zeros."""
-        return self.ready.nothing()
+        return self.ready.zero_memory()
 
     def signal(
         self, model: ControlAffine, x: State, offset: State, memory: FlatMemory
@@ -205,20 +205,25 @@ class FlatLaw(Law):
         return memory.rate
 
     def settle(
-        self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: FlatMemory
+        self,
+        model: ControlAffine,
+        view: LocalView,
+        desired: Input,
+        delivered: Input,
+        memory: FlatMemory,
     ) -> FlatMemory:
         """Return the memory with the input that the actuators delivered."""
-        return self.ready.settle(model, view.x, wanted, got, memory, view.period)
+        return self.ready.settle(model, view.x, desired, delivered, memory, view.period)
 
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
         """Yield the starts outside of the model's flat coordinates."""
         for bound in model.flat_bounds or ():
             if len(bound.outputs) > 1:
-                yield from self._still(model, states, bound)
+                yield from self._starts_at_rest(model, states, bound)
             else:
                 yield from _outside(self.ready.chains, model, states, bound)
 
-    def _still(
+    def _starts_at_rest(
         self, model: ControlAffine, states: Array, bound: FlatBound
     ) -> Iterator[tuple[int, str]]:
         """Yield the rows of states (K, n) at which a bounded vector is 0, and has no direction."""
@@ -230,7 +235,7 @@ class FlatLaw(Law):
 
         values = np.asarray(jax.vmap(one)(jnp.asarray(states)))[:, bound.derivative, places]
         names = listing(name + "'" * bound.derivative for name in bound.outputs)
-        for k in np.flatnonzero(~(np.linalg.norm(values, axis=1) > bound.above + _STILL)):
+        for k in np.flatnonzero(~(np.linalg.norm(values, axis=1) > bound.above + _REST)):
             yield int(k), f"{names} are 0 there, and allowed is {bound.within}"
 
 
@@ -251,10 +256,10 @@ def _left(roots: tuple[float, ...], bound: FlatBound, slowest: float) -> float:
     if bound.derivative == 1:
         return allowed / math.sqrt(len(bound.outputs))
     # v' is at most the variation of h over that speed, and h rises once to its largest value.
-    apart = [np.prod([b - a for b in roots if b != a]) for a in roots]
+    products = [np.prod([b - a for b in roots if b != a]) for a in roots]
     times = np.linspace(0.0, 20.0 / min(roots), 20_000)
     falls = np.exp(-np.outer(roots, times))
-    h = (np.prod(roots) / np.array(apart)) @ falls
+    h = (np.prod(roots) / np.array(products)) @ falls
     return allowed / (2.0 * float(h.max())) / math.sqrt(len(bound.outputs))
 
 

@@ -27,7 +27,7 @@ class FlatMemory(NamedTuple):
     Attributes:
         chain: the states of the integrators before inputs, normalized (k,).
         rate: zeta' that it commands, (m,), which followers may receive.
-        got: the normalized input (m,) that the actuators delivered in the step before.
+        delivered: the normalized input (m,) that the actuators delivered in the step before.
         base, push: of the observer (m,): the speed that the model predicts but for the last half
             step, and the acceleration that the model lacks.
         half: half of the step before, s; 0 at first.
@@ -35,7 +35,7 @@ class FlatMemory(NamedTuple):
 
     chain: jax.Array
     rate: jax.Array
-    got: jax.Array
+    delivered: jax.Array
     base: jax.Array
     push: jax.Array
     half: jax.Array
@@ -69,35 +69,37 @@ class FlatLoop(eqx.Module):
 
     # ---- memory ----
 
-    def nothing(self) -> FlatMemory:
+    def zero_memory(self) -> FlatMemory:
         """Return a memory of zeros."""
         zero = jnp.zeros(len(self.stiffness))
         return FlatMemory(jnp.zeros(self.chains.size), zero, zero, zero, zero, jnp.zeros(()))
 
-    def begun(self, model: ControlAffine, x: State, chain: jax.Array) -> FlatMemory:
+    def initial_memory(self, model: ControlAffine, x: State, chain: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x, with an exact model."""
         zero = jnp.zeros(len(self.stiffness), x.dtype)
-        held = FlatMemory(chain, zero, zero, zero, zero, jnp.zeros((), x.dtype))
-        return held._replace(base=self._observed(model, x, held.got)[0])
+        memory = FlatMemory(chain, zero, zero, zero, zero, jnp.zeros((), x.dtype))
+        return memory._replace(base=self._observed(model, x, memory.delivered)[0])
 
     # ---- coordinates ----
 
-    def place(self, model: ControlAffine, x: State, offset: State, held: FlatMemory) -> jax.Array:
+    def place(self, model: ControlAffine, x: State, offset: State, memory: FlatMemory) -> jax.Array:
         """Return zeta less the offset, (m,): where the agent would come to rest."""
         outputs = self.chains.outputs
         shift = flat_output(model, outputs, offset) - flat_output(model, outputs, 0.0 * offset)
-        return self.stop(self._flat_values(model, x, held)) - shift
+        return self.stop(self._flat_values(model, x, memory)) - shift
 
     def stop(self, values: jax.Array) -> jax.Array:
         """Return zeta (m,) of flat coordinates (r, m)."""
         return (jnp.asarray(self.weights, values.dtype) * values).sum(axis=0)
 
-    def _flat_values(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
+    def _flat_values(self, model: ControlAffine, x: State, memory: FlatMemory) -> jax.Array:
         """Return the flat coordinates (r, m), corrected by the observer."""
-        values = flatten(model, self.chains, x, held.chain).values
+        values = flatten(model, self.chains, x, memory.chain).values
         if not self.observer:
             return values
-        for order, more in zip((2, 3), (held.push, self._push_rate(model, x, held)), strict=True):
+        for order, more in zip(
+            (2, 3), (memory.push, self._push_rate(model, x, memory)), strict=True
+        ):
             inside = np.array(self.chains.degrees) > order
             if inside.any():
                 values = values.at[order].add(jnp.where(inside, more, 0.0))
@@ -110,21 +112,24 @@ class FlatLoop(eqx.Module):
         model: ControlAffine,
         x: State,
         rate: jax.Array,
-        held: FlatMemory,
+        memory: FlatMemory,
         period: Scalar | float,
     ) -> tuple[Input, FlatMemory]:
         """Return the physical input that makes zeta move at a rate (m,), and the next memory."""
-        flat, values = flatten(model, self.chains, x, held.chain), self._flat_values(model, x, held)
+        flat, values = (
+            flatten(model, self.chains, x, memory.chain),
+            self._flat_values(model, x, memory),
+        )
         degrees = np.array(self.chains.degrees)
         lower = np.arange(len(values))[:, None] < degrees - 1
         k = jnp.where(lower, jnp.asarray(self.weights, x.dtype), 0.0)
         tops = rate - (k[:-1] * values[1:]).sum(axis=0)
         tops = jnp.asarray(self.stiffness, x.dtype) * tops
         if self.observer:
-            tops = tops - jnp.where(degrees <= 2, held.push, 0.0)
+            tops = tops - jnp.where(degrees <= 2, memory.push, 0.0)
         w = flat.invert(tops)
-        chain, mean = self._integrate(held.chain, w, period)
-        return model.physical(mean), held._replace(chain=chain, rate=rate)
+        chain, mean = self._integrate(memory.chain, w, period)
+        return model.physical(mean), memory._replace(chain=chain, rate=rate)
 
     def _integrate(self, e: jax.Array, w: Input, period: Scalar | float) -> tuple[jax.Array, Input]:
         """Return the integrators after a hold, and the mean (m,) of their outputs during it."""
@@ -140,39 +145,39 @@ class FlatLoop(eqx.Module):
         self,
         model: ControlAffine,
         x: State,
-        wanted: Input,
-        got: Input,
-        held: FlatMemory,
+        desired: Input,
+        delivered: Input,
+        memory: FlatMemory,
         period: Scalar | float,
     ) -> FlatMemory:
-        """Return the memory once the actuators have delivered `got` of the `wanted` input."""
-        v = model.normalized(got)
+        """Return the memory after the actuators delivered `delivered` of the `desired` input."""
+        v = model.normalized(delivered)
         # An integrator that continues while an actuator is at its limit would wind up.
-        missed = jnp.where(got == wanted, 0.0, v - model.normalized(wanted))
+        shortfall = jnp.where(delivered == desired, 0.0, v - model.normalized(desired))
         first = [(at[0], k) for k, at in enumerate(self.chains.indices) if at]
-        chain = held.chain
+        chain = memory.chain
         for place, k in first:
-            chain = chain.at[place].add(missed[k])
+            chain = chain.at[place].add(shortfall[k])
         if not self.observer:
-            return held._replace(chain=chain)
+            return memory._replace(chain=chain)
         speed, pull = self._observed(model, x, v)
-        error = self._speed_error(model, x, held)
+        error = self._speed_error(model, x, memory)
         half = 0.5 * period
-        base = speed - error + half * pull + period * (held.push + _OBSERVER[0] * error)
-        push = held.push + period * _OBSERVER[1] * error
-        return FlatMemory(chain, held.rate, v, base, push, half + 0.0 * error[0])
+        base = speed - error + half * pull + period * (memory.push + _OBSERVER[0] * error)
+        push = memory.push + period * _OBSERVER[1] * error
+        return FlatMemory(chain, memory.rate, v, base, push, half + 0.0 * error[0])
 
     # ---- the observer ----
 
-    def _speed_error(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
+    def _speed_error(self, model: ControlAffine, x: State, memory: FlatMemory) -> jax.Array:
         """Return the speed less what the model and the estimate predict, (m,)."""
-        speed, pull = self._observed(model, x, held.got)
+        speed, pull = self._observed(model, x, memory.delivered)
         # A trapezoid from the start of the hold to its end, in which the input is the same.
-        return speed - (held.base + held.half * pull)
+        return speed - (memory.base + memory.half * pull)
 
-    def _push_rate(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
+    def _push_rate(self, model: ControlAffine, x: State, memory: FlatMemory) -> jax.Array:
         """Return the rate of the estimated push, (m,)."""
-        return _OBSERVER[1] * self._speed_error(model, x, held)
+        return _OBSERVER[1] * self._speed_error(model, x, memory)
 
     def _observed(self, model: ControlAffine, x: State, v: Input) -> tuple[jax.Array, jax.Array]:
         """Return what the observer measures of each output, and its rate under an input v, (m,).

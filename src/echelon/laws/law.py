@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Iterator
-from typing import Any, ClassVar, TypeAlias, final
+from typing import ClassVar, TypeAlias, final
 
 import equinox as eqx
 import jax
@@ -16,11 +16,11 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide
 from echelon.core.errors import LawError
-from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.types import Array, Input, PyTree, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.synthesis.gains.gain import Gain
 
-Memory: TypeAlias = Any
+Memory: TypeAlias = PyTree
 
 
 @final
@@ -156,9 +156,14 @@ class Law(eqx.Module):
         return None
 
     def settle(
-        self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: Memory
+        self,
+        model: ControlAffine,
+        view: LocalView,
+        desired: Input,
+        delivered: Input,
+        memory: Memory,
     ) -> Memory:
-        """Return the memory once the actuators have delivered `got` of the `wanted` input (m,)."""
+        """Return the memory after a step, given the desired and the delivered input (m,)."""
         return memory
 
     def message(
@@ -231,7 +236,7 @@ def without_certificates(law: Law) -> Law:
     So another coupling, or another graph of the same size, compiles nothing again.
     """
 
-    def strip(node: Any) -> Any:
+    def strip(node: object) -> object:
         if not isinstance(node, Gain):
             return node
         # `filter_jit` takes floats for constants: every other graph would be compiled anew.

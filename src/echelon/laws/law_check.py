@@ -1,7 +1,5 @@
 """The checks of a law before its first run: what it returns, and whether it fits the model."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -14,7 +12,7 @@ from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.trace import check_array, checked_trace
 from echelon.core.words import Feedforward
-from echelon.laws.law import Law, LocalView, reference_of
+from echelon.laws.law import Law, LocalView, Memory, reference_of
 
 _ADVICE = "it must be written with `jax.numpy` and take what one agent knows"
 
@@ -72,6 +70,7 @@ def _check_law(law: Law, model: ControlAffine) -> None:
             "memory: `return u, memory`."
         )
     check_array(LawError, f"the input of `{name}`", output[0], (m,))
+    # A compiled loop carries the memory, whose shapes and types cannot change.
     if _form(memory) != _form(output[1]):
         raise LawError(
             f"the memory of `{name}` is {_in_words(memory)} at first and {_in_words(output[1])} "
@@ -79,7 +78,7 @@ def _check_law(law: Law, model: ControlAffine) -> None:
         )
 
 
-def _memory(law: Law) -> Any:
+def _memory(law: Law) -> Memory:
     """Return the memory of one agent at the beginning, arrays all."""
     memory = law.init()
     try:
@@ -109,12 +108,12 @@ def _view(law: Law, model: ControlAffine) -> LocalView:
     return LocalView(jnp.zeros(()), x, x, z, forward)
 
 
-def _form(memory: Any) -> Any:
+def _form(memory: Memory) -> tuple[object, ...]:
     leaves, structure = jax.tree.flatten(memory)
     return structure, [(leaf.shape, leaf.dtype) for leaf in leaves]
 
 
-def _in_words(memory: Any) -> str:
+def _in_words(memory: Memory) -> str:
     """Return the types and shapes of a memory, such as `float64 (3,), float64 ()`."""
     leaves = jax.tree.leaves(memory)
     return ", ".join(f"{leaf.dtype} {leaf.shape}" for leaf in leaves) or "nothing"

@@ -185,7 +185,7 @@ class StoppingPoint(FlatLaw):
 
     def begin(self, model: ControlAffine, x: State) -> FlatMemory:
         """Return the memory of an agent that begins at x, with its integrators level."""
-        return self.begun(model, x, jnp.asarray(self.ahead, x.dtype))
+        return self.initial_memory(model, x, jnp.asarray(self.ahead, x.dtype))
 
     def strength(self, period: Scalar | float) -> Scalar | float:
         """Return c where inputs are held for a period (s)."""
@@ -288,7 +288,7 @@ class StoppingLeader(FlatLaw):
 
     def begin(self, model: ControlAffine, x: State) -> FlatMemory:
         """Return the memory of a leader that begins at x, as level as its path."""
-        return self.begun(model, x, self.begins(model).astype(x.dtype))
+        return self.initial_memory(model, x, self.begins(model).astype(x.dtype))
 
     def strength(self, period: Scalar | float) -> Scalar | float:
         """Return c where inputs are held for a period (s)."""

@@ -6,14 +6,15 @@ equations, and where errors grow after the first transient.
 """
 
 import threading
-from collections.abc import Callable, Mapping
-from typing import Any, final
+from collections.abc import Callable
+from typing import final
 
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.apps.live.swarm import Picture
+from echelon.core.types import JsonObject
 from echelon.simulation.step.meter import SETTLED, outside
 
 _TRANSIENT = 2.0
@@ -40,14 +41,14 @@ class GuaranteeStatus:
     """
 
     def __init__(
-        self, model: ControlAffine, graph: Graph, show: Callable[[Mapping[str, Any]], None]
+        self, model: ControlAffine, graph: Graph, show: Callable[[JsonObject], None]
     ) -> None:
         """Begin without a guarantee."""
         self.names, self.followers = [*model.chart], list(graph.followers)
         self.columns = [model.state_names.index(name) for name in self.names]
         self.chart = np.array([*model.chart.values()], float).reshape(-1, 2)
         self.show, self.lock, self.severity = show, threading.Lock(), 0
-        self.badge: Mapping[str, Any] = {"state": "pending"}
+        self.badge: JsonObject = {"state": "pending"}
         self.restart()
 
     def restart(self) -> None:
@@ -61,7 +62,7 @@ class GuaranteeStatus:
         self.since, self.transient, self.growing, self.large = np.nan, 0.0, False, False
         self.fresh = False
 
-    def update(self, badge: Mapping[str, Any]) -> None:
+    def update(self, badge: JsonObject) -> None:
         """Show the badge of another guarantee, withdrawn if it does not cover the state."""
         with self.lock:
             self.badge = badge
@@ -128,7 +129,7 @@ class GuaranteeStatus:
             return 2
         return int(self.large and not self.badge.get("anywhere"))
 
-    def _current(self) -> Mapping[str, Any]:
+    def _current(self) -> JsonObject:
         """Return the badge for the present state."""
         self.severity = self._severity()
         if self.severity == 0:
@@ -138,7 +139,7 @@ class GuaranteeStatus:
         causes = [cause for cause in (*self.badge["beyond"], self.departure) if cause]
         return self._replaced("lost", "the guarantee does not cover this state", causes)
 
-    def _replaced(self, state: str, short: str, causes: list[str]) -> Mapping[str, Any]:
+    def _replaced(self, state: str, short: str, causes: list[str]) -> JsonObject:
         whole = f"{' '.join(causes)} {self.badge['whole']}"
         return {**self.badge, "state": state, "short": short, "whole": whole, "causes": causes}
 

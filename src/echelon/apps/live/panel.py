@@ -1,6 +1,6 @@
 """The controls of the live page, each with its range, label, unit and scenario keys."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -263,7 +263,7 @@ class Panel:
             section |= {} if schedule.period is None else {"period": schedule.period}
         return {"edges": edges[0], **section}
 
-    def saved(self, events: Sequence[Mapping[str, Any]]) -> str:
+    def saved(self, events: Sequence[JsonObject]) -> str:
         """Return the YAML of the scenario with live events, which it repeats."""
         data = self.live.data()
         # With absolute paths, since it may be saved in another folder.

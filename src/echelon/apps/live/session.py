@@ -177,7 +177,7 @@ class Session:
 
     # ---- pages ----------------------------------------------------------------------------------
 
-    def send(self, message: Mapping[str, Any]) -> None:
+    def send(self, message: JsonObject) -> None:
         """Send a message to all pages."""
         block = struct.pack("<I", _MESSAGE) + json.dumps(message).encode()
         with self.changed:
@@ -226,7 +226,7 @@ class Session:
 
     # ---- changes --------------------------------------------------------------------------------
 
-    def ask(self, request: Mapping[str, Any]) -> JsonObject:
+    def ask(self, request: JsonObject) -> JsonObject:
         """Apply the request of a page before the next picture, and return the event.
 
         Raises:
@@ -279,7 +279,7 @@ class Session:
         jump[axes[: len(direction)]] = size * np.array(direction)
         return [round(float(x), 6) for x in jump]
 
-    def apply(self, event: Mapping[str, Any]) -> None:
+    def apply(self, event: JsonObject) -> None:
         """Apply an event, and record it with its time."""
         now = round(self.swarm.steps * self.swarm.settings.dt, 9)
         knobs = self.knobs
@@ -297,7 +297,7 @@ class Session:
         if knobs != self.knobs:
             self.knobs = knobs
             self.status.begin()
-            self.swarm.turn(knobs)
+            self.swarm.apply(knobs)
             self.promiser.ask(self.panel, knobs)
             self.send(self.state())
 

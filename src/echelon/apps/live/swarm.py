@@ -1,7 +1,7 @@
-"""The closed loop as it runs live, and knobs that compile nothing."""
+"""The live closed loop: steps for each picture, and knobs that change it without compiling."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
@@ -17,7 +17,7 @@ from echelon.apps.live.live_stepper import choose_stepper
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import GraphError
 from echelon.core.numerics import Precision, precision
-from echelon.core.types import Array
+from echelon.core.types import Array, PyTree
 from echelon.experiments.results.lyapunov import goes_both_ways, potential
 from echelon.laws.law import Law
 from echelon.simulation.engine.law_drive import Laws
@@ -29,16 +29,16 @@ from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain
 
 PICTURE = 0.04
-"""Seconds of a picture."""
+"""Seconds between two pictures."""
 _AHEAD = 60.0
-"""Seconds for which it is known when the graph switches."""
+"""Seconds ahead for which the times of the graph's switches are computed, at least."""
 
 
 class Picture(NamedTuple):
-    """What is seen at a time (s): states (N, n), inputs (N, m), errors (N,), offsets (N, n).
+    """The swarm at a time (s): states (N, n), inputs (N, m), errors (N,), offsets (N, n).
 
-    `lyapunov` is V, NaN where there is none; `beyond` (N,) are those whose numbers are none, or
-    beyond what is computed.
+    `lyapunov` is V, NaN if it does not exist; `beyond` (N,) marks the agents whose states or inputs
+    are not finite, or are too large for the stepper.
     """
 
     time: float
@@ -52,7 +52,7 @@ class Picture(NamedTuple):
 
 @final
 class LiveLoop:
-    """Agents under laws that go on for as long as someone watches.
+    """Agents under laws that are simulated without an end time.
 
     Args:
         parts: of a scenario.
@@ -64,7 +64,7 @@ class LiveLoop:
     """
 
     def __init__(self, parts: Parts, settings: Settings, panel: LiveParts) -> None:
-        """Prepare what the steps need."""
+        """Prepare the loop and its stepper."""
         disturbance = parts.world.disturbance or Disturbance()
         world = dataclasses.replace(parts.world, disturbance=disturbance)
         prepared = prepare(parts.replace(world=world), settings)
@@ -75,14 +75,14 @@ class LiveLoop:
         law = loop.follower
         gain = panel.gain(panel.start)
         if gain is not None:
-            law = eqx.tree_at(lambda each: each.gain.inner, law, _inner(gain), is_leaf=_is_none)
+            law = eqx.tree_at(lambda law: law.gain.inner, law, _inner(gain), is_leaf=_is_none)
         elif panel.start.coupling is not None:
             c = np.asarray(panel.start.coupling)
-            law = eqx.tree_at(lambda each: each.coupling, law, c, is_leaf=_is_none)
+            law = eqx.tree_at(lambda law: law.coupling, law, c, is_leaf=_is_none)
         # The share of the feed-forward is a number of the loop, so that a knob can change it.
         self.loop: Loop = dataclasses.replace(loop, follower=law, share=np.asarray(1.0))
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
-        self.potentials: dict[Any, Callable[[Array], Array]] = {}
+        self.potentials: dict[Hashable, Callable[[Array], Array]] = {}
         self.states, self.measured = problem.states, list(problem.meter.measured)
         self.nearest = np.array(parts.graph.nearest_leader())
         self.weights = np.asarray(loop.exchange.weights, np.float64)
@@ -92,17 +92,17 @@ class LiveLoop:
         self.potential = self._potential(panel.start)
         self.ahead = range(0)
         self._look_ahead(0)
-        engine = choose_stepper(self.loop, self._unlike(), self.states, settings)
+        engine = choose_stepper(self.loop, self._variant(), self.states, settings)
         self.stepper = engine.stepper
         self.precision: Precision = engine.precision
         self.restart()
 
-    def _unlike(self) -> Loop:
-        """Return a loop that differs from this one in all that a knob turns, but for weights."""
+    def _variant(self) -> Loop:
+        """Return a loop that differs in all numbers that knobs change, except for weights."""
         other = [np.full(np.shape(leaf), np.nan) for leaf in self._adjustable(self.loop)]
         return eqx.tree_at(self._adjustable, self.loop, tuple(other))
 
-    def _adjustable(self, loop: Loop) -> tuple[Any, ...]:
+    def _adjustable(self, loop: Loop) -> tuple[PyTree, ...]:
         """Return the numbers that knobs change: the feed-forward's share, and those of the law."""
         follower: Any = loop.follower
         if self.panel.start.coupling is None:
@@ -113,15 +113,15 @@ class LiveLoop:
         return loop.share, gain.coupling, gain.P, gain.R, gain.R_inverse, gain.inner
 
     def _look_ahead(self, step: int) -> None:
-        """Let the loop know when the graph switches in the periods about a step."""
+        """Compute when the graph switches in the periods about a step."""
         schedule, dt = self.parts.graph.schedule, self.settings.dt
         if schedule is None or schedule.period is None or step in self.ahead:
             return
         first = max(0, int(step * dt / schedule.period) - 1)
         horizon = max(_AHEAD, 4.0 * schedule.period)
         switches = Switches(*schedule.switches(dt, horizon, first))
-        self.loop = eqx.tree_at(lambda each: each.switches, self.loop, switches)
-        # A whole period before its end, which no picture is as long as.
+        self.loop = eqx.tree_at(lambda loop: loop.switches, self.loop, switches)
+        # A whole period before the end: a picture that begins in this range also ends in it.
         last = int(first + horizon / schedule.period) * schedule.period
         self.ahead = range(int(switches.steps[0]), int(last / dt) - self.count)
 
@@ -131,7 +131,7 @@ class LiveLoop:
         return self.count * self.settings.dt
 
     def restart(self, states: Array | None = None, step: int = 0) -> None:
-        """Begin again, the knobs as they are; or go on from where others have come, (N, n)."""
+        """Restart from the initial states, or from other ones (N, n), with the same knobs."""
         with precision(self.precision):
             now = begin(self.loop, jnp.asarray(self.states if states is None else states))
             self.now: Moment = now._replace(step=jnp.asarray(step, jnp.int32))
@@ -143,24 +143,24 @@ class LiveLoop:
 
     @property
     def steps(self) -> int:
-        """How many steps were taken."""
+        """The number of steps so far."""
         return int(self.now.step)
 
-    def turn(self, knobs: Knobs) -> None:
-        """Let the loop run with the knobs so."""
+    def apply(self, knobs: Knobs) -> None:
+        """Change the loop to these positions of the knobs."""
         self.potential = self._potential(knobs)
         self.offsets = self.panel.offsets(knobs)
         weights = self.weights.copy()
         weights[..., np.isin(self.edge, list(knobs.cut))] = 0.0
         loop = eqx.tree_at(
-            lambda each: (each.offsets, each.exchange.weights, each.motion.wind.constant),
+            lambda loop: (loop.offsets, loop.exchange.weights, loop.motion.wind.constant),
             self.loop,
             (self.offsets, weights, self.panel.wind(knobs)),
         )
         self.loop = eqx.tree_at(self._adjustable, loop, self._numbers(knobs))
 
-    def _numbers(self, knobs: Knobs) -> tuple[Any, ...]:
-        """Return what these are at the knobs."""
+    def _numbers(self, knobs: Knobs) -> tuple[PyTree, ...]:
+        """Return the values of the adjustable numbers at these positions of the knobs."""
         share, gain = np.asarray(float(knobs.feedforward)), self.panel.gain(knobs)
         if knobs.coupling is None:
             return (share,)
@@ -170,43 +170,43 @@ class LiveLoop:
         return share, c, gain.P, gain.R, gain.R_inverse, _inner(gain)
 
     def _potential(self, knobs: Knobs) -> Callable[[Array], Array] | None:
-        """Return what tells V; None of a law without a P, or where a cut has parted the graph."""
+        """Return the function that computes V; None without a P or for a disconnected graph."""
         gain = self.panel.gain(knobs)
         P = self.parts.drive.metric(self.parts.model) if gain is None else gain.P
-        # Of a law that turns, P stands in axes that turn too.
+        # The P of a law that turns with the heading is in axes that turn too.
         if P is None or self.loop.follower.turning or not goes_both_ways(self.parts.graph):
             return None
-        asked = knobs.cut, knobs.method, knobs.weight
-        if asked not in self.potentials:
+        key = knobs.cut, knobs.method, knobs.weight
+        if key not in self.potentials:
             try:
-                found = potential(self.parts.model, self.panel.graph(knobs), P)
+                function = potential(self.parts.model, self.panel.graph(knobs), P)
             except GraphError:
                 return None
-            # A weight that is turned passes many values.
-            self.potentials = {**dict(list(self.potentials.items())[-16:]), asked: found}
-        return self.potentials[asked]
+            # Bounded, since turning the knob of the weight passes many values.
+            self.potentials = {**dict(list(self.potentials.items())[-16:]), key: function}
+        return self.potentials[key]
 
-    def kick(self, agent: int, by: Array) -> None:
-        """Change the state of an agent by (n,), all at once."""
+    def kick(self, agent: int, change: Array) -> None:
+        """Add a change (n,) to the state of an agent."""
         states = np.array(self.now.states)
-        states[agent] += by
+        states[agent] += change
         self.now = self.now._replace(states=states)
 
     def advance(self, still: bool = False) -> Picture:
-        """Go on to the next picture, or look at the present one, and return it."""
+        """Return the next picture, or the present one if `still`."""
         self._look_ahead(self.steps)
         # Once a picture, however many knobs were turned since the last one.
         if self.stepper.loop is not self.loop:
-            self.stepper.turn(self.loop)
-        # A frame now, from which all steps are taken, and one at their end.
+            self.stepper.replace_loop(self.loop)
+        # A frame at the beginning, from which all steps are taken, and one at the end.
         counts = np.array([0 if still else self.count, 0], np.int32)
         with precision(self.precision):
             chunk = self.stepper.advance(self.now, counts, self._reference())
         self.now, states, inputs = chunk.now, chunk.states[-1], chunk.inputs[-1]
         y = states - self.offsets
         with np.errstate(over="ignore", invalid="ignore"):
-            away = (y - y[self.nearest])[:, self.measured]
-            errors = np.linalg.norm(away, axis=1)
+            deviation = (y - y[self.nearest])[:, self.measured]
+            errors = np.linalg.norm(deviation, axis=1)
         valid = np.isfinite(inputs).all(axis=1) & (np.abs(states) < self.stepper.largest).all(
             axis=1
         )
@@ -215,7 +215,7 @@ class LiveLoop:
         return Picture(time, states, inputs, errors, self.offsets, V, np.logical_not(valid))
 
     def _reference(self) -> Array | None:
-        """Return what the stepper measures leaders against, though no picture shows it."""
+        """Return the leaders' reference states, which the stepper's meter requires."""
         times = self.loop.motion.dt * (self.steps + jnp.arange(self.count + 1))
         reference = _reference_states(self.loop.leader, self.loop.model, times)
         return None if reference is None else np.asarray(reference, np.float64)

@@ -15,7 +15,9 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
+from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
+from echelon.core.words import Verdict
 
 FORMAT = 3
 """Version of the format of `run.nc`; files of other versions are refused."""
@@ -161,11 +163,13 @@ class Recording:
         eigenvalue of that block of P^-1.
         """
         promise, certified = self.promise, self.promise.get("certified_set")
-        satisfied = {x["statement"] for x in promise["hypotheses"] if x["verdict"] == "holds"}
+        verdicts = {x["statement"]: x["verdict"] for x in promise["hypotheses"]}
         proved = promise["theorem"] == "T1" and certified is not None and self.rate is not None
-        if not proved or "starts in the certified set" not in satisfied or self.metric is None:
+        covered = verdicts.get(Hypothesis.STARTS.value) == str(Verdict.HOLDS)
+        if not (proved and covered) or self.metric is None:
             return None
-        if self.saturated.any() or "without what the scenario adds" in promise["sentence"]:
+        disturbed = verdicts.get(Hypothesis.EXACT_STATES.value) == str(Verdict.FAILS)
+        if self.saturated.any() or disturbed:
             return None
         start = float(np.einsum("ia,ab,ib->", self.errors[0], self.metric, self.errors[0]))
         block = np.linalg.inv(self.metric)[np.ix_(self.measured, self.measured)]

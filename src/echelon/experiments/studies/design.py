@@ -205,7 +205,7 @@ def _advantage(best: Design, others: list[Design], dt: float) -> str:
     region = best.promise.region
     if region is None:
         local = f"{number[0].upper()}{number[1:]} are only locally guaranteed"
-        return f"{local}; this one converges fastest ({-rate:.3g} 1/s)."
+        return f"{local}; this one converges fastest ({rate:.3g} 1/s)."
     same = 1 + sum([*d.merit(dt)[1:3]] == argument for d in rivals)
     text = f"Of {number} it has the strongest guarantee: {rate:.3g} 1/s on its domain "
     text += f"({region.kind}, {region.theorem})"

@@ -15,6 +15,7 @@ from echelon.synthesis.certificates.margins import detectability
 
 _LINEAR = Kind.LINEARIZATION
 _GROWS = "with the input held over the step `dt` the disagreement grows"
+_AT_STARTS = "a step where agents start"
 _NOT_STABLE = "the disagreement does not decay at the trim"
 _BENT = "the model is not differentiable at the trim and has no modes there"
 
@@ -187,15 +188,18 @@ def sampling_line(case: Case) -> Statement:
         return _step_line(case, np.inf, text, "use `simulation.integrator: rk4`")
     radii = {f"a step, {loop.where}": radius}
     if case.frozen and not printed:
-        places = ("a step along the leader's path", "a step where agents start")
-        radii |= zip(places, case.frozen.radii(settings))
+        radii |= zip(("a step along the leader's path", _AT_STARTS), case.frozen.radii(settings))
     where = next((x for x, one in radii.items() if not one < 1.0), f"a step, {loop.where}")
     remedy = "use `simulation.integrator: rk4`" if printed else ""
-    return _step_line(case, radii[where], f"spectral radius {radii[where]:.4g} {where}", remedy)
+    text = f"spectral radius {radii[where]:.4g} {where}"
+    # At the starts it lasts a moment, and a guarantee is for starts near the goals.
+    return _step_line(case, radii[where], text, remedy, "" if where == _AT_STARTS else _GROWS)
 
 
-def _step_line(case: Case, radius: float, text: str, remedy: str = "") -> Statement:
-    """Return the line of a step from a spectral radius and where it is met."""
+def _step_line(
+    case: Case, radius: float, text: str, remedy: str, reason: str = _GROWS
+) -> Statement:
+    """Return the line of a step from its spectral radius; the reason it is unstable, if it is."""
     dt = case.settings.dt
     number = radius, f"dt {dt:g} s"
     if radius < 1.0:
@@ -203,7 +207,5 @@ def _step_line(case: Case, radius: float, text: str, remedy: str = "") -> Statem
     if not remedy:
         longest = longest_step(case.loop, case.frozen, case.settings)
         remedy = f"shorten `simulation.dt` below {longest:.3g} s, or lower the gain"
-    # Where agents start it lasts a moment, and a promise is of starts near the goals.
-    reason = "" if "agents start" in text else _GROWS
     text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
     return fails(Hypothesis.SAMPLING, _LINEAR, text, *number, remedy=remedy, reason=reason)

@@ -50,6 +50,7 @@ def find_branches(nodes: list[Node], results: Sequence[Node]) -> list[Branch]:
     for (which, side), selects in sorted(choices.items(), key=lambda c: -c[1][0].number):
         inner = _exclusive(users, outside, which, side, selects)
         inner = [node for node in inner if node.op != "leaf"]
+        # A branch within another would save little more, and complicate the order.
         if len(inner) >= _MANY and not owned.intersection([*inner, *selects, which]):
             inside = set(inner)
             outputs = [n for n in inner if any(u not in inside for u in users[n])]

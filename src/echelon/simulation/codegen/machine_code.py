@@ -5,7 +5,8 @@ import hashlib
 import platform
 from functools import cache
 from pathlib import Path
-from typing import Any, final
+from types import ModuleType
+from typing import final
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from echelon.simulation.scalars.traced_entries import Unsupported
 
 
 @cache
-def llvm() -> Any:
+def llvm() -> ModuleType:
     """Return llvmlite's binding, ready for this machine.
 
     Raises:
@@ -99,25 +100,27 @@ class Code:
         """Run the kernel with the arguments in 64-bit slots: addresses and whole numbers."""
         self._run(slots.ctypes.data)
 
-    def _compile(self, binding: Any, text: str) -> bytes:
+    def _compile(self, binding: ModuleType, text: str) -> bytes:
         try:
             module = binding.parse_assembly(text)
             module.verify()
         except RuntimeError as error:
             raise Unsupported(f"code that LLVM rejects ({error_summary(error)})") from error
         options = binding.create_pipeline_tuning_options(speed_level=2)
+        # The text consists of vectors already, a lane for each agent.
         options.loop_vectorization = options.slp_vectorization = False
         passes = binding.create_pass_builder(self._machine, options)
         passes.getModulePassManager().run(module, passes)
         return self._machine.emit_object(module)
 
 
-def _cache_file(text: str, binding: Any, folder: Path | None) -> Path | None:
+def _cache_file(text: str, binding: ModuleType, folder: Path | None) -> Path | None:
     """Return the file of the code of a text on this machine."""
     if folder is None:
         return None
     import llvmlite
 
+    # All that the code depends on: another processor or LLVM compiles anew.
     parts = [text, _MODEL, features(), binding.get_host_cpu_name(), llvmlite.__version__]
     parts += [platform.system(), platform.machine()]
     return folder / f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}-native-cache"

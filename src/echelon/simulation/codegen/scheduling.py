@@ -60,6 +60,7 @@ def _border(body: Body) -> list[Node]:
     """Return the uniform nodes that are results or operands of nodes that are not uniform."""
     nodes, border = needed(body.all()), set(body.all())
     border |= {a for node in nodes if not node.uniform for a in node.args}
+    # Constants are in the code itself, and need no memory.
     return [n for n in nodes if n.uniform and n.op != "constant" and n in border]
 
 

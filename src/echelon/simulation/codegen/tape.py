@@ -37,6 +37,7 @@ def from_tape(body: Body, names: Mapping[str, str]) -> tuple[Body, list[tuple[st
         names: kind of a leaf that the backward pass has -> its name there.
     """
     leaves = [n for n in needed(body.all()) if n.op == "leaf"]
+    # All other leaves can be read again in the backward pass.
     recorded = [n.value for n in leaves if n.value[0] in _RECORDED]
     after = dict[Node, Node]()
     for node in needed(body.all()):

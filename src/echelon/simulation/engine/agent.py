@@ -28,11 +28,11 @@ class Message(NamedTuple):
 
     Attributes:
         signal: what its neighbours use: its state less its offset, or the signal of its law.
-        told: the feed-forward of its input, of the same step; None before it has acted.
+        feedforward: the feed-forward of its input, of the same step; None before it has acted.
     """
 
     signal: Array
-    told: Array | None = None
+    feedforward: Array | None = None
 
 
 @final
@@ -112,7 +112,7 @@ class Agent:
         missing = [j for j in senders if j not in messages]
         forward = None
         if self._source is not None:
-            forward = messages.get(self._source, Message(np.zeros(0))).told
+            forward = messages.get(self._source, Message(np.zeros(0))).feedforward
         if missing or (forward is None and self._source is not None):
             who = missing[0] if missing else self._source
             what = "its message" if missing else "what it tells of its input"
@@ -184,7 +184,7 @@ def _step(
     law = loop.leader if leads else loop.follower
     signal = _signal(loop, law, own)
     states = law.signal(loop.model, *own) is None
-    apart = loop.model.difference if states else jnp.subtract
-    gaps = jax.vmap(lambda theirs: apart(signal, theirs))(received.reshape(-1, len(signal)))
+    difference = loop.model.difference if states else jnp.subtract
+    gaps = jax.vmap(lambda theirs: difference(signal, theirs))(received.reshape(-1, len(signal)))
     view = LocalView(t, own.x, own.offset, weights @ gaps, forward, loop.motion.dt)
     return signal, act(loop, law, view, own.memory, leads)

@@ -110,17 +110,18 @@ class Batch:
 
     def _share(self, parts: Parts, settings: Settings) -> _SharedRun:
         """Return what runs of these parts share, whatever their seeds."""
-        shared, alike = self._shared.setdefault(parts, {}), settings._replace(seed=0)
-        if alike not in shared:
+        # Runs that differ only in their seeds share everything but their starts.
+        shared, unseeded = self._shared.setdefault(parts, {}), settings._replace(seed=0)
+        if unseeded not in shared:
             prepared = prepare(parts, settings, to_store=True)
             drive = prepared.parts.drive
             with precision("float64"):
                 loop = group = None
                 if isinstance(drive, Laws):
                     loop = assemble(prepared.problem, drive.leader, drive.follower)
-                    group = self.kinds.of(loop, alike)
-                shared[alike] = _SharedRun(prepared, Starts(prepared.parts), loop, group)
-        return shared[alike]
+                    group = self.kinds.of(loop, unseeded)
+                shared[unseeded] = _SharedRun(prepared, Starts(prepared.parts), loop, group)
+        return shared[unseeded]
 
     # ---- runs ----
 
@@ -170,8 +171,8 @@ def _fly(
         chunk = stepper.advance(now, grid.counts(done), reference)
         recorder.keep(chunk, reference, 0.0)
         if stepper.engine == "native":
-            apart = chunk.states.reshape(len(chunk.states), len(far), -1)
-            far |= beyond(apart, bits).any(axis=(0, 2))
+            by_formation = chunk.states.reshape(len(chunk.states), len(far), -1)
+            far |= beyond(by_formation, bits).any(axis=(0, 2))
         now = chunk.now
         if progress is not None:
             progress(recorder.done, grid.steps)

@@ -1,7 +1,7 @@
 """What decides a run: a key of its bits, and copies that no caller can write to."""
 
 from collections.abc import Hashable
-from typing import Any
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -12,6 +12,8 @@ from echelon.core.identity import digest
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
+
+_T = TypeVar("_T")
 
 
 def content_of(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> Hashable | None:
@@ -27,19 +29,20 @@ def content_of(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> Hashab
     return None if acting is None else (acting, parts.graph, wrt)
 
 
-def _acting(parts: Parts) -> Any:
+def _acting(parts: Parts) -> tuple[object, ...]:
     """Return the parts that have code, without the followers' gain."""
     drive = parts.drive
     if isinstance(drive, Laws) and drive.gain is not None:
-        law: Any = eqx.tree_at(lambda law: law.gain, drive.follower, None)
+        law = eqx.tree_at(lambda law: law.gain, drive.follower, None)
         drive = drive.with_follower(law)
     return parts.model, drive, parts.initial, parts.start_error, parts.world
 
 
-def copied(tree: Any) -> Any:
+def copied(tree: _T) -> _T:
     """Return a copy of a tree and its arrays, since the caller may write to the original."""
 
-    def alone(leaf: Any) -> Any:
+    def alone(leaf: object) -> object:
+        # A formation is a leaf to JAX, although it contains an array.
         if isinstance(leaf, Formation):
             return Formation(leaf.offsets)
         return leaf.copy() if isinstance(leaf, np.ndarray) else leaf

@@ -4,8 +4,6 @@ A chunk begins and ends with the same numbers on every device, so that the rest 
 one. Within a chunk each device steps its own agents, and JAX transfers what they receive.
 """
 
-from typing import Any
-
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -15,7 +13,7 @@ from echelon.core.errors import SimulationError
 from echelon.core.types import Array
 from echelon.simulation.step.loop import Loop, Moment
 from echelon.simulation.step.meter import Sums
-from echelon.simulation.step.sequence import advance
+from echelon.simulation.step.sequence import Frames, advance
 
 
 def mesh_of(devices: int, agents: int) -> Mesh:
@@ -51,7 +49,7 @@ def advance_parted(
     counts: jax.Array,
     reference: Array | None,
     first: jax.Array,
-) -> tuple[Moment, tuple[Any, Any], Sums]:
+) -> tuple[Moment, Frames, Sums]:
     """Do what `advance` does, with the agents spread over the devices of a mesh."""
     agents = len(loop.offsets)
 

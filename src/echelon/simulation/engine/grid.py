@@ -1,4 +1,4 @@
-"""How a run is cut into chunks."""
+"""The grid of a run: its frames, and the chunks between them."""
 
 from typing import final
 
@@ -33,7 +33,7 @@ class ChunkGrid:
 
     @property
     def frames(self) -> int:
-        """How many frames are stored: one every so many steps, and the last."""
+        """The number of stored frames: one every so many steps, and the last."""
         return 1 + -(-self.steps // self.every)
 
     @property

@@ -1,4 +1,4 @@
-"""Agents whose inputs come from the host: a pilot gives them every few steps, and they are held."""
+"""Steps agents whose inputs are computed on the host every few steps and held between."""
 
 from collections.abc import Callable, Sequence
 from typing import TypeAlias, final
@@ -21,12 +21,12 @@ Pilot: TypeAlias = Callable[[int, Array], Array]
 """(step, states (N, n)) -> desired physical inputs (N, m) from that step on."""
 
 _PLANS = 64
-"""Plans of one agent each in a chunk: a solver takes some 20 ms for one."""
+"""Plans of one agent per chunk; a solver takes about 20 ms for each."""
 
 
 @final
 class HeldInput(Law):
-    """u = the input (m,) in the agent's memory, where a pilot puts it.
+    """u = the input (m,) in the agent's memory, which the pilot writes.
 
     Args:
         size: m.
@@ -39,7 +39,7 @@ class HeldInput(Law):
         return jnp.zeros(self.size)
 
     def update(self, model: ControlAffine, view: LocalView, memory: Input) -> tuple[Input, Input]:
-        """Return the input that is held."""
+        """Return the input in the memory."""
         return memory, memory
 
 
@@ -69,7 +69,7 @@ class HostStepper(Stepper):
 
     @property
     def work(self) -> SolverStats:
-        """What solving took so far."""
+        """The work of the solvers so far."""
         return self._work()
 
     @property
@@ -78,12 +78,14 @@ class HostStepper(Stepper):
         return self.hold * max(1, _PLANS // len(self.states))
 
     def recall(self, leaves: Sequence[Array]) -> Moment:
-        """Refuse: what a pilot has planned is no part of the moment.
+        """Raise an error, since the plans of a pilot are not part of a moment.
 
         Raises:
             SimulationError: always.
         """
-        raise SimulationError("a run whose inputs are planned cannot go on from what was kept.")
+        raise SimulationError(
+            "a run with planned inputs cannot be continued from stored data; start it again."
+        )
 
     def start(self) -> Moment:
         """Return the moment at which the run begins, before the pilot gives any input."""
@@ -92,7 +94,7 @@ class HostStepper(Stepper):
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps, until a pilot stops or a state is not finite."""
-        chunk = _HeldChunk(now, self.loop.meter.nothing(), reference)
+        chunk = _HeldChunk(now, self.loop.meter.zero_sums(), reference)
         try:
             for count in counts:
                 self._frame(chunk, int(count))
@@ -108,18 +110,18 @@ class HostStepper(Stepper):
         """Store a frame and take `count` steps; query the pilot wherever a hold begins."""
         end = chunk.step + count
         try:
-            # The last frame has no steps after it, and so no plan of its own.
+            # The last frame has no steps after it, and needs no plan.
             if count:
                 self._query_pilot(chunk)
         finally:
-            # Where the pilot stops right here, the frame is kept with the inputs that led to it.
+            # If the pilot stops the run here, the frame has the inputs that led to it.
             if chunk.step or self._queried == 0:
                 self._take(chunk, 0, store=True)
         while chunk.step < end:
             self._query_pilot(chunk)
-            # To the next frame or the next plan, whichever comes first.
+            # Up to the next frame or the next plan, whichever is first.
             self._take(chunk, min(end, (chunk.step // self.hold + 1) * self.hold) - chunk.step)
-            # No solver is given a state that is not finite: it would fail, and count as a failure.
+            # Solvers fail on states that are not finite, which must not count as their failures.
             if not np.isfinite(np.asarray(chunk.now.states)).all():
                 return
 
@@ -138,7 +140,7 @@ class HostStepper(Stepper):
 
     def _take(self, chunk: "_HeldChunk", count: int, store: bool = False) -> None:
         """Take steps, or store a frame."""
-        # As an array, so that another count compiles nothing again.
+        # As an array, so that another count does not compile again.
         counts = np.array([count], np.int32)
         chunk.now, frames, sums = advance(
             self.loop, chunk.now, counts, chunk.reference, chunk.first

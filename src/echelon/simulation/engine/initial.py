@@ -4,14 +4,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError
+from echelon.core.types import Array
 from echelon.simulation.engine.parts import Parts
 
 
-def initial_states(parts: Parts, seed: int) -> np.ndarray:
+def initial_states(parts: Parts, seed: int) -> Float[Array, "N n"]:
     """Return the states (N, n) at time zero.
 
     A leader starts where its drive says, or in its given state, plus its offset and `start_error`.
@@ -42,7 +45,7 @@ class Starts:
         self.graph, self.shape = graph, (graph.agents, len(model.state_names))
         self.error = _per_state(model, parts.start_error, "start error")
         self.states: np.ndarray | None = None
-        self.named: dict[Any, Any] = {}
+        self.named: dict[int, ArrayLike] = {}
         if initial is not None and not isinstance(initial, Mapping):
             self.states = _read_states(
                 initial, self.shape, "initial states have", "(agents, states)"
@@ -60,11 +63,11 @@ class Starts:
         leaders = np.asarray(parts.drive.start(model), np.float64) + self.error
         self.goals = leaders + parts.formation.offsets
 
-    def __call__(self, seed: int) -> np.ndarray:
+    def __call__(self, seed: int) -> Float[Array, "N n"]:
         """Return the states (N, n) for a seed."""
         return self.of([seed])[0]
 
-    def of(self, seeds: Sequence[int]) -> np.ndarray:
+    def of(self, seeds: Sequence[int]) -> Float[Array, "K N n"]:
         """Return the states (K, N, n) for some seeds."""
         if self.states is not None:
             return np.repeat(self.states[None], len(seeds), axis=0)
@@ -80,7 +83,7 @@ class Starts:
         return states
 
 
-def _place(states: np.ndarray, named: Mapping[Any, Any], graph: Graph) -> None:
+def _place(states: Float[Array, "K N n"], named: Mapping[int, ArrayLike], graph: Graph) -> None:
     """Put agents into the states that are given for them, in all starts (K, N, n)."""
     for agent, state in named.items():
         _check_agent(agent, graph)
@@ -107,7 +110,7 @@ def _read_states(values: object, shape: tuple[int, ...], what: str, meaning: str
     return array
 
 
-def _per_state(model: ControlAffine, named: Mapping[str, Any], what: str) -> np.ndarray:
+def _per_state(model: ControlAffine, named: Mapping[str, Any], what: str) -> Float[Array, " n"]:
     """Return one finite number for each state, (n,), from numbers by state or group."""
     for name, value in named.items():
         if not np.isfinite(value):

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, final
+from typing import final
 
 import equinox as eqx
 import jax
@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.compiled import cached_jit
-from echelon.core.types import Array
+from echelon.core.types import Array, PyTree
 from echelon.simulation.engine.devices import advance_parted, mesh_of
 from echelon.simulation.native.varying import is_number
 from echelon.simulation.step.drive import Chunk, Stepper
 from echelon.simulation.step.loop import Loop, Moment, WorldState
-from echelon.simulation.step.meter import on_host
+from echelon.simulation.step.meter import Sums, on_host
 from echelon.simulation.step.sequence import advance, begin
 
 _AGENT_STEPS, _FEWEST = 100_000, 4
@@ -73,7 +73,7 @@ class JaxStepper(Stepper):
         """The magnitude of states beyond which nothing is computed: none."""
         return np.inf
 
-    def turn(self, loop: Loop) -> None:
+    def replace_loop(self, loop: Loop) -> None:
         """Continue in a loop that is like the one before but for its numbers."""
         self.loop = loop
 
@@ -134,32 +134,36 @@ _ALL = Moment(None, 0, 0, 0, 0, WorldState(0, 0))  # type: ignore[arg-type]
 
 
 @cached_jit
-def _begin_all(loop: Loop, axes: Any, states: jax.Array) -> Moment:
+def _begin_all(loop: Loop, axes: PyTree, states: jax.Array) -> Moment:
     return eqx.filter_vmap(begin, in_axes=(axes, 0), out_axes=_ALL)(loop, states)
 
 
 @cached_jit
-def _advance_all(loop: Loop, axes: Any, now: Moment, counts: jax.Array, reference: Any) -> Any:
+def _advance_all(
+    loop: Loop, axes: PyTree, now: Moment, counts: Array, reference: Array | None
+) -> tuple[Moment, tuple[jax.Array, jax.Array], Sums]:
     in_axes = (axes, _ALL, None, None, None)
     return eqx.filter_vmap(advance, in_axes=in_axes, out_axes=(_ALL, 1, 0))(
         loop, now, counts, reference, now.step
     )
 
 
-def _stack(loops: Sequence[Loop]) -> tuple[Loop, Any]:
+def _stack(loops: Sequence[Loop]) -> tuple[Loop, PyTree]:
     """Return one loop whose leaves are stacked where they differ, and the axes of its leaves."""
     if all(loop is loops[0] for loop in loops):
         return loops[0], None
     flat, tree = [jax.tree.leaves(loop) for loop in loops], jax.tree.structure(loops[0])
-    stacked, axes = list[Any](), list[int | None]()
+    stacked, axes = list[object](), list[int | None]()
     for leaves in zip(*flat, strict=True):
+        # By identity first, since most leaves are shared and a comparison reads all their bytes.
         rows = any(leaf is not leaves[0] for leaf in leaves) and _differ(leaves)
         stacked.append(jnp.stack([jnp.asarray(leaf) for leaf in leaves]) if rows else leaves[0])
         axes.append(0 if rows else None)
     return tree.unflatten(stacked), tree.unflatten(axes)
 
 
-def _differ(leaves: Sequence[Any]) -> bool:
+def _differ(leaves: Sequence[object]) -> bool:
     if not is_number(leaves[0]) and not isinstance(leaves[0], np.ndarray):
         return False
+    # By their bits: NaN equals itself there, and -0 differs from 0.
     return any(np.asarray(leaf).tobytes() != np.asarray(leaves[0]).tobytes() for leaf in leaves)

@@ -1,4 +1,4 @@
-"""The drive by control laws: what an agent does is a function of what it knows."""
+"""The drive by control laws: inputs are functions of what each agent knows."""
 
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, TypeVar, final
@@ -43,7 +43,7 @@ class Laws(Drive):
     follower: Law
 
     def __check_init__(self) -> None:
-        """Refuse what is no law."""
+        """Check the types of the laws."""
         for place in ("leader", "follower"):
             check_kind(place, getattr(self, place), Law)
 
@@ -70,7 +70,7 @@ class Laws(Drive):
 
     @property
     def reacts(self) -> bool:
-        """Whether the leaders' law is given a reaction."""
+        """Whether the leaders' law has a reaction."""
         # By name, since a user's own law need not have one.
         return getattr(self.leader, "reaction", None) is not None
 
@@ -80,7 +80,7 @@ class Laws(Drive):
         return getattr(self.follower, "trim", True)
 
     def prepare(self, model: ControlAffine, graph: Graph) -> "Laws":
-        """Return both laws completed; the same object where they already are.
+        """Return both laws completed; the same object if they already are.
 
         Raises:
             LawError: one does not fit the model or the graph.
@@ -115,11 +115,11 @@ class Laws(Drive):
         return warnings + leader_warnings(self.leader, model, settings.horizon, settings.limits)
 
     def start(self, model: ControlAffine) -> State:
-        """Return where the leaders' law begins."""
+        """Return the start state of the leaders' law."""
         return self.leader.start(model)
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
-        """Return what the leaders' law follows."""
+        """Return the reference states of the leaders' law."""
         return self.leader.reference_states(model, times)
 
     def with_follower(self, law: Law) -> "Laws":
@@ -158,7 +158,7 @@ class Laws(Drive):
 
 
 _WORTH = 100_000
-"""Steps of one agent from which on native code saves more than the second of its compilation."""
+"""Agent steps above which native code saves more than its compilation takes, one second."""
 _R = TypeVar("_R")
 
 
@@ -169,7 +169,7 @@ def choose_engine(
     by_jax: Callable[[str], _R],
     least: int = _WORTH,
 ) -> _R:
-    """Return what one of the two engines computes for so many agents.
+    """Return the result of one of the two engines for so many agents.
 
     Args:
         settings: of the run.
@@ -192,7 +192,7 @@ def choose_engine(
 
 
 def worth_native(settings: Settings, agents: int, least: int = _WORTH) -> bool:
-    """Tell whether native code is to step the agents: it is requested, or pays.
+    """Tell whether native code steps the agents: if it is requested, or saves time.
 
     It computes on processors alone, and `least` is from how many steps of one agent on it pays.
     """

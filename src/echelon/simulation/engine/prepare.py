@@ -59,13 +59,13 @@ def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepare
     key = None if bits is None else (parts, bits)
     prepared = _CACHE.get_or_make(key, lambda: _prepare(parts, settings, to_store))
     if to_store:
-        # Again for parts that were prepared when nothing was to be stored.
+        # Checked again, since the parts may have been prepared without storing in mind.
         check_memory(parts.model, parts.graph.agents, settings)
     return prepared
 
 
 def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
-    """Prepare parts that were not prepared before."""
+    """Prepare parts that are not in the cache."""
     model, graph, formation = parts.model, parts.graph, parts.formation
     # Gains, plans and starts are the same in a float32 run, and so is what is guaranteed of them.
     with precision("float64"):
@@ -75,7 +75,7 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
             # Before gains and plans, which may take long.
             check_memory(model, graph.agents, settings)
         drive = parts.drive.prepare(model, graph)
-        # A complete drive stays the same object, so that what was computed of it is found again.
+        # A complete drive stays the same object, since caches use its identity.
         parts = parts if drive is parts.drive else parts.replace(drive=drive)
         problem = Problem(
             model,
@@ -135,7 +135,7 @@ def formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str,
     sentences = [
         f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, "
         "so the agents settle off their goals."
-        # The first is enough: what one offset breaks, the others mostly break too.
+        # One warning is enough: the other offsets mostly break the same symmetry.
         for agent, reason in list(broken.items())[:1]
     ]
     pairs = formation.coincident() if model.position else ()

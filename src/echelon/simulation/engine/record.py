@@ -1,4 +1,4 @@
-"""What is stored of a run while it is computed, and how it ended."""
+"""Records a run while it is computed: frames, sums, and its outcome."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, final
@@ -16,7 +16,7 @@ _VERBS = {Outcome.INTERRUPTED: "interrupted", Outcome.STOPPED: "ended from outsi
 
 
 class Stretch(NamedTuple):
-    """A part of a run, all in NumPy; the last one is all that is needed to continue the run.
+    """A part of a run in NumPy; a run can be continued from its last stretch alone.
 
     Attributes:
         first: the step at which it begins.
@@ -44,7 +44,7 @@ class Stretch(NamedTuple):
 
     @property
     def finite(self) -> bool:
-        """Whether every number of its frames is."""
+        """Whether every number of its frames is finite."""
         return bool(np.isfinite(self.states).all() and np.isfinite(self.inputs).all())
 
     def rows(self, rows: Array | slice) -> "Stretch":
@@ -56,7 +56,7 @@ class Stretch(NamedTuple):
         )
 
     def record(self, outcome: Outcome, message: str) -> "Record":
-        """Return it as the record of a run that ended so."""
+        """Return the stretch as the record of a run with this outcome."""
         frames = self.times, self.states, self.inputs, self.reference
         return Record(*frames, self.sums, outcome, message, self.seconds)
 
@@ -98,9 +98,9 @@ class Recorder:
     def __init__(
         self, problems: Sequence[Problem], grid: ChunkGrid, before: Sequence[Stretch] = ()
     ) -> None:
-        """Begin after the stretches that were computed before."""
+        """Begin after the stretches of an earlier session, if any."""
         self.problems, self.grid, self.stretches = problems, grid, list(before)
-        nothing = on_host(problems[0].meter.nothing(np))
+        nothing = on_host(problems[0].meter.zero_sums(np))
         sums = [stretch.sums for stretch in before[-1:]] or [nothing] * len(problems)
         self.sums = Sums(*map(np.stack, zip(*sums, strict=True)))
         self.frames = sum(len(stretch.times) for stretch in before)
@@ -108,12 +108,12 @@ class Recorder:
 
     @property
     def done(self) -> int:
-        """How many steps were taken."""
+        """The number of steps so far."""
         return self.stretches[-1].done if self.stretches else 0
 
     @property
     def complete(self) -> bool:
-        """Whether every frame is there."""
+        """Whether all frames are recorded."""
         return self.frames == self.grid.frames
 
     @property
@@ -130,16 +130,16 @@ class Recorder:
         frames = self.grid.stored(points)
         parts = map(self._by_formation, (chunk.states, chunk.inputs))
         finite = np.all([np.isfinite(part).all(axis=(2, 3)) for part in parts], axis=0)
-        # Where a formation is lost is kept wherever it stands: it says when that was.
+        # The point where a formation diverges is kept, also between frames: it gives the time.
         stored = frames | (~finite & self._finite).any(axis=1)
         sums = self.sums.plus(chunk.sums)
-        # The sums of a formation that was lost stay what they were when it was.
+        # A formation that diverged keeps the sums up to then.
         self.sums = sums if self._finite.all() else sums.where(self._finite, self.sums)
         self._finite &= finite.all(axis=0)
         self.frames += int(frames.sum())
         alone = len(self.problems) == 1
         if self.stretches:
-            # Only the last one's are ever read, and many would fill the memory.
+            # Only the last one's are read, and those of all stretches would fill the memory.
             self.stretches[-1] = self.stretches[-1]._replace(moment=(), sums=self.sums)
         self.stretches.append(
             Stretch(
@@ -157,28 +157,28 @@ class Recorder:
         )
 
     def stop(self, reason: str) -> None:
-        """Note why the run goes no further."""
+        """Store the reason why the run stops."""
         self.stretches[-1] = self.stretches[-1]._replace(stopped=reason)
 
     def close(self, unfinished: Outcome) -> Iterator[Record]:
         """Yield the record of each formation, cut at its first frame that is not finite.
 
-        `unfinished` is how a run ended that neither reached its horizon nor was lost.
+        `unfinished` is the outcome of a run that neither reached its horizon nor diverged.
         """
         whole = join(self.stretches) or self._nothing()
         states, inputs = (
             np.ascontiguousarray(self._by_formation(part).swapaxes(0, 1))
             for part in (whole.states, whole.inputs)
         )
-        usual = self._usual(whole, states)
+        inside = self._inside(whole, states)
         steps = np.rint(whole.times / self.problems[0].settings.dt).astype(int)
-        # Other points are there where a formation was lost between two frames.
+        # There are points besides frames if a formation diverged between two frames.
         frames = self.grid.stored(steps)
         for k, problem in enumerate(self.problems):
             mine = whole._replace(states=states[k], inputs=inputs[k], sums=self.sums.of(k))
             rows = frames if self._finite[k] else frames | ~_finite(mine).all(axis=1)
             mine = mine if rows.all() else mine.rows(rows)
-            if usual[k]:
+            if inside[k]:
                 yield mine.record(Outcome.COMPLETED, Outcome.COMPLETED.value)
             else:
                 yield self._closed(problem, mine, unfinished)
@@ -188,7 +188,7 @@ class Recorder:
         count = len(self.problems)
         return rows.reshape(len(rows), count, rows.shape[1] // count, rows.shape[2])
 
-    def _usual(
+    def _inside(
         self, whole: Stretch, states: Float[np.ndarray, "F T N n"]
     ) -> Bool[np.ndarray, " F"]:
         """Return which formations reached the horizon, finite and in their chart."""
@@ -199,7 +199,7 @@ class Recorder:
         return self._finite & (inside >= ALWAYS).all(axis=(1, 2))
 
     def _nothing(self) -> Stretch:
-        """Return a stretch without a frame, its arrays of the right shape all the same."""
+        """Return a stretch without frames, whose arrays have the right shapes."""
         states = np.concatenate([problem.states for problem in self.problems])
         m = len(self.problems[0].model.input_names)
         empty = np.zeros((0, *states.shape)), np.zeros((0, len(states), m))

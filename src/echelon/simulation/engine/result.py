@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -126,6 +126,6 @@ class Result:
         return dataclasses.replace(self, provenance={**self.provenance, **texts})
 
 
-def finite_or_none(value: Any) -> float | None:
+def finite_or_none(value: float | np.floating | None) -> float | None:
     """Return a number as a float, or None where it does not exist or is not finite."""
     return float(value) if value is not None and np.isfinite(value) else None

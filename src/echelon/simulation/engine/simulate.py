@@ -24,7 +24,7 @@ from echelon.simulation.step.solver_stats import SolverStats
 
 @final
 class RunSoFar:
-    """A run that is being computed, as progress callbacks see it.
+    """A run in progress, as passed to callbacks.
 
     Attributes:
         done: how many steps were taken.
@@ -38,7 +38,7 @@ class RunSoFar:
 
     @property
     def time(self) -> float:
-        """The simulated time so far, s."""
+        """Simulated time so far, s."""
         return self.done * self._prepared.problem.settings.dt
 
     @property
@@ -47,7 +47,7 @@ class RunSoFar:
         return next(x.states[-1] for x in reversed(self._recorder.stretches) if len(x.states))
 
     def result(self) -> Result:
-        """Return all that was computed so far, as `metrics` takes it."""
+        """Return the run so far as a result, such as for `metrics`."""
         result = _result(self._prepared, self._recorder, self._stepper, Outcome.INTERRUPTED)
         if result.outcome is not Outcome.INTERRUPTED:
             return result
@@ -58,7 +58,7 @@ class RunSoFar:
 Progress: TypeAlias = Callable[[RunSoFar], None]
 """Called between chunks with the run so far."""
 Keep: TypeAlias = Callable[[Stretch], None]
-"""Called with every stretch of a run as it is computed, in their order.
+"""Called with every stretch of a run in order, as soon as it is computed.
 
 Raising `Stopped`, with the reason in words, ends the run there.
 """
@@ -66,7 +66,7 @@ Raising `Stopped`, with the reason in words, ends the run there.
 _ROWS = 512
 """Steps of a reference that cost as much as one."""
 _SECONDS = 2.0
-"""Wall time of a stretch: what is lost at most when a run is killed."""
+"""Wall time of a stretch, s: the most that is lost when the process is killed."""
 
 
 def simulate(
@@ -76,7 +76,7 @@ def simulate(
     keep: Keep | None = None,
     before: Sequence[Stretch] = (),
 ) -> Result:
-    """Run the closed loop and return what happened.
+    """Simulate the closed loop and return its result.
 
     Args:
         parts: agents, graph, formation, what drives them, starts and world.
@@ -94,7 +94,7 @@ def simulate(
     began = time.perf_counter()
     prepared = prepare(parts, settings, to_store=True)
     with precision("float64"):
-        # Plans and solvers are made in float64, whatever the precision of the run.
+        # Plans and solvers need float64, also in a float32 run.
         stepper = prepared.parts.drive.stepper(prepared.problem)
     _check_devices(settings, stepper)
     with precision(settings.precision):
@@ -161,7 +161,7 @@ def result_of(
 
 @final
 class _ChunkLoop:
-    """Computes a run chunk by chunk, so that Ctrl-C or a divergence loses one chunk at most."""
+    """Computes a run chunk by chunk, so that Ctrl-C loses at most one chunk."""
 
     def __init__(
         self, stepper: Stepper, prepared: Prepared, recorder: Recorder, began: float
@@ -170,12 +170,12 @@ class _ChunkLoop:
         self.reference = _ReferenceRows(prepared)
         last = recorder.stretches[-1] if recorder.stretches else None
         self.now = stepper.start() if last is None else stepper.recall(last.moment)
-        # As if it had begun so much earlier: what was computed before counts too.
+        # Shifted into the past by the time of earlier sessions, which counts too.
         self.began = began - (0.0 if last is None else last.seconds)
         self.handed_over, self.last_time = len(recorder.stretches), time.perf_counter()
 
     def run(self, progress: Progress | None, keep: Keep | None) -> None:
-        """Take all remaining steps, as far as they can be taken."""
+        """Take all remaining steps, until the run ends or is stopped."""
         try:
             # Between chunks, or within one of JAX's: that chunk is lost, the others are kept.
             with contextlib.suppress(KeyboardInterrupt):
@@ -199,7 +199,7 @@ class _ChunkLoop:
         self.now = chunk.now
 
     def _hand_over(self, keep: Keep | None) -> None:
-        """Hand over what was computed since the last time."""
+        """Pass the new stretch to the callback."""
         new = join(self.recorder.stretches[self.handed_over :])
         if keep is not None and new is not None:
             keep(new)
@@ -215,7 +215,7 @@ class _ReferenceRows:
         self.states: Array | None = None
 
     def rows(self, first: int, count: int) -> Array | None:
-        """Return those of `count` steps from one on; None where the leaders follow nothing."""
+        """Return the states for `count` steps; None if the leaders have no reference."""
         if self.states is None or first + count > self.first + len(self.states):
             self.first = first
             self.states = sample_reference(self.prepared, first, max(count, _ROWS))
@@ -224,7 +224,7 @@ class _ReferenceRows:
 
 
 def sample_reference(prepared: Prepared, first: int, steps: int) -> Array | None:
-    """Return what the leaders follow from a step on, (steps, n) in float64."""
+    """Return the leaders' reference states from a step on, (steps, n) in float64."""
     with precision("float64"):
         # In float64: after three hours float32 has a millisecond between two times.
         times = jax.device_put(prepared.problem.settings.dt * np.arange(first, first + steps))

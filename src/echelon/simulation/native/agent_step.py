@@ -249,6 +249,7 @@ def body_of(
     outputs: StepOutputs = shapes.unflatten([nodes(graph, part) for part in results])
     memory = jax.tree.leaves(outputs.memory, is_leaf=lambda part: isinstance(part, list))
     stores = {"state": outputs.state, "cut": outputs.cut, "memory": sum(memory, start=[])}
+    # Unless inputs are passed on from parents, nobody reads the message of a follower.
     if leads or loop.levels is not None:
         stores["message"] = outputs.message
     sums = {name: getattr(outputs, name) for name in ("effort", "limited", "chatter")}
@@ -308,6 +309,7 @@ def step_inputs(
         return leaves_of(graph, "row", places)
 
     x, offset, size = row(rows.state), row(rows.offset), memory_size(law)
+    # A truth and not a number, since it chooses between sums.
     late = graph.make("ne", graph.leaf("steady", uniform=True), 0.0)
     return StepInputs(
         t=single(graph.leaf("time", uniform=True)),
@@ -322,6 +324,7 @@ def step_inputs(
         if leads
         else leaves_of(graph, "message", range(len(rows.message))),
         memory=unflatten(law.init(), row(rows.memory[:size])),
+        # A leader is its own leader, so that its error is zero.
         leader=x - offset if leads else leaves_of(graph, "leader", range(n)),
         push=row(rows.push) if len(rows.push) else None,
         noise=row(rows.noise) if len(rows.noise) else None,

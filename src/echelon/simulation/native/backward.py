@@ -211,11 +211,11 @@ class Backward:
     def _leaves(self) -> list[Array]:
         return [leaf.astype(float) for leaf in self.varying.leaves(self.varying.values[0])]
 
-    def turn(self, loop: Loop) -> None:
+    def update(self, loop: Loop) -> None:
         """Continue with a loop that differs only in the varying numbers."""
         self.loop = loop
-        self.varying.turn(loop)
-        self.stepper.turn(loop)
+        self.varying.replace_loop(loop)
+        self.stepper.replace_loop(loop)
 
     @property
     def size(self) -> int:

@@ -224,8 +224,8 @@ class FormationBlocks(Places):
         # The last group is filled with copies.
         formation = np.minimum(np.arange(self.groups * lanes), len(loops) - 1)
         formation = formation.reshape(self.groups, 1, lanes)
-        each = len(self.loop.offsets) * formation + self.swarm.agents[:, None]
-        self.agents, self.segments = each.reshape(-1), self.swarm.segments
+        agents = len(self.loop.offsets) * formation + self.swarm.agents[:, None]
+        self.agents, self.segments = agents.reshape(-1), self.swarm.segments
         self.position = first_places(self.agents)
 
     def neighbourhood(self, width: int, rows: int, dtype: np.dtype) -> Neighbourhood:
@@ -263,8 +263,8 @@ class FormationBlocks(Places):
 
     def spacing(self, edges: Array) -> Array:
         """Return the sums in rows of edges, (formations E,)."""
-        each = edges[:, :, -1].transpose(0, 2, 1).reshape(self.groups * self.lanes, -1)
-        return each[: len(self.loops)].reshape(-1)
+        by_formation = edges[:, :, -1].transpose(0, 2, 1).reshape(self.groups * self.lanes, -1)
+        return by_formation[: len(self.loops)].reshape(-1)
 
 
 def aligned_copy(values: Array, dtype: np.dtype | type) -> Array:

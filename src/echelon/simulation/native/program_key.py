@@ -9,6 +9,7 @@ import numpy as np
 
 from echelon.core.identity import process_key
 from echelon.core.memoize import BoundedCache
+from echelon.core.types import PyTree
 from echelon.simulation.native.varying import bare, is_number
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.settings import Settings
@@ -40,14 +41,15 @@ class ProgramKeys:
             leaves, self._fixed.get_or_make(kind, lambda: _fixed(leaves, tree)), strict=True
         )
         numbers = process_key([leaf for leaf, fixed in pairs if fixed])
+        # A loop without a digest shares its program with no other one.
         return id(loop) if kind is None or numbers is None else (kind, numbers)
 
 
-def _fixed(leaves: Sequence[Any], tree: Any) -> list[bool]:
+def _fixed(leaves: Sequence[object], tree: Any) -> list[bool]:
     """Return which leaves must be equal in all loops."""
     numbers = [k for k, leaf in enumerate(leaves) if is_number(leaf)]
 
-    def outside(values: list[jax.Array]) -> tuple[Any, ...]:
+    def outside(values: list[jax.Array]) -> PyTree:
         replaced = list(leaves)
         for k, value in zip(numbers, values, strict=True):
             replaced[k] = value
@@ -66,6 +68,8 @@ def _fixed(leaves: Sequence[Any], tree: Any) -> list[bool]:
     except Exception:
         # A user's code may need concrete numbers: such loops share no program.
         return [True] * len(leaves)
-    read = {id(v) for each in traced.eqns for v in each.invars} | {id(v) for v in traced.outvars}
+    read = {id(v) for equation in traced.eqns for v in equation.invars} | {
+        id(v) for v in traced.outvars
+    }
     free = {k for k, v in zip(numbers, traced.invars, strict=True) if id(v) not in read}
     return [k not in free for k in range(len(leaves))]

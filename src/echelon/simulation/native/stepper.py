@@ -189,10 +189,10 @@ class NativeStepper(Stepper):
         self._fallback_step = int(now.step) if self._fallback_step < 0 else self._fallback_step
         return self.fallback.advance(now, counts, reference)
 
-    def turn(self, loop: Loop) -> None:
+    def replace_loop(self, loop: Loop) -> None:
         """Continue with a loop of one formation that differs from this one only in numbers."""
         self.loop, self.loops = loop, [loop]
-        self.varying.turn(loop)
+        self.varying.replace_loop(loop)
         self.edge_weights[:] = neighbour_slots(loop, self.places)[2]
         # Offsets, numbers and the wind are written with a moment.
         self._moment = None
@@ -290,8 +290,8 @@ class NativeStepper(Stepper):
         if self._tape is not None:
             tape = self._tape[step - self._tape_start]
             values |= {"tape": tape.ctypes.data, "tape_step": tape.size}
-        names = "rows", "mirror", "next_mirror", "edges"
-        firsts = dict(zip(names, (self.blocks, *self.mirrors, self.edges), strict=True))
+        now, after = self.mirrors
+        firsts = {"rows": self.blocks, "mirror": now, "next_mirror": after, "edges": self.edges}
         uniform_values = np.empty(steps * self.uniform_count, self.dtype)
         self.threads.run(self.code, values, firsts, uniform_values)
         if steps % 2:

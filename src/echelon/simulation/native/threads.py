@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from functools import cache
 from threading import Event
-from typing import Any, final
+from typing import Any, TypeVar, final
 
 import numpy as np
 
@@ -20,6 +20,8 @@ _SHARED, _WORTH = 20_000, 100_000
 """Agents of a swarm from which on threads share its steps, and agent steps of formations from which
 on they share those: to wake threads takes as long as fewer.
 """
+
+_Part = TypeVar("_Part")
 
 
 @cache
@@ -142,14 +144,14 @@ class ThreadPool:
         return self._schedules[steps, thread]
 
 
-def share(pool: Executor, act: Callable[[Any], None], parts: Iterable[Any]) -> None:
+def share(pool: Executor, act: Callable[[_Part], None], parts: Iterable[_Part]) -> None:
     """Let threads act on a part each: all of them or, if Ctrl-C comes before, none.
 
     Otherwise those that began would wait forever for those that did not.
     """
     gate, all_submitted, futures = Event(), list[bool](), list[Future[None]]()
 
-    def begin(part: Any) -> None:
+    def begin(part: _Part) -> None:
         gate.wait()
         if all_submitted:
             act(part)

@@ -6,7 +6,7 @@ of JAX. It reads from a tape what the step depended on.
 
 import functools
 import operator
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.core.types import Array
+from echelon.laws.law import Memory
 from echelon.simulation.codegen import Body, from_tape, stride
 from echelon.simulation.native.agent_step import (
     BlockRows,
+    Entries,
     StepInputs,
     agent_step,
     leaves_of,
@@ -91,12 +93,12 @@ def imbalance(loop: Loop) -> Float[Array, "k N"]:
 class _Arguments(NamedTuple):
     """Inputs of an agent's step that have cotangents, or these cotangents."""
 
-    x: Any
-    offset: Any
-    z: Any
-    message: Any
-    memory: Any
-    leader: Any
+    x: Entries
+    offset: Entries
+    z: Entries
+    message: Entries
+    memory: Memory
+    leader: Entries
 
 
 _RESULTS = (
@@ -175,9 +177,13 @@ class Transpose:
         return TransposedStep(*from_tape(body, {"cotangent": "row", "gathered": "z"}))
 
     def _transposed(
-        self, leaves: list[jax.Array], inputs: StepInputs, arguments: _Arguments, cotangents: Any
+        self,
+        leaves: list[jax.Array],
+        inputs: StepInputs,
+        arguments: _Arguments,
+        cotangents: tuple[Entries, ...],
     ) -> tuple[list[jax.Array], _Arguments]:
-        def step(leaves: list[jax.Array], arguments: _Arguments) -> tuple[Any, ...]:
+        def step(leaves: list[jax.Array], arguments: _Arguments) -> tuple[Entries, ...]:
             act = agent_step(self.varying.filled(leaves), self.leads)
             outputs = act(inputs._replace(**arguments._asdict()))
             return tuple(getattr(outputs, name) for name in _RESULTS)
@@ -204,6 +210,7 @@ class Transpose:
             return jax.vjp(difference, x, y)[1](w)
 
         slopes = [nodes(self.graph, part) for part in lower(transposed, self.graph, values)]
+        # The backward pass gathers plain differences, which is the transpose for these slopes only.
         if slopes != [list(values[2]), [-node for node in values[2]]]:
             raise Unsupported("a `difference` of states that is not x - y up to whole turns")
 
@@ -241,7 +248,7 @@ class Transpose:
 
     # ---- the step ----
 
-    def _of_results(self, of_mirror: np.ndarray) -> tuple[Any, ...]:
+    def _of_results(self, of_mirror: np.ndarray) -> tuple[Entries, ...]:
         """Return the cotangents of the results of a step, in the order of `_RESULTS`."""
         rows, message = self.cotangents, range(len(self.rows.message))
         sends = self.leads or self.loop.levels is not None

@@ -13,11 +13,11 @@ import jax
 import numpy as np
 
 from echelon.core.identity import digest
-from echelon.core.types import Array
+from echelon.core.types import Array, PyTree
 from echelon.simulation.step.loop import Loop
 
 
-def _separate_parts(loop: Loop) -> list[Any]:
+def _separate_parts(loop: Loop) -> list[PyTree]:
     """Return the parts of a loop that have their own rows or draws."""
     return [loop.offsets, loop.meter.offsets, loop.meter.spacings, loop.motion.wind]
 
@@ -30,7 +30,7 @@ def bare(loop: Loop) -> Loop:
     return dataclasses.replace(loop, offsets=None, meter=meter, motion=motion)
 
 
-def is_number(leaf: Any) -> bool:
+def is_number(leaf: object) -> bool:
     """Tell whether a leaf of a loop has real numbers."""
     return isinstance(leaf, float) or (
         isinstance(leaf, np.ndarray | jax.Array) and np.issubdtype(leaf.dtype, np.floating)
@@ -76,7 +76,7 @@ class VaryingNumbers:
         """Return the numbers (k,) of a loop that differs from the others only in them."""
         return self._values(jax.tree.leaves(bare(loop)))
 
-    def _values(self, leaves: Sequence[Any]) -> Array:
+    def _values(self, leaves: Sequence[object]) -> Array:
         pairs = zip(leaves, self._masks, strict=True)
         parts = [np.asarray(leaf, float)[mask] for leaf, mask in pairs if mask.any()]
         return np.concatenate([np.zeros(0), *parts])
@@ -93,12 +93,12 @@ class VaryingNumbers:
         # Functions have no digest: their bits are addresses.
         return same and self._digest is not None and digest(self._constant(leaves)) == self._digest
 
-    def turn(self, loop: Loop) -> None:
+    def replace_loop(self, loop: Loop) -> None:
         """Replace the loop by one that differs from it only in these numbers."""
         self._take(loop)
         self.values = self._values(self._flat)[None]
 
-    def _constant(self, leaves: Sequence[Any]) -> list[Array]:
+    def _constant(self, leaves: Sequence[object]) -> list[Array]:
         """Return the leaves with 0 in place of the numbers that differ."""
         constant = list[Array]()
         for leaf, mask in zip(leaves, self._masks, strict=True):
@@ -119,12 +119,13 @@ class VaryingNumbers:
             at += int(mask.sum())
         return leaves
 
-    def filled(self, leaves: Sequence[Any]) -> Loop:
+    def filled(self, leaves: Sequence[object]) -> Loop:
         """Return the loop with these leaves in place of those in which numbers differ."""
         if not leaves:
             return self.loop
         new_leaves, pairs = iter(leaves), zip(self._flat, self._masks, strict=True)
         new = self._tree.unflatten([next(new_leaves) if m.any() else leaf for leaf, m in pairs])
+        # None is an empty tree to JAX, and could not be replaced without `is_leaf`.
         return eqx.tree_at(
             _separate_parts, new, _separate_parts(self.loop), is_leaf=lambda x: x is None
         )
@@ -132,16 +133,17 @@ class VaryingNumbers:
 
 def alike(loop: Loop, other: Loop) -> bool:
     """Tell whether two loops are equal except for the numbers in their leaves."""
-    return operator.eq(*(_forms(*jax.tree.flatten(bare(each))) for each in (loop, other)))
+    return operator.eq(*(_forms(*jax.tree.flatten(bare(one))) for one in (loop, other)))
 
 
-def _forms(leaves: Sequence[Any], tree: Any) -> tuple[Any, ...]:
+def _forms(leaves: Sequence[object], tree: Any) -> tuple[object, ...]:
     arrays = [np.asarray(leaf) for leaf in leaves]
     return tree, *((array.dtype, array.shape) for array in arrays)
 
 
 def _differing(leaves: Sequence[Any]) -> Array:
     """Return which entries of a leaf are not equal in all loops."""
+    # All other leaves are equal already: they are in the key of the program.
     if not is_number(leaves[0]) or len(leaves) == 1:
         return np.zeros(np.shape(leaves[0]), bool)
     stacked = np.stack([np.asarray(leaf, float) for leaf in leaves])

@@ -1,13 +1,12 @@
 """Wind and noise for agents that native code steps, drawn for many holding intervals at once."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.world.disturbance import draw
+from echelon.agents.world.disturbance import Wind, draw
 from echelon.core.types import Array
 from echelon.simulation.step.loop import Loop
 
@@ -29,7 +28,9 @@ def draw_holds(loops: Sequence[Loop], holds: Array, hold: int) -> list[Array | N
 
 
 @jax.jit
-def _drawn(winds: Sequence[Any], steps: jax.Array, agents: jax.Array) -> Any:
+def _drawn(
+    winds: Sequence[Wind | None], steps: jax.Array, agents: jax.Array
+) -> tuple[jax.Array | None, jax.Array | None]:
     """Return what each wind adds to the rates (T, F, N, n) and noise to the inputs at T steps."""
     many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
     one = jax.vmap(draw, (None, None, 0))

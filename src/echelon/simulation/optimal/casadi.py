@@ -8,15 +8,23 @@ array of scalar `SX`; all other arrays hold plain numbers, on which JAX computes
 import functools
 import operator
 from collections.abc import Callable, Mapping
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from echelon.core.errors import MissingExtraError, ModelError
 from echelon.core.jaxpr import Algebra, Rule, dot, entrywise, evaluate, map_entries, reduction
 
+if TYPE_CHECKING:  # it comes with an extra
+    from casadi import SX, Function
 
-def casadi() -> Any:
+Expression: TypeAlias = "SX | float"
+"""A symbol, or a number that depends on none."""
+
+
+def casadi() -> ModuleType:
     """Return the library.
 
     Raises:
@@ -34,8 +42,8 @@ def casadi() -> Any:
 
 
 def casadi_function(
-    name: str, function: Callable[..., Any], *lengths: int, owner: str | None = None
-) -> Any:
+    name: str, function: Callable[..., object], *lengths: int, owner: str | None = None
+) -> "Function":
     """Return a `casadi.Function` of vectors that computes what a function for JAX does.
 
     Args:
@@ -43,23 +51,23 @@ def casadi_function(
         function: takes one float64 vector for each of `lengths` and returns an array of any shape,
             whose entries are the result in row-major order.
         lengths: of the vectors.
-        owner: what the function belongs to, for messages; `name` when left out.
+        owner: of the function, for messages; `name` by default.
 
     Raises:
         MissingExtraError: casadi is not installed.
-        ModelError: the function uses a primitive that is not known here.
+        ModelError: the function uses a primitive without a rule.
     """
     ca = casadi()
     # SX has a node for each scalar: a model of a dozen states is straight-line code, and is
     # differentiated entry by entry.
     columns = [ca.SX.sym(f"a{k}", length) for k, length in enumerate(lengths)]
     operands = [_symbols(ca, column) for column in columns]
-    # A result that depends on no symbol is a plain number, and `SX(e)` makes it one of them.
+    # A result that depends on no symbol is a plain number, which `SX(e)` converts.
     result = evaluate(function, operands, symbols(owner or name))[0]
     return ca.Function(name, columns, [ca.vertcat(*(ca.SX(e) for e in result.ravel()))])
 
 
-def _symbols(ca: Any, column: Any) -> np.ndarray:
+def _symbols(ca: ModuleType, column: "SX") -> np.ndarray:
     # Filled afterwards: NumPy would take each SX for an array of its own.
     entries = np.empty(column.shape[0], object)
     entries[:] = ca.vertsplit(column) if len(entries) else []
@@ -69,7 +77,7 @@ def _symbols(ca: Any, column: Any) -> np.ndarray:
 def symbols(owner: str) -> Algebra:
     """Return the algebra of CasADi's symbols; plain numbers stay numbers.
 
-    Evaluating in it raises `ModelError` at a primitive that is not known here.
+    Evaluating in it raises `ModelError` at a primitive without a rule.
 
     Args:
         owner: of the function that is evaluated, for that message.
@@ -78,7 +86,7 @@ def symbols(owner: str) -> Algebra:
         MissingExtraError: casadi is not installed.
     """
 
-    def unknown(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
+    def unknown(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
         raise ModelError(
             f"`{owner}` uses `{equation.primitive.name}`, which has no expression for the solvers; "
             "allowed are arithmetic, powers, trigonometric and hyperbolic functions, exponentials, "
@@ -92,11 +100,11 @@ def symbols(owner: str) -> Algebra:
 # ---- the rules -----------------------------------------------------------------------------------
 
 
-def _rules(ca: Any) -> dict[str, Rule]:
-    """Return what each primitive of JAX means for symbols, beyond what the walk itself knows."""
+def _rules(ca: ModuleType) -> dict[str, Rule]:
+    """Return the rules of JAX's primitives for symbols, in addition to those of the walk."""
     written: dict[str, Rule] = {
         "integer_pow": lambda params, x: map_entries(lambda value: value ** params["y"], x),
-        # A symbol counts as finite; what is not, a solver finds out and reports.
+        # A symbol counts as finite, since its value is unknown; solvers report what is not.
         "is_finite": lambda params, x: np.full(x.shape, True),
         "round": functools.partial(_round, ca),
         "convert_element_type": functools.partial(_convert, ca),
@@ -111,7 +119,7 @@ def _rules(ca: Any) -> dict[str, Rule]:
     return {name: entrywise(function) for name, function in _functions(ca).items()} | written
 
 
-def _functions(ca: Any) -> dict[str, Callable[..., object]]:
+def _functions(ca: ModuleType) -> dict[str, Callable[..., object]]:
     """Return the primitives that are functions of entries."""
     return {
         **{name: getattr(ca, name) for name in _SAME_NAME},
@@ -137,7 +145,9 @@ _SAME_NAME += ("acosh", "atanh", "atan2", "exp", "expm1", "log", "log1p", "sqrt"
 _SAME_NAME += ("sign", "floor", "ceil")
 
 
-def _choose(ca: Any, which: Any, first: Any, *others: Any) -> Any:
+def _choose(
+    ca: ModuleType, which: Expression, first: Expression, *others: Expression
+) -> Expression:
     """Return the case whose number is chosen; JAX numbers them from zero."""
     if not isinstance(which, ca.SX):
         return (first, *others)[int(which)]
@@ -148,11 +158,11 @@ def _choose(ca: Any, which: Any, first: Any, *others: Any) -> Any:
     return result
 
 
-def _round(ca: Any, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+def _round(ca: ModuleType, params: Mapping[str, int], x: np.ndarray) -> np.ndarray:
     """Round to the nearest whole number; halves to the even one, or away from zero."""
     to_even = int(params["rounding_method"]) == 1
 
-    def one(value: Any) -> Any:
+    def one(value: Expression) -> Expression:
         # CasADi has no rounding; on the size alone, both sides of zero are alike.
         size = ca.fabs(value)
         low = ca.floor(size)
@@ -164,7 +174,7 @@ def _round(ca: Any, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     return map_entries(one, x)
 
 
-def _convert(ca: Any, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+def _convert(ca: ModuleType, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     """Return entries under another type; truth is one and falsehood zero among the symbols."""
     kind = np.dtype(params["new_dtype"]).kind
     if kind == "b":

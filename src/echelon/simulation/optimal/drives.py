@@ -1,4 +1,4 @@
-"""Agents driven by optimization: plans replayed open loop, and plans over a receding horizon."""
+"""Drives by optimization: plans applied open loop, and model predictive control."""
 
 import abc
 import time
@@ -26,7 +26,7 @@ from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats, solver_stats
 
 _SETTLING = 20
-"""Most quadratic programs of an agent's first plan, which no plan precedes."""
+"""Most quadratic programs of an agent's first plan, which has no earlier plan as its guess."""
 
 
 class _Optimized(Drive):
@@ -35,22 +35,24 @@ class _Optimized(Drive):
     reference: eqx.AbstractVar[Guide | None]
 
     def __check_init__(self) -> None:
-        """Refuse what is no reference."""
+        """Check the type of the reference."""
         if self.reference is not None:
             check_kind_of(self.reference)
 
     @property
     @abc.abstractmethod
-    def sent(self) -> str:
-        """What followers are sent by others."""
+    def neighbour_information(self) -> str:
+        """What followers receive from their neighbours."""
 
     @property
     def information(self) -> Information:
         """The reference for the leaders, plans of others for the followers."""
-        return Information(() if self.reference is None else ("the reference",), (self.sent,))
+        return Information(
+            () if self.reference is None else ("the reference",), (self.neighbour_information,)
+        )
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
-        """Tell what of the reference the agents cannot do."""
+        """Return a warning for each part of the reference that the agents cannot follow."""
         if self.reference is None:
             return ()
         return reference_warnings(model, self.reference, settings.horizon, settings.limits)
@@ -66,30 +68,30 @@ class _Optimized(Drive):
 
 @final
 class Plans(_Optimized):
-    """The whole run of each agent planned from its start, and the inputs replayed open loop.
+    """Plans of the whole run, one per agent, whose inputs are applied open loop.
 
-    Leaders plan first, then the followers outward, each given the plans of the neighbours before
-    it. The plans know the model; the plant and the disturbance then do what they do. The limits of
-    the settings hold in the plans and in the plant.
+    Leaders plan first, then the followers outward, each with the plans of the neighbours before it.
+    The plans are made with the model, and ignore a different plant and the disturbance. The limits
+    of the settings hold in the plans and in the plant.
 
     Args:
         reference: what the leaders follow; without one they keep their trim.
-        options: how the plans are posed.
+        options: of the planning problems.
     """
 
     reference: Guide | None = None
     options: TrackingOptions = eqx.field(default_factory=TrackingOptions, static=True)
 
     @property
-    def sent(self) -> str:
+    def neighbour_information(self) -> str:
         """Whole plans."""
         return "the whole plans of the neighbours before it, before the start"
 
     def stepper(self, problem: Problem) -> Stepper:
-        """Plan the run, and return what replays it.
+        """Plan the run, and return the stepper that applies the plans.
 
         Raises:
-            PlanError: a plan misses a constraint (which, and by how much).
+            PlanError: a plan violates a constraint; the message names it and the amount.
             MissingExtraError: casadi is not installed.
         """
         settings = problem.settings
@@ -104,7 +106,7 @@ class Plans(_Optimized):
             planning=self.options,
             limits=settings.limits,
         )
-        # One input a hold: the last interval may go beyond the run, and its end is not flown.
+        # One input per interval; the last interval may extend beyond the run's end.
         inputs = np.stack([plan.inputs for plan in formation_plan.plans], axis=1)
         plan = formation_plan
         work = plan.seconds, plan.iterations, plan.failures, plan.setup_seconds
@@ -116,11 +118,11 @@ class Plans(_Optimized):
 
 @final
 class RecedingHorizon(_Optimized):
-    """Agents that plan over a receding horizon, each from its own measured state.
+    """Model predictive control: each agent plans over a receding horizon from its measured state.
 
-    Every period the leaders plan first, then the followers outward, each given the plans that its
-    neighbours before it have just made; each applies its first input. Computing takes no time in
-    the run; `Result.work` has what it took. A solver that fails is no error.
+    Every period the leaders plan first, then the followers outward, each with the new plans of the
+    neighbours before it; each applies its first input. Computing takes no time in the simulation;
+    `Result.work` reports the time that it took. A failing solver is no error.
 
     Args:
         reference: what the leaders follow; without one they keep their trim.
@@ -131,25 +133,25 @@ class RecedingHorizon(_Optimized):
     mpc: MPC = eqx.field(default_factory=MPC, static=True)
 
     @property
-    def sent(self) -> str:
+    def neighbour_information(self) -> str:
         """Plans, every period."""
         return "the plans that the neighbours before it have just made, every period"
 
     def stepper(self, problem: Problem) -> Stepper:
-        """Make the solvers ready, and return what queries them.
+        """Build the solvers, and return the stepper that queries them.
 
         Raises:
             MissingExtraError: casadi is not installed.
         """
         # A plan is made at whole steps of the run alone.
         hold = max(1, round(self.mpc.period / problem.settings.dt))
-        pilots = _Pilots(problem, self.reference, self.mpc, hold)
-        return HostStepper(problem, pilots, hold, pilots.work)
+        planners = _Planners(problem, self.reference, self.mpc, hold)
+        return HostStepper(problem, planners, hold, planners.work)
 
 
 @final
-class _Pilots:
-    """All agents over a receding horizon: called with the measured states, return the inputs."""
+class _Planners:
+    """The planners of all agents; called with the measured states, they return the inputs."""
 
     def __init__(self, problem: Problem, reference: Guide | None, mpc: MPC, hold: int) -> None:
         began = time.perf_counter()
@@ -173,15 +175,15 @@ class _Pilots:
         self.setup_seconds = time.perf_counter() - began
 
     def work(self) -> SolverStats:
-        """Return what solving took so far."""
+        """Return the work of the solvers so far."""
         work = self.seconds, self.iterations, self.failures, self.setup_seconds
         return solver_stats("mpc", self.mpc.solver, *work)
 
     def __call__(self, step: int, states: Array) -> Array:
-        """Return the wanted inputs (N, m) of all agents, planned in the order of the graph.
+        """Return the desired inputs (N, m) of all agents, planned in the order of the graph.
 
         Raises:
-            Stopped: a solver failed, and that was to end the run.
+            Stopped: a solver failed, and `on_failure` is `stop`.
         """
         inputs = np.zeros((len(states), self.horizon.m))
         for agent, earlier, share in self.turns:
@@ -192,9 +194,9 @@ class _Pilots:
         return self.problem.model.physical(inputs)
 
     def _targets(self, agent: int, earlier: tuple[int, ...], share: Array, period: int) -> Course:
-        """Return what an agent follows: the reference, or the mean of what its neighbours plan."""
+        """Return an agent's targets: the reference, or the mean of its neighbours' plans."""
         formation = self.problem.formation
-        # A leader alone has no neighbour before it, and knows the reference.
+        # Only leaders have no neighbour before them, and know the reference.
         if not earlier:
             span = slice(period, period + self.steps + 1)
             x, v = self.reference.states[span], self.reference.inputs[span]
@@ -210,24 +212,24 @@ class _Pilots:
         """Return an agent's plan, or its last one shifted where the solver fails."""
         began = time.perf_counter()
         last = self.courses.get(agent)
-        # Nothing is near the first plan, so that it takes several linearizations; those after it
-        # begin from the one before, and one is enough (real-time iteration).
+        # The first plan has no good guess and takes several linearizations; each later one starts
+        # from the plan before, and one is enough (real-time iteration).
         if last is None:
-            near, most = Course(np.vstack([start, targets.states[1:]]), targets.inputs), _SETTLING
+            guess, most = Course(np.vstack([start, targets.states[1:]]), targets.inputs), _SETTLING
         else:
-            near, most = self.horizon.shift(last, targets.inputs[-1]), self.mpc.iterations
+            guess, most = self.horizon.shift(last, targets.inputs[-1]), self.mpc.iterations
         answer, count = Answer(None, ""), 0
-        course = near
+        course = guess
         while count < most:
             answer, count = self.horizon.solve(start, targets, course), count + 1
             if answer.course is None:
                 break
             change = np.abs(answer.course.inputs - course.inputs).max()
             course = answer.course
-            # Plan and linearization agree: another program would find the same.
+            # Plan and linearization agree: another program would have the same solution.
             if change < 1e-6:
                 break
-        # Before a failure may end the run: its time and attempts count as well.
+        # Recorded first, since a failure that ends the run counts too.
         self.seconds.append(time.perf_counter() - began)
         self.iterations.append(count)
         if answer.course is not None:
@@ -235,4 +237,4 @@ class _Pilots:
         self.failures += 1
         if self.mpc.on_failure == "stop":
             raise Stopped(f"the solver of agent {agent} failed (`{answer.status}`)")
-        return near
+        return guess

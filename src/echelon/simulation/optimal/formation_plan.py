@@ -1,4 +1,4 @@
-"""Plans for a whole formation: agents plan in the order of the graph, after their neighbours."""
+"""Plans for a whole formation, made agent by agent outward from the leaders."""
 
 import time
 from collections.abc import Callable
@@ -29,13 +29,13 @@ from echelon.simulation.optimal.objectives import (
 from echelon.simulation.optimal.problem import OptimalControl
 from echelon.simulation.optimal.solver import Solver, Trajectory
 
-_EASIER = (1e2, 1e4)
-"""Factors on the input weight of the problems that lead to one that its solver fails on."""
+_INPUT_WEIGHT_FACTORS = (1e2, 1e4)
+"""Factors on the input weight of easier problems, solved when the solver fails on the original."""
 
-_PATIENCE = {"ipopt.max_iter": 300}
-"""A problem that takes more iterations is better begun elsewhere."""
+_ITERATION_LIMIT = {"ipopt.max_iter": 300}
+"""Beyond this, another initial guess helps more than more iterations."""
 
-_RESUMED = {
+_WARM_START = {
     "ipopt.warm_start_init_point": "yes",
     "ipopt.mu_init": 1e-6,
     "ipopt.warm_start_bound_push": 1e-9,
@@ -44,19 +44,19 @@ _RESUMED = {
     "ipopt.warm_start_slack_bound_frac": 1e-9,
     "ipopt.warm_start_mult_bound_push": 1e-9,
 }
-"""What makes IPOPT go on from a solution instead of first leaving its limits."""
+"""Options by which IPOPT starts at a solution, instead of first moving off the limits."""
 
 
 class FormationPlan(NamedTuple):
-    """The plans of all agents, by agent, and what making them took.
+    """The plans of all agents, and the work of the solvers.
 
     Attributes:
         grid: the times.
         plans: one for each agent; states on the grid and inputs held between.
         seconds: of solving, for each agent.
         iterations: of the solver, for each agent.
-        failures: how many solutions failed on the way, each followed by another attempt.
-        setup_seconds: of making the solvers ready.
+        failures: number of failed attempts, each followed by another one.
+        setup_seconds: of building the solvers.
     """
 
     grid: PlanTimes
@@ -80,36 +80,38 @@ def plan_formation(
 ) -> FormationPlan:
     """Return the plans of all agents from their states (N, n), leaders first.
 
-    A follower plans given the plans of its neighbours that come before it, breadth first from the
-    leaders. A leader without a reference keeps its trim.
+    Agents plan breadth first from the leaders; each follower uses the plans of the neighbours that
+    planned before it. A leader without a reference keeps its trim.
 
     Raises:
-        PlanError: an agent's plan misses a constraint, with which and by how much.
+        PlanError: an agent's plan violates a constraint; the message names it and the amount.
         MissingExtraError: casadi is not installed.
     """
     targets = reference_targets(model, reference, grid.times)
-    desk = _Desk(model, planning, grid, limits)
+    planner = _Planner(model, planning, grid, limits)
     plans: dict[int, Trajectory] = {}
     for agent, earlier in graph.outward():
         if not earlier:
             goals = shifted_targets(model, targets, formation.offsets[agent])
-            plans[agent] = desk.follow(agent, states[agent], goals)
+            plans[agent] = planner.follow(agent, states[agent], goals)
             continue
         goals = _neighbour_targets(model, graph, formation, agent, {j: plans[j] for j in earlier})
         if planning.specification == "offset":
-            plans[agent] = desk.follow(agent, states[agent], goals)
+            plans[agent] = planner.follow(agent, states[agent], goals)
         else:
             neighbours = [plans[j].states for j in earlier]
             displacements = [formation.displacement(j, agent) for j in earlier]
-            plans[agent] = desk.keep_apart(agent, states[agent], goals, neighbours, displacements)
+            plans[agent] = planner.keep_distances(
+                agent, states[agent], goals, neighbours, displacements
+            )
     order = range(graph.agents)
     return FormationPlan(
         grid,
         tuple(plans[agent] for agent in order),
-        tuple(desk.seconds[agent] for agent in order),
-        tuple(desk.iterations[agent] for agent in order),
-        desk.failures,
-        desk.setup_seconds,
+        tuple(planner.seconds[agent] for agent in order),
+        tuple(planner.iterations[agent] for agent in order),
+        planner.failures,
+        planner.setup_seconds,
     )
 
 
@@ -124,10 +126,10 @@ def plan_tracking(
     """Return the plan of one agent that follows targets.
 
     Raises:
-        PlanError: it misses a constraint, with which and by how much.
+        PlanError: the plan violates a constraint; the message names it and the amount.
         MissingExtraError: casadi is not installed.
     """
-    return _Desk(model, planning, grid, limits).follow(0, start, targets)
+    return _Planner(model, planning, grid, limits).follow(0, start, targets)
 
 
 def _neighbour_targets(
@@ -137,17 +139,17 @@ def _neighbour_targets(
     agent: int,
     plans: dict[int, Trajectory],
 ) -> Targets:
-    """Return the targets that the plans of earlier neighbours leave an agent."""
+    """Return the targets of an agent: the mean of its earlier neighbours' plans plus offsets."""
     states = np.stack([p.states - formation.displacement(agent, j) for j, p in plans.items()])
     inputs = np.stack([model.normalized(p.inputs) for p in plans.values()])
-    # Inputs are held between times, and targets have one at each: the last is held on.
+    # Targets have an input at each time, plans one per interval: the last one is repeated.
     last = np.concatenate([inputs, inputs[:, -1:]], axis=1)
     return mean_targets(model, states, last, shares(graph, agent, tuple(plans)))
 
 
 @final
-class _Desk:
-    """Solvers made ready once and used by all agents whose problems have the same form."""
+class _Planner:
+    """Plans agent by agent; agents whose problems have the same form share the solvers."""
 
     def __init__(
         self, model: ControlAffine, planning: TrackingOptions, grid: PlanTimes, limits: bool
@@ -156,7 +158,7 @@ class _Desk:
         self.seconds: dict[int, float] = {}
         self.iterations: dict[int, int] = {}
         self.failures, self.setup_seconds = 0, 0.0
-        self._ready: dict[tuple[object, ...], tuple[Solver, Solver | None]] = {}
+        self._solvers: dict[tuple[object, ...], tuple[Solver, Solver | None]] = {}
 
     def follow(self, agent: int, start: Array, targets: Targets) -> Trajectory:
         """Return the plan of an agent that follows targets."""
@@ -166,7 +168,7 @@ class _Desk:
         )
         return self._plan(agent, key, start, targets.outputs, targets)
 
-    def keep_apart(
+    def keep_distances(
         self,
         agent: int,
         start: Array,
@@ -179,7 +181,7 @@ class _Desk:
         Args:
             agent: its number.
             start: its state, (n,).
-            targets: where the solver begins.
+            targets: the initial guess of the solver.
             neighbours: the neighbours' states, (T, n) each.
             displacements: displacements (n,) whose lengths are the distances.
         """
@@ -194,14 +196,18 @@ class _Desk:
         return self._plan(agent, key, start, positions, targets)
 
     def _prepare(self, key: tuple[object, ...], pose: Callable[[bool], OptimalControl]) -> None:
-        if key in self._ready:
+        if key in self._solvers:
             return
         began, solver = time.perf_counter(), self.planning.solver
         # These are IPOPT's own names; any other solver keeps its defaults.
-        begun, resumed = (_PATIENCE, _PATIENCE | _RESUMED) if solver == "ipopt" else (None, None)
+        cold, warm = (
+            (_ITERATION_LIMIT, _ITERATION_LIMIT | _WARM_START)
+            if solver == "ipopt"
+            else (None, None)
+        )
         finer = self.grid.hold > coarse(self.grid)
-        finely = Solver(pose(True), solver, resumed) if finer else None
-        self._ready[key] = Solver(pose(False), solver, begun), finely
+        fine_solver = Solver(pose(True), solver, warm) if finer else None
+        self._solvers[key] = Solver(pose(False), solver, cold), fine_solver
         self.setup_seconds += time.perf_counter() - began
 
     def _plan(
@@ -213,24 +219,24 @@ class _Desk:
         targets: Targets,
     ) -> Trajectory:
         """Solve on coarse steps, which take most iterations, and then on fine ones."""
-        coarsely, finely = self._ready[key]
+        coarse_solver, fine_solver = self._solvers[key]
         self.seconds[agent], self.iterations[agent] = 0.0, 0
         # The targets, after the start, are near the solution.
-        near = (
+        guess = (
             np.vstack([start, targets.states[1:]]),
             self.model.physical(targets.inputs[:-1]),
         )
-        plan = self._attempt(agent, coarsely, start, parameters, targets, near, 1.0)
-        # Costly inputs keep the plan by the targets' own, where the problem is nearly quadratic;
-        # its solution is then a better place to begin.
-        for factor in () if plan.solved else _EASIER:
-            easier = self._attempt(agent, coarsely, start, parameters, targets, near, factor)
-            near = (easier.states, easier.inputs)
-            plan = self._attempt(agent, coarsely, start, parameters, targets, near, 1.0)
+        plan = self._attempt(agent, coarse_solver, start, parameters, targets, guess, 1.0)
+        # A larger input weight keeps the plan near the targets' inputs, where the problem is nearly
+        # quadratic; its solution is then a better guess.
+        for factor in () if plan.solved else _INPUT_WEIGHT_FACTORS:
+            easier = self._attempt(agent, coarse_solver, start, parameters, targets, guess, factor)
+            guess = (easier.states, easier.inputs)
+            plan = self._attempt(agent, coarse_solver, start, parameters, targets, guess, 1.0)
             if plan.solved:
                 break
-        if finely is not None:
-            plan = self._attempt(agent, finely, start, parameters, targets, plan, 1.0)
+        if fine_solver is not None:
+            plan = self._attempt(agent, fine_solver, start, parameters, targets, plan, 1.0)
         # Judged by the constraints, not by the status of the solver: it may have stopped short of
         # its tolerance with a valid plan.
         if plan.violations:
@@ -240,7 +246,7 @@ class _Desk:
     def _attempt(
         self,
         agent: int,
-        planner: Solver,
+        solver: Solver,
         start: Array,
         parameters: Array,
         targets: Targets,
@@ -249,7 +255,7 @@ class _Desk:
     ) -> Trajectory:
         # The factor is data, so that the easier problems need no solvers of their own.
         weight = np.full((len(parameters), 1), factor * self.planning.input_weight)
-        plan = planner.solve(start, np.hstack([parameters, targets.inputs, weight]), guess)
+        plan = solver.solve(start, np.hstack([parameters, targets.inputs, weight]), guess)
         self.seconds[agent] += plan.seconds
         self.iterations[agent] += plan.iterations
         self.failures += not plan.solved

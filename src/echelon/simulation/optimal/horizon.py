@@ -1,11 +1,12 @@
-"""One agent's problem over a receding horizon, by real-time iteration.
+"""The optimal control problem of model predictive control, solved by real-time iteration.
 
-At each period the motion is linearized along the last plan, and one quadratic program is solved.
+In each period the motion is linearized along the last plan, and one quadratic program is solved.
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple, final
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +27,12 @@ from echelon.simulation.optimal.problem_check import (
     read_weights,
 )
 
+if TYPE_CHECKING:  # it comes with an extra
+    from casadi import DM, Function, Sparsity
+
 ON_FAILURE = ("shift", "stop")
 SOLVERS = ("piqp", "proxqp", "osqp", "qrqp", "qpoases", "daqp", "highs")
-_SILENT: dict[str, dict[str, Any]] = {
+_SILENT: dict[str, dict[str, object]] = {
     # Its own tolerance is 1e-3, of metres and of metres per second squared alike.
     "osqp": {"osqp": {"verbose": False, "eps_abs": 1e-7, "eps_rel": 1e-7}},
     "qrqp": {"print_iter": False, "print_header": False},
@@ -43,9 +47,9 @@ class MPC:
 
     The cost is that of the paper's gains: the integral of e'Q e + w'R w over the horizon, plus the
     cost of the Riccati gain from its end on. e is the deviation from the targets' states, w that
-    from their normalized inputs. Weights left out are the model's own on the states that its output
-    shows, a 25th of them on all others, and a 100th of them on the inputs: an optimization is to
-    make small errors, and the limits it knows are what holds it back.
+    from their normalized inputs. Default weights are the model's own for the states that its
+    output depends on, 1/25 of them for all others, and 1/100 of them for the inputs: errors should
+    be small, and the limits bound the inputs anyway.
 
     Args:
         period: how long an input is held before the next plan, and the step of the horizon's grid,
@@ -54,8 +58,8 @@ class MPC:
         state_weight: diagonal of Q, n numbers.
         input_weight: diagonal of R, m numbers.
         iterations: quadratic programs a period.
-        on_failure: when a solver fails, `shift` goes on with the agent's last plan, and `stop` ends
-            the run.
+        on_failure: when a solver fails, `shift` continues with the agent's last plan, and `stop`
+            ends the run.
         solver: a quadratic solver of CasADi.
         options: for it, by CasADi's names.
 
@@ -97,7 +101,7 @@ class MPC:
         R = R / 100.0 if self.input_weight is None else self.input_weight
         Q = read_weights("state_weight", Q, model.state_names)
         R = read_weights("input_weight", R, model.input_names)
-        # An input that costs nothing leaves the quadratic program without a unique solution.
+        # Without a cost on every input the quadratic program has no unique solution.
         if not (R > 0.0).all():
             raise PlanError(f"`input_weight` is {R.tolist()}, and must be positive.")
         return Q, R
@@ -118,7 +122,7 @@ class Course(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """A plan, or None, and the solver's own word on it."""
+    """A plan or None, and the solver's return status."""
 
     course: Course | None
     status: str
@@ -128,19 +132,19 @@ class Answer(NamedTuple):
 class Horizon:
     """The quadratic programs of one model, limits and weights, for any start and targets.
 
-    Variables are v_0, x_1, v_1, ..., x_N: the start is data, so that a solver needs no equation
-    for it, which those that go through the interior could not meet.
+    Variables are v_0, x_1, v_1, ..., x_N. The start is data, so that no equation is needed for it,
+    which interior-point solvers could not meet.
     """
 
     def __init__(self, model: ControlAffine, mpc: MPC, steps: int, dt: float, limits: bool) -> None:
-        """Make the programs ready.
+        """Build the quadratic program.
 
         Args:
             model: of the agent.
             mpc: the horizon.
             steps: of the horizon's grid.
             dt: of that grid, s.
-            limits: whether the actuators' limits hold.
+            limits: whether the actuators' limits are constraints.
         """
         self.steps, self.dt = steps, dt
         self.n, self.m = len(model.state_names), len(model.input_names)
@@ -158,18 +162,18 @@ class Horizon:
         self._flow, self._matrix = _assembly(model, steps, dt, rows)
         self._solve = _program(ca, mpc, self._hessian, self._matrix.sparsity_out(0))
 
-    def solve(self, start: Array, targets: Course, near: Course) -> Answer:
-        """Return the plan from a start (n,), linearized along a course near it."""
+    def solve(self, start: Array, targets: Course, guess: Course) -> Answer:
+        """Return the plan from a start (n,), linearized along a guess."""
         n, m, N = self.n, self.m, self.steps
         # About the measured start, so that the equations are exact in x_0, which is no variable.
-        states = np.vstack([start, near.states[1:]])
-        matrix, constants = self._matrix(states[:N].T, near.inputs.T)
+        states = np.vstack([start, guess.states[1:]])
+        matrix, constants = self._matrix(states[:N].T, guess.inputs.T)
         desired = _interleave(targets.inputs, targets.states[1:])
         equal = np.array(constants).T
         # Both bounds of an equation are alike; the rows of a step are its motion, then its limits.
         low = np.hstack([equal, np.tile(self._low, (N, 1))]).ravel()
         high = np.hstack([equal, np.tile(self._high, (N, 1))]).ravel()
-        # Checked here, since solvers fail in different ways on such data.
+        # Checked here, since each solver fails on such data in its own way.
         if not (np.isfinite(equal).all() and np.isfinite(desired).all()):
             return Answer(None, "its data is not finite")
         solution = self._solve(
@@ -179,7 +183,7 @@ class Horizon:
             a=matrix,
             lba=low,
             uba=high,
-            x0=_interleave(near.inputs, near.states[1:]),
+            x0=_interleave(guess.inputs, guess.states[1:]),
         )
         stats = self._solve.stats()
         w = np.array(solution["x"]).reshape(N, m + n)
@@ -188,7 +192,7 @@ class Horizon:
         return Answer(Course(np.vstack([start, w[:, m:]]), w[:, :m]), "")
 
     def shift(self, course: Course, last: Array) -> Course:
-        """Return a course one step later, its new last input (m,) given."""
+        """Return a course shifted by one step, with a new last input (m,)."""
         end = np.array(self._flow(course.states[-1], last)).ravel()
         # A guess must be finite; the next solution corrects it.
         end = end if np.isfinite(end).all() else course.states[-1]
@@ -200,7 +204,7 @@ def _interleave(inputs: Array, states: Array) -> Array:
 
 
 def _cost_to_go(model: ControlAffine, Q: Array, R: Array, dt: float) -> Array:
-    """Return the cost matrix of the best linear feedback near the trim, on steps of dt."""
+    """Return the cost matrix of the LQR about the trim in discrete time."""
     A, B = linearize(model)
     n, m = B.shape
     block = np.zeros((n + m, n + m))
@@ -230,8 +234,10 @@ def _limit_rows(model: ControlAffine, limits: bool) -> tuple[Array, Array, Array
     return rows / size[:, None], (low - at_trim) / size, (high - at_trim) / size
 
 
-def _assembly(model: ControlAffine, steps: int, dt: float, rows: Array) -> tuple[Any, Any]:
-    """Return the flow (x, v) -> x after dt, and what makes the equations along a course.
+def _assembly(
+    model: ControlAffine, steps: int, dt: float, rows: Array
+) -> "tuple[Function, Function]":
+    """Return the flow (x, v) -> x after dt, and the function of the equations along a course.
 
     The latter takes states (n, N) and inputs (m, N), and returns the matrix of the program and the
     right-hand side (n, N) of its equations.
@@ -239,7 +245,8 @@ def _assembly(model: ControlAffine, steps: int, dt: float, rows: Array) -> tuple
     ca, n, m = casadi(), len(model.state_names), len(model.input_names)
     x, v = ca.SX.sym("x", n), ca.SX.sym("v", m)
     owner = type(model).__name__
-    field = casadi_function("velocity", model.velocity, n, m, owner=owner)
+    # `rk4` is annotated for JAX, and needs arithmetic alone.
+    field: Any = casadi_function("velocity", model.velocity, n, m, owner=owner)
     physical = casadi_function("physical", model.physical, m, owner=owner)
     # One Runge-Kutta step a period, which is short: the next plan begins from what is measured.
     after = rk4(field, x, physical(v), dt)
@@ -259,12 +266,12 @@ def _assembly(model: ControlAffine, steps: int, dt: float, rows: Array) -> tuple
         blocks += [ca.horzcat(ca.MX(free, left), limit, ca.MX(free, width - left - m))]
         # A x + B v - x_next = A x' + B v' - flow(x', v') about the last plan (x', v'); without the
         # terms in x_0, which is x'_0.
-        moved = Bs[k] @ V[:, k] - ends[:, k]
-        constants += [moved + As[k] @ X[:, k] if k else moved]
+        constant = Bs[k] @ V[:, k] - ends[:, k]
+        constants += [constant + As[k] @ X[:, k] if k else constant]
     return flow, ca.Function("equations", [X, V], [ca.vertcat(*blocks), ca.horzcat(*constants)])
 
 
-def _program(ca: Any, mpc: MPC, hessian: Any, matrix: Any) -> Any:
+def _program(ca: ModuleType, mpc: MPC, hessian: "DM", matrix: "Sparsity") -> "Function":
     # A failure comes back as a status: the run goes on with the last plan.
     options = {"print_time": False, "error_on_fail": False, **_SILENT.get(mpc.solver, {})}
     try:

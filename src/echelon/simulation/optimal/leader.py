@@ -1,7 +1,7 @@
-"""A leader that minimizes its tracking error, as the paper's does: a plan, and feedback on it.
+"""A leader that minimizes its tracking error, as in the paper: an optimal plan with feedback.
 
-The plan is made once, before the run, from where the leader is to start. The feedback keeps wind
-and a false mass from adding up, as they would open loop.
+The plan is made once, before the run, from the leader's intended start. The feedback bounds the
+errors by wind and a wrong mass, which would grow in open loop.
 """
 
 from collections.abc import Mapping
@@ -40,10 +40,10 @@ class OptimalTracking(Law):
     Args:
         reference: the path to follow.
         horizon: of the plan, s.
-        start_error: what is added to the leader's start, per state or group: where the plan begins.
-            A leader that starts elsewhere is brought to the plan by the feedback.
+        start_error: added to the leader's start, per state or group, for the start of the plan. The
+            feedback brings a leader that starts elsewhere to the plan.
         limits: whether the plan keeps to the actuators' limits.
-        planning: how the plan is posed.
+        planning: options of the planning problem.
         gain: of the feedback, used with coupling 1; the model's Riccati gain when left out.
     """
 
@@ -65,7 +65,7 @@ class OptimalTracking(Law):
         planning: TrackingOptions | None = None,
         gain: Gain | None = None,
     ) -> None:
-        """Keep the problem; `prepared` solves it."""
+        """Store the problem, which `prepared` solves."""
         self.reference, self.gain, self.states, self.inputs = reference, gain, None, None
         self.horizon, self.limits = horizon, limits
         self.start_error = tuple((start_error or {}).items())
@@ -100,7 +100,7 @@ class OptimalTracking(Law):
         )
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
-        """Tell what of the reference the leader cannot do."""
+        """Return a warning for each part of the reference that the leader cannot follow."""
         return reference_warnings(model, self.reference, self.horizon, self.limits)
 
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
@@ -116,7 +116,7 @@ class OptimalTracking(Law):
         x_r, u_r = self.reference.follow(model, t)
         dtype, count = x_r.dtype, len(self.inputs)
         span = grid(self.horizon, _STEP, self.planning.interval).interval
-        # A time that rounding has left just before an interval belongs to it.
+        # Rounding may leave a time just before the interval that it belongs to.
         k = jnp.floor(t / span + 1e-4).astype(jnp.int32)
         interval = jnp.clip(k, 0, count - 1)
         u = jnp.asarray(self.inputs, dtype)[interval]
@@ -126,7 +126,7 @@ class OptimalTracking(Law):
         x = jax.lax.fori_loop(
             0, _BETWEEN, lambda _, x: rk4(model.velocity, x, u, step / _BETWEEN), x
         )
-        # Both are computed and one is taken: in a compiled step there is no other choice.
+        # Both are computed, since a compiled step cannot branch on a traced value.
         planned = k < count
         return jnp.where(planned, x, x_r), jnp.where(planned, u, u_r)
 

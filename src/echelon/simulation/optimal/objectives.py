@@ -1,6 +1,6 @@
-"""Objectives of the optimization method: follow targets or keep distances, with little input.
+"""Objectives of the optimization method: tracking of targets, or keeping of distances.
 
-The targets of a leader are its reference; those of a follower follow from its neighbours' plans.
+A leader's targets are its reference; a follower's are computed from its neighbours' plans.
 """
 
 import dataclasses
@@ -20,23 +20,23 @@ from echelon.simulation.optimal.problem_check import check_choice, check_seconds
 
 SPECIFICATIONS = ("offset", "distance")
 _INSIDE = 0.9
-"""A plan keeps to this part of a chart's half-width: at its edge the equations are singular."""
+"""The share of a chart's half-width that plans use: at its edge the equations are singular."""
 _SUBSTEP = 0.025
-"""Longest Runge-Kutta step of a first solution, s; a second one on the fine steps follows."""
+"""Longest Runge-Kutta step of the coarse solution, s; a solution on fine steps follows it."""
 
 
 @final
 @dataclasses.dataclass(frozen=True)
 class TrackingOptions:
-    """How the plans of a formation are posed.
+    """Options of the planning problems of a formation.
 
     Args:
         interval: how long an input is held, s; rounded to whole steps of the simulation.
         output_weight: weight of the squared error of each output, q numbers; ones when left out.
         input_weight: factor on the model's own input weights, for the normalized input's deviation
             from that of the reference or of the neighbours' plans.
-        specification: what a follower keeps to: its `offset` from its neighbours, or its `distance`
-            alone.
+        specification: what a follower regulates: its `offset` from its neighbours, or only its
+            `distance`.
         solver: a nonlinear solver of CasADi.
 
     Raises:
@@ -58,7 +58,7 @@ class TrackingOptions:
             )
         check_choice("specification", self.specification, SPECIFICATIONS)
         if isinstance(self.output_weight, list | np.ndarray):
-            # A law holds this in a static field, which JAX compares by its hash.
+            # A law has this in a static field, which JAX compares by its hash.
             object.__setattr__(self, "output_weight", tuple(np.ravel(self.output_weight).tolist()))
 
     def weights(self, model: ControlAffine) -> Array:
@@ -102,7 +102,7 @@ def grid(horizon: float, dt: float, interval: float) -> PlanTimes:
         )
     count = max(1, round(horizon / dt))
     hold = min(count, max(1, round(interval / dt)))
-    # Rounded up: a run that ended within an interval must have an input there.
+    # Rounded up, since a run that ends within an interval needs an input there.
     return PlanTimes(-(-count // hold), hold, dt)
 
 
@@ -134,7 +134,7 @@ def spacing(
     fine: bool,
     distances: Array,
 ) -> OptimalControl:
-    """Return the problem of a follower with wanted distances (J,) from J neighbours.
+    """Return the problem of a follower with desired distances (J,) from J neighbours.
 
     Its parameters at a time are the neighbours' positions (J d,), the normalized input (m,) and the
     factor on the input weights.
@@ -151,16 +151,18 @@ def spacing(
     input_cost, count = _input_cost(model), len(distances) * len(axes)
 
     def stage(x: jax.Array, u: jax.Array, p: jax.Array) -> jax.Array:
-        apart = p[:count].reshape(len(distances), len(axes)) - x[None, np.array(axes)]
-        # Without a derivative where two coincide, which no wanted distance is near.
-        off = jnp.sqrt(jnp.sum(apart * apart, axis=1)) - jnp.asarray(distances, x.dtype)
-        return jnp.sum(off * off) + input_cost(u, p[count:])
+        displacement = p[:count].reshape(len(distances), len(axes)) - x[None, np.array(axes)]
+        # It has no derivative where two agents coincide, far from any desired distance.
+        error = jnp.sqrt(jnp.sum(displacement * displacement, axis=1)) - jnp.asarray(
+            distances, x.dtype
+        )
+        return jnp.sum(error * error) + input_cost(u, p[count:])
 
     return _problem(model, times, limits, fine, stage, count + len(model.input_names) + 1)
 
 
 def _input_cost(model: ControlAffine) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Return the cost of an input u given (its target's normalized input, factor)."""
+    """Return the cost of an input u; its data p is the target's normalized input and a factor."""
     # In normalized inputs, as deviations: a formation in motion costs nothing (theory page).
     R = np.asarray(model.weights[1])
 

@@ -1,9 +1,9 @@
 """The optimization-based method of arXiv 2301.05841 on planar quadrotors, printed and repaired.
 
-An agent plans its whole flight, off-line and open loop, given the plans of its neighbours that come
-before it in the graph. As printed, three things are wrong with the problem, and each has a repair.
-The distance term beta (d - |G_i - G_j|) is linear, so the farther apart the better; the terminal
-cost x(T)' P x(T) pulls to the origin, wherever the path ends; and an open loop adds up the noise.
+An agent plans its whole flight off-line and open loop, with the plans of the neighbours before it
+in the graph. The printed problem has three errors, each of which can be repaired. The distance term
+beta (d - |G_i - G_j|) is linear, so the farther apart the better; the terminal cost x(T)' P x(T)
+pulls to the origin, wherever the path ends; and an open loop adds up the noise.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from echelon.agents.models.planar_quadrotor_linear import LinearPlanarQuadrotor
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import PlanError
 from echelon.core.types import Array, Input, Scalar, State
-from echelon.simulation.optimal.problem import Constraint, OptimalControl
+from echelon.simulation.optimal.problem import Constraint, OptimalControl, Stage, Terminal
 from echelon.simulation.optimal.problem_check import check_choice
 from echelon.simulation.optimal.solver import Trajectory, solve
 
@@ -63,7 +63,7 @@ class PlanarBaseline:
     noise: float = 0.2
 
     def __post_init__(self) -> None:
-        """Refuse an unknown option."""
+        """Check the options."""
         check_choice("terminal", self.terminal, TERMINALS)
         check_choice("separation", self.separation, SEPARATIONS)
 
@@ -80,11 +80,11 @@ class PlanarBaseline:
     @property
     def reference(self) -> Array:
         """The leader's reference states on the grid, (steps + 1, 6)."""
-        # The source gives the curve and T; a constant speed along y is what is left to assume.
+        # The source gives the curve and T only; a constant speed along y is our assumption.
         speed = 2.0 * np.pi / self.horizon
         y = np.linspace(-np.pi, np.pi, self.steps + 1)
-        still = np.zeros_like(y)
-        rows = [y, still + speed, np.sin(y), speed * np.cos(y), still, still]
+        zeros = np.zeros_like(y)
+        rows = [y, zeros + speed, np.sin(y), speed * np.cos(y), zeros, zeros]
         return np.stack(rows, axis=1)
 
     def leader(self) -> OptimalControl:
@@ -102,30 +102,30 @@ class PlanarBaseline:
 
     def follower(self, neighbours: int) -> OptimalControl:
         """Return the problem of a follower; its parameters are its neighbours' states in a row."""
-        # All but (y, z), whose place relative to a neighbour the distance leaves open.
-        still = np.array([1, 3, 4, 5])
+        # All but (y, z), since a distance does not fix the position relative to a neighbour.
+        others = np.array([1, 3, 4, 5])
 
-        def apart(x: State, p: jax.Array) -> jax.Array:
+        def squared_distances(x: State, p: jax.Array) -> jax.Array:
             return jnp.sum((x[None, 0:3:2] - p.reshape(neighbours, 6)[:, 0:3:2]) ** 2, axis=1)
 
         def stage(x: State, u: Input, p: jax.Array) -> Scalar:
             if self.separation == "constraint":
                 return u @ u
-            gap = self.distance - jnp.sqrt(apart(x, p))
+            gap = self.distance - jnp.sqrt(squared_distances(x, p))
             return u @ u + self.beta * jnp.sum(gap if self.separation == "linear" else gap**2)
 
         def terminal(x: State, p: jax.Array) -> Scalar:
-            moving = (x[None] - p.reshape(neighbours, 6))[:, still]
-            return jnp.sum({"origin": x, "error": moving, "none": 0.0 * x}[self.terminal] ** 2)
+            error = (x[None] - p.reshape(neighbours, 6))[:, others]
+            return jnp.sum({"origin": x, "error": error, "none": 0.0 * x}[self.terminal] ** 2)
 
         # Squares, which have derivatives everywhere; a distance has none at zero.
         d = self.distance**2
-        exact = (Constraint("squared distance", apart, d, d),)
+        exact = (Constraint("squared distance", squared_distances, d, d),)
         constraints = exact if self.separation == "constraint" else ()
         return self._problem(stage, terminal, constraints, 6 * neighbours)
 
     def _problem(
-        self, stage: Any, terminal: Any, constraints: tuple[Constraint, ...], parameters: int
+        self, stage: Stage, terminal: Terminal, constraints: tuple[Constraint, ...], parameters: int
     ) -> OptimalControl:
         return OptimalControl(
             self.model,
@@ -142,8 +142,8 @@ class PlanarBaseline:
         """Return each agent's plan by IPOPT, planned outward from the leader.
 
         Args:
-            graph: who knows whose plan.
-            offsets: (N, 2), where the agents start from, at rest, relative to the leader's start.
+            graph: which agents know whose plans.
+            offsets: (N, 2) starts relative to the leader's, all at rest.
 
         Raises:
             PlanError: the offsets do not fit the graph.
@@ -164,8 +164,8 @@ class PlanarBaseline:
                 continue
             first = plans[earlier[0]]
             parameters = np.hstack([plans[j].states for j in earlier])
-            # Flying along with the first neighbour is the guess: it meets all constraints but the
-            # distances from others.
+            # The guess, the first neighbour's plan shifted, meets all constraints but the distances
+            # from other neighbours.
             guess = first.states + starts[agent] - starts[earlier[0]], first.inputs
             plans[agent] = solve(
                 self.follower(len(earlier)), starts[agent], parameters, guess=guess

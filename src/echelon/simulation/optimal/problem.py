@@ -23,10 +23,10 @@ TRANSCRIPTIONS = ("shooting", "collocation")
 
 
 class Constraint(NamedTuple):
-    """low <= function(x, p) <= high at all times of the grid but the first, whose state is given.
+    """low <= function(x, p) <= high at all times of the grid except the first, whose state is data.
 
     Attributes:
-        name: what it is called in messages.
+        name: for messages.
         function: written with `jax.numpy`, of the state (n,) and the time's parameters (k,); it
             returns a number or an array.
         low, high: a number, or one for each entry; equal ones make an equation.
@@ -49,13 +49,13 @@ class OptimalControl:
     """min of the integral of stage(x, u, p) dt, plus terminal(x(T), p(T)).
 
     Subject to xdot = f(x) + g(x) u, to a start state, to the actuators' limits and to constraints
-    on the state. Cost and constraints are functions written with `jax.numpy`. p holds what differs
-    from time to time or from one solution to the next, such as a reference or a neighbour's plan.
+    on the state. Cost and constraints are functions written with `jax.numpy`. p is the data
+    that differs between times or solutions, such as a reference or a neighbour's plan.
 
     Args:
         model: the agent.
         horizon: T, s.
-        steps: of the grid; the integral is taken by the trapezoidal rule on it.
+        steps: of the grid, on which the integral is taken by the trapezoidal rule.
         stage: cost per second of state (n,), physical input (m,) and parameters (k,).
         terminal: cost of the last state and parameters; none when left out.
         constraints: on the state.
@@ -81,7 +81,7 @@ class OptimalControl:
     substeps: int = 1
 
     def __post_init__(self) -> None:
-        """Refuse what is out of range."""
+        """Check the range of each argument."""
         if not isinstance(self.model, ControlAffine):
             raise PlanError(
                 f"the model is {self.model!r}, and must be an instance of a `ControlAffine` class."
@@ -92,7 +92,7 @@ class OptimalControl:
         check_whole("parameters", self.parameters, 0)
         check_choice("transcription", self.transcription, TRANSCRIPTIONS)
         if self.limits is True:
-            _check_known(self.model)
+            _check_has_limits(self.model)
         _check_limits(self.bounds, len(self.model.input_names))
 
     @property
@@ -102,20 +102,20 @@ class OptimalControl:
 
     @property
     def nodes(self) -> int:
-        """How many inputs the plan has: one a step, or one a time."""
+        """The number of inputs of a plan: one per step, or one per time."""
         # The trapezoidal rule needs the input at both ends of a step.
         return self.steps + (self.transcription == "collocation")
 
     @property
     def bounds(self) -> Limits | None:
-        """The limits on the input that hold."""
+        """The limits on the input; None without any."""
         if isinstance(self.limits, Limits):
             return self.limits
         return self.model.input_limits if self.limits else None
 
 
-def _check_known(model: ControlAffine) -> None:
-    # A plan keeps to inequalities, and none can be read off a function that clips.
+def _check_has_limits(model: ControlAffine) -> None:
+    # A plan needs inequalities, which cannot be derived from a function that clips.
     if model.input_limits is None and type(model).limit is not ControlAffine.limit:
         raise PlanError(
             f"`{type(model).__name__}` has a `limit`, and plans need it as `input_limits` too; add "

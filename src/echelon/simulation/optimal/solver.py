@@ -1,11 +1,12 @@
-"""The solver of an optimal control problem: the plan, and its status in words."""
+"""Solves optimal control problems by CasADi, and says in words how the solver ended."""
 
 import dataclasses
 import time
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from echelon.agents.models.model_check import check_model
 from echelon.core.errors import PlanError, listing
@@ -15,12 +16,15 @@ from echelon.simulation.optimal.casadi import casadi
 from echelon.simulation.optimal.problem import OptimalControl
 from echelon.simulation.optimal.transcription import NonlinearProgram, transcribe
 
-FELT = 1e-6
-"""A constraint that is missed by less than this counts as met."""
+if TYPE_CHECKING:  # it comes with an extra
+    from casadi import DM
+
+_TOLERANCE = 1e-6
+"""A constraint that is violated by less than this counts as met."""
 
 
 class Violation(NamedTuple):
-    """By how much a constraint is missed at most, in its own units, and when (s)."""
+    """The largest violation of a constraint, in the constraint's units, and its time (s)."""
 
     name: str
     amount: float
@@ -28,13 +32,13 @@ class Violation(NamedTuple):
 
 
 def violations(program: NonlinearProgram, g: Array) -> tuple[Violation, ...]:
-    """Return by how much each kind of constraint is missed at most, the largest first."""
+    """Return the largest violation of each kind of constraint, the largest first."""
     sizes = np.array([row.size for row in program.rows])
     amounts = sizes * np.maximum(program.low - g, g - program.high)
     worst: dict[str, Violation] = {}
-    # `~(<=)` and not `>`: what is not a number is missed. In the program's rows, which are divided
-    # by their size, all are forgiven alike.
-    for k in np.flatnonzero(~(amounts <= FELT * sizes)):
+    # `~(<=)` and not `>`, so that NaN counts as violated. By size, since the program's rows are
+    # divided by it and the solver's tolerance is the same for all of them.
+    for k in np.flatnonzero(~(amounts <= _TOLERANCE * sizes)):
         name, amount = program.rows[k].name, float(amounts[k])
         if name not in worst or not amount <= worst[name].amount:
             worst[name] = Violation(name, amount, program.rows[k].time)
@@ -42,14 +46,14 @@ def violations(program: NonlinearProgram, g: Array) -> tuple[Violation, ...]:
 
 
 def least_violations(program: NonlinearProgram, w: Array, p: Array) -> tuple[Violation, ...]:
-    """Return what is missed where the sum of all misses of the problem's own constraints is least.
+    """Return the violations at the point of least total violation of the problem's constraints.
 
-    The motion, the start and the actuators' limits are kept. Where these alone contradict each
-    other, or no such point is found, nothing is returned.
+    The motion, the start and the actuators' limits are met. The result is empty if these alone
+    contradict each other, or the solver finds no such point.
 
     Args:
         program: has no feasible point.
-        w: where to begin.
+        w: the initial guess.
         p: the program's data.
     """
     ca = casadi()
@@ -60,17 +64,17 @@ def least_violations(program: NonlinearProgram, w: Array, p: Array) -> tuple[Vio
     place = ca.DM(np.eye(len(program.rows))[:, relaxed])
     elastic = {
         "x": ca.vertcat(program.problem["x"], above, below),
-        # The sum of misses and not of squares: it leaves most at zero and so names the few that
-        # stand against each other.
+        # The sum of violations and not of squares: it leaves most of them at zero, and so names
+        # the few constraints that contradict each other.
         "f": ca.sum1(above) + ca.sum1(below),
         "g": program.problem["g"] + ca.mtimes(ca.sparsify(place), below - above),
         "p": program.problem["p"],
     }
     quiet = {"print_time": False, "error_on_fail": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
     solver = ca.nlpsol("elastic", "ipopt", elastic, quiet)
-    # Slacks begin at 1: an interior solver starts off its bounds.
+    # Slacks begin at 1, since an interior-point solver starts inside of the bounds.
     free, slack = np.full(len(w), np.inf), np.ones(2 * len(relaxed))
-    solution: dict[str, Any] = solver(
+    solution: dict[str, DM] = solver(
         x0=np.concatenate([w, slack]),
         lbx=np.concatenate([-free, 0.0 * slack]),
         lbg=program.low,
@@ -96,9 +100,9 @@ class Trajectory:
         inputs: physical; (N, m) held over each step, or (N + 1, m) at the times (collocation).
         cost: the value of the cost.
         solved: whether the solver reached its tolerance.
-        message: how it ended, with the constraints that are missed most if any are.
-        violations: what is missed by more than 1e-6, the largest first; where the solver found a
-            contradiction, what must be missed at least if all else is met.
+        message: how it ended, with the largest violations of constraints if there are any.
+        violations: those above 1e-6, the largest first; if the solver found a contradiction, the
+            smallest violations that are possible with all else met.
         iterations: of the solver.
         seconds: of solving.
         multipliers: of the variables' bounds and of the constraints, for a warm start.
@@ -116,21 +120,21 @@ class Trajectory:
     multipliers: tuple[Array, Array]
 
 
-_DEFAULTS: dict[str, dict[str, Any]] = {
+_DEFAULTS: dict[str, dict[str, object]] = {
     # IPOPT would widen every bound by 1e-8, and a plan then leave the actuators' limits.
     "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.bound_relax_factor": 0.0},
     "fatrop": {"structure_detection": "auto", "fatrop.print_level": 0},
 }
-"""What makes a solver silent, exact about limits, and aware of the structure."""
+"""Options that silence a solver, make limits exact, and let it use the structure."""
 
 
 class Solver:
-    """A problem made ready for a solver, to be solved again and again with other data.
+    """A problem transcribed for a solver, to be solved many times with different data.
 
     Args:
         problem: what to solve.
         solver: a nonlinear solver of CasADi: `ipopt`, `fatrop`, `sqpmethod`, ...
-        options: for it, by CasADi's names, on top of what makes it silent.
+        options: for it, by CasADi's names, in addition to the defaults.
 
     Raises:
         EchelonError: the model or the problem is malformed, or casadi is missing.
@@ -140,7 +144,7 @@ class Solver:
         self,
         problem: OptimalControl,
         solver: str = "ipopt",
-        options: Mapping[str, Any] | None = None,
+        options: Mapping[str, object] | None = None,
     ) -> None:
         self.problem, self.solver = problem, solver
         ca = casadi()
@@ -150,13 +154,17 @@ class Solver:
         with precision("float64"):
             check_model(problem.model)
             self.program: NonlinearProgram = transcribe(problem)
-        chosen = {"print_time": False, "error_on_fail": False, **_DEFAULTS.get(solver, {})}
-        # It splits the rows of a step into equations and inequalities, and must be given which.
+        merged: dict[str, object] = {
+            "print_time": False,
+            "error_on_fail": False,
+            **_DEFAULTS.get(solver, {}),
+        }
+        # It treats equations and inequalities differently, and cannot tell them apart itself.
         if solver == "fatrop":
-            chosen["equality"] = (self.program.low == self.program.high).tolist()
-        chosen |= options or {}
+            merged["equality"] = (self.program.low == self.program.high).tolist()
+        merged |= options or {}
         try:
-            self._solve = ca.nlpsol("plan", solver, self.program.problem, chosen)
+            self._solve = ca.nlpsol("plan", solver, self.program.problem, merged)
         except RuntimeError as error:
             raise PlanError(
                 f"`{solver}` refuses the problem or its options: {_complaint(error)}."
@@ -164,8 +172,8 @@ class Solver:
 
     def solve(
         self,
-        start: Any,
-        parameters: Any = None,
+        start: ArrayLike,
+        parameters: ArrayLike | None = None,
         guess: "Trajectory | tuple[Array, Array] | None" = None,
     ) -> Trajectory:
         """Return the plan from a start state.
@@ -173,12 +181,12 @@ class Solver:
         Args:
             start: (n,).
             parameters: p at each time, (steps + 1, k) or (k,) for all times alike.
-            guess: a plan to begin from, its multipliers included, or states and inputs shaped as
-                those of a plan; standing at the start with the trim's input when left out.
+            guess: a plan, whose multipliers are used as well, or states and inputs in the shapes of
+                a plan; by default the start state with the trim's input at all times.
 
         Raises:
-            PlanError: data of a wrong shape, or not finite. A failing solver is no error: the plan
-                says so and holds where it stopped.
+            PlanError: the data has a wrong shape or is not finite. A failing solver is no error:
+                the plan says so, and contains the point where the solver stopped.
         """
         problem, program = self.problem, self.program
         n, N, k = len(problem.model.state_names), problem.steps, problem.parameters
@@ -191,11 +199,11 @@ class Solver:
         seconds = time.perf_counter() - began
         return self._plan(solution, data["p"], self._solve.stats(), seconds)
 
-    def _begin(self, x: Array, guess: Any) -> dict[str, Any]:
-        """Return where the solver begins."""
+    def _begin(self, x: Array, guess: Trajectory | tuple[Array, Array] | None) -> dict[str, Array]:
+        """Return the solver's initial guess."""
         problem = self.problem
         shapes = (problem.steps + 1, len(x)), (problem.nodes, len(problem.model.input_names))
-        # Multipliers go with a plan of the same problem alone, so a bare guess has none.
+        # Only a plan of the same problem has multipliers.
         multipliers = {}
         if guess is None:
             states, inputs = (
@@ -215,7 +223,7 @@ class Solver:
         return {"x0": np.concatenate([body, states[N], v[N:].ravel()]), **multipliers}
 
     def _plan(
-        self, solution: Any, data: Array, stats: Mapping[str, Any], seconds: float
+        self, solution: "dict[str, DM]", data: Array, stats: Mapping[str, Any], seconds: float
     ) -> Trajectory:
         problem = self.problem
         n, m, N = len(problem.model.state_names), len(problem.model.input_names), problem.steps
@@ -223,8 +231,8 @@ class Solver:
         body, tail = w[: N * (n + m)].reshape(N, n + m), w[N * (n + m) :]
         v = np.vstack([body[:, n:], tail[n:].reshape(-1, m)])
         solved, status = bool(stats["success"]), str(stats["return_status"])
-        missed, least = violations(self.program, g), ()
-        # Where it stopped is no answer to what is wrong: another point may miss much less.
+        amounts, least = violations(self.program, g), ()
+        # The point where it stopped does not show what is wrong: another may violate much less.
         if status in _CONTRADICTION:
             least = least_violations(self.program, w, data)
         return Trajectory(
@@ -233,8 +241,8 @@ class Solver:
             inputs=problem.model.physical(v),
             cost=float(solution["f"]),
             solved=solved,
-            message=_message(self.solver, status, solved, least or missed, bool(least)),
-            violations=least or missed,
+            message=_message(self.solver, status, solved, least or amounts, bool(least)),
+            violations=least or amounts,
             iterations=int(stats.get("iter_count", 0)),
             seconds=seconds,
             multipliers=(
@@ -246,12 +254,12 @@ class Solver:
 
 def solve(
     problem: OptimalControl,
-    start: Any,
-    parameters: Any = None,
+    start: ArrayLike,
+    parameters: ArrayLike | None = None,
     *,
     guess: Trajectory | tuple[Array, Array] | None = None,
     solver: str = "ipopt",
-    options: Mapping[str, Any] | None = None,
+    options: Mapping[str, object] | None = None,
 ) -> Trajectory:
     """Solve an optimal control problem once; see `Solver` for solving it again with other data.
 
@@ -259,7 +267,7 @@ def solve(
         problem: what to solve.
         start: state, (n,).
         parameters: p at each time, (steps + 1, k) or (k,) for all times alike.
-        guess: where to begin.
+        guess: the initial guess.
         solver: of CasADi.
         options: for it.
 
@@ -269,7 +277,7 @@ def solve(
     return Solver(problem, solver, options).solve(start, parameters, guess)
 
 
-def _numbers(name: str, value: Any, shape: tuple[int, ...], repeat: bool = False) -> Array:
+def _numbers(name: str, value: object, shape: tuple[int, ...], repeat: bool = False) -> Array:
     """Return finite numbers of a shape; a single row of it is repeated if that is allowed."""
     try:
         array = np.asarray(value, np.float64)
@@ -278,21 +286,22 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...], repeat: bool = False
     if repeat and array.shape == shape[1:]:
         array = np.tile(array, (shape[0], 1))
     if array.shape != shape:
-        got = f"of shape {value.shape}" if hasattr(value, "shape") else value
-        raise PlanError(f"`{name}` is {got}, and must be numbers of shape {shape}.")
+        received = getattr(value, "shape", None)
+        received = value if received is None else f"of shape {received}"
+        raise PlanError(f"`{name}` is {received}, and must be numbers of shape {shape}.")
     if not np.isfinite(array).all():
         raise PlanError(f"`{name}` holds a number that is not finite.")
     return array
 
 
 def _complaint(error: RuntimeError) -> str:
-    """Return the line of a message of CasADi's that speaks of options, or else its last."""
+    """Return the line of a CasADi message that names an option, or else its last line."""
     lines = str(error).strip().splitlines()
     line = next((line for line in lines if "option: " in line), lines[-1])
     return line.partition(": ")[2].rstrip(".") or line.rstrip(".")
 
 
-# ---- the ending in words -------------------------------------------------------------------------
+# ---- return statuses in words --------------------------------------------------------------------
 
 _WORDS = {
     "Solve_Succeeded": "it reached its tolerance",
@@ -317,13 +326,13 @@ _CONTRADICTION = ("Infeasible_Problem_Detected", "Restoration_Failed")
 
 
 def _message(
-    solver: str, status: str, solved: bool, missed: tuple[Violation, ...], least: bool
+    solver: str, status: str, solved: bool, amounts: tuple[Violation, ...], least: bool
 ) -> str:
-    known_status = "Solve_Succeeded" if solved else status
-    words = _WORDS.get(status, _WORDS.get(known_status, f"it ended with the status `{status}`"))
+    fallback = "Solve_Succeeded" if solved else status
+    words = _WORDS.get(status, _WORDS.get(fallback, f"it ended with the status `{status}`"))
     ending = f"{solver} {'solved' if solved else 'failed to solve'} the problem: {words}"
-    if solved or not missed:
+    if solved or not amounts:
         return f"{ending}."
-    largest = "; ".join(f"`{v.name}` by {v.amount:.3g} at {v.time:.3g} s" for v in missed[:3])
-    what = "what is missed at least" if least else "what is missed most"
+    largest = "; ".join(f"`{v.name}` by {v.amount:.3g} at {v.time:.3g} s" for v in amounts[:3])
+    what = "smallest possible violations" if least else "largest violations"
     return f"{ending}; {what}: {largest}."

@@ -5,7 +5,7 @@ an undisturbed agent is its run. Trapezoidal collocation lets the input vary lin
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from echelon.core.types import Array
 from echelon.simulation.optimal.casadi import casadi, casadi_function
 from echelon.simulation.optimal.problem import Constraint, OptimalControl
 
+if TYPE_CHECKING:  # it comes with an extra
+    from casadi import MX, SX, Function
+
 
 class ConstraintRow(NamedTuple):
     """One row of the program's constraints.
@@ -22,8 +25,8 @@ class ConstraintRow(NamedTuple):
     Attributes:
         name: of the constraint.
         time: at which it holds, s.
-        size: by which it is divided. Solvers forgive the same small number in every row, which
-            would be much of a torque in N m.
+        size: by which it is divided, since a solver's tolerance is the same for all rows, and would
+            be large for a torque in N m.
         of_problem: whether it is a constraint of the problem, not of the agent.
     """
 
@@ -41,7 +44,7 @@ class NonlinearProgram(NamedTuple):
     p is the start state and then the parameters of each time.
     """
 
-    problem: dict[str, Any]
+    problem: dict[str, "MX"]
     low: Array
     high: Array
     rows: tuple[ConstraintRow, ...]
@@ -50,12 +53,12 @@ class NonlinearProgram(NamedTuple):
 class _Parts(NamedTuple):
     """The problem's functions of x (n,), v (m,) and p (k,) at one time, as `casadi.Function`."""
 
-    move: Any
-    stage: Any
-    terminal: Any
-    limit: Any
-    keep: Any
-    end: Any
+    move: "Function"
+    stage: "Function"
+    terminal: "Function"
+    limit: "Function"
+    path: "Function"
+    end: "Function"
 
 
 def transcribe(problem: OptimalControl) -> NonlinearProgram:
@@ -64,7 +67,7 @@ def transcribe(problem: OptimalControl) -> NonlinearProgram:
     Raises:
         MissingExtraError: casadi is not installed.
         ModelError: model, cost or constraint uses a primitive that no solver's expression has.
-        PlanError: a cost or constraint returns what it must not.
+        PlanError: a cost is no single number, or the bounds of a constraint do not fit it.
     """
     ca, parts = casadi(), _parts(problem)
     n, m = len(problem.model.state_names), len(problem.model.input_names)
@@ -84,8 +87,8 @@ def transcribe(problem: OptimalControl) -> NonlinearProgram:
     cost += parts.terminal(x[:, -1], p[:, -1])
     gaps = parts.move.map(N)(*ends)
     limits = parts.limit.map(problem.nodes)(v)
-    path = parts.keep.map(N)(x[:, 1:], p[:, 1:])
-    # The first state is given, so that no constraint of the problem is put on it.
+    path = parts.path.map(N)(x[:, 1:], p[:, 1:])
+    # The first state is data, so that no constraint of the problem applies to it.
     first = ca.vertcat(gaps[:, 0], x[:, 0] - start, limits[:, 0])
     middle = ca.vec(ca.vertcat(gaps[:, 1:], limits[:, 1:N], path[:, :-1]))
     closing = [limits[:, -1]] if problem.nodes > N else []
@@ -115,11 +118,11 @@ def _parts(problem: OptimalControl) -> _Parts:
     stage = _scalar("stage", casadi_function("stage", problem.stage, n, m, k))
     terminal = _scalar("terminal", casadi_function("terminal", problem.terminal, n, k))
     matrix = problem.bounds.matrix if problem.bounds else np.zeros((0, m))
-    # By size, since a solver forgives every row the same: of a torque limit of 5e-6 N m, 1e-8 is
-    # 0.2 % (theory page).
+    # By size, since a solver's tolerance is the same for all rows: 1e-8 is 0.2 % of a torque limit
+    # of 5e-6 N m (theory page).
     matrix = np.array(matrix, float) / np.array([size for _, _, size in _limits(problem)])[:, None]
 
-    def join(name: str, end: bool) -> Any:
+    def join(name: str, end: bool) -> "Function":
         values = [f(x, p) for one, f in _constraints(problem) if one.end is end]
         return ca.Function(name, [x, p], [ca.vertcat(ca.SX(0, 1), *values)])
 
@@ -133,12 +136,12 @@ def _parts(problem: OptimalControl) -> _Parts:
         ca.Function("stage", [x, v, p], [stage(x, u, p)]),
         terminal,
         ca.Function("limit", [v], [ca.DM(matrix) @ u]),
-        join("keep", False),
+        join("path", False),
         join("end", True),
     )
 
 
-def _constraints(problem: OptimalControl) -> list[tuple[Constraint, Any]]:
+def _constraints(problem: OptimalControl) -> list[tuple[Constraint, "Function"]]:
     """Return each constraint with its `casadi.Function` of x and p."""
     n, k = len(problem.model.state_names), problem.parameters
     return [
@@ -147,7 +150,7 @@ def _constraints(problem: OptimalControl) -> list[tuple[Constraint, Any]]:
     ]
 
 
-def _flow(field: Any, substeps: int, dt: float) -> Callable[[Any, Any], Any]:
+def _flow(field: Any, substeps: int, dt: float) -> Callable[["SX", "SX"], "SX"]:
     """Return the state after dt with the input held, by the same steps as those of `simulate`."""
 
     def flow(x: Any, u: Any) -> Any:
@@ -158,7 +161,7 @@ def _flow(field: Any, substeps: int, dt: float) -> Callable[[Any, Any], Any]:
     return flow
 
 
-def _scalar(name: str, function: Any) -> Any:
+def _scalar(name: str, function: "Function") -> "Function":
     if function.numel_out() != 1:
         raise PlanError(
             f"`{name}` returns {function.numel_out()} numbers, and must return one: a cost."

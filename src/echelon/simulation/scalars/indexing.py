@@ -273,7 +273,7 @@ def logical(name: str) -> PrimitiveRule:
     return rule
 
 
-def cumulative(join: Callable[[Any, Any], Any]) -> Callable[..., np.ndarray]:
+def cumulative(join: Callable[..., object]) -> Callable[..., np.ndarray]:
     """Return the rule of cumulative results along an axis."""
     joined = np.frompyfunc(join, 2, 1)
 

@@ -8,7 +8,6 @@ import contextlib
 import functools
 import operator
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -17,6 +16,7 @@ from jax.extend.core import JaxprEqn
 from echelon.core.jaxpr import Algebra, Rule, dot, entrywise, map_entries, reduction, walk
 from echelon.core.numerics import precision
 from echelon.core.trace import error_summary
+from echelon.core.types import PyTree
 from echelon.simulation.scalars import elementary
 from echelon.simulation.scalars.indexing import CUMULATIVE, INDEXING, less, one_of
 from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph
@@ -35,7 +35,9 @@ from echelon.simulation.scalars.traced_entries import (
 )
 
 
-def lower(function: Callable[..., Any], graph: ScalarGraph, arguments: Sequence[Any]) -> Arrays:
+def lower(
+    function: Callable[..., PyTree], graph: ScalarGraph, arguments: Sequence[PyTree]
+) -> Arrays:
     """Return the results of a function for JAX, flattened, as arrays of nodes and numbers.
 
     Args:

@@ -41,7 +41,7 @@ def act(loop: Loop, law: Law, view: LocalView, memory: Memory, leads: bool) -> A
         law, follower, heading = law.facing(angle), follower.facing(angle), angle[None]
     if loop.share is not None and not leads:
         share = jnp.asarray(loop.share, view.x.dtype) * view.feedforward
-        view = eqx.tree_at(lambda known: known.feedforward, view, share)
+        view = eqx.tree_at(lambda view: view.feedforward, view, share)
     desired, memory = law.update(loop.model, view, memory)
     # After the limits: what a leader could not do its followers must not copy (theory page).
     delivered = loop.motion.deliver(desired)
@@ -55,7 +55,7 @@ def _split_heading(loop: Loop, law: Law, view: LocalView, leads: bool) -> tuple[
     if leads:
         return view, law.heading(loop.model, view.t, view.x)
     received = view.feedforward
-    return eqx.tree_at(lambda known: known.feedforward, view, received[:-1]), received[-1]
+    return eqx.tree_at(lambda view: view.feedforward, view, received[:-1]), received[-1]
 
 
 def feedforward_of(

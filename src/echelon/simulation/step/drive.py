@@ -5,7 +5,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from echelon.agents.network.channel import Channel
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError
-from echelon.core.types import Array, Scalar, State
+from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.core.words import Feedforward, Frame
 from echelon.laws.law import Law
 from echelon.simulation.step.meter import Meter, Sums
@@ -28,7 +28,7 @@ from echelon.simulation.step.solver_stats import SolverStats
 if TYPE_CHECKING:  # a gain is passed on to callers, and never read here
     from echelon.synthesis.gains.gain import Gain
 
-Moment: TypeAlias = Any
+Moment: TypeAlias = PyTree
 """All that changes during a run, as `loop.Moment`."""
 
 
@@ -80,14 +80,14 @@ def numbers(now: Moment) -> tuple[Array, ...]:
     return tuple(np.asarray(jax.random.key_data(x) if _is_key(x) else x) for x in leaves)
 
 
-def _leaf(stored: Array, like: Any) -> Any:
+def _leaf(stored: Array, like: jax.Array) -> jax.Array:
     """Return one of the numbers as the leaf that it was in the moment."""
     if _is_key(like):
         return jax.random.wrap_key_data(jnp.asarray(stored), impl=jax.random.key_impl(like))
     return jnp.asarray(stored, like.dtype)
 
 
-def _is_key(leaf: Any) -> bool:
+def _is_key(leaf: object) -> bool:
     """Tell whether a law remembers a random key, which is no number to NumPy."""
     return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 

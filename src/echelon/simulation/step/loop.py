@@ -13,7 +13,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.graph import Graph
-from echelon.core.types import Array, States
+from echelon.core.types import Array, PyTree, States
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law, Memory, without_certificates
 from echelon.simulation.step.drive import Problem
@@ -87,8 +87,8 @@ class WorldState(NamedTuple):
         actuators: where the actuators stand that do not follow their commands at once.
     """
 
-    in_flight: Any = None
-    actuators: Any = None
+    in_flight: PyTree = None
+    actuators: PyTree = None
 
 
 class Moment(NamedTuple):
@@ -157,6 +157,7 @@ def _levels(graph: Graph) -> Array:
 
 def begin_forgetful(loop: Loop, states: Any) -> Moment:
     """Return it for laws without memory, without JAX: one of its calls costs many steps."""
+    # `Any`, since NumPy's arrays are where a moment has JAX's until the first step.
     cut: Any = np.zeros((len(states), len(loop.model.input_names)), np.int8)
     step: Any = np.zeros((), np.int32)
     return Moment(step, states, loop.leader.init(), loop.follower.init(), cut)

@@ -1,52 +1,54 @@
-"""The sums over all steps of a run, of which its means are computed.
+"""Sums over all steps of a run, from which its means are computed.
 
 A mean over stored frames would depend on how many are stored, and its first frame would weigh as
 much as all the steps after it.
 """
 
-from typing import Any, NamedTuple, TypeAlias, final
+from types import ModuleType
+from typing import NamedTuple, TypeAlias, TypeVar, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
-from echelon.core.types import Array, Inputs, Output, State, States
+from echelon.core.types import Array, Input, Inputs, Output, PyTree, State, States
 from echelon.simulation.step.settings import Settings
 
-Total: TypeAlias = Any
+Total: TypeAlias = PyTree
 """JAX within a chunk, float64 NumPy on the host: chunks of a float32 run are added without loss."""
 
+_Numbers = TypeVar("_Numbers", jax.Array, Array)
+
 ALWAYS = 2**31 - 1
-"""Stands for the first step at which a state left its chart, where it never did."""
+"""The first step at which a state was outside of its chart, if it never was."""
 
 SETTLED = 0.01
 """A follower has settled when its error stays below this: 1 cm for a position."""
 
 
 class Sums(NamedTuple):
-    """Sums over K steps, each of the moment at which a step begins.
+    """Sums over K steps, each measured at the beginning of a step.
 
-    Pairs are of all steps and of those in the steady window. N agents, L leaders, E edges, q
+    Pairs are for all steps and for those in the steady window. N agents, L leaders, E edges, q
     outputs.
 
     Attributes:
-        steps: (2,) how many steps.
+        steps: (2,) number of steps.
         errors: (2, N) squared deviation from the goal relative to the leader.
         tracking: (2, L) squared deviation of the leaders from their reference; 0 without one.
-        outputs: (L, q) the same for each output.
+        outputs: (L, q) the squared deviation of each output.
         effort: (N,) squared normalized input about the trim.
         spacing: (E,) squared error of the distance between neighbours.
-        limited: (N,) how many times a limit changed the input.
-        unsettled: (N,) the last step at which the error was not below `SETTLED`; -1 without any.
+        limited: (N,) number of steps in which a limit changed the input.
+        unsettled: (N,) the last step at which the error was above `SETTLED`; -1 if there is none.
         inside: (N, k) the first step at which each of the k states that the model's chart bounds
-            was not inside; `ALWAYS` without any.
-        chatter: (N,) how many times an input went from beyond one limit to beyond the other from a
-            step to the next.
+            was not inside; `ALWAYS` if there is none.
+        chatter: (N,) number of steps in which an input went from one limit to the opposite one.
     """
 
     steps: Total
@@ -77,6 +79,7 @@ class Sums(NamedTuple):
 
     def where(self, which: Bool[np.ndarray, " F"], others: "Sums") -> "Sums":
         """Return these sums of some formations, and other ones of the rest."""
+        # The parts have different ranks, and the mask broadcasts from the front.
         shapes = (which.reshape(-1, *[1] * (np.ndim(part) - 1)) for part in self)
         return Sums(*(np.where(w, a, b) for w, a, b in zip(shapes, self, others, strict=True)))
 
@@ -85,6 +88,7 @@ class Sums(NamedTuple):
 
         Of one swarm of them all; its steps are those of each.
         """
+        # These have their axis of two in front of that of the agents.
         pairs = ("errors", "tracking")
         parts = {
             name: part.reshape(2, count, -1).swapaxes(0, 1)
@@ -96,32 +100,32 @@ class Sums(NamedTuple):
         return Sums(steps=np.stack([self.steps] * count), **parts)
 
 
-def on_host(tree: Any) -> Any:
+def on_host(tree: PyTree) -> PyTree:
     """Return the same with every array in float64 NumPy."""
     return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), tree)
 
 
 class OfAgent(NamedTuple):
-    """What one agent adds to the sums at a step: (2,) squared error, effort, and two steps.
+    """The terms of one agent in the sums of a step: (2,) squared error, effort, and two steps.
 
-    `unsettled` is the step or -1, of which the largest counts; `inside` (k,) is the step or
-    `ALWAYS` for each bounded state, of which the least counts.
+    `unsettled` is the step or -1, and the maximum is kept; `inside` (k,) is the step or `ALWAYS`
+    for each bounded state, and the minimum is kept.
     """
 
-    errors: Any
-    effort: Any
-    unsettled: Any
-    inside: Any
+    errors: jax.Array
+    effort: jax.Array
+    unsettled: jax.Array
+    inside: jax.Array
 
 
-def _twice(steady: Any, square: Any) -> Any:
+def _twice(steady: jax.Array, square: jax.Array) -> Float[jax.Array, "2"]:
     """Return a square for all steps and for those of the steady window."""
     return jnp.where(jnp.stack([jnp.asarray(True), steady]), square, 0.0)
 
 
 @final
 class Meter(eqx.Module):
-    """What is measured at the beginning of each step, on the model and never on the plant."""
+    """Measures the agents at the beginning of each step, by the model and never by the plant."""
 
     model: ControlAffine
     offsets: Array
@@ -157,7 +161,7 @@ class Meter(eqx.Module):
             measured=measured,
         )
 
-    def nothing(self, xp: Any = jnp) -> Sums:
+    def zero_sums(self, xp: ModuleType = jnp) -> Sums:
         """Return the sums of no step, as arrays of JAX or of NumPy."""
         # The precision that is switched on now: float32 within a float32 run.
         dtype = jax.dtypes.canonicalize_dtype(np.float64)
@@ -182,7 +186,7 @@ class Meter(eqx.Module):
         inputs: Inputs,
         limited: jax.Array,
         chatter: jax.Array,
-        reference: jax.Array | None,
+        reference: State | None,
     ) -> Sums:
         """Return the sums of one step.
 
@@ -190,9 +194,9 @@ class Meter(eqx.Module):
             step: its number.
             states: (N, n) at its beginning.
             inputs: (N, m) delivered over it.
-            limited: (N,) whose inputs a limit changed.
-            chatter: (N,) whose inputs went beyond the one limit after the other.
-            reference: (n,) what the leaders follow at its beginning, or None.
+            limited: (N,) the agents whose inputs a limit changed.
+            chatter: (N,) the agents with an input that went from one limit to the opposite one.
+            reference: (n,) the state that the leaders follow at its beginning, or None.
         """
         offsets = jnp.asarray(self.offsets, states.dtype)
         y = states - offsets
@@ -216,8 +220,10 @@ class Meter(eqx.Module):
             chatter=chatter.astype(jnp.int32),
         )
 
-    def of_agent(self, step: Any, steady: Any, x: Any, offset: Any, leader: Any, u: Any) -> OfAgent:
-        """Return what one agent adds to the sums at a step.
+    def of_agent(
+        self, step: jax.Array, steady: jax.Array, x: State, offset: State, leader: State, u: Input
+    ) -> OfAgent:
+        """Return the terms of one agent in the sums of a step.
 
         Args:
             step: its number.
@@ -240,18 +246,20 @@ class Meter(eqx.Module):
             inside=jnp.where(out, step, ALWAYS),
         )
 
-    def of_leader(self, steady: Any, x: Any, offset: Any, reference: Any) -> tuple[Any, Any]:
+    def of_leader(
+        self, steady: jax.Array, x: State, offset: State, reference: State
+    ) -> tuple[Float[jax.Array, "2"], Output]:
         """Return the squared deviations of a leader at x from a reference, (2,), and its outputs'.
 
         Args:
             steady: whether the step begins in the steady window.
             x: its state (n,).
             offset: of its goal (n,).
-            reference: what it follows (n,), without that offset.
+            reference: the state that it follows (n,), without that offset.
         """
         # The offset back in: outputs are nonlinear in the state, so each is taken where it holds.
-        away = output_error(self.model, x, reference + offset)
-        return _twice(steady, self._length(x - offset - reference)), away * away
+        deviation = output_error(self.model, x, reference + offset)
+        return _twice(steady, self._length(x - offset - reference)), deviation * deviation
 
     def _length(self, deviation: jax.Array) -> jax.Array:
         """Return the squared length of the measured part of a deviation (n,)."""
@@ -271,7 +279,7 @@ class Meter(eqx.Module):
         )
         return off.T, outputs
 
-    def spacing(self, states: States) -> jax.Array:
+    def spacing(self, states: States) -> Float[jax.Array, " E"]:
         """Return the squared errors of the distances along the edges, (E,)."""
         i, j = self.edges.T
         square = jax.vmap(self._length)(states[i] - states[j])
@@ -279,19 +287,19 @@ class Meter(eqx.Module):
 
 
 def spacing_error(square: jax.Array, desired: jax.Array) -> jax.Array:
-    """Return the squared errors of distances, whose squares are given, to the desired ones."""
+    """Return the squared errors of distances, given as squares, from the desired ones."""
     return (distance_of(square) - desired) ** 2
 
 
 def distance_of(square: jax.Array) -> jax.Array:
     """Return the root of a square, with a slope of 1 where two agents meet."""
     # A root has no slope at 0, and a single `where` would still differentiate it there.
-    apart = square > 0.0
-    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), square)
+    positive = square > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), square)
 
 
-def outside(bounded: Any, low: Any, high: Any) -> Any:
-    """Return which states are beyond their chart; NaN is not, since it is another outcome."""
+def outside(bounded: _Numbers, low: _Numbers, high: _Numbers) -> _Numbers:
+    """Return which states are outside of their chart; NaN is not, since it ends the run itself."""
     return (bounded <= low) | (bounded >= high)
 
 
@@ -301,13 +309,13 @@ def reference_at(reference: Array | None, k: jax.Array, states: States) -> jax.A
 
 
 def measured_states(model: ControlAffine) -> tuple[int, ...]:
-    """Return the indices of the states that errors are measured on: the position, else all."""
+    """Return the indices of the states whose errors are measured: the position, or else all."""
     return model.position_indices() or tuple(range(len(model.state_names)))
 
 
 def output_error(model: ControlAffine, x: State, reference: State) -> Output:
     """Return h(x) - h(reference), (q,), of two states (n,).
 
-    The model's difference of states, which may wind angles, decides how far apart they are.
+    The states differ by the model's difference, which may wind angles.
     """
     return model.output(reference + model.difference(x, reference)) - model.output(reference)

@@ -2,7 +2,7 @@
 
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from echelon.agents.network.exchange import Difference, Exchange
 from echelon.core.compiled import cached_jit
-from echelon.core.types import Array, Inputs, States
+from echelon.core.types import Array, Inputs, State, States
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act, limit_sides
 from echelon.simulation.step.loop import Loop, Moment, WorldState
@@ -56,10 +56,12 @@ def control(loop: Loop, now: Moment) -> Control:
     t = now.step.astype(x.dtype) * loop.motion.dt
 
     def act_all(
-        law: Law, agents: Any, forward: jax.Array, memory: Memory, leads: bool = False
+        law: Law, agents: Array | jax.Array, forward: jax.Array, memory: Memory, leads: bool = False
     ) -> Action:
         # One time for all; of everything else, an agent sees its own row and no other.
-        def one(x: Any, offset: Any, z: Any, forward: Any, memory: Memory) -> Action:
+        def one(
+            x: State, offset: State, z: jax.Array, forward: jax.Array, memory: Memory
+        ) -> Action:
             view = LocalView(t, x, offset, z, forward, loop.motion.dt)
             return act(loop, law, view, memory, leads)
 
@@ -86,8 +88,10 @@ def _by_depth(loop: Loop, now: Moment, led: Action, act_all: Callable[..., Actio
     messages = messages.at[loop.leaders].set(led.message)
     nothing = jnp.zeros((len(followers), led.input.shape[1]), led.input.dtype)
 
-    def level(done: tuple[jax.Array, Action], places: jax.Array) -> tuple[Any, None]:
-        messages, actions = done
+    def level(
+        carry: tuple[jax.Array, Action], places: jax.Array
+    ) -> tuple[tuple[jax.Array, Action], None]:
+        messages, actions = carry
         agents = followers[places]
         memory = jax.tree.map(lambda leaf: leaf[places], now.follower_memory)
         acted = act_all(loop.follower, agents, messages[parents[agents]], memory)
@@ -111,8 +115,8 @@ def signals(
     x = jnp.asarray(now.states)
 
     def of(law: Law, agents: Array, memory: Memory) -> jax.Array | None:
-        known = x[agents], offsets[agents], memory
-        return jax.vmap(lambda *known: law.signal(loop.model, *known))(*known)
+        rows = x[agents], offsets[agents], memory
+        return jax.vmap(lambda *row: law.signal(loop.model, *row))(*rows)
 
     followers = of(loop.follower, loop.followers, now.follower_memory)
     if followers is None:
@@ -180,31 +184,39 @@ def measured_step(
     return _move(loop, now, acted), loop.meter.read(*moment, acted.limited, chatter, followed)
 
 
+Frames: TypeAlias = tuple[Float[jax.Array, "T N n"], Float[jax.Array, "T N m"]]
+"""States and inputs at T times."""
+
+
 @cached_jit
 def advance(
     loop: Loop, now: Moment, counts: jax.Array, reference: Array | None, first: jax.Array | int
-) -> tuple[Moment, tuple[Any, Any], Sums]:
+) -> tuple[Moment, Frames, Sums]:
     """Store a frame and take counts[k] steps, for each k.
 
     Return the last moment, the stored states and inputs, and the sums over the steps. `reference`
     (S, n) is what the leaders follow from the step `first` on.
     """
 
-    def one(_: jax.Array, done: tuple[Moment, Sums]) -> tuple[Moment, Sums]:
-        now, sums = measured_step(loop, done[0], reference, first)
-        return now, done[1].plus(sums)
+    def one(_: jax.Array, carry: tuple[Moment, Sums]) -> tuple[Moment, Sums]:
+        now, sums = measured_step(loop, carry[0], reference, first)
+        return now, carry[1].plus(sums)
 
-    def frame(done: tuple[Moment, Sums], count: jax.Array) -> tuple[Any, tuple[Any, Any]]:
+    def frame(
+        carry: tuple[Moment, Sums], count: jax.Array
+    ) -> tuple[tuple[Moment, Sums], tuple[States, Inputs]]:
         # The first step computes these inputs again, but after the last frame there is none.
-        stored = (done[0].states, control(loop, done[0]).inputs)
-        return jax.lax.fori_loop(0, count, one, done), stored
+        stored = (carry[0].states, control(loop, carry[0]).inputs)
+        return jax.lax.fori_loop(0, count, one, carry), stored
 
-    (now, sums), stored = jax.lax.scan(frame, (now, loop.meter.nothing()), counts)
+    (now, sums), stored = jax.lax.scan(frame, (now, loop.meter.zero_sums()), counts)
     return now, stored, sums
 
 
 @cached_jit
-def final_states(loop: Loop, starts: jax.Array, steps: int) -> jax.Array:
+def final_states(
+    loop: Loop, starts: Float[jax.Array, "S N n"], steps: int
+) -> Float[jax.Array, "S N n"]:
     """Return the states (S, N, n) after `steps` steps from each of the starts (S, N, n)."""
 
     def last(states: States) -> States:

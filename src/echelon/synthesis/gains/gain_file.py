@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import GainError, OutputError
 from echelon.core.files import write_atomic
-from echelon.core.types import Array, PathLike
+from echelon.core.types import Array, JsonObject, PathLike
 from echelon.core.words import Kind, Theorem
 from echelon.synthesis.certificates.certificate import Certificate, RegionCertificate
 from echelon.synthesis.certificates.domain import Domain
@@ -30,7 +29,7 @@ _ENDS = {"lower": -np.inf, "upper": np.inf, "input_lower": 0.0, "input_upper": 0
 """The bounds of a domain, and the value of None in each."""
 
 
-def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> dict[str, Any]:
+def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> JsonObject:
     """Return a gain ready for JSON, with the data of its certificate.
 
     These are the model, the graph with its eigenvalues, the domain and the corners of the hull of
@@ -71,7 +70,7 @@ def _sums(graph: Graph) -> list[float] | None:
     return None if sums is None else sums.tolist()
 
 
-def _model_as_mapping(model: ControlAffine) -> dict[str, Any]:
+def _model_as_mapping(model: ControlAffine) -> JsonObject:
     linear = linearize(model)
     return {
         "class": _public_path(type(model)),
@@ -93,7 +92,7 @@ def _public_path(cls: type) -> str:
     return f"{cls.__module__}:{cls.__qualname__}"
 
 
-def _parameters(model: ControlAffine) -> dict[str, Any] | None:
+def _parameters(model: ControlAffine) -> JsonObject | None:
     """Return the fields of a model, or None where JSON cannot hold one of them."""
     fields = [field.name for field in dataclasses.fields(model) if field.init]
     stored = {name: getattr(model, name) for name in fields}
@@ -112,7 +111,7 @@ def _edges(graph: Graph) -> list[list[float]] | None:
     return [[*map(int, e), float(w)] for e, w in zip(graph.edges, graph.weights, strict=True)]
 
 
-def _certificate_as_mapping(certificate: Certificate) -> dict[str, Any]:
+def _certificate_as_mapping(certificate: Certificate) -> JsonObject:
     region = certificate.region
     return {
         "kind": str(certificate.kind),
@@ -126,7 +125,7 @@ def _certificate_as_mapping(certificate: Certificate) -> dict[str, Any]:
     }
 
 
-def _region_as_mapping(region: RegionCertificate) -> dict[str, Any]:
+def _region_as_mapping(region: RegionCertificate) -> JsonObject:
     domain = region.domain
     return {
         "kind": str(region.kind),
@@ -145,7 +144,7 @@ def _finite(bounds: Array) -> list[float | None]:
     return [x if np.isfinite(x) else None for x in bounds.tolist()]
 
 
-def _pack(matrices: Array) -> dict[str, Any]:
+def _pack(matrices: Array) -> JsonObject:
     """Return matrices as the first one and the entries that vary; most are the same in all."""
     # A vehicle's hull has thousands of corners that differ in a few entries of (n, n) or (n, 2n).
     places = np.argwhere((matrices != matrices[0]).any(axis=0))
@@ -153,7 +152,7 @@ def _pack(matrices: Array) -> dict[str, Any]:
     return {"base": matrices[0].tolist(), "places": places.tolist(), "values": values.tolist()}
 
 
-def _unpack(stored: Mapping[str, Any]) -> Array:
+def _unpack(stored: JsonObject) -> Array:
     values = np.array(stored["values"], float)
     # A hull of one matrix has no places, and an empty list no second axis.
     places = np.array(stored["places"], int).reshape(-1, 2)
@@ -196,7 +195,7 @@ def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
     return gain
 
 
-def _read(path: PathLike) -> Mapping[str, Any]:
+def _read(path: PathLike) -> JsonObject:
     try:
         stored = json.loads(Path(path).read_text("utf-8"), object_pairs_hook=_mapping)
     except OSError as error:
@@ -214,7 +213,7 @@ def _read(path: PathLike) -> Mapping[str, Any]:
     return stored
 
 
-def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _mapping(pairs: list[tuple[str, Any]]) -> JsonObject:
     """Return a mapping; readers differ in which of two equal keys they take, so it rejects them."""
     mapping = dict(pairs)
     if len(mapping) < len(pairs):
@@ -223,7 +222,7 @@ def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return mapping
 
 
-def _gain(stored: Mapping[str, Any]) -> Gain:
+def _gain(stored: JsonObject) -> Gain:
     # Names in the file become members of enumerations here, so that unknown ones are rejected.
     inner, certificate = stored["inner"], stored["certificate"]
     region = None if certificate["region"] is None else _region(certificate["region"])
@@ -244,7 +243,7 @@ def _gain(stored: Mapping[str, Any]) -> Gain:
     )
 
 
-def _number(stored: Mapping[str, Any], name: str) -> float:
+def _number(stored: JsonObject, name: str) -> float:
     value = stored[name]
     if (
         isinstance(value, bool)
@@ -255,14 +254,14 @@ def _number(stored: Mapping[str, Any], name: str) -> float:
     return float(value)
 
 
-def _count(stored: Mapping[str, Any], name: str) -> int:
+def _count(stored: JsonObject, name: str) -> int:
     value = stored[name]
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise ValueError(f"`{name}` is {value!r}, and must be a whole number")
     return value
 
 
-def _region(stored: Mapping[str, Any]) -> RegionCertificate:
+def _region(stored: JsonObject) -> RegionCertificate:
     bounds = [
         [end if x is None else x for x in stored["domain"][name]] for name, end in _ENDS.items()
     ]
@@ -278,7 +277,7 @@ def _region(stored: Mapping[str, Any]) -> RegionCertificate:
     )
 
 
-def _check_model(path: PathLike, stored: Mapping[str, Any], model: ControlAffine) -> None:
+def _check_model(path: PathLike, stored: JsonObject, model: ControlAffine) -> None:
     """Check that the model is the one that the gain was made for, near its trim."""
     linear = linearize(model)
     name, made_for = f"`{type(model).__name__}`", str(stored["class"]).rpartition(":")[2]
@@ -306,7 +305,7 @@ def _check_model(path: PathLike, stored: Mapping[str, Any], model: ControlAffine
             )
 
 
-def _check_graph(path: PathLike, stored: Mapping[str, Any], graph: Graph) -> None:
+def _check_graph(path: PathLike, stored: JsonObject, graph: Graph) -> None:
     """Check that the spectrum is the one that the coupling was chosen for."""
     values, spectrum = stored["spectrum"], graph.spectrum()
     sizes = [abs(complex(*x)) if isinstance(x, list) else float(x) for x in values]
