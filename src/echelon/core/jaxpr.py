@@ -1,7 +1,7 @@
-"""The one walk through a trace by JAX, for entries of any kind: polynomials, a solver's symbols.
+"""Evaluation of JAX traces in any algebra, such as polynomials or symbols of a solver.
 
-What an equation means for them is the `Algebra`, an argument of the walk. Entries that are no plain
-numbers stand in NumPy arrays of objects; an array of another type holds numbers, on which JAX
+What an equation means for them is the `Algebra`, an argument of the walk. Entries other than
+numbers are stored in NumPy arrays of objects; an array of another type holds numbers, on which JAX
 computes itself. Equations that only call, move entries about or add them up mean the same in every
 algebra, and are here.
 """
@@ -32,7 +32,7 @@ Rule: TypeAlias = Callable[..., np.ndarray]
 
 
 class Algebra(NamedTuple):
-    """What the entries are, and what equations mean for them.
+    """The rules by which the equations of a trace act on entries.
 
     Attributes:
         rules: by the name of a primitive with one result. They go before the rules of `COMMON`, and
@@ -88,7 +88,7 @@ def walk(
     values |= dict(zip(jaxpr.invars, arguments, strict=True))
 
     def read(variable: Var | Literal) -> np.ndarray:
-        # A literal stands in the equation itself and bears its value.
+        # A literal is stored in the equation itself, with its value.
         literal = isinstance(variable, Literal)
         return algebra.lift(np.asarray(variable.val)) if literal else values[variable]
 

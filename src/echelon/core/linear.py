@@ -1,4 +1,4 @@
-"""Linear systems theory that knows no agent: held steps, controllability, Riccati."""
+"""Linear systems theory: discretization, controllability, observability, Riccati equation."""
 
 from collections.abc import Callable, Sequence
 from typing import TypeAlias, cast

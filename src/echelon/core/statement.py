@@ -1,4 +1,4 @@
-"""One statement that was looked at: its verdict, by which kind of argument, and what would help."""
+"""Statements of a check: the verdict, the kind of the argument, and a remedy."""
 
 import dataclasses
 from typing import NamedTuple, TypeAlias, final
@@ -62,7 +62,7 @@ Line: TypeAlias = Hypothesis | Topic
 
 
 class Cause(NamedTuple):
-    """Why something is not as it should be, and what to do about it; neither is ever empty."""
+    """The cause of a fault and its remedy; neither is empty."""
 
     text: str
     remedy: str

@@ -1,4 +1,4 @@
-"""What a trace of somebody's function shows before it runs: shapes, types, casts, frozen values."""
+"""Checks of user functions by a JAX trace: shapes, types, casts and frozen values."""
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple

@@ -1,6 +1,6 @@
-"""The words that tables and files hold, each a type whose value is what it means.
+"""Enumerations of the words that tables and files contain, with their meanings.
 
-Nothing here needs JAX, so a scenario's checks can read them. Rooms compare members, never names.
+Nothing here needs JAX, so scenarios can be checked without it. Code compares members, never names.
 """
 
 import enum
