@@ -295,7 +295,7 @@ def test_both_pictures_are_written_and_both_radii_are_said(echelon, tmp_path):
     assert code == 2 and "did you mean `rate`?" in err and err.count("\n") == 1
     (tmp_path / "file").write_text("")
     code, _, err = echelon(*call[:-1], "file")
-    assert code == 2 and "is a file, and the figures need a folder" in err and err.count("\n") == 1
+    assert code == 2 and "is a file; give a folder" in err and err.count("\n") == 1
 
 
 def test_where_nothing_is_certified_the_picture_says_so(tmp_path):

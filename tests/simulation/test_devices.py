@@ -42,6 +42,8 @@ def fly(out, processes, each):
         found.bind(("127.0.0.1", 0))
         port = found.getsockname()[1]
     environment = {**os.environ, "JAX_NUM_CPU_DEVICES": str(each), "JAX_PLATFORMS": "cpu"}
+    # The bits are those of programs as users compile them, not of those compiled quickly for tests.
+    environment.pop("XLA_FLAGS", None)
     words = [str(processes), str(port), str(processes * each), str(out)]
     started = [
         subprocess.Popen([sys.executable, "-c", FLY, str(k), *words], env=environment)
