@@ -86,13 +86,17 @@ def tool(name: str, *arguments: str) -> list[str]:
 
 
 def tests(rest: list[str]) -> list[list[str]]:
-    """Return the command that runs the tests, in parallel where there are several cores."""
+    """Return the commands that run the tests, in parallel where there are several cores."""
     if chromium() is None:
         install_browser()
+    parallel = ["-n", str(cores()), "--dist", "loadgroup"] if cores() > 1 else []
+    if not rest:
+        # One after the other: processes that compiled the programs of both crashed in XLA.
+        marks = ["not slow and not study", "slow and not study"]
+        return [tool("pytest", *parallel, "-m", mark) for mark in marks]
     chosen = [word for word in rest if word != "--quick"]
     if not any(word.startswith("-m") for word in chosen):
         chosen += ["-m", "not slow and not study" if "--quick" in rest else "not study"]
-    parallel = ["-n", str(cores()), "--dist", "loadgroup"] if cores() > 1 else []
     return [tool("pytest", *parallel, *chosen)]
 
 

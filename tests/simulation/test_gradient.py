@@ -57,6 +57,7 @@ def flock():
     return ech.build(ech.load_scenario("paper", horizon))
 
 
+@pytest.mark.slow
 def test_the_slopes_of_the_paper_s_run_are_those_of_differences():
     parts, settings = flock()
     found = ech.gradient(parts, settings, squares, ("P", "coupling"))

@@ -399,7 +399,7 @@ def test_a_file_with_two_equal_keys_is_refused_where_it_is_flown_and_where_it_is
     text = file.read_text()
     file.write_text(text.replace('"coupling":', '"coupling": 0.001, "coupling":', 1))
     for read in (lambda: ech.load_gain(file, model, graph), lambda: ech.verify(file)):
-        with pytest.raises(ech.errors.GainError, match="`coupling` (stands there )?twice"):
+        with pytest.raises(ech.errors.GainError, match="`coupling` (occurs )?twice"):
             read()
 
 
