@@ -32,7 +32,7 @@ MAPPINGS = 30_000
 """Memory mappings from which on compiled programs are let go of between files."""
 
 LIMIT = 5.0
-"""Seconds of a processor that a test may take unless it is marked `slow` or `study`."""
+"""Seconds of a processor from which on a test is `slow` or `study`; it fails from twice as many."""
 
 
 def pytest_configure(config):
@@ -132,8 +132,8 @@ def echelon(here, monkeypatch, capsys):
 def pytest_runtest_teardown(item, nextitem):
     """Let go of compiled programs between files, before there are more than Linux can map.
 
-    Each program of XLA takes some memory mappings, of which a process may have 65,530; beyond, XLA
-    crashes while it compiles.
+    Each program of XLA takes some memory mappings, of which Linux allows a process 65,530.
+    Processes that compiled all tests' programs crashed in XLA, and this is the likely reason.
     """
     if nextitem is not None and nextitem.path == item.path:
         return
