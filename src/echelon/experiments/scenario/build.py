@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, cast
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
+from echelon.agents.network.channel import Bursts, Network
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide
@@ -153,6 +154,7 @@ def _with_laws(
     with faults.at("leader"):
         reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
         leader = _leader(scenario, faults, model, graph, reference, reaction)
+    network = _network(scenario, faults, graph, leader, follower)
     for place, named in (
         (("initial", "spread"), scenario.initial.spread or {}),
         (("leader", "start_error"), scenario.leader.start_error),
@@ -168,7 +170,7 @@ def _with_laws(
         Laws(cast(Law, leader), cast(Law, follower)),
         initial=_initial(scenario),
         start_error=scenario.leader.start_error,
-        world=World(plant, disturbance),
+        world=World(plant, disturbance, network),
     )
     with faults.at("initial"):
         initial_states(parts, scenario.seed)
@@ -251,6 +253,24 @@ def _disturbance(scenario: Scenario, faults: _Faults, model: ControlAffine) -> D
             # Each alone, so that its fault is reported at its own line.
             Disturbance(**{key: getattr(spec, key)}).prepared(model, scenario.simulation.dt, 0)
     return Disturbance(**spec.model_dump())
+
+
+def _network(
+    scenario: Scenario, faults: _Faults, graph: Graph, leader: Law | None, follower: Law | None
+) -> Network | None:
+    spec = scenario.network
+    if spec is None:
+        return None
+    network = None
+    with faults.at("network"):
+        settings = _settings(scenario)
+        numbers: dict[str, Any] = spec.model_dump()
+        numbers["bursts"] = Bursts(**numbers["bursts"])
+        network = Network(**numbers)
+        network.prepared(settings.dt, settings.horizon, settings.seed)
+        if leader is not None and follower is not None:
+            Laws(leader, follower).check_network(network, graph, settings.dt)
+    return network
 
 
 def _graph(scenario: Scenario) -> Graph:
