@@ -15,8 +15,6 @@ from echelon.core.types import Array
 from echelon.simulation.engine.result import Result, finite_or_none
 from echelon.simulation.step.meter import SETTLED, output_error
 
-_FEW = 8
-"""Agents up to which comparing all pairs is faster than a search for the nearest."""
 ERROR = "error"
 """In place of a unit: that of the formation errors, `Result.unit`."""
 
@@ -139,22 +137,16 @@ def steady_error(row: LeaderMetrics | FollowerMetrics) -> float:
 def metrics(result: Result) -> Metrics:
     """Return the numbers of a run; means are over all its steps, whatever frames were stored."""
     exists = result.outcome is not Outcome.DIVERGED and bool(result.sums.steps[0] > 0)
+    least = result.least_distances() if len(result.times) else None
     with np.errstate(over="ignore", invalid="ignore"):
         return Metrics(
             leaders=_leaders(result, exists),
             followers=_followers(result, exists),
             edges=_edges(result, exists),
-            minimum_distance=_minimum_distance(result),
+            minimum_distance=None if least is None else finite_or_none(least.min()),
             saturation_fraction=float(result.saturated.mean()),
             steady_window=result.settings.window,
         )
-
-
-def formation_errors(result: Result) -> Array:
-    """Return each agent's error length over time, (T, N), in the result's unit."""
-    # Where a square overflows, the length is infinite.
-    with np.errstate(over="ignore"):
-        return np.linalg.norm(result.errors[:, :, list(result.measured)], axis=2)
 
 
 def output_errors(result: Result, leader: int | None = None) -> Array | None:
@@ -204,7 +196,7 @@ def _leaders(result: Result, exists: bool) -> tuple[LeaderMetrics, ...]:
 
 def _followers(result: Result, exists: bool) -> tuple[FollowerMetrics, ...]:
     sums, saturated = result.sums, result.saturated
-    last = formation_errors(result)[-1] if exists and len(result.times) else None
+    last = result.formation_errors[-1] if exists and len(result.times) else None
     nothing = FollowerMetrics(0, None, None, None, None, 0.0)
     return tuple(
         nothing._replace(agent=agent, saturated=float(saturated[agent]))
@@ -238,18 +230,3 @@ def _edges(result: Result, exists: bool) -> tuple[EdgeMetrics, ...]:
         EdgeMetrics(pair, _root_mean(total, steps))
         for pair, total in zip(pairs, result.sums.spacing, strict=True)
     )
-
-
-def _minimum_distance(result: Result) -> float | None:
-    """Return the smallest distance between two agents over all frames; None without a position."""
-    axes = result.model.position_indices()
-    if not axes or not len(result.times):
-        return None
-    places = result.states[:, :, list(axes)]
-    if places.shape[1] <= _FEW:
-        i, j = np.triu_indices(places.shape[1], 1)
-        return finite_or_none(np.linalg.norm(places[:, i] - places[:, j], axis=2).min())
-    from scipy.spatial import KDTree
-
-    nearest = [KDTree(points).query(points, k=2)[0][:, 1].min() for points in places]
-    return finite_or_none(min(nearest))

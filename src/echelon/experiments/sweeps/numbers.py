@@ -16,7 +16,6 @@ from echelon.experiments.results.metrics import (
     FollowerMetrics,
     Metrics,
     Quantity,
-    formation_errors,
     metrics,
     quantities,
 )
@@ -126,7 +125,7 @@ def numbers_of(result: Result, promise: Promise) -> JsonObject:
     agents = {name: np.full(result.graph.agents, np.nan) for name in AGENT_NUMBERS}
     if result.outcome is not Outcome.DIVERGED and len(result.times):
         followers = list(result.graph.followers)
-        agents["final_error"][followers] = formation_errors(result)[-1][followers]
+        agents["final_error"][followers] = result.formation_errors[-1][followers]
     for follower in numbers.followers:
         for name in quantities(FollowerMetrics):
             agents[name][follower.agent] = _number(getattr(follower, name))

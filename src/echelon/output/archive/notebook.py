@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterator
 
 from echelon.experiments.results.foreseen import foreseen
-from echelon.experiments.results.metrics import formation_errors, metrics
+from echelon.experiments.results.metrics import metrics
 from echelon.experiments.results.recording import Recording
 from echelon.guarantees.promises.promise import promise
 from echelon.output.plots.run_figures import figures
@@ -52,7 +52,7 @@ def _table(result: Result) -> str:
 
 def _cells(result: Result) -> Iterator[tuple[str, ...]]:
     """Yield the rows of leaders and followers, with the labels of the report."""
-    numbers, errors = metrics(result), formation_errors(result)
+    numbers, errors = metrics(result), result.formation_errors
     for label, row in labelled("leader", numbers.leaders):
         yield label, "", "", f"{100.0 * row.saturated:.3g}"
     for label, row in labelled("follower", numbers.followers):
@@ -70,7 +70,6 @@ def _recorded(result: Result) -> Recording:
         states=states,
         inputs=result.inputs,
         reference=result.reference,
-        errors=result.errors,
     )
 
 

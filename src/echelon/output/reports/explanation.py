@@ -31,7 +31,7 @@ def _outcome(result: Result, numbers: Metrics) -> Iterator[str]:
     yield result.message
     if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
         return
-    unit = "" if result.unit == "state" else f" {result.unit}"
+    unit = f" {result.length_unit}".rstrip()
     if grows(result):
         first, last = sizes(result)
         yield (
