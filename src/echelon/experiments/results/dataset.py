@@ -9,18 +9,19 @@ import numpy as np
 
 from echelon.core.files import write_atomic
 from echelon.core.types import JsonObject
-from echelon.experiments.results.labelled import Labelled, Variables
-from echelon.experiments.results.labelled_parts import labelled_parts
-from echelon.experiments.results.lyapunov import lyapunov
-from echelon.experiments.results.metrics import (
+from echelon.experiments.results.agent_metrics import (
     EdgeMetrics,
     Metrics,
-    metrics,
-    output_errors,
     representatives,
     steady_error,
 )
+from echelon.experiments.results.labelled import Labelled, Variables
+from echelon.experiments.results.labelled_parts import labelled_parts
+from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.results.metrics import metrics, output_errors
+from echelon.experiments.results.quantity import Shown
 from echelon.experiments.results.recording import Recording, recording
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RunNumbers
 from echelon.guarantees.promises.promise import promise
 from echelon.simulation.engine.result import Result
 
@@ -133,6 +134,7 @@ def save_dataset(run: "Result | Labelled | xr.Dataset", path: Path) -> None:
 def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
     """Return the run's summary as JSON data; numbers that do not exist are None."""
     numbers = metrics(result) if numbers is None else numbers
+    guarantee = promise(result.parts, result.settings)
     gain = result.drive.gain
     spectrum = result.graph.spectrum()
     return {
@@ -161,12 +163,10 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
             "P": gain.P.tolist(),
             "R": gain.R.tolist(),
         },
-        "promise": promise(result.parts, result.settings).as_mapping(),
+        "promise": guarantee.as_mapping(),
         "lambda_min": spectrum.low,
         "lambda_max": spectrum.high,
-        "minimum_distance": numbers.minimum_distance,
-        "saturation_fraction": numbers.saturation_fraction,
-        "alternations": int(result.chatter.max()),
+        **RunNumbers(result, numbers, guarantee).json(Shown.SUMMARY),
         "steady_window_s": numbers.steady_window,
         "warnings": list(result.warnings),
         "engine": result.engine,
@@ -187,6 +187,5 @@ def _distance_error(edge: EdgeMetrics) -> float:
 
 
 def _follower(entry: JsonObject) -> JsonObject:
-    return {
-        "settling_time_s" if key == "settling_time" else key: value for key, value in entry.items()
-    }
+    keys = {name: quantity.key or name for name, quantity in AGENT_NUMBERS.items()}
+    return {keys.get(name, name): value for name, value in entry.items()}

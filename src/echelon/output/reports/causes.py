@@ -6,7 +6,7 @@ import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.statement import Cause, Hypothesis
-from echelon.experiments.results.metrics import Metrics
+from echelon.experiments.results.agent_metrics import Metrics
 from echelon.guarantees.promises.promise import Promise
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED

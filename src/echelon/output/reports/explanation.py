@@ -7,8 +7,8 @@ import numpy as np
 from echelon.agents.network.hearing import who_hears_whom
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
+from echelon.experiments.results.agent_metrics import Metrics
 from echelon.experiments.results.lyapunov import Lyapunov, lyapunov
-from echelon.experiments.results.metrics import Metrics
 from echelon.guarantees.promises.covering import coverage
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.output.reports.causes import causes, grows, sizes
