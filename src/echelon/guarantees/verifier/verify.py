@@ -4,13 +4,13 @@ No code of the synthesis is used: neither its matrix algebra nor its exact arith
 graphs. The equations of the bundled models are the only shared part.
 """
 
+import warnings
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.linear import without_warnings
 from echelon.core.types import PathLike
 from echelon.guarantees.verifier import exact_minors
 from echelon.guarantees.verifier.agent_claims import check_equations
@@ -68,7 +68,8 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verification:
 def _collect(checks: Iterator[Finding]) -> tuple[Finding, ...]:
     findings = list[Finding]()
     # Numbers of a false file may overflow; comparisons with non-finite numbers then fail.
-    with without_warnings():
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         try:
             for finding in checks:
                 findings.append(finding)
