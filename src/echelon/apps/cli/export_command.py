@@ -7,7 +7,8 @@ import typer
 
 from echelon.apps.cli.console import print_file
 from echelon.apps.cli.options import OverwriteOption, RunArgument
-from echelon.output.archive.folder import claim_file
+from echelon.core.files import write_atomic
+from echelon.output.archive.folder import claim_file, write_errors
 
 
 def export(
@@ -19,10 +20,13 @@ def export(
     force: OverwriteOption = False,
 ) -> None:
     """Write a run's states, inputs and errors for pandas, NumPy, MATLAB or a spreadsheet."""
-    from echelon.output.archive.export import export as write
-    from echelon.output.archive.open_folder import open_run
+    from echelon.output.archive.export import content_of
 
+    content = content_of(to)
     file = Path(f"run.{to}") if out is None else out
     claim_file(file, force)
-    write(open_run(run), file, to)
+    from echelon.output.archive.open_folder import open_run
+
+    with write_errors(file):
+        write_atomic(file, content(open_run(run)))
     print_file(file, "{}")

@@ -53,6 +53,10 @@ def sweep(
 ) -> None:
     """Run a scenario for all combinations of values; write the numbers of all runs as a dataset."""
     check_inputs("sweep", scenario, resume, over, set_, out, force)
+    if cluster is not None:
+        from echelon.experiments.sweeps.cluster import check_scheduler
+
+        check_scheduler(cluster)
     from echelon.output.archive.folder import BATCHES, writing
 
     if resume is None:

@@ -6,7 +6,7 @@ one fault never hides another. Each check yields the path of a fault and its sen
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, TypeGuard
 
 from pydantic import BaseModel
 
@@ -111,8 +111,8 @@ def _taken(
     other = {"law", *SOURCES.get(path, ((), False))[0], *foreign}
     allowed = [key for key in kind.model_fields if key not in other]
     for key in (key for key in part if key in foreign):
-        message = f"allowed {is_or_are(allowed)}" if allowed else "it takes no keys"
-        yield (*path, str(key)), f"got a key that `{choice}` does not take, {message}."
+        said = f"allowed {is_or_are(allowed)}" if allowed else "it takes no keys"
+        yield (*path, str(key)), f"got a key that `{choice}` does not take, {said}."
 
 
 def _source(data: Part, path: KeyPath) -> str | None:
@@ -152,14 +152,26 @@ def _gain_choices(data: Part, path: KeyPath) -> Iterator[Finding]:
         )
 
 
-def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
+def _edge_lists(graph: Part) -> Iterator[tuple[KeyPath, list[Any]]]:
+    """Yield the path and the items of every list of edges: the first one and the schedule's."""
+    later = graph.get("schedule")
+    stretches = [("schedule", k, part) for k, part in enumerate(later)] if _is_list(later) else []
+    for *inside, part in ((graph,), *stretches):
+        edges = part.get("edges") if isinstance(part, dict) else None
+        if isinstance(edges, list):
+            yield ("graph", *inside, "edges"), edges
+
+
+def _is_list(value: object) -> TypeGuard[list[Any]]:
+    return isinstance(value, list)
+
+
+def _pairs(edges: list[Any], directed: bool = True) -> Iterator[tuple[int, tuple[int, int]]]:
     """Yield the place in the list, and the two agents, of every well-formed edge.
 
     The smaller agent comes first, unless the graph is directed.
     """
-    directed = graph.get("directed") is True
-    edges = graph.get("edges")
-    for index, edge in enumerate(edges if isinstance(edges, list) else ()):
+    for index, edge in enumerate(edges):
         if not isinstance(edge, list) or len(edge) < 2:
             continue
         i, j = _whole(edge[0]), _whole(edge[1])
@@ -169,37 +181,70 @@ def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
 
 def _edges(document: Document) -> Iterator[Finding]:
     graph = section(document.data, "graph")
-    agents = _whole(graph.get("agents"))
-    first: dict[tuple[int, int], int] = {}
-    for index, pair in _pairs(graph):
-        path = ("graph", "edges", index)
-        if pair in first:
-            at = document.place(("graph", "edges", first[pair]))
-            per = "direction" if graph.get("directed") is True else "pair"
-            message = f"got a second edge of agents `{pair[0]}` and `{pair[1]}`"
-            yield path, f"{message}, allowed is one for each {per}; the first is at {at}."
-        first.setdefault(pair, index)
-        if agents is not None and max(pair) >= agents > 0:
-            yield path, f"got agent `{max(pair)}`, {_range(agents)}."
+    agents, directed = _whole(graph.get("agents")), graph.get("directed") is True
+    for path, edges in _edge_lists(graph):
+        first: dict[tuple[int, int], int] = {}
+        for index, pair in _pairs(edges, directed):
+            if pair in first:
+                at = document.place((*path, first[pair]))
+                per = "direction" if directed else "pair"
+                said = f"got a second edge of agents `{pair[0]}` and `{pair[1]}`"
+                yield (
+                    (*path, index),
+                    f"{said}, allowed is one for each {per}; the first is at {at}.",
+                )
+            first.setdefault(pair, index)
+            if agents is not None and max(pair) >= agents > 0:
+                yield (*path, index), f"got agent `{max(pair)}`, {_range(agents)}."
+
+
+def _gaps(data: Part) -> Iterator[Finding]:
+    """Yield an edge whose agents have numbers that leave others, which are in no edge."""
+    graph = section(data, "graph")
+    if graph.get("agents") is not None or _numbered(graph) is None:
+        return
+    leaders = graph.get("leaders")
+    numbers = [
+        (agent, (*path, index))
+        for path, edges in _edge_lists(graph)
+        for index, pair in _pairs(edges)
+        for agent in pair
+    ]
+    named = {agent for agent, _ in numbers}
+    # A leader needs no edge.
+    named |= {_whole(agent) for agent in (leaders if _is_list(leaders) else [0])} - {None}
+    last, place = max(numbers)
+    if last >= len(named):
+        lost = next(agent for agent in range(last) if agent not in named)
+        yield (
+            place,
+            f"got agent `{last}`, but agent `{lost}` is in no edge; number agents without gaps.",
+        )
 
 
 def _weights(data: Part) -> Iterator[Finding]:
-    """Yield a wrong number of weights, and edges that already have a weight."""
+    """Yield a wrong number of weights, edges that already have a weight, and wrong weights."""
     graph = section(data, "graph")
     edges, weights = graph.get("edges"), graph.get("weights")
-    if not isinstance(edges, list) or not isinstance(weights, list):
-        return
-    if len(edges) != len(weights):
-        message = f"got {len(weights)} weights for {len(edges)} edges, allowed is one for each edge"
-        yield ("graph", "weights"), f"{message}."
-    for index, edge in enumerate(edges):
-        if isinstance(edge, list) and len(edge) == 3:
-            message = "got an edge with a weight, allowed with `weights` is `[i, j]`"
-            yield ("graph", "edges", index), f"{message}."
-    for index, weight in enumerate(weights):
+    listed: list[tuple[KeyPath, object]] = []
+    if isinstance(edges, list) and isinstance(weights, list):
+        if len(edges) != len(weights):
+            said = (
+                f"got {len(weights)} weights for {len(edges)} edges, allowed is one for each edge"
+            )
+            yield ("graph", "weights"), f"{said}."
+        for index, edge in enumerate(edges):
+            if isinstance(edge, list) and len(edge) == 3:
+                said = "got an edge with a weight, allowed with `weights` is `[i, j]`"
+                yield ("graph", "edges", index), f"{said}."
+        listed += [(("graph", "weights", index), weight) for index, weight in enumerate(weights)]
+    for path, items in _edge_lists(graph):
+        triples = ((k, edge) for k, edge in enumerate(items) if _is_list(edge) and len(edge) == 3)
+        listed += [((*path, k, 2), edge[2]) for k, edge in triples]
+    for place, weight in listed:
         number = number_of(weight)
         if number is not None and not number > 0.0:
-            yield ("graph", "weights", index), f"got `{weight}`, allowed is a number above 0."
+            yield place, f"got the weight {quoted(weight)}, allowed is a number above 0."
 
 
 def _schedule(data: Part) -> Iterator[Finding]:
@@ -214,12 +259,12 @@ def _schedule(data: Part) -> Iterator[Finding]:
     for index, stretch in enumerate(stretches):
         at = number_of(stretch.get("at")) if isinstance(stretch, dict) else None
         if at is not None and 0.0 < at <= last:
-            message = f"got `{stretch['at']}`, allowed are ascending times, here above {last:g} s"
-            yield ("graph", "schedule", index, "at"), f"{message}."
+            said = f"got `{stretch['at']}`, allowed are ascending times, here above {last:g} s"
+            yield ("graph", "schedule", index, "at"), f"{said}."
         last = max(last, at or 0.0)
     if period is not None and 0.0 < period <= last:
-        message = f"got `{graph['period']}`, allowed is a time after the last of the schedule"
-        yield ("graph", "period"), f"{message}, {last:g} s."
+        said = f"got `{graph['period']}`, allowed is a time after the last of the schedule"
+        yield ("graph", "period"), f"{said}, {last:g} s."
 
 
 def _range(agents: int) -> str:
@@ -228,12 +273,11 @@ def _range(agents: int) -> str:
 
 def _numbered(graph: Part) -> int | None:
     """Return the largest number in the edges, plus one; None where an edge cannot be read."""
-    later = graph.get("schedule")
-    all_ = [graph, *(later if isinstance(later, list) else [])]
-    if not all(isinstance(part, dict) and isinstance(part.get("edges"), list) for part in all_):
+    later, lists = graph.get("schedule"), [edges for _, edges in _edge_lists(graph)]
+    if len(lists) != 1 + (len(later) if _is_list(later) else 0):
         return None
-    pairs = [pair for part in all_ for _, pair in _pairs(part)]
-    if len(pairs) != sum(len(part["edges"]) for part in all_):
+    pairs = [pair for edges in lists for _, pair in _pairs(edges)]
+    if len(pairs) != sum(map(len, lists)):
         return None
     return max((max(pair) + 1 for pair in pairs), default=None)
 
@@ -253,8 +297,8 @@ def _grid(data: Part) -> Iterator[Finding]:
     graph = section(data, "graph")
     agents, size = _whole(graph.get("agents")), _agents(graph)
     if graph.get("name") == "grid" and agents is not None and size is not None and agents != size:
-        message = f"got `{agents}`, allowed is rows times columns, `{size}`"
-        yield ("graph", "agents"), f"{message}; the key may be left out."
+        said = f"got `{agents}`, allowed is rows times columns, `{size}`"
+        yield ("graph", "agents"), f"{said}; the key may be left out."
 
 
 def _unknown(
@@ -296,16 +340,16 @@ def _following(data: Part) -> Iterator[Finding]:
     if entry is not None and entry.reference == "needed" and reference is None:
         yield ("leader", "law"), f"got `{law}` without a `reference`, this law needs one."
     if entry is not None and entry.reference == "none" and reference is not None:
-        message = f"got a reference, but the leader's law `{law}` takes none"
-        yield ("reference",), f"{message}; {listing(registry.TRACKING_LAWS)} take one."
+        said = f"got a reference, but the leader's law `{law}` takes none"
+        yield ("reference",), f"{said}; {listing(registry.TRACKING_LAWS)} take one."
 
 
 def _changed(data: Part) -> Iterator[Finding]:
     """Yield parameters of the plant that are both set and scaled."""
     values, factors = (section(data, "plant", key) for key in ("parameters", "scale"))
     for name in (name for name in factors if isinstance(name, str) and name in values):
-        message = "got a factor for a parameter that `plant.parameters` sets"
-        yield ("plant", "scale", name), f"{message}, allowed is one of them."
+        said = "got a factor for a parameter that `plant.parameters` sets"
+        yield ("plant", "scale", name), f"{said}, allowed is one of them."
 
 
 def _durations(data: Part) -> Iterator[Finding]:
@@ -330,6 +374,7 @@ def cross_faults(document: Document) -> Iterator[Finding]:
     yield from _sources(data)
     yield from _choices(data)
     yield from _edges(document)
+    yield from _gaps(data)
     yield from _weights(data)
     yield from _schedule(data)
     yield from _grid(data)
