@@ -120,10 +120,7 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         of=lambda run: run.root_mean("steady_rmse"),
     ),
     "worst_rmse": Quantity(
-        "largest RMSE of a follower",
-        ERROR,
-        of=lambda run: run.worst("rmse"),
-        shown=Shown(0),
+        "largest RMSE of a follower", ERROR, of=lambda run: run.worst("rmse"), shown=Shown(0)
     ),
     "worst_steady_rmse": Quantity(
         "largest RMSE of a follower in the steady window",

@@ -7,12 +7,7 @@ from typing import TYPE_CHECKING
 from echelon.core.errors import Outcome
 from echelon.core.types import JsonObject
 from echelon.experiments.results.quantity import ERROR, Shown
-from echelon.experiments.results.run_numbers import (
-    AGENT_NUMBERS,
-    RUN_NUMBERS,
-    RunNumbers,
-    shown_in,
-)
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.guarantees.promises.promise import Promise
 from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
