@@ -1,6 +1,8 @@
 """Linear systems theory: discretization, controllability, observability, Riccati equation."""
 
-from collections.abc import Callable, Sequence
+import contextlib
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias, cast
 
 import numpy as np
@@ -143,6 +145,14 @@ def longest_step(
     return float(bisect(decays, dt, 1.1 * dt, 20))
 
 
+@contextlib.contextmanager
+def without_warnings() -> Iterator[None]:
+    """Let NumPy and SciPy compute without warnings what is judged by its result."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
 def eigenvalue_text(eigenvalue: complex) -> str:
     """Return an eigenvalue as text, without an imaginary part that is zero."""
     # Adding zero makes 0.0 of -0.0, whose sign would read as decay.
@@ -209,9 +219,10 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
     try:
         # Part by part, so that what has nothing to do with each other is 0 and not rounding: it
         # then costs nothing in a step.
-        for part in _uncoupled(A, B, Q, R):
-            block = np.ix_(part, part)
-            P[block] = _stabilizing(A[block], B[part], Q[block], R)
+        with without_warnings():
+            for part in _uncoupled(A, B, Q, R):
+                block = np.ix_(part, part)
+                P[block] = _stabilizing(A[block], B[part], Q[block], R)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise GainError(
             f"the Riccati equation has no stabilizing solution ({str(error).rstrip('.').lower()}); "

@@ -7,13 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.errors import (
-    EchelonError,
-    GainError,
-    ScenarioError,
-    did_you_mean,
-    listing,
-)
+from echelon.core.errors import EchelonError, GainError, ScenarioError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Theorem

@@ -8,15 +8,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.linearization import trim_slopes
 from echelon.agents.models.model import ControlAffine
-from echelon.core.statement import (
-    Hypothesis,
-    Statement,
-    Topic,
-    fails,
-    holds,
-    unneeded,
-    vacuous,
-)
+from echelon.core.statement import Hypothesis, Statement, Topic, fails, holds, unneeded, vacuous
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind
 from echelon.guarantees.promises.closed_loop import LinearLoop
