@@ -15,7 +15,6 @@ from echelon.synthesis.certificates.delays import delay_margin
 from echelon.synthesis.certificates.margins import (
     ClosedLoop,
     decays_between,
-
     detectability,
     gain_margin,
     input_scaling,
