@@ -1,6 +1,5 @@
 """`echelon sweep`: a scenario many times, with other seeds or other values of its keys."""
 
-import contextlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from echelon.apps.cli.options import (
     ResumeOption,
     SetOption,
 )
-from echelon.apps.cli.stop import STOP
+from echelon.apps.cli.stop import STOP, Ended
 
 if TYPE_CHECKING:
     from echelon.experiments.sweeps.plan import Sweep
@@ -105,8 +104,12 @@ def _compute(
     plan: "Sweep", batches: "Batches", threads: int | None, cluster: str | None, quiet: bool
 ) -> "list[SweepBatch]":
     """Return the batches of a sweep, each written as soon as it is computed."""
+    from echelon.experiments.results.labelled import labelled
     from echelon.experiments.sweeps.sweep import compute
+    from echelon.experiments.sweeps.sweep_dataset import dataset_of
 
+    # What writes results is loaded before there are any: Ctrl-C then does not wait for it.
+    labelled(dataset_of(plan, ())[[]]).netcdf()
     results = batches.read()
 
     def store(batch: "SweepBatch") -> None:
@@ -119,10 +122,15 @@ def _compute(
             show(done, runs)
             STOP.check()
 
-        # What is computed by then is stored, and the report says so.
-        with contextlib.suppress(KeyboardInterrupt):
-            compute(plan, store, progress, tuple(results), threads, cluster)
-    return results
+        stored = tuple(results)
+        try:
+            STOP.aside(lambda: compute(plan, store, progress, stored, threads, cluster))
+        except KeyboardInterrupt:
+            # What is computed by then is stored, and the report says so.
+            if not results:
+                raise Ended from None
+    # A copy, as a thread that goes on may add to them.
+    return [*results]
 
 
 def _write(
@@ -137,8 +145,8 @@ def _write(
     text = sweep_report(data)
     if not quiet:
         print(text, flush=True)
-    write_sweep(data, text, job.folder, figures)
     complete = sum(batch.runs for batch in results) == plan.count
+    write_sweep(data, text, job.folder, figures and complete)
     if complete:
         job.chunks.remove()
     if quiet:
