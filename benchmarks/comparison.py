@@ -33,20 +33,20 @@ def number(value: float | None) -> str:
 
 def cells(row: ComparisonRow) -> list[str]:
     """Return one method's cells."""
-    if row.flight is None or row.numbers is None:
+    if row.flight is None:
         return [row.label, *["-"] * (len(HEADS) - 1)]
-    numbers = row.numbers
+    numbers, settled = row.flight.metrics, row.number("worst_settling_time")
     return [
         f"`{row.label}`",
         number(numbers.leader.rmse),
         *(number(each.rmse) for each in numbers.followers),
         number(numbers.leader.steady_rmse),
-        number(row.steady),
-        "never" if row.settled is None else f"{row.settled:.3g}",
-        number(row.effort),
+        number(row.number("worst_steady_rmse")),
+        "never" if settled is None else f"{settled:.3g}",
+        number(row.number("effort")),
         f"{100.0 * numbers.saturation_fraction:.3g}",
         number(numbers.minimum_distance),
-        f"{1e3 * row.flight.computing:.3g}",
+        f"{1e3 * (row.flight.computing or 0.0):.3g}",
     ]
 
 

@@ -5,10 +5,9 @@ from typing import Annotated
 
 import typer
 
-from echelon.apps.cli.console import print_file
+from echelon.apps.cli.console import write_file
 from echelon.apps.cli.options import OverwriteOption, RunArgument
-from echelon.core.files import write_atomic
-from echelon.output.archive.folder import claim_file, write_errors
+from echelon.output.archive.folder import claim_file
 
 
 def export(
@@ -27,6 +26,4 @@ def export(
     claim_file(file, force)
     from echelon.output.archive.open_folder import open_run
 
-    with write_errors(file):
-        write_atomic(file, content(open_run(run)))
-    print_file(file, "{}")
+    write_file(file, content(open_run(run)))

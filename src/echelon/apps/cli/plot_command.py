@@ -17,15 +17,10 @@ _LEAST, _MOST = 30, 1200
 def plot(
     run: RunArgument,
     what: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME,...",
-            help=f"Only these: {', '.join(NAMES)}.",
-        ),
+        str | None, typer.Option(metavar="NAME,...", help=f"Only these: {', '.join(NAMES)}.")
     ] = None,
     paper: Annotated[
-        bool,
-        typer.Option("--paper", help="Sizes of one and two columns of a paper, in 8 pt."),
+        bool, typer.Option("--paper", help="Sizes of one and two columns of a paper, in 8 pt.")
     ] = False,
     dpi: Annotated[
         int | None, typer.Option(help="Resolution of the PNG (default: 150, with --paper 300).")

@@ -7,16 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from echelon.apps.cli import options
 from echelon.apps.cli.console import print_folder, show_progress
 from echelon.apps.cli.job import Job, check_inputs
-from echelon.apps.cli.options import (
-    FiguresOption,
-    FolderOption,
-    ForceOption,
-    JsonOption,
-    ResumeOption,
-    SetOption,
-)
 from echelon.apps.cli.stop import STOP, Ended
 
 if TYPE_CHECKING:
@@ -36,19 +29,18 @@ def sweep(
             help="Values to vary, as in seed=0..99 or follower.gain.coupling=1,2.",
         ),
     ] = None,
-    set_: SetOption = None,
-    out: FolderOption = None,
-    resume: ResumeOption = None,
-    force: ForceOption = False,
+    set_: options.SetOption = None,
+    out: options.FolderOption = None,
+    resume: options.ResumeOption = None,
+    force: options.ForceOption = False,
     threads: Annotated[
         int | None, typer.Option(min=1, help="Threads of native code (default: one per processor).")
     ] = None,
     cluster: Annotated[
-        str | None,
-        typer.Option(metavar="URL", help="Compute on workers of this dask scheduler."),
+        str | None, typer.Option(metavar="URL", help="Compute on workers of this dask scheduler.")
     ] = None,
-    figures: FiguresOption = True,
-    as_json: JsonOption = False,
+    figures: options.FiguresOption = True,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Run a scenario for all combinations of values; write the numbers of all runs as a dataset."""
     check_inputs("sweep", scenario, resume, over, set_, out, force)

@@ -19,7 +19,7 @@ from echelon.apps.live.promiser import Promiser
 from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.core.types import Array, JsonObject
-from echelon.experiments.results.foreseen import heard_in
+from echelon.experiments.results.labelled_parts import heard_in
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.viewer.replay import heard_by
 

@@ -18,6 +18,7 @@ from echelon.core.errors import OutputError
 from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
 from echelon.core.words import Verdict
+from echelon.simulation.engine.frame_numbers import FrameNumbers
 
 FORMAT = 3
 """Version of the format of `run.nc`; files of other versions are refused."""
@@ -48,7 +49,7 @@ class LoopPoles(NamedTuple):
 
 @final
 @dataclasses.dataclass(frozen=True, eq=False)
-class Recording:
+class Recording(FrameNumbers):
     """A run: T stored frames of N agents with n states and m inputs, L of them leaders.
 
     Attributes:
@@ -58,7 +59,6 @@ class Recording:
         states: of all agents.
         inputs: as delivered by the actuators.
         reference: the leaders' reference state; None without one.
-        errors: deviation of each agent from its goal relative to its nearest leader.
         offsets: each agent's goal relative to its leader.
         leaders: their numbers.
         nearest: each agent's nearest leader.
@@ -85,7 +85,6 @@ class Recording:
     states: Float[np.ndarray, "T N n"]
     inputs: Float[np.ndarray, "T N m"]
     reference: Float[np.ndarray, "T n"] | None
-    errors: Float[np.ndarray, "T N n"]
     offsets: Float[np.ndarray, "N n"]
     leaders: tuple[int, ...]
     nearest: Int[np.ndarray, " N"]
@@ -132,22 +131,6 @@ class Recording:
         """The agents that do not lead."""
         leaders = {*self.leaders}
         return tuple(k for k in range(self.agents) if k not in leaders)
-
-    @property
-    def measured(self) -> tuple[int, ...]:
-        """Indices of the states in formation errors: the position if any, else all."""
-        return self.position or tuple(range(len(self.state_names)))
-
-    @property
-    def unit(self) -> str:
-        """The unit of errors: m for a position, else nothing."""
-        return "m" if self.position else ""
-
-    @functools.cached_property
-    def formation_errors(self) -> Float[np.ndarray, "T N"]:
-        """Each agent's distance from its goal."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.linalg.norm(self.errors[:, :, list(self.measured)], axis=2)
 
     @property
     def rate(self) -> float | None:
@@ -225,7 +208,6 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         states=arrays["states"],
         inputs=arrays["inputs"],
         reference=arrays.get("reference"),
-        errors=arrays["error"],
         offsets=arrays["offset"],
         leaders=tuple(int(k) for k in np.flatnonzero(arrays["is_leader"])),
         nearest=arrays["nearest_leader"].astype(int),

@@ -14,13 +14,7 @@ from echelon.agents.references.reference import Reference, check_reference
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.plant import check_plant, vary_parameters
 from echelon.agents.world.world import World
-from echelon.core.errors import (
-    EchelonError,
-    MissingExtraError,
-    ModelError,
-    ScenarioError,
-    listing,
-)
+from echelon.core.errors import EchelonError, MissingExtraError, ModelError, ScenarioError, listing
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry

@@ -81,10 +81,10 @@ def formation(run: Recording) -> "Figure":
         look = {"color": draw.EDGE, "linewidth": 1.0, "linestyle": (0, (1.0, 1.5)), "zorder": 2.2}
         text = f"bound, by {run.promise['kind']} ({run.promise['theorem']})"
         draw.plot(ax, times, bound[keep], label=text, **look)
-    if run.unit:
+    if run.length_unit:
         ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
-    ax.set_ylabel(draw.label("formation error", run.unit))
-    marks = [SETTLED] if run.unit else []
+    ax.set_ylabel(draw.label("formation error", run.length_unit))
+    marks = [SETTLED] if run.length_unit else []
     # The end of the bound may lie far below all errors, so only its start sets the axis.
     draw.logarithmic(ax, errors[keep], np.array(marks if bound is None else [*marks, bound[0]]))
     return draw.finish(figure)
@@ -304,7 +304,9 @@ def distances(run: Recording) -> "Figure | None":
     linked.set_ylabel(draw.label("linked agents", "m"))
     _edges(linked, run, run.times[keep], apart, desired)
     few = draw.thin(len(run.times), run.agents)
-    draw.plot(nearest, run.times[few], _least(places[few]), color=draw.LEADER, label="any two")
+    least = run.least_distances(few)
+    assert least is not None
+    draw.plot(nearest, run.times[few], least, color=draw.LEADER, label="any two")
     nearest.set_ylabel(draw.label("smallest distance", "m"))
     nearest.set_ylim(bottom=0.0)
     return draw.finish(figure)
@@ -325,14 +327,6 @@ def _edges(ax: "Axes", run: Recording, times: Array, apart: Array, desired: Arra
         ax.axhline(desired[place], **_DESIRED | {"color": look["color"]})
     # In the legend it has no colour of a link.
     ax.plot([], [], label="desired", **_DESIRED)
-
-
-def _least(places: Array) -> Array:
-    """Return the smallest distance of two agents at each time, of places (T, N, k)."""
-    from scipy.spatial import KDTree
-
-    finite = np.where(np.isfinite(places), places, 1e300)
-    return np.array([KDTree(row).query(row, k=2)[0][:, 1].min() for row in finite])
 
 
 def _panels(run: Recording, rows: int, height: float) -> "tuple[Figure, list[Axes]]":

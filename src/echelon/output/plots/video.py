@@ -213,7 +213,7 @@ def _curves(figure: Any, run: Recording) -> list[Any]:
         for agent, line in zip(followers, values.T, strict=True):
             errors.plot(run.times[keep], line, **pen_of(run, agent))
     draw.logarithmic(errors, values)
-    errors.set_title(draw.label("formation error", run.unit), size=9, loc="left")
+    errors.set_title(draw.label("formation error", run.length_unit), size=9, loc="left")
     loads = run.loads
     sizes = (
         np.abs(run.inputs).max(axis=1)[keep] if loads is None else 100.0 * loads.max(axis=2)[keep]

@@ -77,8 +77,8 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
             sheet.line("median", np.median(rows, axis=1), 0, True),
         ]
     lines += _slope(run, errors[0].max(), 1.0)
-    marks = [{"value": SETTLED, "name": "1 cm" if run.unit else "0.01"}]
-    return _chart("formation error", run.unit, True, lines, marks)
+    marks = [{"value": SETTLED, "name": "1 cm" if run.length_unit else "0.01"}]
+    return _chart("formation error", run.length_unit, True, lines, marks)
 
 
 def _slope(run: Recording, begin: float, times: float) -> list[JsonObject]:
