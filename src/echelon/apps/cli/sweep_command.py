@@ -1,6 +1,5 @@
 """`echelon sweep`: a scenario many times, with other seeds or other values of its keys."""
 
-import contextlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ import typer
 from echelon.apps.cli import options
 from echelon.apps.cli.console import print_folder, show_progress
 from echelon.apps.cli.job import Job, check_inputs
-from echelon.apps.cli.stop import STOP
+from echelon.apps.cli.stop import STOP, Ended
 
 if TYPE_CHECKING:
     from echelon.experiments.sweeps.plan import Sweep
@@ -97,8 +96,12 @@ def _compute(
     plan: "Sweep", batches: "Batches", threads: int | None, cluster: str | None, quiet: bool
 ) -> "list[SweepBatch]":
     """Return the batches of a sweep, each written as soon as it is computed."""
+    from echelon.experiments.results.labelled import labelled
     from echelon.experiments.sweeps.sweep import compute
+    from echelon.experiments.sweeps.sweep_dataset import dataset_of
 
+    # What writes results is loaded before there are any: Ctrl-C then does not wait for it.
+    labelled(dataset_of(plan, ())[[]]).netcdf()
     results = batches.read()
 
     def store(batch: "SweepBatch") -> None:
@@ -111,10 +114,15 @@ def _compute(
             show(done, runs)
             STOP.check()
 
-        # What is computed by then is stored, and the report says so.
-        with contextlib.suppress(KeyboardInterrupt):
-            compute(plan, store, progress, tuple(results), threads, cluster)
-    return results
+        stored = tuple(results)
+        try:
+            STOP.aside(lambda: compute(plan, store, progress, stored, threads, cluster))
+        except KeyboardInterrupt:
+            # What is computed by then is stored, and the report says so.
+            if not results:
+                raise Ended from None
+    # A copy, as a thread that goes on may add to them.
+    return [*results]
 
 
 def _write(
@@ -129,8 +137,8 @@ def _write(
     text = sweep_report(data)
     if not quiet:
         print(text, flush=True)
-    write_sweep(data, text, job.folder, figures)
     complete = sum(batch.runs for batch in results) == plan.count
+    write_sweep(data, text, job.folder, figures and complete)
     if complete:
         job.chunks.remove()
     if quiet:
