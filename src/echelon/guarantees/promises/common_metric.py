@@ -38,7 +38,7 @@ class CommonMetric(NamedTuple):
 
     @classmethod
     def of(cls, graph: Graph, gain: Gain, A: Array, B: Array) -> "CommonMetric":
-        """Return that of a graph that switches; A (n, n) and B (n, m) are the agents' at the trim."""
+        """Return that of a graph that switches; A (n, n) and B (n, m) are of agents at the trim."""
         weakest = graph.spectrum().proved
         felt = 2.0 * gain.coupling * weakest
         rate = rate_of(gain.P, A[None], B, gain.R, felt) if weakest > 0.0 else -np.inf
