@@ -23,7 +23,9 @@ from echelon.experiments.results.metrics import (
 )
 from echelon.experiments.results.recording import FORMAT, Recording, recording
 from echelon.guarantees.promises.promise import promise
+from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
+from echelon.simulation.step.settings import Settings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -205,20 +207,44 @@ def save_dataset(run: "Result | Labelled | xr.Dataset", path: Path) -> None:
         write_atomic(path, bytes(data.to_netcdf(None, engine="h5netcdf")))
 
 
+def statement(parts: Parts, settings: Settings, name: str) -> JsonObject:
+    """Return the entries of a summary that follow from the parts of a run, without running it."""
+    gain, spectrum = parts.drive.gain, parts.graph.spectrum()
+    return {
+        "scenario": name,
+        "agents": parts.graph.agents,
+        "unit": "m" if parts.model.position else "state",
+        "horizon_s": settings.horizon,
+        "dt_s": settings.dt,
+        "seed": settings.seed,
+        **parts.world.describe(parts.model),
+        "gain": None
+        if gain is None
+        else {
+            "method": gain.method,
+            "coupling": gain.coupling,
+            "P": gain.P.tolist(),
+            "R": gain.R.tolist(),
+        },
+        "promise": promise(parts, settings).as_mapping(),
+        "lambda_min": spectrum.low,
+        "lambda_max": spectrum.high,
+    }
+
+
+OBSERVED = ("outcome", "leader", "leaders", "followers", "edges", "minimum_distance")
+OBSERVED += ("saturation_fraction", "alternations", "steady_window_s", "warnings", "engine")
+OBSERVED += ("wall_time_s", "versions")
+"""The other entries of a summary, which only the run itself gives."""
+
+
 def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
     """Return the run's summary as JSON data; numbers that do not exist are None."""
     numbers = metrics(result) if numbers is None else numbers
-    gain = result.drive.gain
-    spectrum = result.graph.spectrum()
+    name = result.provenance.get("scenario", "")
     return {
-        "scenario": result.provenance.get("scenario", ""),
+        **statement(result.parts, result.settings, name),
         "outcome": {"name": result.outcome.name.lower(), "message": result.message},
-        "agents": result.graph.agents,
-        "unit": result.unit,
-        "horizon_s": result.settings.horizon,
-        "dt_s": result.settings.dt,
-        "seed": result.settings.seed,
-        **result.world.describe(result.model),
         "leader": numbers.leader._asdict(),
         "leaders": [each._asdict() for each in numbers.leaders],
         "followers": [
@@ -228,17 +254,6 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
             {"edge": list(each.edge), "distance_rmse": each.distance_rmse}
             for each in _listed(numbers.edges, _distance_error)
         ],
-        "gain": None
-        if gain is None
-        else {
-            "method": gain.method,
-            "coupling": gain.coupling,
-            "P": gain.P.tolist(),
-            "R": gain.R.tolist(),
-        },
-        "promise": promise(result.parts, result.settings).as_mapping(),
-        "lambda_min": spectrum.low,
-        "lambda_max": spectrum.high,
         "minimum_distance": numbers.minimum_distance,
         "saturation_fraction": numbers.saturation_fraction,
         "alternations": int(result.chatter.max()),
