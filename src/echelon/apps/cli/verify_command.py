@@ -61,9 +61,7 @@ def _load(scenario: str | Path) -> "Scenario":
     return load_scenario(scenario)
 
 
-def _source(
-    files: "ClaimFiles", trusted: "Scenario | None"
-) -> "tuple[Scenario | None, str]":
+def _source(files: "ClaimFiles", trusted: "Scenario | None") -> "tuple[Scenario | None, str]":
     """Return the scenario from which claims are computed again; or None, and what is against it."""
     from echelon.experiments.scenario.self_contained import files_of, names_code, without_folders
 
@@ -81,9 +79,7 @@ def _source(
     return own, ""
 
 
-def _independent(
-    files: "ClaimFiles", trusted: "Scenario | None"
-) -> "tuple[list[Finding], str]":
+def _independent(files: "ClaimFiles", trusted: "Scenario | None") -> "tuple[list[Finding], str]":
     """Return what independent code finds in each file, and its notes."""
     from echelon.guarantees.verifier.verify import verify as check
 
@@ -116,6 +112,8 @@ def _print_advice(
         return
     if scenario is None:
         own = file if files.scenario is not None else "SCENARIO"
-        print(f"To check the rest, with code that you trust: echelon verify {file} --scenario {own}")
+        print(
+            f"To check the rest, with code that you trust: echelon verify {file} --scenario {own}"
+        )
     elif obstacle:
         print(f"`--scenario {scenario}`: {obstacle}.")

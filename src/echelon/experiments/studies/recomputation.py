@@ -26,7 +26,6 @@ from echelon.guarantees.verifier.strict_json import parse_json, read_json
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.parts import Parts
 from echelon.synthesis.gains.gain_file import gain_as_mapping, load_gain
 
 _SOLVED = 1e-3

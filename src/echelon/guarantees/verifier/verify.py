@@ -120,9 +120,9 @@ def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[Finding
 def judge(findings: Sequence[Finding], note: str = "") -> Verification:
     """Return the verdict on findings, with a note; of nothing at all it is `incomplete`."""
     claims = {name: [x.claim for x in findings if x.verdict == name] for name in VERDICTS}
-    counts = {"holds": "claims hold as stored", "recomputed": "values agree with the scenario"}
-    counts = {name: f"{len(claims[name])} {text}" for name, text in counts.items()}
-    text = ", ".join(counts[name] for name in counts if claims[name]) or "no claim holds"
+    held = [f"{len(claims['holds'])} claims hold as stored"] if claims["holds"] else []
+    agree = ["all values agree with the scenario"] if claims["recomputed"] else []
+    text = ", and ".join(held + agree) or "no claim was checked"
     false, open_ = claims["refused"], claims["not checked"]
     if false:
         does = "does" if len(false) == 1 else "do"
