@@ -320,9 +320,9 @@ class Lost(ech.models.Pendulum):
 
 
 class Stated(Lost):
-    """The same with a word of its own."""
+    """The same with a declaration of its own."""
 
-    flat_bounds = ()
+    flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
 
 
 class Quickened(ech.models.Unicycle):

@@ -246,7 +246,7 @@ def test_chains_are_found_where_nothing_is_stated():
         def input_map(self, x):
             return jnp.stack([jnp.stack([jnp.cos(x[1]), 0.0 * x[0]]), jnp.array([0.0, 1.0])])
 
-    assert chains_of(Cart()).degrees == (1, 1) and chains_of(Cart()).sampled
+    assert chains_of(Cart())[1:] == ((1, 1), (0, 0), ())
 
 
 @pytest.mark.parametrize(

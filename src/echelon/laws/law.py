@@ -155,6 +155,14 @@ class Law(eqx.Module):
         """Return what an agent sends to its neighbours, for z; None for x - offset."""
         return None
 
+    def signal_names(self, model: ControlAffine) -> tuple[str, ...]:
+        """Return the names of what an agent sends for z, by which unlike agents use it."""
+        return model.state_names
+
+    def message_names(self, model: ControlAffine) -> tuple[str, ...]:
+        """Return the names of what `message` sends, likewise."""
+        return model.input_names
+
     def settle(
         self,
         model: ControlAffine,

@@ -1,9 +1,9 @@
 """Builds the parts of a checked scenario, and runs them."""
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
@@ -14,13 +14,7 @@ from echelon.agents.references.reference import Reference, check_reference
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.plant import check_plant, vary_parameters
 from echelon.agents.world.world import World
-from echelon.core.errors import (
-    EchelonError,
-    MissingExtraError,
-    ModelError,
-    ScenarioError,
-    listing,
-)
+from echelon.core.errors import EchelonError, MissingExtraError, ModelError, ScenarioError, listing
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
@@ -51,6 +45,8 @@ from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain, Method, synthesize
 from echelon.synthesis.gains.gain_file import load_gain
 
+_Part = TypeVar("_Part")
+
 
 class Experiment(NamedTuple):
     """The arguments of `simulate`: the parts of a scenario, and its settings."""
@@ -76,6 +72,12 @@ class _Faults:
         except EchelonError as error:
             self.faults.append(Fault(self.scenario.place(*path), joined(path), str(error)))
 
+    def part(self, make: Callable[[], _Part], *path: str | int) -> _Part:
+        """Return a part; in place of one with a fault None, until `settle` raises the fault."""
+        with self.at(*path):
+            return make()
+        return cast(_Part, None)
+
     def settle(self) -> None:
         """Raise all recorded faults, a line each."""
         if self.faults:
@@ -97,28 +99,22 @@ def build(scenario: Scenario, to_run: bool = False) -> Experiment:
     faults = _Faults(scenario)
     # Gains are computed here, and would have 7 digits under float32.
     with precision("float64"):
-        model = graph = None
-        with faults.at("simulation"):
-            _settings(scenario).check()
-        with faults.at("model"):
-            model = _model(scenario)
-            check_model(model)
-        with faults.at("graph"):
-            graph = _graph(scenario)
-        reference = None
-        with faults.at("reference"):
-            reference = _reference(scenario, model)
+        settings = faults.part(lambda: _settings(scenario), "simulation")
+        model = faults.part(lambda: _model(scenario), "model")
+        graph = faults.part(lambda: _graph(scenario), "graph")
+        reference = faults.part(lambda: _reference(scenario, model), "reference")
         # Before the laws: they need the model and the graph, and would report these faults again.
         faults.settle()
         if to_run:
             # And before a gain is computed, which takes long for many agents.
-            _check_run(scenario, faults, cast(ControlAffine, model), cast(Graph, graph))
-        return _with_laws(
-            scenario, faults, cast(ControlAffine, model), cast(Graph, graph), reference
-        )
+            _check_run(scenario, faults, model, graph, settings)
+        parts = _parts(scenario, faults, model, graph, reference)
+    return Experiment(parts, settings)
 
 
-def _check_run(scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph) -> None:
+def _check_run(
+    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, settings: Settings
+) -> None:
     """Check that a scenario has no live events, and that its run fits in memory."""
     with faults.at("live"):
         if scenario.live:
@@ -127,7 +123,7 @@ def _check_run(scenario: Scenario, faults: _Faults, model: ControlAffine, graph:
                 "`live` to run the scenario without them."
             )
     with faults.at("simulation"):
-        check_memory(model, graph.agents, _settings(scenario))
+        check_memory(model, graph.agents, settings)
     faults.settle()
 
 
@@ -138,21 +134,18 @@ def _check_scenario(scenario: object) -> None:
         )
 
 
-def _with_laws(
+def _parts(
     scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, reference: Guide | None
-) -> Experiment:
+) -> Parts:
     """Return all parts, from the model, the graph and the reference."""
-    formation = leader = follower = plant = None
-    with faults.at("plant"):
-        plant = _plant(scenario, model)
+    plant = faults.part(lambda: _plant(scenario, model), "plant")
     disturbance = _disturbance(scenario, faults, model)
-    with faults.at("formation"):
-        formation = _formation(scenario, model, graph)
-    with faults.at("follower"):
-        follower = _follower(scenario, faults, model, graph)
-    with faults.at("leader"):
-        reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
-        leader = _leader(scenario, faults, model, graph, reference, reaction)
+    formation = faults.part(lambda: _formation(scenario, model, graph), "formation")
+    follower = faults.part(lambda: _follower(scenario, faults, model, graph), "follower")
+    reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
+    leader = faults.part(
+        lambda: _leader(scenario, faults, model, graph, reference, reaction), "leader"
+    )
     for place, named in (
         (("initial", "spread"), scenario.initial.spread or {}),
         (("leader", "start_error"), scenario.leader.start_error),
@@ -161,25 +154,21 @@ def _with_laws(
             with faults.at(*place, name):
                 model.states_called(name)
     faults.settle()
+    # Spreads by state or group, and states by agent: these are different keys.
+    initial: Any = dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
     parts = Parts(
         model,
         graph,
-        cast(Formation, formation),
+        formation,
         Laws(cast(Law, leader), cast(Law, follower)),
-        initial=_initial(scenario),
+        initial=initial,
         start_error=scenario.leader.start_error,
         world=World(plant, disturbance),
     )
     with faults.at("initial"):
         initial_states(parts, scenario.seed)
     faults.settle()
-    return Experiment(parts, _settings(scenario))
-
-
-def _initial(scenario: Scenario) -> Any:
-    """Return spreads by state or group, and states by agent, in one mapping."""
-    # Names of states and numbers of agents are different keys.
-    return dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
+    return parts
 
 
 def run(
@@ -216,8 +205,11 @@ def _model(scenario: Scenario) -> ControlAffine:
     parameters = spec.parameters or {}
     arguments = {"set": parameters} if isinstance(parameters, str) else {**parameters}
     if "set" in arguments and "set" not in accepted(part.cls):
-        return _named_set(part, arguments.pop("set"), {**arguments, **extra})
-    return part._replace(arguments={**arguments, **extra}).create()
+        model = _named_set(part, arguments.pop("set"), {**arguments, **extra})
+    else:
+        model = part._replace(arguments={**arguments, **extra}).create()
+    check_model(model)
+    return model
 
 
 def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) -> ControlAffine:
@@ -305,7 +297,7 @@ def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, scenario: Scenario
         return load_gain(scenario.folder / spec.file, model, graph)
     part = named_class(scenario, Method, registry.METHODS, spec.method, spec.python, spec.arguments)
     method = part.create()
-    with as_scenario_error(f"`{part.name}` fails") if part.by_user else contextlib.nullcontext():
+    with part.guard():
         return synthesize(model, graph, method)
 
 
@@ -339,7 +331,7 @@ def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: NamedClass
 def _law(part: NamedClass, offers: Mapping[str, object], model: ControlAffine, graph: Graph) -> Law:
     """Return the law of a scenario, completed and checked."""
     law = part.create(offers)
-    with as_scenario_error(f"`{part.name}` fails") if part.by_user else contextlib.nullcontext():
+    with part.guard():
         return prepare_law(law, model, graph)
 
 
@@ -382,8 +374,7 @@ def _leader(
 
 
 def _settings(scenario: Scenario) -> Settings:
-    return Settings(
-        **scenario.simulation.model_dump(),
-        seed=scenario.seed,
-        steady_window=scenario.report.steady_window,
-    )
+    numbers, window = scenario.simulation.model_dump(), scenario.report.steady_window
+    settings = Settings(**numbers, seed=scenario.seed, steady_window=window)
+    settings.check()
+    return settings

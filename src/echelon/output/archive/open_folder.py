@@ -10,7 +10,7 @@ from echelon.experiments.scenario.scenario import SCENARIO_FILE
 from echelon.guarantees.verifier.strict_json import read_json
 from echelon.guarantees.verifier.verify import states_gain
 from echelon.output.archive.chunks import Chunks
-from echelon.output.archive.folder import DATA, GAIN, SUMMARY
+from echelon.output.archive.folder import DATA, GAIN, SUMMARY, check_exists
 
 
 def open_run(place: PathLike) -> Recording:
@@ -22,7 +22,7 @@ def open_run(place: PathLike) -> Recording:
         OutputError: there is none, it is damaged, or of another version.
         ScenarioError: the scenario of an unfinished run cannot be read.
     """
-    path = Path(place)
+    path = check_exists(Path(place))
     if path.is_file():
         return read_recording(path)
     if (path / DATA).is_file():
@@ -33,8 +33,6 @@ def open_run(place: PathLike) -> Recording:
         from echelon.output.archive.run_folder import load_run
 
         return recording_of(load_run(path))
-    if not path.exists():
-        raise OutputError(f"`{path}` does not exist; give the folder of a run, or its `{DATA}`.")
     if (path / "comparison.json").is_file():
         raise OutputError(f"`{path}` is a comparison; give one of its runs, `{path}/runs/NAME.nc`.")
     raise OutputError(f"the folder `{path}` holds no run: it has no `{DATA}`.")

@@ -7,8 +7,8 @@ import numpy as np
 from echelon.agents.network.hearing import who_hears_whom
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
+from echelon.experiments.results.agent_metrics import Metrics
 from echelon.experiments.results.lyapunov import Lyapunov, lyapunov
-from echelon.experiments.results.metrics import Metrics
 from echelon.guarantees.promises.covering import coverage
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.output.reports.causes import causes, grows, sizes
@@ -31,7 +31,7 @@ def _outcome(result: Result, numbers: Metrics) -> Iterator[str]:
     yield result.message
     if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
         return
-    unit = "" if result.unit == "state" else f" {result.unit}"
+    unit = f" {result.length_unit}".rstrip()
     if grows(result):
         first, last = sizes(result)
         yield (
