@@ -130,13 +130,18 @@ class MetricPromise(Promise):
         if self.region is not None:
             return self.region.rate
         if self.loop.common is not None:
-            return max(0.0, min(self.loop.common, -self.slowest_turn))
-        return -max(self.loop.slowest, self.slowest_turn)
+            return max(0.0, min(self.loop.common, -self._slowest_beside))
+        return -max(self.loop.slowest, self._slowest_beside)
+
+    @property
+    def _slowest_beside(self) -> float:
+        """The slowest mode in steady turns, and of what leaders add to the errors, 1/s."""
+        return max(self.slowest_turn, self.case.leaders_share)
 
     @property
     def slowest(self) -> float | None:
         """The slowest mode near the trim, 1/s; None where the model bends there and has none."""
-        return self.loop.slowest if self.linear else None
+        return max(self.loop.slowest, self.case.leaders_share) if self.linear else None
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which modes decay at the trim and wherever agents go."""

@@ -124,7 +124,7 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     )
     if brief:
         return tube, lines
-    arrival = arrival_of(run.flat, run.parts.graph, run.law, run.coupling, _positions(run))
+    arrival = arrival_of(run, _positions(run))
     motor_load, line = motor_load_of(run)
     return tube._replace(arrival=arrival, motor_load=motor_load), [*lines, line]
 
