@@ -35,9 +35,7 @@ _SLACK = 1e-9
 """m; more than floats leave of the sums."""
 
 
-def arrival_of(
-    run: StoppingRun, position: Sequence[int]
-) -> float | None:
+def arrival_of(run: StoppingRun, position: Sequence[int]) -> float | None:
     """Return when (s) all followers are within 1 cm for good; None where it is not known.
 
     Args:
