@@ -169,11 +169,11 @@ class Session:
 
     def _loads(self, picture: Picture) -> Float[Array, "N k"]:
         """Return the loads of motors as fractions of their limits; no columns without limits."""
-        if self.bounds is None or not np.isfinite([self.bounds.low, self.bounds.high]).all():
+        loads = None if self.bounds is None else self.bounds.loads(picture.inputs)
+        if loads is None:
             return np.zeros((len(picture.states), 0))
-        matrix, low, high = self.bounds
         # A saturated motor is at its limit but for rounding.
-        return np.round((picture.inputs @ matrix.T - low) / (high - low), 9)
+        return np.round(loads, 9)
 
     # ---- pages ----------------------------------------------------------------------------------
 

@@ -31,6 +31,13 @@ class InputBounds(NamedTuple):
     low: Float[np.ndarray, " k"]
     high: Float[np.ndarray, " k"]
 
+    def loads(self, inputs: Float[np.ndarray, "... m"]) -> Float[np.ndarray, "... k"] | None:
+        """Return rows of G u as fractions of their range; None where a row has a single bound."""
+        matrix, low, high = self
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            return None
+        return (inputs @ matrix.T - low) / (high - low)
+
 
 class TrackingErrors(NamedTuple):
     """Outputs of the L leaders minus their references', with the outputs' names and units."""
@@ -161,13 +168,8 @@ class Recording(FrameNumbers):
 
     @property
     def loads(self) -> Float[np.ndarray, "T N k"] | None:
-        """Rows of G u as fractions of their range; None where a row has a single bound."""
-        if self.bounds is None:
-            return None
-        matrix, low, high = self.bounds
-        if not (np.isfinite(low).all() and np.isfinite(high).all()):
-            return None
-        return (self.inputs @ matrix.T - low) / (high - low)
+        """Loads of the inputs; None where they have none."""
+        return None if self.bounds is None else self.bounds.loads(self.inputs)
 
 
 def read_recording(file: Path) -> Recording:

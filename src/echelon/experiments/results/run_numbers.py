@@ -125,7 +125,7 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
     "worst_steady_rmse": Quantity(
         "largest RMSE of a follower in the steady window",
         ERROR,
-        of=lambda run: run.worst("steady_rmse"),
+        of=lambda run: run.metrics.worst_steady,
         shown=Shown(0),
     ),
     "worst_final_error": Quantity(

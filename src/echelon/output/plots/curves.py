@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from echelon.core.types import Array
+from echelon.experiments.results.lyapunov import rises
 from echelon.experiments.results.metrics import SETTLED
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
@@ -177,10 +178,10 @@ def lyapunov(run: Recording) -> "Figure | None":
 def _increases_between(run: Recording) -> bool:
     """Return whether V increases between two frames with a negative rate."""
     assert run.lyapunov is not None and run.lyapunov_rate is not None
-    value, decreasing = run.lyapunov, run.lyapunov_rate < 0.0
-    # Far below its start V is only rounding.
-    increases = np.diff(value) > 1e-9 * value[:-1] + 1e-20 * value[0]
-    return bool((increases & decreasing[:-1] & decreasing[1:]).any())
+    decreasing = run.lyapunov_rate < 0.0
+    return bool(
+        (rises(run.lyapunov[:-1], run.lyapunov[1:]) & decreasing[:-1] & decreasing[1:]).any()
+    )
 
 
 # ---- inputs -----------------------------------------------------------------------------------

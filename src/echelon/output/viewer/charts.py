@@ -83,8 +83,8 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
 
 def _slope(run: Recording, begin: float, times: float) -> list[JsonObject]:
     """Return the line of the guaranteed rate from the first value on, if there is one."""
-    rate = run.promise["rate"] if run.promise["promised"] else None
-    if not rate or begin <= 0.0 or not np.isfinite(begin):
+    rate = run.rate
+    if rate is None or begin <= 0.0 or not np.isfinite(begin):
         return []
     slope = -times * rate / float(np.log(10.0))
     ends = [float(np.log10(begin)), slope]

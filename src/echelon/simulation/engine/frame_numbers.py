@@ -58,6 +58,11 @@ class FrameNumbers(abc.ABC):
         return y - y[:, self.nearest]
 
     @property
+    def goals(self: _Frames) -> Float[Array, "T N n"]:
+        """The states that the agents would have without errors."""
+        return self.states - self.errors
+
+    @property
     def formation_errors(self: _Frames) -> Float[Array, "T N"]:
         """Each agent's distance from its goal."""
         # Where a square overflows, the length is infinite.
