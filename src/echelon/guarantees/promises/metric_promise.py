@@ -129,14 +129,9 @@ class MetricPromise(Promise):
             return None
         if self.region is not None:
             return self.region.rate
-        if self.loop.common is not None:
-            return max(0.0, min(self.loop.common, -self._slowest_beside))
-        return -max(self.loop.slowest, self._slowest_beside)
-
-    @property
-    def _slowest_beside(self) -> float:
-        """The slowest mode in steady turns, and of what leaders add to the errors, 1/s."""
-        return max(self.slowest_turn, self.case.leaders_share)
+        common, held = self.loop.common, self.loop.held_rate(self.case.settings)
+        rate = -self.loop.slowest if common is None else common.rate
+        return max(0.0, min(rate, held, -self.slowest_turn, -self.case.leaders_share))
 
     @property
     def slowest(self) -> float | None:
