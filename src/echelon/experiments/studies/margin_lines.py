@@ -49,7 +49,8 @@ def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
         yield unneeded(Topic.MARGINS, _KIND, text, stiffness)
         return
     low, high = margins.gain_margin(loop.closed)
-    yield holds(Topic.GAIN, _KIND, "factors on the coupling", low, f"{low:.3g} to {high:.3g}")
+    text = "factors on the coupling, in continuous time"
+    yield holds(Topic.GAIN, _KIND, text, low, f"{low:.3g} to {high:.3g}")
     delay = delay_margin(loop.closed)
     time = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
     text = f"uniform delay of z, critical mode lambda = {delay.eigenvalue:.3g}; {loop.where}"
@@ -69,7 +70,8 @@ def _switching_lines(promise: Promise) -> Iterator[Statement]:
     anywhere = promise.agreement is not None
     if not anywhere and edge is not None and not lines[Hypothesis.DISAGREEMENT_DECAY].fails:
         low = edge / promise.loop.closed.coupling
-        what = "factors on the coupling for which one P serves all graphs, however they switch"
+        what = "factors on the coupling for which one P serves all graphs, however they switch, in "
+        what += "continuous time"
         yield holds(Topic.GAIN, _KIND, what, low, f"{low:.3g} to inf")
     text = "any coupling; " if anywhere else ""
     text += "delay margins are known for one graph only, not for switching graphs"

@@ -14,11 +14,12 @@ from echelon.core.linear import discretize, longest_step, radius_between, spectr
 from echelon.core.rational import bisect
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
+from echelon.guarantees.promises.common_metric import CommonMetric
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import Certificate, certify
-from echelon.synthesis.certificates.lmi import falls, rate_of
+from echelon.synthesis.certificates.lmi import falls
 from echelon.synthesis.certificates.margins import ClosedLoop, slowest_between
 from echelon.synthesis.gains.gain import Gain
 
@@ -26,7 +27,7 @@ SHOWN = 32
 """So many eigenvalues stand for an interval of them where numbers are shown."""
 _DENSE = 400
 """Real eigenvalues beyond so many are judged as the interval that holds them."""
-_HALVINGS = 12  # of a step that an interval of eigenvalues does not bear
+_HALVINGS = 20  # of a step that an interval of eigenvalues, or some graph, does not bear
 _SLACK = 1e-9
 """Relative; what a solver leaves of the inequality behind an edge, which is often tight."""
 
@@ -43,9 +44,8 @@ class LinearLoop(NamedTuple):
         every: whether the modes of all eigenvalues of the graph decay.
         slowest: real part of the slowest mode, 1/s; of an interval, of the modes looked at.
         certificate: of the linearization.
-        common: the rate, 1/s, at which the sum of all delta_i'P delta_i falls near the trim on
-            every one of the graphs that take turns (T8), below 0 where it may rise; None where the
-            graph does not switch.
+        common: the sum of all delta_i'P delta_i near the trim on graphs that take turns (T8); None
+            where the graph does not switch.
     """
 
     linear: Linearization
@@ -56,7 +56,7 @@ class LinearLoop(NamedTuple):
     every: bool
     slowest: float
     certificate: Certificate
-    common: float | None = None
+    common: CommonMetric | None = None
 
     @property
     def gains(self) -> Array:
@@ -86,14 +86,30 @@ class LinearLoop(NamedTuple):
         real = np.real(self.closed.strengths[np.imag(self.closed.strengths) == 0.0])
         return max(radius, radius_between(F - G @ self.inner, G @ self.closed.K, *real[[0, -1]]))
 
+    def growth(self, settings: Settings) -> float:
+        """Return the most by which a step multiplies errors, on any graph, in the norm of P.
+
+        Below 1 errors decay in any order of the graphs; without `common` it is 0.
+        """
+        if self.common is None or not self.common.weakest > 0.0:
+            return 0.0
+        F, G = discretize(*self.open, settings.dt, settings.integrator)
+        return self.common.growth(F - G @ self.inner, G, self.closed.K, settings.dt)
+
+    def held_rate(self, settings: Settings) -> float:
+        """Return the rate (1/s) at which errors decay in held steps."""
+        growth = self.growth(settings) or self.radius(settings)
+        return -float(np.log(growth)) / settings.dt if growth > 0.0 else np.inf
+
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) of that integrator with which every mode decays."""
         step = longest_step(*self.open, self.gains, settings.integrator)
-        if not self.closed.between or not np.isfinite(step):
+        if not (self.closed.between or self.common) or not np.isfinite(step):
             return step
 
         def decays(dt: float) -> bool:
-            return self.radius(settings._replace(dt=dt)) < 1.0
+            then = settings._replace(dt=dt)
+            return self.radius(then) < 1.0 and self.growth(then) < 1.0
 
         # No smaller number is stated than need be: rounding alone lies between this and the step.
         near = (1.0 - 1e-6) * step
@@ -136,20 +152,13 @@ def loop_of(parts: Parts) -> LinearLoop:
         slowest = max(slowest, slowest_between(closed))
     inner = np.zeros((m, n)) if inner is None else inner
     common = None
-    if parts.graph.schedule is not None and gain is not None:
-        common = _common(parts, gain, linear)
+    alike = all_alike(parts.drive, parts.model)
+    if parts.graph.schedule is not None and gain is not None and not alike:
+        common = CommonMetric.of(parts.graph, gain, *linear)
     every = slowest < 0.0
     return LinearLoop(
         linear, inner, closed, where, modes.symmetric, every, slowest, certificate, common
     )
-
-
-def _common(parts: Parts, gain: Gain, linear: Linearization) -> float:
-    """Return at what rate one P serves all graphs that take turns."""
-    weakest = parts.graph.spectrum().proved
-    if not weakest > 0.0 or all_alike(parts.drive, parts.model):
-        return -np.inf
-    return rate_of(gain.P, linear.A[None], linear.B, gain.R, 2.0 * gain.coupling * weakest)
 
 
 def modes_of(parts: Parts) -> NetworkModes:

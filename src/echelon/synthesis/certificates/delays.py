@@ -43,10 +43,10 @@ def delay_margin(loop: ClosedLoop) -> DelayMargin:
     if loop.between:
         # What lies between two eigenvalues may be worse than both.
         at = np.concatenate([at, _turning_points(loci, grid)])
-    at = at[np.isfinite(at[:, 0].real)]
+    at = at[np.isfinite(np.real(at[:, 0]))]
     if not len(at):
         return DelayMargin(np.inf, 0.0, strengths[0] / loop.coupling)
-    delay, w, k = at[at[:, 0].real.argmin()]
+    delay, w, k = at[np.real(at[:, 0]).argmin()]
     k = k if k.imag else k.real
     return DelayMargin(float(delay.real), float(w.real), k / loop.coupling)
 
