@@ -23,7 +23,6 @@ import planted_faults
 
 import echelon as ech
 from echelon.core.provenance import versions
-from echelon.experiments.results.metrics import formation_errors
 from echelon.experiments.studies.speedup import time_constant
 
 HERE = Path(__file__).resolve().parent
@@ -224,7 +223,7 @@ def inner_loops(lengths: Sequence[tuple[int, float]]) -> list[Row]:
             ),
             ech.Settings(horizon=horizon, dt=0.005, store_every=100, steady_window=0.1 * horizon),
         )
-        errors = formation_errors(result)[:, 1:]
+        errors = result.formation_errors[:, 1:]
         above = np.flatnonzero(errors.max(axis=1) > 1e-9)
         steady = ech.metrics(result).worst_steady
         reached = result.times[min(above[-1] + 1, len(errors) - 1)] if len(above) else 0.0

@@ -10,6 +10,7 @@ import optimization
 from pages import write_part
 
 import echelon as ech
+from echelon.experiments.results.run_numbers import RUN_NUMBERS
 from echelon.experiments.studies.compare import ComparisonRow
 from echelon.output.reports.comparison_report import verdict
 from echelon.output.reports.printed import PRINTED
@@ -26,6 +27,12 @@ HEADS = (
 )
 
 
+NAMES = (
+    *("worst_steady_rmse", "worst_settling_time", "effort", "saturation_fraction"),
+    *("minimum_distance", "computing"),
+)
+
+
 def number(value: float | None) -> str:
     """Return a number for the page, a dash where there is none."""
     return "-" if value is None else f"{value:.3g}"
@@ -33,20 +40,15 @@ def number(value: float | None) -> str:
 
 def cells(row: ComparisonRow) -> list[str]:
     """Return one method's cells."""
-    if row.flight is None or row.numbers is None:
+    if row.flight is None:
         return [row.label, *["-"] * (len(HEADS) - 1)]
-    numbers = row.numbers
+    numbers = row.flight.metrics
     return [
         f"`{row.label}`",
         number(numbers.leader.rmse),
         *(number(each.rmse) for each in numbers.followers),
         number(numbers.leader.steady_rmse),
-        number(row.steady),
-        "never" if row.settled is None else f"{row.settled:.3g}",
-        number(row.effort),
-        f"{100.0 * numbers.saturation_fraction:.3g}",
-        number(numbers.minimum_distance),
-        f"{1e3 * row.flight.computing:.3g}",
+        *(RUN_NUMBERS[name].cell(row.number(name), 3) for name in NAMES),
     ]
 
 

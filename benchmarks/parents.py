@@ -10,7 +10,6 @@ import numpy as np
 
 import echelon as ech
 from echelon.agents.models.linearization import linearize
-from echelon.experiments.results.metrics import formation_errors
 from echelon.synthesis.certificates.margins import ClosedLoop, string_gain
 
 MODEL = ech.models.Quadrotor()
@@ -37,7 +36,7 @@ def converged(followers: int, feedforward: str, coupling: float | None, seeds: i
             ech.Settings(horizon=60.0, dt=0.005, store_every=200, seed=seed),
         )
         done = run.outcome is ech.Outcome.COMPLETED
-        count += bool(done and np.all(formation_errors(run)[-1] < 0.01))
+        count += bool(done and np.all(run.formation_errors[-1] < 0.01))
     return count
 
 

@@ -12,7 +12,6 @@ from pages import write_part
 
 import echelon as ech
 from echelon.core.provenance import versions
-from echelon.experiments.results.metrics import formation_errors
 
 OFFSETS = {1: (1.0, 0.0, 0.0), 2: (1.0, 0.8, 0.0), 3: (1.0, -0.8, 0.0)}
 
@@ -124,7 +123,7 @@ def what_fails(seeds: Sequence[int]) -> list[Row]:
     """Measure what the printed law and a missing feed-forward do."""
     lag = np.array([steady(r) for r in runs("paper", seeds[:10], "follower.feedforward=none")])
     literal = runs("paper-literal", seeds[:10])
-    ends = np.array([np.sqrt((formation_errors(r)[-1, 1:] ** 2).mean()) for r in literal])
+    ends = np.array([np.sqrt((r.formation_errors[-1, 1:] ** 2).mean()) for r in literal])
     rank = literal[0].drive.gain.certificate.observable  # type: ignore[union-attr]
     return [
         (
@@ -161,7 +160,7 @@ def inner_loops() -> list[Row]:
             ),
             ech.Settings(horizon=horizon, dt=0.005, store_every=100, steady_window=0.1 * horizon),
         )
-        worst = formation_errors(result)[:, 1:].max(axis=1)
+        worst = result.formation_errors[:, 1:].max(axis=1)
         above = np.flatnonzero(worst > 1e-9)
         reached = result.times[above[-1] + 1]
         last = max(steady(result))

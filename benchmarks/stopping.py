@@ -15,7 +15,7 @@ import numpy as np
 import echelon as ech
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.experiments.results.metrics import formation_errors, metrics
+from echelon.experiments.results.metrics import metrics
 from echelon.guarantees.stopping.motor_load import motors_bear
 from echelon.guarantees.stopping.stopping_run import stopping_of
 from echelon.simulation.engine.batch import Batch
@@ -73,7 +73,7 @@ def flights(count: int, *changes: str) -> Iterator[dict[str, Any]]:
     for found in Batch().fly(runs):
         if isinstance(found, Exception):
             raise found
-        numbers, errors = metrics(found), formation_errors(found)
+        numbers, errors = metrics(found), found.formation_errors
         late = np.flatnonzero((errors >= 0.01).any(axis=1))
         yield {
             "1 cm": float(found.times[min(late[-1] + 1, len(errors) - 1)]) if len(late) else 0.0,

@@ -1,5 +1,6 @@
 """Constructed recordings with chosen numbers, for tests of figures and pages."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -74,7 +75,6 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
         times=times,
         states=states,
         inputs=inputs,
-        errors=errors,
         offsets=offsets,
         leaders=leaders,
         nearest=nearest,
@@ -82,6 +82,11 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
         position=position,
         **own,
     )
+
+
+def with_errors(run, errors):
+    """A recording with these deviations from the goals, zero for leaders."""
+    return dataclasses.replace(run, states=errors, offsets=np.zeros_like(run.offsets))
 
 
 def tracked(run):

@@ -13,8 +13,11 @@ from .agents import (
     references as references,
 )
 from .agents.models.model import ControlAffine as ControlAffine
+from .agents.network.channel import Bursts as Bursts
+from .agents.network.channel import Network as Network
 from .agents.network.formation import Formation as Formation
 from .agents.network.graph import Graph as Graph
+from .agents.network.inbox import Message as Message
 from .agents.references.reference import Reference as Reference
 from .agents.world.disturbance import Disturbance as Disturbance
 from .agents.world.world import World as World
@@ -71,7 +74,6 @@ from .simulation import (
     optimal as optimal,
 )
 from .simulation.engine.agent import Agent as Agent
-from .simulation.engine.agent import Message as Message
 from .simulation.engine.gradient import gradient as gradient
 from .simulation.engine.law_drive import Laws as Laws
 from .simulation.engine.parts import Parts as Parts

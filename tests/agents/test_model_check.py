@@ -487,3 +487,15 @@ def test_an_input_map_may_bend_and_not_jump():
     bent = scalar(lambda x: -x, lambda x: 1.0 + jnp.abs(x)[:, None])
     jumping = scalar(lambda x: -x, lambda x: jnp.where(x > 0, 1.0, 2.0)[:, None])
     assert not at_trim(bent).bends.any() and at_trim(jumping).bends.all()
+
+
+@pytest.mark.parametrize("name", ["velocity", "normalized_drift", "normalized", "physical"])
+def test_what_follows_from_the_equations_is_not_replaced(name):
+    # A run would move by one of them, and a proof be of the other.
+    assert told(spoiled(**{name: lambda self, *parts: parts[0]})) == (
+        f"`Tank` replaces `{name}`, which follows from `drift`, `input_map`, `trim` and "
+        "`input_scale`; change those."
+    )
+    model = Tank()
+    object.__setattr__(model, name, lambda *parts: parts[0])
+    assert name in told(model)

@@ -237,7 +237,7 @@ def test_a_name_cannot_become_code(browser, run, tmp_path):
 
 def parts_of(run, cuts):
     """The stretches of a run between frames."""
-    names = ("times", "states", "inputs", "errors", "lyapunov")
+    names = ("times", "states", "inputs", "lyapunov")
     for a, b in itertools.pairwise(cuts):
         yield dataclasses.replace(run, **{name: getattr(run, name)[a:b] for name in names})
 
@@ -382,7 +382,7 @@ def test_agents_that_fly_away_spoil_neither_the_scale_nor_the_rest():
 
 
 def test_a_run_without_frames_is_refused(run):
-    empty = {name: getattr(run, name)[:0] for name in ("times", "states", "inputs", "errors")}
+    empty = {name: getattr(run, name)[:0] for name in ("times", "states", "inputs")}
     with pytest.raises(OutputError, match="no stored frame"):
         replay_data(dataclasses.replace(run, **empty))
 
@@ -420,7 +420,7 @@ def test_what_is_read_from_a_file_is_what_ran(stored):
     run = recording_of(result)
     np.testing.assert_array_equal(run.states, result.states)
     np.testing.assert_array_equal(run.errors, result.errors)
-    assert run.position == (0, 1) and run.unit == "m"
+    assert run.position == (0, 1) and run.length_unit == "m"
     assert run.heard.tolist() == [[False, True], [True, True]] and run.schedule is None
     assert run.nearest.tolist() == list(result.graph.nearest_leader())
     assert run.modes is not None and run.modes.poles.real.max() < 0.0

@@ -4,16 +4,19 @@ import json
 import os
 import subprocess
 import sys
-import types
 
 import numpy as np
 import pytest
 
 import echelon as ech
 from echelon.apps.cli.app import app
-from echelon.experiments.results.metrics import FollowerMetrics, LeaderMetrics, Metrics
+from echelon.experiments.results import run_numbers
+from echelon.experiments.results.agent_metrics import FollowerMetrics, LeaderMetrics, Metrics
+from echelon.experiments.results.quantity import Quantity, Shown
+from echelon.experiments.results.run_numbers import RunNumbers
 from echelon.experiments.studies.compare import LABELS, Comparison, ComparisonRow
 from echelon.output.reports.comparison_report import comparison_mapping, comparison_report, verdict
+from echelon.output.reports.glossary import glossary
 
 LAWS = ("literal", "riccati-relay", "riccati", "inner-loop")
 SHORT = ["simulation.horizon=1.0"]
@@ -65,7 +68,7 @@ def test_the_steady_window_is_shorter_than_the_run(planar):
 
 def test_the_paragraph_names_the_row_with_the_least_number(planar):
     text = " ".join(verdict(planar))
-    whole = {row.label: row.whole for row in planar.rows}
+    whole = {row.label: row.number("worst_rmse") for row in planar.rows}
     best = min(whole, key=whole.__getitem__)
     assert f"{best} has the smallest error over the whole run" in text
     assert "do not bring every follower within 1 cm" in text
@@ -75,7 +78,7 @@ def row_of(label, settles, effort, computing):
     """A method of one follower, with the numbers that the paragraph reads."""
     follower = FollowerMetrics(1, 0.1, 0.1, settles, effort, 0.0)
     numbers = Metrics((LeaderMetrics(None, None, {}),), (follower,), (), None, 0.0, 1.0)
-    return ComparisonRow(label, types.SimpleNamespace(computing=computing), numbers)
+    return ComparisonRow(label, RunNumbers(None, numbers, None, computing))
 
 
 def test_what_is_said_of_those_that_settle_is_said_to_be_of_them():
@@ -89,6 +92,21 @@ def test_what_is_said_of_those_that_settle_is_said_to_be_of_them():
     assert "Of those that settle, a takes the least computing time, b 4 times as much." in text
     text = " ".join(verdict(Comparison("mine", rows[1:], 5.0, 1.0, ())))
     assert "Of those" not in text and "a has the smallest effort (5; next b, 6)." in text
+
+
+def test_a_number_of_the_table_is_in_every_table_that_it_names(planar, monkeypatch):
+    def fastest(run):
+        return float(np.abs(run.result.states).max())
+
+    number = Quantity(
+        "largest state", "m", column="largest\nstate", of=fastest, shown=Shown.COMPARISON
+    )
+    monkeypatch.setitem(run_numbers.RUN_NUMBERS, "largest_state", number)
+    rows = comparison_mapping(planar)["methods"]
+    for label, result in flown(planar).items():
+        assert rows[label]["largest_state"] == np.abs(result.states).max()
+    assert "largest" in comparison_report(planar)
+    assert glossary()["largest_state"] == "largest state, m"
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from runs import made_up, simulate
 
 import echelon as ech
 from echelon.core.errors import Outcome
-from echelon.experiments.results.metrics import formation_errors, metrics, output_errors
+from echelon.experiments.results.metrics import metrics, output_errors
 
 
 @pytest.fixture
@@ -32,8 +32,8 @@ def follower_moved(result, frame):
 
 def test_formation_error_is_the_vector_to_the_goal(exponential):
     t = exponential.times
-    assert np.allclose(formation_errors(exponential)[:, 1], 5.0 * 2.0**-t, rtol=1e-12)
-    assert not formation_errors(exponential)[:, 0].any()
+    assert np.allclose(exponential.formation_errors[:, 1], 5.0 * 2.0**-t, rtol=1e-12)
+    assert not exponential.formation_errors[:, 0].any()
     numbers = metrics(exponential).followers[0]
     # Steps begin at all frames but the last; two of them in the window of 2 s.
     squares = 25.0 * 4.0 ** -t[:-1]
@@ -110,7 +110,7 @@ def test_no_mean_depends_on_the_frames_that_are_stored(stored):
 
 def test_means_are_those_of_the_frames_where_every_step_is_stored(stored):
     result, numbers = stored[0], metrics(stored[0])
-    errors = formation_errors(result)[:-1]
+    errors = result.formation_errors[:-1]
     rms = np.sqrt(np.mean(errors**2, axis=0))
     assert [each.rmse for each in numbers.followers] == pytest.approx(rms[1:].tolist(), rel=1e-12)
     trim, scale = result.model.trim[1], np.asarray(result.model.input_scale)
@@ -166,5 +166,5 @@ def test_the_relay_is_a_fixed_point_of_the_formation():
         horizon=2.0,
         dt=0.01,
     )
-    assert formation_errors(result).max() < 1e-13
+    assert result.formation_errors.max() < 1e-13
     assert result.saturated[0] > 0.0

@@ -532,6 +532,38 @@ def test_ctrl_c_ends_a_sweep_soon_and_keeps_what_is_done(here):
     assert done and int((arrays(here / "cut")["outcome"] >= 0).sum()) == done
 
 
+# In the middle of an instruction of Python that takes a minute, as a compilation does.
+BUSY = """
+import hashlib, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+def busy(*_):
+    open("busy", "w").close()
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 10**8)
+
+{}
+from echelon.apps.cli.app import main
+main()
+"""
+IN_A_BATCH = BUSY.format("import echelon.experiments.sweeps.workers as x; x.Workers.batch = busy")
+IN_A_CHECK = BUSY.format(
+    "import echelon.experiments.scenario.scenario as x; x.load_scenario = busy"
+)
+
+
+@pytest.mark.parametrize(
+    ("code", "arguments"), [(IN_A_BATCH, [*SWEEP, "--out", "o"]), (IN_A_CHECK, ["check", "paper"])]
+)
+def test_ctrl_c_waits_for_no_compilation(here, code, arguments):
+    with started(code, *arguments) as process:
+        wait_for(process, lambda: (here / "busy").exists())
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=20)
+        assert process.returncode == 130
+    assert told.endswith("echelon: stopped; there were no results to save.\n")
+    assert not (here / "o").exists()
+
+
 def test_a_sweep_writes_its_folder_and_is_complete(here):
     call = ["sweep", "van-der-pol", "--over", "seed=0..2", "--out", "o"]
     for change in SHORT:

@@ -246,7 +246,7 @@ def test_chains_are_found_where_nothing_is_stated():
         def input_map(self, x):
             return jnp.stack([jnp.stack([jnp.cos(x[1]), 0.0 * x[0]]), jnp.array([0.0, 1.0])])
 
-    assert chains_of(Cart()).degrees == (1, 1) and chains_of(Cart()).sampled
+    assert chains_of(Cart())[1:] == ((1, 1), (0, 0), ())
 
 
 @pytest.mark.parametrize(
@@ -511,7 +511,7 @@ def test_verify_recomputes_a_tube_and_refuses_a_false_one(tmp_path):
     file = tmp_path / "summary.json"
     file.write_text(json.dumps({"promise": told}))
     found = verify(file)
-    assert found.holds and len(found.findings) == 6, found.sentence
+    assert found.verdict == "incomplete" and found.sentence.startswith("Incomplete: 6 claims hold")
     [border] = told["anywhere"]["borders"]
     for key, factor in (("left", 1.01), ("steepest", 1.2), ("speed", 1.6)):
         was, border[key] = border[key], border[key] * factor

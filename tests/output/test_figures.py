@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from recordings import PROMISE, as_file, flown, swinging, tracked
+from recordings import PROMISE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
@@ -88,7 +88,7 @@ def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_s
     shrink = np.exp(-0.5 * run.times)[:, None, None]
     errors = shrink * rng.normal(size=(1, 4, 12))
     errors[:, 0] = 0.0
-    proved = dataclasses.replace(run, errors=errors, metric=P, promise=CERTIFIED)
+    proved = dataclasses.replace(with_errors(run, errors), metric=P, promise=CERTIFIED)
     bound = proved.error_bound()
     assert (bound[:, None] >= proved.formation_errors).all()
     drawn = lines_of(figures(proved, ["formation"])["formation"])["bound, by proof (T1)"]
@@ -98,7 +98,7 @@ def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_s
     block = np.linalg.inv(P)
     direction = np.linalg.eigh(block[:3, :3])[1][:, -1]
     worst[0, 1] = block[:, :3] @ direction
-    tight = dataclasses.replace(proved, errors=shrink * worst)
+    tight = with_errors(proved, shrink * worst)
     np.testing.assert_allclose(tight.error_bound(), tight.formation_errors[:, 1], rtol=1e-9)
 
 
@@ -174,15 +174,15 @@ def test_the_worst_of_a_flock_is_that_of_the_steady_window_as_in_the_table(flock
     errors = np.zeros_like(flock.errors)
     errors[:, 7, 0] = np.where(flock.times < 0.8 * flock.horizon - 1e-9, 9.0, 0.1)
     errors[:, 9, 0] = 1.0
-    told = lines_of(figures(dataclasses.replace(flock, errors=errors), ["formation"])["formation"])
+    told = lines_of(figures(with_errors(flock, errors), ["formation"])["formation"])
     assert "worst: follower 9" in told
     # Ended before that window, it is the worst of all that there is.
-    early = dataclasses.replace(flock, errors=errors, horizon=9.0)
+    early = dataclasses.replace(with_errors(flock, errors), horizon=9.0)
     assert "worst: follower 7" in lines_of(figures(early, ["formation"])["formation"])
 
 
 def test_an_error_of_zero_is_no_tiny_number(flock):
-    still = dataclasses.replace(flock, errors=np.zeros_like(flock.errors))
+    still = with_errors(flock, np.zeros_like(flock.errors))
     (ax,) = figures(still, ["formation"])["formation"].axes
     assert ax.get_ylim()[0] >= 1e-3
 

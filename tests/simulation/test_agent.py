@@ -1,5 +1,7 @@
 """A single `Agent` computes what it computes in `simulate`, from the messages it receives alone."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from echelon.core.errors import EchelonError
 CARTS = ech.models.DoubleIntegrator()
 CIRCLE = ech.references.Circle(radius=1.0, rate=0.6)
 TREE = ech.Graph([(0, 1, 0.7), (1, 2), (1, 3, 2.0)])
+X = np.array([0.3, -0.2, 0.1, 0.4])
 
 
 def gain():
@@ -25,39 +28,151 @@ LAWS = {
 }
 
 
-def formation(law):
+def formation(law, **initial):
     offsets = {1: (1.0, 0.0), 2: (1.0, 0.8), 3: (1.0, -0.8)}
     places = ech.Formation.from_offsets(CARTS, TREE, offsets)
-    return ech.Parts(CARTS, TREE, places, LAWS[law](), initial={"position": 1.0})
+    return ech.Parts(CARTS, TREE, places, LAWS[law](), initial=initial)
+
+
+@pytest.fixture(params=LAWS)
+def pair(request):
+    """Return agent 1, which hears 0, 2 and 3, and agent 2, which it hears."""
+    parts = formation(request.param)
+    return ech.Agent(parts, 1, dt=0.01), ech.Agent(parts, 2, dt=0.01)
 
 
 @pytest.mark.parametrize("law", LAWS)
 def test_agents_by_themselves_do_what_simulate_does(law):
-    parts = formation(law)
+    parts = formation(law, position=1.0)
     result = ech.simulate(parts, ech.Settings(horizon=0.2, dt=0.01, seed=3, engine="jax"))
     agents = [ech.Agent(parts, k, dt=0.01) for k in range(4)]
     for k, t in enumerate(result.times[:-1]):
         x = result.states[k]
-        said = {agent.number: agent.hello(x[agent.number]) for agent in agents}
+        for agent in agents:
+            broadcast(agents, agent.hello(x[agent.number]))
         # Outward: the leader, its neighbour, and the two behind.
         for agent in agents:
-            heard = {j: said[j] for j in {*agent.neighbours, 0}}
-            u, said[agent.number] = agent.step(0.01 * k, x[agent.number], heard)
-            np.testing.assert_allclose(
-                u, result.inputs[k, agent.number], atol=1e-12, err_msg=f"{t}"
-            )
+            u, message = agent.step(0.01 * k, x[agent.number])
+            broadcast(agents, message)
+            expected = result.inputs[k, agent.number]
+            np.testing.assert_allclose(u, expected, atol=1e-12, err_msg=f"{t}")
             assert u.dtype == np.float64
 
 
-def test_an_agent_says_what_it_misses():
-    agent = ech.Agent(formation("stopping-point"), 2)
-    x = np.zeros(4)
-    lone = {1: ech.Agent(formation("stopping-point"), 1).hello(x)}
-    with pytest.raises(EchelonError, match="needs its message of agent 1"):
-        agent.step(0.0, x, {})
-    with pytest.raises(EchelonError, match="what it tells of its input of agent 0"):
-        agent.step(0.0, x, lone)
+def broadcast(agents, message):
+    for agent in agents:
+        agent.receive(message)
+
+
+def spoiled(message):
+    """Yield what a network may deliver in place of a message, and the word for it."""
+    names, values = message.signal
+    ones = np.ones(len(values))
+    for bad in (math.nan, math.inf, -math.inf, 1e13):
+        for k in range(len(values)):
+            wrong = np.where(np.arange(len(values)) == k, bad, values)
+            yield message._replace(signal=(names, wrong)), "not-finite"
+    forward = message.feedforward
+    yield message._replace(feedforward=(forward[0], forward[1] * math.nan)), "not-finite"
+    yield message._replace(signal=(names, values[:-1])), "wrong-size"
+    yield message._replace(signal=(names, values[None])), "wrong-size"
+    yield message._replace(signal=(("height",), ones[:1])), "wrong-size"
+    yield message._replace(signal=(names[:1] * len(names), values)), "wrong-size"
+    yield message._replace(sender=2**70), "not-heard"
+    yield message._replace(sender=1), "not-heard"
+    texts = np.array(["1"] * len(values))
+    for values_ in (None, "text", texts, [[1.0], [1.0, 2.0]], values * 1j, [object()]):
+        yield message._replace(signal=(names, values_)), "no-message"
+    for odd in (None, "text", 3, b"", {}, (), (2, values), math.nan, object()):
+        yield odd, "no-message"
+    for odd in (None, "text", np.zeros(3)):
+        yield message._replace(signal=odd), "no-message"
+        yield message._replace(sender=odd), "no-message"
+    yield message._replace(feedforward="text"), "no-message"
+
+
+def test_a_bad_message_is_rejected_with_a_reason_and_changes_nothing(pair):
+    agent, neighbour = pair
+    twin = ech.Agent(formation_of(agent), 1, dt=0.01)
+    _, message = neighbour.step(0.0, X)
+    for one in (agent, twin):
+        assert str(one.receive(message)) == "taken"
+    for bad, word in spoiled(message):
+        assert str(agent.receive(bad)) == word, bad
+    for k in range(3):
+        (u, sent), (other, other_sent) = agent.step(0.01 * k, -X), twin.step(0.01 * k, -X)
+        np.testing.assert_array_equal(u, other)
+        for mine, theirs in zip(sent[1:], other_sent[1:], strict=True):
+            np.testing.assert_array_equal(mine.values, theirs.values)
+
+
+def formation_of(agent):
+    law = "consensus" if "vx" in agent.hello(X).signal.names else "stopping-point"
+    return formation(law)
+
+
+def test_an_agent_that_hears_nobody_acts_and_goes_on_with_what_it_last_heard(pair):
+    agent, neighbour = pair
+    alone, _ = agent.step(0.0, X)
+    assert np.isfinite(alone).all()
+    agent.receive(neighbour.hello(X + 1.0))
+    (first, _), (later, _) = agent.step(0.01, X), agent.step(0.01, X)
+    assert np.isfinite([first, later]).all() and np.abs(first - alone).max() > 1e-3
+
+
+def test_a_state_that_is_not_finite_leaves_the_input_and_the_memory(pair):
+    agent, _ = pair
+    twin = ech.Agent(formation_of(agent), 1, dt=0.01)
+    assert agent.step(0.0, X * math.nan)[1] is None and agent.hello(X * math.inf) is None
+    np.testing.assert_array_equal(agent.step(0.0, X * math.nan)[0], CARTS.trim[1])
+    u, message = agent.step(0.0, X)
+    held, again = agent.step(0.01, X * math.nan)
+    np.testing.assert_array_equal(held, u)
+    assert again is message and agent.blind == 3
+    twin.step(0.0, X)
+    np.testing.assert_array_equal(agent.step(0.02, -X)[0], twin.step(0.02, -X)[0])
+
+
+def test_unlike_agents_use_the_outputs_that_both_have():
+    places = {1: (1.0, 0.0, 0.0), 2: (1.0, 0.8, 0.0), 3: (1.0, -0.8, 0.0)}
+    models = ech.models.Quadrotor(), ech.models.DoubleIntegrator(dimension=3)
+    for mine, theirs in (models, models[::-1]):
+        agent, other = (
+            ech.Agent(
+                ech.Parts(
+                    model,
+                    TREE,
+                    ech.Formation.from_offsets(model, TREE, places),
+                    ech.Laws(ech.laws.StoppingLeader(), ech.laws.StoppingPoint()),
+                ),
+                number,
+            )
+            for model, number in ((mine, 1), (theirs, 2))
+        )
+        x, y = np.array(mine.trim[0]), np.array(theirs.trim[0])
+        alone, _ = agent.step(0.0, x)
+        assert str(agent.receive(other.step(0.0, y)[1])) == "taken"
+        # At the same place relative to their goals nothing is to be done.
+        y[1] += 0.8
+        agent.receive(other.hello(y))
+        np.testing.assert_allclose(agent.step(0.005, x)[0], alone, atol=1e-9)
+        y[0] += 5.0
+        agent.receive(other.hello(y))
+        assert np.abs(agent.step(0.01, x)[0] - alone).max() > 1e-6
+
+
+def test_what_a_caller_does_wrong_raises():
+    parts = formation("stopping-point")
+    agent = ech.Agent(parts, 2)
     with pytest.raises(EchelonError, match="has shape"):
         agent.hello(np.zeros(3))
-    with pytest.raises(EchelonError, match="not in this graph"):
-        ech.Agent(formation("stopping-point"), 4)
+    for odd in (None, "text", ["1", "2", "3", "4"], [object()] * 4):
+        with pytest.raises(EchelonError, match="numbers"):
+            agent.step(0.0, odd)
+    agent.step(1.0, X)
+    for t in (0.5, math.nan, math.inf, "1", None):
+        with pytest.raises(EchelonError, match="`t` is"):
+            agent.step(t, X)
+    for number in (4, -1, 1.0, "1", None):
+        with pytest.raises(EchelonError, match="not in this graph"):
+            ech.Agent(parts, number)

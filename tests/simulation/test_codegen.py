@@ -14,6 +14,7 @@ from scipy.special import erf
 
 from echelon.agents.models import Quadrotor
 from echelon.core.numerics import precision, rk4
+from echelon.core.private_folder import PrivateFolder
 from echelon.simulation.codegen import factored, machine_code
 from echelon.simulation.scalars import ScalarGraph, Unsupported, needed
 from echelon.simulation.scalars.scalar_graph import OPERATIONS
@@ -625,21 +626,26 @@ def test_a_processor_with_less_computes_the_same_and_says_what_it_has(monkeypatc
 
 def test_what_was_compiled_is_kept_and_a_damaged_file_is_made_again(tmp_path):
     columns = rng.normal(size=(3, 8))
-    first = run(PROGRAMS["a loop"], columns, cache=tmp_path)
+    first = run(PROGRAMS["a loop"], columns, cache=PrivateFolder(tmp_path))
     [file] = tmp_path.iterdir()
     whole = file.read_bytes()
-    assert run(PROGRAMS["a loop"], columns, cache=tmp_path).tobytes() == first.tobytes()
+    assert (
+        run(PROGRAMS["a loop"], columns, cache=PrivateFolder(tmp_path)).tobytes() == first.tobytes()
+    )
     for damaged in (whole[: len(whole) // 2], b"", whole[:40] + b"x" + whole[41:]):
         file.write_bytes(damaged)
-        assert run(PROGRAMS["a loop"], columns, cache=tmp_path).tobytes() == first.tobytes()
+        assert (
+            run(PROGRAMS["a loop"], columns, cache=PrivateFolder(tmp_path)).tobytes()
+            == first.tobytes()
+        )
         assert file.read_bytes() == whole
 
 
 def test_a_folder_without_room_for_code_is_no_fault(tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("in the way")
+    folder = PrivateFolder(tmp_path / "removed")
+    folder.path.rmdir()
     columns = rng.normal(size=(3, 8))
-    found = run(PROGRAMS["a loop"], columns, cache=blocked)
+    found = run(PROGRAMS["a loop"], columns, cache=folder)
     np.testing.assert_allclose(found, by_jax(PROGRAMS["a loop"], columns), rtol=1e-14)
 
 

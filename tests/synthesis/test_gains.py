@@ -1,6 +1,8 @@
 """Gains and their certificates, against closed forms and eigenvalues."""
 
+import contextlib
 import dataclasses
+import itertools
 import json
 
 import jax.numpy as jnp
@@ -274,6 +276,17 @@ def test_a_position_without_weight_cannot_be_held():
 def test_an_undamped_mode_without_weight_is_refused_beside_others(model, method):
     with pytest.raises(GainError, match="has no stabilizing solution .*weighted by `Q`.$"):
         synthesize(model, LINE, method)
+
+
+@pytest.mark.parametrize("method", [Riccati, InnerLoop])
+def test_weights_of_any_size_give_a_gain_or_a_sentence_and_no_warning(method, recwarn):
+    for model, size in itertools.product((DoubleIntegrator(), QUAD, Pendulum()), (1e-300, 1e70)):
+        for name, count in (("Q", len(model.state_names)), ("R", len(model.input_names))):
+            weights = np.ones(count)
+            weights[-1] = size
+            with contextlib.suppress(GainError):
+                synthesize(model, TREE, method(**{name: weights}))
+    assert not [str(each.message) for each in recwarn]
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from runs import simulate
 import echelon as ech
 from echelon.agents.models.linearization import linearize
 from echelon.core.numerics import precision
-from echelon.experiments.results.metrics import formation_errors
 from echelon.synthesis.gains.inner_loop import symmetric_states
 
 AGENTS = {
@@ -74,7 +73,7 @@ def test_quadrotors_converge_by_the_relay_of_the_input_beyond_the_loop(gains):
         dt=0.005,
         store_every=20,
     )
-    errors = formation_errors(result)
+    errors = result.formation_errors
     assert errors[-1].max() < 1e-9 and errors[0].max() > 0.5
     started = simulate(
         model,
@@ -86,7 +85,7 @@ def test_quadrotors_converge_by_the_relay_of_the_input_beyond_the_loop(gains):
         horizon=3.0,
         dt=0.005,
     )
-    assert formation_errors(started).max() < 1e-13
+    assert started.formation_errors.max() < 1e-13
 
 
 def test_v_never_rises_where_the_drift_is_linear():

@@ -11,10 +11,10 @@ from echelon.agents.models import Quadrotor
 from echelon.core.errors import GainError
 from echelon.core.linear import matrix_exponential
 from echelon.synthesis.certificates.bounds import invariant_ellipsoid, peak_gain
+from echelon.synthesis.certificates.delays import delay_margin
 from echelon.synthesis.certificates.margins import (
     ClosedLoop,
     decays_between,
-    delay_margin,
     detectability,
     gain_margin,
     input_scaling,
@@ -120,7 +120,7 @@ def test_the_quadrotor_stands_almost_half_of_the_edge_and_any_more():
 @settings(max_examples=25)
 def test_inside_the_gain_margin_all_decays_and_at_its_edge_not(seed, m):
     loop, rng = random_loop(seed, m=m)
-    A, B, P, R, c, lam = loop
+    A, B, P, R, c, lam, _ = loop
     low, high = gain_margin(loop)
     # A Riccati gain keeps what its theorem promises.
     assert low <= EDGE / c + 1e-9 and high == np.inf
@@ -209,7 +209,7 @@ def test_the_quadrotor_on_the_line_of_three_bears_14_5_ms():
 @settings(max_examples=15)
 def test_the_delay_margin_is_where_the_rightmost_root_crosses(seed, m):
     loop, _ = random_loop(seed, m=m)
-    A, B, P, R, c, lam = loop
+    A, B, P, R, c, lam, _ = loop
     margin = delay_margin(loop)
     G = c * B @ np.linalg.solve(R, B.T @ P)
     if np.isinf(margin.delay):
@@ -246,7 +246,7 @@ def test_a_scalar_loop_is_worst_where_its_input_is_weakest():
 @settings(max_examples=10)
 def test_the_worst_corner_is_no_better_than_any_corner(seed):
     loop, rng = random_loop(seed, m=2)
-    A, B, P, R, c, lam = loop
+    A, B, P, R, c, lam, _ = loop
     worst = input_scaling(loop, spread=0.2)
     K = np.linalg.solve(R, B.T @ P)
     loops = [
@@ -374,7 +374,7 @@ def test_the_ellipsoid_is_the_best_of_its_family(seed):
 
 def test_the_ellipsoid_holds_for_every_follower_of_the_whole_network():
     loop, rng = random_loop(5)
-    A, B, P, R, c, _ = loop
+    A, B, P, R, c, _, _ = loop
     L = np.array([[2.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.0]])
     E = rng.normal(size=(3, 1))
     whole = np.kron(np.eye(3), A) - c * np.kron(L, B @ np.linalg.solve(R, B.T @ P))
@@ -423,7 +423,7 @@ def norm_by_bisection(A, B, C):
 @given(st.integers(0, 10**6), st.integers(1, 2))
 @settings(max_examples=15)
 def test_string_gain_agrees_with_the_hamiltonian(seed, m):
-    (A, B, P, R, _, _), _ = random_loop(seed, m=m)
+    (A, B, P, R, *_), _ = random_loop(seed, m=m)
     found = string_gain(ClosedLoop(A, B, P, R, 1.0, [1.0]))
     K = np.linalg.solve(R, B.T @ P)
     assert found.gain == pytest.approx(norm_by_bisection(A - B @ K, B, K), rel=1e-4)

@@ -1,6 +1,8 @@
 """Linear systems theory: discretization, controllability, observability, Riccati equation."""
 
-from collections.abc import Callable, Sequence
+import contextlib
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias, cast
 
 import numpy as np
@@ -13,6 +15,10 @@ from echelon.core.rational import bisect
 from echelon.core.types import Array
 
 _DEGREE = 18  # of Taylor's polynomial: at norm 1 its remainder is 1e-17
+_INTERVALS = 512  # of strengths at a time, each with a P of its own
+_DOUBLINGS = 40  # of the number of steps, over which errors must vanish
+_ENDED = 1e-9  # of what is left of an error then
+_ROUNDING = 16 * float(np.finfo(float).eps)  # of a norm, times a condition number
 _AXIS = 64 * float(np.finfo(float).eps)  # of the fastest mode's rate, that of rounding
 
 
@@ -69,7 +75,50 @@ def sampled_radius(
         integrator: its name; the exact flow without.
     """
     F, G = discretize(A, B, dt, integrator)
-    return float(np.abs(np.linalg.eigvals(F - G @ gains)).max())
+    return float(spectral_radii(F - G @ gains).max())
+
+
+def radius_between(F: Array, G: Array, low: float, high: float) -> float:
+    """Return the largest spectral radius found of F - k G, low <= k <= high; 1 where undecided.
+
+    (F - k G)'P (F - k G) is convex in k. So a P above it at both ends of an interval is above it
+    on all of it, and no radius there reaches 1: intervals are halved until each has such a P.
+    """
+    ends, largest = np.array([[low, high]]), 0.0
+    while len(ends) and largest < 1.0:
+        middles = ends.mean(axis=1)
+        radii = spectral_radii(steps := F - middles[:, None, None] * G)
+        largest = max(largest, float(radii.max()))
+        # A P in which errors decay half as fast as they do, in every direction.
+        middle = steps / (0.5 + 0.5 * radii)[:, None, None]
+        open_ = ~_fall(F - ends[..., None, None] * G, middle)
+        if open_.sum() > _INTERVALS:
+            return max(largest, 1.0)
+        halves = np.stack([ends[:, 0], middles, ends[:, 1]], axis=1)[open_]
+        ends = np.concatenate([halves[:, :2], halves[:, 1:]])
+        # Halves of rounding's width say nothing more.
+        if (ends[:, 1] - ends[:, 0] <= _ROUNDING * high).any():
+            return max(largest, 1.0)
+    return largest
+
+
+def spectral_radii(matrices: Array) -> Array:
+    """Return the spectral radius of each of matrices (..., n, n)."""
+    return np.abs(np.linalg.eigvals(matrices)).max(axis=-1)
+
+
+def _fall(steps: Array, middles: Array) -> Array:
+    """Return (K,) whether a P that falls in a step (K, n, n) falls in both of its (K, 2, n, n)."""
+    P, power = np.broadcast_to(np.eye(middles.shape[-1]), middles.shape), middles
+    # The sum of all M^k' M^k, of which each round doubles the number of terms; one that grows
+    # ends beyond all numbers.
+    with np.errstate(all="ignore"):
+        for _ in range(_DOUBLINGS):
+            P, power = P + power.swapaxes(1, 2) @ P @ power, power @ power
+    ended, one = np.abs(power).max(axis=(1, 2)) < _ENDED, np.eye(P.shape[-1])
+    root = np.linalg.cholesky(np.where(ended[:, None, None], P, one)).swapaxes(1, 2)
+    norms = np.linalg.norm(root[:, None] @ steps @ np.linalg.inv(root)[:, None], 2, (-2, -1))
+    return ended & (norms.max(axis=1) < 1.0 - _ROUNDING * np.linalg.cond(root))
 
 
 def longest_step(
@@ -94,6 +143,14 @@ def longest_step(
             return float("inf")
     # 20 halvings of a tenth leave 1e-7 of the step.
     return float(bisect(decays, dt, 1.1 * dt, 20))
+
+
+@contextlib.contextmanager
+def without_warnings() -> Iterator[None]:
+    """Let NumPy and SciPy compute without warnings what is judged by its result."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def eigenvalue_text(eigenvalue: complex) -> str:
@@ -162,9 +219,10 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
     try:
         # Part by part, so that what has nothing to do with each other is 0 and not rounding: it
         # then costs nothing in a step.
-        for part in _uncoupled(A, B, Q, R):
-            block = np.ix_(part, part)
-            P[block] = _stabilizing(A[block], B[part], Q[block], R)
+        with without_warnings():
+            for part in _uncoupled(A, B, Q, R):
+                block = np.ix_(part, part)
+                P[block] = _stabilizing(A[block], B[part], Q[block], R)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise GainError(
             f"the Riccati equation has no stabilizing solution ({str(error).rstrip('.').lower()}); "

@@ -204,6 +204,12 @@ class FlatLaw(Law):
         """Return zeta', (m,)."""
         return memory.rate
 
+    def signal_names(self, model: ControlAffine) -> tuple[str, ...]:
+        """Return the names of the outputs."""
+        return self.ready.chains.outputs
+
+    message_names = signal_names
+
     def settle(
         self,
         model: ControlAffine,

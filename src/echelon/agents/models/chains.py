@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from echelon.agents.models.declarations import undeclared
 from echelon.agents.models.model import ControlAffine, FlatBound, Flattened
 from echelon.core.errors import ModelError, listing
 from echelon.core.memoize import memoize
@@ -31,6 +32,10 @@ _MAX_CHOICES = 20
 """How many sets of outputs are tried."""
 
 
+DECLARED = ("flat_chains", "flat_bounds", "flatten", "switch_on")
+"""What a model may declare of its flat coordinates."""
+
+
 class Chains(NamedTuple):
     """The chains of integrators that feedback makes of an agent.
 
@@ -38,13 +43,14 @@ class Chains(NamedTuple):
         outputs: names of the m flat outputs y.
         degrees: r_k, the first derivative of each output that the inputs reach.
         integrators: number of integrators before each input.
-        sampled: whether degrees and rank were computed at samples; else the model states them.
+        declared: which of `DECLARED` the model declares of its own motion; without `flat_chains`
+            degrees and rank were computed at samples, or are those of another motion.
     """
 
     outputs: tuple[str, ...]
     degrees: tuple[int, ...]
     integrators: tuple[int, ...]
-    sampled: bool
+    declared: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
@@ -74,7 +80,7 @@ def flat_output(model: ControlAffine, outputs: tuple[str, ...], x: State) -> jax
 
 def flatten(model: ControlAffine, chains: Chains, x: State, e: Float[jax.Array, " k"]) -> Flattened:
     """Return the flat coordinates of a state with its integrators, and the inverse for inputs."""
-    stated = model.flatten(x, e)
+    stated = model.flatten(x, e) if "flatten" in chains.declared else None
     return differentiate(model, chains, x, e) if stated is None else stated
 
 
@@ -127,7 +133,7 @@ def switch_on(model: ControlAffine, chains: Chains, x: State, ahead: jax.Array) 
     Where the model bounds a derivative of a single flat output, the integrators start so that its
     derivatives are those of the path to follow, `ahead` (r, m); else they start at the trim.
     """
-    stated = model.switch_on(x, ahead)
+    stated = model.switch_on(x, ahead) if "switch_on" in chains.declared else None
     e = jnp.zeros(chains.size, x.dtype)
     bound = next((b for b in model.flat_bounds or () if len(b.outputs) == 1), None)
     if stated is not None or bound is None:
@@ -190,6 +196,12 @@ def _fault_of(bound: FlatBound, chains: Chains) -> str:
 # ---- the chains of a model ----------------------------------------------------------------------
 
 
+def declared_of(model: ControlAffine) -> tuple[str, ...]:
+    """Return what a model declares of the flat coordinates of its own motion."""
+    others = undeclared(model, *DECLARED)
+    return tuple(name for name in DECLARED if name not in others)
+
+
 @memoize
 def chains_of(model: ControlAffine) -> Chains:
     """Return the chains of a model, as it states them or as computed at samples.
@@ -199,13 +211,13 @@ def chains_of(model: ControlAffine) -> Chains:
     """
     if model.flat_chains is not None:
         outputs = model.flat_outputs or model.output_names[: len(model.input_names)]
-        return Chains(tuple(outputs), *model.flat_chains, sampled=False)
+        return Chains(tuple(outputs), *model.flat_chains, declared_of(model))
     with precision("float64"):
         failures = list[str]()
         for outputs in _candidates(model):
             chains = _extend(model, outputs)
             if isinstance(chains, Chains):
-                return chains
+                return chains._replace(declared=declared_of(model))
             failures.append(chains)
     raise ModelError(
         f"`{type(model).__name__}` is not linearized by feedback, which the law `stopping-point` "
@@ -268,7 +280,7 @@ def look_for_chains(
         return RankLoss(why, tuple(early.tolist()))
     if sum(degrees) < n:
         return f"the chains of {reached} hold {sum(degrees)} of {n} states"
-    return Chains(outputs, tuple(degrees), integrators, sampled=True)
+    return Chains(outputs, tuple(degrees), integrators)
 
 
 @memoize
@@ -276,7 +288,7 @@ def _reach(
     model: ControlAffine, outputs: tuple[str, ...], integrators: tuple[int, ...], order: int
 ) -> Array:
     """Return the effect of each input (last axis) on derivatives of the outputs, (S, m, m)."""
-    chains = Chains(outputs, (order,) * len(outputs), integrators, sampled=True)
+    chains = Chains(outputs, (order,) * len(outputs), integrators)
     n, draw = len(model.state_names), np.random.default_rng(0)
     x = np.asarray(model.trim[0], float) + draw.uniform(-0.5, 0.5, (_SAMPLES, n))
     e = draw.uniform(0.2, 0.8, (_SAMPLES, sum(integrators)))

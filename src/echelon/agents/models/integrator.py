@@ -6,7 +6,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from echelon.agents.models.model import ControlAffine, FlatChains, check_not_negative
+from echelon.agents.models.model import (
+    ControlAffine,
+    FlatChains,
+    check_not_negative,
+    default,
+)
 from echelon.core.errors import ModelError
 from echelon.core.limits import excess_states
 from echelon.core.types import Input, InputMap, Output, State
@@ -14,6 +19,12 @@ from echelon.core.types import Input, InputMap, Output, State
 _PREFIXES = ("", "v", "a")
 _UNITS = ("m", "m/s", "m/s^2")
 """Of a position and its first two derivatives."""
+
+
+_ONE_AN_AXIS = default(
+    lambda agent: FlatChains((agent.order,) * agent.dimension, (0,) * agent.dimension)
+)
+"""`flat_chains`: one chain an axis, with no integrator before an input."""
 
 
 class Integrator(ControlAffine):
@@ -82,11 +93,6 @@ class Integrator(ControlAffine):
         return self.order
 
     @property
-    def flat_chains(self) -> FlatChains:
-        """One chain an axis, with no integrator before an input."""
-        return FlatChains((self.order,) * self.dimension, (0,) * self.dimension)
-
-    @property
     def flat_outputs(self) -> tuple[str, ...]:
         """The axes, up to three."""
         # A reference has three coordinates of space.
@@ -104,7 +110,7 @@ class SingleIntegrator(Integrator):
     """xdot = u, with x a position in `dimension` axes (m) and u a velocity (m/s)."""
 
     order = 1
-    flat_bounds = ()
+    flat_chains, flat_bounds = _ONE_AN_AXIS, ()
 
     def drift(self, x: State) -> State:
         """Return f = 0."""
@@ -124,7 +130,7 @@ class DoubleIntegrator(Integrator):
     drag: float = 0.0
 
     order = 2
-    flat_bounds = ()
+    flat_chains, flat_bounds = _ONE_AN_AXIS, ()
 
     def __check_init__(self) -> None:
         """Refuse a negative drag."""

@@ -40,7 +40,9 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
     Raises:
         ModelError: the first fault found, as one sentence.
     """
-    return _warnings_of(model, _check_kind(model))
+    name = _check_kind(model)
+    _check_derived(model, name)
+    return _warnings_of(model, name)
 
 
 @memoize
@@ -68,6 +70,19 @@ def _check_kind(model: ControlAffine) -> str:
             f"the model is {model!r}, and must be an instance of a `ControlAffine` class."
         )
     return type(model).__name__
+
+
+_DERIVED = ("velocity", "normalized_drift", "normalized_input_map", "physical", "normalized")
+
+
+def _check_derived(model: ControlAffine, name: str) -> None:
+    """Check that what follows from the equations is not replaced: runs and proofs read both."""
+    for what in _DERIVED:
+        if what in vars(model) or getattr(type(model), what) is not getattr(ControlAffine, what):
+            raise ModelError(
+                f"`{name}` replaces `{what}`, which follows from `drift`, `input_map`, `trim` and "
+                "`input_scale`; change those."
+            )
 
 
 def _check_words(model: ControlAffine, name: str) -> None:

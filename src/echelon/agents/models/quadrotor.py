@@ -23,7 +23,7 @@ from echelon.agents.models.rigid_body import (
     free_spin,
     thrust_axis,
 )
-from echelon.agents.models.rigid_vehicle import UPRIGHT, RigidVehicle
+from echelon.agents.models.rigid_vehicle import THRUST_TWICE, UPRIGHT, RigidVehicle
 from echelon.agents.models.rotors import attitude_priority, fits
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, State
@@ -94,7 +94,7 @@ class Quadrotor(RigidVehicle):
     state_names = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "p", "q", "r")
     input_names = ("thrust", "torque_x", "torque_y", "torque_z")
     input_units = ("N", "N m", "N m", "N m")
-    flat_bounds = UPRIGHT
+    flat_chains, flat_bounds = THRUST_TWICE, UPRIGHT
     state_groups = {
         "position": ("x", "y", "z"),
         "velocity": ("vx", "vy", "vz"),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from echelon.agents.models.model import FlatChains
 from echelon.agents.models.rigid_body import attitude_along, lift_along, thrust_axis
-from echelon.agents.models.rigid_vehicle import UPRIGHT, RigidVehicle
+from echelon.agents.models.rigid_vehicle import THRUST_TWICE, UPRIGHT, RigidVehicle
 from echelon.core.numerics import derivatives as derivatives_of
 from echelon.core.types import Input, InputMap, Scalar, State
 
@@ -49,7 +49,7 @@ class QuadrotorEuler(RigidVehicle):
     state_groups = _GROUPS
     input_names = ("thrust", "roll_acceleration", "pitch_acceleration", "yaw_acceleration")
     input_units = ("m/s^2",) + ("rad/s^2",) * 3
-    flat_bounds = UPRIGHT
+    flat_chains, flat_bounds = THRUST_TWICE, UPRIGHT
 
     def drift(self, x: State) -> State:
         """Return f(x)."""

@@ -17,12 +17,14 @@ from echelon.agents.models.model import (
 from echelon.core.types import Output, State
 
 # z'' = (T/m) cos(roll) cos(pitch) - g, and none of the three factors passes 0 unless z'' passes -g.
-# Each vehicle states the bound itself: stated by a base class it would also hold for subclasses
-# that change the motion, and nobody relies on it there.
+# Each vehicle declares bound and chains itself: a proof reads no declaration of a base class whose
+# motion it does not have (`declarations.py`).
 UPRIGHT = default(
     lambda vehicle: (FlatBound(("z",), 2, -vehicle.gravity, "roll and pitch within 90 deg"),)
 )
 """`flat_bounds` of a vehicle: its thrust stays above 0, its roll and pitch within 90 degrees."""
+THRUST_TWICE = FlatChains((4, 4, 4, 2), (2, 0, 0, 0))
+"""`flat_chains` of a vehicle: with two integrators before the thrust."""
 
 
 class RigidVehicle(ControlAffine):
@@ -44,7 +46,6 @@ class RigidVehicle(ControlAffine):
     flat_outputs = ("x", "y", "z", "yaw")
     # The path's second derivative sets the attitude, whose second derivative is the input.
     flat_order = 4
-    flat_chains = FlatChains((4, 4, 4, 2), (2, 0, 0, 0))
 
     def __check_init__(self) -> None:
         """Refuse a gravity that is not positive."""

@@ -29,7 +29,7 @@ from echelon.apps.cli.live_command import live
 from echelon.apps.cli.plot_command import plot
 from echelon.apps.cli.report_command import report
 from echelon.apps.cli.run_command import run
-from echelon.apps.cli.stop import STOP, Ended
+from echelon.apps.cli.stop import NOTHING, STOP, Ended
 from echelon.apps.cli.streams import outlive_readers
 from echelon.apps.cli.sweep_command import sweep
 from echelon.apps.cli.tune_command import tune
@@ -62,6 +62,14 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line; an error becomes one sentence and its exit code."""
+    try:
+        _main()
+    except SystemExit as end:
+        STOP.leave(end.code)
+        raise
+
+
+def _main() -> None:
     # Where the home folder is read-only, matplotlib prints two lines about its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     folder = keep_compiled_code(os.environ)
@@ -71,7 +79,7 @@ def main() -> None:
         except EchelonError as error:
             _leave(str(error), error.exit_code)
         except Ended:
-            _leave("stopped; there were no results to save.", STOP.exit_code)
+            _leave(NOTHING, STOP.exit_code)
         except Exception as error:
             if isinstance(error, OSError) and error.errno == errno.ENOSPC:
                 _leave(f"the output cannot be written: {error.strerror}.", EchelonError.exit_code)

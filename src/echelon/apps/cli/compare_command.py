@@ -7,15 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from echelon.apps.cli import tables
+from echelon.apps.cli import options, tables
 from echelon.apps.cli.console import print_folder
-from echelon.apps.cli.options import (
-    FiguresOption,
-    FolderOption,
-    ForceOption,
-    JsonOption,
-    SetOption,
-)
 from echelon.apps.cli.stop import STOP
 
 if TYPE_CHECKING:
@@ -33,11 +26,11 @@ def compare(
     method: Annotated[
         list[str] | None, typer.Option(help="Only this method; repeat the option for several.")
     ] = None,
-    set_: SetOption = None,
-    out: FolderOption = None,
-    force: ForceOption = False,
-    figures: FiguresOption = True,
-    as_json: JsonOption = False,
+    set_: options.SetOption = None,
+    out: options.FolderOption = None,
+    force: options.ForceOption = False,
+    figures: options.FiguresOption = True,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Simulate the consensus laws and the optimization-based methods from the same starts."""
     from echelon.experiments.scenario.scenario import load_scenario

@@ -6,6 +6,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from echelon.core.files import write_atomic
+from echelon.output.archive.folder import write_errors
+
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
@@ -55,6 +58,17 @@ def print_folder(folder: Path) -> None:
     """Print the names of all files in a folder."""
     names = sorted(path.name + ("/" if path.is_dir() else "") for path in folder.iterdir())
     print(f"- Written to {folder}: {', '.join(names)}.")
+
+
+def write_file(file: Path, content: bytes | str, remark: str = "{}") -> None:
+    """Write a file, and print its size as `print_file` does.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with write_errors(file):
+        write_atomic(file, content)
+    print_file(file, remark)
 
 
 def print_file(file: Path, remark: str) -> None:

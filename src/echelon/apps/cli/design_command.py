@@ -6,14 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from echelon.apps.cli import tables
-from echelon.apps.cli.options import (
-    GainFileOption,
-    JsonOption,
-    OverwriteOption,
-    ScenarioArgument,
-    SetOption,
-)
+from echelon.apps.cli import options, tables
 from echelon.output.archive.folder import claim_design, write_errors
 
 if TYPE_CHECKING:
@@ -23,19 +16,19 @@ if TYPE_CHECKING:
 
 
 def design(
-    scenario: ScenarioArgument,
-    set_: SetOption = None,
+    scenario: options.ScenarioArgument,
+    set_: options.SetOption = None,
     method: Annotated[str | None, typer.Option(help="Only this method.")] = None,
-    out: GainFileOption = None,
+    out: options.GainFileOption = None,
     figures: Annotated[
         Path | None, typer.Option(help="Draw modes and certified set into this folder.")
     ] = None,
-    force: OverwriteOption = False,
+    force: options.OverwriteOption = False,
     slice_: Annotated[
         str | None,
         typer.Option("--slice", metavar="STATE,STATE", help="Draw the set in these two states."),
     ] = None,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Try all gain methods, recommend one, save its gain, and draw its guarantee."""
     from echelon.experiments.scenario.scenario import load_scenario

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from echelon.apps.cli.console import print_file
+from echelon.apps.cli.console import write_file
 from echelon.apps.cli.options import OverwriteOption, RunArgument
 from echelon.output.archive.folder import claim_file
 
@@ -19,10 +19,11 @@ def export(
     force: OverwriteOption = False,
 ) -> None:
     """Write a run's states, inputs and errors for pandas, NumPy, MATLAB or a spreadsheet."""
-    from echelon.output.archive.export import export as write
-    from echelon.output.archive.open_folder import open_run
+    from echelon.output.archive.export import content_of
 
+    content = content_of(to)
     file = Path(f"run.{to}") if out is None else out
     claim_file(file, force)
-    write(open_run(run), file, to)
-    print_file(file, "{}")
+    from echelon.output.archive.open_folder import open_run
+
+    write_file(file, content(open_run(run)))

@@ -6,9 +6,7 @@ from typing import Annotated
 import typer
 
 
-def init(
-    folder: Annotated[Path, typer.Argument(help="A new folder, such as my-swarm.")],
-) -> None:
+def init(folder: Annotated[Path, typer.Argument(help="A new folder, such as my-swarm.")]) -> None:
     """Create a folder with a scenario, a model, a law and a notebook that run as they are."""
     from echelon.output.archive.starter_folder import create_starter
 

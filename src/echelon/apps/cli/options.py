@@ -5,6 +5,16 @@ from typing import Annotated
 
 import typer
 
+from echelon.core.errors import OutputError
+from echelon.output.archive.folder import check_exists
+
+
+def _check_port(port: int | None) -> int | None:
+    if port is not None and not 0 <= port <= 65535:
+        raise OutputError(f"`--port` is {port}, and must be from 0 to 65535.")
+    return port
+
+
 BrowserOption = Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")]
 FiguresOption = Annotated[bool, typer.Option("--figures/--no-figures", help="Draw the figures.")]
 FolderOption = Annotated[
@@ -18,14 +28,18 @@ GainFileOption = Annotated[Path | None, typer.Option("--out", help="Save the gai
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 OverwriteOption = Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")]
 PortOption = Annotated[
-    int | None, typer.Option("--port", help="Serve on this port or the next free one.")
+    int | None,
+    typer.Option("--port", help="Serve on this port or the next free one.", callback=_check_port),
 ]
 ResumeOption = Annotated[
     Path | None,
     typer.Option("--resume", metavar="DIR", help="Continue the unfinished work in this folder."),
 ]
 RunArgument = Annotated[
-    Path, typer.Argument(metavar="RUN", help="The folder of a run, or its `run.nc`.")
+    Path,
+    typer.Argument(
+        metavar="RUN", help="The folder of a run, or its `run.nc`.", callback=check_exists
+    ),
 ]
 ScenarioArgument = Annotated[
     str, typer.Argument(help="The name of a bundled scenario, or a YAML file.")

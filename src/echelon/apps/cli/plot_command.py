@@ -8,6 +8,7 @@ import typer
 from echelon.apps.cli.options import OverwriteOption, RunArgument
 from echelon.core.errors import OutputError
 from echelon.output.archive.folder import claim_files, write_errors
+from echelon.output.plots.figure_files import NAMES, check_names, save
 
 _KINDS = ("png", "pdf", "svg")
 _LEAST, _MOST = 30, 1200
@@ -16,16 +17,10 @@ _LEAST, _MOST = 30, 1200
 def plot(
     run: RunArgument,
     what: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME,...",
-            help="Only these: leader_3d, trajectories, top_view, tracking, formation, inputs, "
-            "states, distances, lyapunov, modes, network.",
-        ),
+        str | None, typer.Option(metavar="NAME,...", help=f"Only these: {', '.join(NAMES)}.")
     ] = None,
     paper: Annotated[
-        bool,
-        typer.Option("--paper", help="Sizes of one and two columns of a paper, in 8 pt."),
+        bool, typer.Option("--paper", help="Sizes of one and two columns of a paper, in 8 pt.")
     ] = False,
     dpi: Annotated[
         int | None, typer.Option(help="Resolution of the PNG (default: 150, with --paper 300).")
@@ -38,13 +33,13 @@ def plot(
     """Draw a run's figures again, as PNG, PDF and SVG."""
     if dpi is not None and not _LEAST <= dpi <= _MOST:
         raise OutputError(f"`--dpi` is {dpi}, and must be from {_LEAST} to {_MOST}.")
+    names = NAMES if what is None else tuple(filter(None, map(str.strip, what.split(","))))
+    check_names(names)
     from echelon.output.archive.open_folder import open_run
-    from echelon.output.plots.figure_files import save
-    from echelon.output.plots.run_figures import NAMES, figures
+    from echelon.output.plots.run_figures import figures
     from echelon.output.plots.style import ONE_COLUMN, SCREEN, TWO_COLUMNS
 
     recording = open_run(run)
-    names = NAMES if what is None else tuple(filter(None, map(str.strip, what.split(","))))
     folder = (run if run.is_dir() else run.parent) / "figures" if out is None else out
     pages = {"_one_column": ONE_COLUMN, "_two_columns": TWO_COLUMNS} if paper else {"": SCREEN}
     drawings = {

@@ -5,10 +5,9 @@ from typing import Annotated
 
 import typer
 
-from echelon.apps.cli.console import print_file
+from echelon.apps.cli.console import write_file
 from echelon.apps.cli.options import OverwriteOption, RunArgument
-from echelon.core.files import write_atomic
-from echelon.output.archive.folder import claim_file, write_errors
+from echelon.output.archive.folder import claim_file
 
 
 def report(
@@ -22,6 +21,4 @@ def report(
     from echelon.output.archive.report_page import report_page
 
     page = report_page(open_run(run), run if run.is_dir() else None)
-    with write_errors(out):
-        write_atomic(out, page)
-    print_file(out, "{}, one self-contained file")
+    write_file(out, page, "{}, one self-contained file")

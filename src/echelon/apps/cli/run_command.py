@@ -8,17 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from echelon.apps.cli import tables
+from echelon.apps.cli import options, tables
 from echelon.apps.cli.console import foretell, print_folder, show_progress
 from echelon.apps.cli.job import Job, check_inputs
-from echelon.apps.cli.options import (
-    FiguresOption,
-    FolderOption,
-    ForceOption,
-    JsonOption,
-    ResumeOption,
-    SetOption,
-)
 from echelon.apps.cli.stop import STOP
 from echelon.core.errors import Outcome, OutputError
 
@@ -36,15 +28,15 @@ def run(
         str | None,
         typer.Argument(help="The name of a bundled scenario, a YAML file, or a run's folder."),
     ] = None,
-    set_: SetOption = None,
-    out: FolderOption = None,
-    resume: ResumeOption = None,
-    force: ForceOption = False,
-    figures: FiguresOption = True,
+    set_: options.SetOption = None,
+    out: options.FolderOption = None,
+    resume: options.ResumeOption = None,
+    force: options.ForceOption = False,
+    figures: options.FiguresOption = True,
     view: Annotated[
         bool, typer.Option("--view", help="Show the run in the browser while it is computed.")
     ] = False,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Simulate a scenario; write its report, figures and dataset."""
     if view:

@@ -6,13 +6,20 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Iterator
-from typing import final
+from collections.abc import Callable, Iterator
+from typing import NoReturn, final
 
+NOTHING = "stopped; there were no results to save."
 _MESSAGE = "echelon: stopping and saving results. Press Ctrl-C again to quit immediately."
 
 _CURSOR = "\x1b[?25h\n"
 """Shows the cursor again, which the progress bar hides."""
+
+
+_PATIENCE = 1.0
+"""Seconds after which a signal ends the process although Python has not yet handled it."""
+_GRACE = 0.2
+"""Seconds in which work in a thread may end by itself."""
 
 
 @final
@@ -34,7 +41,8 @@ class Stop:
     def __init__(self) -> None:
         """Begin without a signal."""
         self.number: int | None = None
-        self._saving, self._message = False, _MESSAGE
+        self._saving, self._message, self._handled = False, _MESSAGE, False
+        self._hurried = False
 
     @property
     def exit_code(self) -> int:
@@ -53,7 +61,7 @@ class Stop:
             for number in (signal.SIGINT, signal.SIGTERM)
             if signal.getsignal(number) != signal.SIG_IGN
         ]
-        self.number, self._saving = None, False
+        self.number, self._saving, self._handled = None, False, False
         receiver, sender = socket.socketpair()
         sender.setblocking(False)
         wakeup = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
@@ -90,24 +98,74 @@ class Stop:
         if self.number is not None:
             raise KeyboardInterrupt
 
+    def aside(self, work: Callable[[], None]) -> None:
+        """Do work in a thread, and return soon after a signal, even in the middle of a compilation.
+
+        The work may then go on until the process ends; what it has stored is complete.
+
+        Raises:
+            KeyboardInterrupt: there was a signal.
+            BaseException: that of the work.
+        """
+        faults = list[BaseException]()
+
+        def attempt() -> None:
+            try:
+                work()
+            except BaseException as fault:
+                faults.append(fault)
+
+        thread = threading.Thread(target=attempt, daemon=True)
+        thread.start()
+        while thread.is_alive() and self.number is None:
+            thread.join(_GRACE / 4)
+        thread.join(_GRACE)
+        self._hurried = self.number is not None
+        if faults:
+            raise faults[0]
+        if thread.is_alive():
+            raise KeyboardInterrupt
+
+    def leave(self, code: object) -> None:
+        """End the process at once after a signal, if its work was in a thread.
+
+        Python's own end would wait for that, and takes a second on a machine with other work.
+        """
+        if self._hurried:
+            sys.stdout.flush()
+            os._exit(code if isinstance(code, int) else 0)
+
     def _answer(self, receiver: socket.socket, signals: set[int]) -> None:
         count = 0
-        while number := receiver.recv(1):
-            if number[0] not in signals:
+        while True:
+            try:
+                number = receiver.recv(1)
+            except TimeoutError:
+                # The main thread compiles, and nothing needs to be saved.
+                if not self._handled and not self._saving:
+                    self._quit(f"echelon: {NOTHING}\n")
+                receiver.settimeout(None)
                 continue
-            count += 1
-            if count > 1:
+            if not number:
+                return
+            if number[0] in signals:
+                count += 1
                 # Nothing is lost: every file is either complete or under another name.
-                if sys.stderr.isatty():
-                    sys.stderr.write(_CURSOR)
-                    sys.stderr.flush()
-                os._exit(self.exit_code)
-            self.number = number[0]
-            if self._saving and self._message:
-                print(self._message, file=sys.stderr, flush=True)
+                if count > 1:
+                    self._quit()
+                self.number = number[0]
+                if not self._saving:
+                    receiver.settimeout(_PATIENCE)
+                elif self._message:
+                    print(self._message, file=sys.stderr, flush=True)
+
+    def _quit(self, sentence: str = "") -> NoReturn:
+        sys.stderr.write(_CURSOR * sys.stderr.isatty() + sentence)
+        sys.stderr.flush()
+        os._exit(self.exit_code)
 
     def _interrupt(self, number: int, _: object) -> None:
-        self.number = number
+        self.number, self._handled = number, True
         if not self._saving:
             raise Ended
 

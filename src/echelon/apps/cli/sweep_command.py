@@ -1,6 +1,5 @@
 """`echelon sweep`: a scenario many times, with other seeds or other values of its keys."""
 
-import contextlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,17 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from echelon.apps.cli import options
 from echelon.apps.cli.console import print_folder, show_progress
 from echelon.apps.cli.job import Job, check_inputs
-from echelon.apps.cli.options import (
-    FiguresOption,
-    FolderOption,
-    ForceOption,
-    JsonOption,
-    ResumeOption,
-    SetOption,
-)
-from echelon.apps.cli.stop import STOP
+from echelon.apps.cli.stop import STOP, Ended
 
 if TYPE_CHECKING:
     from echelon.experiments.sweeps.plan import Sweep
@@ -37,22 +29,25 @@ def sweep(
             help="Values to vary, as in seed=0..99 or follower.gain.coupling=1,2.",
         ),
     ] = None,
-    set_: SetOption = None,
-    out: FolderOption = None,
-    resume: ResumeOption = None,
-    force: ForceOption = False,
+    set_: options.SetOption = None,
+    out: options.FolderOption = None,
+    resume: options.ResumeOption = None,
+    force: options.ForceOption = False,
     threads: Annotated[
         int | None, typer.Option(min=1, help="Threads of native code (default: one per processor).")
     ] = None,
     cluster: Annotated[
-        str | None,
-        typer.Option(metavar="URL", help="Compute on workers of this dask scheduler."),
+        str | None, typer.Option(metavar="URL", help="Compute on workers of this dask scheduler.")
     ] = None,
-    figures: FiguresOption = True,
-    as_json: JsonOption = False,
+    figures: options.FiguresOption = True,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Run a scenario for all combinations of values; write the numbers of all runs as a dataset."""
     check_inputs("sweep", scenario, resume, over, set_, out, force)
+    if cluster is not None:
+        from echelon.experiments.sweeps.cluster import check_scheduler
+
+        check_scheduler(cluster)
     from echelon.output.archive.folder import BATCHES, writing
 
     if resume is None:
@@ -101,8 +96,12 @@ def _compute(
     plan: "Sweep", batches: "Batches", threads: int | None, cluster: str | None, quiet: bool
 ) -> "list[SweepBatch]":
     """Return the batches of a sweep, each written as soon as it is computed."""
+    from echelon.experiments.results.labelled import labelled
     from echelon.experiments.sweeps.sweep import compute
+    from echelon.experiments.sweeps.sweep_dataset import dataset_of
 
+    # What writes results is loaded before there are any: Ctrl-C then does not wait for it.
+    labelled(dataset_of(plan, ())[[]]).netcdf()
     results = batches.read()
 
     def store(batch: "SweepBatch") -> None:
@@ -115,10 +114,15 @@ def _compute(
             show(done, runs)
             STOP.check()
 
-        # What is computed by then is stored, and the report says so.
-        with contextlib.suppress(KeyboardInterrupt):
-            compute(plan, store, progress, tuple(results), threads, cluster)
-    return results
+        stored = tuple(results)
+        try:
+            STOP.aside(lambda: compute(plan, store, progress, stored, threads, cluster))
+        except KeyboardInterrupt:
+            # What is computed by then is stored, and the report says so.
+            if not results:
+                raise Ended from None
+    # A copy, as a thread that goes on may add to them.
+    return [*results]
 
 
 def _write(
@@ -133,8 +137,8 @@ def _write(
     text = sweep_report(data)
     if not quiet:
         print(text, flush=True)
-    write_sweep(data, text, job.folder, figures)
     complete = sum(batch.runs for batch in results) == plan.count
+    write_sweep(data, text, job.folder, figures and complete)
     if complete:
         job.chunks.remove()
     if quiet:

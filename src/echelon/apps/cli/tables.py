@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from echelon.experiments.studies.design import Design
 
 
-def console() -> "Console":
+def console(width: int = 200) -> "Console":
     """Return a console that keeps each row on one line where the output is no terminal."""
     from rich.console import Console
 
     # Wider than any table here, since `grep` and `awk` read lines.
-    return Console() if sys.stdout.isatty() else Console(width=200)
+    return Console() if sys.stdout.isatty() else Console(width=width)
 
 
 def pairs(facts: dict[str, str]) -> "Table":

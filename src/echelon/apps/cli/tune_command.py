@@ -7,14 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from echelon.apps.cli import tables
-from echelon.apps.cli.options import (
-    GainFileOption,
-    JsonOption,
-    OverwriteOption,
-    ScenarioArgument,
-    SetOption,
-)
+from echelon.apps.cli import options, tables
 from echelon.output.archive.folder import claim_design
 
 if TYPE_CHECKING:
@@ -25,8 +18,8 @@ if TYPE_CHECKING:
 
 
 def tune(
-    scenario: ScenarioArgument,
-    set_: SetOption = None,
+    scenario: options.ScenarioArgument,
+    set_: options.SetOption = None,
     params: Annotated[
         str, typer.Option(metavar="KEY,KEY", help="Keys to tune; follower.gain.coupling too.")
     ] = "follower.gain.Q,follower.gain.R",
@@ -34,9 +27,9 @@ def tune(
         str, typer.Option(help="Cost to minimize: a sum of formation, effort and spacing.")
     ] = "formation + 0.01*effort",
     rounds: Annotated[int, typer.Option(min=1, help="Maximum number of search rounds.")] = 30,
-    out: GainFileOption = None,
-    force: OverwriteOption = False,
-    as_json: JsonOption = False,
+    out: options.GainFileOption = None,
+    force: options.OverwriteOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Tune a Riccati gain by the gradient of a run's cost; print what is guaranteed with it."""
     from echelon.experiments.scenario.scenario import load_scenario

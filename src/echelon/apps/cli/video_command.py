@@ -20,7 +20,7 @@ def video(
     """Draw a run as a video, without a browser."""
     if not 0.01 <= speed <= 100.0:
         raise OutputError(f"`--speed` is {speed:g}, and must be from 0.01 to 100.")
-    claim_file(file, force)
+    claim_file(file, force, endings=(".mp4", ".gif"))
     from echelon.output.archive.open_folder import open_run
     from echelon.output.plots.video import encoder, save_video
 

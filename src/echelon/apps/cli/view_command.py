@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from echelon.apps.cli.console import print_file
+from echelon.apps.cli.console import write_file
 from echelon.apps.cli.options import BrowserOption, OverwriteOption, PortOption, RunArgument
 from echelon.apps.cli.stop import STOP
-from echelon.core.files import write_atomic
-from echelon.output.archive.folder import claim_file, write_errors
+from echelon.output.archive.folder import claim_file
 
 if TYPE_CHECKING:
     from http.server import ThreadingHTTPServer
@@ -40,9 +39,7 @@ def view(
     if html is None:
         show_page(page, port, browser)
         return
-    with write_errors(html):
-        write_atomic(html, page)
-    print_file(html, "{}, one self-contained file")
+    write_file(html, page, "{}, one self-contained file")
 
 
 def show_page(page: bytes, port: int | None, browser: bool) -> None:

@@ -29,7 +29,7 @@ def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: JsonObject) -> 
         "turns": len(space.angles),
         "loads": 0 if loads is None else loads.shape[2],
         "thrust": loads is not None,
-        "unit": run.unit,
+        "unit": run.length_unit,
         "limited": run.loads is not None,
     }
 

@@ -19,7 +19,7 @@ from echelon.apps.live.promiser import Promiser
 from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.core.types import Array, JsonObject
-from echelon.experiments.results.foreseen import heard_in
+from echelon.experiments.results.labelled_parts import heard_in
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.viewer.replay import heard_by
 
@@ -169,11 +169,11 @@ class Session:
 
     def _loads(self, picture: Picture) -> Float[Array, "N k"]:
         """Return the loads of motors as fractions of their limits; no columns without limits."""
-        if self.bounds is None or not np.isfinite([self.bounds.low, self.bounds.high]).all():
+        loads = None if self.bounds is None else self.bounds.loads(picture.inputs)
+        if loads is None:
             return np.zeros((len(picture.states), 0))
-        matrix, low, high = self.bounds
         # A saturated motor is at its limit but for rounding.
-        return np.round((picture.inputs @ matrix.T - low) / (high - low), 9)
+        return np.round(loads, 9)
 
     # ---- pages ----------------------------------------------------------------------------------
 

@@ -1,16 +1,17 @@
 """Recordings of a run before it is computed, and of each part while it is computed."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from echelon.agents.network.hearing import heard_along
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
-from echelon.experiments.results.recording import InputBounds, Recording
+from echelon.experiments.results.labelled_parts import labelled_parts
+from echelon.experiments.results.recording import Recording, recording
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.record import Stretch
 from echelon.simulation.step.settings import Settings
@@ -46,61 +47,19 @@ def foreseen(
         name: of the scenario.
         promise: as `Promise.as_mapping` returns it; none by default.
     """
-    model, graph = parts.model, parts.graph
+    model, known = parts.model, labelled_parts(parts, settings)
     times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)
     ahead = _ahead(parts, states, times)
-    limits = model.input_limits if settings.limits else None
-    return Recording(
-        name=name,
-        model=type(model).__name__,
-        times=times,
-        states=ahead,
-        inputs=np.broadcast_to(
-            np.asarray(model.trim[1], float), (_PLACES, graph.agents, len(model.input_names))
-        ),
-        reference=None,
-        errors=_errors(ahead, parts.formation.offsets, graph.nearest_leader()),
-        offsets=parts.formation.offsets,
-        leaders=graph.leaders,
-        nearest=np.array(graph.nearest_leader()),
-        edges=graph.edges,
-        weights=graph.weights,
-        heard=heard_in(parts),
-        schedule=graph.schedule,
-        state_names=model.state_names,
-        state_units=model.state_units,
-        input_names=model.input_names,
-        input_units=model.input_units,
-        position=model.position_indices(),
-        bounds=None if limits is None else InputBounds(*(np.asarray(x, float) for x in limits)),
-        lyapunov=None,
-        lyapunov_rate=None,
-        metric=None,
-        saturated=np.zeros(graph.agents),
-        tracking=None,
-        modes=None,
-        promise=promise,
-        horizon=settings.horizon,
-        dt=settings.dt,
-        attributes={"outcome": "completed", "message": "", "directed": int(graph.directed)},
-    )
-
-
-def heard_in(parts: Parts) -> Bool[Array, "E 2"]:
-    """Return whether each end of each edge receives from the other under the laws."""
-    drive = parts.drive
-    reacts = drive.reacts or "neighbours' states" in drive.information.leader
-    # A drive without laws, such as plans, uses all neighbours.
-    leaderward = getattr(getattr(drive, "follower", None), "leaderward", False)
-    return heard_along(parts.graph, leaderward, reacts)
-
-
-def _errors(
-    states: Float[Array, "T N n"], offsets: Float[Array, "N n"], nearest: Sequence[int] | Array
-) -> Float[Array, "T N n"]:
-    """Return the deviations from the goals relative to each agent's nearest leader."""
-    y = states - offsets
-    return y - y[:, np.asarray(nearest)]
+    trim, agents = np.asarray(model.trim[1], float), parts.graph.agents
+    frames = {
+        "time": times,
+        "states": ahead,
+        "inputs": np.broadcast_to(trim, (_PLACES, agents, len(trim))),
+        "saturated": np.zeros(agents),
+    }
+    attributes = {"scenario": name, "outcome": "completed", "message": ""}
+    attributes["promise"] = json.dumps(promise)
+    return recording(known.arrays() | frames, known.attributes | attributes)
 
 
 def _ahead(
@@ -131,7 +90,6 @@ def so_far(
         times=stretch.times,
         states=stretch.states,
         inputs=stretch.inputs,
-        errors=_errors(stretch.states, run.offsets, run.nearest),
         lyapunov=None if potential is None else _in_blocks(potential, stretch.states - run.offsets),
     )
 

@@ -69,6 +69,15 @@ class Labelled(NamedTuple):
         ]
 
 
+def labelled(data: "xr.Dataset") -> Labelled:
+    """Return the arrays of a dataset."""
+    variables, coordinates = (
+        {str(name): (each.dims, each.values, each.attrs) for name, each in some.items()}
+        for some in (data.data_vars, data.coords)
+    )
+    return Labelled(variables, coordinates, data.attrs)
+
+
 def _whole(name: str, part: Any) -> tuple[tuple[str, ...], Array, JsonObject]:
     dimensions, values, *attributes = part if isinstance(part, tuple) else (name, part)
     names = (dimensions,) if isinstance(dimensions, str) else tuple(dimensions)

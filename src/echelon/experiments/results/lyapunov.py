@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from echelon.agents.models.heading_symmetry import state_turn
 from echelon.agents.models.model import ControlAffine
@@ -43,9 +43,9 @@ class Lyapunov(NamedTuple):
     drift_after: Float[Array, " T"]
     rounding: float
 
-    def rises(self) -> Array:
-        """Return (T - 1,) booleans: where V increases to the next frame by more than rounding."""
-        return np.diff(self.value) > 1e-9 * self.value[:-1] + self.rounding
+    def rises(self) -> Bool[Array, " T-1"]:
+        """Return where V increases to the next frame by more than rounding."""
+        return rises(self.value[:-1], self.value[1:], self.rounding)
 
     def forbidden(self) -> Array:
         """Return (T,) booleans: where V increases over a step although theory excludes it.
@@ -57,8 +57,16 @@ class Lyapunov(NamedTuple):
         """
         slack = 1e-9 * np.maximum(np.abs(self.rate), np.abs(self.drift))
         falls = (self.drift <= slack) & (self.rate - self.drift <= slack)
-        rises = self.after - self.value > 1e-9 * self.value + self.rounding
-        return falls & (self.drift_after <= slack) & rises
+        increases = rises(self.value, self.after, self.rounding)
+        return falls & (self.drift_after <= slack) & increases
+
+
+def rises(
+    before: Float[Array, " T"], after: Float[Array, " T"], rounding: float | None = None
+) -> Bool[Array, " T"]:
+    """Return where V increases by more than rounding, by default that of its sum."""
+    rounding = _ROUNDING * float(before.max(initial=0.0)) if rounding is None else rounding
+    return after - before > 1e-9 * before + rounding
 
 
 def goes_both_ways(graph: Graph) -> bool:

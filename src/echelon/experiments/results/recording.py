@@ -18,6 +18,7 @@ from echelon.core.errors import OutputError
 from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
 from echelon.core.words import Verdict
+from echelon.simulation.engine.frame_numbers import FrameNumbers
 
 FORMAT = 3
 """Version of the format of `run.nc`; files of other versions are refused."""
@@ -29,6 +30,13 @@ class InputBounds(NamedTuple):
     matrix: Float[np.ndarray, "k m"]
     low: Float[np.ndarray, " k"]
     high: Float[np.ndarray, " k"]
+
+    def loads(self, inputs: Float[np.ndarray, "... m"]) -> Float[np.ndarray, "... k"] | None:
+        """Return rows of G u as fractions of their range; None where a row has a single bound."""
+        matrix, low, high = self
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            return None
+        return (inputs @ matrix.T - low) / (high - low)
 
 
 class TrackingErrors(NamedTuple):
@@ -48,7 +56,7 @@ class LoopPoles(NamedTuple):
 
 @final
 @dataclasses.dataclass(frozen=True, eq=False)
-class Recording:
+class Recording(FrameNumbers):
     """A run: T stored frames of N agents with n states and m inputs, L of them leaders.
 
     Attributes:
@@ -58,7 +66,6 @@ class Recording:
         states: of all agents.
         inputs: as delivered by the actuators.
         reference: the leaders' reference state; None without one.
-        errors: deviation of each agent from its goal relative to its nearest leader.
         offsets: each agent's goal relative to its leader.
         leaders: their numbers.
         nearest: each agent's nearest leader.
@@ -85,7 +92,6 @@ class Recording:
     states: Float[np.ndarray, "T N n"]
     inputs: Float[np.ndarray, "T N m"]
     reference: Float[np.ndarray, "T n"] | None
-    errors: Float[np.ndarray, "T N n"]
     offsets: Float[np.ndarray, "N n"]
     leaders: tuple[int, ...]
     nearest: Int[np.ndarray, " N"]
@@ -134,22 +140,6 @@ class Recording:
         return tuple(k for k in range(self.agents) if k not in leaders)
 
     @property
-    def measured(self) -> tuple[int, ...]:
-        """Indices of the states in formation errors: the position if any, else all."""
-        return self.position or tuple(range(len(self.state_names)))
-
-    @property
-    def unit(self) -> str:
-        """The unit of errors: m for a position, else nothing."""
-        return "m" if self.position else ""
-
-    @functools.cached_property
-    def formation_errors(self) -> Float[np.ndarray, "T N"]:
-        """Each agent's distance from its goal."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.linalg.norm(self.errors[:, :, list(self.measured)], axis=2)
-
-    @property
     def rate(self) -> float | None:
         """The rate at which errors are guaranteed to decay, 1/s; None where none is guaranteed."""
         return self.promise["rate"] or None if self.promise["promised"] else None
@@ -178,13 +168,8 @@ class Recording:
 
     @property
     def loads(self) -> Float[np.ndarray, "T N k"] | None:
-        """Rows of G u as fractions of their range; None where a row has a single bound."""
-        if self.bounds is None:
-            return None
-        matrix, low, high = self.bounds
-        if not (np.isfinite(low).all() and np.isfinite(high).all()):
-            return None
-        return (self.inputs @ matrix.T - low) / (high - low)
+        """Loads of the inputs; None where they have none."""
+        return None if self.bounds is None else self.bounds.loads(self.inputs)
 
 
 def read_recording(file: Path) -> Recording:
@@ -225,7 +210,6 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         states=arrays["states"],
         inputs=arrays["inputs"],
         reference=arrays.get("reference"),
-        errors=arrays["error"],
         offsets=arrays["offset"],
         leaders=tuple(int(k) for k in np.flatnonzero(arrays["is_leader"])),
         nearest=arrays["nearest_leader"].astype(int),

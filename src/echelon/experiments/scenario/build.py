@@ -1,7 +1,6 @@
 """Builds the parts of a checked scenario, and runs them."""
 
-import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -11,20 +10,13 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
-from echelon.agents.world.disturbance import Disturbance
-from echelon.agents.world.plant import check_plant, vary_parameters
 from echelon.agents.world.world import World
-from echelon.core.errors import (
-    EchelonError,
-    MissingExtraError,
-    ModelError,
-    ScenarioError,
-    listing,
-)
+from echelon.core.errors import ModelError, ScenarioError, listing
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.checks import ROLES, section
+from echelon.experiments.scenario.fault_list import FaultList
 from echelon.experiments.scenario.law_sections import GainSpec, law_arguments
 from echelon.experiments.scenario.named_class import (
     NamedClass,
@@ -34,10 +26,10 @@ from echelon.experiments.scenario.named_class import (
     named_class,
     offered,
 )
-from echelon.experiments.scenario.scenario import Fault, Scenario, refuse
+from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.user_code import as_scenario_error
 from echelon.experiments.scenario.values import marked_keys
-from echelon.experiments.scenario.yaml import joined
+from echelon.experiments.scenario.world_parts import disturbance_of, network_of, plant_of
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
 from echelon.simulation.engine.initial import initial_states
@@ -59,29 +51,6 @@ class Experiment(NamedTuple):
     settings: Settings
 
 
-class _Faults:
-    """Collects the faults of parts, each with the place of its key."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self.scenario = scenario
-        self.faults: list[Fault] = []
-
-    @contextlib.contextmanager
-    def at(self, *path: str | int) -> Iterator[None]:
-        """Record an error that is raised inside, and continue."""
-        try:
-            yield
-        except MissingExtraError:
-            raise
-        except EchelonError as error:
-            self.faults.append(Fault(self.scenario.place(*path), joined(path), str(error)))
-
-    def settle(self) -> None:
-        """Raise all recorded faults, a line each."""
-        if self.faults:
-            refuse(self.faults)
-
-
 def build(scenario: Scenario, to_run: bool = False) -> Experiment:
     """Return the parts and the settings of a scenario.
 
@@ -94,31 +63,25 @@ def build(scenario: Scenario, to_run: bool = False) -> Experiment:
         ScenarioError: one line for each part that cannot be built, with its place in the file.
     """
     _check_scenario(scenario)
-    faults = _Faults(scenario)
+    faults = FaultList(scenario)
     # Gains are computed here, and would have 7 digits under float32.
     with precision("float64"):
-        model = graph = None
-        with faults.at("simulation"):
-            _settings(scenario).check()
-        with faults.at("model"):
-            model = _model(scenario)
-            check_model(model)
-        with faults.at("graph"):
-            graph = _graph(scenario)
-        reference = None
-        with faults.at("reference"):
-            reference = _reference(scenario, model)
+        settings = faults.part(lambda: _settings(scenario), "simulation")
+        model = faults.part(lambda: _model(scenario), "model")
+        graph = faults.part(lambda: _graph(scenario), "graph")
+        reference = faults.part(lambda: _reference(scenario, model), "reference")
         # Before the laws: they need the model and the graph, and would report these faults again.
         faults.settle()
         if to_run:
             # And before a gain is computed, which takes long for many agents.
-            _check_run(scenario, faults, cast(ControlAffine, model), cast(Graph, graph))
-        return _with_laws(
-            scenario, faults, cast(ControlAffine, model), cast(Graph, graph), reference
-        )
+            _check_run(scenario, faults, model, graph, settings)
+        parts = _parts(scenario, faults, model, graph, reference)
+    return Experiment(parts, settings)
 
 
-def _check_run(scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph) -> None:
+def _check_run(
+    scenario: Scenario, faults: FaultList, model: ControlAffine, graph: Graph, settings: Settings
+) -> None:
     """Check that a scenario has no live events, and that its run fits in memory."""
     with faults.at("live"):
         if scenario.live:
@@ -127,7 +90,7 @@ def _check_run(scenario: Scenario, faults: _Faults, model: ControlAffine, graph:
                 "`live` to run the scenario without them."
             )
     with faults.at("simulation"):
-        check_memory(model, graph.agents, _settings(scenario))
+        check_memory(model, graph.agents, settings)
     faults.settle()
 
 
@@ -138,21 +101,23 @@ def _check_scenario(scenario: object) -> None:
         )
 
 
-def _with_laws(
-    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, reference: Guide | None
-) -> Experiment:
+def _parts(
+    scenario: Scenario,
+    faults: FaultList,
+    model: ControlAffine,
+    graph: Graph,
+    reference: Guide | None,
+) -> Parts:
     """Return all parts, from the model, the graph and the reference."""
-    formation = leader = follower = plant = None
-    with faults.at("plant"):
-        plant = _plant(scenario, model)
-    disturbance = _disturbance(scenario, faults, model)
-    with faults.at("formation"):
-        formation = _formation(scenario, model, graph)
-    with faults.at("follower"):
-        follower = _follower(scenario, faults, model, graph)
-    with faults.at("leader"):
-        reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
-        leader = _leader(scenario, faults, model, graph, reference, reaction)
+    plant = faults.part(lambda: plant_of(scenario, model), "plant")
+    disturbance = disturbance_of(scenario, faults, model)
+    formation = faults.part(lambda: _formation(scenario, model, graph), "formation")
+    follower = faults.part(lambda: _follower(scenario, faults, model, graph), "follower")
+    reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
+    leader = faults.part(
+        lambda: _leader(scenario, faults, model, graph, reference, reaction), "leader"
+    )
+    network = network_of(scenario, faults, graph, leader, follower)
     for place, named in (
         (("initial", "spread"), scenario.initial.spread or {}),
         (("leader", "start_error"), scenario.leader.start_error),
@@ -161,25 +126,21 @@ def _with_laws(
             with faults.at(*place, name):
                 model.states_called(name)
     faults.settle()
+    # Spreads by state or group, and states by agent: these are different keys.
+    initial: Any = dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
     parts = Parts(
         model,
         graph,
-        cast(Formation, formation),
+        formation,
         Laws(cast(Law, leader), cast(Law, follower)),
-        initial=_initial(scenario),
+        initial=initial,
         start_error=scenario.leader.start_error,
-        world=World(plant, disturbance),
+        world=World(plant, disturbance, network),
     )
     with faults.at("initial"):
         initial_states(parts, scenario.seed)
     faults.settle()
-    return Experiment(parts, _settings(scenario))
-
-
-def _initial(scenario: Scenario) -> Any:
-    """Return spreads by state or group, and states by agent, in one mapping."""
-    # Names of states and numbers of agents are different keys.
-    return dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
+    return parts
 
 
 def run(
@@ -216,8 +177,11 @@ def _model(scenario: Scenario) -> ControlAffine:
     parameters = spec.parameters or {}
     arguments = {"set": parameters} if isinstance(parameters, str) else {**parameters}
     if "set" in arguments and "set" not in accepted(part.cls):
-        return _named_set(part, arguments.pop("set"), {**arguments, **extra})
-    return part._replace(arguments={**arguments, **extra}).create()
+        model = _named_set(part, arguments.pop("set"), {**arguments, **extra})
+    else:
+        model = part._replace(arguments={**arguments, **extra}).create()
+    check_model(model)
+    return model
 
 
 def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) -> ControlAffine:
@@ -230,27 +194,6 @@ def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) ->
     check_names(part.cls, part.name, changes)
     with as_scenario_error(f"`{part.name}` refuses these parameters"):
         return named(name, **changes)
-
-
-def _plant(scenario: Scenario, model: ControlAffine) -> ControlAffine | None:
-    spec = scenario.plant
-    if spec is None:
-        return None
-    plant = vary_parameters(model, spec.parameters, spec.scale)
-    check_model(plant)
-    check_plant(model, plant)
-    return plant
-
-
-def _disturbance(scenario: Scenario, faults: _Faults, model: ControlAffine) -> Disturbance | None:
-    spec = scenario.disturbance
-    if spec is None:
-        return None
-    for key in ("constant", "rms", "input_rms"):
-        with faults.at("disturbance", key):
-            # Each alone, so that its fault is reported at its own line.
-            Disturbance(**{key: getattr(spec, key)}).prepared(model, scenario.simulation.dt, 0)
-    return Disturbance(**spec.model_dump())
 
 
 def _graph(scenario: Scenario) -> Graph:
@@ -305,12 +248,12 @@ def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, scenario: Scenario
         return load_gain(scenario.folder / spec.file, model, graph)
     part = named_class(scenario, Method, registry.METHODS, spec.method, spec.python, spec.arguments)
     method = part.create()
-    with as_scenario_error(f"`{part.name}` fails") if part.by_user else contextlib.nullcontext():
+    with part.guard():
         return synthesize(model, graph, method)
 
 
 def _follower(
-    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph
+    scenario: Scenario, faults: FaultList, model: ControlAffine, graph: Graph
 ) -> Law | None:
     spec = scenario.follower
     part = law_class(scenario, registry.FOLLOWER_LAWS, spec.law)
@@ -324,7 +267,7 @@ def _follower(
     return _law(part, offers, model, graph)
 
 
-def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: NamedClass) -> None:
+def _check_keys(scenario: Scenario, faults: FaultList, role: str, part: NamedClass) -> None:
     """Note the keys of a role that its law, a class of the user, does not take."""
     taken = accepted(part.cls)
     for key in marked_keys(ROLES[role][0]):
@@ -339,13 +282,13 @@ def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: NamedClass
 def _law(part: NamedClass, offers: Mapping[str, object], model: ControlAffine, graph: Graph) -> Law:
     """Return the law of a scenario, completed and checked."""
     law = part.create(offers)
-    with as_scenario_error(f"`{part.name}` fails") if part.by_user else contextlib.nullcontext():
+    with part.guard():
         return prepare_law(law, model, graph)
 
 
 def _leader(
     scenario: Scenario,
-    faults: _Faults,
+    faults: FaultList,
     model: ControlAffine,
     graph: Graph,
     reference: Guide | None,
@@ -382,8 +325,7 @@ def _leader(
 
 
 def _settings(scenario: Scenario) -> Settings:
-    return Settings(
-        **scenario.simulation.model_dump(),
-        seed=scenario.seed,
-        steady_window=scenario.report.steady_window,
-    )
+    numbers, window = scenario.simulation.model_dump(), scenario.report.steady_window
+    settings = Settings(**numbers, seed=scenario.seed, steady_window=window)
+    settings.check()
+    return settings

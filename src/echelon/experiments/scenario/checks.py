@@ -6,7 +6,7 @@ one fault never hides another. Each check yields the path of a fault and its sen
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, TypeGuard
 
 from pydantic import BaseModel
 
@@ -152,14 +152,26 @@ def _gain_choices(data: Part, path: KeyPath) -> Iterator[Finding]:
         )
 
 
-def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
+def _edge_lists(graph: Part) -> Iterator[tuple[KeyPath, list[Any]]]:
+    """Yield the path and the items of every list of edges: the first one and the schedule's."""
+    later = graph.get("schedule")
+    stretches = [("schedule", k, part) for k, part in enumerate(later)] if _is_list(later) else []
+    for *inside, part in ((graph,), *stretches):
+        edges = part.get("edges") if isinstance(part, dict) else None
+        if isinstance(edges, list):
+            yield ("graph", *inside, "edges"), edges
+
+
+def _is_list(value: object) -> TypeGuard[list[Any]]:
+    return isinstance(value, list)
+
+
+def _pairs(edges: list[Any], directed: bool = True) -> Iterator[tuple[int, tuple[int, int]]]:
     """Yield the place in the list, and the two agents, of every well-formed edge.
 
     The smaller agent comes first, unless the graph is directed.
     """
-    directed = graph.get("directed") is True
-    edges = graph.get("edges")
-    for index, edge in enumerate(edges if isinstance(edges, list) else ()):
+    for index, edge in enumerate(edges):
         if not isinstance(edge, list) or len(edge) < 2:
             continue
         i, j = _whole(edge[0]), _whole(edge[1])
@@ -169,37 +181,70 @@ def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
 
 def _edges(document: Document) -> Iterator[Finding]:
     graph = section(document.data, "graph")
-    agents = _whole(graph.get("agents"))
-    first: dict[tuple[int, int], int] = {}
-    for index, pair in _pairs(graph):
-        path = ("graph", "edges", index)
-        if pair in first:
-            at = document.place(("graph", "edges", first[pair]))
-            per = "direction" if graph.get("directed") is True else "pair"
-            said = f"got a second edge of agents `{pair[0]}` and `{pair[1]}`"
-            yield path, f"{said}, allowed is one for each {per}; the first is at {at}."
-        first.setdefault(pair, index)
-        if agents is not None and max(pair) >= agents > 0:
-            yield path, f"got agent `{max(pair)}`, {_range(agents)}."
+    agents, directed = _whole(graph.get("agents")), graph.get("directed") is True
+    for path, edges in _edge_lists(graph):
+        first: dict[tuple[int, int], int] = {}
+        for index, pair in _pairs(edges, directed):
+            if pair in first:
+                at = document.place((*path, first[pair]))
+                per = "direction" if directed else "pair"
+                said = f"got a second edge of agents `{pair[0]}` and `{pair[1]}`"
+                yield (
+                    (*path, index),
+                    f"{said}, allowed is one for each {per}; the first is at {at}.",
+                )
+            first.setdefault(pair, index)
+            if agents is not None and max(pair) >= agents > 0:
+                yield (*path, index), f"got agent `{max(pair)}`, {_range(agents)}."
+
+
+def _gaps(data: Part) -> Iterator[Finding]:
+    """Yield an edge whose agents have numbers that leave others, which are in no edge."""
+    graph = section(data, "graph")
+    if graph.get("agents") is not None or _numbered(graph) is None:
+        return
+    leaders = graph.get("leaders")
+    numbers = [
+        (agent, (*path, index))
+        for path, edges in _edge_lists(graph)
+        for index, pair in _pairs(edges)
+        for agent in pair
+    ]
+    named = {agent for agent, _ in numbers}
+    # A leader needs no edge.
+    named |= {_whole(agent) for agent in (leaders if _is_list(leaders) else [0])} - {None}
+    last, place = max(numbers)
+    if last >= len(named):
+        lost = next(agent for agent in range(last) if agent not in named)
+        yield (
+            place,
+            f"got agent `{last}`, but agent `{lost}` is in no edge; number agents without gaps.",
+        )
 
 
 def _weights(data: Part) -> Iterator[Finding]:
-    """Yield a wrong number of weights, and edges that already have a weight."""
+    """Yield a wrong number of weights, edges that already have a weight, and wrong weights."""
     graph = section(data, "graph")
     edges, weights = graph.get("edges"), graph.get("weights")
-    if not isinstance(edges, list) or not isinstance(weights, list):
-        return
-    if len(edges) != len(weights):
-        said = f"got {len(weights)} weights for {len(edges)} edges, allowed is one for each edge"
-        yield ("graph", "weights"), f"{said}."
-    for index, edge in enumerate(edges):
-        if isinstance(edge, list) and len(edge) == 3:
-            said = "got an edge with a weight, allowed with `weights` is `[i, j]`"
-            yield ("graph", "edges", index), f"{said}."
-    for index, weight in enumerate(weights):
+    listed: list[tuple[KeyPath, object]] = []
+    if isinstance(edges, list) and isinstance(weights, list):
+        if len(edges) != len(weights):
+            said = (
+                f"got {len(weights)} weights for {len(edges)} edges, allowed is one for each edge"
+            )
+            yield ("graph", "weights"), f"{said}."
+        for index, edge in enumerate(edges):
+            if isinstance(edge, list) and len(edge) == 3:
+                said = "got an edge with a weight, allowed with `weights` is `[i, j]`"
+                yield ("graph", "edges", index), f"{said}."
+        listed += [(("graph", "weights", index), weight) for index, weight in enumerate(weights)]
+    for path, items in _edge_lists(graph):
+        triples = ((k, edge) for k, edge in enumerate(items) if _is_list(edge) and len(edge) == 3)
+        listed += [((*path, k, 2), edge[2]) for k, edge in triples]
+    for place, weight in listed:
         number = number_of(weight)
         if number is not None and not number > 0.0:
-            yield ("graph", "weights", index), f"got `{weight}`, allowed is a number above 0."
+            yield place, f"got the weight {quoted(weight)}, allowed is a number above 0."
 
 
 def _schedule(data: Part) -> Iterator[Finding]:
@@ -228,12 +273,11 @@ def _range(agents: int) -> str:
 
 def _numbered(graph: Part) -> int | None:
     """Return the largest number in the edges, plus one; None where an edge cannot be read."""
-    later = graph.get("schedule")
-    all_ = [graph, *(later if isinstance(later, list) else [])]
-    if not all(isinstance(part, dict) and isinstance(part.get("edges"), list) for part in all_):
+    later, lists = graph.get("schedule"), [edges for _, edges in _edge_lists(graph)]
+    if len(lists) != 1 + (len(later) if _is_list(later) else 0):
         return None
-    pairs = [pair for part in all_ for _, pair in _pairs(part)]
-    if len(pairs) != sum(len(part["edges"]) for part in all_):
+    pairs = [pair for edges in lists for _, pair in _pairs(edges)]
+    if len(pairs) != sum(map(len, lists)):
         return None
     return max((max(pair) + 1 for pair in pairs), default=None)
 
@@ -330,6 +374,7 @@ def cross_faults(document: Document) -> Iterator[Finding]:
     yield from _sources(data)
     yield from _choices(data)
     yield from _edges(document)
+    yield from _gaps(data)
     yield from _weights(data)
     yield from _schedule(data)
     yield from _grid(data)

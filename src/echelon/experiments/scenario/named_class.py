@@ -1,5 +1,6 @@
 """A class that a scenario names: by a name of the registry, or in a file of the user."""
 
+import contextlib
 import importlib
 import inspect
 from collections.abc import Callable, Mapping
@@ -74,6 +75,12 @@ class NamedClass(NamedTuple):
                 )
         with as_scenario_error(f"`{self.name}` refuses these parameters"):
             return self.cls(**arguments)
+
+    def guard(self) -> contextlib.AbstractContextManager[None]:
+        """Return a context in which errors of the user's code are a `ScenarioError`."""
+        if self.by_user:
+            return as_scenario_error(f"`{self.name}` fails")
+        return contextlib.nullcontext()
 
 
 def named_class(

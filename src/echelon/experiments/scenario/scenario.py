@@ -4,7 +4,7 @@ All faults of a file are reported at once, a line each: `file:line: field: got .
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, final, get_args
 
@@ -48,6 +48,7 @@ class Scenario(BaseModel, **STRICT):
     follower: law_sections.FollowerSpec = Field(default_factory=law_sections.FollowerSpec)
     initial: sections.InitialSpec = Field(default_factory=sections.InitialSpec)
     disturbance: sections.DisturbanceSpec | None = None
+    network: sections.NetworkSpec | None = None
     simulation: sections.SimulationSpec
     report: sections.ReportSpec = Field(default_factory=sections.ReportSpec)
     live: Annotated[tuple[sections.LiveSpec, ...], Field(strict=False)] = ()
@@ -103,10 +104,18 @@ def _keys(path: KeyPath) -> list[str]:
     """Return the keys that the section at `path` takes."""
     part: type[BaseModel] = Scenario
     for key in path:
-        annotation = part.model_fields[str(key)].annotation
-        kinds = (annotation, *get_args(annotation))
-        part = next(k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel))
+        # The place in a list of sections has the keys of any other.
+        if isinstance(key, str):
+            part = next(_sections(part.model_fields[key].annotation))
     return list(part.model_fields)
+
+
+def _sections(annotation: object) -> Iterator[type[BaseModel]]:
+    """Yield the sections in the annotation of a key: its own, or those of its list."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _sections(inner)
 
 
 def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:

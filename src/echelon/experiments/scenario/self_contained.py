@@ -25,6 +25,19 @@ def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]
     return (dump_yaml(data) if files else scenario.text), files
 
 
+def names_code(scenario: Scenario) -> bool:
+    """Tell whether building a scenario executes code that it names."""
+    return any(path[-1] == "python" for path, _, _ in named_files(scenario.data, ()))
+
+
+def without_folders(data: Any) -> Any:
+    """Return the data of a scenario in which files are named without their folders."""
+    data = copy.deepcopy(data)
+    for path, file, rest in list(named_files(data, ())):
+        _replace(data, path, Path(file).name + rest)
+    return data
+
+
 def files_of(scenario: Scenario) -> list[Path]:
     """Return the file of a scenario and all files that it names."""
     return [scenario.file, *self_contained(scenario, "")[1].values()]

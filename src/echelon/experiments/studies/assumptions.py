@@ -10,22 +10,9 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import who_hears_whom
-from echelon.agents.references.demand import (
-    ReferenceDemand,
-    infeasible,
-    reference_demand,
-    too_fast,
-)
+from echelon.agents.references.demand import ReferenceDemand, infeasible, reference_demand, too_fast
 from echelon.core.linear import eigenvalue_text
-from echelon.core.statement import (
-    Hypothesis,
-    Statement,
-    Topic,
-    fails,
-    holds,
-    unneeded,
-    vacuous,
-)
+from echelon.core.statement import Hypothesis, Statement, Topic, fails, holds, unneeded, vacuous
 from echelon.core.words import Kind, Verdict
 from echelon.experiments.studies.finite_condition import finite_condition
 from echelon.guarantees.promises.hypotheses import goal_drifts

@@ -5,27 +5,25 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import numpy as np
 
 from echelon.core.errors import EchelonError, LawError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
-from echelon.experiments.results.metrics import Metrics, metrics
+from echelon.experiments.results.metrics import metrics
+from echelon.experiments.results.run_numbers import RunNumbers
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario
-from echelon.guarantees.promises.promise import Promise, promise
+from echelon.guarantees.promises.promise import promise
 from echelon.laws.consensus import Consensus
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import RunSoFar, simulate
 from echelon.simulation.optimal.drives import Plans, RecedingHorizon
 from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.settings import Settings
-from echelon.simulation.step.solver_stats import SolverStats
 from echelon.synthesis.gains.fixed import FixedGain
 from echelon.synthesis.gains.gain import Gain, Method, synthesize
 from echelon.synthesis.gains.inner_loop import InnerLoop
@@ -35,67 +33,16 @@ OWN = "own"
 """Label of the scenario's drive."""
 
 
-class Flight(NamedTuple):
-    """The run of a method on the scenario.
-
-    Attributes:
-        result: the run.
-        promise: of its parts.
-        received: the information that each follower receives, in words.
-        computing: computing time (s) for one agent and one second of flight, without compilation.
-        solver: statistics of the solver; None for a law.
-    """
-
-    result: Result
-    promise: Promise
-    received: tuple[str, ...]
-    computing: float
-    solver: SolverStats | None
-
-
 class ComparisonRow(NamedTuple):
-    """A method's label with its flight and numbers, or the reason why there are none."""
+    """A method's label with the numbers of its run, or the reason why there is none."""
 
     label: str
-    flight: Flight | None
-    numbers: Metrics | None
+    flight: RunNumbers | None
     reason: str = ""
 
-    @property
-    def converged(self) -> bool:
-        """Whether every follower settled."""
-        return self.numbers is not None and self.settled is not None
-
-    @property
-    def settled(self) -> float | None:
-        """Time (s) after which all followers stay within 1 cm; None where one does not."""
-        times = [each.settling_time for each in self.numbers.followers] if self.numbers else []
-        settled = [time for time in times if time is not None]
-        # The swarm has settled only if all followers have.
-        return max(settled) if settled and len(settled) == len(times) else None
-
-    @property
-    def whole(self) -> float | None:
-        """The largest whole-run error of a follower."""
-        return self._worst("rmse")
-
-    @property
-    def steady(self) -> float | None:
-        """The largest steady error of a follower."""
-        return self._worst("steady_rmse")
-
-    @property
-    def effort(self) -> float | None:
-        """Root mean square of the followers' normalized inputs about the trim."""
-        values = [each.effort for each in self.numbers.followers] if self.numbers else []
-        finite = [value for value in values if value is not None]
-        # The mean of the squares: the root mean square of all inputs together.
-        return float(np.sqrt(np.mean(np.square(finite)))) if finite else None
-
-    def _worst(self, name: str) -> float | None:
-        values = [getattr(each, name) for each in self.numbers.followers] if self.numbers else []
-        finite = [value for value in values if value is not None]
-        return max(finite) if finite and len(finite) == len(values) else None
+    def number(self, name: str) -> float | None:
+        """Return a number of `RUN_NUMBERS`; None if it does not exist."""
+        return None if self.flight is None else self.flight.number(name)
 
 
 class Comparison(NamedTuple):
@@ -218,9 +165,7 @@ def compare(
             began(label)
             rows.append(_row(label, drive, scene, settings, check))
         except KeyboardInterrupt:
-            rows.append(
-                ComparisonRow(label, None, None, "it was not run because of an interruption.")
-            )
+            rows.append(ComparisonRow(label, None, "it was not run because of an interruption."))
         landed(rows[-1])
 
     for label in (label for label in only if label != OWN):
@@ -237,10 +182,9 @@ def _row(
     label: str, drive: DriveOf, parts: Parts, settings: Settings, check: Callable[[], None]
 ) -> ComparisonRow:
     try:
-        flight = _fly(parts.replace(drive=drive(parts)), settings, check)
+        return ComparisonRow(label, _fly(parts.replace(drive=drive(parts)), settings, check))
     except EchelonError as error:
-        return ComparisonRow(label, None, None, str(error))
-    return ComparisonRow(label, flight, metrics(flight.result))
+        return ComparisonRow(label, None, str(error))
 
 
 def _with_starts(parts: Parts, settings: Settings) -> Parts:
@@ -258,14 +202,13 @@ def _conditions(parts: Parts) -> tuple[str, ...]:
     return tuple(f"{name}: {text}" for name, text in described.items() if text)
 
 
-def _fly(parts: Parts, settings: Settings, check: Callable[[], None]) -> Flight:
+def _fly(parts: Parts, settings: Settings, check: Callable[[], None]) -> RunNumbers:
     """Run a method, and measure the time of solving, or of the compiled steps."""
     watch = _Watch(check)
     result = simulate(parts, settings, watch)
     seconds = watch.seconds if result.work is None else result.work.seconds
     computing = seconds / (parts.graph.agents * settings.horizon)
-    received = result.drive.information.follower
-    return Flight(result, promise(result.parts, settings), received, computing, result.work)
+    return RunNumbers(result, metrics(result), promise(result.parts, settings), computing)
 
 
 class _Watch:

@@ -7,13 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.errors import (
-    EchelonError,
-    GainError,
-    ScenarioError,
-    did_you_mean,
-    listing,
-)
+from echelon.core.errors import EchelonError, GainError, ScenarioError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Theorem
@@ -29,6 +23,7 @@ from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates import margins
+from echelon.synthesis.certificates.delays import delay_margin
 from echelon.synthesis.certificates.domain import Domain
 from echelon.synthesis.gains.fixed import FixedGain
 from echelon.synthesis.gains.gain import Gain, Method, synthesize
@@ -263,7 +258,7 @@ def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Promise) 
     return design._replace(
         step=guarantee.longest_step(settings),
         factors=margins.gain_margin(closed),
-        delay=margins.delay_margin(closed).delay,
+        delay=delay_margin(closed).delay,
         advice=_advice(gain, parts),
     )
 

@@ -8,15 +8,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.linearization import trim_slopes
 from echelon.agents.models.model import ControlAffine
-from echelon.core.statement import (
-    Hypothesis,
-    Statement,
-    Topic,
-    fails,
-    holds,
-    unneeded,
-    vacuous,
-)
+from echelon.core.statement import Hypothesis, Statement, Topic, fails, holds, unneeded, vacuous
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind
 from echelon.guarantees.promises.closed_loop import LinearLoop
@@ -24,6 +16,7 @@ from echelon.guarantees.promises.promise import AgreementModes, Promise
 from echelon.simulation.engine.parts import Parts
 from echelon.synthesis.certificates import margins
 from echelon.synthesis.certificates.bounds import invariant_ellipsoid, peak_gain
+from echelon.synthesis.certificates.delays import delay_margin
 
 _KIND = Kind.LINEARIZATION
 _WIDE = 4
@@ -56,13 +49,14 @@ def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
         yield unneeded(Topic.MARGINS, _KIND, text, stiffness)
         return
     low, high = margins.gain_margin(loop.closed)
-    yield holds(Topic.GAIN, _KIND, "factors on the coupling", low, f"{low:.3g} to {high:.3g}")
-    delay = margins.delay_margin(loop.closed)
+    text = "factors on the coupling, in continuous time"
+    yield holds(Topic.GAIN, _KIND, text, low, f"{low:.3g} to {high:.3g}")
+    delay = delay_margin(loop.closed)
     time = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
     text = f"uniform delay of z, critical mode lambda = {delay.eigenvalue:.3g}; {loop.where}"
     yield holds(Topic.DELAY, _KIND, text, delay.delay, time)
     low, high = loop.certificate.lambda_min, loop.certificate.lambda_max
-    best = margins.delay_margin(loop.closed._replace(eigenvalues=np.array([low]))).delay
+    best = delay_margin(loop.closed._replace(eigenvalues=np.array([low]))).delay
     yield _spread_line(low, high, delay.delay, best)
     yield _scaling_line(parts.model, loop)
     # The bound for the network needs a symmetric matrix.
@@ -76,7 +70,8 @@ def _switching_lines(promise: Promise) -> Iterator[Statement]:
     anywhere = promise.agreement is not None
     if not anywhere and edge is not None and not lines[Hypothesis.DISAGREEMENT_DECAY].fails:
         low = edge / promise.loop.closed.coupling
-        what = "factors on the coupling for which one P serves all graphs, however they switch"
+        what = "factors on the coupling for which one P serves all graphs, however they switch, in "
+        what += "continuous time"
         yield holds(Topic.GAIN, _KIND, what, low, f"{low:.3g} to inf")
     text = "any coupling; " if anywhere else ""
     text += "delay margins are known for one graph only, not for switching graphs"
@@ -156,7 +151,9 @@ def _disturbance_lines(model: ControlAffine, loop: LinearLoop) -> Iterator[State
     def line(name: Topic, bounds: Float[Array, " n"], text: str) -> Statement:
         sizes = ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in bounded)
         worst, text = float(bounds[list(bounded)].max()), f"{unit}per {where}: {text}; {loop.where}"
-        return holds(name, _KIND, text, worst, sizes)
+        # Of an interval of eigenvalues, so many values are tried.
+        kind = Kind.SAMPLES if loop.closed.between else _KIND
+        return holds(name, kind, text, worst, sizes)
 
     text = "bound for any disturbance of that norm on all followers together"
     yield line(Topic.DISTURBANCE_NETWORK, invariant_ellipsoid(loop.closed, E), text)

@@ -5,10 +5,7 @@ from typing import NamedTuple
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.topology import (
-    recommend_edges,
-    recommend_leaders,
-)
+from echelon.agents.network.topology import recommend_edges, recommend_leaders
 from echelon.synthesis.certificates.certificate import certify
 from echelon.synthesis.gains.gain import Gain
 

@@ -1,25 +1,54 @@
 """A sweep on many machines: the workers of a dask cluster compute its batches."""
 
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from echelon.core.errors import EchelonError, MissingExtraError, OutputError
-from echelon.experiments.sweeps.plan import Sweep
-from echelon.experiments.sweeps.workers import SweepBatch, Workers
+
+if TYPE_CHECKING:
+    from echelon.experiments.sweeps.plan import Sweep
+    from echelon.experiments.sweeps.workers import SweepBatch, Workers
 
 _PATIENCE = 10.0
 """Seconds in which a scheduler must answer."""
+_KNOCK = 3.0
+"""Seconds in which its machine must accept a connection."""
 _POLL = 0.2
 """Seconds between two checks for finished batches, so that Ctrl-C takes effect at once."""
-_workers: dict[str, Workers] = {}
+_workers: "dict[str, Workers]" = {}
 _one_at_a_time = threading.Lock()
 
 
+def check_scheduler(address: str) -> None:
+    """Check that something listens at the address of a scheduler, which takes no JAX and no dask.
+
+    Raises:
+        OutputError: it is no address, or nothing listens there.
+    """
+    parts = urlsplit(address if "://" in address else f"tcp://{address}")
+    try:
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if host is None or port is None:
+        raise OutputError(
+            f"`--cluster` is `{address}`, and must be an address with a port, such as "
+            "`tcp://host:8786`."
+        )
+    try:
+        socket.create_connection((host, port), _KNOCK).close()
+    except OSError as error:
+        why = error.strerror or f"nothing in {_KNOCK:g} s"
+        raise OutputError(f"the cluster at `{address}` does not answer: {why}.") from error
+
+
 def fly_on(
-    address: str, plan: Sweep, todo: Sequence[tuple[int, int]], progress: Callable[[], None]
-) -> Iterator[SweepBatch]:
+    address: str, plan: "Sweep", todo: Sequence[tuple[int, int]], progress: Callable[[], None]
+) -> "Iterator[SweepBatch]":
     """Yield batches (first, count) of a sweep as the workers of a cluster complete them.
 
     A batch whose worker is lost is computed again by another, to the same bits. Workers must have
@@ -54,8 +83,10 @@ def fly_on(
         client.close()
 
 
-def _fly(name: str, plan: Sweep, first: int, count: int) -> SweepBatch:
+def _fly(name: str, plan: "Sweep", first: int, count: int) -> "SweepBatch":
     """Return a batch, computed by this worker, which builds the sweep's parts once."""
+    from echelon.experiments.sweeps.workers import Workers
+
     # Two threads of a worker would compile the same code, and use more threads than processors.
     with _one_at_a_time:
         if name not in _workers:
@@ -64,7 +95,7 @@ def _fly(name: str, plan: Sweep, first: int, count: int) -> SweepBatch:
         return _workers[name].batch(first, count, lambda done, steps: None)
 
 
-def _result(future: Any) -> SweepBatch:
+def _result(future: Any) -> "SweepBatch":
     try:
         return future.result()
     except EchelonError:

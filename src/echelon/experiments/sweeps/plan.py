@@ -108,7 +108,7 @@ class Sweep:
     def _columns(self) -> int:
         """Return how many values are stored of a run."""
         from echelon.experiments.scenario.build import build
-        from echelon.experiments.sweeps.numbers import AGENT_NUMBERS, NUMBERS, WORDS
+        from echelon.experiments.sweeps.numbers import AGENT_COLUMNS, RUN_COLUMNS, WORDS
 
         agents = build(self.case((0,) * len(self.axes))).parts.graph.agents
-        return len(NUMBERS) + len(WORDS) + len(AGENT_NUMBERS) * agents
+        return len(RUN_COLUMNS) + len(WORDS) + len(AGENT_COLUMNS) * agents

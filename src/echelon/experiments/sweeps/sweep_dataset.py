@@ -9,15 +9,16 @@ from echelon.core.errors import Outcome
 from echelon.core.provenance import versions
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.labelled import Variables
-from echelon.experiments.results.metrics import ERROR, Quantity
+from echelon.experiments.results.quantity import ERROR, Quantity
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps.axes import Axis
 from echelon.experiments.sweeps.numbers import (
-    AGENT_NUMBERS,
+    AGENT_COLUMNS,
     MISSING,
-    NUMBERS,
     OUTCOMES,
     REFUSED,
+    RUN_COLUMNS,
     UNIT,
     WORDS,
 )
@@ -36,7 +37,7 @@ _MEANINGS = {
     "warnings": "settings of the run that are probably not intended, a line each",
     "promise_against": "why nothing is guaranteed",
 }
-_QUANTITIES = {**AGENT_NUMBERS, **NUMBERS}
+_QUANTITIES = {**AGENT_NUMBERS, **RUN_NUMBERS}
 
 
 def dataset_of(plan: Sweep, batches: "Sequence[SweepBatch]") -> "xr.Dataset":
@@ -50,8 +51,8 @@ def dataset_of(plan: Sweep, batches: "Sequence[SweepBatch]") -> "xr.Dataset":
     agents = max([0, *(batch.columns["saturated"].shape[1] for batch in batches)])
     keys = [axis.key for axis in plan.axes]
     variables: Variables = {}
-    for name, fill in (*_FILLS.items(), *((name, np.nan) for name in AGENT_NUMBERS)):
-        inner = name in AGENT_NUMBERS
+    for name, fill in (*_FILLS.items(), *((name, np.nan) for name in AGENT_COLUMNS)):
+        inner = name in AGENT_COLUMNS
         whole = np.full((plan.count, agents) if inner else plan.count, fill)
         whole = whole.astype(np.int8 if name in _CODES else object if name in WORDS else float)
         for batch in batches:
@@ -71,13 +72,13 @@ def _measure(variables: Variables) -> None:
     """Replace the column of the errors' unit by an attribute of errors, if all runs have m."""
     units = {str(unit) for unit in variables.pop(UNIT)[1].ravel() if unit}
     for name, quantity in _QUANTITIES.items():
-        if quantity.unit == ERROR and units == {"m"}:
+        if quantity.unit == ERROR and name in variables and units == {"m"}:
             variables[name][2]["units"] = "m"
 
 
 _CODES = ("outcome", "promised")
 _FILLS: Variables = {"outcome": MISSING, "promised": 0}
-_FILLS |= dict.fromkeys(NUMBERS, np.nan) | dict.fromkeys(WORDS, "")
+_FILLS |= dict.fromkeys(RUN_COLUMNS, np.nan) | dict.fromkeys(WORDS, "")
 
 
 def _arranged(plan: Sweep, whole: Array) -> Array:

@@ -69,5 +69,6 @@ class Case(NamedTuple):
         sources = {
             "wind or noise acts on the agents": world.disturbance,
             "the agents differ from the model": world.plant,
+            "messages are late or lost": world.network,
         }
         return " and ".join(text for text, what in sources.items() if what is not None)

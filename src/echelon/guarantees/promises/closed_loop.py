@@ -10,23 +10,24 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.eigenvalues import in_order
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.spectrum import Spectrum
-from echelon.core.linear import longest_step, sampled_radius
+from echelon.core.linear import discretize, longest_step, radius_between, spectral_radii
+from echelon.core.rational import bisect
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
+from echelon.guarantees.promises.common_metric import CommonMetric
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import Certificate, certify
-from echelon.synthesis.certificates.lmi import falls, rate_of
+from echelon.synthesis.certificates.lmi import falls
 from echelon.synthesis.certificates.margins import ClosedLoop, slowest_between
 from echelon.synthesis.gains.gain import Gain
 
 SHOWN = 32
-"""Of more eigenvalues of the graph than these, so many stand for all in the margins."""
-_FEW = 8  # modes that a longest step is sought with, the extreme ones among them
+"""So many eigenvalues stand for an interval of them where numbers are shown."""
 _DENSE = 400
-_MANY = 1000
-"""As many complex eigenvalues as a circle of agents may have."""
+"""Real eigenvalues beyond so many are judged as the interval that holds them."""
+_HALVINGS = 20  # of a step that an interval of eigenvalues, or some graph, does not bear
 _SLACK = 1e-9
 """Relative; what a solver leaves of the inequality behind an edge, which is often tight."""
 
@@ -37,15 +38,14 @@ class LinearLoop(NamedTuple):
     Attributes:
         linear: A (with the inner loop closed) and B at the trim.
         inner: (m, n), the inner loop K that is closed in A; zero without one.
-        closed: the modes that margins are taken of.
-        where: which eigenvalues of the graph those are, in words.
+        closed: the modes that margins are taken of: all of them, or an interval that holds them.
+        where: which eigenvalues of the graph were looked at, in words.
         symmetric: whether they are of a symmetric matrix between followers' errors.
-        every: whether the modes of all eigenvalues of the graph decay, not only of those.
-        slowest: real part of the slowest mode, 1/s; of a large graph, of the modes looked at.
+        every: whether the modes of all eigenvalues of the graph decay.
+        slowest: real part of the slowest mode, 1/s; of an interval, of the modes looked at.
         certificate: of the linearization.
-        common: the rate, 1/s, at which the sum of all delta_i'P delta_i falls near the trim on
-            every one of the graphs that take turns (T8), below 0 where it may rise; None where the
-            graph does not switch.
+        common: the sum of all delta_i'P delta_i near the trim on graphs that take turns (T8); None
+            where the graph does not switch.
     """
 
     linear: Linearization
@@ -56,7 +56,7 @@ class LinearLoop(NamedTuple):
     every: bool
     slowest: float
     certificate: Certificate
-    common: float | None = None
+    common: CommonMetric | None = None
 
     @property
     def gains(self) -> Array:
@@ -75,15 +75,45 @@ class LinearLoop(NamedTuple):
         return np.linalg.eigvals(A - self.closed.strengths[:, None, None] * (B @ self.closed.K))
 
     def radius(self, settings: Settings) -> float:
-        """Return the largest spectral radius of a step of the integrator that runs."""
-        A, B = self.open
-        return sampled_radius(A, B, self.gains, settings.dt, settings.integrator)
+        """Return the largest spectral radius of a step of the integrator that runs.
+
+        Of an interval of eigenvalues it is at least 1 unless all of them are shown to decay.
+        """
+        F, G = discretize(*self.open, settings.dt, settings.integrator)
+        radius = float(spectral_radii(F - G @ self.gains).max())
+        if not self.closed.between or not radius < 1.0:
+            return radius
+        real = np.real(self.closed.strengths[np.imag(self.closed.strengths) == 0.0])
+        return max(radius, radius_between(F - G @ self.inner, G @ self.closed.K, *real[[0, -1]]))
+
+    def growth(self, settings: Settings) -> float:
+        """Return the most by which a step multiplies errors, on any graph, in the norm of P.
+
+        Below 1 errors decay in any order of the graphs; without `common` it is 0.
+        """
+        if self.common is None or not self.common.weakest > 0.0:
+            return 0.0
+        F, G = discretize(*self.open, settings.dt, settings.integrator)
+        return self.common.growth(F - G @ self.inner, G, self.closed.K, settings.dt)
+
+    def held_rate(self, settings: Settings) -> float:
+        """Return the rate (1/s) at which errors decay in held steps."""
+        growth = self.growth(settings) or self.radius(settings)
+        return -float(np.log(growth)) / settings.dt if growth > 0.0 else np.inf
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) of that integrator with which every mode decays."""
-        A, B = self.open
-        few = telling(self.closed.strengths, _FEW)
-        return longest_step(A, B, self.gains[few], settings.integrator)
+        step = longest_step(*self.open, self.gains, settings.integrator)
+        if not (self.closed.between or self.common) or not np.isfinite(step):
+            return step
+
+        def decays(dt: float) -> bool:
+            then = settings._replace(dt=dt)
+            return self.radius(then) < 1.0 and self.growth(then) < 1.0
+
+        # No smaller number is stated than need be: rounding alone lies between this and the step.
+        near = (1.0 - 1e-6) * step
+        return near if decays(near) else float(bisect(decays, 0.0, near, _HALVINGS))
 
     @property
     def open(self) -> Linearization:
@@ -116,26 +146,19 @@ def loop_of(parts: Parts) -> LinearLoop:
     linear, modes = linearize(model).with_inner(inner), modes_of(parts)
     edge = None if gain is None else _edge(gain, linear, modes.spectrum.low)
     certificate = certify(linear, modes.spectrum, P, R, c, edge)
-    values, where = _representatives(modes)
-    closed, slowest = ClosedLoop(*linear, P, R, c, values), certificate.abscissa
-    if certificate.modes < modes.spectrum.total:
+    values, between, where = _representatives(modes)
+    closed, slowest = ClosedLoop(*linear, P, R, c, values, between), certificate.abscissa
+    if between:
         slowest = max(slowest, slowest_between(closed))
     inner = np.zeros((m, n)) if inner is None else inner
     common = None
-    if parts.graph.schedule is not None and gain is not None:
-        common = _common(parts, gain, linear)
+    alike = all_alike(parts.drive, parts.model)
+    if parts.graph.schedule is not None and gain is not None and not alike:
+        common = CommonMetric.of(parts.graph, gain, *linear)
     every = slowest < 0.0
     return LinearLoop(
         linear, inner, closed, where, modes.symmetric, every, slowest, certificate, common
     )
-
-
-def _common(parts: Parts, gain: Gain, linear: Linearization) -> float:
-    """Return at what rate one P serves all graphs that take turns."""
-    weakest = parts.graph.spectrum().proved
-    if not weakest > 0.0 or all_alike(parts.drive, parts.model):
-        return -np.inf
-    return rate_of(gain.P, linear.A[None], linear.B, gain.R, 2.0 * gain.coupling * weakest)
 
 
 def modes_of(parts: Parts) -> NetworkModes:
@@ -212,20 +235,20 @@ def telling(values: Array, count: int) -> Array:
     return np.unique([*few, *(k for mark in marks for k in np.argsort(mark)[: count // 2])])
 
 
-def _representatives(modes: NetworkModes) -> tuple[Array, str]:
-    """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
+def _representatives(modes: NetworkModes) -> tuple[Array, bool, str]:
+    """Return the eigenvalues that margins are taken of, if any between count too, and which."""
     (values, total, *_), _, what = modes
+    # The modes of a conjugate pair mirror each other.
+    which = f"all {what} of the graph"
     if np.iscomplexobj(values):
-        # The modes of a conjugate pair mirror each other.
-        values = np.unique(values[np.imag(values) >= 0.0])
-        # A pair in the midst may need the shortest step, so all are looked at where they can be.
-        few = telling(values, _MANY)
-        which = "all" if len(few) == len(values) else f"{len(few)}, the extreme ones among them,"
-        return values[few], f"{which} {what} of the graph, one of each pair"
-    if len(values) < total:
-        between = np.geomspace(values[0], values[-1], SHOWN)
-        return between, f"lambda_min, lambda_max and {SHOWN - 2} values between them"
-    if total <= SHOWN:
-        return values, f"all {what} of the graph"
-    places = np.linspace(0, total - 1, SHOWN).round().astype(int)
-    return values[places], f"{SHOWN} of {total} {what}, the extreme ones among them"
+        values, which = values[np.imag(values) >= 0.0], f"{which}, one of each pair"
+    known, values = len(values) >= total or np.iscomplexobj(values), np.unique(values)
+    real = np.real(values[np.imag(values) == 0.0])
+    if known and len(real) <= _DENSE:
+        return values, False, which
+    between = np.geomspace(real[0], real[-1], SHOWN)
+    few = f"lambda_min, lambda_max and {SHOWN - 2} values between them"
+    pairs = values[np.imag(values) != 0.0]
+    if not len(pairs):
+        return between, True, few
+    return np.concatenate([between, pairs]), True, f"{few}, and all pairs of {what}"

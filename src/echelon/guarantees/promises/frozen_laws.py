@@ -28,7 +28,7 @@ from echelon.simulation.step.settings import Settings
 
 _STARTS = 64
 """Starts that are looked at, with the moments of the path one shape for the compiler."""
-_MODES = 8  # of the graph, the extreme ones among them
+_MODES = 32  # of the graph, the extreme ones among them
 _HARDEST = 8  # states with the fastest modes, which a longest step is sought with
 _TENFOLD = float(np.log(10.0))
 

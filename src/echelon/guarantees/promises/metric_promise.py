@@ -129,9 +129,9 @@ class MetricPromise(Promise):
             return None
         if self.region is not None:
             return self.region.rate
-        if self.loop.common is not None:
-            return max(0.0, min(self.loop.common, -self.slowest_turn))
-        return -max(self.loop.slowest, self.slowest_turn)
+        common, held = self.loop.common, self.loop.held_rate(self.case.settings)
+        rate = -self.loop.slowest if common is None else common.rate
+        return max(0.0, min(rate, held, -self.slowest_turn))
 
     @property
     def slowest(self) -> float | None:

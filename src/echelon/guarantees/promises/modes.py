@@ -15,7 +15,9 @@ from echelon.synthesis.certificates.margins import detectability
 
 _LINEAR = Kind.LINEARIZATION
 _GROWS = "with the input held over the step `dt` the disagreement grows"
-_AT_STARTS = "a step where agents start"
+_IN_TURNS = "on one of the graphs errors are multiplied by {:.4g} a step in the norm of P"
+_ON_PATH = "spectral radius {:.4g} a step along the leader's path"
+_AT_STARTS = "spectral radius {:.4g} a step where agents start"
 _NOT_STABLE = "the disagreement does not decay at the trim"
 _BENT = "the model is not differentiable at the trim and has no modes there"
 
@@ -136,10 +138,10 @@ def _taking_turns(case: Case) -> Statement:
         text = "no theorem covers this law on switching graphs"
         return fails(name, _LINEAR, text, remedy="use `consensus`", reason=text)
     # At the edge the sum may only stay; what feels nothing then decays by detectability.
-    if common is not None and edge is not None and c >= edge and common > -np.inf:
+    if common is not None and edge is not None and c >= edge and common.weakest > 0.0:
         text, rate = (
             "sum_i delta_i'P delta_i increases on no graph, whenever they switch",
-            max(0.0, common),
+            max(0.0, common.rate),
         )
         return holds(name, _LINEAR, text, rate, f"{rate:.3g} 1/s")
     text = "no one P is known that serves all graphs of the schedule"
@@ -186,12 +188,13 @@ def sampling_line(case: Case) -> Statement:
     if printed and goals.any():
         text = "`printed` takes f + g u as the next state, which ignores the goals"
         return _step_line(case, np.inf, text, "use `simulation.integrator: rk4`")
-    radii = {f"a step, {loop.where}": radius}
+    where = f"spectral radius {{:.4g}} a step, {loop.where}"
+    radii = {where: radius, _IN_TURNS: loop.growth(settings)}
     if case.frozen and not printed:
-        radii |= zip(("a step along the leader's path", _AT_STARTS), case.frozen.radii(settings))
-    where = next((x for x, one in radii.items() if not one < 1.0), f"a step, {loop.where}")
+        radii |= zip((_ON_PATH, _AT_STARTS), case.frozen.radii(settings))
+    where = next((x for x, one in radii.items() if not one < 1.0), where)
     remedy = "use `simulation.integrator: rk4`" if printed else ""
-    text = f"spectral radius {radii[where]:.4g} {where}"
+    text = where.format(radii[where])
     # At the starts it lasts a moment, and a guarantee is for starts near the goals.
     return _step_line(case, radii[where], text, remedy, "" if where == _AT_STARTS else _GROWS)
 

@@ -21,8 +21,6 @@ from echelon.simulation.scalars import (
 
 _PARTIAL = {"exponent", "mantissa", "root_guess"}
 """Operations that are not defined for all numbers; quotients and roots are not for some."""
-_MOTION = ("drift", "input_map", "velocity", "output", "input_scale", "flat_chains", "flat_outputs")
-"""Of a model: what its flat coordinates follow from."""
 _Form: TypeAlias = dict[int | None, Fraction]
 """A sum of multiples of nodes by their numbers, and of 1 under None."""
 
@@ -30,23 +28,14 @@ _Form: TypeAlias = dict[int | None, Fraction]
 def bounds_of(model: ControlAffine, chains: Chains) -> Sequence[FlatBound] | None:
     """Return the borders of a model's flat coordinates; None where they are not known.
 
-    A model states them. Of one that does not, that changes the motion of which it inherits the
-    word, or whose chains were found at samples, they are none if its own equations, traced, are
+    A model declares them with its chains. Of one that does not, or whose motion is another than
+    that of which it inherits the declaration, they are none if its own equations, traced, are
     defined everywhere and make flat coordinates an invertible linear map of all states and
     integrators, above which the inputs act by an invertible constant matrix.
     """
-    if model.flat_bounds is not None and not chains.sampled and _is_its_own_word(type(model)):
+    if {"flat_chains", "flat_bounds"} <= {*chains.declared}:
         return model.flat_bounds
     return () if _is_everywhere(model, chains) else None
-
-
-def _is_its_own_word(kind: type) -> bool:
-    """Tell whether what says where coordinates end comes with, or after, all that moves them."""
-
-    def place(name: str) -> int:
-        return next(k for k, each in enumerate(kind.__mro__) if name in vars(each))
-
-    return all(place("flat_bounds") <= place(name) for name in _MOTION)
 
 
 @memoize

@@ -8,7 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from echelon.agents.models.airframe import Airframe
+from echelon.agents.models.declarations import undeclared
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model_check import is_limited
 from echelon.core.enclosure.interval import Interval
 from echelon.core.memoize import memoize
 from echelon.core.rational import bisect, float_above, float_below, norm_above
@@ -144,7 +146,7 @@ class _MotorCase(NamedTuple):
 
 def motors_suffice_for(run: StoppingRun) -> bool:
     """Tell whether the motors are certified from the starts of a run."""
-    frame = run.parts.model.airframe
+    frame = _airframe(run.parts.model)
     if frame is None or _beyond(run):
         return False
     case = _MotorCase.of(run, frame)
@@ -153,7 +155,7 @@ def motors_suffice_for(run: StoppingRun) -> bool:
 
 def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
     """Return the load of the motors of a run's agents, if they suffice, and its line."""
-    frame, reason = run.parts.model.airframe, _beyond(run)
+    frame, reason = _airframe(run.parts.model), _beyond(run)
     if frame is None or reason:
         return None, unneeded(Hypothesis.LIMITS, Kind.PROOF, reason or _UNKNOWN)
     case = _MotorCase.of(run, frame)
@@ -181,10 +183,15 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
     return load, holds(Hypothesis.LIMITS, kind, text, *number)
 
 
+def _airframe(model: ControlAffine) -> Airframe | None:
+    """Return the body under motors that a model declares of its own motion and limits."""
+    return None if undeclared(model, "airframe") else model.airframe
+
+
 def _beyond(run: StoppingRun) -> str:
     """Return why nothing is to be asked of motors, or nothing is known; empty where it is."""
     chains = run.law.ready.chains
-    if not run.settings.limits or run.parts.model.input_limits is None:
+    if not (run.settings.limits and is_limited(run.parts.model)):
         return "the inputs have no limits"
     if (chains.outputs, chains.degrees) != (_OUTPUTS, _DEGREES):
         return _UNKNOWN

@@ -2,38 +2,36 @@
 
 import io
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from echelon.core.errors import MissingExtraError, OutputError, did_you_mean, listing
-from echelon.core.files import write_atomic
-from echelon.core.types import JsonObject
-from echelon.experiments.results.recording import Recording
-from echelon.output.archive.folder import write_errors
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from echelon.core.types import JsonObject
+    from echelon.experiments.results.recording import Recording
 
-def export(run: Recording, file: Path, kind: str) -> None:
-    """Write a run: `csv` and `parquet` one row per agent and time, `npz` and `mat` arrays.
+
+def content_of(kind: str) -> "Callable[[Recording], bytes]":
+    """Return the writer of a format.
+
+    `csv` and `parquet` have one row per agent and time, `npz` and `mat` arrays.
 
     Raises:
-        OutputError: the kind is unknown, or the file cannot be written.
-        MissingExtraError: Parquet needs pyarrow, which is not installed.
+        OutputError: there is no such format.
     """
-    if kind not in KINDS:
+    if kind not in _WRITERS:
         raise OutputError(
-            f"`--to` is `{kind}`{did_you_mean(kind, KINDS)}, and must be one of {listing(KINDS)}."
+            f"`--to` is `{kind}`{did_you_mean(kind, _WRITERS)}, and must be one of "
+            f"{listing(_WRITERS)}."
         )
-    content = _WRITERS[kind](run)
-    with write_errors(file):
-        write_atomic(file, content)
+    return _WRITERS[kind]
 
 
-def table(run: Recording) -> "pd.DataFrame":
+def table(run: "Recording") -> "pd.DataFrame":
     """Return one row per agent and time: states and inputs by name, and the formation error."""
     import pandas as pd
 
@@ -53,11 +51,11 @@ def table(run: Recording) -> "pd.DataFrame":
     return pd.DataFrame(columns)
 
 
-def _csv(run: Recording) -> bytes:
+def _csv(run: "Recording") -> bytes:
     return table(run).to_csv(index=False).encode()
 
 
-def _parquet(run: Recording) -> bytes:
+def _parquet(run: "Recording") -> bytes:
     content = io.BytesIO()
     try:
         table(run).to_parquet(content, index=False)
@@ -69,7 +67,7 @@ def _parquet(run: Recording) -> bytes:
     return content.getvalue()
 
 
-def _arrays(run: Recording) -> JsonObject:
+def _arrays(run: "Recording") -> "JsonObject":
     """Return the arrays of a run by name."""
     arrays: JsonObject = {
         "time": run.times,
@@ -90,13 +88,13 @@ def _arrays(run: Recording) -> JsonObject:
     return arrays | {name: value for name, value in more.items() if value is not None}
 
 
-def _npz(run: Recording) -> bytes:
+def _npz(run: "Recording") -> bytes:
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, **_arrays(run))
     return content.getvalue()
 
 
-def _mat(run: Recording) -> bytes:
+def _mat(run: "Recording") -> bytes:
     from scipy.io import savemat
 
     content = io.BytesIO()
@@ -109,10 +107,9 @@ def _mat(run: Recording) -> bytes:
     return content.getvalue()
 
 
-_WRITERS: dict[str, Callable[[Recording], bytes]] = {
+_WRITERS: "dict[str, Callable[[Recording], bytes]]" = {
     "csv": _csv,
     "parquet": _parquet,
     "npz": _npz,
     "mat": _mat,
 }
-KINDS = tuple(_WRITERS)

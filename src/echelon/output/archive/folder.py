@@ -78,13 +78,31 @@ def claim_design(
         claim_file(out, force, inputs)
 
 
-def claim_file(file: Path, force: bool, inputs: Sequence[Path] = ()) -> None:
+def check_exists(run: Path) -> Path:
+    """Return the path of a run, after checking that there is something.
+
+    Raises:
+        OutputError: there is nothing.
+    """
+    if not run.exists():
+        raise OutputError(f"`{run}` does not exist; give the folder of a run, or its `{DATA}`.")
+    return run
+
+
+def claim_file(
+    file: Path, force: bool, inputs: Sequence[Path] = (), endings: Sequence[str] = ()
+) -> None:
     """Check that a file can be written without the loss of another.
 
     Raises:
-        OutputError: it is a folder, is among the `inputs` of the command, or exists and `force` was
-            not given; or its folder does not exist.
+        OutputError: it has none of the `endings`, if there are any; it is a folder, is among the
+            `inputs` of the command, or exists and `force` was not given; or its folder does not
+            exist.
     """
+    if endings and file.suffix.lower() not in endings:
+        raise OutputError(
+            f"`{file.name}` ends in `{file.suffix}`, and must end in {' or '.join(endings)}."
+        )
     if file.is_dir():
         raise OutputError(f"`{file}` is a folder; give a file.")
     if any(path.exists() and file.exists() and file.samefile(path) for path in inputs):

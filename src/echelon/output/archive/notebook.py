@@ -7,14 +7,16 @@ import io
 from collections.abc import Iterator
 
 from echelon.experiments.results.foreseen import foreseen
-from echelon.experiments.results.metrics import formation_errors, metrics
+from echelon.experiments.results.metrics import metrics
 from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS
 from echelon.guarantees.promises.promise import promise
 from echelon.output.plots.run_figures import figures
 from echelon.output.reports.causes import causes, grows
 from echelon.output.reports.run_report import labelled
 from echelon.simulation.engine.result import Result
 
+_COLUMNS = ("start_error", "final_error", "saturated")
 _PICTURES = ("trajectories", "formation")
 
 
@@ -40,8 +42,9 @@ def _causes(result: Result) -> str:
 
 
 def _table(result: Result) -> str:
-    unit = " (m)" if result.unit == "m" else ""
-    heads = ("agent", f"error at the start{unit}", f"at the end{unit}", "saturated (% of steps)")
+    unit = result.length_unit and f", {result.length_unit}"
+    columns = (AGENT_NUMBERS[name].column.format(unit=unit) for name in _COLUMNS)
+    heads = ("agent", *(column.replace("\n", " ") for column in columns))
     rows = "".join(
         f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in cells)}</tr>"
         for cells in _cells(result)
@@ -52,13 +55,14 @@ def _table(result: Result) -> str:
 
 def _cells(result: Result) -> Iterator[tuple[str, ...]]:
     """Yield the rows of leaders and followers, with the labels of the report."""
-    numbers, errors = metrics(result), formation_errors(result)
+    numbers, errors = metrics(result), result.formation_errors
+    saturated = AGENT_NUMBERS["saturated"]
     for label, row in labelled("leader", numbers.leaders):
-        yield label, "", "", f"{100.0 * row.saturated:.3g}"
+        yield label, "", "", saturated.cell(row.saturated)
     for label, row in labelled("follower", numbers.followers):
         ends = errors[[0, -1], row.agent] if len(errors) else ()
         cells = [f"{size:.3g}" for size in ends] or ["", ""]
-        yield label, *cells, f"{100.0 * row.saturated:.3g}"
+        yield label, *cells, saturated.cell(row.saturated)
 
 
 def _recorded(result: Result) -> Recording:
@@ -70,7 +74,6 @@ def _recorded(result: Result) -> Recording:
         states=states,
         inputs=result.inputs,
         reference=result.reference,
-        errors=result.errors,
     )
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.experiments.results.metrics import SETTLED, formation_errors, output_errors
+from echelon.experiments.results.metrics import SETTLED, output_errors
 from echelon.experiments.studies.compare import Comparison
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import save
@@ -52,9 +52,8 @@ _Runs = list[tuple[int, str, Result]]
 
 
 def _formation_error(runs: _Runs) -> "Figure":
-    lines = {k: formation_errors(run).max(axis=1) for k, _, run in runs}
-    metric = runs[0][2].unit == "m"
-    return _over_time(runs, lines, draw.label("worst formation error", "m" if metric else ""))
+    lines = {k: run.formation_errors.max(axis=1) for k, _, run in runs}
+    return _over_time(runs, lines, draw.label("worst formation error", runs[0][2].length_unit))
 
 
 def _tracking_error(runs: _Runs) -> "Figure | None":
@@ -68,8 +67,7 @@ def _tracking_error(runs: _Runs) -> "Figure | None":
     }
     if not lines:
         return None
-    metric = runs[0][2].unit == "m"
-    text = draw.label("leader's tracking error", "m" if metric else "")
+    text = draw.label("leader's tracking error", runs[0][2].length_unit)
     return _over_time([run for run in runs if run[0] in lines], lines, text)
 
 
@@ -112,7 +110,7 @@ def _approach(runs: _Runs) -> "Figure | None":
     if len(axes) < 2:
         return None
     # All methods have the same starts, so that the first gives the follower.
-    follower = int(np.argmax(formation_errors(first)[0]))
+    follower = int(np.argmax(first.formation_errors[0]))
     names, units = first.model.state_names, first.model.state_units
     figure, ax = draw.canvas([draw.label(f"{names[k]} error", units[k]) for k in axes])
     start, goal = first.errors[:1, follower][:, axes], np.zeros((1, 2))

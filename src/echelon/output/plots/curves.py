@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from echelon.core.types import Array
+from echelon.experiments.results.lyapunov import rises
 from echelon.experiments.results.metrics import SETTLED
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
@@ -81,10 +82,10 @@ def formation(run: Recording) -> "Figure":
         look = {"color": draw.EDGE, "linewidth": 1.0, "linestyle": (0, (1.0, 1.5)), "zorder": 2.2}
         text = f"bound, by {run.promise['kind']} ({run.promise['theorem']})"
         draw.plot(ax, times, bound[keep], label=text, **look)
-    if run.unit:
+    if run.length_unit:
         ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
-    ax.set_ylabel(draw.label("formation error", run.unit))
-    marks = [SETTLED] if run.unit else []
+    ax.set_ylabel(draw.label("formation error", run.length_unit))
+    marks = [SETTLED] if run.length_unit else []
     # The end of the bound may lie far below all errors, so only its start sets the axis.
     draw.logarithmic(ax, errors[keep], np.array(marks if bound is None else [*marks, bound[0]]))
     return draw.finish(figure)
@@ -177,10 +178,10 @@ def lyapunov(run: Recording) -> "Figure | None":
 def _increases_between(run: Recording) -> bool:
     """Return whether V increases between two frames with a negative rate."""
     assert run.lyapunov is not None and run.lyapunov_rate is not None
-    value, decreasing = run.lyapunov, run.lyapunov_rate < 0.0
-    # Far below its start V is only rounding.
-    increases = np.diff(value) > 1e-9 * value[:-1] + 1e-20 * value[0]
-    return bool((increases & decreasing[:-1] & decreasing[1:]).any())
+    decreasing = run.lyapunov_rate < 0.0
+    return bool(
+        (rises(run.lyapunov[:-1], run.lyapunov[1:]) & decreasing[:-1] & decreasing[1:]).any()
+    )
 
 
 # ---- inputs -----------------------------------------------------------------------------------
@@ -304,7 +305,9 @@ def distances(run: Recording) -> "Figure | None":
     linked.set_ylabel(draw.label("linked agents", "m"))
     _edges(linked, run, run.times[keep], apart, desired)
     few = draw.thin(len(run.times), run.agents)
-    draw.plot(nearest, run.times[few], _least(places[few]), color=draw.LEADER, label="any two")
+    least = run.least_distances(few)
+    assert least is not None
+    draw.plot(nearest, run.times[few], least, color=draw.LEADER, label="any two")
     nearest.set_ylabel(draw.label("smallest distance", "m"))
     nearest.set_ylim(bottom=0.0)
     return draw.finish(figure)
@@ -325,14 +328,6 @@ def _edges(ax: "Axes", run: Recording, times: Array, apart: Array, desired: Arra
         ax.axhline(desired[place], **_DESIRED | {"color": look["color"]})
     # In the legend it has no colour of a link.
     ax.plot([], [], label="desired", **_DESIRED)
-
-
-def _least(places: Array) -> Array:
-    """Return the smallest distance of two agents at each time, of places (T, N, k)."""
-    from scipy.spatial import KDTree
-
-    finite = np.where(np.isfinite(places), places, 1e300)
-    return np.array([KDTree(row).query(row, k=2)[0][:, 1].min() for row in finite])
 
 
 def _panels(run: Recording, rows: int, height: float) -> "tuple[Figure, list[Axes]]":

@@ -4,11 +4,32 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from echelon.core.errors import OutputError, did_you_mean, listing
 from echelon.core.files import make_atomic
-from echelon.output.plots.style import style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+NAMES = (
+    *("leader_3d", "trajectories", "top_view", "tracking", "formation", "inputs"),
+    *("states", "distances", "lyapunov", "modes", "network"),
+)
+"""All figures of a run."""
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Check that these are figures of a run.
+
+    Raises:
+        OutputError: there is no figure of a name.
+    """
+    for name in names:
+        if name not in NAMES:
+            raise OutputError(
+                f"there is no figure `{name}`{did_you_mean(name, NAMES)}; a run has "
+                f"{listing(NAMES)}."
+            )
 
 
 def save(
@@ -22,6 +43,8 @@ def save(
     Raises:
         OSError: the folder or a file cannot be written.
     """
+    from echelon.output.plots.style import style  # which loads what draws
+
     paths = []
     folder.mkdir(parents=True, exist_ok=True)
     # Without the date, so that the same run writes the same file.

@@ -157,10 +157,11 @@ def _near_leaders(run: Recording) -> Recording:
     schedule = run.schedule and run.schedule._replace(weights=run.schedule.weights[:, links])
     return dataclasses.replace(
         run,
-        **{name: getattr(run, name)[:, agents] for name in ("states", "inputs", "errors")},
+        **{name: getattr(run, name)[:, agents] for name in ("states", "inputs")},
         **{name: getattr(run, name)[agents] for name in ("offsets", "saturated")},
         leaders=tuple(np.flatnonzero(np.isin(agents, run.leaders)).tolist()),
-        nearest=np.zeros(len(agents), int),
+        # Leaders are the first to be kept, so that each agent has its own.
+        nearest=np.searchsorted(agents, run.nearest[agents]),
         edges=np.searchsorted(agents, run.edges[links]),
         weights=run.weights[links],
         heard=run.heard[links],

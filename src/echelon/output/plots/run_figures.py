@@ -4,32 +4,27 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from echelon.core.errors import OutputError, did_you_mean, listing
 from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import curves, network, trajectories
 from echelon.output.plots import style as draw
-from echelon.output.plots.figure_files import save
+from echelon.output.plots.figure_files import NAMES, check_names, save
 from echelon.simulation.engine.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MAKERS: "dict[str, Callable[[Recording], Figure | None]]" = {
-    "leader_3d": trajectories.leader,
-    "trajectories": trajectories.trajectories,
-    "top_view": trajectories.top_view,
-    "tracking": curves.tracking,
-    "formation": curves.formation,
-    "inputs": curves.inputs,
-    "states": curves.states,
-    "distances": curves.distances,
-    "lyapunov": curves.lyapunov,
-    "modes": network.modes,
-    "network": network.network,
-}
-NAMES = tuple(_MAKERS)
-"""All figures of a run."""
+_MAKERS: "dict[str, Callable[[Recording], Figure | None]]" = dict(
+    zip(
+        NAMES,
+        (
+            *(trajectories.leader, trajectories.trajectories, trajectories.top_view),
+            *(curves.tracking, curves.formation, curves.inputs, curves.states, curves.distances),
+            *(curves.lyapunov, network.modes, network.network),
+        ),
+        strict=True,
+    )
+)
 DEFAULT = ("leader_3d", "trajectories", "tracking", "formation", "inputs", "lyapunov")
 """Figures that a run writes into its folder."""
 
@@ -61,12 +56,7 @@ def figures(
     Raises:
         OutputError: a name is unknown.
     """
-    for name in what:
-        if name not in _MAKERS:
-            raise OutputError(
-                f"there is no figure `{name}`{did_you_mean(name, NAMES)}; a run has "
-                f"{listing(NAMES)}."
-            )
+    check_names(what)
     if not len(run.times):
         return {}
     data = recording_of(run) if isinstance(run, Result) else run

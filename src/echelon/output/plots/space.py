@@ -97,7 +97,7 @@ def _angles(run: Recording, kind: str, names: tuple[str, ...]) -> tuple[tuple[in
 def clipped_places(run: Recording, axes: tuple[int, ...]) -> tuple[Array, bool]:
     """Return places (T, N, k) within ten times the extent of leaders and goals."""
     places, columns = run.states[:, :, list(axes)], list(axes)
-    goals = places - run.errors[:, :, columns]
+    goals = run.goals[:, :, columns]
     leaders = goals[:, list(run.leaders)].reshape(-1, len(axes))
     points = np.concatenate([leaders, goals[0], places[0]])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -150,7 +150,7 @@ def body_width(run: Recording, space: Space) -> float:
     from scipy.spatial import KDTree
 
     reach = float((space.high - space.low)[: 3 if space.kind == "space" else 2].max())
-    goals = (run.states[0] - run.errors[0])[:, list(space.axes)]
+    goals = run.goals[0][:, list(space.axes)]
     apart = KDTree(goals).query(goals, k=2)[0][:, 1] if run.agents > 1 else np.zeros(1)
     apart = apart[np.isfinite(apart) & (apart > 0.0)]
     if space.kind not in ("space", "plane") or not apart.size:

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from echelon.core.types import Array
+from echelon.experiments.results.run_numbers import RUN_NUMBERS
 from echelon.experiments.sweeps.axes import SEED
-from echelon.experiments.sweeps.numbers import NUMBERS, SUMMARIZED
+from echelon.experiments.sweeps.numbers import SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import save
@@ -63,7 +64,7 @@ def _distributions(data: "xr.Dataset") -> "Figure":
     for ax, name in zip(axes, SUMMARIZED, strict=True):
         values = np.sort(data[name].values.ravel())
         values = values[np.isfinite(values)]
-        ax.set_xlabel(draw.label(NUMBERS[name].label, data[name].attrs.get("units", "")))
+        ax.set_xlabel(draw.label(RUN_NUMBERS[name].label, data[name].attrs.get("units", "")))
         ax.set_ylim(0.0, 1.02)
         if not values.size:
             continue

@@ -27,18 +27,15 @@ _SCENE: Final = 620
 """Width of the scene in pixels; the rest is for curves."""
 _RATE: Final = 25.0
 _PAPER, _GRID = "#f7f8fa", "#dde2e8"
-KINDS: Final = (".mp4", ".gif")
 
 
 def save_video(run: Recording, file: Path, speed: float = 1.0) -> int:
     """Write a run as MP4 or GIF, by ffmpeg, and return the number of pictures.
 
     Raises:
-        OutputError: the run has no frames, the name has another ending, or ffmpeg fails.
+        OutputError: the run has no frames, or ffmpeg fails.
         MissingExtraError: there is no ffmpeg.
     """
-    if file.suffix.lower() not in KINDS:
-        raise OutputError(f"`{file.name}` ends in `{file.suffix}`, and must end in .mp4 or .gif.")
     if len(run.times) < 2:
         raise OutputError("the run has fewer than two stored frames; a video needs at least two.")
     program, pictures = encoder(), times_of(run, speed)
@@ -216,7 +213,7 @@ def _curves(figure: Any, run: Recording) -> list[Any]:
         for agent, line in zip(followers, values.T, strict=True):
             errors.plot(run.times[keep], line, **pen_of(run, agent))
     draw.logarithmic(errors, values)
-    errors.set_title(draw.label("formation error", run.unit), size=9, loc="left")
+    errors.set_title(draw.label("formation error", run.length_unit), size=9, loc="left")
     loads = run.loads
     sizes = (
         np.abs(run.inputs).max(axis=1)[keep] if loads is None else 100.0 * loads.max(axis=2)[keep]

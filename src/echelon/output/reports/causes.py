@@ -6,7 +6,7 @@ import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.statement import Cause, Hypothesis
-from echelon.experiments.results.metrics import Metrics, formation_errors
+from echelon.experiments.results.agent_metrics import Metrics
 from echelon.guarantees.promises.promise import Promise
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED
@@ -75,7 +75,7 @@ def _lag(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[Cause
     worst, matched = numbers.worst_steady, guarantee.hypotheses[Hypothesis.MATCHED_MOTION]
     if worst is None or worst <= _LAG or not matched.fails or result.reference is None:
         return
-    unit = "" if result.unit == "state" else f" {result.unit}"
+    unit = f" {result.length_unit}".rstrip()
     # Nobody lags behind a leader at rest, so that a steady error has another cause there.
     if np.ptp(result.reference, axis=0).max() > 0.0:
         yield Cause(
@@ -93,7 +93,7 @@ def _offset(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[Ca
         return
     if not (guarantee.promised or unknown):
         return
-    unit = "" if result.unit == "state" else f" {result.unit}"
+    unit = f" {result.length_unit}".rstrip()
     text = f"the leader has a steady error of {steady:.3g}{unit} from its reference"
     saturated = 100.0 * result.saturated[result.graph.leaders[0]]
     if unknown:
@@ -129,7 +129,7 @@ def _chatter(result: Result) -> Iterator[Cause]:
 
 def sizes(result: Result) -> tuple[float, float]:
     """Return the root-mean-square error of the followers in the first and the last frame."""
-    error = formation_errors(result)[:, list(result.graph.followers)]
+    error = result.formation_errors[:, list(result.graph.followers)]
     with np.errstate(over="ignore"):
         first, last = (float(np.sqrt((row**2).mean())) for row in (error[0], error[-1]))
     return first, last

@@ -1,11 +1,13 @@
 """The report of a comparison: tables of errors and costs, and a paragraph on who wins."""
 
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from echelon.core.errors import Outcome
 from echelon.core.types import JsonObject
+from echelon.experiments.results.quantity import ERROR, Shown
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.guarantees.promises.promise import Promise
 from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
@@ -67,13 +69,13 @@ def _errors_table(comparison: Comparison, printed: bool) -> "Table":
         f", {text}" for text in comparison.conditions
     )
     columns = [f"{head}\n{whole}" for head in heads] + [f"{head}\n{last}" for head in heads]
-    table = _table(title, [*columns, "within 1 cm\nfrom, s"])
+    table = _table(title, [*columns, AGENT_NUMBERS["settling_time"].column.format(settled="1 cm")])
     for row in comparison.rows:
         table.add_row(row.label, *_errors(row, bool(followers)))
     if printed:
         table.add_section()
         for method, values in PRINTED.items():
-            cells = [_number(value) for value in values]
+            cells = [f"{value:.3g}" for value in values]
             table.add_row(f"printed, {method}", *cells, *[""] * (len(columns) - len(cells) + 1))
     return table
 
@@ -85,41 +87,39 @@ def _followers(comparison: Comparison) -> Sequence[int]:
 
 def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
     """Yield the cells of one method: whole-run errors, steady errors, settling time."""
-    if row.flight is None or row.numbers is None:
+    if row.flight is None:
         return
-    leader, followers = row.numbers.leader, row.numbers.followers
-    yield _number(leader.rmse)
-    yield from [_number(f.rmse) for f in followers] if named else [_number(row.whole)]
-    yield _number(leader.steady_rmse)
-    yield from [_number(f.steady_rmse) for f in followers] if named else [_number(row.steady)]
-    yield "never" if row.settled is None else f"{row.settled:.3g}"
+    for name in ("rmse", "steady_rmse"):
+        cell, numbers = AGENT_NUMBERS[name].cell, row.flight.metrics
+        followers = [getattr(each, name) for each in numbers.followers]
+        errors = followers if named else [row.number(f"worst_{name}")]
+        for error in [getattr(numbers.leader, name), *errors]:
+            yield cell(error, 3)
+    yield _cell(row.flight, "worst_settling_time")
 
 
 def _costs_table(comparison: Comparison) -> "Table":
     """Return the costs, one row per method: effort, computing, information."""
-    table = _table(
-        "costs",
-        [
-            *("effort", "saturated,\n% steps", "smallest\ndistance", "computing,\nms per agent s"),
-            *("guaranteed,\n1/s", "information"),
-        ],
-    )
+    costs = {k: q.column for k, q in shown_in(RUN_NUMBERS, Shown.COMPARISON).items() if q.column}
+    heads = [*costs.values(), RUN_NUMBERS["promise_rate"].column, "information"]
+    table = _table("costs", heads)
     table.columns[-1].justify = "left"
     table.columns[-1].no_wrap = False
     for row in comparison.rows:
-        if row.flight is None or row.numbers is None:
+        if row.flight is None:
             table.add_row(row.label)
             continue
         table.add_row(
             row.label,
-            _number(row.effort),
-            f"{100.0 * row.numbers.saturation_fraction:.3g}",
-            _number(row.numbers.minimum_distance),
-            f"{1e3 * row.flight.computing:.3g}",
+            *(_cell(row.flight, name) for name in costs),
             _guaranteed(row.flight.promise),
-            ", ".join(row.flight.received) or "none",
+            ", ".join(row.flight.result.drive.information.follower) or "none",
         )
     return table
+
+
+def _cell(run: RunNumbers, name: str) -> str:
+    return RUN_NUMBERS[name].cell(run.number(name), 3)
 
 
 def _table(title: str, columns: Sequence[str]) -> "Table":
@@ -143,10 +143,6 @@ def _guaranteed(promise: Promise) -> str:
     return f"{promise.rate:.3g}{source}"
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
-
-
 def _remarks(row: ComparisonRow) -> Iterator[str]:
     """Yield why a method did not run, how its run ended, its solver times, and warnings."""
     if row.flight is None:
@@ -155,9 +151,9 @@ def _remarks(row: ComparisonRow) -> Iterator[str]:
     result = row.flight.result
     if result.outcome is not Outcome.COMPLETED:
         yield result.message
-    if row.flight.solver is not None:
-        yield _solver_times(row.flight.solver)
-    yield from row.flight.result.warnings
+    if result.work is not None:
+        yield _solver_times(result.work)
+    yield from result.warnings
 
 
 def _solver_times(figures: SolverStats) -> str:
@@ -174,20 +170,18 @@ def _solver_times(figures: SolverStats) -> str:
 
 def verdict(comparison: Comparison) -> tuple[str, ...]:
     """Return which method wins by which number, one sentence each."""
-    runs = [row for row in comparison.rows if row.flight is not None and row.numbers is not None]
-    settled = [row for row in runs if row.converged]
+    runs = [row for row in comparison.rows if row.flight is not None]
+    settled = [row for row in runs if row.number("worst_settling_time") is not None]
     some = 0 < len(settled) < len(runs)
     return tuple(
         sentence
         for sentence in (
             _unsettled(runs, settled),
             _among_settled(some, _closest(settled or runs)),
-            _best(settled, "settles first", lambda row: row.settled, "s"),
-            _best(runs, "has the smallest error over the whole run", lambda row: row.whole, "m"),
+            _best(settled, "settles first", "worst_settling_time"),
+            _best(runs, "has the smallest error over the whole run", "worst_rmse"),
             _leader(runs),
-            _among_settled(
-                some, _best(settled, "has the smallest effort", lambda row: row.effort, "")
-            ),
+            _among_settled(some, _best(settled, "has the smallest effort", "effort")),
             _among_settled(some, _cheapest(settled)),
         )
         if sentence
@@ -211,38 +205,34 @@ def _unsettled(runs: Sequence[ComparisonRow], settled: Sequence[ComparisonRow]) 
 
 def _closest(rows: Sequence[ComparisonRow]) -> str:
     """Return which method ends closest; errors at the level of rounding are a tie."""
-    errors = {row.label: row.steady for row in rows if row.steady is not None}
-    if not errors:
-        return ""
+    errors = _numbers(rows, "worst_steady_rmse")
     tied = [label for label, value in errors.items() if value <= _ROUNDING_LEVEL]
     if len(tied) > 1:
         return f"{_listed(tied)} end at the level of rounding errors."
-    return _best(rows, "ends closest", lambda row: row.steady, "m")
+    return _best(rows, "ends closest", "worst_steady_rmse")
 
 
-def _best(
-    rows: Sequence[ComparisonRow],
-    claim: str,
-    of: Callable[[ComparisonRow], float | None],
-    unit: str,
-) -> str:
+def _numbers(rows: Sequence[ComparisonRow], name: str) -> dict[str, float]:
+    """Return a number of all rows that have it, by label."""
+    values = {row.label: row.number(name) for row in rows}
+    return {label: value for label, value in values.items() if value is not None}
+
+
+def _best(rows: Sequence[ComparisonRow], claim: str, name: str) -> str:
     """Return which method has the smallest of a number, and the next one."""
-    # The comparison excludes NaN, which would break the order.
-    ranking = sorted(
-        (value, row.label) for row in rows if (value := of(row)) is not None and value >= 0.0
-    )
+    ranking = sorted((value, label) for label, value in _numbers(rows, name).items())
     if not ranking:
         return ""
     (least, label), *others = ranking
-    text = f"{label} {claim} ({least:.3g}{' ' + unit if unit else ''}"
+    unit = RUN_NUMBERS[name].unit.replace(ERROR, "m")
+    text = f"{label} {claim} ({least:.3g} {unit}".rstrip()
     if others:
         text += f"; next {others[0][1]}, {others[0][0]:.3g}"
     return text + ")."
 
 
 def _leader(rows: Sequence[ComparisonRow]) -> str:
-    errors = {row.label: row.numbers.leader.rmse for row in rows if row.numbers is not None}
-    values = {label: value for label, value in errors.items() if value is not None}
+    values = _numbers(rows, "leader_rmse")
     if not values:
         return ""
     least, most = min(values, key=values.__getitem__), max(values, key=values.__getitem__)
@@ -256,7 +246,7 @@ def _leader(rows: Sequence[ComparisonRow]) -> str:
 
 
 def _cheapest(rows: Sequence[ComparisonRow]) -> str:
-    times = {row.label: row.flight.computing for row in rows if row.flight is not None}
+    times = _numbers(rows, "computing")
     if len(times) < 2:
         return ""
     least, most = min(times, key=times.__getitem__), max(times, key=times.__getitem__)
@@ -290,21 +280,17 @@ def comparison_mapping(comparison: Comparison) -> JsonObject:
 
 
 def _row_mapping(row: ComparisonRow) -> JsonObject:
-    if row.flight is None or row.numbers is None:
+    if row.flight is None:
         return {"reason": row.reason}
-    result, numbers = row.flight.result, row.numbers
+    result, followers = row.flight.result, row.flight.metrics.followers
     return {
         "outcome": result.outcome.name.lower(),
-        "leader_rmse": numbers.leader.rmse,
-        "leader_steady_rmse": numbers.leader.steady_rmse,
-        "follower_rmse": {str(f.agent): f.rmse for f in numbers.followers},
-        "follower_steady_rmse": {str(f.agent): f.steady_rmse for f in numbers.followers},
-        "settling_time_s": row.settled,
-        "effort": row.effort,
-        "saturation_fraction": numbers.saturation_fraction,
-        "minimum_distance": numbers.minimum_distance,
-        "computing_s_per_agent_s": row.flight.computing,
+        **{
+            f"follower_{name}": {str(each.agent): getattr(each, name) for each in followers}
+            for name in ("rmse", "steady_rmse")
+        },
+        **row.flight.json(Shown.COMPARISON),
         "promise": row.flight.promise.as_mapping(),
-        "told": list(row.flight.received),
-        "solver": None if row.flight.solver is None else row.flight.solver._asdict(),
+        "told": list(result.drive.information.follower),
+        "solver": None if result.work is None else result.work._asdict(),
     }

@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Final
 
 from echelon.core.errors import OutputError, did_you_mean
+from echelon.experiments.results.quantity import ERROR
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS
 
 _PLACES: Final = (
     Path(__file__).with_name("glossary.md"),  # in a wheel
@@ -28,7 +30,15 @@ def glossary() -> dict[str, str]:
         name, _, text = block.split("\n\n")[0].partition("**: ")
         plain = _LINK.sub(r"\1", " ".join(text.split()))
         terms[name.strip("* ").replace("**", "")] = plain.replace("*", "")
-    return terms
+    return {**_numbers(), **terms}
+
+
+def _numbers() -> dict[str, str]:
+    """Return the meanings of the numbers in data sets and JSON, by name, with their units."""
+    return {
+        name: quantity.meaning + (f", {quantity.unit.replace(ERROR, 'm')}" if quantity.unit else "")
+        for name, quantity in {**AGENT_NUMBERS, **RUN_NUMBERS}.items()
+    }
 
 
 def explain_term(term: str) -> dict[str, str]:

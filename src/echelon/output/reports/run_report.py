@@ -4,15 +4,15 @@ import io
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
-from echelon.experiments.results.metrics import (
+from echelon.experiments.results.agent_metrics import (
     FollowerMetrics,
     LeaderMetrics,
     Metrics,
-    metrics,
-    quantities,
     representatives,
     steady_error,
 )
+from echelon.experiments.results.metrics import metrics
+from echelon.experiments.results.quantity import quantities
 from echelon.output.reports.explanation import explain
 from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
 from echelon.simulation.engine.result import Result
@@ -57,11 +57,11 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
     from rich.table import Table
 
     texts = {
-        "unit": "" if result.unit == "state" else f", {result.unit}",
+        "unit": result.length_unit and f", {result.length_unit}",
         "window": numbers.steady_window,
-        "settled": "1 cm" if result.unit == "m" else "0.01",
+        "settled": "1 cm" if result.length_unit else "0.01",
     }
-    columns = ["agent", *(quantity.label.format(**texts) for quantity in _COLUMNS.values())]
+    columns = ["agent", *(quantity.column.format(**texts) for quantity in _COLUMNS.values())]
     if printed:
         columns += ["printed,\nconsensus", "printed,\noptimiz."]
     agents = f"{result.graph.agents} x {type(result.model).__name__}"
@@ -91,7 +91,7 @@ def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
     rows = [[label, *(_cell(numbers, name) for name in _COLUMNS)] for label, numbers in agents]
     if printed:
         for k, row in enumerate(rows):
-            row += [_number(PRINTED[method][k]) for method in ("consensus", "optimization")]
+            row += [f"{PRINTED[method][k]:.4g}" for method in ("consensus", "optimization")]
     return rows
 
 
@@ -112,15 +112,7 @@ def labelled(
 
 def _cell(agent: LeaderMetrics | FollowerMetrics, name: str) -> str:
     """Return a cell of the table; empty if the agent's role has no such number."""
-    if name == "saturated":
-        return f"{100.0 * agent.saturated:.3g}"
     if not hasattr(agent, name):
         return ""
     value: float | None = getattr(agent, name)
-    if name == "settling_time" and value is None and agent.rmse is not None:
-        return "never"
-    return _number(value)
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
+    return "-" if value is None and agent.rmse is None else _COLUMNS[name].cell(value)

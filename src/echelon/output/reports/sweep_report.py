@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from echelon.core.types import Array, JsonObject
+from echelon.experiments.results.run_numbers import RUN_NUMBERS
 from echelon.experiments.sweeps.axes import SEED
-from echelon.experiments.sweeps.numbers import NUMBERS, SUMMARIZED
+from echelon.experiments.sweeps.numbers import SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def sweep_report(data: "xr.Dataset") -> str:
         if values is not None:
             low, median, high = (f"{value:.3g}" for value in values)
             label = name.replace("_", " ").capitalize()
-            unit = " s" if NUMBERS[name].unit == "s" else ""
+            unit = " s" if RUN_NUMBERS[name].unit == "s" else ""
             lines.append(f"- {label}: median {median}{unit}; 5 to 95 %: {low} to {high}{unit}.")
     return "\n".join([*lines, *_warnings(data), *_cases(data)])
 

@@ -77,14 +77,14 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
             sheet.line("median", np.median(rows, axis=1), 0, True),
         ]
     lines += _slope(run, errors[0].max(), 1.0)
-    marks = [{"value": SETTLED, "name": "1 cm" if run.unit else "0.01"}]
-    return _chart("formation error", run.unit, True, lines, marks)
+    marks = [{"value": SETTLED, "name": "1 cm" if run.length_unit else "0.01"}]
+    return _chart("formation error", run.length_unit, True, lines, marks)
 
 
 def _slope(run: Recording, begin: float, times: float) -> list[JsonObject]:
     """Return the line of the guaranteed rate from the first value on, if there is one."""
-    rate = run.promise["rate"] if run.promise["promised"] else None
-    if not rate or begin <= 0.0 or not np.isfinite(begin):
+    rate = run.rate
+    if rate is None or begin <= 0.0 or not np.isfinite(begin):
         return []
     slope = -times * rate / float(np.log(10.0))
     ends = [float(np.log10(begin)), slope]

@@ -71,7 +71,7 @@ class Growing:
 
 def _joined(before: Recording, stretch: Recording) -> Recording:
     """Return a part with the last frame of the previous one, for interpolation."""
-    names = ("times", "states", "inputs", "errors", "lyapunov")
+    names = ("times", "states", "inputs", "lyapunov")
     parts = {
         name: np.concatenate([getattr(before, name)[-1:], getattr(stretch, name)])
         for name in names

@@ -76,8 +76,6 @@ def serve(handler: type[BaseHTTPRequestHandler], port: int | None = None) -> Thr
         OutputError: none of the next 50 is free.
     """
     first = PORT if port is None else port
-    if not 0 <= first <= 65535:
-        raise OutputError(f"`--port` is {first}, and must be from 0 to 65535.")
     for number in range(first, min(first + _TRIES, 65536)):
         try:
             return _Server((HOST, number), handler)

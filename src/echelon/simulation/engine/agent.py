@@ -1,6 +1,7 @@
 """One agent in a process of its own: what a vehicle computes from its state and messages."""
 
-from collections.abc import Mapping
+import math
+import numbers
 from typing import NamedTuple, final
 
 import jax
@@ -9,45 +10,44 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
+from echelon.agents.network.inbox import Inbox, Message, NamedValues, Received
 from echelon.core.compiled import cached_jit
-from echelon.core.errors import SimulationError, check_kind, listing
+from echelon.core.errors import SimulationError, check_kind
 from echelon.core.numerics import precision
-from echelon.core.types import Array, Scalar, State
+from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.action import Action, act
+from echelon.simulation.step.action import Action, act, feedforward_of
 from echelon.simulation.step.loop import Loop, assemble
 from echelon.simulation.step.settings import Settings
-
-
-class Message(NamedTuple):
-    """What an agent sends.
-
-    Attributes:
-        signal: what its neighbours use: its state less its offset, or the signal of its law.
-        feedforward: the feed-forward of its input, of the same step; None before it has acted.
-    """
-
-    signal: Array
-    feedforward: Array | None = None
 
 
 @final
 class Agent:
     """One agent of a formation under laws, which knows its own state and what it receives.
 
-    In every step each agent sends its `hello`, and then takes its `step` with the messages that it
-    received: leaders first, where their input is fed forward, and followers by their distance from
+    In every step each agent sends its `hello`, and then takes its `step` after it received the
+    messages: leaders first, where their input is fed forward, and followers by their distance from
     the leaders where it is their parents'. Together they do what `simulate` does, to rounding.
+
+    A message may be missing: the last one of its sender is used, and a neighbour that sent none is
+    left out. Agents of other models are heard in the outputs that both have. Nothing that is not
+    finite reaches the memory.
 
     Args:
         parts: of the whole formation; the starts are not used.
         agent: its number.
         dt: how long its inputs are held, s.
         limits: whether the actuators' limits act on it.
+
+    Attributes:
+        number: its number.
+        neighbours: the numbers of those that it hears.
+        blind: how many steps repeated the last input, as the state, or what follows from it, was
+            not finite.
 
     Raises:
         EchelonError: the parts do not fit each other, or there is no such agent.
@@ -57,9 +57,9 @@ class Agent:
         """Prepare its law."""
         check_kind("parts", parts, Parts)
         check_kind("drive", parts.drive, Laws)
-        if not 0 <= agent < parts.graph.agents:
+        if not isinstance(agent, numbers.Integral) or not 0 <= agent < parts.graph.agents:
             raise SimulationError(
-                f"agent {agent} is not in this graph, whose agents are 0 to "
+                f"agent {agent!r} is not in this graph, whose agents are 0 to "
                 f"{parts.graph.agents - 1}."
             )
         prepared = prepare(parts, Settings(horizon=dt, dt=dt, limits=limits))
@@ -67,7 +67,7 @@ class Agent:
         assert isinstance(drive, Laws)
         with precision("float64"):
             self._loop = assemble(prepared.problem, drive.leader, drive.follower)
-        self.number, graph = agent, parts.graph
+        self.number, graph = int(agent), parts.graph
         self.leads = agent in graph.leaders
         self._law = self._loop.leader if self.leads else self._loop.follower
         exchange = self._loop.exchange
@@ -75,11 +75,15 @@ class Agent:
         self.neighbours = tuple(np.asarray(exchange.senders)[edges].tolist())
         self._weights = np.atleast_2d(np.asarray(exchange.weights))[:, edges]
         self._schedule = graph.schedule
-        self._source = self._source_in(parts)
+        with precision("float64"):
+            self._names = _names(self._loop, self._law)
+        self._inbox = Inbox(self.neighbours, self._source_in(parts), *self._names)
         self._memory: Memory | None = None
+        self._begun, self._time, self.blind = False, -math.inf, 0
+        self._last: tuple[Array, Message | None] = np.array(self._loop.model.trim[1], float), None
 
     def _source_in(self, parts: Parts) -> int | None:
-        """Return whose feed-forward this agent needs; None for nobody's."""
+        """Return whose feed-forward this agent uses; None for nobody's."""
         silent = self._loop.follower.feedforward is Feedforward.NONE
         if self.leads or silent and not self._loop.follower.turning:
             return None
@@ -87,67 +91,100 @@ class Agent:
             return int(self._loop.parents[self.number])
         return parts.graph.nearest_leader()[self.number]
 
-    def hello(self, x: ArrayLike) -> Message:
-        """Return the message of the agent at a state (n,), before it acts."""
-        with precision("float64"):
-            state = self._state(x)
-            return Message(np.asarray(_signal(self._loop, self._law, self._own(state))))
+    def receive(self, message: object) -> Received:
+        """Take a message of another agent, or return why it is not used. It never raises."""
+        return self._inbox.receive(message)
 
-    def step(
-        self, t: float, x: ArrayLike, messages: Mapping[int, Message]
-    ) -> tuple[Array, Message]:
+    def hello(self, x: ArrayLike) -> Message | None:
+        """Return the message of the agent at a state (n,), before it acts.
+
+        If the state is not finite, it is the last message, None if there was none.
+
+        Raises:
+            SimulationError: the state has another shape.
+        """
+        with precision("float64"):
+            signal = np.asarray(_signal(self._loop, self._law, self._own(self._state(x))))
+        return self._message(signal) if np.isfinite(signal).all() else self._last[1]
+
+    def step(self, t: float, x: ArrayLike) -> tuple[Array, Message | None]:
         """Return the physical input (m,) that is delivered from t (s) on, and the whole message.
+
+        They are the last ones if the state, or what follows from it, is not finite, and at first
+        the trim's input and None.
 
         Args:
             t: time, s.
             x: own state (n,).
-            messages: of the neighbours, by their numbers; that of the leader or the parent with
-                its feed-forward, where the law uses one.
 
         Raises:
-            SimulationError: one is missing, or the state has another shape.
+            SimulationError: the time goes back, or the state has another shape.
         """
-        weights = self._weights[0 if self._schedule is None else self._schedule.row(t)]
-        senders = [j for j, weight in zip(self.neighbours, weights, strict=True) if weight > 0.0]
-        missing = [j for j in senders if j not in messages]
-        forward = None
-        if self._source is not None:
-            forward = messages.get(self._source, Message(np.zeros(0))).feedforward
-        if missing or (forward is None and self._source is not None):
-            who = missing[0] if missing else self._source
-            what = "its message" if missing else "what it tells of its input"
+        if not isinstance(t, numbers.Real) or not self._time <= float(t) < math.inf:
             raise SimulationError(
-                f"agent {self.number} needs {what} of agent {who} at t = {t:g} s, and got messages "
-                f"of {listing(map(str, messages)) or 'nobody'}."
+                f"`t` is {t!r}, and must be a finite time in seconds that does not go back; the "
+                f"last step was at {self._time:g} s."
             )
+        self._time = float(t)
+        row = 0 if self._schedule is None else self._schedule.row(t)
         with precision("float64"):
-            received = jnp.asarray(np.array([messages[j].signal for j in senders]))
-            if forward is None:
-                forward = np.zeros(len(self._loop.model.input_names))
-            signal, action = _step(
+            step = _step(
                 self._loop,
                 self.leads,
-                jnp.asarray(float(t)),
+                jnp.asarray(self._time),
                 self._own(self._state(x)),
-                received,
-                weights[weights > 0.0],
-                jnp.asarray(forward),
+                self._inbox.signals,
+                self._weights[row],
+                self._inbox.feedforward,
             )
-        self._memory = action.memory
-        return np.asarray(action.input), Message(np.asarray(signal), np.asarray(action.message))
+        if step.finite:
+            self._memory, self._begun = step.action.memory, True
+            message = self._message(step.signal, step.action.message)
+            self._last = np.asarray(step.action.input), message
+        else:
+            self.blind += 1
+        return self._last
+
+    def _message(self, signal: ArrayLike, forward: ArrayLike | None = None) -> Message:
+        names, forward_names = self._names
+        sent = None if forward is None else NamedValues(forward_names, np.asarray(forward))
+        return Message(self.number, NamedValues(names, np.asarray(signal)), sent)
 
     def _state(self, x: ArrayLike) -> State:
-        state, n = jnp.asarray(np.asarray(x, float)), len(self._loop.model.state_names)
-        if state.shape != (n,):
+        state, n = np.asarray(x), len(self._loop.model.state_names)
+        if state.shape != (n,) or state.dtype.kind not in "iuf":
             raise SimulationError(
-                f"the state of an agent has shape {state.shape}, and needs {(n,)}."
+                f"the state of an agent has shape {state.shape} of {state.dtype}, and must have "
+                f"shape {(n,)} of numbers."
             )
-        if self._memory is None:
-            self._memory = _begin(self._loop, self._law, state)
-        return state
+        return jnp.asarray(state, float)
 
     def _own(self, state: State) -> "_OwnState":
-        return _OwnState(state, jnp.asarray(self._loop.offsets[self.number]), self._memory)
+        memory = self._memory if self._begun else _begin(self._loop, self._law, state)
+        return _OwnState(state, jnp.asarray(self._loop.offsets[self.number]), memory)
+
+
+def _names(loop: Loop, law: Law) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of what an agent sends: of its signal and of its feed-forward."""
+    model, follower = loop.model, loop.follower
+    x, v = jnp.zeros(len(model.state_names)), jnp.zeros(len(model.input_names))
+
+    def sizes() -> tuple[jax.Array, jax.Array]:
+        own = _OwnState(x, x, law.begin(model, x))
+        forward = feedforward_of(follower, model, x, v, own.memory)
+        return _signal(loop, law, own), forward
+
+    signal, forward = jax.eval_shape(sizes)
+    heading = ("heading",) * follower.turning
+    return (
+        _fitting(law.signal_names(model), signal.size),
+        (*_fitting(follower.message_names(model), forward.size), *heading),
+    )
+
+
+def _fitting(names: tuple[str, ...], size: int) -> tuple[str, ...]:
+    """Return names of as many values; numbers where a law of a user's own says no names."""
+    return names if len(names) == size else tuple(map(str, range(size)))
 
 
 class _OwnState(NamedTuple):
@@ -170,21 +207,42 @@ def _signal(loop: Loop, law: Law, own: _OwnState) -> Float[jax.Array, " s"]:
     return own.x - own.offset if signal is None else signal
 
 
+class _Step(NamedTuple):
+    """The signal (s,) of an agent, what it does, and whether both and its state are finite."""
+
+    signal: jax.Array
+    action: Action
+    finite: jax.Array
+
+
 @cached_jit
 def _step(
     loop: Loop,
     leads: bool,
     t: Scalar,
     own: _OwnState,
-    received: Float[jax.Array, "..."],
+    received: Float[jax.Array, "K s"],
     weights: Float[jax.Array, " K"],
     forward: Float[jax.Array, " k"],
-) -> tuple[Float[jax.Array, " s"], Action]:
-    """Return the signal and what the agent does with the signals that it received."""
-    law = loop.leader if leads else loop.follower
+) -> _Step:
+    """Return what the agent does with what it received, NaN for what it did not."""
+    law, model = loop.leader if leads else loop.follower, loop.model
     signal = _signal(loop, law, own)
-    states = law.signal(loop.model, *own) is None
-    difference = loop.model.difference if states else jnp.subtract
-    gaps = jax.vmap(lambda theirs: difference(signal, theirs))(received.reshape(-1, len(signal)))
+    states = law.signal(model, *own) is None
+    difference = model.difference if states else jnp.subtract
+    # The own value has no difference: a neighbour that is not heard does not act.
+    theirs = jnp.where(jnp.isnan(received), signal, received)
+    gaps = jax.vmap(lambda value: difference(signal, value))(theirs)
+    alone = jnp.zeros_like(forward)
+    if loop.follower.turning and not leads:
+        alone = alone.at[-1].set(law.heading(model, t, own.x))
+    forward = jnp.where(jnp.isnan(forward), alone, forward)
+    forward = jnp.zeros(len(model.input_names)) if leads else forward
     view = LocalView(t, own.x, own.offset, weights @ gaps, forward, loop.motion.dt)
-    return signal, act(loop, law, view, own.memory, leads)
+    action = act(loop, law, view, own.memory, leads)
+    return _Step(signal, action, _finite((own.x, signal, action)))
+
+
+def _finite(tree: PyTree) -> jax.Array:
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+    return jnp.all(jnp.array([jnp.isfinite(leaf).all() for leaf in leaves]))

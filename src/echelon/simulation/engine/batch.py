@@ -5,13 +5,13 @@ lane, or by JAX, where states may differ from those of a single run by rounding.
 after the other.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, TypeAlias, final
 from weakref import WeakKeyDictionary
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool
 
@@ -23,7 +23,7 @@ from echelon.simulation.engine.initial import Starts
 from echelon.simulation.engine.jax_stepper import JaxFormations
 from echelon.simulation.engine.law_drive import Laws, choose_engine, is_long, worth_native
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.engine.prepare import Prepared, prepare
+from echelon.simulation.engine.prepare import Prepared, channel_of, prepare
 from echelon.simulation.engine.record import Recorder
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import result_of, sample_reference, simulate
@@ -204,10 +204,13 @@ def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _Ba
     prepared, loop = case.prepared, case.loop
     assert loop is not None
     problem = prepared.problem._replace(settings=settings, states=states)
-    if prepared.parts.world.disturbance is not None:
-        motion = Motion.of(problem.model, prepared.parts.world, settings)
-        problem = problem._replace(motion=motion)
-        loop = eqx.tree_at(lambda x: x.motion, loop, motion)
+    world = prepared.parts.world
+    if world.disturbance is not None or world.network is not None:
+        # Draws of a seed of its own.
+        motion = Motion.of(problem.model, world, settings)
+        channel = channel_of(prepared.parts, settings)
+        problem = problem._replace(motion=motion, channel=channel)
+        loop = dataclasses.replace(loop, motion=motion, channel=channel)
     return _BatchJob(place, prepared._replace(problem=problem), loop)
 
 

@@ -75,9 +75,11 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
 
     Raises:
         EchelonError: a part is malformed or does not fit the others; the agents are not driven by
-            laws, or these have no gain; a variable is unknown; `settings.engine` is `native`, and
-            native code is unavailable.
+            laws, or these have no gain; messages are late; a variable is unknown;
+            `settings.engine` is `native`, and native code is unavailable.
     """
+    if parts.world.network is not None:
+        raise SimulationError("got a network, but derivatives are of messages that are never late.")
     with precision("float64"):
         prepared = _take(parts, settings, tuple(wrt))
         result = choose_engine(

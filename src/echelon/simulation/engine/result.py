@@ -13,16 +13,17 @@ from echelon.agents.world.world import World
 from echelon.core.errors import Outcome
 from echelon.core.pages import notebook_page
 from echelon.core.types import Array
+from echelon.simulation.engine.frame_numbers import FrameNumbers
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Drive
-from echelon.simulation.step.meter import Sums, measured_states
+from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats
 
 
 @final
 @dataclasses.dataclass(frozen=True, eq=False)
-class Result:
+class Result(FrameNumbers):
     """A run: T stored frames of N agents with n states and m inputs.
 
     Attributes:
@@ -92,24 +93,24 @@ class Result:
         return self.sums.chatter
 
     @property
-    def errors(self) -> Array:
-        """Deviation of each agent from its goal relative to its leader, (T, N, n).
-
-        The leaders' rows are zero.
-        """
-        # delta_i = y_i - y_0 (theory page), which V and the certified set are written in.
-        y = self.states - self.formation.offsets
-        return y - y[:, list(self.graph.nearest_leader())]
+    def offsets(self) -> Array:
+        """The goal offsets, (N, n)."""
+        return self.formation.offsets
 
     @property
-    def measured(self) -> tuple[int, ...]:
-        """Indices of the states that errors are measured on: the position if any, else all."""
-        return measured_states(self.model)
+    def nearest(self) -> Array:
+        """The leader nearest to each agent, (N,)."""
+        return np.array(self.graph.nearest_leader())
+
+    @property
+    def position(self) -> tuple[int, ...]:
+        """Indices of the states that are the position; none of an abstract agent."""
+        return self.model.position_indices()
 
     @property
     def unit(self) -> str:
         """The unit of errors: m for a position, `state` for abstract states."""
-        return "m" if self.model.position else "state"
+        return self.length_unit or "state"
 
     def __repr__(self) -> str:
         """Return the agents, the number of frames, and how the run ended."""

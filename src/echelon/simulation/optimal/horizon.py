@@ -17,6 +17,7 @@ import scipy.sparse
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import PlanError
+from echelon.core.linear import without_warnings
 from echelon.core.numerics import precision, rk4
 from echelon.core.types import Array
 from echelon.simulation.optimal.casadi import casadi, casadi_function
@@ -212,9 +213,10 @@ def _cost_to_go(model: ControlAffine, Q: Array, R: Array, dt: float) -> Array:
     # expm([[A, B], [0, 0]] dt) holds both matrices of a step with the input held, exactly.
     flow = scipy.linalg.expm(block * dt)
     try:
-        return scipy.linalg.solve_discrete_are(
-            flow[:n, :n], flow[:n, n:], np.diag(dt * Q), np.diag(dt * R)
-        )
+        with without_warnings():
+            return scipy.linalg.solve_discrete_are(
+                flow[:n, :n], flow[:n, n:], np.diag(dt * Q), np.diag(dt * R)
+            )
     except (np.linalg.LinAlgError, ValueError) as error:
         raise PlanError(
             f"the cost from the horizon's end on does not exist for `{type(model).__name__}`: "

@@ -9,7 +9,8 @@ import scipy.linalg
 
 from echelon.core.linear import matrix_exponential
 from echelon.core.types import Array
-from echelon.synthesis.certificates.margins import ClosedLoop, lowest, modes
+from echelon.synthesis.certificates.frequency import lowest
+from echelon.synthesis.certificates.margins import ClosedLoop, modes
 
 
 def invariant_ellipsoid(loop: ClosedLoop, E: Array, bound: float = 1.0) -> Array:

@@ -11,7 +11,6 @@ faster: the strength rho = 2 c lambda_min is all that a metric needs of the grap
 P and decides nothing: eigenvalues in the caller's own states accept or refuse it.
 """
 
-import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -20,7 +19,13 @@ import scipy.fft
 import scipy.linalg
 
 from echelon.core.errors import GainError, MissingExtraError, listing
-from echelon.core.linear import eigenvalue_text, riccati, symmetric_basis, symmetric_part
+from echelon.core.linear import (
+    eigenvalue_text,
+    riccati,
+    symmetric_basis,
+    symmetric_part,
+    without_warnings,
+)
 from echelon.core.types import Array
 from echelon.synthesis.certificates.axis_modes import AXIS, axis_modes, obstacle, vertices_of
 
@@ -272,8 +277,7 @@ def _least(cp: Any, goal: Any, cones: list[Any], gaps: list[Any]) -> bool:
     while True:
         active += new
         cones = [*cones, *(gaps[k] + _STRICT * np.eye(gaps[k].shape[0]) << 0 for k in new)]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with without_warnings():
             try:
                 # What a solver calls inaccurate may do, and what it calls solved may not:
                 # eigenvalues decide.

@@ -1,14 +1,14 @@
-"""Robustness margins of a stable linear loop: gain, delay, input scaling, string stability.
+"""Robustness margins of a stable linear loop: gain, input scaling, string stability.
 
 The law u = -c R^-1 B'P z splits over the eigenvectors of the grounded Laplacian into the modes
 A - c lambda B K, K = R^-1 B'P, one for each of its eigenvalues lambda; those of a directed graph
 may be complex, and one of a pair stands for both, whose modes mirror each other. All that is said
-here is of these matrices (kind: linearization), with the same delay or scale for every agent.
+here is of these matrices (kind: linearization), with the same scale for every agent.
 """
 
 import itertools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -17,13 +17,19 @@ from echelon.core.errors import GainError
 from echelon.core.linear import symmetric_basis
 from echelon.core.rational import bisect
 from echelon.core.types import Array
+from echelon.synthesis.certificates.frequency import frequencies, peaks, resolvent
 
 _FAR = 1e6  # factors on the coupling beyond this count as infinite
+_HALVINGS = 30  # of a rate
 _HIDDEN = 1e-9  # relative size below which a singular value or a damping counts as zero
 
 
 class ClosedLoop(NamedTuple):
-    """What every margin is of: the modes A - c lambda B R^-1 B'P for lambda in `eigenvalues`."""
+    """What every margin is of: the modes A - c lambda B R^-1 B'P for lambda in `eigenvalues`.
+
+    With `between` every real number from the least to the largest of them is an eigenvalue too, as
+    where only the extremes of a large graph are known.
+    """
 
     A: Array
     B: Array
@@ -31,6 +37,7 @@ class ClosedLoop(NamedTuple):
     R: Array
     coupling: float
     eigenvalues: Array
+    between: bool = False
 
     @property
     def K(self) -> Array:
@@ -48,14 +55,6 @@ class GainMargin(NamedTuple):
 
     low: float
     high: float
-
-
-class DelayMargin(NamedTuple):
-    """The least delay (s) that costs stability, or infinity, and where: w (rad/s) and lambda."""
-
-    delay: float
-    frequency: float
-    eigenvalue: complex
 
 
 class InputScaling(NamedTuple):
@@ -118,23 +117,34 @@ def gain_margin(loop: ClosedLoop) -> GainMargin:
     """
     modes(loop)
     G, strengths = loop.B @ loop.K, loop.strengths
-    real = np.real(strengths[np.imag(strengths) == 0.0])
-    edges = _crossings(loop.A, G, _FAR * real[-1]) if len(real) else real
-    ranges = [_ends(loop.A, G, float(k), edges) for k in real]
+    ranges = _real_ends(loop.A, G, np.real(strengths[np.imag(strengths) == 0.0]))
     for k in strengths[np.imag(strengths) != 0.0]:
-        ranges.append(_ends(loop.A, k * G, 1.0, _crossings(loop.A, k * G, _FAR)))
+        ranges.append(_ends(loop.A, k * G, np.ones(1), _crossings(loop.A, k * G, _FAR)))
     low, high = max(ends[0] for ends in ranges), min(ends[1] for ends in ranges)
     return GainMargin(low if low > 1.0 / _FAR else 0.0, high if high < 0.999 * _FAR else np.inf)
 
 
-def _ends(A: Array, G: Array, k: float, edges: Array) -> tuple[float, float]:
-    """Return the factors about 1 between which A - factor k G decays, by the k of its edges."""
+def _real_ends(A: Array, G: Array, strengths: Array) -> list[tuple[float, float]]:
+    """Return the factors about 1 for which A - factor k G decays, for runs of k without an edge."""
+    if not len(strengths):
+        return []
+    edges = _crossings(A, G, _FAR * strengths[-1])
+    probes = 0.5 * (edges[:-1] + edges[1:])
+    growing = np.linalg.eigvals(A - probes[:, None, None] * G).real.max(axis=1, initial=-1) >= 0.0
+    # All strengths of a run share both edges, so its least and largest speak for it.
+    runs = np.split(strengths, np.unique(np.searchsorted(strengths, probes[growing])))
+    return [_ends(A, G, run, edges) for run in runs if len(run)]
+
+
+def _ends(A: Array, G: Array, run: Array, edges: Array) -> tuple[float, float]:
+    """Return the factors about 1 between which A - factor k G decays for all k of a run."""
 
     def decays(k: float) -> bool:
         return bool(np.linalg.eigvals(A - k * G).real.max() < 0.0)
 
-    low = _edge(decays, k, edges[edges < k][::-1], 0.0)
-    return float(low / k), float(_edge(decays, k, edges[edges > k], _FAR * k) / k)
+    low = _edge(decays, run[0], edges[edges < run[0]][::-1], 0.0)
+    high = _edge(decays, run[-1], edges[edges > run[-1]], _FAR * run[-1])
+    return float(low / run[0]), float(high / run[-1])
 
 
 def decays_between(loop: ClosedLoop) -> bool:
@@ -143,61 +153,34 @@ def decays_between(loop: ClosedLoop) -> bool:
 
 
 def slowest_between(loop: ClosedLoop) -> float:
-    """Return the largest real part of a mode (1/s) at points that decide on all between extremes.
+    """Return the largest real part of a mode (1/s) over the real eigenvalues and all between them.
 
-    So the extremes of a large graph's spectrum speak for all of it: between the candidates of
-    `gain_margin` nothing can change its sign, and one sample decides.
+    Between the candidates of `gain_margin` no real part changes its sign, and one sample decides.
+    So does it for modes that are shifted by a rate, which is bisected.
     """
-    G, strengths = loop.B @ loop.K, loop.strengths
-    edges = _crossings(loop.A, G, strengths[-1])
-    ends = np.union1d(strengths, edges[edges > strengths[0]])
-    probes = np.union1d(ends, 0.5 * (ends[:-1] + ends[1:]))
-    closed = loop.A - probes[:, None, None] * G
-    return float(np.linalg.eigvals(closed).real.max())
+    return _slowest_between(loop.A, loop.B @ loop.K, loop.strengths)
 
 
-def delay_margin(loop: ClosedLoop) -> DelayMargin:
-    """Return the largest delay tau of all z, u = -c R^-1 B'P z(t - tau), that every mode survives.
+def _slowest_between(A: Array, G: Array, strengths: Array) -> float:
+    """Return the same of A - k G, over k in `strengths` and between the real ones."""
+    slowest = _at_probes(A, G, strengths)
+    if not slowest < 0.0:
+        return slowest
 
-    A root of det(s I - A + c lambda B K e^{-s tau}) reaches the axis at s = i w only where an
-    eigenvalue mu of K (i w I - A)^-1 B has size 1 / |c lambda|, and first at the delay that turns
-    c lambda mu into -1. The sizes are swept over frequency once and crossed for each lambda; of a
-    pair of complex ones both are looked at, so that w > 0 suffices.
+    def decays(rate: float) -> bool:
+        return _at_probes(A + rate * np.eye(len(A)), G, strengths) < 0.0
 
-    Raises:
-        GainError: a mode does not decay without delay.
-    """
-    closed, K, strengths = modes(loop), loop.K, loop.strengths
+    near = -(1.0 - 1e-6) * slowest
+    return -near if decays(near) else -float(bisect(decays, 0.0, near, _HALVINGS))
 
-    def loci(w: Array) -> Array:
-        # Times i w all are of one size, and real where A is nothing: LAPACK's sweeps do not end on
-        # some multiples of i that are almost one of the identity.
-        rotated = 1j * w[:, None, None]
-        mu = np.linalg.eigvals(rotated * (K @ _resolvent(loop.A, w, loop.B))) / rotated[:, 0]
-        return np.take_along_axis(mu, np.abs(mu).argsort(-1), -1)
 
-    def size(w: float, i: int, at: float = 0.0) -> float:
-        return float(np.abs(loci(np.array([w]))[0, i])) - at
-
-    from scipy.optimize import root_scalar  # which few runs need, and takes long to load
-
-    grid = _frequencies([loop.A, *closed])
-    columns = enumerate(np.abs(loci(grid)).T)
-    peaks = [_peaks(lambda w, i=i: size(w, i), grid, column) for i, column in columns]
-    grid = np.union1d(grid, np.concatenate(peaks))
-    sizes, best = np.abs(loci(grid)), DelayMargin(np.inf, 0.0, strengths[0] / loop.coupling)
-    for k in strengths:
-        for at, i in np.argwhere(np.diff(sizes > 1.0 / abs(k), axis=0)):
-            ends, sharp = (grid[at], grid[at + 1]), 1e-13 * grid[at]
-            edge = (i, 1.0 / abs(k))
-            w = root_scalar(size, edge, "brentq", ends, xtol=sharp).root
-            mu = loci(np.array([w]))[0]
-            # Loci that cross together share the size and differ in phase: the first one counts.
-            mu = mu[np.abs(np.abs(mu * k) - 1.0) < 1e-6]
-            phases = np.angle(-np.outer([k, np.conj(k)], mu)) % (2.0 * np.pi)
-            margin = DelayMargin(float(phases.min() / w), float(w), k / loop.coupling)
-            best = min(best, margin, key=lambda m: m.delay)
-    return best
+def _at_probes(A: Array, G: Array, strengths: Array) -> float:
+    """Return the largest real part of a mode where, among real strengths, a sign may change."""
+    real = np.real(strengths[np.imag(strengths) == 0.0])
+    edges = _crossings(A, G, real[-1])
+    ends = np.union1d(real, edges[edges > real[0]])
+    probes = np.union1d(np.union1d(ends, 0.5 * (ends[:-1] + ends[1:])), strengths)
+    return float(np.linalg.eigvals(A - probes[:, None, None] * G).real.max())
 
 
 def input_scaling(
@@ -216,15 +199,17 @@ def input_scaling(
     A, B, m = loop.A, loop.B, loop.B.shape[1]
     if not 0.0 <= spread < 1.0 or m > 12:
         raise GainError(f"`spread` is {spread} on {m} inputs; allowed are [0, 1) and 12 inputs.")
-    K, values = loop.K, np.unique(loop.eigenvalues)
+    K, strengths = loop.K, loop.strengths
     slopes = np.zeros((m, *A.shape)) if slopes is None else slopes
     worst = InputScaling(-np.inf, (), 0.0)
     for scales in itertools.product((1.0 - spread, 1.0 + spread), repeat=m):
         plant = A + np.tensordot(np.array(scales) - 1.0, slopes, 1)
-        closed = plant - loop.coupling * values[:, None, None] * (B * np.array(scales) @ K)
-        abscissas = np.linalg.eigvals(closed).real.max(1)
-        at = int(abscissas.argmax())
-        margin = InputScaling(float(abscissas[at]), scales, values[at])
+        G = B * np.array(scales) @ K
+        abscissas = np.linalg.eigvals(plant - strengths[:, None, None] * G).real.max(1)
+        at, slowest = int(abscissas.argmax()), float(abscissas.max())
+        if loop.between:
+            slowest = _slowest_between(plant, G, strengths)
+        margin = InputScaling(slowest, scales, strengths[at] / loop.coupling)
         worst = max(worst, margin, key=lambda m: m.abscissa)
     return worst
 
@@ -242,11 +227,11 @@ def string_gain(loop: ClosedLoop) -> StringGain:
     K = loop.coupling * loop.K
 
     def sizes(w: Array) -> Array:
-        return np.linalg.norm(K @ _resolvent(closed, w, loop.B), ord=2, axis=(-2, -1))
+        return np.linalg.norm(K @ resolvent(closed, w, loop.B), ord=2, axis=(-2, -1))
 
     # The sweep is logarithmic, so w = 0 is added by hand.
-    grid = np.append(0.0, _frequencies([loop.A, closed]))
-    grid = np.union1d(grid, _peaks(lambda w: float(sizes(np.array([w]))[0]), grid, sizes(grid)))
+    grid = np.append(0.0, frequencies([loop.A, closed]))
+    grid = np.union1d(grid, peaks(lambda w: float(sizes(np.array([w]))[0]), grid, sizes(grid)))
     at = int(sizes(grid).argmax())
     return StringGain(float(sizes(grid)[at]), float(grid[at]))
 
@@ -306,41 +291,6 @@ def _positive(fixed: Array, moved: Array, top: float) -> Array:
     # Rounding splits double roots into complex pairs; a candidate too many costs one sample.
     real = np.isfinite(k) & (np.abs(k.imag) <= 1e-3 * np.abs(k)) & (k.real > 0.0)
     return np.unique(k.real[real & (k.real < top)])
-
-
-def _resolvent(A: Array, w: Array, B: Array) -> Array:
-    """Return (i w I - A)^-1 B for each frequency, (N, n, m)."""
-    return np.linalg.solve(1j * w[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex))
-
-
-def _frequencies(matrices: list[Array]) -> Array:
-    """Return frequencies up to the largest norm of the matrices, denser about their resonances."""
-    # |w| <= |A - k B K z| for |z| = 1, which is at most twice the norm of A and that of A - k B K.
-    top = 3.0 * max(float(np.linalg.norm(M, 2)) for M in matrices) or 1.0
-    poles = np.concatenate([np.linalg.eigvals(M) for M in matrices])
-    width = np.maximum(np.abs(poles.real), 1e-6 * np.abs(poles))
-    steps = np.geomspace(0.05, 20.0, 12)
-    near = np.abs(poles.imag)[:, None] + width[:, None] * np.concatenate([-steps, steps])
-    # 400 frequencies a decade.
-    sweep = np.geomspace(1e-9 * top, top, 3600)
-    return np.union1d(sweep, near[near > sweep[0]])
-
-
-def _peaks(f: Callable[[float], float], grid: Array, values: Array) -> Array:
-    """Return the local maxima of f between the points of a grid where it has these values."""
-    middle, left, right = values[1:-1], values[:-2], values[2:]
-    # A flat stretch has maxima by rounding, which are no peaks.
-    tops = (middle >= left) & (middle >= right) & (middle > (1.0 + 1e-9) * np.minimum(left, right))
-    around = [(grid[k - 1], grid[k + 1]) for k in np.flatnonzero(tops) + 1]
-    return np.array([lowest(lambda w: -f(w), *ends).x for ends in around])
-
-
-def lowest(f: Callable[[float], float], low: float, high: float) -> Any:
-    """Return SciPy's account of the least f between two points, where it has one minimum."""
-    from scipy.optimize import minimize_scalar
-
-    sharp = {"xatol": 1e-7 * (high - low)}
-    return minimize_scalar(f, None, (low, high), (), "bounded", options=sharp)
 
 
 def _unobservable(A: Array, C: Array) -> Array:

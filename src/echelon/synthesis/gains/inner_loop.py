@@ -9,7 +9,7 @@ from echelon.agents.models.linearization import Linearization
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import GainError, listing
-from echelon.core.linear import Weight, riccati, symmetric_part
+from echelon.core.linear import Weight, riccati, symmetric_part, without_warnings
 from echelon.core.types import Array
 from echelon.synthesis.gains.gain import Feedback, Method
 from echelon.synthesis.gains.weights import weights_of
@@ -124,7 +124,13 @@ def _monotone(model: ControlAffine, A: Array, fixed: list[int], weights: Array) 
     inner = A[np.ix_(free, free)]
     # Without other states nothing needs to decay; -1 stands for a mode that does.
     slow = np.linalg.eigvals(inner).real.max() if free else -1.0
-    if slow >= 0.0:
+    one = np.eye(len(free))
+    with without_warnings():
+        # With any positive weights V does not rise, since y is constant; they only set rates.
+        decaying = scipy.linalg.solve_continuous_lyapunov(inner.T, -one)
+        exact = np.allclose(inner.T @ decaying + decaying @ inner, -one, atol=1e-6)
+    # SciPy moves a mode that is nearly on the axis, and solves another equation.
+    if slow >= 0.0 or not exact:
         names = listing(model.state_names[k] for k in free)
         raise GainError(
             f"the inner loop leaves a mode at {slow:.3g} 1/s among {names}, and must damp them all."
@@ -133,8 +139,7 @@ def _monotone(model: ControlAffine, A: Array, fixed: list[int], weights: Array) 
     # The columns of the symmetric states are zero in A, so y = x_f - A_fs A_ss^-1 x_s has ydot = 0.
     T_inverse[np.ix_(fixed, free)] = -A[np.ix_(fixed, free)] @ np.linalg.inv(inner)
     core = np.zeros_like(A)
-    # With any positive weights V does not rise, since y is constant; they only set rates.
     core[fixed, fixed] = weights
-    core[np.ix_(free, free)] = scipy.linalg.solve_continuous_lyapunov(inner.T, -np.eye(len(free)))
+    core[np.ix_(free, free)] = decaying
     # P A + A'P = T^-T diag(0, -I) T^-1 <= 0. Rounding leaves it a little off symmetry.
     return symmetric_part(T_inverse.T @ core @ T_inverse)

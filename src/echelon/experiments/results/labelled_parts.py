@@ -1,0 +1,113 @@
+"""Labelled arrays of the parts of a run, which are known before it starts."""
+
+import numpy as np
+from jaxtyping import Bool
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.hearing import heard_along
+from echelon.core.types import Array, JsonObject
+from echelon.experiments.results.labelled import Labelled, Variables
+from echelon.experiments.results.recording import FORMAT
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.settings import Settings
+
+
+def labelled_parts(parts: Parts, settings: Settings) -> Labelled:
+    """Return the arrays of `dataset` that do not depend on how a run went.
+
+    Args:
+        parts: of the run, with its drive completed.
+        settings: of the run.
+    """
+    model, graph = parts.model, parts.graph
+    agents = np.arange(graph.agents)
+    variables: Variables = {
+        "offset": (("agent", "state"), parts.formation.offsets),
+        "is_leader": ("agent", np.isin(agents, graph.leaders).astype(np.int8)),
+        "nearest_leader": ("agent", np.array(graph.nearest_leader())),
+        **_edges(parts),
+        **_gain(parts),
+        **_limits(model, settings),
+    }
+    coordinates = {
+        "agent": agents,
+        "state": list(model.state_names),
+        "state_unit": ("state", list(model.state_units)),
+        "input": list(model.input_names),
+        "input_unit": ("input", list(model.input_units)),
+        "output": list(model.output_names),
+        "output_unit": ("output", _output_units(model)),
+    }
+    return Labelled(variables, coordinates, _attributes(parts, settings))
+
+
+def _attributes(parts: Parts, settings: Settings) -> JsonObject:
+    """Return parts and settings as attributes that netCDF can hold."""
+    numbers = {**settings._asdict(), "steady_window": settings.window}
+    world = parts.world.describe(parts.model)
+    return {
+        **{key: text for key, text in world.items() if text is not None},
+        **{key: int(v) if isinstance(v, bool) else v for key, v in numbers.items()},
+        **{
+            f"{role}_needs": "; ".join(received) or "nothing"
+            for role, received in parts.drive.information._asdict().items()
+        },
+        "model": type(parts.model).__name__,
+        "position": " ".join(parts.model.position),
+        "directed": int(parts.graph.directed),
+        "format": FORMAT,
+    }
+
+
+def _edges(parts: Parts) -> Variables:
+    """Return the edges of the graph, who receives along them, and their weights over time."""
+    graph, schedule = parts.graph, parts.graph.schedule
+    variables: Variables = {
+        "edge_agents": (("edge", "end"), graph.edges),
+        "edge_weight": ("edge", graph.weights),
+        "edge_heard": (("edge", "end"), heard_in(parts).astype(np.int8)),
+    }
+    if schedule is not None:
+        variables["stretch_start"] = ("stretch", schedule.starts, {"units": "s"})
+        variables["edge_weight_then"] = (("stretch", "edge"), schedule.weights)
+        period = np.inf if schedule.period is None else schedule.period
+        variables["graph_period"] = ((), period, {"units": "s"})
+    return variables
+
+
+def _output_units(model: ControlAffine) -> list[str]:
+    """Return the units of the outputs, known for those that are states."""
+    units = dict(zip(model.state_names, model.state_units, strict=True))
+    return [units.get(name, "") for name in model.output_names]
+
+
+def heard_in(parts: Parts) -> Bool[Array, "E 2"]:
+    """Return whether each end of each edge receives from the other under the laws."""
+    drive = parts.drive
+    reacts = drive.reacts or "neighbours' states" in drive.information.leader
+    # A drive without laws, such as plans, uses all neighbours.
+    leaderward = getattr(getattr(drive, "follower", None), "leaderward", False)
+    return heard_along(parts.graph, leaderward, reacts)
+
+
+def _gain(parts: Parts) -> Variables:
+    """Return the gain; nothing without one."""
+    gain = parts.drive.gain
+    if gain is None:
+        return {}
+    return {
+        # A variable cannot have the same dimension twice, so columns have another one.
+        "P": (("state", "state_column"), gain.P),
+        "R": (("input", "input_column"), gain.R),
+        "coupling": ((), gain.coupling),
+    }
+
+
+def _limits(model: ControlAffine, settings: Settings) -> Variables:
+    """Return the limits of the inputs; nothing without limits."""
+    limits = model.input_limits if settings.limits else None
+    if limits is None:
+        return {}
+    matrix, low, high = (np.asarray(part, np.float64) for part in limits)
+    rows = {"limit_low": ("limit", low), "limit_high": ("limit", high)}
+    return {"limit_matrix": (("limit", "input"), matrix), **rows}

@@ -1,0 +1,94 @@
+"""Numbers that follow from the stored frames of a run, computed now or read from its dataset."""
+
+import abc
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from echelon.core.types import Array
+
+_FEW = 8
+"""Agents up to which comparing all pairs is faster than a search for the nearest."""
+
+
+class _Frames(Protocol):
+    """What the numbers are computed from."""
+
+    @property
+    def states(self) -> Float[Array, "T N n"]: ...
+
+    @property
+    def offsets(self) -> Float[Array, "N n"]: ...
+
+    @property
+    def nearest(self) -> Int[Array, " N"]: ...
+
+    @property
+    def position(self) -> tuple[int, ...]: ...
+
+    @property
+    def measured(self) -> tuple[int, ...]: ...
+
+    @property
+    def errors(self) -> Float[Array, "T N n"]: ...
+
+
+class FrameNumbers(abc.ABC):
+    """Numbers of T frames of N agents with n states, of a `Result` and of a `Recording`."""
+
+    @property
+    def measured(self: _Frames) -> tuple[int, ...]:
+        """Indices of the states that errors are measured on: the position if any, else all."""
+        return self.position or tuple(range(self.offsets.shape[1]))
+
+    @property
+    def length_unit(self: _Frames) -> str:
+        """The unit of errors: m for a position, nothing for abstract states."""
+        return "m" if self.position else ""
+
+    @property
+    def errors(self: _Frames) -> Float[Array, "T N n"]:
+        """Deviation of each agent from its goal relative to its nearest leader.
+
+        The leaders' rows are zero.
+        """
+        # delta_i = y_i - y_0 (theory page), which V and the certified set are written in.
+        y = self.states - self.offsets
+        return y - y[:, self.nearest]
+
+    @property
+    def goals(self: _Frames) -> Float[Array, "T N n"]:
+        """The states that the agents would have without errors."""
+        return self.states - self.errors
+
+    @property
+    def formation_errors(self: _Frames) -> Float[Array, "T N"]:
+        """Each agent's distance from its goal."""
+        # Where a square overflows, the length is infinite.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.linalg.norm(self.errors[:, :, list(self.measured)], axis=2)
+
+    def least_distances(
+        self: _Frames, frames: slice | Array = slice(None)
+    ) -> Float[Array, " F"] | None:
+        """Return the smallest distance between two agents in frames, NaN if one is not finite.
+
+        None without a position.
+        """
+        if not self.position:
+            return None
+        places = self.states[frames][:, :, list(self.position)]
+        least = np.full(len(places), np.nan)
+        finite = np.isfinite(places).all(axis=(1, 2))
+        least[finite] = _least(places[finite])
+        return least
+
+
+def _least(places: Float[Array, "T N k"]) -> Float[Array, " T"]:
+    if places.shape[1] <= _FEW:
+        i, j = np.triu_indices(places.shape[1], 1)
+        return np.linalg.norm(places[:, i] - places[:, j], axis=2).min(axis=1)
+    from scipy.spatial import KDTree
+
+    return np.array([KDTree(points).query(points, k=2)[0][:, 1].min() for points in places])

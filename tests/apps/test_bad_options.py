@@ -1,0 +1,52 @@
+"""An option that no input could satisfy is rejected at once: before JAX is loaded."""
+
+import subprocess
+import sys
+
+import pytest
+
+CALL = """
+import sys
+sys.modules["jax"] = None
+from echelon.apps.cli.app import main
+main()
+"""
+PORT = "`--port` is {}, and must be from 0 to 65535."
+GONE = "`gone` does not exist; give the folder of a run, or its `run.nc`."
+KINDS = "`csv`, `parquet`, `npz`, `mat`"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ("live paper --port 99999", PORT.format(99999)),
+        ("view . --port -1", PORT.format(-1)),
+        ("view gone", GONE),
+        ("plot gone", GONE),
+        ("report gone", GONE),
+        ("video gone out.mp4", GONE),
+        ("video . out.avi", "`out.avi` ends in `.avi`, and must end in .mp4 or .gif."),
+        ("export gone", GONE),
+        ("export . --to xls", f"`--to` is `xls`, and must be one of {KINDS}."),
+        ("plot . --what top_vieu", "there is no figure `top_vieu` (did you mean `top_view`?)"),
+        (
+            "sweep paper --over seed=0..3 --cluster tcp://127.0.0.1:1",
+            "the cluster at `tcp://127.0.0.1:1` does not answer: Connection refused.",
+        ),
+        (
+            "sweep paper --over seed=0..3 --cluster 127.0.0.1",
+            "`--cluster` is `127.0.0.1`, and must be an address with a port, such as "
+            "`tcp://host:8786`.",
+        ),
+    ],
+)
+def test_a_bad_option_is_rejected_before_anything_is_loaded(tmp_path, arguments, sentence):
+    done = subprocess.run(
+        [sys.executable, "-c", CALL, *arguments.split()],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith(f"echelon: {sentence}")
