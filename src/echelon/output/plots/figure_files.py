@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from echelon.core.errors import OutputError, did_you_mean, listing
+from echelon.core.errors import OutputError, check_name
 from echelon.core.files import make_atomic
 
 if TYPE_CHECKING:
@@ -25,11 +25,7 @@ def check_names(names: Sequence[str]) -> None:
         OutputError: there is no figure of a name.
     """
     for name in names:
-        if name not in NAMES:
-            raise OutputError(
-                f"there is no figure `{name}`{did_you_mean(name, NAMES)}; a run has "
-                f"{listing(NAMES)}."
-            )
+        check_name("the figure is", name, NAMES, OutputError)
 
 
 def save(
