@@ -24,6 +24,8 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 
 _PROOF = Kind.PROOF
+_TOGETHER = 1e-9
+"""In flat coordinates; leaders that start nearer to each other differ by rounding."""
 
 
 class StoppingRun(NamedTuple):
@@ -61,9 +63,17 @@ class StoppingRun(NamedTuple):
     @property
     def rate(self) -> float:
         """The slowest mode of the formation, 1/s, as a positive number."""
-        agreement = self.agreement
-        moves = max(self.law.ready.chains.degrees) > 1
-        return min(self.law.slowest_root, agreement) if moves else agreement
+        modes = [self.agreement]
+        if max(self.law.ready.chains.degrees) > 1:
+            modes.append(self.law.slowest_root)
+        if self.apart:
+            modes.append(float(self.leader.strength(self.settings.dt)))
+        return min(modes)
+
+    @property
+    def apart(self) -> bool:
+        """Whether leaders start apart, so that their own agreement is in the errors."""
+        return bool(np.ptp(self.flat[list(self.parts.graph.leaders)], axis=0).max() > _TOGETHER)
 
     @property
     def agreement(self) -> float:
@@ -157,9 +167,11 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     yield unneeded(Hypothesis.DETECTABLE, _PROOF, text)
     yield holds(Hypothesis.MATCHED_MOTION, _PROOF, run.law.information[1])
     yield holds(Hypothesis.COUPLING, _PROOF, "any coupling suffices", c, f"c {c:.4g}, edge 0")
-    text = "the slower of the slowest root and c lambda_min; far away the `speed` limits it"
+    text = "c lambda_min"
     if run.parts.graph.schedule is not None:
-        text = "the slower of the slowest root and of the agreement over a period, or eventually"
+        text = "the agreement over a period, or eventually"
+    text += ", and the leaders' own coupling" * run.apart
+    text = f"the slowest of the roots, {text}; far away the `speed` limits it"
     yield holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, -run.rate, f"{-run.rate:.3g} 1/s")
     text = "the law is linear in flat coordinates everywhere"
     yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)
