@@ -74,6 +74,7 @@ def plan_of(
         one_leader=one_leader,
         weighted=weighted or bool((np.asarray(loop.exchange.weights) != 1.0).any()),
         edges=loop.meter.measured,
+        exception_row=rows.exception.start,
         table=(n if tracks else 0) + (varying.count if in_table else 0),
         dt=loop.motion.dt,
     )
