@@ -29,7 +29,7 @@ from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import result_of, sample_reference, simulate
 from echelon.simulation.native.kernel_cache import KERNELS
 from echelon.simulation.native.program_key import ProgramKeys
-from echelon.simulation.native.stepper import NativeStepper, beyond
+from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.native.threads import processors
 from echelon.simulation.step.drive import Stepper
 from echelon.simulation.step.loop import Loop, assemble
@@ -154,7 +154,7 @@ class Batch:
             for job, record, lost in zip(
                 jobs, recorder.close(Outcome.INTERRUPTED), far, strict=True
             )
-            # Those beyond the kernels' range are run again by JAX, each by itself.
+            # Those others are run again, each by itself.
             if not lost
         }
 
@@ -162,17 +162,15 @@ class Batch:
 def _fly(
     stepper: Stepper, first: Prepared, recorder: Recorder, progress: StepCount | None
 ) -> Bool[np.ndarray, " F"]:
-    """Take all steps; return which formations went beyond what native code computes."""
+    """Take all steps; return for which formations native code does not compute what JAX does."""
     now, far = stepper.start(), np.zeros(len(recorder.problems), bool)
-    bits = int(first.problem.settings.precision[5:])
     while not recorder.ended:
         done, grid = recorder.done, recorder.grid
         reference = sample_reference(first, done, grid.longest + 1)
         chunk = stepper.advance(now, grid.counts(done), reference)
         recorder.keep(chunk, reference, 0.0)
-        if stepper.engine == "native":
-            by_formation = chunk.states.reshape(len(chunk.states), len(far), -1)
-            far |= beyond(by_formation, bits).any(axis=(0, 2))
+        if isinstance(stepper, NativeStepper):
+            far |= stepper.inexact
         now = chunk.now
         if progress is not None:
             progress(recorder.done, grid.steps)

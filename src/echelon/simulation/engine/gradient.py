@@ -228,7 +228,7 @@ class Native:
         backward = self._backward(_uses_distances(cost, self._shapes))
         sums = backward.run()
         if sums is None:
-            raise Unsupported("states beyond the range of its sines")
+            raise Unsupported("angles or whole numbers as large as these")
         value, by_sums = _cost_slopes(cost, sums)
         slopes = backward.slopes(by_sums)
         parts = dict(zip(self._order, slopes.leaves, strict=True))
