@@ -51,6 +51,7 @@ class ModelSpec(BaseModel, **_either("name", "python")):
     """Whether parameters that no rigid body can have are accepted."""
 
 
+@final
 class VariationSpec(BaseModel, **STRICT):
     """An actual agent, where it differs from the model."""
 
@@ -61,9 +62,13 @@ class VariationSpec(BaseModel, **STRICT):
 
 
 @final
-class PlantSpec(VariationSpec):
+class PlantSpec(BaseModel, **STRICT):
     """The actual agents, where they differ from the model that laws and gains use."""
 
+    parameters: Annotated[dict[str, Numeric], Unit("the parameters'")] = {}
+    """Parameters that differ, in the model's units."""
+    scale: Annotated[dict[str, Positive], Unit("1")] = {}
+    """Factors on the model's parameters; a list is multiplied number by number."""
     agents: dict[int, VariationSpec] = {}
     """By number, agents that differ from the others; theirs replaces what stands above."""
 

@@ -12,7 +12,7 @@ from echelon.agents.world.plant import check_plant, vary_parameters
 from echelon.agents.world.sensing import Sensing
 from echelon.experiments.scenario.fault_list import FaultList
 from echelon.experiments.scenario.scenario import Scenario
-from echelon.experiments.scenario.sections import VariationSpec
+from echelon.experiments.scenario.sections import PlantSpec, VariationSpec
 from echelon.laws.law import Law
 from echelon.simulation.engine.law_drive import Laws
 
@@ -25,7 +25,7 @@ def plants_of(
     if spec is None:
         return None, {}
 
-    def varied(part: VariationSpec) -> ControlAffine:
+    def varied(part: VariationSpec | PlantSpec) -> ControlAffine:
         plant = vary_parameters(model, part.parameters, part.scale)
         check_model(plant)
         check_plant(model, plant)
