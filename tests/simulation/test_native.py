@@ -418,23 +418,33 @@ def test_what_has_no_native_code_runs_by_jax_and_says_why():
     assert "`erf_inv`" in warning
 
 
-def test_states_beyond_the_range_of_the_sines_are_stepped_by_jax():
+class Swings(ech.laws.Law):
+    """Reads an angle that is no state, and grows with it."""
+
+    def update(self, model, view, memory):
+        return jnp.sin(1e7 * view.x[:1] ** 3), memory
+
+
+def test_angles_that_are_too_large_are_stepped_by_jax():
     model = ech.models.SingleIntegrator(dimension=1)
-    graph = ech.Graph.path(2)
-    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Agreement())
-    parts = ech.Parts(
-        model, graph, ech.Formation(np.zeros((2, 1))), drive, initial=np.array([[0.0], [1e6]])
-    )
-    (ours, stepper), (theirs, _) = (
-        stepped(parts, run_settings(), (10,), name) for name in ("native", "jax")
-    )
-    assert stepper.engine == "native"
-    assert ours.states.tobytes() == theirs.states.tobytes()
-    [warning] = stepper.warnings
-    assert warning == (
-        "From t = 0 s on, JAX stepped the agents whenever a state was beyond 100000, where the "
-        "sines of native code lose digits."
-    )
+    drive = ech.Laws(ech.laws.TrimInput(), Swings())
+    for start, agrees in ((2.0, False), (1e3, True)):
+        parts = ech.Parts(
+            model, LINE, ech.Formation(np.zeros((2, 1))), drive, initial=np.array([[0.0], [start]])
+        )
+        (ours, stepper), (theirs, _) = (
+            stepped(parts, run_settings(), (10,), name) for name in ("native", "jax")
+        )
+        assert stepper.engine == "native"
+        assert (ours.states.tobytes() == theirs.states.tobytes()) or not agrees
+        assert (
+            stepper.warnings
+            == (
+                "From t = 0 s on, JAX stepped the agents whenever an angle or a whole number "
+                "was too large for native code.",
+            )
+            * agrees
+        )
 
 
 def test_an_agent_that_is_lost_is_told_as_by_jax():

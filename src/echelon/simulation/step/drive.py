@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.network.channel import Channel
+from echelon.agents.network.channel import Channel, Network
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError
@@ -209,6 +209,17 @@ class Drive(eqx.Module):
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return what is allowed but probably not meant, a sentence each."""
         return ()
+
+    def check_network(self, network: Network, graph: Graph, dt: float) -> None:
+        """Check that a network that is not ideal suits the drive, at a step dt (s).
+
+        Raises:
+            SimulationError: it does not.
+        """
+        raise SimulationError(
+            f"got a network, but `{type(self).__name__}` optimizes inputs, whose exchange over a "
+            "network is not simulated; use control laws, or remove `network`."
+        )
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of a run under a drive that is prepared.
