@@ -563,6 +563,55 @@ def test_a_push_that_carries_the_leader_away_is_told():
     assert promised(flight(observer=True, world=wind)).promised
 
 
+def drifting(model, plant, reference, speed):
+    """How fast a leader alone is carried off its path in the end, m/s, and its promise."""
+    drive = ech.Laws(
+        StoppingLeader(reference=reference, observer=False, speed=speed),
+        StoppingPoint(observer=False),
+    )
+    goals = ech.Formation(np.zeros((2, len(model.state_names))))
+    parts = ech.Parts(
+        model, ech.Graph([(0, 1)]), goals, drive, initial=None, world=ech.World(plant=plant)
+    )
+    settings = ech.Settings(horizon=40.0, dt=0.01, limits=False)
+    result, found = ech.simulate(parts, settings), promise(parts, settings)
+    place = list(model.position_indices())
+    off = np.linalg.norm((result.states[:, 0] - result.reference)[:, place], axis=1)
+    middle = len(off) // 2
+    return (off[-1] - off[middle]) / (result.times[-1] - result.times[middle]), found
+
+
+@pytest.mark.parametrize("share", [0.95, 1.05])
+def test_a_plant_with_drag_behind_a_straight_path_demands_its_drag(share):
+    # The model lacks 0.8 * 2 m/s^2 along the path, of which agreement makes up 1 / root.
+    demand = 0.8 * 2.0 / 4.0
+    line = ech.references.Line(velocity=(2.0, 0.0, 0.0))
+    plant = ech.models.DoubleIntegrator(2, drag=0.8)
+    speed, found = drifting(CARTS, plant, line, share * demand)
+    assert (speed > 0.01) == (share < 1.0) != found.promised
+    assert (f"demands a speed of {demand:.3g}" in found.sentence()) == (share < 1.0)
+
+
+def test_drag_that_turns_with_the_path_demands_nothing_that_lasts():
+    circle = ech.references.Circle(radius=2.0, rate=1.0)
+    plant = ech.models.DoubleIntegrator(2, drag=0.8)
+    speed, found = drifting(CARTS, plant, circle, 0.3)
+    assert speed < 0.01 and found.promised
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.7, 1.3])
+@pytest.mark.parametrize("share", [0.95, 1.05])
+def test_a_plant_of_another_mass_demands_what_it_needs_at_rest(factor, share):
+    k0, k1 = np.poly(-np.array([4.0, 4.5, 5.0]))[:1:-1]
+    # The thrust at which it rests makes the model fall, or rise, by this.
+    demand = k1 / k0 * 9.81 * abs(factor - 1.0)
+    plant = ech.models.Quadrotor(mass=factor * QUADROTOR.mass)
+    speed, found = drifting(QUADROTOR, plant, ech.references.Hover(), share * demand)
+    assert (speed > 0.01) == (share < 1.0) != found.promised
+    assert (f"demands a speed of {demand:.3g}" in found.sentence()) == (share < 1.0)
+
+
 @pytest.mark.parametrize("observer", [True, False])
 def test_a_current_that_carries_the_leader_away_is_told_with_an_observer_too(observer):
     # It moves a position with no force: x' = v + d, which no rate of v shows.

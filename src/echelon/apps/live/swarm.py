@@ -18,7 +18,7 @@ from echelon.core.compiled import cached_jit
 from echelon.core.errors import GraphError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, PyTree
-from echelon.experiments.results.lyapunov import goes_both_ways, potential
+from echelon.experiments.results.lyapunov import fixed_metric, potential
 from echelon.laws.law import Law
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
@@ -173,11 +173,10 @@ class LiveLoop:
 
     def _potential(self, knobs: Knobs) -> Callable[[Array], Array] | None:
         """Return the function that computes V; None without a P or for a disconnected graph."""
-        gain = self.panel.gain(knobs)
-        P = self.parts.drive.metric(self.parts.model) if gain is None else gain.P
-        # The P of a law that turns with the heading is in axes that turn too.
-        if P is None or self.loop.follower.turning or not goes_both_ways(self.parts.graph):
+        P, gain = fixed_metric(self.parts), self.panel.gain(knobs)
+        if P is None:
             return None
+        P = P if gain is None else gain.P
         key = knobs.cut, knobs.method, knobs.weight
         if key not in self.potentials:
             try:

@@ -1,5 +1,7 @@
 """Figures as PNG, PDF and SVG files, written completely or not at all."""
 
+import base64
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +28,14 @@ def check_names(names: Sequence[str]) -> None:
     """
     for name in names:
         check_name("the figure is", name, NAMES, OutputError)
+
+
+def html_image(figure: "Figure", name: str, dpi: int) -> str:
+    """Return a figure as an element of an HTML page."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=dpi)
+    data = base64.b64encode(content.getvalue()).decode("ascii")
+    return f'<img alt="{name}" src="data:image/png;base64,{data}">'
 
 
 def save(
