@@ -559,8 +559,8 @@ def test_a_named_set_of_parameters_may_be_changed(load):
     made = echelon.build(load(model)).parts.model
     assert (made.mass, made.motor_thrust) == (0.03, 0.12)
     for parameters, said in (
-        ("{set: crazyfly}", "are `crazyfly`, allowed are `crazyflie`"),
-        ("{set: [1]}", "are `[1]`, allowed are `crazyflie`"),
+        ("{set: crazyfly}", "the parameters of `Quadrotor` are `crazyfly`"),
+        ("{set: [1]}", "the parameters of `Quadrotor` are `[1]`"),
         ("{set: crazyflie, weight: 1}", "got the parameter `weight` of `quadrotor`"),
     ):
         with pytest.raises(echelon.EchelonError) as caught:

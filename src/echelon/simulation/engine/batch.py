@@ -18,6 +18,7 @@ from jaxtyping import Bool
 from echelon.core.errors import EchelonError, Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
+from echelon.simulation.engine.divergence import advance_until_lost
 from echelon.simulation.engine.grid import ChunkGrid
 from echelon.simulation.engine.initial import Starts
 from echelon.simulation.engine.jax_stepper import JaxFormations
@@ -167,10 +168,10 @@ def _fly(
     while not recorder.ended:
         done, grid = recorder.done, recorder.grid
         reference = sample_reference(first, done, grid.longest + 1)
-        chunk = stepper.advance(now, grid.counts(done), reference)
-        recorder.keep(chunk, reference, 0.0)
-        if isinstance(stepper, NativeStepper):
-            far |= stepper.inexact
+        planned = now, grid.counts(done), reference, len(far)
+        chunk, counts = advance_until_lost(stepper, *planned)
+        recorder.keep(chunk, counts, reference, 0.0)
+        far |= chunk.inexact
         now = chunk.now
         if progress is not None:
             progress(recorder.done, grid.steps)

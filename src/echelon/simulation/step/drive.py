@@ -68,6 +68,7 @@ class Chunk(NamedTuple):
         inputs: (T, F N, m) delivered from each of them on, float64.
         sums: over its steps, with an axis F in front; F is 1 for a run alone.
         stopped: why no further step can be taken, in words; None where one can.
+        inexact: (F,) the formations whose numbers are not those that JAX would compute.
     """
 
     now: Moment
@@ -75,6 +76,7 @@ class Chunk(NamedTuple):
     inputs: Array
     sums: Sums
     stopped: str | None = None
+    inexact: Array | bool = False
 
 
 def numbers(now: Moment) -> tuple[Array, ...]:
@@ -131,6 +133,11 @@ class Stepper(abc.ABC):
         if [np.shape(leaf) for leaf in numbers(like)] != [np.shape(leaf) for leaf in leaves]:
             raise SimulationError("the stored moment has another shape than this run's.")
         return tree.unflatten(map(_leaf, leaves, like))
+
+    @property
+    def repeats(self) -> bool:
+        """Whether steps can be taken again from a moment, with the same results."""
+        return True
 
     @property
     def work(self) -> SolverStats | None:
