@@ -34,6 +34,7 @@ except ImportError:
 from steppers import FORMATIONS, STEPS, Yardstick, flock, rate
 
 import echelon as ech
+from echelon.core.private_folder import PrivateFolder
 from echelon.simulation.codegen import Code, program
 from echelon.simulation.engine.batch import Batch
 from echelon.simulation.native.kernel_cache import Kernels
@@ -379,9 +380,9 @@ GROUPS: dict[str, list[Measure]] = {
 def _reloaded(text: str) -> float:
     """Return the CPU seconds in which code is there again that was kept."""
     with tempfile.TemporaryDirectory() as folder:
-        Code(text, Path(folder))
+        Code(text, PrivateFolder(Path(folder)))
         begin = time.process_time()
-        Code(text, Path(folder))
+        Code(text, PrivateFolder(Path(folder)))
         return time.process_time() - begin
 
 

@@ -29,13 +29,14 @@ def lowered(function, count, bits=64):
 def text_of(function, count, bits=64, lanes=None):
     """Return the code of a function, how many results it has, and its plan."""
     results = lowered(function, count, bits)
-    body = Body(stores=dict(enumerate(results, count)))
+    exceptions = results[0].graph.exceptions_of(results)
+    body = Body(stores=dict(enumerate(results, count)), exceptions=exceptions)
     plan = Plan(
         bits=bits,
         lanes=lanes or 512 // bits,
         batched=False,
         row_major=False,
-        rows=count + len(results),
+        rows=count + len(results) + 1,
         width=0,
         first=body,
         others=Body(),
@@ -45,6 +46,7 @@ def text_of(function, count, bits=64, lanes=None):
         one_leader=False,
         weighted=False,
         edges=(),
+        exception_row=count + len(results),
         table=0,
         dt=0.0,
     )
@@ -53,10 +55,15 @@ def text_of(function, count, bits=64, lanes=None):
 
 def run(function, columns, bits=64, lanes=None, cache=None):
     """Return what a function for JAX makes of columns (count, N), as (results, N)."""
+    return run_with_exceptions(function, columns, bits, lanes, cache)[:-1]
+
+
+def run_with_exceptions(function, columns, bits=64, lanes=None, cache=None):
+    """Return the same, and in a last row 1 for each column of which JAX is to make it."""
     lanes, (count, agents) = lanes or 512 // bits, columns.shape
     text, results, plan = text_of(function, count, bits, lanes)
     blocks, dtype = -(-agents // lanes), np.float64 if bits == 64 else np.float32
-    rows = aligned((blocks, count + results, lanes), dtype)
+    rows = aligned((blocks, plan.rows, lanes), dtype)
     padded = np.resize(columns.T, (blocks * lanes, count))
     rows[:, :count] = padded.reshape(blocks, lanes, count).transpose(0, 2, 1)
     task, slots = np.array([0, 0, 0, blocks, 0, 0, 0, 0]), np.zeros(len(SLOTS), np.int64)
@@ -68,4 +75,4 @@ def run(function, columns, bits=64, lanes=None, cache=None):
         slots[SLOTS.index(name)] = value
     Code(text, cache).call(slots)
     after = rows[:, count:].transpose(0, 2, 1)
-    return after.reshape(blocks * lanes, results)[:agents].T.copy()
+    return after.reshape(blocks * lanes, results + 1)[:agents].T.copy()

@@ -13,6 +13,8 @@ from .agents import (
     references as references,
 )
 from .agents.models.model import ControlAffine as ControlAffine
+from .agents.network.channel import Bursts as Bursts
+from .agents.network.channel import Network as Network
 from .agents.network.formation import Formation as Formation
 from .agents.network.graph import Graph as Graph
 from .agents.network.inbox import Message as Message

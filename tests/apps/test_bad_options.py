@@ -27,8 +27,8 @@ KINDS = "`csv`, `parquet`, `npz`, `mat`"
         ("video gone out.mp4", GONE),
         ("video . out.avi", "`out.avi` ends in `.avi`, and must end in .mp4 or .gif."),
         ("export gone", GONE),
-        ("export . --to xls", f"`--to` is `xls`, and must be one of {KINDS}."),
-        ("plot . --what top_vieu", "there is no figure `top_vieu` (did you mean `top_view`?)"),
+        ("export . --to xls", f"`--to` is `xls`, allowed are {KINDS}."),
+        ("plot . --what top_vieu", "the figure is `top_vieu`, allowed are"),
         (
             "sweep paper --over seed=0..3 --cluster tcp://127.0.0.1:1",
             "the cluster at `tcp://127.0.0.1:1` does not answer: Connection refused.",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from echelon.apps.cli import app, cache
+from echelon.apps.cli import app
 from echelon.apps.cli.cache import cache_folder, keep_compiled_code
 from echelon.core import disk_cache
 
@@ -118,20 +118,14 @@ def test_the_folder_is_the_users_alone(tmp_path):
     assert (tmp_path / "c" / "compiled").stat().st_mode & 0o777 == 0o700
 
 
-@pytest.mark.parametrize("change", [lambda at: at.chmod(0o770), lambda at: at.chmod(0o702)])
-def test_a_folder_that_others_may_write_is_left_alone(tmp_path, change):
+def test_a_folder_that_others_can_change_is_left_alone(tmp_path):
     folder = tmp_path / "compiled"
     folder.mkdir()
-    change(folder)
+    folder.chmod(0o770)
     environment = {"ECHELON_CACHE": str(tmp_path)}
     assert keep_compiled_code(environment) is None and len(environment) == 1
     folder.chmod(0o755)
-    assert keep_compiled_code(environment) == folder
-
-
-def test_a_folder_of_someone_else_is_left_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
-    assert keep_compiled_code({"ECHELON_CACHE": str(tmp_path)}) is None
+    assert keep_compiled_code(environment).path == folder
 
 
 def test_the_store_is_open_for_one_command_and_no_other_process(tmp_path, monkeypatch, echelon):
@@ -148,15 +142,3 @@ def test_the_store_is_open_for_one_command_and_no_other_process(tmp_path, monkey
     assert seen == [True] and not disk_cache.is_open()
     assert str(tmp_path / "compiled") in os.environ["JAX_COMPILATION_CACHE_DIR"]
     assert not any("ECHELON" in name for name in os.environ if name != "ECHELON_CACHE")
-
-
-def test_what_was_written_first_goes_first(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "_LIMIT", 25)
-    folder = tmp_path / "compiled"
-    folder.mkdir()
-    for age, name in enumerate(["new-cache", "older-cache", "oldest-cache", "not-ours"]):
-        (folder / name).write_bytes(bytes(10))
-        os.utime(folder / name, (1000 - age, 1000 - age))
-    keep_compiled_code({"ECHELON_CACHE": str(tmp_path)})
-    kept = {path.name for path in folder.iterdir()}
-    assert kept == {"new-cache", "older-cache", "not-ours"}

@@ -104,7 +104,7 @@ def test_a_row_is_of_an_agent_at_a_time(run):
 def test_an_unknown_format_is_refused_with_those_there_are(echelon, file):
     code, _, fault = echelon("export", file, "--to", "xls")
     assert code == 2
-    assert fault == "echelon: `--to` is `xls`, and must be one of `csv`, `parquet`, `npz`, `mat`.\n"
+    assert fault == "echelon: `--to` is `xls`, allowed are `csv`, `parquet`, `npz`, `mat`.\n"
 
 
 # ---- pages and videos -------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from echelon.core import compiled, disk_cache, memoize
 from echelon.core.compiled import CompiledFunction
 from echelon.core.memoize import load_or_compute
 from echelon.core.numerics import precision
+from echelon.core.private_folder import PrivateFolder
 from echelon.experiments.scenario.user_code import user_class
 
 
@@ -32,7 +33,7 @@ def folder(tmp_path, monkeypatch):
     forget()
     # Other tests of this process may have loaded a user's file.
     monkeypatch.setattr(disk_cache, "_closed", threading.Event())
-    with disk_cache.use_folder(tmp_path):
+    with disk_cache.use_folder(PrivateFolder(tmp_path)):
         yield tmp_path
     forget()
 
@@ -49,6 +50,10 @@ class Own(VanDerPol):
 
 def place(*values):
     return disk_cache.file_for("what", *values)
+
+
+def stored(entry):
+    return disk_cache.read(disk_cache.CacheFile(PrivateFolder(entry.parent), entry.name))
 
 
 def sensitivity(model, x, scale):
@@ -91,7 +96,7 @@ def test_what_is_damaged_is_made_again(slope, folder):
     for damage in (whole[:40], b"", whole[:-1] + bytes([whole[-1] ^ 1])):
         entry.write_bytes(damage)
         np.testing.assert_array_equal(slope()(VanDerPol(), x, 2.0)["slope"], told)
-        assert disk_cache.read(entry) is not None
+        assert stored(entry) is not None
 
 
 def test_a_program_within_a_trace_is_a_part_of_it(slope, folder):
@@ -112,7 +117,7 @@ def test_code_that_calls_other_code_is_left_to_jax(folder, monkeypatch):
     monkeypatch.setattr(solved, "__module__", "echelon.agents.models.linearization")
     # JAX compiles what it traces itself, under a name that it finds again.
     assert CompiledFunction(solved)(np.eye(2)).shape == (2,) and len(traced) == 2
-    assert [disk_cache.read(entry) for entry in folder.iterdir()] == [b""]
+    assert [stored(entry) for entry in folder.iterdir()] == [b""]
     for _ in range(2):
         assert CompiledFunction(solved)(np.eye(2)).shape == (2,)
     # Nor is it traced to know of it once that is kept.
@@ -251,7 +256,7 @@ def test_nothing_is_kept_where_python_runs_no_sources(home):
 
 
 def test_what_a_killed_process_leaves_goes_with_the_oldest(folder, monkeypatch):
-    def killed(beside, _):
+    def killed(beside, _, **folders):
         begun.append(beside)
         raise KeyboardInterrupt
 

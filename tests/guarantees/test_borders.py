@@ -94,7 +94,7 @@ def test_a_unicycle_is_promised_while_it_drives(tmp_path):
     assert 57.0 < chord < 60.0 and f"{chord:.3g} deg to either side" in found.sentence()
     file = tmp_path / "summary.json"
     file.write_text(json.dumps({"promise": found.as_mapping()}))
-    assert verify(file).holds
+    assert verify(file).verdict == "incomplete"
     told = found.as_mapping()
     [border] = told["anywhere"]["borders"]
     for key, factor in (("left", 1.1), ("steepest", 1.1), ("speed", 1.8), ("starts", 2.0)):

@@ -10,6 +10,7 @@ import echelon as ech
 from echelon.core.linear import matrix_exponential
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind
+from echelon.guarantees.promises.frozen_laws import ModeMatrices
 
 
 def built(scenario, *changes):
@@ -97,3 +98,14 @@ def test_flows_are_exponentials(scale):
     for found, wanted in zip(matrix_exponential(rates), scipy.linalg.expm(rates), strict=True):
         size = np.abs(wanted).max(axis=(1, 2), keepdims=True)
         np.testing.assert_allclose(found / size, wanted / size, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("horizon", [0.1, 60.0, 6e4, 1e6, 1e9])
+def test_the_rate_along_a_path_is_known_however_long_a_run_is(horizon):
+    # A turned frame that moves no mode: the exponent of the whole path is the slowest one's.
+    draw = np.random.default_rng(0)
+    turn = np.linalg.qr(draw.normal(size=(3, 3)))[0]
+    A = turn @ np.diag([-95.0, -1.25, -7.0]) @ turn.T
+    laws = ModeMatrices(np.stack([A] * 192), np.zeros((192, 3, 1)), np.zeros((192, 2, 1, 3)))
+    growth = laws.along(np.linspace(0.0, horizon, 192), "followers'")
+    assert growth.rate == pytest.approx(-1.25, rel=1e-6) and not growth.lost

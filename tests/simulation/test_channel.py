@@ -1,72 +1,177 @@
-"""A network that is not ideal: messages in flight are part of the moment of a run."""
+"""A network that is not ideal: which messages arrive when, and what agents make of them."""
 
-import equinox as eqx
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import echelon as ech
-from echelon.agents.network.channel import Channel
-from echelon.core.errors import EchelonError
+from echelon.agents.network.channel import NEVER
+from echelon.core.errors import EchelonError, SimulationError
+
+DT = 0.01
+SENDERS, RECEIVERS = np.array([0, 1, 1, 2, 0]), np.array([1, 0, 2, 1, 2])
+
+
+def networks():
+    return st.builds(
+        lambda every, **more: ech.Network(rate=1.0 / (every * DT), forget=9.0, **more),
+        every=st.integers(1, 4),
+        delay=st.integers(0, 9).map(lambda k: k * DT),
+        jitter=st.integers(0, 9).map(lambda k: k * DT),
+        loss=st.sampled_from([0.0, 0.3, 1.0]),
+        bursts=st.builds(ech.Bursts, st.sampled_from([0.0, 0.4]), st.just(0.1)),
+        seed=st.integers(0, 2**63 - 1),
+    )
+
+
+def arrivals_of(channel, steps):
+    """The newest stamp that each link has at each step, by the channel."""
+    example = jnp.zeros((3, 1))
+    sends = jnp.ones(3, bool)
+
+    def step(carry, k):
+        posts, newest = carry
+        arrival = channel.arrivals(posts, k, newest)
+        sent = jnp.full((3, 1), k, float)
+        content = jnp.where(arrival.new, posts.content[arrival.slot, SENDERS, 0], -1.0)
+        posts = channel.post(posts, k, sent, sends, RECEIVERS, SENDERS)
+        return (posts, arrival.stamp), (arrival.stamp, content, arrival.new, posts.arrival)
+
+    start = channel.begin(example, 5), jnp.full(5, NEVER, jnp.int32)
+    return jax.lax.scan(step, start, jnp.arange(steps, dtype=jnp.int32))[1]
+
+
+@settings(max_examples=25, deadline=None)
+@given(network=networks())
+def test_messages_arrive_as_in_a_plain_queue(network):
+    steps = 60
+    with jax.enable_x64(True):
+        channel = network.prepared(DT, 10.0, 0)
+        stamps, content, new, arrival = map(
+            np.asarray, jax.jit(arrivals_of, static_argnums=1)(channel, steps)
+        )
+    every, delay, jitter = (int(x) for x in (channel.every, channel.delay, channel.jitter))
+    slots = channel.slots
+    for link in range(5):
+        queue, newest = [], NEVER
+        for k in range(steps):
+            for sent, due in queue:
+                if due == k and sent > newest:
+                    newest = sent
+            assert stamps[k, link] == newest
+            if new[k, link]:
+                # What arrives is what was sent then, and no slot was overwritten before.
+                assert content[k, link] == newest
+            if k % every == 0:
+                due = int(arrival[k, (k // every) % slots, link])
+                assert due == NEVER or k + delay <= due <= k + delay + jitter
+                queue.append((k, due))
+    if network.loss == 1.0:
+        assert (stamps == NEVER).all()
+    if network.loss == 0.0 and not channel.bursty:
+        assert (arrival[-1][arrival[-1] != NEVER] > 0).all() and stamps.max() > NEVER
+
+
+def test_draws_belong_to_a_message_and_its_ends_and_not_to_the_place_of_the_link():
+    network = ech.Network(rate=100.0, jitter=0.05, loss=0.4, bursts=ech.Bursts(0.3, 0.05))
+    with jax.enable_x64(True):
+        channel = network.prepared(DT, 10.0, 5)
+        example, sends = jnp.zeros((3, 1)), jnp.ones(3, bool)
+
+        def posts(order):
+            state = channel.begin(example, 5)
+            for k in range(40):
+                state = channel.post(
+                    state, jnp.asarray(k), example, sends, RECEIVERS[order], SENDERS[order]
+                )
+            return np.asarray(state.arrival)
+
+        order = np.array([3, 1, 4, 0, 2])
+        np.testing.assert_array_equal(posts(np.arange(5))[:, order], posts(order))
+
+
+def test_the_shares_of_loss_and_of_outages_are_those_asked_for():
+    steps = 4000
+    for network, share in (
+        (ech.Network(rate=100.0, loss=0.2), 0.2),
+        (ech.Network(rate=100.0, bursts=ech.Bursts(0.33, 0.2)), 0.33),
+        (ech.Network(rate=100.0, loss=0.5, bursts=ech.Bursts(0.5, 0.1)), 0.75),
+    ):
+        with jax.enable_x64(True):
+            channel = network.prepared(DT, 100.0, 1)
+            arrival = np.asarray(jax.jit(arrivals_of, static_argnums=1)(channel, steps)[3])
+        rows = arrival[np.arange(steps), np.arange(steps) % channel.slots]
+        outages = (rows == NEVER).mean()
+        # Independent losses scatter by .4 %, outages of 20 messages by some 2 %.
+        assert outages == pytest.approx(share, abs=0.04)
+
+
+# ---- in the closed loop --------------------------------------------------------------------------
 
 POINTS = ech.models.SingleIntegrator()
 GRAPH = ech.Graph([(0, 1), (1, 2, 0.5), (2, 3), (3, 1, 2.0)])
 STARTS = np.random.default_rng(4).normal(size=(4, len(POINTS.state_names)))
-STEPS, DT = 40, 0.02
+STEPS = 40
 
 
-class Late(Channel):
-    """Every message arrives so many steps after it was sent."""
-
-    steps: int = eqx.field(static=True)
-
-    def begin(self, sent):
-        return jnp.repeat(sent[None], self.steps, axis=0)
-
-    def carry(self, in_flight, sent, step):
-        queue = jnp.concatenate([in_flight, sent[None]])
-        return queue[0], queue[1:]
-
-
-def parts(channel=None):
+def parts(network=None):
     drive = ech.Laws(ech.laws.Agreement(), ech.laws.Agreement())
     places = ech.Formation.from_offsets(POINTS, GRAPH, {})
-    world = ech.World(channel=channel)
+    world = ech.World(network=network)
     return ech.Parts(POINTS, GRAPH, places, drive, initial=STARTS, world=world)
 
 
-def settings(**more):
+def chosen(**more):
     return ech.Settings(
         **{"horizon": STEPS * DT, "dt": DT, "integrator": "euler", "engine": "jax", **more}
     )
 
 
-def by_hand(late):
+def states_late(late):
     """The states of Euler's steps under messages that are so many steps old."""
     x = [STARTS]
     for k in range(STEPS):
-        old, now = x[max(0, k - late)], x[k]
+        now = x[k]
+        # Before the first message an agent takes its neighbours to be where it is.
+        old = x[k - late] if k >= late else None
         z = np.zeros_like(now)
         for (i, j), weight in zip(GRAPH.edges, GRAPH.weights, strict=True):
-            z[i] += weight * (now[i] - old[j])
-            z[j] += weight * (now[j] - old[i])
+            if old is not None:
+                z[i] += weight * (now[i] - old[j])
+                z[j] += weight * (now[j] - old[i])
         x.append(now - DT * z)
     return np.array(x)
 
 
-@pytest.mark.parametrize("late", [0, 1, 5])
-def test_a_late_message_is_received_as_it_was_sent(late):
-    result = ech.simulate(parts(Late(late)), settings())
-    np.testing.assert_allclose(result.states, by_hand(late), atol=1e-12)
+@pytest.mark.parametrize("late", [1, 5])
+def test_messages_that_contain_states_are_received_as_they_were_sent(late):
+    network = ech.Network(rate=1.0 / DT, delay=late * DT, messages="state")
+    result = ech.simulate(parts(network), chosen())
+    np.testing.assert_allclose(result.states, states_late(late), atol=1e-12)
 
 
-def test_messages_that_take_no_time_are_the_ideal_network_to_the_bit():
-    ideal, late = (ech.simulate(parts(channel), settings()) for channel in (None, Late(0)))
-    np.testing.assert_array_equal(late.states, ideal.states)
+def formation(network=None, **overrides):
+    scenario = ech.load_scenario(
+        "integrators", ["simulation.horizon=12", *(f"{k}={v}" for k, v in overrides.items())]
+    )
+    built, settings = ech.build(scenario)
+    world = dataclasses.replace(built.world, network=network)
+    return built.replace(world=world), settings._replace(engine="jax")
 
 
-def test_a_run_goes_on_with_the_messages_in_flight():
-    run = parts(Late(3)), settings(horizon=200 * DT)
+def errors_of(result):
+    y = result.states - result.formation.offsets
+    return np.abs(y[:, 1:] - y[:, :1])
+
+
+def test_a_run_continues_with_the_messages_that_are_under_way():
+    network = ech.Network(rate=50.0, delay=0.03, loss=0.3, messages="state")
+    run = parts(network), chosen(horizon=200 * DT)
     whole, stretches = ech.simulate(*run), []
 
     def enough(so_far):
@@ -81,4 +186,33 @@ def test_a_run_goes_on_with_the_messages_in_flight():
 
 def test_native_code_refuses_what_it_has_no_memory_for():
     with pytest.raises(EchelonError, match="a network that is not ideal"):
-        ech.simulate(parts(Late(1)), settings(engine="native"))
+        ech.simulate(parts(ech.Network(messages="state")), chosen(engine="native"))
+
+
+def test_a_batch_draws_for_each_seed_what_a_run_alone_draws():
+    from echelon.simulation.engine.batch import Batch
+
+    network = ech.Network(rate=100.0, loss=0.5, jitter=0.02, messages="state")
+    runs = [(parts(network), chosen(seed=k)) for k in range(3)]
+    alone = [ech.simulate(*run).states for run in runs]
+    together = [result.states for result in Batch(1).fly(runs)]
+    np.testing.assert_allclose(together, alone, atol=1e-13)
+    assert not np.allclose(alone[0], alone[1])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rate": 30.0}, r"`rate` .* 30 Hz, .* control rate 100 Hz divided by a whole number"),
+        ({"delay": 9.0, "forget": 10.0}, r"`delay` .* 9 s, .* at most the horizon, 0.4 s"),
+        ({"loss": 1.5}, r"`loss` .* 1.5, .* from 0 to 1"),
+        ({"loss": True}, r"`loss` .* True, .* a number"),
+        ({"bursts": ech.Bursts(share=1.0)}, r"`bursts.share` .* at least 0 and below 1"),
+        ({"forget": 0.02}, r"`forget` .* 0.02 s, .* at least two periods"),
+        ({"messages": "stat"}, r"`messages` .* `stat`, allowed are .* .did you mean"),
+        ({"prediction": "preview"}, r"`prediction` .* `Agreement` has no plan; use `none`"),
+    ],
+)
+def test_a_network_that_cannot_work_is_refused_in_one_sentence(change, message):
+    with pytest.raises(SimulationError, match=message):
+        ech.simulate(parts(ech.Network(**{"rate": 50.0, **change})), chosen())

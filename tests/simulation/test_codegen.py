@@ -14,6 +14,7 @@ from scipy.special import erf
 
 from echelon.agents.models import Quadrotor
 from echelon.core.numerics import precision, rk4
+from echelon.core.private_folder import PrivateFolder
 from echelon.simulation.codegen import factored, machine_code
 from echelon.simulation.scalars import ScalarGraph, Unsupported, needed
 from echelon.simulation.scalars.scalar_graph import OPERATIONS
@@ -102,8 +103,10 @@ def test_what_is_no_number_stays_none_and_what_is_infinite_goes_where_it_must(na
     function, wanted, *_ = FUNCTIONS[name]
     x = np.array([0.0, np.inf, -np.inf, np.nan, 5e-324, 1e-310, 1.0, -1.0])
     [found] = run(lambda v: function(v[0]), x[None])
+    # Denormal numbers are 0, as for JAX.
+    normal = np.where(np.abs(x) < np.finfo(float).tiny, 0.0, x)
     with np.errstate(all="ignore"):
-        np.testing.assert_allclose(found, wanted(x), rtol=1e-14)
+        np.testing.assert_allclose(found, wanted(normal), rtol=1e-14, atol=1e-308)
 
 
 @given(
@@ -340,7 +343,7 @@ def test_what_is_no_number_is_picked_and_ordered_as_by_jax():
         (lambda v: jnp.sort(jnp.concatenate([v, v, v])), "`sort` of 9 entries"),
         (lambda v: v.at[jnp.stack([whole(v), 0])].set(1.0), "`scatter` of more than one entry"),
         (lambda v: (whole(v) & 1) * 1.0, "`and` of whole numbers"),
-        (lambda v: whole(v).astype(jnp.int8) * 1.0, "`convert_element_type` to int8"),
+        (lambda v: whole(v) ** whole(v[1:]) * 1.0, "`and` of whole numbers"),
     ],
 )
 def test_what_is_too_much_to_pick_from_is_told(function, told):
@@ -512,7 +515,10 @@ def test_products_are_made_as_written_where_nothing_is_in_common(large, bits):
 
 
 def test_numbers_too_large_to_be_put_together_are_multiplied_as_written():
-    [found] = run(lambda v: 1e-30 * (1e-30 * (1e35 * v[0] * (1e30 * v[1]))), np.ones((2, 4)), 32)
+    [far] = run(lambda v: 1e-30 * (1e-30 * (1e35 * v[0] * (1e30 * v[1]))), np.ones((2, 4)), 32)
+    # No single precision has the product in the middle.
+    assert np.isinf(far).all()
+    [found] = run(lambda v: 1e-30 * (1e35 * v[0] * (1e-30 * (1e30 * v[1]))), np.ones((2, 4)), 32)
     np.testing.assert_allclose(found, 1e5, rtol=1e-6)
 
 
@@ -620,21 +626,26 @@ def test_a_processor_with_less_computes_the_same_and_says_what_it_has(monkeypatc
 
 def test_what_was_compiled_is_kept_and_a_damaged_file_is_made_again(tmp_path):
     columns = rng.normal(size=(3, 8))
-    first = run(PROGRAMS["a loop"], columns, cache=tmp_path)
+    first = run(PROGRAMS["a loop"], columns, cache=PrivateFolder(tmp_path))
     [file] = tmp_path.iterdir()
     whole = file.read_bytes()
-    assert run(PROGRAMS["a loop"], columns, cache=tmp_path).tobytes() == first.tobytes()
+    assert (
+        run(PROGRAMS["a loop"], columns, cache=PrivateFolder(tmp_path)).tobytes() == first.tobytes()
+    )
     for damaged in (whole[: len(whole) // 2], b"", whole[:40] + b"x" + whole[41:]):
         file.write_bytes(damaged)
-        assert run(PROGRAMS["a loop"], columns, cache=tmp_path).tobytes() == first.tobytes()
+        assert (
+            run(PROGRAMS["a loop"], columns, cache=PrivateFolder(tmp_path)).tobytes()
+            == first.tobytes()
+        )
         assert file.read_bytes() == whole
 
 
 def test_a_folder_without_room_for_code_is_no_fault(tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("in the way")
+    folder = PrivateFolder(tmp_path / "removed")
+    folder.path.rmdir()
     columns = rng.normal(size=(3, 8))
-    found = run(PROGRAMS["a loop"], columns, cache=blocked)
+    found = run(PROGRAMS["a loop"], columns, cache=folder)
     np.testing.assert_allclose(found, by_jax(PROGRAMS["a loop"], columns), rtol=1e-14)
 
 

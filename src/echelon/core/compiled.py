@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import os
-import pickle
 import threading
 from collections.abc import Callable, Sequence
 from typing import Final, Generic, NamedTuple, TypeVar, final
@@ -15,6 +14,7 @@ from jax.core import Tracer
 from echelon.core import disk_cache
 from echelon.core.identity import digest
 from echelon.core.memoize import BoundedCache
+from echelon.core.plain_format import decode, encode
 from echelon.core.types import PyTree
 
 _R = TypeVar("_R")
@@ -180,13 +180,13 @@ def _packed(made: _Compiled) -> bytes:
     if "custom-call" in made.run.as_text():  # type: ignore[attr-defined]
         raise ValueError("the program calls foreign code, which cannot be stored.")
     code, _, back = serialize(made.run)  # type: ignore[arg-type]
-    return pickle.dumps((code, back.num_leaves, made.tree))
+    return encode((code, back.num_leaves, made.tree))
 
 
 def _load(stored: bytes, given: int) -> _Compiled:
     """Return compiled code that takes `given` arrays, from bytes."""
     from jax.experimental.serialize_executable import deserialize_and_load
 
-    code, count, tree = pickle.loads(stored)
+    code, count, tree = decode(stored)
     before = jax.tree.structure(((0,) * given, {}))
     return _Compiled(deserialize_and_load(code, before, jax.tree.structure([0] * count)), tree)

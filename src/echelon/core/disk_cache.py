@@ -12,25 +12,33 @@ import hashlib
 import os
 import platform
 import sys
-import tempfile
 import threading
 import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from echelon.core.identity import digest
+from echelon.core.private_folder import PrivateFolder
 
 _SETTINGS, _IDLE = ("xla_", "jax_"), ("cache", "log")
 """Prefixes of settings that may change compiled code; words in names of settings that do not."""
 _BEGAN = time.time() - 1.0
 """Start of this process, s, less a margin: file clocks are coarse, some modules load earlier."""
-_folder: Path | None = None
+_folder: PrivateFolder | None = None
 _closed = threading.Event()
 
 
+class CacheFile(NamedTuple):
+    """A file of the cache: its folder, and its name there."""
+
+    folder: PrivateFolder
+    name: str
+
+
 @contextlib.contextmanager
-def use_folder(folder: Path | None) -> Iterator[None]:
+def use_folder(folder: PrivateFolder | None) -> Iterator[None]:
     """Cache in a folder, or not at all, within the context and in this process only.
 
     Only the command line opens one: a program that imports echelon may modify its classes.
@@ -53,7 +61,7 @@ def close() -> None:
     _closed.set()
 
 
-def file_for(what: str, *values: object) -> Path | None:
+def file_for(what: str, *values: object) -> CacheFile | None:
     """Return the file for a result of some values; None if it may not be cached.
 
     Args:
@@ -66,7 +74,25 @@ def file_for(what: str, *values: object) -> Path | None:
     identity = digest((what, jax_settings(), values))
     if identity is None:
         return None
-    return folder / f"{hashlib.sha256(ground + identity).hexdigest()}-made-cache"
+    return CacheFile(folder, f"{hashlib.sha256(ground + identity).hexdigest()}-made-cache")
+
+
+def jax_folder() -> PrivateFolder | None:
+    """Return the folder in which JAX keeps compiled code, if only the user can change it.
+
+    Machine code that is read there is run.
+    """
+    import jax
+
+    return _opened(getattr(jax.config, "jax_compilation_cache_dir", None) or "")
+
+
+@functools.cache
+def _opened(path: str) -> PrivateFolder | None:
+    try:
+        return PrivateFolder(Path(path).absolute()) if path else None
+    except OSError:
+        return None
 
 
 def jax_settings() -> tuple[str, ...]:
@@ -79,10 +105,10 @@ def jax_settings() -> tuple[str, ...]:
     return tuple(f"{name}={getattr(jax.config, name, of_all[name])}" for name in _switches())
 
 
-def read(file: Path) -> bytes | None:
-    """Return the content of a file; None if it is missing or damaged."""
+def read(file: CacheFile) -> bytes | None:
+    """Return the content of a file; None if it is missing, damaged or not the user's own."""
     try:
-        stored = file.read_bytes()
+        stored = file.folder.read(file.name)
     except OSError:
         return None
     # Damaged machine code would crash the process.
@@ -92,27 +118,18 @@ def read(file: Path) -> bytes | None:
     return None
 
 
-def write_if_unchanged(file: Path, made: bytes) -> None:
+def write_if_unchanged(file: CacheFile, made: bytes) -> None:
     """Write a result to a file of `file_for`, unless a source changed since the start."""
     # A module that is imported late may have changed since the digest was taken.
     if _sources() == _loaded():
         write(file, made)
 
 
-def write(file: Path, made: bytes) -> None:
+def write(file: CacheFile, made: bytes) -> None:
     """Write a file for `read` atomically; a full disk is ignored."""
     packed = zlib.compress(made, 1)
     with contextlib.suppress(OSError):
-        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # The suffix lets the cleanup find the file if this process is killed before the rename.
-        with tempfile.NamedTemporaryFile(dir=file.parent, suffix="-cache", delete=False) as beside:
-            try:
-                beside.write(hashlib.sha256(packed).digest() + packed)
-                beside.close()
-                os.replace(beside.name, file)
-            except BaseException:
-                Path(beside.name).unlink(missing_ok=True)
-                raise
+        file.folder.write(file.name, hashlib.sha256(packed).digest() + packed)
 
 
 # ---- what it was made from -----------------------------------------------------------------------

@@ -99,6 +99,21 @@ def listing(names: Iterable[str]) -> str:
     return ", ".join(f"`{name}`" for name in names)
 
 
+def check_name(
+    what: str, name: object, allowed: Iterable[str], fault: type[EchelonError] = EchelonError
+) -> None:
+    """Check that a name is one of those that are allowed.
+
+    `what` begins the message, as in "`method` is".
+
+    Raises:
+        EchelonError: it is not; of the class `fault`.
+    """
+    names = list(allowed)
+    if name not in names:
+        raise fault(f"{what} `{name}`, allowed are {listing(names)}{did_you_mean(name, names)}.")
+
+
 def check_kind(
     place: str, part: object, kind: type, fault: type[EchelonError] = SimulationError
 ) -> None:

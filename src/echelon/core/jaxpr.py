@@ -44,6 +44,7 @@ class Algebra(NamedTuple):
         unknown: (equation, operands) -> results of a primitive without a rule; or it raises an
             error that names `equation.primitive.name` and what is allowed.
         within: (equation) -> a context that is entered while what it calls is walked.
+        finish: (equation, results) -> the results under the types that the equation gives them.
     """
 
     rules: Mapping[str, Rule]
@@ -52,6 +53,7 @@ class Algebra(NamedTuple):
     outside: Callable[[], Entry]
     unknown: Callable[[JaxprEqn, list[np.ndarray]], list[np.ndarray]]
     within: Callable[[JaxprEqn], contextlib.AbstractContextManager[object]] = contextlib.nullcontext
+    finish: Callable[[JaxprEqn, list[np.ndarray]], list[np.ndarray]] = lambda _, results: results
 
 
 def evaluate(
@@ -95,6 +97,7 @@ def walk(
     # Equations stand in order and assign once, so one pass binds every variable before its use.
     for equation in _used(jaxpr):
         results = apply(equation, [read(v) for v in equation.invars], algebra)
+        results = algebra.finish(equation, results)
         values |= dict(zip(equation.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import pickle
 import sys
 import threading
 from collections import OrderedDict
@@ -11,6 +10,7 @@ from typing import Generic, ParamSpec, TypeVar, final
 
 from echelon.core import disk_cache
 from echelon.core.identity import process_key
+from echelon.core.plain_format import decode, encode
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -101,11 +101,8 @@ def load_or_compute(compute: Callable[[], _R], what: str, *values: object) -> _R
     # Any failure of the cache is harmless: the result is then computed.
     if packed is not None:
         with contextlib.suppress(Exception):
-            body, *buffers = pickle.loads(packed)
-            return pickle.loads(body, buffers=buffers)
-    result, parts = compute(), list[pickle.PickleBuffer]()
+            return decode(packed)
+    result = compute()
     with contextlib.suppress(Exception):
-        # Arrays in separate buffers, so that they are read-only when loaded.
-        body = pickle.dumps(result, 5, buffer_callback=parts.append)
-        disk_cache.write_if_unchanged(file, pickle.dumps([body, *(bytes(part) for part in parts)]))
+        disk_cache.write_if_unchanged(file, encode(result))
     return result

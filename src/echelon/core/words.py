@@ -43,10 +43,24 @@ class Frame(Word):
 
 
 class NeighbourChoice(Word):
-    """Which of its neighbours an agent under the law `stopping-point` hears."""
+    """Which of its neighbours' messages an agent uses."""
 
     ALL = "all of its neighbours"
     LEADERWARD = "the neighbours that are nearer to a leader"
+
+
+class MessageContent(Word):
+    """What a message on a network contains."""
+
+    DEVIATION = "the sender's deviation from where it expects the leader"
+    STATE = "the sender's signal itself"
+
+
+class Prediction(Word):
+    """How agents predict the leader from what it last sent."""
+
+    PREVIEW = "by its plan, which they know"
+    NONE = "as it was when it sent it"
 
 
 ENGINES = ("auto", "jax", "native")

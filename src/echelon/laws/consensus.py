@@ -11,7 +11,7 @@ from jaxtyping import Float
 from echelon.agents.models.heading_symmetry import state_turn
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.core.errors import LawError, did_you_mean, listing
+from echelon.core.errors import LawError, check_name
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward, Frame, Word
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
@@ -22,13 +22,8 @@ _Word = TypeVar("_Word", bound=Word)
 
 
 def _member(key: str, kind: type[_Word], name: object) -> _Word:
-    try:
-        return kind.named(name)
-    except KeyError:
-        names = list(map(str, kind))
-        raise LawError(
-            f"`{key}` is `{name}`, allowed are {listing(names)}{did_you_mean(str(name), names)}."
-        ) from None
+    check_name(f"`{key}` is", str(name), map(str, kind), LawError)
+    return kind.named(name)
 
 
 def _feedforward(name: object) -> Feedforward:

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Iterator
-from typing import ClassVar, TypeAlias, final
+from typing import ClassVar, NamedTuple, TypeAlias, final
 
 import equinox as eqx
 import jax
@@ -57,6 +57,18 @@ class LocalView(eqx.Module):
                 "a `LocalView` is made where JAX computes in float32, and a law would return 7 "
                 "digits; make it, and call the law, inside `with jax.enable_x64(True):`."
             )
+
+
+class Expected(NamedTuple):
+    """Where a leader is expected, and what it will send.
+
+    Attributes:
+        signal: its signal (s,), or its state less its offset (n,).
+        feedforward: what it sends to followers (k,); None for what its law does at that state.
+    """
+
+    signal: Float[jax.Array, " s"]
+    feedforward: Float[jax.Array, " k"] | None = None
 
 
 class Law(eqx.Module):
@@ -190,6 +202,47 @@ class Law(eqx.Module):
         beyond that loop.
         """
         return v
+
+    def check_late(self, graph: Graph, period: float) -> None:
+        """Check that a follower's law works with late messages, with inputs held for a period (s).
+
+        Raises:
+            LawError: it does not.
+        """
+
+    @property
+    def plans(self) -> bool:
+        """Whether a leader under the law has a plan, so that others can predict it."""
+        return False
+
+    def predictable(self, model: ControlAffine) -> "Law":
+        """Return a prepared leader's law, completed with what others need to predict it."""
+        return self
+
+    def deviation(
+        self, model: ControlAffine, t: Scalar, x: State, offset: State, memory: Memory
+    ) -> Float[jax.Array, " s"] | None:
+        """Return a leader's deviation (s,) from its plan, which it sends; None without a plan."""
+        return None
+
+    def expected(
+        self,
+        model: ControlAffine,
+        t: Scalar,
+        deviation: Float[jax.Array, " s"],
+        age: Scalar,
+        period: Scalar | float,
+    ) -> Expected | None:
+        """Return where a leader is expected at a time t (s); None without a plan.
+
+        Args:
+            model: the agent.
+            t: the time.
+            deviation: (s,) from its plan, `age` earlier.
+            age: s.
+            period: how long its inputs are held, s.
+        """
+        return None
 
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
         """Yield the rows of starts (K, n) that the law cannot take, and why in words."""

@@ -15,14 +15,14 @@ import scipy.linalg
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.flatness import first_state, followed_states
 from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import check_kind_of, check_reference
+from echelon.agents.references.reference import check_reference
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError
 from echelon.core.linear import symmetric_part
-from echelon.core.types import Array, Input, State
-from echelon.laws.law import Law, LocalView, Memory
+from echelon.core.types import Array, Input
+from echelon.laws.law import LocalView, Memory
+from echelon.laws.path_leader import PathLeader
 
 _SPAN = 0.02
 """Between two gains, s; A and B are taken in the middle, an error of second order in it."""
@@ -34,7 +34,7 @@ _HELD = 1500
 of a long one: what the beginning leaves of P falls at twice the slowest mode."""
 
 
-class PathLQR(Law):
+class PathLQR(PathLeader):
     """u_L = u_r(t) - S K(t) (x - x_r(t)), with K = R^-1 B'P of the Riccati differential equation.
 
     -Pdot = A'P + P A - P B R^-1 B'P + Q along the reference (x_r, u_r), where A is the slope of
@@ -47,14 +47,9 @@ class PathLQR(Law):
         horizon: how long it is followed, s; afterwards the last gain holds.
     """
 
-    reference: Guide
     horizon: float = eqx.field(default=10.0, static=True)
     gains: Array | None = None
     decay: Array | None = None
-
-    def __check_init__(self) -> None:
-        """Check that the reference is one."""
-        check_kind_of(self.reference)
 
     @property
     def information(self) -> tuple[str, ...]:
@@ -73,14 +68,6 @@ class PathLQR(Law):
         self.reference.fit(model)
         gains, decay = sweep(model, self.reference, self.horizon)
         return PathLQR(self.reference, self.horizon, gains, decay)
-
-    def start(self, model: ControlAffine) -> State:
-        """Return the reference's state at time zero."""
-        return first_state(model, self.reference)
-
-    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
-        """Return x_r at each of `times`, (T, n)."""
-        return followed_states(model, self.reference, times)
 
     def own_mode(self, model: ControlAffine) -> float | None:
         """Return the slowest rate (1/s, below 0) at which errors shrink, by e'P e."""

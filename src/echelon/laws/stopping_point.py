@@ -6,6 +6,7 @@ on its own start and on a speed alone.
 """
 
 import functools
+import math
 from typing import final
 
 import equinox as eqx
@@ -33,10 +34,13 @@ from echelon.laws.flat_law import (
     waits_for_path,
 )
 from echelon.laws.flat_loop import FlatMemory
-from echelon.laws.law import Law, LocalView
+from echelon.laws.law import Expected, Law, LocalView
 
 _INSTANT = 1e-9
 """s; a shorter period is none."""
+_LINEAR = 1e-8
+"""Of c |x| / s; below it sigma is linear to rounding."""
+_LN2 = math.log(2.0)
 _SEEN = 60.0
 """s of the leader's path, for default speeds; guarantees use the whole run."""
 
@@ -183,6 +187,17 @@ class StoppingPoint(FlatLaw):
         speed = free.speeds_within(model, self.loop.chains, SPEED, _share(links), links, slowest)
         return eqx.tree_at(lambda law: law.speed, law, speed)
 
+    def check_late(self, graph: Graph, period: float) -> None:
+        """Check that no stopping point passes its neighbours' within a step: c d_max dt <= 1."""
+        assert self.reach is not None
+        share = float(self.strength(period)) * self.reach.heaviest * period
+        if share > 1.0:
+            raise LawError(
+                f"`coupling` {self.coupling:g} 1/s times the largest sum of a follower's weights, "
+                f"{self.reach.heaviest:g}, times the step, {period:g} s, is {share:.3g}, and must "
+                "be at most 1 where messages are late; lower `coupling` or `dt`."
+            )
+
     def begin(self, model: ControlAffine, x: State) -> FlatMemory:
         """Return the memory of an agent that begins at x, with its integrators level."""
         return self.initial_memory(model, x, jnp.asarray(self.ahead, x.dtype))
@@ -300,10 +315,71 @@ class StoppingLeader(FlatLaw):
         self, model: ControlAffine, view: LocalView, memory: FlatMemory
     ) -> tuple[Input, FlatMemory]:
         """Return the leader's input."""
-        loop, path = self.ready, self.path(model, view.t)
-        away = loop.place(model, view.x, view.offset, memory) - loop.stop(path[:-1])
-        rate = loop.stop(path[1:]) - self.bounded(self.strength(view.period) * away)
-        return loop.obey(model, view.x, rate, memory, view.period)
+        away = self.deviation(model, view.t, view.x, view.offset, memory)
+        rate = self._rate(model, view.t, away, view.period)
+        return self.ready.obey(model, view.x, rate, memory, view.period)
+
+    def _rate(
+        self, model: ControlAffine, t: Scalar, away: jax.Array, period: Scalar | float
+    ) -> jax.Array:
+        """Return zeta' (m,) that the leader commands at a deviation (m,) from its path."""
+        path = self.path(model, t)
+        return self.ready.stop(path[1:]) - self.bounded(self.strength(period) * away)
+
+    @property
+    def plans(self) -> bool:
+        """Whether others can predict it: always, by its path or its trim."""
+        return True
+
+    def deviation(
+        self, model: ControlAffine, t: Scalar, x: State, offset: State, memory: FlatMemory
+    ) -> jax.Array:
+        """Return zeta_0 - zeta_r, (m,)."""
+        loop = self.ready
+        return loop.place(model, x, offset, memory) - loop.stop(self.path(model, t)[:-1])
+
+    def expected(
+        self,
+        model: ControlAffine,
+        t: Scalar,
+        deviation: jax.Array,
+        age: Scalar,
+        period: Scalar | float,
+    ) -> Expected:
+        """Return zeta_r + D and zeta_r' - sigma(c D), with D' = -sigma(c D) from the deviation."""
+        inverse = 1.0 / jnp.asarray(self.speed, deviation.dtype)
+        away = saturated_decay(deviation, self.strength(period), inverse, age)
+        there = self.ready.stop(self.path(model, t)[:-1])
+        return Expected(there + away, self._rate(model, t, away, period))
+
+
+def saturated_decay(
+    start: jax.Array, coupling: Scalar | float, inverse: jax.Array, age: Scalar
+) -> jax.Array:
+    """Return x after a time (s) of x' = -sigma(c x), sigma(x) = x / sqrt(1 + (x/s)^2), entrywise.
+
+    With v = c |x| / s the function F(v) = sqrt(1 + v^2) - arsinh(1/v) falls by c per second.
+
+    Args:
+        start: x at the beginning.
+        coupling: c, 1/s.
+        inverse: 1/s of each entry, 0 where sigma is linear.
+        age: the time, s.
+    """
+    v = coupling * jnp.abs(start) * inverse
+    linear = v < _LINEAR
+    v = jnp.where(linear, 1.0, v)
+    target = _fallen(v) - coupling * age
+    # F is above ln v and above v - 1 or so; from there Newton's method in ln v has all digits soon.
+    guess = jnp.where(target >= 1.0, jnp.log(jnp.maximum(target, 1.0)), target - 1.0 + _LN2)
+    for _ in range(4):
+        now = jnp.exp(guess)
+        guess = guess - (_fallen(now) - target) / jnp.sqrt(1.0 + now**2)
+    return start * jnp.where(linear, jnp.exp(-coupling * age), jnp.exp(guess) / v)
+
+
+def _fallen(v: jax.Array) -> jax.Array:
+    return jnp.sqrt(1.0 + v**2) - jnp.arcsinh(1.0 / v)
 
 
 @memoize

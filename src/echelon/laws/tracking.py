@@ -4,23 +4,22 @@ It serves the paper's Assumption 4.
 """
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.spectrum import Spectrum
-from echelon.agents.references.flatness import first_state, follow_at, followed_states
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import check_kind_of, check_reference
+from echelon.agents.references.flatness import follow_at
+from echelon.agents.references.reference import check_reference
 from echelon.core.errors import LawError, ReferenceError
 from echelon.core.types import Input, Scalar, State
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
+from echelon.laws.path_leader import PathLeader
 from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.riccati import Riccati
 
 
-class Tracking(Law):
+class Tracking(PathLeader):
     """u_L = u_r(t) - S R^-1 (g S)'P (x - x_r(t)) [- S c R^-1 (g S)'P (e_L + d_L)].
 
     (x_r, u_r) is the reference's, by the model's flatness map or as given. The last term is the
@@ -34,14 +33,9 @@ class Tracking(Law):
         turns: whether the gains turn with the reference's heading; set by `prepared`.
     """
 
-    reference: Guide
     gain: Gain | None = None
     reaction: Gain | None = None
     turns: bool = eqx.field(default=False, static=True)
-
-    def __check_init__(self) -> None:
-        """Check that the reference is one."""
-        check_kind_of(self.reference)
 
     @property
     def information(self) -> tuple[str, ...]:
@@ -71,14 +65,6 @@ class Tracking(Law):
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return (x_r, u_r) at time t."""
         return self.reference.follow(model, t)
-
-    def start(self, model: ControlAffine) -> State:
-        """Return the reference's state at time zero."""
-        return first_state(model, self.reference)
-
-    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
-        """Return x_r at each of `times`, (T, n)."""
-        return followed_states(model, self.reference, times)
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the leader's input."""

@@ -25,7 +25,7 @@ from echelon.agents.models.rigid_body import (
 )
 from echelon.agents.models.rigid_vehicle import THRUST_TWICE, UPRIGHT, RigidVehicle
 from echelon.agents.models.rotors import attitude_priority, fits
-from echelon.core.errors import ModelError, did_you_mean, listing
+from echelon.core.errors import ModelError, check_name
 from echelon.core.types import Input, InputMap, State
 
 _IDENTIFIED = (16.571710e-6, 16.655602e-6, 29.261652e-6)
@@ -116,11 +116,7 @@ class Quadrotor(RigidVehicle):
         Raises:
             ModelError: there is no such set.
         """
-        if str(name) not in PARAMETERS:
-            raise ModelError(
-                f"parameters `{name}` are unknown for `Quadrotor`, "
-                f"allowed are {listing(PARAMETERS)}{did_you_mean(name, PARAMETERS)}."
-            )
+        check_name("the parameters of `Quadrotor` are", name, PARAMETERS, ModelError)
         return cls(**{**PARAMETERS[name], **changes})
 
     @classmethod

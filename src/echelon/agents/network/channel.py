@@ -1,26 +1,308 @@
-"""What a real network does to messages: the seam for delays and losses; an ideal one has none."""
+"""What a real network does to messages: it sends at a rate, delays, loses and reorders them.
 
-import abc
-from typing import Any
+It knows neither models nor laws: a message is a row of arrays. Which messages are lost, and when
+the others arrive, depends only on the seed, the message's number, its sender and its receiver.
+"""
+
+import dataclasses
+import math
+import numbers
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, final
 
 import equinox as eqx
 import jax
-from jaxtyping import Float
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Int
+
+from echelon.core.draws import Draw, key_of, uniform
+from echelon.core.errors import SimulationError, did_you_mean, listing
+from echelon.core.types import Array, PyTree
+from echelon.core.words import MessageContent, NeighbourChoice, Prediction, Word
+
+NEVER = -1
+"""The stamp of a message that never came, and the arrival of one that never does."""
+_ROUNDING = 1e-6
+"""Of a step: what divisions of times leave of whole numbers."""
 
 
-class Channel(eqx.Module):
-    """Carries messages along the edges, from step to step.
+@final
+@dataclasses.dataclass(frozen=True)
+class Bursts:
+    """Outages of a link, during which all its messages are lost.
 
-    It knows neither models nor laws. Its state holds the messages that are in flight, as arrays
-    that keep their shapes, so that a run can be stored and resumed between any two steps.
+    Args:
+        share: of the time that a link is out, from 0 to below 1.
+        length: mean length of an outage, s.
     """
 
-    @abc.abstractmethod
-    def begin(self, sent: Float[jax.Array, "K s"]) -> Any:
-        """Return what is in flight when a run begins, of what is sent along each edge."""
+    share: float = 0.0
+    length: float = 0.2
 
-    @abc.abstractmethod
-    def carry(
-        self, in_flight: Any, sent: Float[jax.Array, "K s"], step: jax.Array
-    ) -> tuple[Float[jax.Array, "K s"], Any]:
-        """Return what is received along each edge in a step, and what is in flight after it."""
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Network:
+    """A network on which messages take time and are lost.
+
+    Each agent sends one message to all that receive from it, `rate` times a second, and uses what
+    it last received. Its own state is never late.
+
+    Args:
+        rate: messages per second, Hz; a whole number of control steps lie between two.
+        delay: of each message, s; rounded up to control steps, and at least one.
+        jitter: largest additional delay, s, drawn for each message and link; messages may overtake
+            each other, and an older one never replaces a newer one.
+        loss: probability that a message is lost on a link, from 0 to 1.
+        bursts: outages of links.
+        messages: `deviation`, the sender's deviation from where it expects the leader, which hardly
+            changes while a message is under way; `state`, the signal itself.
+        prediction: how agents predict the leader from what it last sent: `preview`, they know its
+            plan; `none`, as it was. Only for `deviation`.
+        forget: age, s, beyond which what a neighbour sent is not used.
+        hears: `all` neighbours, or `leaderward`, those alone with fewer hops to the leader, as
+            counted by the messages that arrive.
+        seed: of losses and delays; by default that of the run.
+
+    Raises:
+        SimulationError: a number is out of its range.
+    """
+
+    rate: float = 50.0
+    delay: float = 0.0
+    jitter: float = 0.0
+    loss: float = 0.0
+    bursts: Bursts = Bursts()
+    messages: MessageContent = MessageContent.DEVIATION
+    prediction: Prediction = Prediction.PREVIEW
+    forget: float = 0.5
+    hears: NeighbourChoice = NeighbourChoice.ALL
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check every number, and take words for their members."""
+        values = dataclasses.asdict(self)
+        values |= {f"bursts.{name}": value for name, value in values.pop("bursts").items()}
+        for names, (allowed, fits) in _RANGES.items():
+            for name in names:
+                _check_number(name, values[name], allowed, fits)
+        for name, word in (
+            ("messages", MessageContent),
+            ("prediction", Prediction),
+            ("hears", NeighbourChoice),
+        ):
+            object.__setattr__(self, name, _named(name, word, getattr(self, name)))
+        least = 2.0 / self.rate + self.delay + self.jitter
+        if self.forget < least:
+            raise SimulationError(
+                f"`forget` of the network is {self.forget:g} s, and must be at least two periods, "
+                f"the delay and the jitter together, {least:g} s; otherwise messages are too old "
+                "when they arrive."
+            )
+
+    def prepared(self, dt: float, horizon: float, seed: int) -> "Channel":
+        """Return the network as arrays for a control step and a horizon (s) and a run's seed.
+
+        Raises:
+            SimulationError: its rate does not divide that of the control steps, or no message
+                would arrive within the horizon.
+        """
+        every = round(1.0 / (self.rate * dt))
+        if every < 1 or abs(every * self.rate * dt - 1.0) > _ROUNDING:
+            near = 1.0 / (max(1, every) * dt)
+            raise SimulationError(
+                f"`rate` of the network is {self.rate:g} Hz, and must be the control rate "
+                f"{1.0 / dt:g} Hz divided by a whole number, such as {near:g} Hz."
+            )
+        if self.delay > horizon:
+            raise SimulationError(
+                f"`delay` of the network is {self.delay:g} s, and must be at most the horizon, "
+                f"{horizon:g} s, within which otherwise no message arrives."
+            )
+        delay = max(1, math.ceil(self.delay / dt - _ROUNDING))
+        jitter = math.floor(self.jitter / dt + _ROUNDING)
+        ends = min(1.0, 1.0 / max(self.bursts.length * self.rate, 1.0))
+        share = self.bursts.share
+        return Channel(
+            every=np.asarray(every, np.int32),
+            delay=np.asarray(delay, np.int32),
+            jitter=np.asarray(jitter, np.int32),
+            forget=np.asarray(min(round(self.forget / dt), 2**30), np.int32),
+            loss=np.asarray(self.loss),
+            share=np.asarray(share),
+            begins=np.asarray(min(1.0, ends * share / (1.0 - share))),
+            ends=np.asarray(ends),
+            key=key_of(seed if self.seed is None else self.seed),
+            slots=-(-(delay + jitter) // every) + 1,
+            bursty=share > 0.0,
+            messages=self.messages,
+            prediction=self.prediction,
+            hears=self.hears,
+        )
+
+    def __str__(self) -> str:
+        """Return the network in words."""
+        parts = [f"{self.rate:g} Hz", f"delay {1e3 * self.delay:g} ms"]
+        parts += [f"jitter up to {1e3 * self.jitter:g} ms"] if self.jitter else []
+        parts += [f"{100.0 * self.loss:g} % lost"] if self.loss else []
+        if self.bursts.share:
+            parts.append(
+                f"links out {100.0 * self.bursts.share:g} % of the time, "
+                f"{self.bursts.length:g} s on average"
+            )
+        content = f"messages contain {self.messages.value}"
+        return ", ".join(parts) + f"; {content}"
+
+
+_RANGES: Mapping[tuple[str, ...], tuple[str, Callable[[float], bool]]] = {
+    ("rate", "forget", "bursts.length"): ("positive", lambda x: x > 0.0),
+    ("delay", "jitter"): ("not negative", lambda x: x >= 0.0),
+    ("loss",): ("from 0 to 1", lambda x: 0.0 <= x <= 1.0),
+    ("bursts.share",): ("at least 0 and below 1", lambda x: 0.0 <= x < 1.0),
+}
+"""What is allowed of the numbers of a network, all of them finite."""
+
+
+def _check_number(name: str, value: object, allowed: str, fits: Callable[[float], bool]) -> None:
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise SimulationError(f"`{name}` of the network is {value!r}, and must be a number.")
+    if not (math.isfinite(value) and fits(float(value))):
+        raise SimulationError(f"`{name}` of the network is {value}, and must be {allowed}.")
+
+
+def _named(name: str, word: type[Word], value: object) -> Word:
+    try:
+        return word.named(value)
+    except KeyError:
+        names = list(map(str, word))
+        raise SimulationError(
+            f"`{name}` of the network is `{value}`, allowed are {listing(names)}"
+            f"{did_you_mean(str(value), names)}."
+        ) from None
+
+
+class Posts(NamedTuple):
+    """The last R messages of each agent, and what becomes of them on each of K links.
+
+    Attributes:
+        content: of the messages, leaves (R, N, ...).
+        arrival: (R, K) the step at which a message arrives; `NEVER` if it is lost.
+        out: (K,) whether the link was out when the last message was sent.
+    """
+
+    content: PyTree
+    arrival: Int[jax.Array, "R K"]
+    out: Bool[jax.Array, " K"]
+
+
+class Arrival(NamedTuple):
+    """What arrives at a step on each link: the newest message that is newer than the last one.
+
+    Attributes:
+        slot: (K,) its row of the posts.
+        stamp: (K,) the step at which it was sent; where nothing arrives, the last one's.
+        new: (K,) whether something arrives.
+    """
+
+    slot: Int[jax.Array, " K"]
+    stamp: Int[jax.Array, " K"]
+    new: Bool[jax.Array, " K"]
+
+
+@final
+class Channel(eqx.Module):
+    """The network of a run, in control steps; K links lead from `senders` to `receivers`.
+
+    Attributes:
+        every: steps between two messages of an agent.
+        delay, jitter, forget: steps.
+        loss, share, begins, ends: probabilities; the last two that an outage begins and ends with a
+            message.
+        key: of the draws.
+        slots: R, messages of an agent that may be under way.
+        bursty: whether there are outages.
+        messages, prediction, hears: as in `Network`.
+    """
+
+    every: Array
+    delay: Array
+    jitter: Array
+    forget: Array
+    loss: Array
+    share: Array
+    begins: Array
+    ends: Array
+    key: Array
+    slots: int = eqx.field(static=True)
+    bursty: bool = eqx.field(static=True)
+    messages: MessageContent = eqx.field(static=True)
+    prediction: Prediction = eqx.field(static=True)
+    hears: NeighbourChoice = eqx.field(static=True)
+
+    def begin(self, content: PyTree, links: int) -> Posts:
+        """Return posts before the first message, of which `content` (N, ...) is an example."""
+        rows = jax.tree.map(lambda x: jnp.zeros((self.slots, *x.shape), x.dtype), content)
+        return Posts(
+            rows,
+            jnp.full((self.slots, links), NEVER, jnp.int32),
+            jnp.zeros(links, bool),
+        )
+
+    def post(
+        self,
+        posts: Posts,
+        step: jax.Array,
+        content: PyTree,
+        sends: Bool[jax.Array, " N"],
+        receivers: Array,
+        senders: Array,
+    ) -> Posts:
+        """Return the posts after a step; agents send at every `every`-th one, if `sends`."""
+        number = step // self.every
+        slot = number % self.slots
+
+        def put(posts: Posts) -> Posts:
+            lost, late, out = self._draw(number, step, posts.out, receivers, senders)
+            arrives = step + self.delay + late
+            arrival = jnp.where(lost | ~sends[jnp.asarray(senders)], NEVER, arrives)
+            rows = jax.tree.map(lambda row, x: row.at[slot].set(x), posts.content, content)
+            return Posts(rows, posts.arrival.at[slot].set(arrival.astype(jnp.int32)), out)
+
+        return jax.lax.cond(step % self.every == 0, put, lambda posts: posts, posts)
+
+    def _draw(
+        self,
+        number: jax.Array,
+        step: jax.Array,
+        out: Bool[jax.Array, " K"],
+        receivers: Array,
+        senders: Array,
+    ) -> tuple[Bool[jax.Array, " K"], Int[jax.Array, " K"], Bool[jax.Array, " K"]]:
+        """Return which links lose a message, how late it is beyond the delay, and which are out."""
+
+        def one(
+            out: jax.Array, i: jax.Array, j: jax.Array
+        ) -> tuple[jax.Array, jax.Array, jax.Array]:
+            # By receiver and sender, and not by the link's place: no other edge changes a draw.
+            late = jnp.floor(uniform(self.key, Draw.JITTER, number, i, j) * (self.jitter + 1))
+            lost = uniform(self.key, Draw.LOSS, number, i, j) < self.loss
+            if self.bursty:
+                stays = jnp.where(out, 1.0 - self.ends, self.begins)
+                chance = jnp.where(step == 0, self.share, stays)
+                out = uniform(self.key, Draw.OUTAGE, number, i, j) < chance
+            return lost | out, late.astype(jnp.int32), out
+
+        return jax.vmap(one)(out, jnp.asarray(receivers), jnp.asarray(senders))
+
+    def arrivals(self, posts: Posts, step: jax.Array, newest: Int[jax.Array, " K"]) -> Arrival:
+        """Return what arrives at a step, of what is newer than the `newest` (K,) stamps."""
+        # The number of the last message in each row, counted back from the last one sent.
+        last = (step - 1) // self.every
+        rows = jnp.arange(self.slots)
+        stamps = ((last - (last - rows) % self.slots) * self.every).astype(jnp.int32)
+        # A row that was not written yet has no arrival.
+        now = (posts.arrival == step) & (stamps[:, None] > newest[None])
+        stamp = jnp.max(jnp.where(now, stamps[:, None], newest[None]), axis=0)
+        slot = jnp.argmax(now & (stamps[:, None] == stamp[None]), axis=0)
+        return Arrival(slot, stamp, now.any(axis=0))

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from echelon.core.types import Array, States
 
@@ -55,3 +55,21 @@ class Exchange(eqx.Module):
         # leave rounding.
         differences = weights * difference(values[self.receivers], received)
         return jax.ops.segment_sum(differences, self.receivers, num_segments=len(values))
+
+    def mean(
+        self,
+        values: Float[jax.Array, "N s"],
+        received: Float[jax.Array, "K s"],
+        used: Bool[jax.Array, " K"],
+        alone: Float[jax.Array, "N s"],
+        difference: Difference = operator.sub,
+    ) -> Float[jax.Array, "N s"]:
+        """Return the weighted mean (N, s) of the differences along the links that are used (K,).
+
+        Of an agent without any it is `alone` (N, s).
+        """
+        weights = jnp.where(used, jnp.asarray(self.weights, values.dtype), 0.0)
+        chosen = Exchange(self.receivers, self.senders, weights)
+        total = jax.ops.segment_sum(weights, self.receivers, num_segments=len(values))[:, None]
+        z = chosen(values, received, difference)
+        return jnp.where(total > 0.0, z / jnp.where(total > 0.0, total, 1.0), alone)

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,10 @@ _MAX_TIME = 10**9
 
 class Reference(Guide):
     """A path t -> (x, y, z, yaw), in metres and radians; t in seconds."""
+
+    joined: ClassVar[int | None] = None
+    """How many derivatives are continuous, with one more bounded, of a path that is joined of
+    pieces; None where its equations have none."""
 
     @abc.abstractmethod
     def __call__(self, t: Scalar) -> jax.Array:

@@ -35,6 +35,9 @@ class Waypoints(Reference):
     coefficients: Array
     yaw: float = eqx.field()
 
+    # Six inside; at rest at both ends up to the third.
+    joined = 3
+
     def __init__(
         self, times: Sequence[float], points: Sequence[Sequence[float]], yaw: float = 0.0
     ) -> None:

@@ -15,12 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
+from echelon.core.draws import Draw, key_of, normals
 from echelon.core.errors import ModelError, SimulationError, did_you_mean, listing
 from echelon.core.numerics import Field
 from echelon.core.types import Array, Input, State
-
-# Folded into the key, so that one seed draws wind and noise independently.
-_WIND, _NOISE = 0, 1
 
 
 @final
@@ -104,8 +102,7 @@ class Disturbance:
             # None and not zeros, so that a step without draws is compiled without them.
             rms=rms if rms.any() else None,
             noise=noise if noise.any() else None,
-            # The two halves of the seed: 32-bit integers would cut it to its lower one.
-            key=np.array([seed >> 32 & 0xFFFFFFFF, seed & 0xFFFFFFFF], np.uint32),
+            key=key_of(seed),
             # Whole steps: a wind that changed within one would cost the integrator its order.
             # A draw longer than any run need not be counted further.
             window=np.asarray(max(1, round(min(self.hold / dt, 2**31 - 1))), np.int32),
@@ -139,23 +136,17 @@ class Wind(eqx.Module):
         if self.rms is None:
             return constant
         # The draw of agent 0 for all; the product keeps the number traced.
-        draw = self._draw(_WIND, step, 0 * agent if self.common else agent, len(self.rms))
+        draw = self._draw(Draw.WIND, step, 0 * agent if self.common else agent, len(self.rms))
         return constant + jnp.asarray(self.rms) * draw
 
     def on_input(self, step: jax.Array, agent: jax.Array) -> Input | None:
         """Return the noise on the physical input of an agent during a step."""
         if self.noise is None:
             return None
-        return jnp.asarray(self.noise) @ self._draw(_NOISE, step, agent, len(self.noise))
+        return jnp.asarray(self.noise) @ self._draw(Draw.NOISE, step, agent, len(self.noise))
 
-    def _draw(self, part: int, step: jax.Array, agent: jax.Array, size: int) -> jax.Array:
-        # By name, since the default generator of JAX is a setting of the user.
-        key = jax.random.wrap_key_data(jnp.asarray(self.key), impl="threefry2x32")
-        # Keyed by time and agent instead of carried on: no draw depends on earlier ones.
-        for number in (part, step // jnp.asarray(self.window), agent):
-            key = jax.random.fold_in(key, number)
-        # Drawn in float32, so that draws do not depend on the precision.
-        return jax.random.normal(key, (size,), jnp.float32).astype(float)
+    def _draw(self, kind: Draw, step: jax.Array, agent: jax.Array, size: int) -> jax.Array:
+        return normals(self.key, kind, step // jnp.asarray(self.window), agent, size=size)
 
 
 def draw(wind: Wind | None, step: jax.Array, agent: jax.Array) -> tuple[State | None, Input | None]:

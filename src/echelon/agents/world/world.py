@@ -1,11 +1,11 @@
-"""The world of a run: plant, disturbance and channel, of which the laws know nothing."""
+"""The world of a run: plant, disturbance and network, of which the laws know nothing."""
 
 import dataclasses
 from typing import final
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
-from echelon.agents.network.channel import Channel
+from echelon.agents.network.channel import Network
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.plant import check_plant, differences
 from echelon.core.errors import SimulationError
@@ -19,17 +19,17 @@ class World:
     Args:
         plant: the agents that move, with their actuators, where they differ from the model.
         disturbance: wind and noise on all agents.
-        channel: what the network does to messages; left out, the network is ideal.
+        network: on which messages take time and are lost; left out, it is ideal.
     """
 
     plant: ControlAffine | None = None
     disturbance: Disturbance | None = None
-    channel: Channel | None = None
+    network: Network | None = None
 
     @property
     def ideal(self) -> bool:
         """Whether the agents are as the model says, undisturbed, and the network is ideal."""
-        return self.plant is None and self.disturbance is None and self.channel is None
+        return self.plant is None and self.disturbance is None and self.network is None
 
     def plant_for(self, model: ControlAffine) -> ControlAffine:
         """Return the plant, or the model if there is none."""
@@ -47,6 +47,10 @@ class World:
                 f"`disturbance` is a `{type(self.disturbance).__name__}`, and must be a "
                 "`Disturbance`."
             )
+        if self.network is not None and not isinstance(self.network, Network):
+            raise SimulationError(
+                f"`network` is a `{type(self.network).__name__}`, and must be a `Network`."
+            )
         if self.plant is None:
             return ()
         # First: a malformed plant may have no names to compare.
@@ -55,8 +59,9 @@ class World:
         return warnings
 
     def describe(self, model: ControlAffine) -> dict[str, str | None]:
-        """Return plant and disturbance in words; None for each that is absent."""
+        """Return plant, disturbance and network in words; None for each that is absent."""
         return {
             "plant": None if self.plant is None else differences(model, self.plant),
             "disturbance": None if self.disturbance is None else str(self.disturbance),
+            "network": None if self.network is None else str(self.network),
         }

@@ -20,8 +20,7 @@ def check(scenario: ScenarioArgument, set_: SetOption = None, as_json: JsonOptio
     assumptions = examine(*build(loaded))
     promise = assumptions.promise
     if as_json:
-        lines = [line.as_mapping() for line in assumptions.lines]
-        print(json.dumps({"promise": promise.as_mapping(), "lines": lines}, indent=2))
+        print(json.dumps(assumptions.as_mapping(), indent=2))
     else:
         tables.print_table(tables.statements_table(assumptions.lines), promise.sentence())
     raise typer.Exit(0 if assumptions.promised else 1)

@@ -1,8 +1,9 @@
 """Tables of checks, designs and facts on the terminal."""
 
+import enum
 import sys
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -11,14 +12,15 @@ if TYPE_CHECKING:
     from echelon.core.statement import Statement
     from echelon.core.types import JsonObject
     from echelon.experiments.studies.design import Design
+    from echelon.synthesis.gains.gain import Gain
 
 
-def console() -> "Console":
+def console(width: int = 200) -> "Console":
     """Return a console that keeps each row on one line where the output is no terminal."""
     from rich.console import Console
 
     # Wider than any table here, since `grep` and `awk` read lines.
-    return Console() if sys.stdout.isatty() else Console(width=200)
+    return Console() if sys.stdout.isatty() else Console(width=width)
 
 
 def pairs(facts: dict[str, str]) -> "Table":
@@ -39,57 +41,54 @@ def print_table(table: "Table", sentence: str) -> None:
     out.print(sentence, highlight=False, markup=False, soft_wrap=not out.is_terminal)
 
 
+_DESIGN: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "method": ("method", lambda design: design.method),
+    "coupling": ("coupling", lambda design: design.gain.coupling),
+    "edge": ("edge", lambda design: design.promise.edge),
+    "slowest_mode": ("slowest,\n1/s", lambda design: design.promise.slowest),
+    "fastest_mode": ("fastest,\n1/s", lambda design: design.fastest),
+    "longest_step": ("dt up to,\ns (1)", lambda design: design.step),
+    "condition": ("cond(P)", lambda design: _condition(design.gain)),
+    "gain_margin": ("gain\nmargin", lambda design: design.factors),
+    "delay_margin": ("delay\nmargin, s", lambda design: design.delay),
+    "rate": ("guaranteed,\n1/s", lambda design: design.promise.rate),
+    "kind": ("by", lambda design: str(design.promise.kind) if design.promise.promised else None),
+    "theorem": ("theorem", lambda design: design.promise.theorem),
+    "radius": (
+        "certified\nradius (2)",
+        lambda design: getattr(design.promise.certified, "radius", None),
+    ),
+    "seconds": ("seconds", lambda design: design.seconds),
+    "advice": ("", lambda design: design.advice),
+    "promised": ("", lambda design: design.promise.promised),
+    "promise": ("", lambda design: design.promise.as_mapping()),
+}
+"""The numbers of a design, each with its column, if it has one, and its computation."""
+
+
 def design_row(design: "Design") -> "JsonObject":
     """Return the numbers of a design; missing ones are None."""
     row: JsonObject = {"method": design.method, "reason": design.reason}
-    gain, promise = design.gain, design.promise
-    if gain is None or promise is None:
+    if design.gain is None or design.promise is None:
         return {**row, "seconds": design.seconds}
+    return row | {name: _plain(of(design)) for name, (_, of) in _DESIGN.items()}
+
+
+def _condition(gain: "Gain") -> float:
     import numpy as np
 
-    region, theorem, factors = promise.certified, promise.theorem, design.factors
-    return {
-        **row,
-        "advice": design.advice,
-        "coupling": gain.coupling,
-        "edge": promise.edge,
-        "slowest_mode": promise.slowest,
-        "fastest_mode": design.fastest,
-        "longest_step": _finite(design.step),
-        "condition": float(np.linalg.cond(gain.P)),
-        "gain_margin": None if factors is None else [_finite(factor) for factor in factors],
-        "delay_margin": _finite(design.delay),
-        "promised": promise.promised,
-        "rate": promise.rate,
-        "kind": str(promise.kind) if promise.promised else None,
-        "theorem": None if theorem is None else str(theorem),
-        "radius": None if region is None else _finite(region.radius),
-        "promise": promise.as_mapping(),
-        "seconds": design.seconds,
-    }
+    return float(np.linalg.cond(gain.P))
 
 
-def _finite(value: float | None) -> float | None:
-    """Return a number, or None for infinity, which JSON cannot express."""
-    return None if value is None or value == float("inf") else value
+def _plain(value: object) -> object:
+    """Return a value ready for JSON, with None for infinity, which JSON cannot express."""
+    if isinstance(value, tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, enum.Enum):
+        return str(value)
+    return None if value == float("inf") else value
 
 
-_COLUMNS = {
-    "method": "method",
-    "coupling": "coupling",
-    "edge": "edge",
-    "slowest_mode": "slowest,\n1/s",
-    "fastest_mode": "fastest,\n1/s",
-    "longest_step": "dt up to,\ns (1)",
-    "condition": "cond(P)",
-    "gain_margin": "gain\nmargin",
-    "delay_margin": "delay\nmargin, s",
-    "rate": "guaranteed,\n1/s",
-    "kind": "by",
-    "theorem": "theorem",
-    "radius": "certified\nradius (2)",
-    "seconds": "seconds",
-}
 _FOOTNOTES = (
     "(1) longest sampling period for which all checked modes remain stable.",
     "(2) r in sum_i delta_i'P delta_i <= r^2, reduced by the leader's motion over the horizon.",
@@ -102,10 +101,11 @@ def print_designs(rows: "list[JsonObject]", sentence: str) -> None:
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for key, title in _COLUMNS.items():
+    columns = {key: title for key, (title, _) in _DESIGN.items() if title}
+    for key, title in columns.items():
         table.add_column(title, justify="left" if key == "method" else "right")
     for row in rows:
-        table.add_row(*(_cell(row.get(key)) for key in _COLUMNS))
+        table.add_row(*(_cell(row.get(key)) for key in columns))
     out = console()
     out.print(table)
     notes = [*_FOOTNOTES] if any(row.get("coupling") for row in rows) else []

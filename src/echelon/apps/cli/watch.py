@@ -28,7 +28,7 @@ class WatchedRun:
     def __init__(self, scenario: "Scenario", experiment: "Experiment") -> None:
         """Prepare the page, as far as it is known before the run."""
         from echelon.experiments.results.foreseen import foreseen
-        from echelon.experiments.results.lyapunov import goes_both_ways, potential
+        from echelon.experiments.results.lyapunov import fixed_metric, potential
         from echelon.guarantees.promises.promise import promise
         from echelon.output.viewer.growing import Growing
         from echelon.simulation.engine.prepare import prepare
@@ -37,12 +37,9 @@ class WatchedRun:
         parts, settings = prepared.parts, prepared.problem.settings
         guarantee = promise(parts, settings).as_mapping()
         self.run = foreseen(parts, settings, prepared.problem.states, scenario.name, guarantee)
-        P = parts.drive.metric(parts.model)
-        # P of a law in heading axes turns with them, so V is computed only at the end.
-        turning = getattr(getattr(parts.drive, "follower", None), "turning", False)
-        self.potential = None
-        if P is not None and goes_both_ways(parts.graph) and not turning:
-            self.potential = potential(parts.model, parts.graph, P)
+        # The V of a P that turns is computed only at the end.
+        P = fixed_metric(parts)
+        self.potential = None if P is None else potential(parts.model, parts.graph, P)
         self.page = Growing(self.run)
 
     def add(self, stretch: "Stretch") -> None:

@@ -18,7 +18,7 @@ from echelon.core.compiled import cached_jit
 from echelon.core.errors import GraphError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, PyTree
-from echelon.experiments.results.lyapunov import goes_both_ways, potential
+from echelon.experiments.results.lyapunov import fixed_metric, potential
 from echelon.laws.law import Law
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
@@ -30,6 +30,8 @@ from echelon.synthesis.gains.gain import Gain
 
 PICTURE = 0.04
 """Seconds between two pictures."""
+_FAR = 1e5
+"""A state that is as large as this has diverged."""
 _AHEAD = 60.0
 """Seconds ahead for which the times of the graph's switches are computed, at least."""
 
@@ -171,11 +173,10 @@ class LiveLoop:
 
     def _potential(self, knobs: Knobs) -> Callable[[Array], Array] | None:
         """Return the function that computes V; None without a P or for a disconnected graph."""
-        gain = self.panel.gain(knobs)
-        P = self.parts.drive.metric(self.parts.model) if gain is None else gain.P
-        # The P of a law that turns with the heading is in axes that turn too.
-        if P is None or self.loop.follower.turning or not goes_both_ways(self.parts.graph):
+        P, gain = fixed_metric(self.parts), self.panel.gain(knobs)
+        if P is None:
             return None
+        P = P if gain is None else gain.P
         key = knobs.cut, knobs.method, knobs.weight
         if key not in self.potentials:
             try:
@@ -207,9 +208,9 @@ class LiveLoop:
         with np.errstate(over="ignore", invalid="ignore"):
             deviation = (y - y[self.nearest])[:, self.measured]
             errors = np.linalg.norm(deviation, axis=1)
-        valid = np.isfinite(inputs).all(axis=1) & (np.abs(states) < self.stepper.largest).all(
-            axis=1
-        )
+        valid = np.isfinite(inputs).all(axis=1) & (np.abs(states) < _FAR).all(axis=1)
+        # Which agent it is nobody knows.
+        valid &= not np.any(chunk.inexact)
         time = self.steps * self.settings.dt
         V = float(self.potential(y[None])[0]) if valid.all() and self.potential else np.nan
         return Picture(time, states, inputs, errors, self.offsets, V, np.logical_not(valid))

@@ -5,113 +5,65 @@ the interval (Moore, Interval Analysis, 1966). Derivatives of JAX are not used, 
 quadratic in the order. Ends are integer multiples of 2^-90, rounded outward by every product.
 """
 
-import functools
 import math
-import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import TypeAlias, final
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-from jax.extend.core import JaxprEqn
-
-from echelon.core.enclosure import rules
 from echelon.core.enclosure.interval import ELEMENTARY, Interval, wave
 from echelon.core.errors import GainError
-from echelon.core.jaxpr import Algebra, Params, Rule, dot, entrywise, map_entries, reduction, walk
-from echelon.core.numerics import precision
 
 _BITS = 90
-_UNIT = 1 << _BITS
+UNIT = 1 << _BITS
 
-_Ends: TypeAlias = tuple[int, int]
+Ends: TypeAlias = tuple[int, int]
 """Ends of an interval in units of 2^-90."""
-
-
-def enclose_derivatives(
-    function: Callable[[jax.Array], jax.Array], times: Sequence[Fraction], order: int
-) -> Iterator[list[list[Interval]]]:
-    """Yield enclosures of a function of time and its derivatives between consecutive times.
-
-    By the mean value theorem, a value differs from that at the midpoint by at most half the width
-    times the range of the next derivative.
-
-    Args:
-        function: t () -> (k,), traceable by JAX.
-        times: ascending, two or more.
-        order: of the highest derivative.
-
-    Yields:
-        For each derivative from 0 on, the k intervals.
-
-    Raises:
-        GainError: the function has no enclosure there; the primitive is named.
-    """
-    with precision("float64"):
-        closed = jax.make_jaxpr(function)(jnp.zeros(()))
-
-    def derivatives(low: Fraction, high: Fraction, order: int) -> list[list[_Ends]]:
-        t = np.empty((), object)
-        t[()] = Series(((_down(low), _up(high)), *[_whole(k == 1) for k in range(1, order + 1)]))
-        with precision("float64"):
-            [result] = walk(closed.jaxpr, closed.consts, [t], _algebra(order))
-        rows = [_lifted(entry, order).parts for entry in result.ravel()]
-        return [[_scaled(row[k], math.factorial(k), 1) for row in rows] for k in range(order + 1)]
-
-    for low, high in zip(times, times[1:], strict=False):
-        there = derivatives((low + high) / 2, (low + high) / 2, order)
-        all_over, half = derivatives(low, high, order + 1), _up((high - low) / 2)
-        yield [
-            [_near(*three, half) for three in zip(*rows, strict=True)]
-            for rows in zip(there, all_over, all_over[1:], strict=False)
-        ]
-
-
-def _near(middle: _Ends, all_over: _Ends, slope: _Ends, half: int) -> Interval:
-    """Return the values on an interval from those at its midpoint (mean value theorem)."""
-    low, high = _sum(middle, _times((-half, half), slope))
-    return _interval((max(low, all_over[0]), min(high, all_over[1])))
 
 
 # ---- intervals between whole numbers of units ----------------------------------------------------
 
 
-def _down(x: Fraction) -> int:
-    return math.floor(x * _UNIT)
+def down(x: Fraction) -> int:
+    """Return a number in units, rounded down."""
+    return math.floor(x * UNIT)
 
 
-def _up(x: Fraction) -> int:
-    return math.ceil(x * _UNIT)
+def up(x: Fraction) -> int:
+    """Return a number in units, rounded up."""
+    return math.ceil(x * UNIT)
 
 
-def _ends(x: Interval) -> _Ends:
-    return _down(x.lo), _up(x.hi)
+def ends_of(x: Interval) -> Ends:
+    """Return the ends of an interval, rounded outward."""
+    return down(x.lo), up(x.hi)
 
 
-def _interval(x: _Ends) -> Interval:
-    return Interval(Fraction(x[0], _UNIT), Fraction(x[1], _UNIT))
+def interval_of(x: Ends) -> Interval:
+    """Return an interval from its ends."""
+    return Interval(Fraction(x[0], UNIT), Fraction(x[1], UNIT))
 
 
-def _whole(x: int) -> _Ends:
-    return x * _UNIT, x * _UNIT
+def whole(x: int) -> Ends:
+    """Return a whole number."""
+    return x * UNIT, x * UNIT
 
 
-def _sum(a: _Ends, b: _Ends) -> _Ends:
+def add_ends(a: Ends, b: Ends) -> Ends:
+    """Return a + b."""
     return a[0] + b[0], a[1] + b[1]
 
 
-def _minus(a: _Ends) -> _Ends:
+def _minus(a: Ends) -> Ends:
     return -a[1], -a[0]
 
 
-def _scaled(a: _Ends, numerator: int, denominator: int) -> _Ends:
+def scale_ends(a: Ends, numerator: int, denominator: int) -> Ends:
     """Return an interval times a positive fraction."""
     return a[0] * numerator // denominator, -(-a[1] * numerator // denominator)
 
 
-def _times(a: _Ends, b: _Ends) -> _Ends:
+def multiply_ends(a: Ends, b: Ends) -> Ends:
+    """Return a b, rounded outward."""
     # A product is linear in each factor, so its extremes lie at ends.
     ends = a[0] * b[0], a[0] * b[1], a[1] * b[0], a[1] * b[1]
     return min(ends) >> _BITS, -(-max(ends) >> _BITS)
@@ -126,7 +78,7 @@ class Series:
 
     __slots__ = ("parts",)
 
-    def __init__(self, parts: Sequence[_Ends]) -> None:
+    def __init__(self, parts: Sequence[Ends]) -> None:
         self.parts = tuple(parts)
 
     @property
@@ -140,7 +92,7 @@ class Series:
         return any(low or high for low, high in self.parts[1:])
 
     def __add__(self, other: "Series") -> "Series":
-        return Series(tuple(map(_sum, self.parts, other.parts)))
+        return Series(tuple(map(add_ends, self.parts, other.parts)))
 
     def __neg__(self) -> "Series":
         return Series(tuple(map(_minus, self.parts)))
@@ -152,51 +104,53 @@ class Series:
         return Series([_product(self.parts, other.parts, k) for k in range(len(self.parts))])
 
 
-def _product(a: Sequence[_Ends], b: Sequence[_Ends], k: int, first: int = 0) -> _Ends:
+def _product(a: Sequence[Ends], b: Sequence[Ends], k: int, first: int = 0) -> Ends:
     """Return coefficient k of a product, its terms from a[first] on."""
     total = 0, 0
     for i in range(first, k + 1):
         if a[i] != (0, 0):
-            total = _sum(total, _times(a[i], b[k - i]))
+            total = add_ends(total, multiply_ends(a[i], b[k - i]))
     return total
 
 
 def number(x: float | Fraction, order: int) -> Series:
     """Return a constant."""
     x = Fraction(x)
-    return Series(((_down(x), _up(x)), *[(0, 0)] * order))
+    return Series(((down(x), up(x)), *[(0, 0)] * order))
 
 
-def _lifted(entry: Series | float, order: int) -> Series:
+def lifted(entry: Series | float, order: int) -> Series:
+    """Return an entry as a series."""
     return entry if isinstance(entry, Series) else number(float(entry), order)
 
 
 # ---- functions -----------------------------------------------------------------------------------
 
 
-def _reciprocal(x: Series) -> Series:
+def reciprocal(x: Series) -> Series:
     """Return r = 1 / x, from x r = 1."""
-    first, result = _applied("reciprocal", x.parts[0]), list[_Ends]()
+    first, result = _applied("reciprocal", x.parts[0]), list[Ends]()
     for k in range(x.order + 1):
         rest = _product(x.parts, [*result, (0, 0)], k, first=1)
-        result.append(_minus(_times(first, rest)) if k else first)
+        result.append(_minus(multiply_ends(first, rest)) if k else first)
     return Series(result)
 
 
-def _whole_power(x: Series, k: int) -> Series:
+def whole_power(x: Series, k: int) -> Series:
+    """Return x^k of a whole k."""
     if k < 0:
-        return _reciprocal(_whole_power(x, -k))
+        return reciprocal(whole_power(x, -k))
     result = number(1, x.order)
     for _ in range(k):
         result = result * x
     # Even powers are nonnegative, which interval products do not use.
-    value = _ends(_interval(x.parts[0]).power(k)) if k else result.parts[0]
+    value = ends_of(interval_of(x.parts[0]).power(k)) if k else result.parts[0]
     return Series((value, *result.parts[1:]))
 
 
 def _circle(x: Series) -> tuple[Series, Series]:
     """Return c = cos x and s = sin x, from c' = -s x' and s' = c x'."""
-    c, s = ([_ends(wave(_interval(x.parts[0]), sine=sine))] for sine in (False, True))
+    c, s = ([ends_of(wave(interval_of(x.parts[0]), sine=sine))] for sine in (False, True))
     for k in range(1, x.order + 1):
         rotated = _minus(_integral(x, s, k))
         s.append(_integral(x, c, k))
@@ -204,11 +158,11 @@ def _circle(x: Series) -> tuple[Series, Series]:
     return Series(c), Series(s)
 
 
-def _integral(x: Series, f: Sequence[_Ends], k: int) -> _Ends:
+def _integral(x: Series, f: Sequence[Ends], k: int) -> Ends:
     """Return coefficient k of the integral of f x', from the first k coefficients of f."""
     total = 0, 0
     for i in range(1, k + 1):
-        total = _sum(total, _scaled(_times(x.parts[i], f[k - i]), i, k))
+        total = add_ends(total, scale_ends(multiply_ends(x.parts[i], f[k - i]), i, k))
     return total
 
 
@@ -237,44 +191,49 @@ def _sqrt(x: Series) -> Series:
     result = [_applied("sqrt", x.parts[0])]
     if not x.moves:
         return Series((result[0], *x.parts[1:]))
-    half = _scaled(_applied("reciprocal", result[0]), 1, 2)
+    half = scale_ends(_applied("reciprocal", result[0]), 1, 2)
     for k in range(1, x.order + 1):
         # Without the first and last term of the sum, which contain the unknown coefficient.
         rest = _product([*result, (0, 0)], [*result, (0, 0)], k, first=1)
-        result.append(_times(half, _sum(x.parts[k], _minus(rest))))
+        result.append(multiply_ends(half, add_ends(x.parts[k], _minus(rest))))
     return Series(result)
 
 
-def _applied(name: str, ends: _Ends) -> _Ends:
+def _applied(name: str, ends: Ends) -> Ends:
     """Return the range of an elementary function.
 
     Raises:
         GainError: it is not defined there.
     """
-    elementary, x = ELEMENTARY[name], _interval(ends)
+    elementary, x = ELEMENTARY[name], interval_of(ends)
     if not elementary.defined(x):
         raise GainError(
             f"a path takes `{name}` of an expression in {x.text()}, which {elementary.domain}."
         )
-    return _ends(elementary.range(x))
+    return ends_of(elementary.range(x))
 
 
-def _power(x: Series, exponent: Series | int) -> Series:
+def power(x: Series, exponent: Series | int) -> Series:
+    """Return x to a constant exponent.
+
+    Raises:
+        GainError: the exponent varies.
+    """
     k = exponent if isinstance(exponent, Series) else number(int(exponent), x.order)
     if k.moves:
         raise GainError("a path has an exponent that varies in time, which has no enclosure.")
     low, high = k.parts[0]
-    if low == high and not low % _UNIT:
-        return _whole_power(x, low >> _BITS)
+    if low == high and not low % UNIT:
+        return whole_power(x, low >> _BITS)
     return _exp(k * _log(x))
 
 
-_log = _primitive("log", _reciprocal)
+_log = _primitive("log", reciprocal)
 _SLOPES: dict[str, Callable[[Series], Series]] = {
-    "log1p": lambda x: _reciprocal(number(1, x.order) + x),
-    "atan": lambda x: _reciprocal(number(1, x.order) + x * x),
-    "asin": lambda x: _reciprocal(_sqrt(number(1, x.order) - x * x)),
-    "acos": lambda x: -_reciprocal(_sqrt(number(1, x.order) - x * x)),
+    "log1p": lambda x: reciprocal(number(1, x.order) + x),
+    "atan": lambda x: reciprocal(number(1, x.order) + x * x),
+    "asin": lambda x: reciprocal(_sqrt(number(1, x.order) - x * x)),
+    "acos": lambda x: -reciprocal(_sqrt(number(1, x.order) - x * x)),
 }
 
 
@@ -286,64 +245,29 @@ def _hyperbolic(x: Series, sign: int) -> Series:
 
 def _tangent(x: Series) -> Series:
     c, s = _circle(x)
-    return s * _reciprocal(c)
+    return s * reciprocal(c)
 
 
 def _tanh(x: Series) -> Series:
     """Return 1 - 2 / (exp 2x + 1), within -1 and 1."""
     one, two = number(1, x.order), number(2, x.order)
-    result = one - two * _reciprocal(_exp(two * x) + one)
+    result = one - two * reciprocal(_exp(two * x) + one)
     return Series((_applied("tanh", x.parts[0]), *result.parts[1:]))
 
 
-_FUNCTIONS: dict[str, Callable[[Series], Series]] = {
+FUNCTIONS: dict[str, Callable[[Series], Series]] = {
     **{name: _primitive(name, slope) for name, slope in _SLOPES.items()},
     "log": _log,
     "exp": _exp,
     "expm1": lambda x: _exp(x) - number(1, x.order),
     "sqrt": _sqrt,
-    "rsqrt": lambda x: _reciprocal(_sqrt(x)),
+    "rsqrt": lambda x: reciprocal(_sqrt(x)),
     "sin": lambda x: _circle(x)[1],
     "cos": lambda x: _circle(x)[0],
     "tan": _tangent,
     "sinh": lambda x: _hyperbolic(x, -1),
     "cosh": lambda x: _hyperbolic(x, 1),
     "tanh": _tanh,
-    "logistic": lambda x: _reciprocal(number(1, x.order) + _exp(-x)),
+    "logistic": lambda x: reciprocal(number(1, x.order) + _exp(-x)),
+    "asinh": lambda x: _log(x + _sqrt(number(1, x.order) + x * x)),
 }
-
-
-@functools.cache
-def _algebra(order: int) -> Algebra:
-    """Return the algebra of series up to an order."""
-
-    def lift(array: np.ndarray) -> np.ndarray:
-        lifted = rules.lift(array)
-        if lifted.dtype != object:
-            return lifted
-        # `rules.lift` returns constants as polynomials.
-        return map_entries(lambda p: number(p.value() or 0.0, order), lifted)
-
-    def unknown(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
-        raise GainError(
-            f"a path uses `{equation.primitive.name}`, which has no enclosure over time."
-        )
-
-    zero, one = number(0, order), number(1, order)
-    functions: dict[str, Rule] = {
-        **{name: entrywise(function) for name, function in _FUNCTIONS.items()},
-        "div": entrywise(lambda a, b: a * _reciprocal(b)),
-        "integer_pow": lambda params, x: map_entries(lambda s: _whole_power(s, params["y"]), x),
-        "pow": entrywise(_power),
-        "convert_element_type": _convert,
-        "dot_general": dot(zero),
-        "reduce_sum": reduction(operator.add, zero),
-        "reduce_prod": reduction(operator.mul, one),
-    }
-    return Algebra(functions, lambda x: number(x, order), lift, rules.outside, unknown)
-
-
-def _convert(params: Params, x: np.ndarray) -> np.ndarray:
-    if np.dtype(params["new_dtype"]).kind in "biu":
-        raise GainError("a path converts time to a whole number, which has no enclosure.")
-    return x

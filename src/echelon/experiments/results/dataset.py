@@ -21,9 +21,11 @@ from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import metrics, output_errors
 from echelon.experiments.results.quantity import Shown
 from echelon.experiments.results.recording import Recording, recording
-from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RunNumbers
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
 from echelon.guarantees.promises.promise import promise
+from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
+from echelon.simulation.step.settings import Settings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -131,21 +133,45 @@ def save_dataset(run: "Result | Labelled | xr.Dataset", path: Path) -> None:
         write_atomic(path, bytes(data.to_netcdf(None, engine="h5netcdf")))
 
 
+def statement(parts: Parts, settings: Settings, name: str) -> JsonObject:
+    """Return the entries of a summary that follow from the parts of a run, without running it."""
+    gain, spectrum = parts.drive.gain, parts.graph.spectrum()
+    return {
+        "scenario": name,
+        "agents": parts.graph.agents,
+        "unit": "m" if parts.model.position else "state",
+        "horizon_s": settings.horizon,
+        "dt_s": settings.dt,
+        "seed": settings.seed,
+        **parts.world.describe(parts.model),
+        "gain": None
+        if gain is None
+        else {
+            "method": gain.method,
+            "coupling": gain.coupling,
+            "P": gain.P.tolist(),
+            "R": gain.R.tolist(),
+        },
+        "promise": promise(parts, settings).as_mapping(),
+        "lambda_min": spectrum.low,
+        "lambda_max": spectrum.high,
+    }
+
+
+_NUMBERS = tuple(x.key or name for name, x in shown_in(RUN_NUMBERS, Shown.SUMMARY).items())
+OBSERVED = ("outcome", "leader", "leaders", "followers", "edges", *_NUMBERS)
+OBSERVED += ("steady_window_s", "warnings", "engine", "wall_time_s", "versions")
+"""The other entries of a summary, which only the run itself gives."""
+
+
 def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
     """Return the run's summary as JSON data; numbers that do not exist are None."""
     numbers = metrics(result) if numbers is None else numbers
+    name = result.provenance.get("scenario", "")
     guarantee = promise(result.parts, result.settings)
-    gain = result.drive.gain
-    spectrum = result.graph.spectrum()
     return {
-        "scenario": result.provenance.get("scenario", ""),
+        **statement(result.parts, result.settings, name),
         "outcome": {"name": result.outcome.name.lower(), "message": result.message},
-        "agents": result.graph.agents,
-        "unit": result.unit,
-        "horizon_s": result.settings.horizon,
-        "dt_s": result.settings.dt,
-        "seed": result.settings.seed,
-        **result.world.describe(result.model),
         "leader": numbers.leader._asdict(),
         "leaders": [each._asdict() for each in numbers.leaders],
         "followers": [
@@ -155,17 +181,6 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
             {"edge": list(each.edge), "distance_rmse": each.distance_rmse}
             for each in _listed(numbers.edges, _distance_error)
         ],
-        "gain": None
-        if gain is None
-        else {
-            "method": gain.method,
-            "coupling": gain.coupling,
-            "P": gain.P.tolist(),
-            "R": gain.R.tolist(),
-        },
-        "promise": guarantee.as_mapping(),
-        "lambda_min": spectrum.low,
-        "lambda_max": spectrum.high,
         **RunNumbers(result, numbers, guarantee).json(Shown.SUMMARY),
         "steady_window_s": numbers.steady_window,
         "warnings": list(result.warnings),

@@ -17,6 +17,7 @@ from echelon.agents.world.disturbance import disturbed, draw
 from echelon.core.compiled import cached_jit
 from echelon.core.numerics import precision
 from echelon.core.types import Array
+from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.motion import Motion
@@ -72,6 +73,14 @@ def rises(
 def goes_both_ways(graph: Graph) -> bool:
     """Return whether V is defined for a graph: undirected, and without switching."""
     return not graph.directed and graph.schedule is None
+
+
+def fixed_metric(parts: Parts) -> Float[Array, "n n"] | None:
+    """Return the P of V, if V is a function of the states alone: P does not turn with a heading."""
+    turning = getattr(getattr(parts.drive, "follower", None), "turning", False)
+    if turning or not goes_both_ways(parts.graph):
+        return None
+    return parts.drive.metric(parts.model)
 
 
 def lyapunov(result: Result) -> Lyapunov | None:

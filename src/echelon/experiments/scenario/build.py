@@ -1,9 +1,8 @@
 """Builds the parts of a checked scenario, and runs them."""
 
-import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
@@ -11,14 +10,13 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
-from echelon.agents.world.disturbance import Disturbance
-from echelon.agents.world.plant import check_plant, vary_parameters
 from echelon.agents.world.world import World
-from echelon.core.errors import EchelonError, MissingExtraError, ModelError, ScenarioError, listing
+from echelon.core.errors import ModelError, ScenarioError, listing
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.checks import ROLES, section
+from echelon.experiments.scenario.fault_list import FaultList
 from echelon.experiments.scenario.law_sections import GainSpec, law_arguments
 from echelon.experiments.scenario.named_class import (
     NamedClass,
@@ -28,10 +26,10 @@ from echelon.experiments.scenario.named_class import (
     named_class,
     offered,
 )
-from echelon.experiments.scenario.scenario import Fault, Scenario, refuse
+from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.user_code import as_scenario_error
 from echelon.experiments.scenario.values import marked_keys
-from echelon.experiments.scenario.yaml import joined
+from echelon.experiments.scenario.world_parts import disturbance_of, network_of, plant_of
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
 from echelon.simulation.engine.initial import initial_states
@@ -45,43 +43,12 @@ from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain, Method, synthesize
 from echelon.synthesis.gains.gain_file import load_gain
 
-_Part = TypeVar("_Part")
-
 
 class Experiment(NamedTuple):
     """The arguments of `simulate`: the parts of a scenario, and its settings."""
 
     parts: Parts
     settings: Settings
-
-
-class _Faults:
-    """Collects the faults of parts, each with the place of its key."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self.scenario = scenario
-        self.faults: list[Fault] = []
-
-    @contextlib.contextmanager
-    def at(self, *path: str | int) -> Iterator[None]:
-        """Record an error that is raised inside, and continue."""
-        try:
-            yield
-        except MissingExtraError:
-            raise
-        except EchelonError as error:
-            self.faults.append(Fault(self.scenario.place(*path), joined(path), str(error)))
-
-    def part(self, make: Callable[[], _Part], *path: str | int) -> _Part:
-        """Return a part; in place of one with a fault None, until `settle` raises the fault."""
-        with self.at(*path):
-            return make()
-        return cast(_Part, None)
-
-    def settle(self) -> None:
-        """Raise all recorded faults, a line each."""
-        if self.faults:
-            refuse(self.faults)
 
 
 def build(scenario: Scenario, to_run: bool = False) -> Experiment:
@@ -96,7 +63,7 @@ def build(scenario: Scenario, to_run: bool = False) -> Experiment:
         ScenarioError: one line for each part that cannot be built, with its place in the file.
     """
     _check_scenario(scenario)
-    faults = _Faults(scenario)
+    faults = FaultList(scenario)
     # Gains are computed here, and would have 7 digits under float32.
     with precision("float64"):
         settings = faults.part(lambda: _settings(scenario), "simulation")
@@ -113,7 +80,7 @@ def build(scenario: Scenario, to_run: bool = False) -> Experiment:
 
 
 def _check_run(
-    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, settings: Settings
+    scenario: Scenario, faults: FaultList, model: ControlAffine, graph: Graph, settings: Settings
 ) -> None:
     """Check that a scenario has no live events, and that its run fits in memory."""
     with faults.at("live"):
@@ -135,17 +102,22 @@ def _check_scenario(scenario: object) -> None:
 
 
 def _parts(
-    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, reference: Guide | None
+    scenario: Scenario,
+    faults: FaultList,
+    model: ControlAffine,
+    graph: Graph,
+    reference: Guide | None,
 ) -> Parts:
     """Return all parts, from the model, the graph and the reference."""
-    plant = faults.part(lambda: _plant(scenario, model), "plant")
-    disturbance = _disturbance(scenario, faults, model)
+    plant = faults.part(lambda: plant_of(scenario, model), "plant")
+    disturbance = disturbance_of(scenario, faults, model)
     formation = faults.part(lambda: _formation(scenario, model, graph), "formation")
     follower = faults.part(lambda: _follower(scenario, faults, model, graph), "follower")
     reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
     leader = faults.part(
         lambda: _leader(scenario, faults, model, graph, reference, reaction), "leader"
     )
+    network = network_of(scenario, faults, graph, leader, follower)
     for place, named in (
         (("initial", "spread"), scenario.initial.spread or {}),
         (("leader", "start_error"), scenario.leader.start_error),
@@ -163,7 +135,7 @@ def _parts(
         Laws(cast(Law, leader), cast(Law, follower)),
         initial=initial,
         start_error=scenario.leader.start_error,
-        world=World(plant, disturbance),
+        world=World(plant, disturbance, network),
     )
     with faults.at("initial"):
         initial_states(parts, scenario.seed)
@@ -224,27 +196,6 @@ def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) ->
         return named(name, **changes)
 
 
-def _plant(scenario: Scenario, model: ControlAffine) -> ControlAffine | None:
-    spec = scenario.plant
-    if spec is None:
-        return None
-    plant = vary_parameters(model, spec.parameters, spec.scale)
-    check_model(plant)
-    check_plant(model, plant)
-    return plant
-
-
-def _disturbance(scenario: Scenario, faults: _Faults, model: ControlAffine) -> Disturbance | None:
-    spec = scenario.disturbance
-    if spec is None:
-        return None
-    for key in ("constant", "rms", "input_rms"):
-        with faults.at("disturbance", key):
-            # Each alone, so that its fault is reported at its own line.
-            Disturbance(**{key: getattr(spec, key)}).prepared(model, scenario.simulation.dt, 0)
-    return Disturbance(**spec.model_dump())
-
-
 def _graph(scenario: Scenario) -> Graph:
     spec = scenario.graph
     if spec.edges is not None:
@@ -302,7 +253,7 @@ def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, scenario: Scenario
 
 
 def _follower(
-    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph
+    scenario: Scenario, faults: FaultList, model: ControlAffine, graph: Graph
 ) -> Law | None:
     spec = scenario.follower
     part = law_class(scenario, registry.FOLLOWER_LAWS, spec.law)
@@ -316,7 +267,7 @@ def _follower(
     return _law(part, offers, model, graph)
 
 
-def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: NamedClass) -> None:
+def _check_keys(scenario: Scenario, faults: FaultList, role: str, part: NamedClass) -> None:
     """Note the keys of a role that its law, a class of the user, does not take."""
     taken = accepted(part.cls)
     for key in marked_keys(ROLES[role][0]):
@@ -337,7 +288,7 @@ def _law(part: NamedClass, offers: Mapping[str, object], model: ControlAffine, g
 
 def _leader(
     scenario: Scenario,
-    faults: _Faults,
+    faults: FaultList,
     model: ControlAffine,
     graph: Graph,
     reference: Guide | None,

@@ -48,6 +48,7 @@ class Scenario(BaseModel, **STRICT):
     follower: law_sections.FollowerSpec = Field(default_factory=law_sections.FollowerSpec)
     initial: sections.InitialSpec = Field(default_factory=sections.InitialSpec)
     disturbance: sections.DisturbanceSpec | None = None
+    network: sections.NetworkSpec | None = None
     simulation: sections.SimulationSpec
     report: sections.ReportSpec = Field(default_factory=sections.ReportSpec)
     live: Annotated[tuple[sections.LiveSpec, ...], Field(strict=False)] = ()

@@ -9,7 +9,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from echelon.core.words import ENGINES
+from echelon.core.words import ENGINES, MessageContent, NeighbourChoice, Prediction
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.values import (
     STRICT,
@@ -187,6 +187,53 @@ class DisturbanceSpec(BaseModel, **STRICT):
     """Whether all agents are subject to the same random wind."""
     seed: Seed | None = None
     """Seed of wind and noise; default the scenario's."""
+
+
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+@final
+class BurstsSpec(BaseModel, **STRICT):
+    """Outages of links, during which all messages on them are lost."""
+
+    share: Annotated[Annotated[float, Field(ge=0.0, lt=1.0)], Unit("1")] = 0.0
+    """Share of the time that a link is out."""
+    length: Annotated[Positive, Unit("s")] = 0.2
+    """Mean length of an outage, s."""
+
+
+@final
+class NetworkSpec(BaseModel, **STRICT):
+    """A network on which messages take time and are lost; without the section it is ideal.
+
+    Each agent sends to all that receive from it, and uses what it last received; its own state is
+    never late.
+    """
+
+    rate: Annotated[Positive, Unit("Hz")] = 50.0
+    """Messages of an agent per second, Hz; it divides the control rate, 1 / `simulation.dt`."""
+    delay: Annotated[NotNegative, Unit("s")] = 0.0
+    """Delay of each message, s; rounded up to steps, and at least one."""
+    jitter: Annotated[NotNegative, Unit("s")] = 0.0
+    """Largest additional delay, s, drawn for each message and link; messages may overtake others,
+    and an older one never replaces a newer one."""
+    loss: Annotated[Share, Unit("1")] = 0.0
+    """Probability that a message is lost on a link."""
+    bursts: BurstsSpec = Field(default_factory=BurstsSpec)
+    """Outages of links; by default none."""
+    messages: Annotated[str, OneOf(map(str, MessageContent))] = "deviation"
+    """Content of a message: `deviation`, the sender's deviation from where it expects the leader;
+    `state`, its signal itself, with which followers lag behind a leader that moves."""
+    prediction: Annotated[str, OneOf(map(str, Prediction))] = "preview"
+    """How agents predict the leader from what it last sent: `preview`, by its plan, which they
+    know; `none`, as it was then. Only for the messages `deviation`."""
+    forget: Annotated[Positive, Unit("s")] = 0.5
+    """Age, s, beyond which a neighbour's deviation is not used."""
+    hears: Annotated[str, OneOf(map(str, NeighbourChoice))] = "all"
+    """Whose messages are used: of `all` neighbours, or `leaderward`, of those with fewer hops to
+    the leader, as counted by the messages that arrive."""
+    seed: Seed | None = None
+    """Seed of losses and delays; default the scenario's."""
 
 
 @final

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
-from echelon.core.errors import GainError, did_you_mean, listing
+from echelon.core.errors import GainError, check_name
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.guarantees.promises.promise import promise
@@ -210,11 +210,7 @@ def chosen_slice(model: ControlAffine, names: str | None) -> tuple[int, int]:
     if names is not None:
         parts = [part.strip() for part in names.split(",")]
         for name in parts:
-            if name not in states:
-                raise GainError(
-                    f"`--slice` names `{name}`, allowed are the states {listing(states)}"
-                    f"{did_you_mean(name, states)}."
-                )
+            check_name("`--slice` names", name, states, GainError)
         if len(set(parts)) != 2 or len(parts) != 2:
             raise GainError(
                 f"`--slice` is `{names}`, allowed are two different states such as `y,roll`."

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 from echelon.core.numerics import precision
 from echelon.core.statement import Statement
+from echelon.core.types import JsonObject
 from echelon.experiments.studies.assumptions import drift_lines, graph_lines
 from echelon.experiments.studies.killing_residual import killing_line
 from echelon.experiments.studies.margin_lines import margin_lines
@@ -25,6 +26,11 @@ class CheckResult(NamedTuple):
     def promised(self) -> bool:
         """Whether anything is guaranteed."""
         return self.promise.promised
+
+    def as_mapping(self) -> JsonObject:
+        """Return it ready for JSON."""
+        lines = [line.as_mapping() for line in self.lines]
+        return {"promise": self.promise.as_mapping(), "lines": lines}
 
 
 def check(parts: Parts, settings: Settings) -> CheckResult:

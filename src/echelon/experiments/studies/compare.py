@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 
-from echelon.core.errors import EchelonError, LawError, did_you_mean, listing
+from echelon.core.errors import EchelonError, LawError, check_name
 from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
 from echelon.experiments.results.metrics import metrics
@@ -122,11 +122,7 @@ def known_labels(requested: Sequence[str] | None) -> tuple[str, ...]:
     """
     allowed = (*LABELS, OWN)
     for label in requested or ():
-        if label not in allowed:
-            raise LawError(
-                f"`--method` is `{label}`, allowed are {listing(allowed)}"
-                f"{did_you_mean(label, allowed)}."
-            )
+        check_name("`--method` is", label, allowed, LawError)
     return tuple(label for label in allowed if not requested or label in requested)
 
 

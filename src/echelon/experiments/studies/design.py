@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.errors import EchelonError, GainError, ScenarioError, did_you_mean, listing
+from echelon.core.errors import EchelonError, GainError, ScenarioError, check_name
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Theorem
@@ -110,11 +110,8 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
         EchelonError: a part is malformed or does not fit the others. A method that does not apply
             is a design with its reason.
     """
-    if method is not None and method not in registry.METHODS:
-        raise GainError(
-            f"`method` is `{method}`, allowed are {listing(registry.METHODS)}"
-            f"{did_you_mean(method, registry.METHODS)}."
-        )
+    if method is not None:
+        check_name("`method` is", method, registry.METHODS, GainError)
     spec = scenario.follower.gain if isinstance(scenario, Scenario) else None
     built = _built(scenario) if isinstance(scenario, Scenario) else Experiment(*scenario)
     names = registry.METHODS if method is None else [method]

@@ -15,7 +15,7 @@ import scipy.optimize
 from jaxtyping import Float
 
 from echelon.agents.models.linearization import linearize
-from echelon.core.errors import EchelonError, GainError, did_you_mean, listing
+from echelon.core.errors import EchelonError, GainError, check_name, listing
 from echelon.core.types import Array
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import build
@@ -89,10 +89,7 @@ def _term(text: str) -> tuple[float, str]:
             f"`cost` has the weight `{text.rpartition('*')[0]}` for `{name}`, allowed is a "
             "positive number, as in `formation + 0.01*effort`."
         )
-    if name not in COSTS:
-        raise EchelonError(
-            f"`cost` names `{name}`, allowed are {listing(COSTS)}{did_you_mean(name, COSTS)}."
-        )
+    check_name("`cost` names", name, COSTS)
     return weight, name
 
 
@@ -243,11 +240,7 @@ def through_riccati(
 def _check_parameters(scenario: Scenario, parameters: Sequence[str]) -> None:
     """Refuse parameters and scenarios that cannot be tuned."""
     for name in parameters:
-        if name not in PARAMETERS:
-            raise EchelonError(
-                f"`params` names `{name}`, allowed are {listing(PARAMETERS)}"
-                f"{did_you_mean(name, PARAMETERS)}."
-            )
+        check_name("`params` names", name, PARAMETERS)
     if not parameters:
         raise EchelonError(f"`params` is empty, allowed are {listing(PARAMETERS)}.")
     spec, law = scenario.follower.gain, scenario.follower.law

@@ -1,5 +1,6 @@
 """The data of a run from which its guarantee is computed."""
 
+import math
 from typing import NamedTuple
 
 from echelon.agents.models.linearization import at_trim
@@ -63,11 +64,24 @@ class Case(NamedTuple):
         return sent or self.leaders.rest or self.leaders.alike
 
     @property
+    def leaders_share(self) -> float:
+        """The slowest mode of the leaders that is in the followers' errors, 1/s; -inf for none.
+
+        It is there if leaders start apart, and if followers are not sent the input by which their
+        leader returns to its path.
+        """
+        slowest, leaders = self.leaders.slowest, self.leaders
+        unsent = not self.matched and leaders.damped
+        apart = not (leaders.agree or leaders.alike)
+        return slowest if slowest is not None and (unsent or apart) else -math.inf
+
+    @property
     def disturbed(self) -> str:
         """What acts that no promise covers, in words; empty without any."""
         world = self.parts.world
         sources = {
             "wind or noise acts on the agents": world.disturbance,
             "the agents differ from the model": world.plant,
+            "messages are late or lost": world.network,
         }
         return " and ".join(text for text, what in sources.items() if what is not None)

@@ -93,8 +93,10 @@ class ModeMatrices(NamedTuple):
     def _exponent(self, span: float) -> float:
         """Return ln rho of the product of all flows over `span` (s), by the time that they take."""
         J = self.A[:, None] - self.B[:, None] @ self.gains
-        each = matrix_exponential(span * J)
-        product, logs = each[0], np.zeros(J.shape[1])
+        # Without its slowest decay no flow becomes 0, however long its span is.
+        slowest = np.real(np.linalg.eigvals(J)).max(axis=2)
+        each = matrix_exponential(span * (J - slowest[..., None, None] * np.eye(J.shape[-1])))
+        product, logs = each[0], span * slowest.sum(axis=0)
         for flow in each[1:]:
             sizes = np.linalg.norm(product, axis=(1, 2))
             # Sizes apart, since a product of two hundred would be beyond all numbers.

@@ -131,12 +131,12 @@ class MetricPromise(Promise):
             return self.region.rate
         common, held = self.loop.common, self.loop.held_rate(self.case.settings)
         rate = -self.loop.slowest if common is None else common.rate
-        return max(0.0, min(rate, held, -self.slowest_turn))
+        return max(0.0, min(rate, held, -self.slowest_turn, -self.case.leaders_share))
 
     @property
     def slowest(self) -> float | None:
         """The slowest mode near the trim, 1/s; None where the model bends there and has none."""
-        return self.loop.slowest if self.linear else None
+        return max(self.loop.slowest, self.case.leaders_share) if self.linear else None
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which modes decay at the trim and wherever agents go."""

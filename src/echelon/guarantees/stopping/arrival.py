@@ -19,6 +19,7 @@ import scipy.sparse.linalg as spla
 from echelon.agents.network.graph import Graph
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
+from echelon.guarantees.stopping.stopping_run import StoppingRun
 from echelon.laws.stopping_point import StoppingPoint
 
 _WITHIN = 0.01  # m
@@ -34,22 +35,17 @@ _SLACK = 1e-9
 """m; more than floats leave of the sums."""
 
 
-def arrival_of(
-    flat: Array, graph: Graph, law: StoppingPoint, coupling: float, position: Sequence[int]
-) -> float | None:
+def arrival_of(run: StoppingRun, position: Sequence[int]) -> float | None:
     """Return when (s) all followers are within 1 cm for good; None where it is not known.
 
     Args:
-        flat: (N, r, m) starts in flat coordinates, less the offsets.
-        graph: who hears whom.
-        law: the followers', prepared.
-        coupling: c.
+        run: under the law.
         position: which outputs are one.
     """
+    flat, graph, law, coupling = run.flat, run.parts.graph, run.law, run.coupling
     by_parents = law.feedforward is Feedforward.PARENT
-    apart = np.ptp(flat[list(graph.leaders)], axis=0).max()
     alone = by_parents or graph.schedule is not None
-    if not position or apart > _SLACK or alone and len(graph.followers) > _FEW:
+    if not position or run.apart or alone and len(graph.followers) > _FEW:
         return None
     loop, followers = law.ready, list(graph.followers)
     away = flat[followers] - flat[list(graph.nearest_leader())][followers]

@@ -11,12 +11,12 @@ from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import agent_lines
 from echelon.guarantees.promises.leaders import leaders_of
 from echelon.guarantees.promises.promise import AgreementModes, Promise
+from echelon.guarantees.stopping.leader_drift import leader_drift_line
 from echelon.guarantees.stopping.motor_design import MotorDesign, design_with_motors
 from echelon.guarantees.stopping.stopping_run import (
     StoppingRun,
     agreement_modes,
     condition_lines,
-    leader_drift_line,
     stopping_run_of,
 )
 from echelon.guarantees.stopping.tube import Tube, tube_of

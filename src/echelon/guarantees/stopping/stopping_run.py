@@ -24,6 +24,8 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 
 _PROOF = Kind.PROOF
+_TOGETHER = 1e-9
+"""In flat coordinates; leaders that start nearer to each other differ by rounding."""
 
 
 class StoppingRun(NamedTuple):
@@ -61,9 +63,17 @@ class StoppingRun(NamedTuple):
     @property
     def rate(self) -> float:
         """The slowest mode of the formation, 1/s, as a positive number."""
-        agreement = self.agreement
-        moves = max(self.law.ready.chains.degrees) > 1
-        return min(self.law.slowest_root, agreement) if moves else agreement
+        modes = [self.agreement]
+        if max(self.law.ready.chains.degrees) > 1:
+            modes.append(self.law.slowest_root)
+        if self.apart:
+            modes.append(float(self.leader.strength(self.settings.dt)))
+        return min(modes)
+
+    @property
+    def apart(self) -> bool:
+        """Whether leaders start apart, so that their own agreement is in the errors."""
+        return bool(np.ptp(self.flat[list(self.parts.graph.leaders)], axis=0).max() > _TOGETHER)
 
     @property
     def agreement(self) -> float:
@@ -157,9 +167,11 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     yield unneeded(Hypothesis.DETECTABLE, _PROOF, text)
     yield holds(Hypothesis.MATCHED_MOTION, _PROOF, run.law.information[1])
     yield holds(Hypothesis.COUPLING, _PROOF, "any coupling suffices", c, f"c {c:.4g}, edge 0")
-    text = "the slower of the slowest root and c lambda_min; far away the `speed` limits it"
+    text = "c lambda_min"
     if run.parts.graph.schedule is not None:
-        text = "the slower of the slowest root and of the agreement over a period, or eventually"
+        text = "the agreement over a period, or eventually"
+    text += ", and the leaders' own coupling" * run.apart
+    text = f"the slowest of the roots, {text}; far away the `speed` limits it"
     yield holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, -run.rate, f"{-run.rate:.3g} 1/s")
     text = "the law is linear in flat coordinates everywhere"
     yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)
@@ -261,53 +273,3 @@ def agreement_modes(graph: Graph, law: StoppingPoint) -> Array:
         # Triangular in the order of how far agents are from the leader.
         values = np.unique([L.diagonal() for L in graph.stretches(True)])
     return values[np.abs(values) > 1e-12 * np.abs(values).max()]
-
-
-def leader_drift_line(run: StoppingRun) -> Statement | None:
-    """Return why what lasts carries the leader away for ever; None where it does not."""
-    world, model, loop = run.parts.world, run.parts.model, run.leader.ready
-    if world.ideal:
-        return None
-    push = np.zeros(len(model.state_names))
-    if world.disturbance is not None:
-        push = model.per_state(world.disturbance.constant)
-    pushes = _pushed(model, world.plant_for(model), loop, jnp.asarray(push))
-    for k, (current, force) in enumerate(np.abs(np.stack(pushes)).T.tolist()):
-        s, inner = run.leader.speed_of(k), loop.chains.degrees[k] > 1
-        # The observer watches y' as the model has it, and of what is commanded at once y itself.
-        seen = run.leader.observer
-        current = 0.0 if seen and not inner else current
-        force = float(loop.weights[1, k]) * force if inner and not seen else 0.0
-        if current + force >= s:
-            return _drifts(loop.chains.outputs[k], current, force, s, inner)
-    return None
-
-
-def _drifts(name: str, current: float, force: float, s: float, inner: bool) -> Statement:
-    """Say what a current, and a force by what it asks of agreement, do to a leader of speed s."""
-    asked = current + force
-    what = " and ".join(word for word, d in (("current", current), ("push", force)) if d)
-    text = f"a lasting {what} along `{name}` demands a speed of {asked:.3g} from agreement, the "
-    text += f"leader's is {s:.3g}, and it can drift away for ever"
-    helps = "" if inner and current >= s else "set `observer: true`, or "
-    remedy = f"{helps}raise the leader's `speed` above {asked:.3g}"
-    number = asked, f"{asked:.3g}"
-    return fails(Hypothesis.EXACT_STATES, _PROOF, text, *number, remedy=remedy, reason=text)
-
-
-@cached_jit
-def _pushed(
-    model: ControlAffine, plant: ControlAffine, loop: FlatLoop, push: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Return what outputs' speeds and accelerations differ by at the trim (m,), by the push."""
-    chains = loop.chains
-    x, u = (jnp.asarray(np.asarray(part, float)) for part in model.trim)
-
-    def output(x: jax.Array) -> jax.Array:
-        return flat_output(model, chains.outputs, x)
-
-    def speed(x: jax.Array) -> jax.Array:
-        return jax.jvp(output, (x,), (model.velocity(x, u),))[1]
-
-    more = plant.velocity(x, u) + push - model.velocity(x, u)
-    return jax.jvp(output, (x,), (more,))[1], jax.jvp(speed, (x,), (more,))[1]

@@ -14,6 +14,7 @@ from echelon.guarantees.stopping.arrival import arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
 from echelon.guarantees.stopping.motor_load import MotorLoad, motor_load_of
+from echelon.guarantees.stopping.path_smoothness import path_fault
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 
 _PROOF = Kind.PROOF
@@ -88,6 +89,9 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     """
     model, chains = run.parts.model, run.law.ready.chains
     longest = int(np.argmax(chains.degrees))
+    fault = path_fault(run.leader.reference, chains, run.settings.horizon)
+    if fault:
+        return _nothing(fault, "choose a smooth path, such as one of sines, or `waypoints`")
     try:
         chain = run.chain(longest)
         gains = tuple(float(chain.gain(k)) for k in range(max(1, len(chain.powers) + 1)))
@@ -124,7 +128,7 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     )
     if brief:
         return tube, lines
-    arrival = arrival_of(run.flat, run.parts.graph, run.law, run.coupling, _positions(run))
+    arrival = arrival_of(run, _positions(run))
     motor_load, line = motor_load_of(run)
     return tube._replace(arrival=arrival, motor_load=motor_load), [*lines, line]
 

@@ -17,10 +17,14 @@ DECIDED = 1e-6
 """A rate is undecided if its rounding exceeds this fraction of it."""
 
 
-class Finding(NamedTuple):
-    """A claim of the file with its stored and recomputed value.
+VERDICTS = ("holds", "recomputed", "refused", "not checked")
+"""Verified by code of its own; equal to what the code gives again that made it; false; open."""
 
-    The verdict is `holds`, `refused` or `not checked`.
+
+class Finding(NamedTuple):
+    """A claim of the file with its stored and recomputed value, and one of the `VERDICTS`.
+
+    `by_scenario` is true of what was computed from a scenario, and not by independent code.
     """
 
     claim: str
@@ -28,10 +32,24 @@ class Finding(NamedTuple):
     value: str
     verdict: str
     text: str
+    by_scenario: bool = False
+
+    @property
+    def open(self) -> bool:
+        """Whether the claim could not be checked."""
+        return self.verdict == "not checked"
 
     def as_mapping(self) -> dict[str, str]:
         """Return the finding for JSON, where the recomputed value has the key `found`."""
-        return {"found" if key == "value" else key: x for key, x in self._asdict().items()}
+        means = "scenario" if self.by_scenario else "independent code"
+        return {
+            "claim": self.claim,
+            "stored": self.stored,
+            "found": self.value,
+            "verdict": self.verdict,
+            "text": self.text,
+            "means": means,
+        }
 
 
 def decide(

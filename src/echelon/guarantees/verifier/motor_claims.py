@@ -33,8 +33,10 @@ def motor_findings(claims: JsonObject) -> Iterator[Finding]:
     stored = float(claims["least"])
     fine = 0.0 < stored <= least + _SLACK
     yield decide("least thrust of a motor", fine, stored, least, "evaluated over time")
+    limit = float(claims["airframe"]["motor_thrust"])
+    yield decide("limit of a motor", claims["most"] == limit, claims["most"], limit, "airframe")
     stored = float(claims["largest"])
-    fine = largest - _SLACK <= stored < float(claims["most"])
+    fine = largest - _SLACK <= stored < limit
     yield decide("largest thrust of a motor", fine, stored, largest, "evaluated over time")
     tilt = max(float(r[2].max()) for r in ranges)
     yield decide("steepest tilt", claims["tilt"] >= tilt - _SLACK, claims["tilt"], tilt)

@@ -1,9 +1,6 @@
 """Reader of gain files for the verifier: every entry, type and shape is checked."""
 
-import json
 import math
-from functools import partial
-from pathlib import Path
 from typing import NamedTuple, TypeGuard, final
 
 import numpy as np
@@ -11,7 +8,7 @@ import numpy as np
 from echelon.core.errors import GainError, listing
 from echelon.core.types import Array, JsonObject, PathLike
 
-_FORMAT = "echelon gain 2"
+FORMAT = "echelon gain 2"
 _KINDS = ("proof", "vertices", "samples", "linearization")
 _LARGEST = 1e50
 """Largest number in a gain file; products of larger ones may overflow."""
@@ -89,11 +86,16 @@ class SavedGain(NamedTuple):
 class _Part:
     """A mapping of the file; each method returns an entry of one type or raises an error."""
 
-    def __init__(self, file: PathLike, section: object, name: str = "") -> None:
+    def __init__(
+        self, file: PathLike, section: object, name: str = "", above: "_Part | None" = None
+    ) -> None:
         self.file, self.name = file, name
         if not isinstance(section, dict):
             raise self.fault(name, "must be a mapping")
         self.entries: JsonObject = section
+        self.read_keys = set[str]()
+        self.parts: list[_Part] = [] if above is None else above.parts
+        self.parts.append(self)
 
     def fault(self, name: str, must: str) -> GainError:
         return GainError(f"`{self.file}` is not a gain file that can be verified: `{name}` {must}.")
@@ -103,11 +105,24 @@ class _Part:
         name = f"{self.name}.{key}" if self.name else key
         if key not in self.entries:
             raise self.fault(name, "is missing")
+        self.read_keys.add(key)
         return self.entries[key], name
+
+    def later(self, key: str) -> object:
+        """Return an entry that older files do not have; None where it is missing."""
+        return self.entry(key)[0] if key in self.entries else None
 
     def part(self, key: str) -> "_Part":
         value, name = self.entry(key)
-        return _Part(self.file, value, name)
+        return _Part(self.file, value, name, self)
+
+    def refuse_unread(self) -> None:
+        """Refuse an entry of any part that nothing has read: it would claim what is not checked."""
+        for part in self.parts:
+            for key in part.entries.keys() - part.read_keys:
+                # In ASCII, so that a letter that looks like another one is seen.
+                name = ascii(f"{part.name}.{key}" if part.name else key)[1:-1]
+                raise self.fault(name, "is unknown")
 
     def optional(self, key: str) -> bool:
         """Return whether an entry is not null."""
@@ -185,19 +200,23 @@ def _array(value: object) -> Array | None:
         return None
 
 
-def read(file: PathLike) -> SavedGain:
-    """Return the content of a gain file.
+def read(document: JsonObject, file: PathLike) -> SavedGain:
+    """Return the content of a gain file; `file` is its name in messages.
 
     Raises:
-        GainError: it cannot be read, is not JSON or not a gain, or a part is missing (named).
+        GainError: it is not a gain, or a part is missing or unknown (named).
     """
-    top = _Part(file, _json(file), "the file")
-    # The name serves the error for a file that is no mapping; entries need no prefix.
-    top.name = ""
-    if top.entries.get("format") != _FORMAT:
+    top = _Part(file, document)
+    if top.later("format") != FORMAT:
         raise GainError(
-            f"`{file}` is not a gain file that can be verified; its `format` must be `{_FORMAT}`."
+            f"`{file}` is not a gain file that can be verified; its `format` must be `{FORMAT}`."
         )
+    saved = _gain(top)
+    top.refuse_unread()
+    return saved
+
+
+def _gain(top: _Part) -> SavedGain:
     model = _model(top.part("model"))
     n, m = len(model.state_names), len(model.input_names)
     certificate = top.part("certificate")
@@ -222,26 +241,6 @@ def read(file: PathLike) -> SavedGain:
     )
 
 
-def _json(file: PathLike) -> object:
-    try:
-        return json.loads(Path(file).read_text("utf-8"), object_pairs_hook=partial(_mapping, file))
-    except OSError as error:
-        raise GainError(f"the gain file `{file}` cannot be read: {error.strerror}.") from error
-    except (ValueError, RecursionError) as error:
-        raise GainError(f"the gain file `{file}` is not valid JSON: {error}.") from error
-
-
-def _mapping(file: PathLike, pairs: list[tuple[str, object]]) -> dict[str, object]:
-    """Return a mapping; repeated keys are refused, since readers differ in which one they use."""
-    mapping = dict(pairs)
-    if len(mapping) < len(pairs):
-        twice = next(key for k, (key, _) in enumerate(pairs) if key in dict(pairs[:k]))
-        raise GainError(
-            f"`{file}` is not a gain file that can be verified: `{twice}` occurs twice."
-        )
-    return mapping
-
-
 def _model(section: _Part) -> SavedModel:
     states, inputs = section.names("state_names"), section.names("input_names")
     n, m = len(states), len(inputs)
@@ -249,7 +248,9 @@ def _model(section: _Part) -> SavedModel:
     if not isinstance(trim, list) or len(trim) != 2:
         raise section.fault(name, "must be a state and an input")
     point = _Part(section.file, {"0": trim[0], "1": trim[1]}, name)
-    parameters = section.part("parameters").entries if section.optional("parameters") else None
+    parameters, name = section.entry("parameters")
+    if parameters is not None and not isinstance(parameters, dict):
+        raise section.fault(name, "must be a mapping")
     return SavedModel(
         path=section.text("class"),
         parameters=parameters,
@@ -282,10 +283,10 @@ def _graph(section: _Part) -> SavedGraph:
     if not len(spectrum):
         raise section.fault("graph.spectrum", "must contain a number")
     leader_set = tuple(sorted({int(x) for x in leaders}))
-    directed, switches = (section.entries.get(key) is True for key in ("directed", "switches"))
+    directed, switches = (section.later(key) is True for key in ("directed", "switches"))
     sums = (
         section.array("sums", agents - len(leader_set))
-        if section.entries.get("sums") is not None
+        if section.later("sums") is not None
         else None
     )
     if sums is not None and not (sums > 0.0).all():
@@ -327,6 +328,9 @@ def _unpack_hull(section: _Part, n: int, wide: int) -> Array:
     base = section.array("base", n, wide)
     # A single matrix: an empty list has no second axis to check.
     if section.entry("places")[0] == []:
+        values, name = section.entry("values")
+        if not isinstance(values, list) or any(values):
+            raise section.fault(name, "must be empty without `places`")
         return base[None]
     places = section.array("places", -1, 2)
     values = section.array("values", -1, len(places))

@@ -6,14 +6,12 @@ and a bounded disturbance is evaluated over time. No code of the certificate is 
 """
 
 import itertools
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 
-from echelon.core.types import Array, JsonObject, PathLike
+from echelon.core.types import Array, JsonObject
 from echelon.guarantees.verifier.findings import Finding, compare, decide
 from echelon.guarantees.verifier.motor_claims import motor_findings
 
@@ -24,15 +22,9 @@ _CELLS = 6000
 """Cells of the time grid, which ends where the slowest mode has decayed by e^-30."""
 
 
-def read_tube(path: PathLike) -> JsonObject | None:
-    """Return the tube in a run's summary or a check's JSON, or None if there is none."""
-    try:
-        document = json.loads(Path(path).read_text("utf-8"))
-    except (OSError, ValueError):
-        # The reader of gain files reports an unreadable file with more detail.
-        return None
-    promise = document.get("promise", document) if isinstance(document, dict) else {}
-    tube = promise.get("anywhere") if isinstance(promise, dict) else None
+def tube_of(promise: JsonObject) -> JsonObject | None:
+    """Return the tube in a stored promise; None if there is none."""
+    tube = promise.get("anywhere")
     return tube if isinstance(tube, dict) and tube.get("format") == FORMAT else None
 
 
@@ -69,8 +61,8 @@ def _check_margin(border: JsonObject, roots: Sequence[Fraction], name: str) -> I
     worst = min(
         allowed - _fall(roots, order, sign * steep, float(border["speed"])) for sign in (-1.0, 1.0)
     )
-    text = "margin from this start"
-    yield decide(f"steepest start of {name}", worst >= -1e-9, border["steepest"], worst, text)
+    shown, text = f"{worst:.4g} left", "margin from this start"
+    yield decide(f"steepest start of {name}", worst >= -1e-9, border["steepest"], shown, text)
 
 
 def _as_fractions(roots: Sequence[float]) -> list[Fraction]:

@@ -5,24 +5,28 @@ graphs. The equations of the bundled models are the only shared part.
 """
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.types import PathLike
+from echelon.core.types import JsonObject, PathLike
 from echelon.guarantees.verifier import exact_minors
+from echelon.guarantees.verifier.agent_claims import MODEL as MODEL
 from echelon.guarantees.verifier.agent_claims import check_equations
-from echelon.guarantees.verifier.findings import Finding, decide, facts
+from echelon.guarantees.verifier.findings import VERDICTS, Finding, decide, facts, unchecked
 from echelon.guarantees.verifier.graph_claims import check_graph, check_spectrum
 from echelon.guarantees.verifier.mode_claims import check_linearization
 from echelon.guarantees.verifier.region_claims import check_region
-from echelon.guarantees.verifier.saved_gain import SavedGain, read
-from echelon.guarantees.verifier.tube_claims import read_tube, tube_findings
+from echelon.guarantees.verifier.saved_gain import FORMAT, SavedGain, read
+from echelon.guarantees.verifier.strict_json import read_json
+from echelon.guarantees.verifier.tube_claims import tube_findings, tube_of
 
 # Allowed asymmetry of P after scaling its diagonal to one: rounding of its last digits.
 _SKEW = 1e-12
+PROMISE = "promise."
+"""So begin the claims of a run's guarantee."""
 
 
 class Verification(NamedTuple):
@@ -30,14 +34,16 @@ class Verification(NamedTuple):
 
     Attributes:
         findings: one per claim.
-        verdict: `refused` if a claim does not hold, `incomplete` if all checked claims hold and
-            some could not be checked, otherwise `verified`.
+        verdict: `refused` if a claim is false, `incomplete` if all checked claims hold and some
+            could not be checked, otherwise `verified`.
         sentence: the verdict as text.
+        note: the end of the sentence, on a correct gain that is not stabilizing.
     """
 
     findings: tuple[Finding, ...]
     verdict: Literal["verified", "incomplete", "refused"]
     sentence: str
+    note: str = ""
 
     @property
     def holds(self) -> bool:
@@ -46,23 +52,41 @@ class Verification(NamedTuple):
 
 
 def verify(path: PathLike, model: ControlAffine | None = None) -> Verification:
-    """Recompute all claims of a saved gain, or of a run under the law `stopping-point`.
+    """Recompute all claims of a saved gain, or of the tube of T5 in a run's guarantee.
 
     Args:
         path: a file written by `save_gain`; or the `summary.json` of a run or the output of
-            `check --json`, of which the tube of T5 is recomputed.
+            `check --json`. Of these two the verdict is at best `incomplete`: what is no part of a
+            tube follows from the run's scenario alone, from which `echelon verify` computes it.
         model: the agents' model if it is not bundled. Without it, claims about its equations are
             not checked and the verdict is `incomplete`.
 
     Raises:
-        GainError: the file is not a gain file, or a part is missing.
+        GainError: the file is neither, or a part is missing or unknown.
     """
-    tube = read_tube(path)
+    document = read_json(path)
+    if states_gain(document):
+        saved = read(document, path)
+        return judge(_collect(_findings(saved, model)), _no_decay_sentence(saved))
+    return judge(_collect(_promise_findings(document["promise"])))
+
+
+def states_gain(document: JsonObject) -> bool:
+    """Return whether a file is to be a gain file, and not one with the guarantee of a run."""
+    # A gain first: no key that is added to one may lead to a check of something else.
+    return document.get("format") == FORMAT or "promise" not in document
+
+
+def _promise_findings(promise: object) -> Iterator[Finding]:
+    """Yield what can be checked of a run's guarantee by itself, and name the rest."""
+    if not isinstance(promise, dict):
+        yield decide("promise", False, text="it must be a mapping")
+        return
+    tube = tube_of(promise)
     if tube is not None:
-        return _verdict(_collect(tube_findings(tube)))
-    saved = read(path)
-    result = _verdict(_collect(_findings(saved, model)))
-    return result._replace(sentence=result.sentence + _no_decay_sentence(saved))
+        yield from tube_findings(tube)
+    for key in promise:
+        yield unchecked(f"{PROMISE}{key}", "", "it follows from the run's scenario alone")
 
 
 def _collect(checks: Iterator[Finding]) -> tuple[Finding, ...]:
@@ -94,18 +118,22 @@ def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[Finding
         yield from check_equations(recomputed, model)
 
 
-def _verdict(findings: tuple[Finding, ...]) -> Verification:
-    refused = [item.claim for item in findings if item.verdict == "refused"]
-    open_ = [item.claim for item in findings if item.verdict == "not checked"]
-    count = f"{len(findings) - len(open_)} claims hold as stored"
-    if refused:
-        does = "does" if len(refused) == 1 else "do"
-        text = f"Refused: {'; '.join(refused)} {does} not hold as stored."
-        return Verification(findings, "refused", text)
-    if open_:
-        text = f"Incomplete: {count}, and could not be checked: {'; '.join(open_)}."
-        return Verification(findings, "incomplete", text)
-    return Verification(findings, "verified", f"Verified: {count}.")
+def judge(findings: Sequence[Finding], note: str = "") -> Verification:
+    """Return the verdict on findings, with a note; of nothing at all it is `incomplete`."""
+    claims = {name: [x.claim for x in findings if x.verdict == name] for name in VERDICTS}
+    held = [f"{len(claims['holds'])} claims hold as stored"] if claims["holds"] else []
+    agree = ["all values agree with the scenario"] if claims["recomputed"] else []
+    text = ", and ".join(held + agree) or "no claim was checked"
+    false, open_ = claims["refused"], claims["not checked"]
+    if false:
+        does = "does" if len(false) == 1 else "do"
+        text = f"Refused: {'; '.join(false)} {does} not hold as stored.{note}"
+        return Verification(tuple(findings), "refused", text, note)
+    if open_ or not findings:
+        names = "; ".join(open_) or "anything"
+        text = f"Incomplete: {text}, and could not be checked: {names}.{note}"
+        return Verification(tuple(findings), "incomplete", text, note)
+    return Verification(tuple(findings), "verified", f"Verified: {text}.{note}", note)
 
 
 def _no_decay_sentence(saved: SavedGain) -> str:

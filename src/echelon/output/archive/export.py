@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from echelon.core.errors import MissingExtraError, OutputError, did_you_mean, listing
+from echelon.core.errors import MissingExtraError, OutputError, check_name
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,11 +23,7 @@ def content_of(kind: str) -> "Callable[[Recording], bytes]":
     Raises:
         OutputError: there is no such format.
     """
-    if kind not in _WRITERS:
-        raise OutputError(
-            f"`--to` is `{kind}`{did_you_mean(kind, _WRITERS)}, and must be one of "
-            f"{listing(_WRITERS)}."
-        )
+    check_name("`--to` is", kind, _WRITERS, OutputError)
     return _WRITERS[kind]
 
 

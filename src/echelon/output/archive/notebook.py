@@ -1,9 +1,7 @@
 """The HTML of a result in a notebook: outcome, a table of agents, and pictures."""
 
-import base64
 import dataclasses
 import html
-import io
 from collections.abc import Iterator
 
 from echelon.experiments.results.foreseen import foreseen
@@ -11,6 +9,7 @@ from echelon.experiments.results.metrics import metrics
 from echelon.experiments.results.recording import Recording
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS
 from echelon.guarantees.promises.promise import promise
+from echelon.output.plots.figure_files import html_image
 from echelon.output.plots.run_figures import figures
 from echelon.output.reports.causes import causes, grows
 from echelon.output.reports.run_report import labelled
@@ -78,10 +77,5 @@ def _recorded(result: Result) -> Recording:
 
 
 def _pictures(result: Result) -> str:
-    images = list[str]()
-    for name, figure in figures(_recorded(result), _PICTURES).items() if len(result.times) else ():
-        content = io.BytesIO()
-        figure.savefig(content, format="png", dpi=80)
-        data = base64.b64encode(content.getvalue()).decode("ascii")
-        images.append(f'<img alt="{name}" src="data:image/png;base64,{data}">')
-    return "".join(images)
+    drawings = figures(_recorded(result), _PICTURES) if len(result.times) else {}
+    return "".join(html_image(figure, name, 80) for name, figure in drawings.items())

@@ -1,12 +1,14 @@
 """Read a run's folder: its dataset, its partial results, or its gain."""
 
-import json
 from pathlib import Path
+from typing import NamedTuple
 
 from echelon.core.errors import OutputError
-from echelon.core.types import JsonObject, PathLike
+from echelon.core.types import PathLike
 from echelon.experiments.results.recording import Recording, read_recording
-from echelon.guarantees.verifier.tube_claims import read_tube
+from echelon.experiments.scenario.scenario import SCENARIO_FILE
+from echelon.guarantees.verifier.strict_json import read_json
+from echelon.guarantees.verifier.verify import states_gain
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.folder import DATA, GAIN, SUMMARY, check_exists
 
@@ -36,40 +38,47 @@ def open_run(place: PathLike) -> Recording:
     raise OutputError(f"the folder `{path}` holds no run: it has no `{DATA}`.")
 
 
-def promise_file(place: PathLike) -> Path:
-    """Return the file with the claims about a run's gain or law, which `verify` reads.
+class ClaimFiles(NamedTuple):
+    """Files with claims about a run's gain or law, and what belongs to them; None for each absent.
+
+    Attributes:
+        gain: a gain file.
+        claims: the summary of a run, or the output of a check.
+        data: the dataset of the run.
+        scenario: the scenario of the run.
+    """
+
+    gain: Path | None = None
+    claims: Path | None = None
+    data: Path | None = None
+    scenario: Path | None = None
+
+
+def claim_files(place: PathLike) -> ClaimFiles:
+    """Return the files of a run that `verify` reads.
 
     Args:
-        place: the folder of a run; or such a file, which is returned as it is.
+        place: the folder of a run, its summary, a gain file, or the output of a check.
 
     Raises:
-        OutputError: the folder holds no such file.
+        GainError: a file cannot be read, or is no JSON.
+        OutputError: the folder holds no claims, or its gain file is missing.
     """
     path = Path(place)
+    if path.name == SUMMARY and (path.parent / SCENARIO_FILE).is_file():
+        path = path.parent
     if not path.is_dir():
-        return path
-    # A law without a gain has its tube, if any, in the summary.
-    if (path / GAIN).is_file() or not (path / SUMMARY).is_file():
-        return path / GAIN
-    if read_tube(path / SUMMARY) is None:
-        if _summary(path / SUMMARY).get("gain") is not None:
-            raise OutputError(
-                f"`{path}` has lost its `{GAIN}`; `echelon run {path} --out OTHER` creates it."
-            )
-        raise OutputError(f"the law in `{path}` has neither a gain nor a tube to verify.")
-    return path / SUMMARY
-
-
-def _summary(file: Path) -> JsonObject:
-    """Return the summary in a file.
-
-    Raises:
-        OutputError: the file is damaged.
-    """
-    try:
-        summary = json.loads(file.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise OutputError(f"`{file}` cannot be read, or is damaged: {error}.") from error
-    if not isinstance(summary, dict):
-        raise OutputError(f"`{file}` is damaged: it must hold a mapping.")
-    return summary
+        return ClaimFiles(path) if states_gain(read_json(path)) else ClaimFiles(claims=path)
+    names = GAIN, SUMMARY, DATA, SCENARIO_FILE
+    files = ClaimFiles(*(path / name if (path / name).is_file() else None for name in names))
+    if files.claims is None and files.gain is None:
+        state = "an unfinished run" if Chunks(path).exist else "no run"
+        raise OutputError(f"`{path}` holds {state}: it has neither `{SUMMARY}` nor `{GAIN}`.")
+    summary = {"promise": None} if files.claims is None else read_json(files.claims)
+    if files.gain is None and summary.get("gain") is not None:
+        raise OutputError(
+            f"`{path}` has lost its `{GAIN}`; `echelon run {path} --out OTHER` creates it."
+        )
+    if "promise" not in summary:
+        raise OutputError(f"`{files.claims}` is damaged: it has no `promise`.")
+    return files

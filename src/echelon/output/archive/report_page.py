@@ -1,13 +1,12 @@
 """The HTML report of a run: guarantee, text report, figures, scenario, versions, citation."""
 
-import base64
-import io
 from html import escape
 from pathlib import Path
 
 from echelon import __version__
 from echelon.experiments.results.recording import Recording
 from echelon.experiments.scenario.scenario import SCENARIO_FILE
+from echelon.output.plots.figure_files import html_image
 from echelon.output.plots.run_figures import DEFAULT, figures
 
 _STYLE = """
@@ -96,15 +95,11 @@ def _text(folder: Path | None, name: str) -> str:
 
 
 def _figures(run: Recording) -> list[str]:
-    parts = []
-    for name, figure in figures(run, DEFAULT).items():
-        content = io.BytesIO()
-        figure.savefig(content, format="png", dpi=140)
-        data = base64.b64encode(content.getvalue()).decode("ascii")
-        caption = _CAPTIONS[name]
-        image = f'<img alt="{caption}" src="data:image/png;base64,{data}">'
-        parts.append(f"<figure>{image}<figcaption>{caption}</figcaption></figure>")
-    return parts
+    drawings = ((_CAPTIONS[name], figure) for name, figure in figures(run, DEFAULT).items())
+    return [
+        f"<figure>{html_image(figure, text, 140)}<figcaption>{text}</figcaption></figure>"
+        for text, figure in drawings
+    ]
 
 
 def _hypotheses(run: Recording) -> str:

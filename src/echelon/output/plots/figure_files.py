@@ -1,10 +1,12 @@
 """Figures as PNG, PDF and SVG files, written completely or not at all."""
 
+import base64
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from echelon.core.errors import OutputError, did_you_mean, listing
+from echelon.core.errors import OutputError, check_name
 from echelon.core.files import make_atomic
 
 if TYPE_CHECKING:
@@ -25,11 +27,15 @@ def check_names(names: Sequence[str]) -> None:
         OutputError: there is no figure of a name.
     """
     for name in names:
-        if name not in NAMES:
-            raise OutputError(
-                f"there is no figure `{name}`{did_you_mean(name, NAMES)}; a run has "
-                f"{listing(NAMES)}."
-            )
+        check_name("the figure is", name, NAMES, OutputError)
+
+
+def html_image(figure: "Figure", name: str, dpi: int) -> str:
+    """Return a figure as an element of an HTML page."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=dpi)
+    data = base64.b64encode(content.getvalue()).decode("ascii")
+    return f'<img alt="{name}" src="data:image/png;base64,{data}">'
 
 
 def save(

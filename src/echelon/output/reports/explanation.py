@@ -60,6 +60,8 @@ def _world(result: Result) -> Iterator[str]:
         yield f"Plant: {world['plant']}; laws and gains use the model's values."
     if world["disturbance"]:
         yield f"Disturbance: {world['disturbance']}; unknown to the laws."
+    if world["network"]:
+        yield f"Network: {world['network']}."
 
 
 def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
@@ -87,7 +89,8 @@ def _lyapunov_trend(result: Result, guarantee: Promise) -> Iterator[str]:
     increases, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
     # V' <= 0 is proved for the undisturbed loop that decays only.
     unstable = guarantee.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails
-    if forbidden and not (result.world.disturbance or unstable):
+    disturbed = result.world.disturbance is not None or result.world.network is not None
+    if forbidden and not (disturbed or unstable):
         when = result.times[int(np.argmax(v.forbidden()))]
         yield (
             f"Warning: V increased at {forbidden} of {len(v.value)} stored steps (first at "
@@ -98,7 +101,7 @@ def _lyapunov_trend(result: Result, guarantee: Promise) -> Iterator[str]:
         reason = "since the loop is unstable" if unstable else "as expected under a disturbance"
         if guarantee.hypotheses[Hypothesis.SAMPLING].fails:
             reason = "since `dt` is too long for an input that is held between steps"
-        elif result.world.disturbance is None:
+        elif not disturbed:
             reason = f"as theory allows: {_exception(v, guarantee)}"
         yield f"V increased in {increases} of {len(v.value) - 1} frames, {reason}."
     else:

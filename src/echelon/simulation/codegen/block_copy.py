@@ -1,12 +1,11 @@
 """Copies numbers of agents from rows of blocks into arrays, and back, in any order of agents."""
 
 from functools import cache
-from pathlib import Path
 from threading import Lock
 
-import jax
 import numpy as np
 
+from echelon.core import disk_cache
 from echelon.simulation.codegen.ir_blocks import loop
 from echelon.simulation.codegen.machine_code import Code
 from echelon.simulation.codegen.vector_ir import Writer
@@ -68,8 +67,7 @@ def _copy(w: Writer, source: tuple[str, str], target: tuple[str, str]) -> None:
 @cache
 def _copier(bits: int, lanes: int) -> Code:
     """Return the code of `copy_text`, compiled once."""
-    folder = getattr(jax.config, "jax_compilation_cache_dir", None)
-    return Code(copy_text(bits, lanes), Path(folder) if folder else None)
+    return Code(copy_text(bits, lanes), disk_cache.jax_folder())
 
 
 def copy_rows(

@@ -32,6 +32,7 @@ class Body(NamedTuple):
         to_leaders: what is added to the contributions of the leader, behind the former.
         tape: row of the tape -> what is recorded there at each step, if a tape is given.
         totals: place -> what is added up there over all agents and steps.
+        exceptions: truths; where one holds, the agent's numbers are not what JAX computes.
         mirror_before: what neighbours read at the step, entry by entry.
         difference: of the leaves `self` and `neighbour`, entry by entry; z_k is the weighted sum of
             entry k over the neighbours.
@@ -47,6 +48,7 @@ class Body(NamedTuple):
     to_leaders: Sequence[Node] = ()
     tape: Mapping[int, Node] = _NONE
     totals: Mapping[int, Node] = _NONE
+    exceptions: Sequence[Node] = ()
     # Not written; what is written reads them.
     mirror_before: Sequence[Node] = ()
     difference: Sequence[Node] = ()
@@ -102,6 +104,7 @@ class Plan(NamedTuple):
         weighted: whether some weight of an edge is not 1.
         edges: entries that neighbours read of which distances are computed; none if no distances
             are.
+        exception_row: becomes 1 where one of `Body.exceptions` holds.
         table: numbers per step in the table.
         dt: s.
         leaders_ahead: whether the leaders may take many steps before the others take the first,
@@ -125,6 +128,7 @@ class Plan(NamedTuple):
     one_leader: bool
     weighted: bool
     edges: tuple[int, ...]
+    exception_row: int
     table: int
     dt: float
     leaders_ahead: bool = False

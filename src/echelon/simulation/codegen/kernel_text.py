@@ -11,6 +11,7 @@ steps before the next one, so that it stays in the nearest cache.
 import contextlib
 from collections.abc import Iterator, Sequence
 
+from echelon.simulation.codegen import denormals
 from echelon.simulation.codegen.barriers import announce, wait
 from echelon.simulation.codegen.branches import large_choices
 from echelon.simulation.codegen.emitter import Emitter
@@ -52,12 +53,14 @@ def program(plan: Plan) -> str:
     with loop(w, "0", slots["groups"]) as (group, _, _):
         _tasks(w, plan, _group(w, plan, slots, group), len(numbers))
     w.do("ret void")
-    head = "define void @run(ptr noalias %slots) #0 {"
+    head = "define internal void @steps(ptr noalias %slots) #0 {"
     # 512 bits also where a processor prefers halves: the vector types are chosen on purpose.
-    attributes = 'attributes #0 = { nounwind "prefer-vector-width"="512" }'
+    width = '"prefer-vector-width"="512"'
+    attributes = f"attributes #0 = {{ nounwind noinline {width} {denormals.ATTRIBUTES} }}"
     # The weights of a branch that is hardly ever taken.
     unlikely = '!0 = !{!"branch_weights", i32 1, i32 1000}'
-    return "\n".join([*sorted(w.declared), "", head, *w.lines, "}", "", attributes, unlikely, ""])
+    parts = [*sorted(w.declared), "", head, *w.lines, "}", "", denormals.entry()]
+    return "\n".join([*parts, "", attributes, unlikely, ""])
 
 
 def _write_uniform(
@@ -210,7 +213,7 @@ def _new_minima(body: Body) -> list[tuple[Node, bool]]:
 def _has_no_effect(op: str, node: Node) -> bool:
     """Tell whether an operation with a number changes no sum or minimum."""
     neutral = {"add": 0.0, "min": NO_MINIMUM}.get(op)
-    return node.op == "constant" and node.value == neutral
+    return neutral is not None and node is node.graph.constant(neutral)
 
 
 def _load(
@@ -247,8 +250,22 @@ def _write(
                 continue
             with _if_effective(w, emitter, op, node) as value:
                 w.store_row(w.operation(op, [w.load_row(base, row), value]), base, row)
+    _note_exceptions(w, context.plan.exception_row, body, emitter, base)
     write_mirror(w, context, [emitter.value(node) for node in body.mirror], block)
     record(w, context, body, emitter, block)
+
+
+def _note_exceptions(w: Writer, row: int, body: Body, emitter: Emitter, base: str) -> None:
+    """Write that a row becomes 1 where an exception holds."""
+    kind, either = w.kind(True, False), ""
+    for node in body.exceptions:
+        if node.op != "constant" or node.value:
+            truth = emitter.value(node)
+            either = w.put(f"or {kind} {either}, {truth}") if either else truth
+    if either:
+        with only_if(w, w.put(f"zext i1 {w.any_lane(either)} to i64")):
+            sides = f"{w.vector} {w.number(1.0)}, {w.vector} {w.load_row(base, row)}"
+            w.store_row(w.put(f"select {kind} {either}, {sides}"), base, row)
 
 
 @contextlib.contextmanager

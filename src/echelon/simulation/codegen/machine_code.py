@@ -4,7 +4,6 @@ import ctypes
 import hashlib
 import platform
 from functools import cache
-from pathlib import Path
 from types import ModuleType
 from typing import final
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from echelon.core import disk_cache
 from echelon.core.errors import MissingExtraError
+from echelon.core.private_folder import PrivateFolder
 from echelon.core.trace import error_summary
 from echelon.simulation.scalars.traced_entries import Unsupported
 
@@ -72,7 +72,7 @@ def features() -> str:
 class Code:
     """A kernel as machine code, which exists as long as this object."""
 
-    def __init__(self, text: str, cache_folder: Path | None = None) -> None:
+    def __init__(self, text: str, folder: PrivateFolder | None = None) -> None:
         """Compile a text, or load its code from the cache."""
         binding = llvm()
         target = binding.Target.from_default_triple()
@@ -84,7 +84,7 @@ class Code:
             codemodel=_MODEL,
             reloc="pic" if _LINKED else "default",
         )
-        stored = _cache_file(text, binding, cache_folder)
+        stored = _cache_file(text, binding, folder)
         object_code = None if stored is None else disk_cache.read(stored)
         if object_code is None:
             object_code = self._compile(binding, text)
@@ -114,7 +114,9 @@ class Code:
         return self._machine.emit_object(module)
 
 
-def _cache_file(text: str, binding: ModuleType, folder: Path | None) -> Path | None:
+def _cache_file(
+    text: str, binding: ModuleType, folder: PrivateFolder | None
+) -> disk_cache.CacheFile | None:
     """Return the file of the code of a text on this machine."""
     if folder is None:
         return None
@@ -123,7 +125,8 @@ def _cache_file(text: str, binding: ModuleType, folder: Path | None) -> Path | N
     # All that the code depends on: another processor or LLVM compiles anew.
     parts = [text, _MODEL, features(), binding.get_host_cpu_name(), llvmlite.__version__]
     parts += [platform.system(), platform.machine()]
-    return folder / f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}-native-cache"
+    name = f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}-native-cache"
+    return disk_cache.CacheFile(folder, name)
 
 
 def aligned(shape: tuple[int, ...], dtype: np.dtype | type) -> np.ndarray:

@@ -255,11 +255,18 @@ def _bit(w: Writer, x: str, uniform: bool, place: int) -> str:
     return w.put(f"icmp ne {whole} {masked}, {w.integer(0, uniform)}")
 
 
+def _single(w: Writer, x: str, uniform: bool) -> str:
+    """Write a number rounded to single precision."""
+    real, one = w.kind(False, uniform), "float" if uniform else f"<{w.lanes} x float>"
+    return w.put(f"fpext {one} {w.put(f'fptrunc {real} {x} to {one}')} to {real}")
+
+
 _BITS: dict[str, Callable[[Writer, str, bool], str]] = {
     "pow2": _pow2,
     "exponent": _exponent,
     "mantissa": _mantissa,
     "root_guess": _root_guess,
+    "single": _single,
     "bit0": functools.partial(_bit, place=0),
     "bit1": functools.partial(_bit, place=1),
 }

@@ -5,31 +5,32 @@ lane, or by JAX, where states may differ from those of a single run by rounding.
 after the other.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, TypeAlias, final
 from weakref import WeakKeyDictionary
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool
 
 from echelon.core.errors import EchelonError, Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
+from echelon.simulation.engine.divergence import advance_until_lost
 from echelon.simulation.engine.grid import ChunkGrid
 from echelon.simulation.engine.initial import Starts
 from echelon.simulation.engine.jax_stepper import JaxFormations
 from echelon.simulation.engine.law_drive import Laws, choose_engine, is_long, worth_native
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.engine.prepare import Prepared, prepare
+from echelon.simulation.engine.prepare import Prepared, channel_of, prepare
 from echelon.simulation.engine.record import Recorder
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import result_of, sample_reference, simulate
 from echelon.simulation.native.kernel_cache import KERNELS
 from echelon.simulation.native.program_key import ProgramKeys
-from echelon.simulation.native.stepper import NativeStepper, beyond
+from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.native.threads import processors
 from echelon.simulation.step.drive import Stepper
 from echelon.simulation.step.loop import Loop, assemble
@@ -154,7 +155,7 @@ class Batch:
             for job, record, lost in zip(
                 jobs, recorder.close(Outcome.INTERRUPTED), far, strict=True
             )
-            # Those beyond the kernels' range are run again by JAX, each by itself.
+            # Those others are run again, each by itself.
             if not lost
         }
 
@@ -162,17 +163,15 @@ class Batch:
 def _fly(
     stepper: Stepper, first: Prepared, recorder: Recorder, progress: StepCount | None
 ) -> Bool[np.ndarray, " F"]:
-    """Take all steps; return which formations went beyond what native code computes."""
+    """Take all steps; return for which formations native code does not compute what JAX does."""
     now, far = stepper.start(), np.zeros(len(recorder.problems), bool)
-    bits = int(first.problem.settings.precision[5:])
     while not recorder.ended:
         done, grid = recorder.done, recorder.grid
         reference = sample_reference(first, done, grid.longest + 1)
-        chunk = stepper.advance(now, grid.counts(done), reference)
-        recorder.keep(chunk, reference, 0.0)
-        if stepper.engine == "native":
-            by_formation = chunk.states.reshape(len(chunk.states), len(far), -1)
-            far |= beyond(by_formation, bits).any(axis=(0, 2))
+        planned = now, grid.counts(done), reference, len(far)
+        chunk, counts = advance_until_lost(stepper, *planned)
+        recorder.keep(chunk, counts, reference, 0.0)
+        far |= chunk.inexact
         now = chunk.now
         if progress is not None:
             progress(recorder.done, grid.steps)
@@ -206,10 +205,13 @@ def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _Ba
     prepared, loop = case.prepared, case.loop
     assert loop is not None
     problem = prepared.problem._replace(settings=settings, states=states)
-    if prepared.parts.world.disturbance is not None:
-        motion = Motion.of(problem.model, prepared.parts.world, settings)
-        problem = problem._replace(motion=motion)
-        loop = eqx.tree_at(lambda x: x.motion, loop, motion)
+    world = prepared.parts.world
+    if world.disturbance is not None or world.network is not None:
+        # Draws of a seed of its own.
+        motion = Motion.of(problem.model, world, settings)
+        channel = channel_of(prepared.parts, settings)
+        problem = problem._replace(motion=motion, channel=channel)
+        loop = dataclasses.replace(loop, motion=motion, channel=channel)
     return _BatchJob(place, prepared._replace(problem=problem), loop)
 
 

@@ -75,9 +75,11 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
 
     Raises:
         EchelonError: a part is malformed or does not fit the others; the agents are not driven by
-            laws, or these have no gain; a variable is unknown; `settings.engine` is `native`, and
-            native code is unavailable.
+            laws, or these have no gain; messages are late; a variable is unknown;
+            `settings.engine` is `native`, and native code is unavailable.
     """
+    if parts.world.network is not None:
+        raise SimulationError("got a network, but derivatives are of messages that are never late.")
     with precision("float64"):
         prepared = _take(parts, settings, tuple(wrt))
         result = choose_engine(
@@ -226,7 +228,7 @@ class Native:
         backward = self._backward(_uses_distances(cost, self._shapes))
         sums = backward.run()
         if sums is None:
-            raise Unsupported("states beyond the range of its sines")
+            raise Unsupported("angles or whole numbers as large as these")
         value, by_sums = _cost_slopes(cost, sums)
         slopes = backward.slopes(by_sums)
         parts = dict(zip(self._order, slopes.leaves, strict=True))

@@ -68,11 +68,6 @@ class JaxStepper(Stepper):
         """Steps that take some tenths of a second, or a few of very many agents."""
         return _longest(len(self.states))
 
-    @property
-    def largest(self) -> float:
-        """The magnitude of states beyond which nothing is computed: none."""
-        return np.inf
-
     def replace_loop(self, loop: Loop) -> None:
         """Continue in a loop that is like the one before but for its numbers."""
         self.loop = loop
@@ -129,7 +124,7 @@ class JaxFormations(Stepper):
         return Chunk(now, states, inputs, on_host(sums))
 
 
-_ALL = Moment(None, 0, 0, 0, 0, WorldState(0, 0))  # type: ignore[arg-type]
+_ALL = Moment(None, 0, 0, 0, 0, WorldState(0, 0, 0))  # type: ignore[arg-type]
 """All are at the same step."""
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, TypeVar, final
 import jax
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.channel import Network
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import (
     EchelonError,
@@ -15,7 +16,7 @@ from echelon.core.errors import (
     check_kind,
 )
 from echelon.core.types import Array, Scalar, State
-from echelon.core.words import Feedforward, Frame
+from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
 from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import leader_warnings, prepare_law
 from echelon.simulation.engine.jax_stepper import JaxStepper
@@ -89,6 +90,27 @@ class Laws(Drive):
         follower = follower.following(leader, model)
         same = leader is self.leader and follower is self.follower
         return self if same else Laws(leader, follower)
+
+    def check_network(self, network: Network, graph: Graph, dt: float) -> None:
+        """Check that both laws work with messages that are late.
+
+        Raises:
+            SimulationError: a follower needs others' inputs of the same step, the leader has no
+                plan, or a step is too long for the coupling.
+        """
+        word = self.follower.feedforward
+        if word in (Feedforward.PARENT, Feedforward.RELAY_VELOCITY):
+            raise SimulationError(
+                f"`feedforward` of the follower is `{word}`, {word.value}, and a network delivers "
+                f"nothing in the same step; use `relay`, which is predicted."
+            )
+        preview = network.prediction is Prediction.PREVIEW
+        if network.messages is MessageContent.DEVIATION and preview and not self.leader.plans:
+            raise SimulationError(
+                f"`prediction` of the network is `preview`, and a leader under the law "
+                f"`{type(self.leader).__name__}` has no plan; use `none`."
+            )
+        self.follower.check_late(graph, dt)
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of leaders and followers by their laws.

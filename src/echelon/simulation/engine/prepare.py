@@ -7,6 +7,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
+from echelon.agents.network.channel import Channel
 from echelon.agents.network.formation import Formation
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.identity import digest
@@ -85,13 +86,27 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
             Meter.of(model, graph, formation, settings),
             settings,
             initial_states(parts, settings.seed),
-            parts.world.channel,
+            channel_of(parts, settings),
         )
         parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)
     warnings += formation_warnings(model, formation)
     # Model and drive may say the same; a dictionary keeps the first, and the order.
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
+
+
+def channel_of(parts: Parts, settings: Settings) -> Channel | None:
+    """Return the channel of a run whose drive is complete; None for the ideal network.
+
+    Raises:
+        EchelonError: the network does not suit the drive or the settings.
+    """
+    network = parts.world.network
+    if network is None:
+        return None
+    channel = network.prepared(settings.dt, settings.horizon, settings.seed)
+    parts.drive.check_network(network, parts.graph, settings.dt)
+    return channel
 
 
 def check_given(parts: Parts, settings: Settings) -> None:

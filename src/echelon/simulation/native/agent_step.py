@@ -14,6 +14,7 @@ import numpy as np
 from echelon.core.types import Array, PyTree
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.codegen import Body, factored
+from echelon.simulation.native.exceptions import exceptions_of
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
 from echelon.simulation.step.action import act, feedforward_of, limit_sides
@@ -34,6 +35,7 @@ class BlockRows(NamedTuple):
         varying: numbers of its law and model that differ between formations.
         errors, tracking: as in `Sums`, but of the steps before the steady window and in it.
         effort, limited, unsettled, inside, chatter, outputs: as in `Sums`.
+        exception: 1 where the numbers are not what JAX computes.
         total: how many rows there are.
     """
 
@@ -54,6 +56,7 @@ class BlockRows(NamedTuple):
     chatter: range
     tracking: range
     outputs: range
+    exception: range
     total: int
 
     @classmethod
@@ -80,7 +83,7 @@ class BlockRows(NamedTuple):
             m,
             varying,
         ]
-        sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q]
+        sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q, 1]
         return cls(*row_ranges(sizes))
 
 
@@ -268,6 +271,7 @@ def body_of(
         mirror=[*subtract(outputs.state, inputs.offset), *outputs.next_signal],
         difference=_difference(loop, graph, len(inputs.x), len(outputs.signal)),
     )
+    body = body._replace(exceptions=exceptions_of(graph, body))
     return body.map_nodes(factored(body.all()))
 
 

@@ -30,7 +30,7 @@ from echelon.simulation.native.kernel_cache import (
     plan_of,
 )
 from echelon.simulation.native.schedule import step_by_step
-from echelon.simulation.native.stepper import STEPS, NativeStepper, any_beyond
+from echelon.simulation.native.stepper import STEPS, NativeStepper
 from echelon.simulation.native.threads import call
 from echelon.simulation.native.transpose import (
     CotangentRows,
@@ -235,7 +235,7 @@ class Backward:
     # ---- the forward pass ----
 
     def run(self) -> Sums | None:
-        """Return the sums of the run; None if a state is beyond the range of the kernels."""
+        """Return the sums of the run; None if they are not what JAX computes."""
         now, self.moments = self.stepper.start(), list[Moment]()
         sums: Sums | None = None
         for first in self._firsts():
@@ -245,7 +245,7 @@ class Backward:
             chunk = self._advance(now, first)
             now, more = chunk.now, chunk.sums.of(0)
             sums = more if sums is None else sums.plus(more)
-            if any_beyond(now.states, BITS):
+            if np.any(chunk.inexact):
                 self.moments.clear()
                 return None
         return sums

@@ -1,12 +1,12 @@
 """Compiled kernels, shared by loops that differ only in their numbers."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple, TypeAlias, final
 
 import jax
 import numpy as np
 
+from echelon.core import disk_cache
 from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
 from echelon.simulation.codegen import Code, Plan, has_flag, program, shared
@@ -74,6 +74,7 @@ def plan_of(
         one_leader=one_leader,
         weighted=weighted or bool((np.asarray(loop.exchange.weights) != 1.0).any()),
         edges=loop.meter.measured,
+        exception_row=rows.exception.start,
         table=(n if tracks else 0) + (varying.count if in_table else 0),
         dt=loop.motion.dt,
     )
@@ -88,9 +89,8 @@ def compiled(rows: BlockRows, plan: Plan, codes: BoundedCache[Code]) -> Kernel:
     `codes` are those compiled before, by their texts: other graphs are other numbers in the same.
     """
     # In the folder where JAX keeps compiled code, so that one setting applies to both.
-    cache = getattr(jax.config, "jax_compilation_cache_dir", None)
     text = program(plan)
-    code = codes.get_or_make(text, lambda: Code(text, Path(cache) if cache else None))
+    code = codes.get_or_make(text, lambda: Code(text, disk_cache.jax_folder()))
     return Kernel(code, rows, plan, len(shared(plan)))
 
 

@@ -29,24 +29,8 @@ _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Agent steps of a chunk, which take some hundredths of a second, and its fewest steps."""
 _OPERATIONS, _ENOUGH = {64: 3e10, 32: 6e10}, 1_000
 """Operations of a chunk with at most so many steps: about a second of one thread."""
-_LARGEST = {64: 1e5, 32: 1e3}
-"""The largest state: beyond it the sines of the kernels lose digits, and JAX continues."""
 STEPS, _TASKS, _LEADER_NUMBERS = 2_048, 200_000, 10_000_000
 """Limits of a call: steps, each with its uniform values; tasks; stored numbers of leaders ahead."""
-
-
-def beyond(states: Array, bits: int) -> Array:
-    """Return which states are beyond the range of the kernels' sines; NaN is not."""
-    # Truths only: another array of so many numbers takes longer than all the rest.
-    return (states > _LARGEST[bits]) | (states < -_LARGEST[bits])
-
-
-def any_beyond(states: Array, bits: int) -> bool:
-    """Tell whether a state is beyond that range."""
-    most = _LARGEST[bits]
-    # A third of the time of truths for all; with NaN no comparison holds, and the truths decide.
-    inside = -most <= states.min(initial=0.0) and states.max(initial=0.0) <= most
-    return not inside and bool(beyond(states, bits).any())
 
 
 @final
@@ -57,8 +41,8 @@ class NativeStepper(Stepper):
         loops: of the run, or of each formation.
         states: at its beginning, formation by formation.
         bits: 64 or 32, the precision.
-        fallback: continues if a state is beyond the range of the kernels' sines; None if the caller
-            checks the range.
+        fallback: repeats a chunk whose numbers are not what JAX computes; None if the caller
+            does, by `Chunk.inexact`.
         pool: threads that step formations; None for the caller's only.
         make: returns the kernel; by default from the cache of all runs.
         variant: a loop of the same structure: `turn` may change the numbers in which it differs,
@@ -106,6 +90,7 @@ class NativeStepper(Stepper):
         # The moment in the blocks: a chunk that continues from it need not be written there.
         self._moment: Moment | None = None
         self._hold, self._fallback_step = -1, -1
+        self._inexact = np.zeros(len(loops), bool)
         self._tape: Array | None = None
         self._draws_ahead = holds_at_once(len(states))
 
@@ -151,8 +136,8 @@ class NativeStepper(Stepper):
             return ()
         start = self._fallback_step * self.loop.motion.dt
         return (
-            f"From t = {start:.6g} s on, JAX stepped the agents whenever a state was beyond "
-            f"{_LARGEST[self.bits]:g}, where the sines of native code lose digits.",
+            f"From t = {start:.6g} s on, JAX stepped the agents whenever an angle or a whole "
+            "number was too large for native code.",
         )
 
     @property
@@ -161,11 +146,6 @@ class NativeStepper(Stepper):
         agents = len(self.states) // len(self.loops)
         more = int(_OPERATIONS[self.bits] / (self._work * agents))
         return max(_FEWEST, _AGENT_STEPS // agents, min(_ENOUGH, more))
-
-    @property
-    def largest(self) -> float:
-        """The magnitude of states beyond which kernels lose digits."""
-        return _LARGEST[self.bits]
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
@@ -183,7 +163,7 @@ class NativeStepper(Stepper):
         if now is not self._moment:
             self._load(now)
         chunk = self._advance(now, counts, reference)
-        if self.fallback is None or not any_beyond(chunk.states, self.bits):
+        if self.fallback is None or not np.any(chunk.inexact):
             return chunk
         self._moment = None
         self._fallback_step = int(now.step) if self._fallback_step < 0 else self._fallback_step
@@ -224,8 +204,9 @@ class NativeStepper(Stepper):
                 self._read_next_inputs(step, first, table, u[k])
             else:
                 u[k] = u[k - 1]
+        self._find_inexact()
         self._moment, sums = self._moment_and_sums(first, step)
-        return Chunk(self._moment, x, u, sums)
+        return Chunk(self._moment, x, u, sums, inexact=self._inexact)
 
     def _read_next_inputs(self, step: int, first: int, table: Array | None, out: Array) -> None:
         """Read the inputs of a step that is not taken."""
@@ -233,6 +214,7 @@ class NativeStepper(Stepper):
         copies, hold = [array.copy() for array in arrays], self._hold
         self._run(step, 1, first, table)
         self._read(self.rows.input, out)
+        self._find_inexact()
         self.mirrors.reverse()
         for array, before in zip(arrays, copies, strict=True):
             array[:] = before
@@ -359,8 +341,16 @@ class NativeStepper(Stepper):
         ]
         return Moment(*fields), self._sums(first, step, agent_sums)
 
+    def _find_inexact(self) -> None:
+        """Note the formations whose numbers are not what JAX computes."""
+        row = self.rows.exception.start
+        if self.blocks[:, row].any():
+            positions = np.flatnonzero(self.blocks[:, row])
+            self._inexact[self.places.agents[positions] // len(self.loop.offsets)] = True
+
     def _clear_sums(self) -> None:
         rows = self.rows
+        self._inexact = np.zeros(len(self.loops), bool)
         initial = np.zeros((rows.total, 1), self.dtype)
         initial[rows.unsettled.start], initial[rows.inside.start : rows.inside.stop] = -1.0, ALWAYS
         self.blocks[:, rows.errors.start :] = initial[rows.errors.start :]

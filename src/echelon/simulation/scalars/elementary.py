@@ -11,6 +11,7 @@ from echelon.simulation.scalars.polynomials import (
     EPS,
     LN2,
     PI,
+    TINY,
     arctangent_series,
     cosine_series,
     economized,
@@ -20,6 +21,7 @@ from echelon.simulation.scalars.polynomials import (
     odd_series,
     parts_of,
     polynomial,
+    scaled_tail_fit,
     sine_series,
 )
 from echelon.simulation.scalars.scalar_graph import Node
@@ -40,7 +42,8 @@ def choose(which: Node, a: Node | float, b: Node | float) -> Node:
     return which.graph.make("select", which, a, b)
 
 
-def _less(a: Node | float, b: Node) -> Node:
+def less(a: Node | float, b: Node) -> Node:
+    """Return whether a < b."""
     return b.graph.make("lt", a, b)
 
 
@@ -61,7 +64,9 @@ def _sine_and_cosine(x: Node) -> tuple[Node, Node]:
     """Return both; the graph shares their common operations."""
     g, eps, width = x.graph, EPS[x.graph.bits], 0.62  # (pi / 4)^2 is 0.617
     # Below, nothing is subtracted, and the quarter is 0.
-    far = g.make("unlikely", _less(g.constant(0.61), x * x))
+    far = g.make("unlikely", less(g.constant(0.61), x * x))
+    # Only quarters of so few bits are subtracted exactly.
+    g.except_where(far, g.make("and", far, less(_reach(x), size(x))))
     # Adding 1.5 2^52 puts the whole number nearest to x / (pi / 2) into the last bits.
     magic = 1.5 * 2.0 ** (52 if g.bits == 64 else 23)
     shifted = x * (2.0 / math.pi) + magic
@@ -77,13 +82,20 @@ def _sine_and_cosine(x: Node) -> tuple[Node, Node]:
     return choose(lower, -first, first), choose(left, -second, second)
 
 
+def _reach(x: Node) -> float:
+    """Return up to which size an angle is reduced exactly; with separate roundings, less far."""
+    if x.uniform:
+        return 1e6 if x.graph.bits == 64 else 1e4
+    return 1e10 if x.graph.bits == 64 else 1e6
+
+
 def sin(x: Node) -> Node:
-    """Return sin x, for |x| up to 1e5 (1e3 in single precision)."""
+    """Return sin x; beyond `_reach` it is wrong, which the graph notes."""
     return _sine_and_cosine(x)[0]
 
 
 def cos(x: Node) -> Node:
-    """Return cos x, for |x| up to 1e5 (1e3 in single precision)."""
+    """Return cos x, as `sin`."""
     return _sine_and_cosine(x)[1]
 
 
@@ -92,17 +104,24 @@ def tan(x: Node) -> Node:
     return sin(x) / cos(x)
 
 
-def _scaled_exponential(x: Node) -> tuple[Node, Node, Node]:
+def scaled_exponential(x: Node) -> tuple[Node, Node, Node]:
     """Return e^r - 1 and two factors whose product is 2^k, with x = r + k ln 2."""
-    g, eps = x.graph, EPS[x.graph.bits]
+    g = x.graph
     low, high = (-746.0, 710.0) if g.bits == 64 else (-105.0, 90.0)
     x = g.make("min", g.make("max", x, low), high)
     k = g.make("rint", x * float(1 / LN2))
-    r = _reduce(x, k, LN2)
-    grown = r + r * r * _both_signs(r, eps)
-    # In two factors, because 2^k may overflow when the result does not.
-    half = g.make("floor", 0.5 * k)
-    return grown, g.make("pow2", half), g.make("pow2", k - half)
+    return _grown(_reduce(x, k, LN2)), *_power_of_two(k)
+
+
+def _grown(r: Node) -> Node:
+    """Return e^r - 1 for |r| <= 0.35."""
+    return r + r * r * _both_signs(r, EPS[r.graph.bits])
+
+
+def _power_of_two(k: Node) -> tuple[Node, Node]:
+    """Return 2^k in two factors, because it may overflow when a result does not."""
+    g, half = k.graph, k.graph.make("floor", 0.5 * k)
+    return g.make("pow2", half), g.make("pow2", k - half)
 
 
 def _both_signs(r: Node, eps: float) -> Node:
@@ -115,39 +134,50 @@ def _both_signs(r: Node, eps: float) -> Node:
 
 def exp(x: Node) -> Node:
     """Return e^x."""
-    grown, first, second = _scaled_exponential(x)
+    grown, first, second = scaled_exponential(x)
     return (grown + 1.0) * first * second
+
+
+def exp2(x: Node) -> Node:
+    """Return 2^x."""
+    g, end = x.graph, 1080.0 if x.graph.bits == 64 else 160.0
+    x = g.make("min", g.make("max", x, -end), end)
+    k = g.make("rint", x)
+    first, second = _power_of_two(k)
+    return (_grown((x - k) * float(LN2)) + 1.0) * first * second
 
 
 def expm1(x: Node) -> Node:
     """Return e^x - 1, without cancellation near 0."""
-    grown, first, second = _scaled_exponential(x)
+    grown, first, second = scaled_exponential(x)
     # Up to 2^60 the digits of the two terms overlap; beyond, subtracting 1 changes nothing.
     factor = first * second
     near = factor * grown + (factor - 1.0)
-    large = _less(40.0 if x.graph.bits == 64 else 20.0, x)
+    large = less(40.0 if x.graph.bits == 64 else 20.0, x)
     return choose(large, (grown + 1.0) * first * second, near)
 
 
 def log(x: Node) -> Node:
     """Return ln x; -inf at 0, and NaN below."""
     g, bits = x.graph, x.graph.bits
-    tiny, lift = (2.0**-1022, 54) if bits == 64 else (2.0**-126, 25)
-    low = _less(x, g.constant(tiny))
-    normal = choose(low, x * 2.0**lift, x)
-    e = g.make("exponent", normal) - choose(low, float(lift), 0.0)
-    f = g.make("mantissa", normal) - 1.0
+    e, f = g.make("exponent", x), g.make("mantissa", x) - 1.0
     # ln(1 + f) = f - (f^2/2 - s (f^2/2 + R)) with s = f / (2 + f), 2 artanh s = 2 s + s R.
     s = f / (f + 2.0)
-    square = s * s
-    R = square * polynomial(square, economized(logarithm_series, 0.0295, EPS[bits]))
     half = 0.5 * f * f
     high, *rest = parts_of(LN2, bits)
+    R = logarithm_remainder(s)
     result = e * high - ((half - (s * (half + R) + e * sum(rest))) - f)
     result = choose(g.make("eq", x, math.inf), math.inf, result)
-    result = choose(g.make("eq", x, 0.0), -math.inf, result)
+    # A denormal number is 0, as in all operations.
+    result = choose(less(size(x), g.constant(TINY[bits])), -math.inf, result)
     # NaN below 0, and of NaN, for which the comparison does not hold.
     return choose(g.make("le", 0.0, x), result, math.nan)
+
+
+def logarithm_remainder(s: Node) -> Node:
+    """Return R of ln((1 + s) / (1 - s)) = 2 s + s R for |s| <= 0.172."""
+    square = s * s
+    return square * polynomial(square, economized(logarithm_series, 0.0295, EPS[s.graph.bits]))
 
 
 def log1p(x: Node) -> Node:
@@ -174,28 +204,35 @@ def sinh(x: Node) -> Node:
     grown = expm1(size(x))
     near = 0.5 * (grown + grown / (grown + 1.0))
     half = exp(0.5 * size(x))
-    far = _less(700.0 if x.graph.bits == 64 else 85.0, size(x))
+    far = less(700.0 if x.graph.bits == 64 else 85.0, size(x))
     return signed(choose(far, 0.5 * half * half, near), x)
 
 
 def cosh(x: Node) -> Node:
     """Return cosh x."""
     grown, half = exp(size(x)), exp(0.5 * size(x))
-    far = _less(700.0 if x.graph.bits == 64 else 85.0, size(x))
+    far = less(700.0 if x.graph.bits == 64 else 85.0, size(x))
     return choose(far, 0.5 * half * half, 0.5 * grown + 0.5 / grown)
 
 
 def asinh(x: Node) -> Node:
-    """Return arsinh x, for |x| up to 1e150 (1e18 in single precision)."""
+    """Return arsinh x."""
     a = size(x)
     root = x.graph.make("sqrt", a * a + 1.0)
-    return signed(log1p(a + a * a / (root + 1.0)), x)
+    return signed(_log1p_or_of_double(a, a + a * a / (root + 1.0)), x)
 
 
 def acosh(x: Node) -> Node:
-    """Return arcosh x, for x up to 1e150 (1e18 in single precision)."""
+    """Return arcosh x."""
     above = x - 1.0
-    return log1p(above + x.graph.make("sqrt", above * (x + 1.0)))
+    result = _log1p_or_of_double(x, above + x.graph.make("sqrt", above * (x + 1.0)))
+    return choose(x.graph.make("le", 1.0, x), result, math.nan)
+
+
+def _log1p_or_of_double(a: Node, grown: Node) -> Node:
+    """Return ln(1 + a number), or, where a is so large that its square may overflow, ln 2 a."""
+    far = less(1e100 if a.graph.bits == 64 else 1e15, a)
+    return log1p(choose(far, a, grown)) + choose(far, float(LN2), 0.0)
 
 
 def atanh(x: Node) -> Node:
@@ -216,7 +253,7 @@ def atan2(y: Node, x: Node) -> Node:
         return whole
     # An angle is mostly below pi/8: then the ratio need not be reduced.
     t = y / x
-    far = y.graph.make("unlikely", _less(y.graph.constant(0.41**2), t * t))
+    far = y.graph.make("unlikely", less(y.graph.constant(0.41**2), t * t))
     return choose(far, whole, signed(_small_angle(t), y))
 
 
@@ -234,12 +271,12 @@ def _angle(y: Node, x: Node) -> Node:
     # Two infinite sides are equal, and two zero sides have the angle 0.
     ratio = choose(g.make("eq", low, high), choose(g.make("eq", high, 0.0), 0.0, 1.0), low / high)
     # NaN equals nothing, so `low / high` preserves it. Beyond tan(pi/8) expanded about 1.
-    far = _less(math.tan(math.pi / 8), ratio)
+    far = less(math.tan(math.pi / 8), ratio)
     angle = _small_angle(choose(far, (ratio - 1.0) / (ratio + 1.0), ratio))
     angle = choose(far, math.pi / 4 + angle, angle)
     rest = float(PI / 2 - Fraction(math.pi / 2))
-    angle = choose(_less(b, a), math.pi / 2 - (angle - rest), angle)
-    behind = _less(signed(g.constant(1.0), x), g.constant(0.0))
+    angle = choose(less(b, a), math.pi / 2 - (angle - rest), angle)
+    behind = less(signed(g.constant(1.0), x), g.constant(0.0))
     return signed(choose(behind, math.pi - (angle - 2.0 * rest), angle), y)
 
 
@@ -258,84 +295,45 @@ def acos(x: Node) -> Node:
     return atan2(x.graph.make("sqrt", (1.0 - x) * (1.0 + x)), x)
 
 
-def cbrt(x: Node) -> Node:
-    """Return the cube root of x."""
-    # Subnormal numbers are scaled by a cube first, so that they have all digits.
-    low = _less(size(x), x.graph.constant(2.0**-900 if x.graph.bits == 64 else 2.0**-96))
-    a = choose(low, size(x) * 2.0**90, size(x))
-    root = exp(log(a) / 3.0)
-    # One step of Newton's method doubles the digits.
-    better = root - (root * root * root - a) / (3.0 * root * root)
-    regular = x.graph.make("and", _less(0.0, a), _less(a, x.graph.constant(math.inf)))
-    result = choose(regular, better, a)
-    return signed(choose(low, result * 2.0**-30, result), x)
-
-
-def rsqrt(x: Node) -> Node:
-    """Return 1 / sqrt(x), in a quarter of the time of a root and a quotient."""
-    g = x.graph
-    exact = 1.0 / g.make("sqrt", x)
-    if x.op == "constant":
-        return exact
-    half, y = 0.5 * x, g.make("root_guess", x)
-    # If x is 0, infinite, negative or subnormal, the guess is wrong.
-    far = g.make("unlikely", _less(0.05, size((half * y) * y - 0.5)))
-    # Each step maps the error e to 1.5 e^2: 0.034, 1.8e-3, 4.7e-6, 3e-11.
-    for _ in range(4 if g.bits == 64 else 3):
-        y = y * (1.5 - (half * y) * y)
-    return choose(far, exact, y)
-
-
-def integer_power(x: Node, exponent: int) -> Node:
-    """Return x^k by squaring."""
-    if exponent < 0:
-        return 1.0 / integer_power(x, -exponent)
-    result, square = x.graph.constant(1.0), x
-    while exponent:
-        result = result * square if exponent & 1 else result
-        square, exponent = square * square, exponent >> 1
-    return result
-
-
-def power(x: Node, y: Node) -> Node:
-    """Return x^y; its relative error grows with |y ln x|."""
-    g = x.graph
-    if y.op == "constant":
-        if y.value == 0.5:
-            return g.make("sqrt", x)
-        if y.value == round(y.value) and abs(y.value) <= 64:
-            return integer_power(x, int(y.value))
-    positive = exp(y * log(size(x)))
-    whole = g.make("eq", g.make("floor", y), y)
-    odd = g.make("ne", 2.0 * g.make("floor", 0.5 * y), y)
-    minus = choose(whole, choose(odd, -positive, positive), math.nan)
-    result = choose(_less(x, g.constant(0.0)), minus, positive)
-    one = g.make("or", g.make("eq", y, 0.0), g.make("eq", x, 1.0))
-    return choose(one, 1.0, result)
-
-
 def erf(x: Node) -> Node:
     """Return the error function of x."""
     near, far = error_function_fits()
     a = x.graph.make("min", size(x), 6.5)
     inner = a * polynomial(a * a, near)
     outer = 1.0 - exp(-(a * a)) * polynomial((a - 3.0) / (a + 3.0), far)
-    return signed(choose(_less(1.0, a), outer, inner), x)
+    return signed(choose(less(1.0, a), outer, inner), x)
+
+
+def erfc(x: Node) -> Node:
+    """Return 1 - erf x, without cancellation for large x."""
+    g = x.graph
+    a = g.make("min", size(x), 28.0 if g.bits == 64 else 11.0)
+    square = a * a
+    # The exponent is large, and so would be the effect of its rounding error.
+    error = g.make("fms", a, a, square)
+    tail = exp(-square) * (1.0 - error) * polynomial((a - 3.0) / (a + 3.0), scaled_tail_fit())
+    outer = choose(less(x, g.constant(0.0)), 2.0 - tail, tail)
+    return choose(less(1.0, a), outer, 1.0 - erf(x))
 
 
 def sign(x: Node) -> Node:
     """Return 1, -1, or x itself if it is 0 or NaN."""
-    return choose(_less(0.0, x), 1.0, choose(_less(x, x.graph.constant(0.0)), -1.0, x))
+    return choose(less(0.0, x), 1.0, choose(less(x, x.graph.constant(0.0)), -1.0, x))
 
 
 def remainder(x: Node, y: Node) -> Node:
-    """Return x - y trunc(x / y), exact while the quotient is small."""
+    """Return x - y trunc(x / y), exact while the quotient is below 2^52 (2^23)."""
     g = x.graph
     quotient = g.make("exact_div", x, y)
-    rest = x - y * signed(g.make("floor", size(quotient)), quotient)
+    rest = g.make("fnma", y, signed(g.make("floor", size(quotient)), quotient), x)
     # A quotient just below a whole number may be rounded to it; then one y too many is subtracted.
-    beyond = _less(rest * signed(g.constant(1.0), x), g.constant(0.0))
-    return choose(beyond, rest + signed(y, x), rest)
+    beyond = less(rest * signed(g.constant(1.0), x), g.constant(0.0))
+    rest = choose(beyond, rest + signed(y, x), rest)
+    many = less(2.0 ** (52 if g.bits == 64 else 23), size(quotient))
+    regular = g.make("and", g.make("ne", y, 0.0), less(size(x), g.constant(math.inf)))
+    g.except_where(quotient, g.make("and", many, regular))
+    endless = g.make("and", g.make("eq", size(y), math.inf), regular)
+    return choose(endless, x, choose(g.make("eq", y, 0.0), math.nan, rest))
 
 
 def round_half_away(x: Node) -> Node:

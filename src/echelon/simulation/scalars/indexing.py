@@ -2,10 +2,11 @@
 
 import functools
 import itertools
-import operator
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
@@ -213,64 +214,7 @@ def sorted_by(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands
     return [np.moveaxis(x, 0, axis) for x in columns]
 
 
-# ---- whole numbers -------------------------------------------------------------------------------
-
-
-def convert(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
-    """Return entries under another type; a whole number is a number without a fraction."""
-    [x], [source] = operands, equation.invars
-    to, of = np.dtype(equation.params["new_dtype"]), np.dtype(array_type(source).dtype)
-    if to.kind not in "bfiu":
-        raise Unsupported(f"`convert_element_type` to {to}{where(equation)}")
-
-    def converted(e: Entry) -> Entry:
-        if to.kind == "b":
-            return e if of.kind == "b" else graph.make("ne", entry(e), 0.0)
-        if to.kind == "f" or of.kind == "b":
-            return number(graph, e)
-        return _whole(graph, e, to, of, where(equation))
-
-    return [map_entries(converted, x)]
-
-
-def _whole(graph: ScalarGraph, e: Entry, to: np.dtype, of: np.dtype, at: str) -> Entry:
-    """Return a number as a whole one, as XLA does: truncated and clipped, NaN as 0."""
-    if of.kind == "f":
-        down, up = (graph.make(op, entry(e)) for op in ("floor", "ceil"))
-        towards = select(graph, graph.make("lt", entry(e), 0.0), up, down)
-        towards = select(graph, graph.make("eq", entry(e), entry(e)), towards, 0.0)
-        limits = np.iinfo(to)
-        return graph.make("min", graph.make("max", towards, float(limits.min)), float(limits.max))
-    if to.itemsize < of.itemsize and to.itemsize < 4:
-        raise Unsupported(f"`convert_element_type` to {to}{at}")
-    if to.kind == "u" and of.kind == "i":
-        return select(graph, graph.make("lt", entry(e), 0.0), e + 2.0 ** (8 * to.itemsize), e)
-    return e
-
-
-def divide(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
-    """Return quotients; those of whole numbers are truncated."""
-    whole = np.dtype(array_type(equation.outvars[0]).dtype).kind in "iu"
-
-    def quotient(a: Entry, b: Entry) -> Node:
-        result = graph.make("exact_div" if whole else "div", entry(a), entry(b))
-        if not whole:
-            return result
-        down, up = graph.make("floor", result), graph.make("ceil", result)
-        return select(graph, graph.make("lt", result, 0.0), up, down)
-
-    return [map_entries(quotient, *operands)]
-
-
-def logical(name: str) -> PrimitiveRule:
-    """Return the rule of an operation on truths; there is none for the bits of whole numbers."""
-
-    def rule(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
-        if np.dtype(array_type(equation.outvars[0]).dtype).kind != "b":
-            raise Unsupported(f"`{name}` of whole numbers{where(equation)}")
-        return [map_entries(lambda *e: graph.make(name, *map(entry, e)), *operands)]
-
-    return rule
+# ---- along an axis -------------------------------------------------------------------------------
 
 
 def cumulative(join: Callable[..., object]) -> Callable[..., np.ndarray]:
@@ -286,16 +230,41 @@ def cumulative(join: Callable[..., object]) -> Callable[..., np.ndarray]:
     return accumulate
 
 
+def scattered(
+    op: str, graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays
+) -> Arrays:
+    """Return a table each of whose entries is joined with the updates that fall on it."""
+    if operands[1].dtype == object:
+        return at_index(graph, algebra, equation, operands)
+    table, rows, updates = operands
+    params = {name: equation.params[name] for name in _SCATTERED}
+
+    def landed(unit: jax.Array) -> jax.Array:
+        return jax.lax.scatter_add(jnp.zeros(table.shape), jnp.asarray(rows), unit, **params)
+
+    units = jnp.eye(updates.size).reshape(updates.size, *updates.shape)
+    result = table
+    for update, places in zip(updates.flat, np.asarray(jax.vmap(landed)(units)), strict=True):
+        result = map_entries(
+            lambda e, there, u=update: graph.make(op, entry(e), entry(u)) if there else e,
+            result,
+            places,
+        )
+    return [result]
+
+
+_SCATTERED = ("dimension_numbers", "indices_are_sorted", "unique_indices", "mode")
+
 INDEXING: dict[str, PrimitiveRule] = {
     **{name: at_index for name in ("gather", "dynamic_slice", "dynamic_update_slice")},
     **{name: at_index for name in ("scatter", "scatter-add", "scatter_add")},
-    **{name: logical(name) for name in ("and", "or", "xor", "not")},
+    **{
+        f"scatter{dash}{name}": functools.partial(scattered, name)
+        for dash, name in itertools.product("-_", ("mul", "min", "max"))
+    },
     "cond": cond,
     "argmax": extreme(lambda a, b: (a, b)),
     "argmin": extreme(lambda a, b: (b, a)),
     "sort": sorted_by,
-    "convert_element_type": convert,
-    "div": divide,
 }
-"""Primitives that choose by numbers, or differ for whole numbers."""
-CUMULATIVE = {"cumprod": cumulative(operator.mul)}
+"""Primitives that choose by numbers."""

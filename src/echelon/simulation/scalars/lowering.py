@@ -14,11 +14,11 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from echelon.core.jaxpr import Algebra, Rule, dot, entrywise, map_entries, reduction, walk
-from echelon.core.numerics import precision
+from echelon.core.numerics import Precision, precision
 from echelon.core.trace import error_summary
 from echelon.core.types import PyTree
-from echelon.simulation.scalars import elementary
-from echelon.simulation.scalars.indexing import CUMULATIVE, INDEXING, less, one_of
+from echelon.simulation.scalars import elementary, powers
+from echelon.simulation.scalars.indexing import INDEXING, cumulative, less, one_of
 from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph
 from echelon.simulation.scalars.small_linear_systems import cholesky, lu, solve, triangle
 from echelon.simulation.scalars.traced_entries import (
@@ -33,6 +33,7 @@ from echelon.simulation.scalars.traced_entries import (
     node,
     where,
 )
+from echelon.simulation.scalars.whole_numbers import WHOLE_NUMBERS, TypeRules
 
 
 def lower(
@@ -49,12 +50,14 @@ def lower(
         Unsupported: a primitive has no scalar operations.
     """
     leaves, tree = jax.tree.flatten(list(arguments), is_leaf=lambda a: isinstance(a, np.ndarray))
-    shaped = [_shape(leaf) for leaf in leaves]
+    # In the precision of the run: a user's function may ask for it (`x.dtype`).
+    name: Precision = "float64" if graph.bits == 64 else "float32"
+    shaped = [_shape(leaf, np.dtype(name)) for leaf in leaves]
 
     def flat(*entries: jax.Array) -> list[jax.Array]:
         return jax.tree.leaves(function(*jax.tree.unflatten(tree, entries)))
 
-    with precision("float64"):
+    with precision(name):
         closed = jax.make_jaxpr(flat)(*shaped)
         try:
             return walk(closed.jaxpr, closed.consts, leaves, _algebra(graph))
@@ -63,9 +66,9 @@ def lower(
             raise Unsupported(f"a trace that no rule fits ({error_summary(error)})") from error
 
 
-def _shape(leaf: np.ndarray) -> jax.ShapeDtypeStruct:
+def _shape(leaf: np.ndarray, real: np.dtype) -> jax.ShapeDtypeStruct:
     truths = leaf.dtype == object and leaf.size and all(is_truth(e) for e in leaf.flat)
-    kind = bool if truths else float if leaf.dtype == object else leaf.dtype
+    kind = bool if truths else real if leaf.dtype.kind in "Of" else leaf.dtype
     return jax.ShapeDtypeStruct(leaf.shape, kind)
 
 
@@ -89,7 +92,15 @@ def _algebra(graph: ScalarGraph) -> Algebra:
             return missing(equation)
         raise Unsupported(f"`{name}`{where(equation)}")
 
-    algebra = Algebra(_rules(graph), float, lambda n: n, lambda: float("nan"), unknown, _within)
+    algebra = Algebra(
+        rules=_rules(graph),
+        constant=float,
+        lift=lambda n: n,
+        outside=lambda: float("nan"),
+        unknown=unknown,
+        within=_within,
+        finish=TypeRules(graph),
+    )
     return algebra
 
 
@@ -106,12 +117,11 @@ def _rules(graph: ScalarGraph) -> dict[str, Rule]:
 
     entrywise_rules = {name: op(name) for name in _SAME}
     entrywise_rules |= {name: function(getattr(elementary, name)) for name in _ELEMENTARY}
+    entrywise_rules |= {name: function(getattr(powers, name)) for name in ("cbrt", "rsqrt")}
     entrywise_rules |= {
         "gt": lambda a, b: graph.make("lt", entry(b), entry(a)),
         "ge": lambda a, b: graph.make("le", entry(b), entry(a)),
-        "rem": function(elementary.remainder),
-        "pow": function(elementary.power),
-        "exp2": function(lambda a: elementary.exp(a * float(np.log(2.0)))),
+        "pow": function(powers.power),
         "clamp": lambda low, x, high: graph.make(
             "min", graph.make("max", entry(low), entry(x)), entry(high)
         ),
@@ -122,7 +132,7 @@ def _rules(graph: ScalarGraph) -> dict[str, Rule]:
     }
     array_rules: dict[str, Rule] = {
         "integer_pow": lambda params, x: map_entries(
-            lambda e: elementary.integer_power(node(graph, e), params["y"]), x
+            lambda e: powers.integer_power(node(graph, e), params["y"]), x
         ),
         "round": functools.partial(_round, graph),
         "dot_general": dot(0.0),
@@ -135,13 +145,14 @@ def _rules(graph: ScalarGraph) -> dict[str, Rule]:
         "cholesky": functools.partial(cholesky, graph),
     }
     rules = {name: entrywise(rule) for name, rule in entrywise_rules.items()}
-    return rules | array_rules | CUMULATIVE
+    joins = {"cumprod": operator.mul, "cummax": op("max"), "cummin": op("min")}
+    return rules | array_rules | {name: cumulative(join) for name, join in joins.items()}
 
 
 _SAME = ("abs", "sqrt", "floor", "ceil", "max", "min", "lt", "le", "eq", "ne")
 _ELEMENTARY = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")
-_ELEMENTARY += ("asinh", "acosh", "atanh", "exp", "expm1", "log", "log1p", "logistic", "erf")
-_ELEMENTARY += ("cbrt", "rsqrt", "sign")
+_ELEMENTARY += ("asinh", "acosh", "atanh", "exp", "exp2", "expm1", "log", "log1p", "logistic")
+_ELEMENTARY += ("erf", "erfc", "sign")
 
 
 def _round(graph: ScalarGraph, params: Params, x: np.ndarray) -> np.ndarray:
@@ -189,12 +200,16 @@ def _while(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: A
     raise Unsupported(f"a `while` loop whose end {reason}{where(equation)}")
 
 
-_PRIMITIVES: dict[str, PrimitiveRule] = INDEXING | {
-    "scan": _scan,
-    "while": _while,
-    "custom_linear_solve": solve,
-    "lu": lu,
-    "triangular_solve": triangle,
-}
+_PRIMITIVES: dict[str, PrimitiveRule] = (
+    INDEXING
+    | WHOLE_NUMBERS
+    | {
+        "scan": _scan,
+        "while": _while,
+        "custom_linear_solve": solve,
+        "lu": lu,
+        "triangular_solve": triangle,
+    }
+)
 _UNREAD = {"lu_pivots_to_permutation", "lu_solve"}
 """What JAX computes before it solves equations; `solve` does not read it."""

@@ -14,6 +14,8 @@ import numpy as np
 from echelon.simulation.scalars.scalar_graph import Node
 
 EPS = {64: 2.0**-53, 32: 2.0**-24}
+TINY = {64: 2.0**-1022, 32: 2.0**-126}
+"""The least numbers that are not denormal."""
 _PARTS = {64: (33, 53), 32: (11, 11, 24)}
 """Bits of the parts of pi/2 and ln 2: products with whole numbers of 20 or 13 bits are exact."""
 
@@ -129,3 +131,15 @@ def error_function_fits() -> tuple[list[float], list[float]]:
     far = np.polynomial.Chebyshev.fit(t, erfcx(3.0 * (1.0 + t) / (1.0 - t)), 22, [first, last])
     power = np.polynomial.Polynomial
     return near.convert(kind=power).coef.tolist(), far.convert(kind=power).coef.tolist()
+
+
+@functools.cache
+def scaled_tail_fit() -> list[float]:
+    """Return a fit of e^(x^2) erfc(x) for 1 <= x <= 28, in (x - 3) / (x + 3)."""
+    from scipy.special import erfcx
+
+    first, last = (1.0 - 3.0) / (1.0 + 3.0), (28.0 - 3.0) / (28.0 + 3.0)
+    nodes = np.cos(np.pi * (np.arange(200) + 0.5) / 200)
+    t = 0.5 * (last - first) * (nodes + 1.0) + first
+    fit = np.polynomial.Chebyshev.fit(t, erfcx(3.0 * (1.0 + t) / (1.0 - t)), 24, [first, last])
+    return fit.convert(kind=np.polynomial.Polynomial).coef.tolist()

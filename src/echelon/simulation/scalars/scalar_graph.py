@@ -60,11 +60,14 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "mantissa": lambda x: x / 2.0 ** float(np.round(np.log2(x))),
     # An estimate of 1 / sqrt(a), from which Newton's method starts.
     "root_guess": lambda a: float(1.0 / np.sqrt(a)),
+    # To single precision, and back.
+    "single": lambda a: float(np.float32(a)),
     # A truth that may also be assumed to hold always (`codegen.fast_path`).
     "unlikely": lambda a: a,
 }
 TRUTHS = {"lt", "le", "eq", "ne", "and", "or", "xor", "not", "bit0", "bit1", "unlikely"}
 _COMMUTE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
+LOGICAL = {"and", "or", "xor", "not", "unlikely"}
 _NEVER_FOLDED = {"exponent", "mantissa", "bit0", "bit1", "root_guess"}
 
 
@@ -150,17 +153,25 @@ def _is_at_least_0(op: str, args: tuple[Node, ...], value: Any) -> bool:
 class ScalarGraph:
     """Nodes, each once.
 
-    Args:
+    Attributes:
         bits: 64 or 32, the precision of the code that is generated from it.
+        exceptions: node -> a truth; where it holds, the node is not what JAX computes.
+        ranges: node -> the least and the largest number that it may be.
     """
 
     def __init__(self, bits: int = 64) -> None:
         self.bits, self.nodes, self._verbatim = bits, list[Node](), False
+        self.exceptions = dict[Node, Node]()
+        self.ranges = dict[Node, tuple[float, float]]()
         self._by_key: dict[Hashable, Node] = {}
 
     def constant(self, value: float | bool) -> Node:
         """Return a plain number as a node."""
         value = bool(value) if isinstance(value, bool | np.bool_) else float(value)
+        if self.bits == 32 and not isinstance(value, bool):
+            # As JAX folds constants; a large one becomes infinite.
+            with np.errstate(over="ignore"):
+                value = float(np.float32(value))
         # By its bits: 0 and -0 are two numbers, and NaN is one.
         key = value if isinstance(value, bool) else np.float64(value).tobytes()
         return self._once(("constant", type(value), key), "constant", (), value, True)
@@ -168,6 +179,17 @@ class ScalarGraph:
     def leaf(self, *name: str | int, uniform: bool = False) -> Node:
         """Return a number that is read from memory under a name."""
         return self._once(("leaf", name), "leaf", (), name, uniform)
+
+    def except_where(self, node: Node, truth: Node) -> None:
+        """Note that a node is not what JAX computes where a truth holds."""
+        if truth.op != "constant" or truth.value:
+            self.exceptions[node] = truth
+
+    def exceptions_of(self, results: Iterable[Node]) -> list[Node]:
+        """Return the truths of which one holds where results are not what JAX computes."""
+        truths, known = [self.exceptions.get(n) for n in needed(results)], dict[Node, None]()
+        known.update((truth, None) for truth in truths if truth is not None)
+        return list(known)
 
     def make(self, op: str, *operands: Entry) -> Node:
         """Return the result of an operation, simplified if possible."""
@@ -324,7 +346,9 @@ def _either(a: Node, b: Node) -> Node | None:
 
 
 def _at_most(a: Node, b: Node) -> Node | None:
-    """Return sqrt(x) <= b as x <= the largest number whose root is at most b."""
+    """Return sqrt(x) <= b as x <= the largest number whose root is at most b; or of two truths."""
+    if a.truth:
+        return a.graph.make("or", a.graph.make("not", a), b)
     if a.op != "sqrt" or b.op != "constant" or not b.value > 0.0 or not a.args[0].at_least_0:
         return None
     kind = np.float64 if a.graph.bits == 64 else np.float32
@@ -348,6 +372,10 @@ _SIMPLER: dict[str, Callable[..., Node | None]] = {
     "abs": lambda a: a if a.op == "abs" else None,
     "eq": lambda a, b: a.graph.make("not", a.graph.make("xor", a, b)) if a.truth else None,
     "ne": lambda a, b: a.graph.make("xor", a, b) if a.truth else None,
+    # Of truths, of which true is the larger one.
+    "max": lambda a, b: a.graph.make("or", a, b) if a.truth else None,
+    "min": lambda a, b: a.graph.make("and", a, b) if a.truth else None,
+    "lt": lambda a, b: a.graph.make("and", a.graph.make("not", a), b) if a.truth else None,
     "le": _at_most,
     "not": lambda a: a.args[0] if a.op == "not" else None,
     "select": _choice,

@@ -30,10 +30,16 @@ class Unsupported(EchelonError):
 
 @final
 class Missing:
-    """Stands for a result that nothing may read, such as intermediate results of a library."""
+    """Stands for a result that nothing may read, such as intermediate results of a library.
 
-    def __init__(self, primitive: str, where: str) -> None:
-        self.primitive, self.where = primitive, where
+    Attributes:
+        primitive: that makes it.
+        where: it is in the user's code.
+        source: the number of which it is a part; None if it is of no number.
+    """
+
+    def __init__(self, primitive: str, where: str, source: Node | None = None) -> None:
+        self.primitive, self.where, self.source = primitive, where, source
 
     __array_ufunc__ = None
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.network.channel import Channel
+from echelon.agents.network.channel import Channel, Network
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError
@@ -65,6 +65,7 @@ class Chunk(NamedTuple):
         inputs: (T, F N, m) delivered from each of them on, float64.
         sums: over its steps, with an axis F in front; F is 1 for a run alone.
         stopped: why no further step can be taken, in words; None where one can.
+        inexact: (F,) the formations whose numbers are not those that JAX would compute.
     """
 
     now: Moment
@@ -72,6 +73,7 @@ class Chunk(NamedTuple):
     inputs: Array
     sums: Sums
     stopped: str | None = None
+    inexact: Array | bool = False
 
 
 def numbers(now: Moment) -> tuple[Array, ...]:
@@ -128,6 +130,11 @@ class Stepper(abc.ABC):
         if [np.shape(leaf) for leaf in numbers(like)] != [np.shape(leaf) for leaf in leaves]:
             raise SimulationError("the stored moment has another shape than this run's.")
         return tree.unflatten(map(_leaf, leaves, like))
+
+    @property
+    def repeats(self) -> bool:
+        """Whether steps can be taken again from a moment, with the same results."""
+        return True
 
     @property
     def work(self) -> SolverStats | None:
@@ -209,6 +216,17 @@ class Drive(eqx.Module):
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return what is allowed but probably not meant, a sentence each."""
         return ()
+
+    def check_network(self, network: Network, graph: Graph, dt: float) -> None:
+        """Check that a network that is not ideal suits the drive, at a step dt (s).
+
+        Raises:
+            SimulationError: it does not.
+        """
+        raise SimulationError(
+            f"got a network, but `{type(self).__name__}` optimizes inputs, whose exchange over a "
+            "network is not simulated; use control laws, or remove `network`."
+        )
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of a run under a drive that is prepared.

@@ -83,11 +83,13 @@ class WorldState(NamedTuple):
     """What the world remembers between two steps; empty in the ideal world.
 
     Attributes:
-        in_flight: messages that were sent and not yet received, in the form of `Loop.channel`.
+        in_flight: the last messages that were sent, as `Posts` of the channel.
+        inbox: what agents keep of those that they received, as `Inbox`.
         actuators: where the actuators stand that do not follow their commands at once.
     """
 
     in_flight: PyTree = None
+    inbox: PyTree = None
     actuators: PyTree = None
 
 
@@ -113,6 +115,7 @@ class Moment(NamedTuple):
 def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
     """Return the loop of prepared laws."""
     graph = problem.graph
+    leader = leader if problem.channel is None else leader.predictable(problem.model)
     leaders, followers = np.array(graph.leaders), np.array(graph.followers)
     by_depth = follower.feedforward is Feedforward.PARENT
     nearest = np.array(graph.nearest_leader())

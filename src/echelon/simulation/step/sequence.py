@@ -1,7 +1,6 @@
 """The order of a step: agents send, receive, act and move; and many steps one after the other."""
 
 import operator
-from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -13,6 +12,12 @@ from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Inputs, State, States
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act, limit_sides
+from echelon.simulation.step.inbox import (
+    Message,
+    empty_inbox,
+    read_messages,
+    send_messages,
+)
 from echelon.simulation.step.loop import Loop, Moment, WorldState
 from echelon.simulation.step.meter import Sums, reference_at
 
@@ -31,10 +36,22 @@ def begin(loop: Loop, states: States) -> Moment:
         follower_memory=remember(loop.follower, loop.followers),
         cut=jnp.zeros((len(states), len(loop.model.input_names)), jnp.int8),
     )
-    if loop.channel is None:
-        return moment
-    in_flight = loop.channel.begin(loop.exchange.along_edges(_sent(loop, moment)[0]))
-    return moment._replace(world=WorldState(in_flight=in_flight))
+    return moment if loop.channel is None else moment._replace(world=_begin_world(loop, moment))
+
+
+def _begin_world(loop: Loop, moment: Moment) -> WorldState:
+    """Return the state of a network before the first message."""
+    sent, _ = _sent(loop, moment)
+    inbox = empty_inbox(loop, sent, _feedforward_size(loop, moment))
+    agents = jnp.arange(len(sent), dtype=jnp.int32)
+    assert loop.channel is not None
+    posts = loop.channel.begin(Message(sent, agents, inbox.packet), len(inbox.stamp))
+    return WorldState(in_flight=posts, inbox=inbox)
+
+
+def _feedforward_size(loop: Loop, moment: Moment) -> int:
+    """Return how many numbers leaders send to their followers."""
+    return jax.eval_shape(lambda: _lead(loop, moment, _sent(loop, moment)[0])).message.shape[1]
 
 
 class Control(NamedTuple):
@@ -50,38 +67,65 @@ class Control(NamedTuple):
 
 def control(loop: Loop, now: Moment) -> Control:
     """Return what all agents do from a moment on."""
-    x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
-    z, world = _receive(loop, now)
-    # From the step number, since a sum of many dt would gather rounding.
-    t = now.step.astype(x.dtype) * loop.motion.dt
-
-    def act_all(
-        law: Law, agents: Array | jax.Array, forward: jax.Array, memory: Memory, leads: bool = False
-    ) -> Action:
-        # One time for all; of everything else, an agent sees its own row and no other.
-        def one(
-            x: State, offset: State, z: jax.Array, forward: jax.Array, memory: Memory
-        ) -> Action:
-            view = LocalView(t, x, offset, z, forward, loop.motion.dt)
-            return act(loop, law, view, memory, leads)
-
-        return jax.vmap(one)(x[agents], offsets[agents], z[agents], forward, memory)
-
-    # Nobody is before a leader whose input it could be sent.
-    silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), x.dtype)
-    led = act_all(loop.leader, loop.leaders, silence, now.leader_memory, leads=True)
-    if loop.levels is None:
-        forward = led.message[loop.sender]
-        followed = act_all(loop.follower, loop.followers, forward, now.follower_memory)
+    sent, difference = _sent(loop, now)
+    exchange = _exchange_at(loop, now.step)
+    knowledge = None
+    if loop.channel is None:
+        # The ideal network neither delays nor loses: what is sent is received.
+        z = exchange(sent, exchange.along_edges(sent), difference)
     else:
-        followed = _by_depth(loop, now, led, act_all)
+        knowledge = read_messages(loop, exchange, now, sent, difference)
+        z = knowledge.disagreement
+    led = _lead(loop, now, z)
+    if loop.levels is not None:
+        followed = _by_depth(loop, now, led, z)
+    else:
+        forward = (
+            led.message[loop.sender] if knowledge is None else knowledge.feedforward[loop.followers]
+        )
+        followed = _act_all(
+            loop, now, z, loop.follower, loop.followers, forward, now.follower_memory
+        )
+    world = now.world
+    if knowledge is not None:
+        world = send_messages(loop, now, knowledge, sent, difference, led.message)
     u = jnp.concatenate([led.input, followed.input])[loop.order]
     desired = jnp.concatenate([led.desired, followed.desired])[loop.order]
     limited, cut = limit_sides(u, desired)
     return Control(u, limited.any(axis=1), cut.astype(jnp.int8), led.memory, followed.memory, world)
 
 
-def _by_depth(loop: Loop, now: Moment, led: Action, act_all: Callable[..., Action]) -> Action:
+def _lead(loop: Loop, now: Moment, z: Float[jax.Array, "N s"]) -> Action:
+    """Return what the leaders do."""
+    # Nobody is before a leader whose input it could be sent.
+    silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), z.dtype)
+    rows = loop.leaders, silence, now.leader_memory
+    return _act_all(loop, now, z, loop.leader, *rows, leads=True)
+
+
+def _act_all(
+    loop: Loop,
+    now: Moment,
+    z: Float[jax.Array, "N s"],
+    law: Law,
+    agents: Array | jax.Array,
+    forward: Float[jax.Array, "K k"],
+    memory: Memory,
+    leads: bool = False,
+) -> Action:
+    """Return what some agents do, with what they are sent (K, k) and remember."""
+    x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
+    # From the step number, since a sum of many dt would gather rounding.
+    t = now.step.astype(x.dtype) * loop.motion.dt
+
+    # One time for all; of everything else, an agent sees its own row and no other.
+    def one(x: State, offset: State, z: jax.Array, forward: jax.Array, memory: Memory) -> Action:
+        return act(loop, law, LocalView(t, x, offset, z, forward, loop.motion.dt), memory, leads)
+
+    return jax.vmap(one)(x[agents], offsets[agents], z[agents], forward, memory)
+
+
+def _by_depth(loop: Loop, now: Moment, led: Action, z: Float[jax.Array, "N s"]) -> Action:
     """Let the followers act level by level, each sent what its parent has just done."""
     followers, parents = jnp.asarray(loop.followers), jnp.asarray(loop.parents)
     messages = jnp.zeros((len(now.states), led.message.shape[1]), led.message.dtype)
@@ -94,7 +138,8 @@ def _by_depth(loop: Loop, now: Moment, led: Action, act_all: Callable[..., Actio
         messages, actions = carry
         agents = followers[places]
         memory = jax.tree.map(lambda leaf: leaf[places], now.follower_memory)
-        acted = act_all(loop.follower, agents, messages[parents[agents]], memory)
+        forward = messages[parents[agents]]
+        acted = _act_all(loop, now, z, loop.follower, agents, forward, memory)
         # Where a level repeats an agent, the same is written twice.
         actions = jax.tree.map(lambda a, b: a.at[places].set(b), actions, acted)
         return (messages.at[agents].set(acted.message), actions), None
@@ -133,18 +178,6 @@ def _sent(loop: Loop, now: Moment) -> tuple[Float[jax.Array, "N s"], Difference]
     if sent is not None:
         return sent, operator.sub
     return now.states - offsets, jax.vmap(loop.model.difference)
-
-
-def _receive(loop: Loop, now: Moment) -> tuple[Float[jax.Array, "N s"], WorldState]:
-    """Return z of what neighbours receive of each other, and what the world then remembers."""
-    sent, difference = _sent(loop, now)
-    exchange, world = _exchange_at(loop, now.step), now.world
-    received = exchange.along_edges(sent)
-    # The ideal network neither delays nor loses: what is sent is received.
-    if loop.channel is not None:
-        received, in_flight = loop.channel.carry(world.in_flight, received, now.step)
-        world = world._replace(in_flight=in_flight)
-    return exchange(sent, received, difference), world
 
 
 def _exchange_at(loop: Loop, step: jax.Array) -> Exchange:

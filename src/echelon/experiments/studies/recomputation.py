@@ -1,0 +1,122 @@
+"""The guarantee of a run, computed again from its scenario and compared with the run's files.
+
+This is not an independent check: the code is that which made the files. It shows that a file states
+what its scenario gives, word for word; the verifier checks by code of its own what it can.
+"""
+
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from echelon.core.errors import GainError
+from echelon.core.types import JsonObject
+from echelon.experiments.results.dataset import OBSERVED, statement
+from echelon.experiments.results.recording import read_recording
+from echelon.experiments.scenario.build import Experiment, build
+from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.self_contained import without_folders
+from echelon.experiments.scenario.yaml import read_yaml
+from echelon.experiments.studies.check import check
+from echelon.experiments.studies.design import with_gain
+from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.verifier.findings import Finding, decide
+from echelon.guarantees.verifier.stored_values import compare_values
+from echelon.guarantees.verifier.strict_json import parse_json, read_json
+from echelon.laws.consensus import Consensus
+from echelon.simulation.engine.initial import initial_states
+from echelon.simulation.engine.law_drive import Laws
+from echelon.synthesis.gains.gain_file import gain_as_mapping, load_gain
+
+_SOLVED = 1e-3
+"""Relative. On another machine a semidefinite program ends at another P, 1e-4 apart."""
+
+
+def recompute(
+    scenario: Scenario, claims: Path | None, gain: Path | None = None, data: Path | None = None
+) -> Iterator[Finding]:
+    """Yield a finding for each value that a run's files state and its scenario gives.
+
+    Args:
+        scenario: of the run. Code that it names is executed.
+        claims: the run's `summary.json`, or the output of `check --json`.
+        gain: the run's gain file; the guarantee is then that of the gain in it.
+        data: the run's `run.nc`, of which the guarantee, the scenario and the starts are compared.
+
+    Raises:
+        EchelonError: the scenario cannot be built, or a file cannot be read.
+    """
+    # As for a run: what is too large to have been run is refused.
+    experiment = build(scenario, to_run=True)
+    if gain is not None:
+        yield from compare_gain(gain, experiment)
+        with contextlib.suppress(GainError):
+            experiment = with_gain_of(experiment, gain)
+    if claims is not None:
+        yield from compare_claims(read_json(claims), experiment, scenario.name)
+    if data is not None:
+        yield from _compare_data(data, scenario, experiment)
+
+
+def with_gain_of(experiment: Experiment, file: Path) -> Experiment:
+    """Return the parts with the gain of a file.
+
+    Raises:
+        GainError: it is not a gain of them.
+    """
+    parts, drive = experiment.parts, experiment.parts.drive
+    if drive.gain is None:
+        raise GainError("the law of the scenario has no gain.")
+    gain = load_gain(file, parts.model, parts.graph)
+    # A law of the user's own is built with its gain, and not taken apart.
+    if not (isinstance(drive, Laws) and isinstance(drive.follower, Consensus)):
+        return experiment
+    return experiment._replace(parts=with_gain(parts, gain))
+
+
+def compare_gain(file: Path, experiment: Experiment) -> Iterator[Finding]:
+    """Compare a gain file with the gain of a scenario; its certificate the verifier checks."""
+    try:
+        with_gain_of(experiment, file)
+    except GainError as error:
+        yield decide(file.name, False, text=str(error).rstrip("."))._replace(by_scenario=True)
+        return
+    parts, stored = experiment.parts, read_json(file)
+    assert parts.drive.gain is not None
+    value = _as_json(gain_as_mapping(parts.drive.gain, parts.model, parts.graph))
+    for key in ("method", "coupling", "P", "R", "inner"):
+        yield from compare_values(f"{file.name}: {key}", stored[key], value[key], _SOLVED)
+    yield from compare_values(f"{file.name}: graph", stored["graph"], value["graph"])
+    # The name of a class may change with the version, and the verifier has evaluated it.
+    stored, value = ({**each["model"], "class": ""} for each in (stored, value))
+    yield from compare_values(f"{file.name}: model", stored, value)
+
+
+def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Iterator[Finding]:
+    """Compare a summary, or the output of a check, with what a scenario of a name gives."""
+    if "lines" in stored:
+        value = check(*experiment).as_mapping()
+    else:
+        value = statement(*experiment, name)
+        stored = {key: stored[key] for key in stored if key not in OBSERVED}
+    yield from compare_values("", stored, _as_json(value))
+
+
+def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
+    """Compare guarantee, scenario, starts and P of a dataset."""
+    run, (parts, settings), name = read_recording(file), experiment, file.name
+    stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
+    value = _as_json(promise(parts, settings).as_mapping())
+    yield from compare_values(f"{name}: promise", stored, value)
+    text = read_yaml(str(run.attributes.get("scenario_text", "")), str(file)).data
+    ours = without_folders(scenario.data)
+    yield from compare_values(f"{name}: scenario_text", without_folders(text), ours)
+    starts = initial_states(parts, settings.seed)[None][: len(run.states)]
+    yield from compare_values(f"{name}: states", run.states[:1].tolist(), starts.tolist())
+    P = None if parts.drive.gain is None else parts.drive.gain.P.tolist()
+    yield from compare_values(f"{name}: P", None if run.metric is None else run.metric.tolist(), P)
+
+
+def _as_json(value: JsonObject) -> JsonObject:
+    """Return a mapping as it is read from a file: lists for tuples, plain numbers."""
+    return json.loads(json.dumps(value, allow_nan=False))

@@ -1,0 +1,101 @@
+"""Whether a leader's path has the derivatives that T5 asks of it."""
+
+from collections.abc import Callable
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.chains import Chains
+from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import COORDINATES, Reference
+from echelon.core.enclosure.over_time import enclose_derivatives
+from echelon.core.errors import GainError
+from echelon.core.memoize import memoize
+from echelon.core.numerics import derivatives, precision
+
+_SHORT = Fraction(1, 10**4)
+"""s; shorter spans of time are not cut further."""
+_MOST = 2000
+"""Spans of time that are looked at."""
+_TIMES = 8
+"""At which handwritten derivatives are compared."""
+_SAME = 1e-6
+"""Relative; far more than floats leave of a derivative."""
+
+
+def path_fault(reference: Guide | None, chains: Chains, horizon: float) -> str:
+    """Return why a path is not known to have bounded derivatives; empty where it has.
+
+    An output with a chain of r integrators needs r - 1 continuous derivatives until the horizon (s)
+    and a bounded one more. A path has all of them if every function in its equations is smooth on
+    the values that it takes there, which are enclosed, span by span.
+    """
+    if not isinstance(reference, Reference):
+        return ""
+    try:
+        _check(reference, chains.outputs, max(chains.degrees), horizon)
+    except GainError as error:
+        name, order = type(reference).__name__, max(chains.degrees)
+        why = str(error).rstrip(".")
+        return f"`{name}` is not known to have {order} bounded derivatives, since {why}"
+    return ""
+
+
+@memoize
+def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: float) -> None:
+    """Check a path.
+
+    Raises:
+        GainError: it may lack a derivative.
+    """
+    if type(reference).derivatives is not Reference.derivatives:
+        raise GainError("a path replaces `derivatives`, which may be those of another path")
+    if _is_joined(reference, order):
+        return
+    picked = np.array([COORDINATES.index(name) for name in outputs])
+
+    def path(t: jax.Array) -> jax.Array:
+        return reference(t)[picked]
+
+    spans, count = [(Fraction(0), Fraction(horizon))], 0
+    while spans:
+        low, high = spans.pop()
+        count += 1
+        try:
+            list(enclose_derivatives(path, (low, high), 0))
+        except GainError:
+            if high - low < _SHORT or count > _MOST:
+                raise
+            spans += [((low + high) / 2, high), (low, (low + high) / 2)]
+    _compare(path, order, horizon)
+
+
+def _is_joined(reference: Reference, order: int) -> bool:
+    """Tell whether a class says of the path that it defines that its pieces fit together."""
+    kinds = type(reference).__mro__
+    said, moves = (
+        next(k for k, kind in enumerate(kinds) if name in vars(kind))
+        for name in ("joined", "__call__")
+    )
+    return said <= moves and reference.joined is not None and reference.joined >= order - 1
+
+
+def _compare(path: Callable[[jax.Array], jax.Array], order: int, horizon: float) -> None:
+    """Check handwritten derivatives in a path, which the law uses, at a few times.
+
+    Raises:
+        GainError: they are not those of its values.
+    """
+    with precision("float64"):
+        if "custom_" not in str(jax.make_jaxpr(path)(jnp.zeros(()))):
+            return
+        for t in np.linspace(0.0, horizon, _TIMES):
+            values = np.asarray(derivatives(path, jnp.asarray(t), order)).ravel().tolist()
+            [rows] = enclose_derivatives(path, (Fraction(t), Fraction(t)), order)
+            for x, value in zip(sum(rows, []), values, strict=True):
+                slack = Fraction(_SAME) * (1 + max(abs(x.lo), abs(x.hi)))
+                if not (np.isfinite(value) and x.lo - slack <= Fraction(value) <= x.hi + slack):
+                    when = f"at {t:.3g} s"
+                    raise GainError(f"a path has a derivative {when} that is not of its values")

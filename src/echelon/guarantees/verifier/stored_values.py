@@ -1,0 +1,130 @@
+"""Comparison of stored values with the same values computed again, possibly on another machine.
+
+Processors and libraries round differently, so numbers agree to six digits, and residuals of
+rounding agree with each other. Words agree letter by letter.
+"""
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+from echelon.core.types import Array
+from echelon.guarantees.verifier.findings import Finding
+
+SAME = 1e-6
+"""Relative difference allowed; eigenvalues and solutions of Riccati equations differ by less."""
+_NOISE = 1e-12
+"""Numbers below it, or in a matrix below this fraction of its largest, are rounding."""
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+_SHOWN = 60
+"""Letters of a text that a finding shows from where it differs."""
+
+
+def compare_values(
+    claim: str, stored: object, value: object, same: float = SAME
+) -> Iterator[Finding]:
+    """Yield a finding for each number, matrix or text of a stored value.
+
+    Args:
+        claim: the name of the value.
+        stored: plain data of a file.
+        value: the same, computed again.
+        same: the relative difference of numbers that is allowed.
+    """
+    arrays = _array(stored), _array(value)
+    if isinstance(stored, dict) and isinstance(value, dict):
+        for key in [*value, *(key for key in stored if key not in value)]:
+            name = f"{claim}.{key}" if claim else str(key)
+            if key not in stored:
+                yield _differs(name, "", _shown(value[key]), "it is missing")
+            elif key not in value:
+                # In ASCII, so that a letter that looks like another one is seen.
+                yield _differs(ascii(name)[1:-1], _shown(stored[key]), "", "it is unknown")
+            else:
+                yield from compare_values(name, stored[key], value[key], same)
+    elif arrays[0] is not None and arrays[1] is not None:
+        yield _finding(claim, stored, value, _agree(arrays[0], arrays[1], same))
+    elif isinstance(stored, list) and isinstance(value, list) and len(stored) == len(value):
+        for k, pair in enumerate(zip(stored, value, strict=True)):
+            yield from compare_values(f"{claim}.{k}", *pair, same)
+    else:
+        yield _compare_leaf(claim, stored, value, same)
+
+
+def _compare_leaf(claim: str, stored: object, value: object, same: float) -> Finding:
+    if isinstance(stored, str) and isinstance(value, str):
+        fine, at = _same_text(stored, value), _first_difference(stored, value)
+        shown = [ascii(text[at : at + _SHOWN])[1:-1] for text in (stored, value)]
+        reason = f"from letter {at} on `{shown[0]}` is stored, and computed is `{shown[1]}`"
+        return _finding(claim, stored, value, fine, reason)
+    if _is_number(stored) and _is_number(value):
+        fine = _agree(np.array(stored, float), np.array(value, float), same)
+        return _finding(claim, stored, value, fine)
+    # `True == 1` in Python, so types are compared too.
+    return _finding(claim, stored, value, type(stored) is type(value) and stored == value)
+
+
+def _finding(claim: str, stored: object, value: object, fine: bool, reason: str = "") -> Finding:
+    if not fine:
+        return _differs(claim, _shown(stored), _shown(value), reason)
+    return Finding(claim, _shown(stored), _shown(value), "recomputed", "", True)
+
+
+def _differs(claim: str, stored: str, value: str, reason: str) -> Finding:
+    return Finding(
+        claim, stored, value, "refused", reason or "the scenario gives another value", True
+    )
+
+
+def _shown(value: object) -> str:
+    """Return a value for a table; of a text or a list only what it is."""
+    array = _array(value)
+    if array is not None:
+        return f"{' x '.join(map(str, array.shape))} numbers"
+    if isinstance(value, dict | list):
+        return f"{len(value)} values"
+    if isinstance(value, str):
+        return "text" if len(value) > 12 else ascii(value)[1:-1]
+    return f"{value:.10g}" if isinstance(value, float) else str(value).lower()
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _array(value: object) -> Array | None:
+    """Return nested lists of numbers as an array, otherwise None."""
+
+    def plain(x: object) -> bool:
+        return all(map(plain, x)) if isinstance(x, list) else _is_number(x)
+
+    if not isinstance(value, list) or not value or not plain(value):
+        return None
+    try:
+        return np.array(value, float)
+    except ValueError:  # rows of different lengths
+        return None
+
+
+def _agree(stored: Array, value: Array, same: float) -> bool:
+    if stored.shape != value.shape:
+        return False
+    size = np.maximum(np.abs(stored), np.abs(value))
+    noise = _NOISE * max(1.0, float(np.abs(value).max())) if value.ndim else _NOISE
+    return bool(((np.abs(stored - value) <= same * size) | (size <= noise)).all())
+
+
+def _same_text(stored: str, value: str) -> bool:
+    """Return whether two texts agree, but for residuals of rounding in them."""
+    if stored == value:
+        return True
+    if _NUMBER.split(stored) != _NUMBER.split(value):
+        return False
+    pairs = zip(_NUMBER.findall(stored), _NUMBER.findall(value), strict=True)
+    return all(a == b or max(abs(float(a)), abs(float(b))) <= _NOISE for a, b in pairs)
+
+
+def _first_difference(a: str, b: str) -> int:
+    pairs = enumerate(zip(a, b))
+    return next((k for k, (x, y) in pairs if x != y), min(len(a), len(b)))

@@ -1,0 +1,254 @@
+"""`echelon verify`: honest runs are verified, forged folders never, and what is open is named."""
+
+import json
+import os
+import shutil
+
+import pytest
+import xarray as xr
+from runs import OWN_PENDULUM
+
+import echelon as ech
+
+SMALL = """
+name: small
+model: {name: double-integrator, parameters: {dimension: 2}}
+graph: {name: path, agents: 4}
+follower: {gain: {method: riccati}}
+initial: {spread: {position: 1.0}}
+simulation: {horizon: 0.2, dt: 0.01}
+"""
+T5 = SMALL.replace(
+    "follower: {gain: {method: riccati}}", "follower: {law: stopping-point}"
+).replace("follower:", "leader: {law: stopping-point}\nfollower:")
+ALONE = SMALL.replace("{gain: {method: riccati}}", "{law: agreement}").replace("double", "single")
+ALONE += "leader: {law: agreement}\n"
+
+
+TURNS = ALONE.replace("law: agreement", "gain: {method: riccati}", 1).replace(
+    "agreement", "passive"
+)
+TURNS = TURNS.replace(
+    "{name: path, agents: 4}",
+    "{agents: 3, leaders: [0], edges: [[0, 1], [1, 2]], period: 0.2, "
+    "schedule: [{at: 0.1, edges: [[0, 2], [2, 1]]}]}",
+)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """The folders of runs: with a gain, under T5 without borders, without either, and switching."""
+    place = tmp_path_factory.mktemp("runs")
+    for name, text in (("gain", SMALL), ("tube", T5), ("alone", ALONE), ("turns", TURNS)):
+        (place / f"{name}.yaml").write_text(text)
+        result = ech.run(ech.load_scenario(place / f"{name}.yaml"))
+        ech.save_run(result, place / name, figures=False)
+    return place
+
+
+@pytest.mark.parametrize("name", ["gain", "tube", "alone", "turns"])
+def test_an_honest_run_is_verified_by_all_that_it_states(runs, echelon, name):
+    code, out, err = echelon("verify", runs / name)
+    assert (code, err) == (0, "") and "Verified: " in out
+    assert max(map(len, out.splitlines())) <= 80 or str(runs) in max(out.splitlines(), key=len)
+    assert "Computed again from the scenario" in out and "Not covered: " in out
+    assert echelon("verify", runs / name / "summary.json")[0] == 0
+    code, out, _ = echelon("verify", runs / name, "--json")
+    found = json.loads(out)
+    verdicts = {x["verdict"] for x in found["findings"]}
+    assert code == 0 and found["holds"] and verdicts <= {"holds", "recomputed"}
+    by = {x["claim"]: x["means"] for x in found["findings"]}
+    assert by["promise.sentence"] == by["promise.rate"] == "scenario"
+    assert ("independent code" in by.values()) is (name in ("gain", "turns"))
+
+
+def in_json(name, change):
+    """Change the mapping in a file of a run."""
+
+    def act(folder):
+        file = folder / name
+        document = json.loads(file.read_text())
+        change(document)
+        file.write_text(json.dumps(document))
+
+    return act
+
+
+def in_text(name, old, new):
+    """Replace a text in a file of a run, once."""
+
+    def act(folder):
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new, 1))
+
+    return act
+
+
+def in_data(**attributes):
+    """Change attributes of the dataset of a run."""
+
+    def act(folder):
+        with xr.open_dataset(folder / "run.nc", engine="h5netcdf") as data:
+            data = data.load()
+        for name, change in attributes.items():
+            data.attrs[name] = change(data.attrs[name])
+        data.to_netcdf(folder / "run.nc", engine="h5netcdf")
+
+    return act
+
+
+def moved_start(folder):
+    with xr.open_dataset(folder / "run.nc", engine="h5netcdf") as data:
+        data = data.load()
+    data["states"][0, 1, 0] += 0.5
+    data.to_netcdf(folder / "run.nc", engine="h5netcdf")
+
+
+def link(folder):
+    """A link to the gain file of another run, which is a correct gain."""
+    other = ech.load_scenario(folder / "scenario.yaml", ["graph.agents=5"])
+    ech.save_run(ech.run(other), folder.parent / "other", figures=False)
+    (folder / "gain.json").unlink()
+    os.symlink(folder.parent / "other" / "gain.json", folder / "gain.json")
+
+
+def weaken(document):
+    document["coupling"] *= 1e-6
+    document["anywhere"] = {"format": "echelon tube 1", "borders": []}
+
+
+def hide(document):
+    weaken(document)
+    document["promise"] = {"anywhere": document.pop("anywhere")}
+
+
+FORGED = {
+    # Of a gain, with what once led elsewhere.
+    "a gain with a tube": ("gain", in_json("gain.json", weaken), 2),
+    "a gain in a promise": ("gain", in_json("gain.json", hide), 2),
+    "a gain of another run": ("gain", link, 1),
+    "no gain": ("gain", lambda folder: (folder / "gain.json").unlink(), 2),
+    "no summary": ("gain", lambda folder: (folder / "summary.json").write_text("{}"), 2),
+    "a gain doubled in all files": (
+        "gain",
+        lambda folder: [
+            in_json("gain.json", lambda d: d.update(R=[[4 * x for x in row] for row in d["R"]]))(
+                folder
+            ),
+            in_json("summary.json", lambda d: d["gain"].update(coupling=9.0))(folder),
+        ],
+        1,
+    ),
+    # JSON that readers take in different ways.
+    "a key twice": ("tube", in_text("summary.json", '"borders":', '"borders": [1], "borders":'), 2),
+    "a tube twice": (
+        "tube",
+        in_text("summary.json", '"anywhere":', '"anywhere": {}, "anywhere":'),
+        2,
+    ),
+    "NaN": ("tube", in_text("summary.json", '"rate": ', '"rate": NaN, "x": '), 2),
+    "Infinity": ("tube", in_text("summary.json", '"edge": null', '"edge": -Infinity'), 2),
+    "an overflow": ("tube", in_text("summary.json", '"edge": null', '"edge": 1e999'), 2),
+    "a long number": ("tube", in_text("summary.json", '"agents": 4', '"agents": 4' + "0" * 400), 2),
+    "a longer number": (
+        "tube",
+        in_text("summary.json", '"agents": 4', '"agents": 4' + "0" * 40),
+        1,
+    ),
+    "deep": ("tube", in_text("summary.json", '"edge": null', '"edge": ' + "[" * 10**5), 2),
+    # One statement each.
+    "a faster rate": ("tube", in_json("summary.json", lambda d: d["promise"].update(rate=9.0)), 1),
+    "a sentence": (
+        "tube",
+        in_json("summary.json", lambda d: d["promise"].update(sentence="All is well.")),
+        1,
+    ),
+    "an arrival": (
+        "tube",
+        in_json("summary.json", lambda d: d["promise"]["anywhere"].update(within_1_cm_from=0.01)),
+        1,
+    ),
+    "no tube": ("tube", in_json("summary.json", lambda d: d["promise"].update(anywhere=None)), 1),
+    "another tube": ("tube", in_json("summary.json", lambda d: d["promise"].update(anywhere=3)), 1),
+    "no promise": ("tube", in_json("summary.json", lambda d: d.pop("promise")), 2),
+    "more promises": ("alone", in_json("summary.json", lambda d: d.update(proved="stable")), 1),
+    "another seed": ("alone", in_json("summary.json", lambda d: d.update(seed=1)), 1),
+    # What the run was of.
+    "another scenario": ("tube", in_text("scenario.yaml", "agents: 4", "agents: 3"), 1),
+    "a scenario twice": ("tube", in_text("scenario.yaml", "agents: 4", "agents: 4, agents: 4"), 2),
+    "another start": ("alone", in_text("scenario.yaml", "position: 1.0", "position: 2.0"), 1),
+    "a start in the data": ("alone", moved_start, 1),
+    "the data's promise": (
+        "tube",
+        in_data(promise=lambda text: text.replace('"rate": ', '"rate": 1')),
+        1,
+    ),
+    "the data's graph": (
+        "alone",
+        in_data(scenario_text=lambda text: text.replace("agents: 4", "agents: 400")),
+        1,
+    ),
+}
+
+
+@pytest.mark.parametrize("what", FORGED)
+def test_no_forged_folder_is_verified(runs, echelon, here, what):
+    name, forge, code = FORGED[what]
+    shutil.copytree(runs / name, here / "run")
+    forge(here / "run")
+    found, out, err = echelon("verify", "run")
+    assert found == code, out + err
+    assert ("Verified" in out) is (code == 0) and ("Refused: " in out) is (code == 1)
+    assert err.count("\n") == (code == 2)
+
+
+def test_what_another_version_made_is_refused_with_a_hint(runs, echelon, here):
+    shutil.copytree(runs / "alone", here / "run")
+    in_json("summary.json", lambda d: d["versions"].update(echelon="0.0.1"))(here / "run")
+    assert echelon("verify", "run")[0] == 0
+    in_json("summary.json", lambda d: d["promise"].update(sentence="Old words."))(here / "run")
+    code, out, _ = echelon("verify", "run")
+    assert code == 1 and "It was made by echelon 0.0.1 (" in out
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_a_file_outside_of_the_folder_is_not_read_for_a_verification(runs, echelon, here):
+    shutil.copytree(runs / "gain", here / "run")
+    shutil.copy(runs / "gain" / "gain.json", here / "elsewhere.json")
+    in_text("scenario.yaml", "{method: riccati}", "{file: ../elsewhere.json}")(here / "run")
+    code, out, _ = echelon("verify", "run")
+    assert code == 5 and "the scenario names a file outside of its folder" in " ".join(out.split())
+
+
+def test_code_is_executed_for_a_verification_only_where_it_is_named(echelon, here):
+    (here / "pendulum.py").write_text(OWN_PENDULUM)
+    text = SMALL.replace(
+        "{name: double-integrator, parameters: {dimension: 2}}", "{python: 'pendulum.py:Pendulum'}"
+    )
+    (here / "own.yaml").write_text(text.replace("position: 1.0", "angle: 0.1"))
+    assert echelon("run", "own.yaml", "--no-figures", "--out", "own")[0] == 0
+    code, out, err = echelon("verify", "own")
+    assert (code, err) == (5, "") and "promise.promised; " in out
+    assert out.splitlines()[-1].endswith("echelon verify own --scenario own")
+    assert echelon("verify", "own", "--scenario", "own")[0] == 0
+    assert echelon("verify", "own", "--scenario", "own.yaml")[0] == 0
+    # Another scenario gives the class, and says nothing about this run.
+    (here / "own.yaml").write_text(text.replace("position: 1.0", "angle: 0.2"))
+    code, out, _ = echelon("verify", "own", "--scenario", "own.yaml")
+    assert code == 5 and "the scenario is not that of the run" in " ".join(out.split())
+    # The folder's code is not executed, whatever it would say.
+    (here / "own" / "inputs" / "pendulum.py").write_text("raise SystemExit(0)")
+    assert echelon("verify", "own")[0] == 5
+
+
+def test_the_output_of_a_check_is_verified_with_its_scenario(echelon, here):
+    (here / "t5.yaml").write_text(T5)
+    code, out, _ = echelon("check", "t5.yaml", "--json")
+    (here / "check.json").write_text(out)
+    code, out, _ = echelon("verify", "check.json")
+    assert code == 5 and "promise.anywhere" in out
+    assert out.splitlines()[-1].endswith("echelon verify check.json --scenario SCENARIO")
+    assert echelon("verify", "check.json", "--scenario", "t5.yaml")[0] == 0
+    in_json("check.json", lambda d: d["lines"][3].update(text="every graph"))(here)
+    assert echelon("verify", "check.json", "--scenario", "t5.yaml")[0] == 1

@@ -1,0 +1,72 @@
+"""Guarantees behind several leaders: their own motion is part of the followers' errors."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon.guarantees.promises.promise import promise
+from echelon.laws import Consensus, TrimInput
+from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
+
+LINE = ech.Graph.path(4, leaders=(0, 3))
+
+
+class Sinking(ech.ControlAffine):
+    """A body that comes to rest at its origin by itself, but slowly."""
+
+    state_names = ("x",)
+    input_names = ("speed",)
+    position = ("x",)
+
+    def drift(self, x):
+        return -0.05 * x
+
+    def input_map(self, x):
+        return jnp.ones((1, 1), x.dtype)
+
+
+def formation(apart, coupling):
+    """Two leaders so far apart (m) and their followers under stopping points, on a line."""
+    model = ech.models.DoubleIntegrator(2)
+    states = np.zeros((4, 4))
+    states[1, :2], states[3, 0] = (1.0, 2.0), apart
+    drive = ech.Laws(StoppingLeader(coupling=coupling), StoppingPoint())
+    goals = ech.Formation(np.zeros((4, 4)))
+    return ech.Parts(model, LINE, goals, drive, initial=states)
+
+
+def shrinking(parts, begin, end):
+    """At what rate the errors of all agents shrink between two times, 1/s, and the promise."""
+    settings = ech.Settings(horizon=end, dt=0.02)
+    result = ech.simulate(parts, settings)
+    sizes = np.linalg.norm(result.errors.reshape(len(result.times), -1), axis=1)
+    first, last = np.searchsorted(result.times, [begin, end])
+    measured = np.log(sizes[first] / sizes[last]) / (result.times[last] - result.times[first])
+    return measured, promise(parts, settings)
+
+
+@pytest.mark.parametrize("coupling", [0.05, 0.3])
+def test_leaders_apart_come_together_no_faster_than_their_own_coupling(coupling):
+    measured, found = shrinking(formation(1.0, coupling), 20.0, 40.0)
+    assert found.rate == pytest.approx(coupling) and measured == pytest.approx(coupling, rel=1e-2)
+    assert found.slowest == -found.rate and found.tube.arrival is None
+    assert f"decay at {coupling} 1/s or faster" in found.sentence()
+
+
+def test_leaders_that_start_alike_leave_the_rate_to_their_followers():
+    found = shrinking(formation(0.0, 0.05), 1.0, 2.0)[1]
+    assert found.rate == pytest.approx(4.0) and found.tube.arrival is not None
+
+
+def test_passive_leaders_apart_come_together_by_their_own_drift():
+    model = Sinking()
+    law = Consensus(ech.synthesize(model, LINE, ech.gains.Riccati()))
+    for leader, rate in ((1.0, 0.05), (0.0, None)):
+        states = np.array([[0.0], [1.0], [2.0], [leader]])
+        parts = ech.Parts(
+            model, LINE, ech.Formation(np.zeros((4, 1))), ech.Laws(TrimInput(), law), initial=states
+        )
+        measured, found = shrinking(parts, *((10.0, 20.0) if rate else (0.5, 1.0)))
+        assert found.rate == pytest.approx(rate or -found.loop.slowest)
+        assert measured == pytest.approx(found.rate, rel=0.05) and found.slowest == -found.rate

@@ -1,0 +1,65 @@
+"""Where a leader is expected, from what it last said of itself."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+import echelon as ech
+from echelon.laws.stopping_point import saturated_decay
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    start=st.floats(-50.0, 50.0),
+    coupling=st.floats(0.1, 30.0),
+    speed=st.sampled_from([0.01, 0.5, 2.5, 100.0]),
+    age=st.floats(1e-6, 3.0),
+)
+def test_the_closed_form_solves_its_differential_equation(start, coupling, speed, age):
+    def slope(_, x):
+        return -coupling * x / np.sqrt(1.0 + (coupling * x / speed) ** 2)
+
+    solved = solve_ivp(slope, (0.0, age), [start], "DOP853", rtol=1e-12, atol=1e-15)
+    with jax.enable_x64(True):
+        args = jnp.asarray([start]), coupling, jnp.asarray([1.0 / speed]), jnp.asarray(age)
+        value = float(jax.jit(saturated_decay)(*args)[0])
+    assert value == pytest.approx(solved.y[0, -1], rel=2e-10, abs=1e-13)
+
+
+def test_without_a_speed_it_is_exponential_and_zero_stays():
+    with jax.enable_x64(True):
+        start = jnp.asarray([3.0, 0.0, -2.0, 1e-12])
+        inverse = jnp.asarray([0.0, 2.0, 0.0, 0.4])
+        value = saturated_decay(start, 4.0, inverse, jnp.asarray(0.7))
+    np.testing.assert_allclose(value, np.asarray(start) * np.exp(-2.8), rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["paper", "paper-global", "unicycle"])
+def test_a_leader_on_its_plan_is_expected_where_it_is(name):
+    """Of any age: with no deviation the prediction is the plan at that time."""
+    parts, _ = ech.build(ech.load_scenario(name, ["leader.start_error={}"]))
+    with jax.enable_x64(True):
+        leader = parts.drive.prepare(parts.model, parts.graph).leader.predictable(parts.model)
+        for t, age in ((0.0, 0.0), (1.3, 0.4), (2.0, 2.0)):
+            x = leader.reference_states(parts.model, jnp.asarray([t]))[0]
+            memory = leader.begin(parts.model, x)
+            zero = jnp.zeros_like(x)
+            deviation = leader.deviation(parts.model, jnp.asarray(t), x, zero, memory)
+            there = leader.expected(
+                parts.model, jnp.asarray(t), 0.0 * deviation, jnp.asarray(age), 0.005
+            )
+            signal = leader.signal(parts.model, x, zero, memory)
+            if signal is None:
+                np.testing.assert_allclose(there.signal, x, atol=1e-12)
+                np.testing.assert_allclose(deviation, 0.0, atol=1e-12)
+            else:
+                # zeta_r, whatever is known of the leader's own integrators.
+                path = leader.path(parts.model, jnp.asarray(t))
+                np.testing.assert_allclose(there.signal, leader.ready.stop(path[:-1]), atol=1e-12)
+                np.testing.assert_allclose(
+                    there.feedforward, leader.ready.stop(path[1:]), atol=1e-12
+                )
