@@ -45,7 +45,7 @@ def find_jump(
         ends: last points of the segments.
     """
     low, high, changes = np.asarray(starts, float), np.asarray(ends, float), []
-    size: Array | None = None
+    size = np.zeros(())
     shares = np.linspace(0.0, 1.0, _PARTS + 1)[:, None]
     with precision("float64"):
         values = jax.jit(jax.vmap(jax.vmap(function)))
@@ -57,7 +57,8 @@ def find_jump(
             rows = np.arange(len(low))
             low, high = points[rows, most], points[rows, most + 1]
             changes.append(steps[rows, most])
-            size = np.abs(sampled).max(axis=1) if size is None else size
+            # Of the whole segment at first, since it is the largest of all.
+            size = np.maximum(size, np.abs(sampled).max(axis=1))
     # A change that rounding of the values can cause is no jump.
     jumps = (changes[-1] > 0.5 * changes[-3]) & (changes[-1] > 1e-10 * size)
     if not jumps.any():
@@ -125,7 +126,7 @@ class Sides(NamedTuple):
         What only bends between the axes is charged to the variable that moves first.
         """
         scale = _BENT * np.maximum(np.abs(self.forward), np.abs(self.backward))
-        bends = self._stays(self.forward - self.backward, scale) | self.jumps()
+        bends = np.asarray(self._stays(self.forward - self.backward, scale) | self.jumps())
         axes, oblique = self.forward[..., :n], self.forward[..., n:]
         sums = axes @ _oblique(n).T
         size = _BENT * (np.abs(axes) @ np.abs(_oblique(n)).T)
@@ -138,12 +139,12 @@ class Sides(NamedTuple):
         """Return (k, q) whether values differ between the sides at any distance."""
         sizes = np.maximum(np.abs(self.forward), np.abs(self.backward))
         # A jump over a step a hundred times shorter is a slope a hundred times steeper.
-        return ((sizes[1::2] > 50.0 * sizes[::2]) & self._seen(sizes[1::2])).any(axis=0)
+        return np.any((sizes[1::2] > 50.0 * sizes[::2]) & self._seen(sizes[1::2]), axis=0)
 
     def _stays(self, away: Array, least: Array) -> Array:
         wide, narrow = np.abs(away[::2]), np.abs(away[1::2])
         stays = (narrow > least[1::2]) & (narrow > 0.1 * wide) & self._seen(narrow)
-        return stays.any(axis=0)
+        return np.any(stays, axis=0)
 
     def _seen(self, slopes: Array) -> Array:
         """Return whether slopes over the narrow steps are more than rounding."""
@@ -174,7 +175,7 @@ def stencil(point: Float[Array, " n"], units: Float[Array, " n"]) -> Float[Array
 
 
 def sides(point: Float[Array, " n"], values: Float[Array, "K k"]) -> Sides:
-    """Return the slopes at a point (n,), in steps of its units, from the values of its `stencil`."""
+    """Return the slopes at a point (n,), per unit of each state, from the values of its stencil."""
     here, widths = values[0], _STEPS[:, None, None]
     around = values[1:].reshape(-1, len(point) + _OBLIQUE, values.shape[1])
     # Other checks report values that are not finite; here they compare as false.
@@ -200,7 +201,8 @@ def find_gap(
         around = jnp.asarray(np.stack([stencil(point, units) for point in points]))
         values = np.asarray(jax.jit(jax.vmap(jax.vmap(function)))(around))
         slopes = np.asarray(jax.jit(jax.vmap(jax.jacfwd(function)))(jnp.asarray(points)))
-    gaps = (
-        sides(p, v).gap(s, units_at(p, units)) for p, v, s in zip(points, values, slopes, strict=True)
-    )
-    return next((gap for gap in gaps if gap is not None), None)
+    for point, around_it, slope in zip(points, values, slopes, strict=True):
+        gap = sides(point, around_it).gap(slope, units_at(point, units))
+        if gap is not None:
+            return gap
+    return None
