@@ -101,9 +101,7 @@ def _points(domain: Domain) -> tuple[Array, Array]:
     return both[:_SAMPLES], both[_SAMPLES:]
 
 
-def _check_samples(
-    model: ControlAffine, points: Array, velocity: _OfState, units: Array
-) -> None:
+def _check_samples(model: ControlAffine, points: Array, velocity: _OfState, units: Array) -> None:
     """Refuse a model whose Jacobians say less than its values, at points (K, n + m)."""
     n, name = len(model.state_names), type(model).__name__
 
