@@ -276,7 +276,8 @@ def test_an_unknown_section_gets_a_guess(refused):
     assert refused(seed="sed: 0") == [
         "s.yaml:11: sed: got an unknown key, allowed are `name`, `model`, `plant`, `graph`,"
         " `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`,"
-        " `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed` (did you mean `seed`?)."
+        " `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed` (did"
+        " you mean `seed`?)."
     ]
 
 
