@@ -42,8 +42,7 @@ class Domain:
         Args:
             model: defines the names, the trim and the chart.
             bounds: a half-width, or (lower, upper), in the state's unit or that of the normalized
-                input. Other states are unbounded, but angles that wind within a quarter of a turn;
-                other inputs are those of the trim.
+                input. Other states are unbounded, other inputs are those of the trim.
 
         Raises:
             GainError: a name is unknown, a bound is empty, inverted or leaves the model's chart.
@@ -59,7 +58,7 @@ class Domain:
         state = np.array([model.per_state(lower, -np.inf), model.per_state(upper, np.inf)])
         _check_chart(model, state)
         _check_turns(model, state)
-        return cls(*state, *inputs).straight(model)
+        return cls(*state, *inputs)
 
     def straight(self, model: ControlAffine) -> "Domain":
         """Return the domain with a bound for each state whose difference is x - y only nearby.
