@@ -88,7 +88,7 @@ def _lag(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[Cause
 def _offset(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[Cause]:
     """Yield why a leader keeps an error from its reference."""
     steady = numbers.leader.steady_rmse
-    unknown = result.world.plant is not None or result.world.disturbance is not None
+    unknown = not result.world.ideal
     if steady is None or steady <= SETTLED or _falls(result, steady):
         return
     if not (guarantee.promised or unknown):
