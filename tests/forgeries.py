@@ -63,7 +63,7 @@ def changes(value, kept=()):
     elif value is None:
         yield from (1.0, "", [], False)
     else:
-        yield from (f"{value}.", value.swapcase() or " ", None, 0)
+        yield from (f"{value}.", f" {value.swapcase()}", None, 0)
         if (digit := NUMBER.search(value)) and "e-" not in value:
             number = digit.group()
             yield value.replace(number, number[:-1] + str((int(number[-1]) + 1) % 10), 1)

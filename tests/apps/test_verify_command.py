@@ -25,18 +25,28 @@ ALONE = SMALL.replace("{gain: {method: riccati}}", "{law: agreement}").replace("
 ALONE += "leader: {law: agreement}\n"
 
 
+TURNS = ALONE.replace("law: agreement", "gain: {method: riccati}", 1).replace(
+    "agreement", "passive"
+)
+TURNS = TURNS.replace(
+    "{name: path, agents: 4}",
+    "{agents: 3, leaders: [0], edges: [[0, 1], [1, 2]], period: 0.2, "
+    "schedule: [{at: 0.1, edges: [[0, 2], [2, 1]]}]}",
+)
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """The folders of three runs: with a gain, under T5 without borders, and without either."""
+    """The folders of runs: with a gain, under T5 without borders, without either, and switching."""
     place = tmp_path_factory.mktemp("runs")
-    for name, text in (("gain", SMALL), ("tube", T5), ("alone", ALONE)):
+    for name, text in (("gain", SMALL), ("tube", T5), ("alone", ALONE), ("turns", TURNS)):
         (place / f"{name}.yaml").write_text(text)
         result = ech.run(ech.load_scenario(place / f"{name}.yaml"))
         ech.save_run(result, place / name, figures=False)
     return place
 
 
-@pytest.mark.parametrize("name", ["gain", "tube", "alone"])
+@pytest.mark.parametrize("name", ["gain", "tube", "alone", "turns"])
 def test_an_honest_run_is_verified_by_all_that_it_states(runs, echelon, name):
     code, out, err = echelon("verify", runs / name)
     assert (code, err) == (0, "") and "Verified: " in out
@@ -49,7 +59,7 @@ def test_an_honest_run_is_verified_by_all_that_it_states(runs, echelon, name):
     assert code == 0 and found["holds"] and verdicts <= {"holds", "recomputed"}
     by = {x["claim"]: x["means"] for x in found["findings"]}
     assert by["promise.sentence"] == by["promise.rate"] == "scenario"
-    assert ("independent code" in by.values()) is (name == "gain")
+    assert ("independent code" in by.values()) is (name in ("gain", "turns"))
 
 
 def in_json(name, change):
@@ -191,6 +201,16 @@ def test_no_forged_folder_is_verified(runs, echelon, here, what):
     assert found == code, out + err
     assert ("Verified" in out) is (code == 0) and ("Refused: " in out) is (code == 1)
     assert err.count("\n") == (code == 2)
+
+
+def test_what_another_version_made_is_refused_with_a_hint(runs, echelon, here):
+    shutil.copytree(runs / "alone", here / "run")
+    in_json("summary.json", lambda d: d["versions"].update(echelon="0.0.1"))(here / "run")
+    assert echelon("verify", "run")[0] == 0
+    in_json("summary.json", lambda d: d["promise"].update(sentence="Old words."))(here / "run")
+    code, out, _ = echelon("verify", "run")
+    assert code == 1 and "It was made by echelon 0.0.1 (" in out
+    assert max(map(len, out.splitlines())) <= 80
 
 
 def test_a_file_outside_of_the_folder_is_not_read_for_a_verification(runs, echelon, here):

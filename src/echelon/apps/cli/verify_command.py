@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,8 +13,11 @@ from echelon.apps.cli.options import JsonOption
 if TYPE_CHECKING:
     from echelon.experiments.scenario.scenario import Scenario
     from echelon.guarantees.verifier.findings import Finding
+    from echelon.guarantees.verifier.verify import Verification
     from echelon.output.archive.open_folder import ClaimFiles
 
+_SETTLED = {"graph spectrum": "graph.spectrum"}
+"""What independent code leaves open of large and of switching graphs, and what settles it."""
 _EXIT_CODES = {"verified": 0, "refused": 1, "incomplete": 5}
 
 
@@ -40,18 +44,15 @@ def verify(
     findings, note = _independent(files, trusted)
     computed = [] if source is None else _recomputed(source, files)
     from echelon.apps.cli.verify_report import as_mapping, print_verification
-    from echelon.guarantees.verifier.verify import PROMISE, judge
+    from echelon.guarantees.verifier.verify import judge
 
-    rest = [each for each in findings if each.claim.startswith(PROMISE)]
-    findings = [each for each in findings if not each.claim.startswith(PROMISE)]
-    if not computed:
-        findings += [each._replace(text=obstacle or each.text) for each in rest]
-    verification = judge([*findings, *computed], note)
+    verification = judge([*_still_open(findings, computed, obstacle), *computed], note)
     if as_json:
         print(json.dumps(as_mapping(verification), indent=2))
     else:
         print_verification(verification, file if files.data is not None else None)
-        _print_advice(file, files, verification.verdict, obstacle, scenario)
+        for text in _advice(file, files, verification, obstacle, scenario):
+            print(text)
     raise typer.Exit(_EXIT_CODES[verification.verdict])
 
 
@@ -104,16 +105,51 @@ def _recomputed(scenario: "Scenario", files: "ClaimFiles") -> "list[Finding]":
     return list(recompute(scenario, files.claims, files.gain, files.data))
 
 
-def _print_advice(
-    file: Path, files: "ClaimFiles", verdict: str, obstacle: str, scenario: str | None
-) -> None:
-    """Print how what is open can be checked."""
-    if verdict != "incomplete":
-        return
-    if scenario is None:
+def _still_open(
+    findings: "list[Finding]", computed: "list[Finding]", obstacle: str
+) -> "Iterator[Finding]":
+    """Yield what independent code found, without what it left open and the scenario has settled."""
+    from echelon.guarantees.verifier.verify import PROMISE
+
+    agree = {each.claim.partition(": ")[2] for each in computed if each.verdict == "recomputed"}
+    for each in findings:
+        if each.claim.startswith(PROMISE):
+            if not computed:
+                yield each._replace(text=obstacle or each.text)
+        elif not (each.open and _SETTLED.get(each.claim) in agree):
+            yield each
+
+
+def _advice(
+    file: Path,
+    files: "ClaimFiles",
+    verification: "Verification",
+    obstacle: str,
+    scenario: str | None,
+) -> "Iterator[str]":
+    """Yield how what is open can be checked, and what a refusal may come from."""
+    from echelon.guarantees.verifier.verify import MODEL, PROMISE
+
+    if verification.verdict == "refused":
+        yield from _other_version(files)
+    elif any(x.open and x.claim.startswith((PROMISE, MODEL)) for x in verification.findings):
+        if scenario is not None:
+            yield f"`--scenario {scenario}`: {obstacle}."
         own = file if files.scenario is not None else "SCENARIO"
-        print(
-            f"To check the rest, with code that you trust: echelon verify {file} --scenario {own}"
-        )
-    elif obstacle:
-        print(f"`--scenario {scenario}`: {obstacle}.")
+        command = f"echelon verify {file} --scenario {own}"
+        yield f"To check the rest, with code that you trust: {command}"
+
+
+def _other_version(files: "ClaimFiles") -> "Iterator[str]":
+    """Yield that a run was made by another version, if its summary says so."""
+    if files.claims is None:
+        return
+    from echelon.core.provenance import versions
+    from echelon.guarantees.verifier.strict_json import read_json
+
+    made, ours = read_json(files.claims).get("versions"), versions()
+    names = [f"{made.get('echelon')} ({made.get('git')})"] if isinstance(made, dict) else []
+    current = f"{ours['echelon']} ({ours.get('git')})"
+    if names and names[0] != current:
+        yield f"It was made by echelon {ascii(names[0])[1:-1]}, and this is {current}."
+        yield "Another version may compute or word the same guarantee in another way."

@@ -11,7 +11,7 @@ from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment
-from echelon.experiments.scenario.override import named_files
+from echelon.experiments.scenario.override import rename_files
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.experiments.scenario.yaml import dump_yaml
 from echelon.synthesis.gains.fixed import FixedGain
@@ -267,11 +267,7 @@ class Panel:
         """Return the YAML of the scenario with live events, which it repeats."""
         data = self.live.data()
         # With absolute paths, since it may be saved in another folder.
-        for path, file, rest in list(named_files(data, ())):
-            place: Any = data
-            for key in path[:-1]:
-                place = place[key]
-            place[path[-1]] = f"{(self.scenario.folder / file).resolve()}{rest}"
+        rename_files(data, lambda file: str((self.scenario.folder / file).resolve()))
         return dump_yaml({**data, "live": [dict(event) for event in events]})
 
 

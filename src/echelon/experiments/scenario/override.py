@@ -1,7 +1,7 @@
 """Overrides from the command line: they remove the keys of the file that they exclude."""
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ def settle_overrides(document: Document) -> Document:
     data = copy.deepcopy(document.data)
     set_ = [path for path, _ in document.overrides]
     for path in set_:
-        _make_absolute(data, path)
+        rename_files(data, lambda name: str(Path(name).resolve()), path)
         part = _at(data, path[:-1])
         for rival in _rivals(path, part):
             other = (*path[:-1], rival)
@@ -42,9 +42,10 @@ def _rivals(path: KeyPath, part: Any) -> list[Any]:
     return [key for key in excluded if key in part and key != path[-1]]
 
 
-def _make_absolute(data: object, path: KeyPath) -> None:
-    for place, name, rest in named_files(_at(data, path), path):
-        _at(data, place[:-1])[place[-1]] = f"{Path(name).resolve()}{rest}"
+def rename_files(data: object, rename: Callable[[str], str], path: KeyPath = ()) -> None:
+    """Replace the name of every file in a part of plain data."""
+    for place, name, rest in list(named_files(_at(data, path), path)):
+        _at(data, place[:-1])[place[-1]] = rename(name) + rest
 
 
 def named_files(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str, str]]:

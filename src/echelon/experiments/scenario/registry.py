@@ -24,14 +24,16 @@ class Entry(NamedTuple):
     leader: str | None = None
 
 
-def _models(**entries: tuple[str, str]) -> dict[str, Entry]:
+def _family(module: str, **entries: tuple[str, str]) -> dict[str, Entry]:
+    """Return the entries of a family: classes of a module, each with its summary."""
     return {
-        name.replace("_", "-"): Entry(f"echelon.agents.models:{cls}", text)
+        name.replace("_", "-"): Entry(f"echelon.{module}:{cls}", text)
         for name, (cls, text) in entries.items()
     }
 
 
-MODELS = _models(
+MODELS = _family(
+    "agents.models",
     single_integrator=("SingleIntegrator", "position driven by velocity, in any dimension"),
     double_integrator=(
         "DoubleIntegrator",
@@ -52,41 +54,26 @@ MODELS = _models(
     ),
 )
 
-REFERENCES = {
-    "lemniscate": Entry(
-        "echelon.agents.references:Lemniscate", "the paper's loop (lemniscate of Bernoulli)"
-    ),
-    "figure-eight": Entry("echelon.agents.references:FigureEight", "sin and sin 2 figure eight"),
-    "circle": Entry("echelon.agents.references:Circle", "circle at constant height"),
-    "hover": Entry("echelon.agents.references:Hover", "one fixed point"),
-    "line": Entry("echelon.agents.references:Line", "straight line at constant velocity"),
-    "waypoints": Entry(
-        "echelon.agents.references:Waypoints", "smooth polynomials through timed points"
-    ),
-    "states": Entry(
-        "echelon.agents.references:StatePath",
-        "states and inputs over time, from a CSV file, of any model",
-    ),
-}
+REFERENCES = _family(
+    "agents.references",
+    lemniscate=("Lemniscate", "the paper's loop (lemniscate of Bernoulli)"),
+    figure_eight=("FigureEight", "sin and sin 2 figure eight"),
+    circle=("Circle", "circle at constant height"),
+    hover=("Hover", "one fixed point"),
+    line=("Line", "straight line at constant velocity"),
+    waypoints=("Waypoints", "smooth polynomials through timed points"),
+    states=("StatePath", "states and inputs over time, from a CSV file, of any model"),
+)
 
-METHODS = {
-    "riccati": Entry(
-        "echelon.synthesis.gains:Riccati", "Riccati equation at the trim, coupling 1/lambda_min"
-    ),
-    "given": Entry("echelon.synthesis.gains:FixedGain", "a P (and R, coupling) of your own"),
-    "inner-loop": Entry(
-        "echelon.synthesis.gains:InnerLoop", "damp all but position, then any coupling works"
-    ),
-    "monotone": Entry(
-        "echelon.synthesis.gains:Monotone", "the paper's Assumption 5 on a domain, as an SDP"
-    ),
-    "robust-lqr": Entry(
-        "echelon.synthesis.gains:RobustLQR", "one P for all Jacobians of a domain, as an SDP"
-    ),
-    "contraction": Entry(
-        "echelon.synthesis.gains:Contraction", "weakest gain of a given rate on a domain"
-    ),
-}
+METHODS = _family(
+    "synthesis.gains",
+    riccati=("Riccati", "Riccati equation at the trim, coupling 1/lambda_min"),
+    given=("FixedGain", "a P (and R, coupling) of your own"),
+    inner_loop=("InnerLoop", "damp all but position, then any coupling works"),
+    monotone=("Monotone", "the paper's Assumption 5 on a domain, as an SDP"),
+    robust_lqr=("RobustLQR", "one P for all Jacobians of a domain, as an SDP"),
+    contraction=("Contraction", "weakest gain of a given rate on a domain"),
+)
 DEFAULT_METHOD = "riccati"
 
 FOLLOWER_LAWS = {

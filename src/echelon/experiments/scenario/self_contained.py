@@ -4,9 +4,9 @@ import copy
 from pathlib import Path
 from typing import Any
 
-from echelon.experiments.scenario.override import named_files
+from echelon.experiments.scenario.override import named_files, rename_files
 from echelon.experiments.scenario.scenario import Scenario
-from echelon.experiments.scenario.yaml import KeyPath, dump_yaml
+from echelon.experiments.scenario.yaml import dump_yaml
 
 
 def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]]:
@@ -17,11 +17,14 @@ def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]
     """
     data = copy.deepcopy(scenario.data)
     files: dict[str, Path] = {}
-    for path, file, rest in list(named_files(data, ())):
+
+    def copied(file: str) -> str:
         source = (scenario.folder / file).resolve()
         name = _free(f"{place}/{source.name}", source, files)
         files[name] = source
-        _replace(data, path, name + rest)
+        return name
+
+    rename_files(data, copied)
     return (dump_yaml(data) if files else scenario.text), files
 
 
@@ -33,8 +36,7 @@ def names_code(scenario: Scenario) -> bool:
 def without_folders(data: Any) -> Any:
     """Return the data of a scenario in which files are named without their folders."""
     data = copy.deepcopy(data)
-    for path, file, rest in list(named_files(data, ())):
-        _replace(data, path, Path(file).name + rest)
+    rename_files(data, lambda file: Path(file).name)
     return data
 
 
@@ -51,9 +53,3 @@ def _free(name: str, source: Path, taken: dict[str, Path]) -> str:
         count += 1
         name = f"{folder}/{count}/{base}"
     return name
-
-
-def _replace(data: Any, path: KeyPath, value: str) -> None:
-    for key in path[:-1]:
-        data = data[key]
-    data[path[-1]] = value

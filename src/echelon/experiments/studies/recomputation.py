@@ -88,8 +88,8 @@ def compare_gain(file: Path, experiment: Experiment) -> Iterator[Finding]:
         yield from compare_values(f"{file.name}: {key}", stored[key], value[key], _SOLVED)
     yield from compare_values(f"{file.name}: graph", stored["graph"], value["graph"])
     # The name of a class may change with the version, and the verifier has evaluated it.
-    models = ({**each["model"], "class": ""} for each in (stored, value))
-    yield from compare_values(f"{file.name}: model", *models)
+    stored, value = ({**each["model"], "class": ""} for each in (stored, value))
+    yield from compare_values(f"{file.name}: model", stored, value)
 
 
 def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Iterator[Finding]:

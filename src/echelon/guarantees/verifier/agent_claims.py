@@ -13,6 +13,8 @@ from echelon.guarantees.verifier.points import Points, pairs, points
 from echelon.guarantees.verifier.region_claims import needs_constant, slowest
 from echelon.guarantees.verifier.saved_gain import SavedModel, SavedRegion
 
+MODEL = "equations of the model"
+"""The claim that is open without the agents' model."""
 _TRIM_TOLERANCE = 1e-9
 """Largest velocity at the trim; echelon requires it of every model."""
 _SAMPLED = 0.02
@@ -27,7 +29,7 @@ _ROUNDING = 256.0 * float(np.finfo(float).eps)
 
 def check_equations(facts: Facts, user_model: ControlAffine | None) -> Iterator[Finding]:
     """Check the claims about the model; without `user_model` it is rebuilt from the file."""
-    saved, claim = facts.saved.model, "equations of the model"
+    saved, claim = facts.saved.model, MODEL
     model = model_of(saved) if user_model is None else user_model
     if isinstance(model, NoModel):
         broken = decide(claim, False, saved.path, "", model.reason)
@@ -47,7 +49,7 @@ def _check_model(facts: Facts, model: ControlAffine) -> Iterator[Finding]:
         saved.state_names,
         saved.input_names,
     ):
-        yield decide("equations of the model", False, saved.path, name, "names differ")
+        yield decide(MODEL, False, saved.path, name, "names differ")
         return
     # The law uses the trim and the input units of the model, so stored ones must agree.
     of_model = (*map(np.asarray, model.trim), np.asarray(model.input_scale))

@@ -13,6 +13,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.core.types import JsonObject, PathLike
 from echelon.guarantees.verifier import exact_minors
+from echelon.guarantees.verifier.agent_claims import MODEL as MODEL
 from echelon.guarantees.verifier.agent_claims import check_equations
 from echelon.guarantees.verifier.findings import VERDICTS, Finding, decide, facts, unchecked
 from echelon.guarantees.verifier.graph_claims import check_graph, check_spectrum
