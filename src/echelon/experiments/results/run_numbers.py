@@ -76,7 +76,7 @@ class RunNumbers:
         followers = list(self.result.graph.followers)
         if self.result.outcome is Outcome.DIVERGED or not len(self.result.times):
             return np.full((2, len(followers)), np.nan)
-        return self.result.formation_errors[[0, -1]][:, followers]
+        return self.result.goal_distances([0, -1])[:, followers]
 
     @property
     def certified_radius(self) -> float | None:

@@ -16,6 +16,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel, Network
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
+from echelon.agents.world.sensing import Sensors
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.core.words import Feedforward, Frame
@@ -44,6 +45,7 @@ class Problem(NamedTuple):
         settings: horizon, step and the like.
         states: (N, n) at the beginning.
         channel: what the network does to messages; None for the ideal network.
+        sensors: of the agents' own states; None for exact ones.
     """
 
     model: ControlAffine
@@ -54,6 +56,7 @@ class Problem(NamedTuple):
     settings: Settings
     states: Array
     channel: Channel | None = None
+    sensors: Sensors | None = None
 
 
 class Chunk(NamedTuple):
