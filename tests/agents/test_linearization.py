@@ -8,7 +8,12 @@ import pytest
 from model_family import MODELS
 
 from echelon.agents.models import ControlAffine, Linear, Pendulum, PlanarQuadrotor, Quadrotor
-from echelon.agents.models.linearization import Linearization, linearize, trim_slopes
+from echelon.agents.models.linearization import (
+    Linearization,
+    at_trim,
+    linearize,
+    trim_slopes,
+)
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 
@@ -129,3 +134,56 @@ def test_an_inner_loop_is_closed_in_the_drift_alone():
     assert linear.with_inner(None) is linear
     closed = linear.with_inner(K)
     assert closed.A.tolist() == [[1.0, 0.0], [-3.0, -2.0]] and closed.B is B
+
+
+# ---- what bends at the trim, in any units ----
+
+SMOOTH = {
+    "pendulum": lambda x: jnp.stack([x[1], -9.81 * jnp.sin(x[0]) - 0.5 * x[1]]),
+    "even": lambda x: jnp.stack([x[1], 1.0 - jnp.cos(x[0]) - 0.5 * x[1] + x[0] ** 2]),
+    "cubic": lambda x: jnp.stack([x[1] * jnp.abs(x[1]), -(x[0] ** 3) + jnp.tanh(x[1])]),
+    "exponential": lambda x: jnp.stack([x[1], jnp.exp(x[0]) - 1.0 - x[1] / (1.0 + x[0] ** 2)]),
+}
+BENT = {
+    "one side": lambda x: jnp.stack([x[1], -x[0] + jnp.where(x[1] > 0.0, 6.0 * x[1], 0.0)]),
+    "size": lambda x: jnp.stack([x[1], -jnp.abs(x[0]) - x[1]]),
+    "slow": lambda x: 1e-4 * jnp.stack([x[1], -jnp.abs(x[0]) - x[1]]),
+    "jump": lambda x: jnp.stack([x[1], -jnp.sign(x[0]) - x[1]]),
+    "between axes": lambda x: jnp.stack(
+        [x[1], jnp.where(x[0] * x[1] > 0.0, 6.0 * x[1], 0.0) - x[0] - x[1]]
+    ),
+    "lesser of both": lambda x: jnp.stack(
+        [x[1], jnp.minimum(jnp.abs(x[0]), jnp.abs(x[1])) - x[0] - x[1]]
+    ),
+}
+
+
+def in_units(drift, sizes, weigh):
+    """A drift of two states whose usual deviations have these sizes, with weights that say so."""
+    scale = np.asarray(sizes)
+
+    class Scaled(ControlAffine):
+        state_names, input_names = ("a", "b"), ("u",)
+
+        def drift(self, x):
+            return drift(x / scale) * scale
+
+        def input_map(self, x):
+            return jnp.zeros((2, 1), x.dtype).at[1, 0].set(scale[1])
+
+    if weigh:
+        Scaled.weights = (tuple(1.0 / scale**2), (1.0,))
+    return Scaled()
+
+
+@pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.parametrize(
+    "size", [1e-8, *(pytest.param(10.0**k, marks=pytest.mark.slow) for k in (-4, -2, 2, 4)), 1e8]
+)
+def test_a_bend_at_the_trim_is_seen_in_any_units_and_nothing_else(size, place):
+    sizes = (size, 1.0) if place == 0 else (1.0, size)
+    for name, drift in BENT.items():
+        assert at_trim(in_units(drift, sizes, False)).bends.any(), name
+    for name, drift in SMOOTH.items():
+        found = at_trim(in_units(drift, sizes, True))
+        assert not found.bends.any() and found.gap is None, name

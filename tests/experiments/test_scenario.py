@@ -143,6 +143,8 @@ def test_defaults():
         },
         "initial": {"spread": None, "states": None},
         "disturbance": None,
+        "actuator": None,
+        "sensing": None,
         "network": None,
         "simulation": {
             "horizon": 30.0,
@@ -152,6 +154,7 @@ def test_defaults():
             "store_every": 1,
             "precision": "float64",
             "engine": "auto",
+            "substeps": 1,
             "devices": 1,
         },
         "report": {"steady_window": 6.0},
@@ -272,8 +275,9 @@ def test_a_missing_key_is_told_at_its_parent(refused, key):
 def test_an_unknown_section_gets_a_guess(refused):
     assert refused(seed="sed: 0") == [
         "s.yaml:11: sed: got an unknown key, allowed are `name`, `model`, `plant`, `graph`,"
-        " `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`, `network`,"
-        " `simulation`, `report`, `live`, `seed` (did you mean `seed`?)."
+        " `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`,"
+        " `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed` (did"
+        " you mean `seed`?)."
     ]
 
 
@@ -381,7 +385,7 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, got):
     assert str(caught.value) == (
         f"{file}:1: got {got}, allowed is a mapping with the keys `name`, `model`, `plant`,"
         " `graph`, `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`,"
-        " `network`, `simulation`, `report`, `live`, `seed`."
+        " `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed`."
     )
 
 

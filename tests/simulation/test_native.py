@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 import echelon as ech
 from echelon.simulation import codegen as kernels
 from echelon.simulation.codegen import block_copy
+from echelon.simulation.engine.batch import Batch
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.native import agent_order, buffers, schedule, threads
 from echelon.simulation.native import kernel_cache as kernel_code
@@ -447,16 +448,17 @@ def test_angles_that_are_too_large_are_stepped_by_jax():
         )
 
 
+class Cubic(ech.ControlAffine):
+    state_names, input_names = ("x",), ("push",)
+
+    def drift(self, x):
+        return x**3
+
+    def input_map(self, x):
+        return jnp.ones((1, 1), x.dtype)
+
+
 def test_an_agent_that_is_lost_is_told_as_by_jax():
-    class Cubic(ech.ControlAffine):
-        state_names, input_names = ("x",), ("push",)
-
-        def drift(self, x):
-            return x**3
-
-        def input_map(self, x):
-            return jnp.ones((1, 1), x.dtype)
-
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
     parts = ech.Parts(
         Cubic(),
@@ -470,6 +472,25 @@ def test_an_agent_that_is_lost_is_told_as_by_jax():
         for name in ("native", "jax")
     ]
     assert found[0].message == found[1].message and "follower 1" in found[0].message
+
+
+@pytest.mark.parametrize("store_every", [1, 7, 1000])
+def test_both_engines_and_batches_say_the_same_time_of_a_divergence(store_every):
+    def parts(start):
+        rest = ech.laws.TrimInput()
+        initial = np.array([[0.1], [start]])
+        return ech.Parts(
+            Cubic(), LINE, ech.Formation(np.zeros((2, 1))), ech.Laws(rest, rest), initial=initial
+        )
+
+    chosen = ech.Settings(horizon=9.0, dt=0.01, store_every=store_every, steady_window=1.0)
+    messages = list[str]()
+    for name in ("native", "jax"):
+        alone = [ech.simulate(parts(x), chosen._replace(engine=name)) for x in (3.0, 0.4)]
+        batch = Batch(1).fly([(parts(x), chosen._replace(engine=name)) for x in (3.0, 0.4)])
+        messages += ["; ".join(run.message for run in runs) for runs in (alone, batch)]
+        assert all(run.outcome is ech.Outcome.DIVERGED for run in alone)
+    assert len(set(messages)) == 1 and "t = 0.08 s" in messages[0], messages
 
 
 def test_where_agents_stand_changes_no_bit(monkeypatch):

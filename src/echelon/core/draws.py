@@ -19,6 +19,8 @@ class Draw(enum.IntEnum):
     LOSS = 2
     JITTER = 3
     OUTAGE = 4
+    SENSING = 5
+    GUST = 6
 
 
 def key_of(seed: int) -> UInt32[np.ndarray, "2"]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.models.secants import Gap, Sides, sides, stencil
+from echelon.agents.models.secants import Gap, Sides, sides, stencil, units_at
 from echelon.core.compiled import cached_jit
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
@@ -62,10 +62,19 @@ def at_trim(model: ControlAffine) -> AtTrim:
     x, u = (np.asarray(part, float) for part in model.trim)
     # Gains are stored in files, so they must not depend on the precision of the run that uses them.
     with precision("float64"):
-        *values, around = map(_freeze, _evaluate(model, x, u, stencil(x)))
+        units = _units(model)
+        *values, around = map(_freeze, _evaluate(model, x, u, stencil(x, units)))
     derivatives = np.concatenate([values[3], values[4].reshape(-1, len(x))])
     slopes = sides(x, around)
-    return AtTrim(*values, bends=_bends(slopes, u), gap=slopes.gap(derivatives))  # pyright: ignore
+    gap = slopes.gap(derivatives, units_at(x, units))
+    return AtTrim(*values, bends=_bends(slopes, u, len(x)), gap=gap)  # pyright: ignore
+
+
+def _units(model: ControlAffine) -> Array:
+    """Return (n,) how much of each state its weight calls as large as one of the others."""
+    Q = np.asarray(model.weights[0], float)
+    diagonal = Q if Q.ndim == 1 else np.diag(Q)
+    return np.sqrt(1.0 / np.where(diagonal > 0.0, diagonal, 1.0))
 
 
 @cached_jit
@@ -81,16 +90,11 @@ def _evaluate(model: ControlAffine, x: State, u: Input, points: States) -> list[
     return [*(function(x) for function in functions), *slopes, model.limit(u), around]
 
 
-def _bends(slopes: Sides, u: Array) -> Array:
+def _bends(slopes: Sides, u: Array, n: int) -> Array:
     """Return (n, n) whether an entry of f + g u* has a kink, or one of g a jump, in each state."""
-    n = slopes.forward.shape[-1]
-    below, above = (np.split(side, [n], axis=1) for side in slopes)
-    velocity = (
-        side[0] + np.einsum("hikn,k->hin", side[1].reshape(2, n, -1, n), u)
-        for side in (below, above)
-    )
-    jumps = Sides(below[1], above[1]).jumps().reshape(n, -1, n).any(axis=1)
-    return Sides(*velocity).bends() | jumps
+    motion = slopes.combine(np.hstack([np.eye(n), np.kron(np.eye(n), u)]))
+    maps = slopes.combine(np.eye(n + n * len(u))[n:])
+    return motion.bends(n) | maps.jumps()[:, :n].reshape(n, -1, n).any(axis=1)
 
 
 @memoize

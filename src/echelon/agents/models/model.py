@@ -248,7 +248,7 @@ class ControlAffine(eqx.Module):
         G, low, high = (jnp.asarray(part, u.dtype) for part in self.input_limits)
         rows = G @ u
         clipped = jnp.clip(rows, low, high)
-        inverse = jnp.asarray(np.linalg.inv(np.asarray(self.input_limits.matrix)), u.dtype)
+        inverse = _inverse(self.input_limits.matrix, G)
         # Multiplying by G and its inverse rounds, which would count as saturation.
         return jnp.where(jnp.all(rows == clipped), u, inverse @ clipped)
 
@@ -361,3 +361,10 @@ def check_not_negative(owner: object, **values: float) -> None:
                 f"`{name}` of `{type(owner).__name__}` is {value}, and must be finite "
                 "and not negative."
             )
+
+
+def _inverse(rows: Rows, G: jax.Array) -> jax.Array:
+    """Return the inverse of a matrix, which is computed once unless its numbers are traced."""
+    if any(isinstance(x, Tracer) for row in rows for x in row):
+        return jnp.linalg.inv(G)
+    return jnp.asarray(np.linalg.inv(np.asarray(rows)), G.dtype)

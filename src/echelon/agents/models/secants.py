@@ -57,9 +57,10 @@ def find_jump(
             rows = np.arange(len(low))
             low, high = points[rows, most], points[rows, most + 1]
             changes.append(steps[rows, most])
-            size = np.abs(sampled).max(axis=1)
+            # Of the whole segment at first, since it is the largest of all.
+            size = np.maximum(size, np.abs(sampled).max(axis=1))
     # A change that rounding of the values can cause is no jump.
-    jumps = (changes[-1] > 0.5 * changes[-3]) & (changes[-1] > 1e-7 * (1e-3 + size))
+    jumps = (changes[-1] > 0.5 * changes[-3]) & (changes[-1] > 1e-10 * size)
     if not jumps.any():
         return None
     k, entry = np.unravel_index(np.argmax(np.where(jumps, changes[-1], 0.0)), jumps.shape)
@@ -75,83 +76,133 @@ class Gap(NamedTuple):
     variable: int
 
 
-_STEPS = (1e-4, 1e-6)
-_TOLERANCE = 1e-3
+_STEPS = 2.0 ** np.array([-13, -20, -33, -40])
+"""Two pairs of a wide and a narrow step, in units of each state: 1e-4 and 1e-6, 1e-10 and 1e-12."""
+_NEARBY = np.array([1.0, 1.37, 1.74])
+"""Times a narrow step: equally far apart, so that what is not linear in them is rounding."""
+_TOLERANCE = 1e-3  # relative, of a derivative
+_BENT = 1e-9  # relative, of the slopes of two sides
+_NOISE = 50.0  # times the rounding that is seen
+_OBLIQUE = 8  # directions beside the axes, along which what bends at none of them shows
 
 
 class Sides(NamedTuple):
-    """Slopes (2, k, n) of a function at a point, over a wide step and a hundredth of it.
+    """Slopes (4, k, q) of a function at a point in q directions, over each of `_STEPS`.
 
     A difference due to curvature shrinks with the step; one due to a kink, a jump or a wrong
-    derivative does not.
+    derivative does not. All are compared with each other or with rounding, never with a
+    number of their own units. Rounding (2, k) is that over each narrow step.
     """
 
     forward: Array
     backward: Array
+    rounding: Array
 
-    def gap(self, derivative: Float[Array, "k n"]) -> Gap | None:
+    def combine(self, weights: Float[Array, "r k"]) -> "Sides":
+        """Return the slopes of sums of the function's entries."""
+        with np.errstate(invalid="ignore"):
+            forward, backward = weights @ self.forward, weights @ self.backward
+        return Sides(forward, backward, self.rounding @ np.abs(weights).T)
+
+    def gap(self, derivative: Float[Array, "k n"], units: Float[Array, " n"]) -> Gap | None:
         """Return where a derivative (k, n) differs most clearly from the slopes, or None."""
         # At a kink any slope between those of the two sides is correct.
-        low, high = np.minimum(*self), np.maximum(*self)
-        away = derivative - np.clip(derivative, low, high)
-        no_slope = self._stays(away, 1.0 + np.abs(derivative).max()) & ~self.jumps()
-        stays = np.where(no_slope, np.abs(away[1]), 0.0)
+        n, scaled = derivative.shape[1], derivative * units
+        axes = Sides(self.forward[..., :n], self.backward[..., :n], self.rounding)
+        low, high = np.minimum(*axes[:2]), np.maximum(*axes[:2])
+        away = scaled - np.clip(scaled, low, high)
+        size = np.maximum(np.abs(scaled), np.maximum(np.abs(low), np.abs(high)))
+        no_slope = axes._stays(away, _TOLERANCE * size) & ~axes.jumps()
+        stays = np.where(no_slope, np.abs(away[1]) / units, 0.0)
         if not stays.any():
             return None
         entry, variable = np.unravel_index(np.argmax(stays), stays.shape)
-        slope = 0.5 * (self.forward + self.backward)[1, entry, variable]
+        slope = (0.5 * (axes.forward + axes.backward)[1] / units)[entry, variable]
         return Gap(float(derivative[entry, variable]), float(slope), int(entry), int(variable))
 
-    def bends(self) -> Array:
-        """Return (k, n) whether the slopes of the two sides differ, or the values do."""
-        scale = 1.0 + np.minimum(np.abs(self.forward[1]), np.abs(self.backward[1])).max()
-        return self._stays(self.forward - self.backward, scale) | self.jumps()
+    def bends(self, n: int) -> Array:
+        """Return (k, n) whether slopes of the two sides differ, or values, or they do not add up.
+
+        What only bends between the axes is charged to the variable that moves first.
+        """
+        scale = _BENT * np.maximum(np.abs(self.forward), np.abs(self.backward))
+        bends = np.asarray(self._stays(self.forward - self.backward, scale) | self.jumps())
+        axes, oblique = self.forward[..., :n], self.forward[..., n:]
+        sums = axes @ _oblique(n).T
+        size = _BENT * (np.abs(axes) @ np.abs(_oblique(n)).T)
+        with np.errstate(invalid="ignore"):
+            crooked = self._stays(oblique - sums, size)
+        first = np.eye(n, dtype=bool)[0]
+        return bends[:, :n] | (bends[:, n:] | crooked).any(axis=1)[:, None] & first
 
     def jumps(self) -> Array:
-        """Return (k, n) whether values differ between the sides at any distance."""
-        wide, narrow = (np.maximum(np.abs(f), np.abs(b)) for f, b in zip(*self, strict=True))
+        """Return (k, q) whether values differ between the sides at any distance."""
+        sizes = np.maximum(np.abs(self.forward), np.abs(self.backward))
         # A jump over a step a hundred times shorter is a slope a hundred times steeper.
-        return narrow > 50.0 * (wide + 1e-3)
+        return np.any((sizes[1::2] > 50.0 * sizes[::2]) & self._seen(sizes[1::2]), axis=0)
 
-    @staticmethod
-    def _stays(away: Array, scale: float) -> Array:
-        wide, narrow = np.abs(away)
-        return (narrow > _TOLERANCE * scale) & (narrow > 0.1 * wide)
+    def _stays(self, away: Array, least: Array) -> Array:
+        wide, narrow = np.abs(away[::2]), np.abs(away[1::2])
+        stays = (narrow > least[1::2]) & (narrow > 0.1 * wide) & self._seen(narrow)
+        return np.any(stays, axis=0)
 
-
-def stencil(point: Float[Array, " n"]) -> Float[Array, "K n"]:
-    """Return a point and the 4 n points around it from which `sides` computes slopes."""
-    steps = [np.diag(_widths(point, step)) for step in _STEPS]
-    moves = np.concatenate([m for step in steps for m in (step, -step)])
-    return np.concatenate([point[None], point + moves])
+    def _seen(self, slopes: Array) -> Array:
+        """Return whether slopes over the narrow steps are more than rounding."""
+        return slopes > _NOISE * self.rounding[..., None] / _STEPS[1::2, None, None]
 
 
-def sides(point: Array, values: Array) -> Sides:
-    """Return the slopes at a point (n,) from the values (1 + 4 n, k) of its `stencil`."""
-    n, here = len(point), values[0]
-    around = values[1:].reshape(len(_STEPS), 2, n, -1)
-    widths = np.array([_widths(point, step) for step in _STEPS])[:, :, None]
+def _oblique(n: int) -> Float[Array, "q n"]:
+    """Return directions between the axes; no products of steps round."""
+    return np.random.default_rng(0).choice([-1.0, -0.5, 0.5, 1.0], (_OBLIQUE, n))
+
+
+def _moves(units: Float[Array, " n"]) -> Float[Array, "q n"]:
+    return np.concatenate([np.eye(len(units)), _oblique(len(units))]) * units
+
+
+def units_at(point: Float[Array, " n"], units: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return the units of steps from a point: powers of two, so that x + h - x is h."""
+    return 2.0 ** np.round(np.log2(np.maximum(units, np.abs(point))))
+
+
+def stencil(point: Float[Array, " n"], units: Float[Array, " n"]) -> Float[Array, "K n"]:
+    """Return a point and the points around it from which `sides` computes slopes."""
+    moves = _moves(units_at(point, units))
+    nearby = np.outer(_STEPS[1::2], _NEARBY).reshape(-1)
+    steps = np.concatenate([_STEPS, -_STEPS, nearby, -nearby])
+    around = point + steps[:, None, None] * moves
+    return np.concatenate([point[None], around.reshape(-1, len(point))])
+
+
+def sides(point: Float[Array, " n"], values: Float[Array, "K k"]) -> Sides:
+    """Return the slopes at a point (n,), per unit of each state, from the values of its stencil."""
+    here, widths = values[0], _STEPS[:, None, None]
+    around = values[1:].reshape(-1, len(point) + _OBLIQUE, values.shape[1])
     # Other checks report values that are not finite; here they compare as false.
     with np.errstate(invalid="ignore", over="ignore"):
-        forward, backward = (around[:, 0] - here) / widths, (here - around[:, 1]) / widths
-    return Sides(np.moveaxis(forward, 1, 2), np.moveaxis(backward, 1, 2))
+        forward, backward = (around[:4] - here) / widths, (here - around[4:8]) / widths
+        nearby = around[8:].reshape(2, 2, 3, *around.shape[1:])
+        crooked = np.abs(nearby[:, :, 0] - 2.0 * nearby[:, :, 1] + nearby[:, :, 2])
+        rounding = np.maximum(crooked.max(axis=(0, 2)), np.finfo(float).eps * np.abs(here))
+    return Sides(np.moveaxis(forward, 1, 2), np.moveaxis(backward, 1, 2), rounding)
 
 
-def _widths(point: Float[Array, " n"], step: float) -> Float[Array, " n"]:
-    # A power of two, so that x + h - x is h.
-    return 2.0 ** np.round(np.log2(step * np.maximum(1.0, np.abs(point))))
-
-
-def find_gap(function: _Function, points: Float[Array, "K n"]) -> Gap | None:
+def find_gap(
+    function: _Function, points: Float[Array, "K n"], units: Float[Array, " n"]
+) -> Gap | None:
     """Return where the derivative of a function by JAX is not its slope, or None.
 
     Args:
         function: (n,) -> (k,), traceable by JAX.
         points: where the two are compared.
+        units: of each variable.
     """
     with precision("float64"):
-        around = jnp.asarray(np.stack([stencil(point) for point in points]))
+        around = jnp.asarray(np.stack([stencil(point, units) for point in points]))
         values = np.asarray(jax.jit(jax.vmap(jax.vmap(function)))(around))
         slopes = np.asarray(jax.jit(jax.vmap(jax.jacfwd(function)))(jnp.asarray(points)))
-    gaps = (sides(p, v).gap(s) for p, v, s in zip(points, values, slopes, strict=True))
-    return next((gap for gap in gaps if gap is not None), None)
+    for point, around_it, slope in zip(points, values, slopes, strict=True):
+        gap = sides(point, around_it).gap(slope, units_at(point, units))
+        if gap is not None:
+            return gap
+    return None

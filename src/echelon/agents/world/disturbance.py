@@ -32,7 +32,11 @@ class Disturbance:
         rms: root mean square of the random part of the wind, by state or group, for each state.
         input_rms: root mean square of the noise, by input, in normalized inputs. It acts after the
             actuators, so limits do not apply to it.
-        hold: duration of a draw, s; rounded to whole steps, and at least one.
+        hold: duration of a draw, s; rounded to whole steps, and at least one. Not with `time`.
+        time: time constant, s, of the random wind as a Gauss-Markov process, drawn for every step
+            in place of `hold`; None for independent draws.
+        air: velocity of the air by coordinate of the position, m/s, which acts by `drag`.
+        drag: acceleration of an agent by the air, 1/s times the velocity that it has through it.
         common: whether one random wind acts on all agents; otherwise each has its own.
         seed: of the draws; by default that of the run.
 
@@ -49,6 +53,9 @@ class Disturbance:
     hold: float = 0.5
     common: bool = False
     seed: int | None = None
+    time: float | None = None
+    air: tuple[float, ...] = ()
+    drag: float = 0.0
 
     def __post_init__(self) -> None:
         """Reject numbers that are not finite, and negative ones where only positive are allowed."""
@@ -65,6 +72,19 @@ class Disturbance:
             raise SimulationError(
                 f"`hold` of the disturbance is {self.hold}, and must be a positive finite number "
                 "of seconds."
+            )
+        for name, value, fits in (
+            ("time", self.time, self.time is None or self.time > 0.0),
+            ("drag", self.drag, self.drag >= 0.0),
+        ):
+            if not fits or not math.isfinite(value or 0.0):
+                raise SimulationError(
+                    f"`{name}` of the disturbance is {value}, and must be finite and "
+                    f"{'positive' if name == 'time' else 'not negative'}."
+                )
+        if not all(map(math.isfinite, self.air)):
+            raise SimulationError(
+                f"`air` of the disturbance is {list(self.air)}, and must be finite."
             )
         if self.seed is not None and (self.seed != int(self.seed) or self.seed < 0):
             raise SimulationError(
@@ -84,7 +104,11 @@ class Disturbance:
         ]
         if self.rms or self.input_rms:
             whose = ", one for all agents" if self.common and self.rms else ""
-            parts.append(f"drawn every {self.hold:g} s{whose}")
+            how = f"drawn every {self.hold:g} s"
+            how = how if self.time is None else f"correlated over {self.time:g} s"
+            parts.append(f"{how}{whose}")
+        if self.drag:
+            parts.append(f"drag {self.drag:g} 1/s in air of {list(self.air)} m/s")
         return "; ".join(parts) or "none"
 
     def prepared(self, plant: ControlAffine, dt: float, seed: int) -> "Wind":
@@ -107,7 +131,25 @@ class Disturbance:
             # A draw longer than any run need not be counted further.
             window=np.asarray(max(1, round(min(self.hold / dt, 2**31 - 1))), np.int32),
             common=self.common,
+            fade=None
+            if self.time is None or not rms.any()
+            else np.asarray(np.exp(-dt / self.time)),
+            air=self._in_air(plant),
         )
+
+    def _in_air(self, plant: ControlAffine) -> Array | None:
+        """Return the drag (1/s) and the velocity of the air for each state, (2, n)."""
+        if not self.drag:
+            return None
+        velocity = plant.state_groups.get("velocity", ())
+        if len(velocity) != len(plant.position) or len(self.air) not in (0, len(velocity)):
+            raise SimulationError(
+                f"got `drag` with an `air` of {len(self.air)} numbers, and "
+                f"`{type(plant).__name__}` has {len(velocity)} states in its group `velocity` for "
+                f"{len(plant.position)} coordinates; allowed is a number for each."
+            )
+        air = dict(zip(velocity, self.air, strict=False))
+        return np.stack([plant.per_state(dict.fromkeys(velocity, self.drag)), plant.per_state(air)])
 
 
 @final
@@ -121,6 +163,8 @@ class Wind(eqx.Module):
         key: (2,), the halves of the seed.
         window: duration of a draw in steps.
         common: whether all agents share one random wind.
+        fade: what is left of a correlated wind after a step; None for independent draws.
+        air: (2, n) the drag (1/s) and the velocity of the air for each state.
     """
 
     constant: Array
@@ -129,11 +173,22 @@ class Wind(eqx.Module):
     key: np.ndarray
     window: np.ndarray
     common: bool = eqx.field(static=True)
+    fade: np.ndarray | None = None
+    air: Array | None = None
+
+    def gusts(self, last: State, step: jax.Array, agent: jax.Array) -> State:
+        """Return the correlated part of the wind of an agent at a step, from that of the last."""
+        fade = jnp.asarray(self.fade, last.dtype)
+        agent = 0 * agent if self.common else agent
+        draw = normals(self.key, Draw.GUST, step, agent, size=len(last)).astype(last.dtype)
+        # Of the same size at all times: at the first step it is drawn as at any other.
+        size = jnp.where(step == 0, 1.0, jnp.sqrt(1.0 - fade**2))
+        return fade * last + size * jnp.asarray(self.rms, last.dtype) * draw
 
     def on_state(self, step: jax.Array, agent: jax.Array) -> State:
         """Return the wind on xdot of an agent during a step."""
         constant = jnp.asarray(self.constant)
-        if self.rms is None:
+        if self.rms is None or self.fade is not None:
             return constant
         # The draw of agent 0 for all; the product keeps the number traced.
         draw = self._draw(Draw.WIND, step, 0 * agent if self.common else agent, len(self.rms))
@@ -156,14 +211,20 @@ def draw(wind: Wind | None, step: jax.Array, agent: jax.Array) -> tuple[State | 
     )
 
 
-def disturbed(plant: ControlAffine, push: State | None, noise: Input | None) -> Field:
-    """Return (x, u) -> xdot of an agent under wind and noise, constant over a step."""
-    if push is None and noise is None:
+def disturbed(
+    plant: ControlAffine, push: State | None, noise: Input | None, air: Array | None = None
+) -> Field:
+    """Return (x, u) -> xdot of an agent under wind, noise and air (2, n), constant over a step."""
+    if push is None and noise is None and air is None:
         return plant.velocity
 
     def velocity(x: State, u: Input) -> State:
         xdot = plant.velocity(x, u if noise is None else u + noise)
-        return xdot if push is None else xdot + push
+        xdot = xdot if push is None else xdot + push
+        if air is None:
+            return xdot
+        drag, wind = jnp.asarray(air, x.dtype)
+        return xdot + drag * (wind - x)
 
     return velocity
 

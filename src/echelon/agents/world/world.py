@@ -1,13 +1,16 @@
-"""The world of a run: plant, disturbance and network, of which the laws know nothing."""
+"""The world of a run: plants, disturbances, actuators, sensors and network, unknown to the laws."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import final
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Network
+from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.plant import check_plant, differences
+from echelon.agents.world.sensing import Sensing
 from echelon.core.errors import SimulationError
 
 
@@ -20,48 +23,88 @@ class World:
         plant: the agents that move, with their actuators, where they differ from the model.
         disturbance: wind and noise on all agents.
         network: on which messages take time and are lost; left out, it is ideal.
+        actuator: lag and levels of all agents' actuators; left out, inputs act at once.
+        sensing: delay and noise of what agents measure of themselves; left out, it is exact.
+        plants: of single agents, by number, where they differ from the others.
     """
 
     plant: ControlAffine | None = None
     disturbance: Disturbance | None = None
     network: Network | None = None
+    actuator: Actuator | None = None
+    sensing: Sensing | None = None
+    plants: Mapping[int, ControlAffine] = dataclasses.field(default_factory=dict)
 
     @property
     def ideal(self) -> bool:
         """Whether the agents are as the model says, undisturbed, and the network is ideal."""
-        return self.plant is None and self.disturbance is None and self.network is None
+        return not any(self.differences.values())
+
+    @property
+    def differences(self) -> dict[str, bool]:
+        """What no law knows and no promise covers, in words, and whether it is there."""
+        return {
+            "wind or noise acts on the agents": self.disturbance is not None,
+            "the agents differ from the model": self.plant is not None or bool(self.plants),
+            "messages are late or lost": self.network is not None,
+            "the actuators lag or have levels": self.actuator is not None,
+            "agents measure their states late or with noise": self.sensing is not None,
+        }
 
     def plant_for(self, model: ControlAffine) -> ControlAffine:
         """Return the plant, or the model if there is none."""
         return model if self.plant is None else self.plant
 
     def check(self, model: ControlAffine) -> tuple[str, ...]:
-        """Check plant and disturbance, and return warnings.
+        """Check all parts, and return warnings.
 
         Raises:
             ModelError: the plant is malformed, or has other states or inputs than the model.
-            SimulationError: the disturbance is not a `Disturbance`.
+            SimulationError: a part is of another kind.
         """
-        if self.disturbance is not None and not isinstance(self.disturbance, Disturbance):
-            raise SimulationError(
-                f"`disturbance` is a `{type(self.disturbance).__name__}`, and must be a "
-                "`Disturbance`."
-            )
-        if self.network is not None and not isinstance(self.network, Network):
-            raise SimulationError(
-                f"`network` is a `{type(self.network).__name__}`, and must be a `Network`."
-            )
-        if self.plant is None:
-            return ()
-        # First: a malformed plant may have no names to compare.
-        warnings = check_model(self.plant)
-        check_plant(model, self.plant)
+        kinds = {
+            "disturbance": Disturbance,
+            "network": Network,
+            "actuator": Actuator,
+            "sensing": Sensing,
+        }
+        for name, kind in kinds.items():
+            part = getattr(self, name)
+            if part is not None and not isinstance(part, kind):
+                raise SimulationError(
+                    f"`{name}` is a `{type(part).__name__}`, and must be a `{kind.__name__}`."
+                )
+        warnings = tuple[str, ...]()
+        for plant in (self.plant, *self.plants.values()):
+            if plant is not None:
+                # First: a malformed plant may have no names to compare.
+                warnings += check_model(plant)
+                check_plant(model, plant)
         return warnings
 
+    def check_agents(self, model: ControlAffine, agents: int) -> None:
+        """Check the plants of single agents.
+
+        Raises:
+            SimulationError: there is no such agent, or a plant is of another class.
+        """
+        kind = type(self.plant_for(model))
+        for k, plant in self.plants.items():
+            if not 0 <= k < agents:
+                raise SimulationError(
+                    f"got a plant for agent {k}, and the agents are 0 to {agents - 1}."
+                )
+            if type(plant) is not kind:
+                raise SimulationError(
+                    f"the plant of agent {k} is a `{type(plant).__name__}`, and must be a "
+                    f"`{kind.__name__}` as those of the others."
+                )
+
     def describe(self, model: ControlAffine) -> dict[str, str | None]:
-        """Return plant, disturbance and network in words; None for each that is absent."""
-        return {
-            "plant": None if self.plant is None else differences(model, self.plant),
-            "disturbance": None if self.disturbance is None else str(self.disturbance),
-            "network": None if self.network is None else str(self.network),
-        }
+        """Return each part in words; None for each that is absent."""
+        plants = [] if self.plant is None else [differences(model, self.plant)]
+        plants += [f"agent {k}: {differences(model, x)}" for k, x in sorted(self.plants.items())]
+        names = "disturbance", "network", "actuator", "sensing"
+        parts = {name: getattr(self, name) for name in names}
+        words = {name: None if part is None else str(part) for name, part in parts.items()}
+        return {"plant": "; ".join(plants) or None, **words}

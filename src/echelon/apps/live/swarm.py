@@ -23,7 +23,6 @@ from echelon.laws.law import Law
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.step.loop import Loop, Moment, Switches, assemble
 from echelon.simulation.step.sequence import begin
 from echelon.simulation.step.settings import Settings
@@ -211,7 +210,7 @@ class LiveLoop:
             errors = np.linalg.norm(deviation, axis=1)
         valid = np.isfinite(inputs).all(axis=1) & (np.abs(states) < _FAR).all(axis=1)
         # Which agent it is nobody knows.
-        valid &= not (isinstance(self.stepper, NativeStepper) and self.stepper.inexact.any())
+        valid &= not np.any(chunk.inexact)
         time = self.steps * self.settings.dt
         V = float(self.potential(y[None])[0]) if valid.all() and self.potential else np.nan
         return Picture(time, states, inputs, errors, self.offsets, V, np.logical_not(valid))

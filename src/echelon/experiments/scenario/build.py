@@ -29,7 +29,13 @@ from echelon.experiments.scenario.named_class import (
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.user_code import as_scenario_error
 from echelon.experiments.scenario.values import marked_keys
-from echelon.experiments.scenario.world_parts import disturbance_of, network_of, plant_of
+from echelon.experiments.scenario.world_parts import (
+    actuator_of,
+    disturbance_of,
+    network_of,
+    plants_of,
+    sensing_of,
+)
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
 from echelon.simulation.engine.initial import initial_states
@@ -109,7 +115,7 @@ def _parts(
     reference: Guide | None,
 ) -> Parts:
     """Return all parts, from the model, the graph and the reference."""
-    plant = faults.part(lambda: plant_of(scenario, model), "plant")
+    plant, plants = plants_of(scenario, faults, model)
     disturbance = disturbance_of(scenario, faults, model)
     formation = faults.part(lambda: _formation(scenario, model, graph), "formation")
     follower = faults.part(lambda: _follower(scenario, faults, model, graph), "follower")
@@ -135,7 +141,14 @@ def _parts(
         Laws(cast(Law, leader), cast(Law, follower)),
         initial=initial,
         start_error=scenario.leader.start_error,
-        world=World(plant, disturbance, network),
+        world=World(
+            plant,
+            disturbance,
+            network,
+            actuator_of(scenario, faults, model),
+            sensing_of(scenario, faults, model),
+            plants,
+        ),
     )
     with faults.at("initial"):
         initial_states(parts, scenario.seed)

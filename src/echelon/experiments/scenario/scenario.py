@@ -48,6 +48,8 @@ class Scenario(BaseModel, **STRICT):
     follower: law_sections.FollowerSpec = Field(default_factory=law_sections.FollowerSpec)
     initial: sections.InitialSpec = Field(default_factory=sections.InitialSpec)
     disturbance: sections.DisturbanceSpec | None = None
+    actuator: sections.ActuatorSpec | None = None
+    sensing: sections.SensingSpec | None = None
     network: sections.NetworkSpec | None = None
     simulation: sections.SimulationSpec
     report: sections.ReportSpec = Field(default_factory=sections.ReportSpec)

@@ -52,6 +52,16 @@ class ModelSpec(BaseModel, **_either("name", "python")):
 
 
 @final
+class VariationSpec(BaseModel, **STRICT):
+    """An actual agent, where it differs from the model."""
+
+    parameters: Annotated[dict[str, Numeric], Unit("the parameters'")] = {}
+    """Parameters that differ, in the model's units."""
+    scale: Annotated[dict[str, Positive], Unit("1")] = {}
+    """Factors on the model's parameters; a list is multiplied number by number."""
+
+
+@final
 class PlantSpec(BaseModel, **STRICT):
     """The actual agents, where they differ from the model that laws and gains use."""
 
@@ -59,6 +69,8 @@ class PlantSpec(BaseModel, **STRICT):
     """Parameters that differ, in the model's units."""
     scale: Annotated[dict[str, Positive], Unit("1")] = {}
     """Factors on the model's parameters; a list is multiplied number by number."""
+    agents: dict[int, VariationSpec] = {}
+    """By number, agents that differ from the others; theirs replaces what stands above."""
 
 
 @final
@@ -187,6 +199,38 @@ class DisturbanceSpec(BaseModel, **STRICT):
     """Whether all agents are subject to the same random wind."""
     seed: Seed | None = None
     """Seed of wind and noise; default the scenario's."""
+    time: Annotated[Positive | None, Unit("s")] = None
+    """Time constant of gusts, s: the random wind is then a Gauss-Markov process of each agent, in
+    place of independent draws every `hold`."""
+    air: Annotated[Numbers | None, Unit("m/s")] = None
+    """Velocity of the air by coordinate of the position, m/s; it acts by `drag`."""
+    drag: Annotated[NotNegative, Unit("1/s")] = 0.0
+    """Acceleration of an agent by the air, 1/s times its velocity through the air."""
+
+
+@final
+class ActuatorSpec(BaseModel, **STRICT):
+    """Actuators of all agents that are not ideal; the laws know nothing of it."""
+
+    lag: Annotated[NotNegative, Unit("s")] = 0.0
+    """Time constant with which every actuator follows its command, s."""
+    levels: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    """Number of values that a motor can be commanded between its limits; 0 for any value."""
+    minimum: Annotated[NotNegative | None, Unit("the motors', mostly N")] = None
+    """Least thrust of a motor, mostly N; default the lower limit."""
+
+
+@final
+class SensingSpec(BaseModel, **STRICT):
+    """What all agents measure of their own states, which laws and messages use."""
+
+    delay: Annotated[NotNegative, Unit("s")] = 0.0
+    """Age of the measurement, s; rounded to steps."""
+    noise: Annotated[dict[str, NotNegative], Unit("the states'")] = {}
+    """Standard deviation of each measurement, by state or group, in the states' units;
+    independent from step to step."""
+    seed: Seed | None = None
+    """Seed of the noise; default the scenario's."""
 
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -256,6 +300,8 @@ class SimulationSpec(BaseModel, **STRICT):
     engine: Annotated[str, OneOf(ENGINES)] = "auto"
     """What integrates the agents: `jax`, or `native` machine code, which differs by rounding;
     `auto` uses native code for long runs where possible."""
+    substeps: Count = 1
+    """Steps of the integrator in each `dt`, over which inputs are held."""
     devices: Count = 1
     """Number of JAX devices, such as GPUs, among which the agents are divided; more than one only
     with the engine `jax`, and the number of agents a multiple of it."""

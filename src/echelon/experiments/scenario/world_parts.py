@@ -1,4 +1,4 @@
-"""Builds the world of a scenario: plant, disturbance and network."""
+"""Builds the world of a scenario: plants, disturbances, actuators, sensors and network."""
 
 from typing import Any
 
@@ -6,23 +6,37 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Bursts, Network
 from echelon.agents.network.graph import Graph
+from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.plant import check_plant, vary_parameters
+from echelon.agents.world.sensing import Sensing
 from echelon.experiments.scenario.fault_list import FaultList
 from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.sections import PlantSpec, VariationSpec
 from echelon.laws.law import Law
 from echelon.simulation.engine.law_drive import Laws
 
 
-def plant_of(scenario: Scenario, model: ControlAffine) -> ControlAffine | None:
-    """Return the agents that move, where they differ from the model."""
+def plants_of(
+    scenario: Scenario, faults: FaultList, model: ControlAffine
+) -> tuple[ControlAffine | None, dict[int, ControlAffine]]:
+    """Return the agents that move, where they differ from the model: all, and single ones."""
     spec = scenario.plant
     if spec is None:
-        return None
-    plant = vary_parameters(model, spec.parameters, spec.scale)
-    check_model(plant)
-    check_plant(model, plant)
-    return plant
+        return None, {}
+
+    def varied(part: VariationSpec | PlantSpec) -> ControlAffine:
+        plant = vary_parameters(model, part.parameters, part.scale)
+        check_model(plant)
+        check_plant(model, plant)
+        return plant
+
+    plants = {
+        k: faults.part(lambda part=part: varied(part), "plant", "agents", k)
+        for k, part in spec.agents.items()
+    }
+    alike = spec.agents and not (spec.parameters or spec.scale)
+    return (None if alike else faults.part(lambda: varied(spec), "plant")), plants
 
 
 def disturbance_of(
@@ -36,7 +50,30 @@ def disturbance_of(
         with faults.at("disturbance", key):
             # Each alone, so that its fault is reported at its own line.
             Disturbance(**{key: getattr(spec, key)}).prepared(model, scenario.simulation.dt, 0)
-    return Disturbance(**spec.model_dump())
+    numbers: dict[str, Any] = spec.model_dump() | {"air": spec.air or ()}
+    return faults.part(lambda: Disturbance(**numbers), "disturbance")
+
+
+def actuator_of(scenario: Scenario, faults: FaultList, model: ControlAffine) -> Actuator | None:
+    """Return the actuators; None for ideal ones."""
+    spec = scenario.actuator
+    if spec is None:
+        return None
+    actuator = Actuator(**spec.model_dump())
+    with faults.at("actuator"):
+        actuator.prepared(model)
+    return actuator
+
+
+def sensing_of(scenario: Scenario, faults: FaultList, model: ControlAffine) -> Sensing | None:
+    """Return what agents measure; None for exact states."""
+    spec = scenario.sensing
+    if spec is None:
+        return None
+    sensing = Sensing(**spec.model_dump())
+    with faults.at("sensing", "noise"):
+        sensing.prepared(model, scenario.simulation.dt, 0)
+    return sensing
 
 
 def network_of(

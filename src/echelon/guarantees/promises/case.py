@@ -78,10 +78,4 @@ class Case(NamedTuple):
     @property
     def disturbed(self) -> str:
         """What acts that no promise covers, in words; empty without any."""
-        world = self.parts.world
-        sources = {
-            "wind or noise acts on the agents": world.disturbance,
-            "the agents differ from the model": world.plant,
-            "messages are late or lost": world.network,
-        }
-        return " and ".join(text for text, what in sources.items() if what is not None)
+        return " and ".join(text for text, acts in self.parts.world.differences.items() if acts)

@@ -13,6 +13,7 @@ from echelon.core.words import Feedforward, Kind, Theorem
 from echelon.guarantees.stopping.arrival import arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
+from echelon.guarantees.stopping.flat_states import flat_states_of
 from echelon.guarantees.stopping.motor_load import MotorLoad, motor_load_of
 from echelon.guarantees.stopping.path_smoothness import path_fault
 from echelon.guarantees.stopping.stopping_run import StoppingRun
@@ -230,6 +231,8 @@ def _angle(border: Border) -> str:
 
 
 def _positions(run: StoppingRun) -> tuple[int, ...]:
-    """Return which outputs are a position."""
-    outputs, position = run.law.ready.chains.outputs, run.parts.model.position
-    return tuple(k for k, name in enumerate(outputs) if name in position)
+    """Return which outputs are the position; none where a part of it is no output."""
+    chains, position = run.law.ready.chains, run.parts.model.position
+    if not set(position) <= {*flat_states_of(run.parts.model, chains).outputs}:
+        return ()
+    return tuple(map(chains.outputs.index, position))

@@ -62,6 +62,10 @@ def _world(result: Result) -> Iterator[str]:
         yield f"Disturbance: {world['disturbance']}; unknown to the laws."
     if world["network"]:
         yield f"Network: {world['network']}."
+    if world["actuator"]:
+        yield f"Actuators: {world['actuator']}; unknown to the laws."
+    if world["sensing"]:
+        yield f"Sensing of own states: {world['sensing']}."
 
 
 def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
@@ -89,7 +93,7 @@ def _lyapunov_trend(result: Result, guarantee: Promise) -> Iterator[str]:
     increases, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
     # V' <= 0 is proved for the undisturbed loop that decays only.
     unstable = guarantee.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails
-    disturbed = result.world.disturbance is not None or result.world.network is not None
+    disturbed = not result.world.ideal
     if forbidden and not (disturbed or unstable):
         when = result.times[int(np.argmax(v.forbidden()))]
         yield (

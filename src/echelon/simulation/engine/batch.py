@@ -18,12 +18,13 @@ from jaxtyping import Bool
 from echelon.core.errors import EchelonError, Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
+from echelon.simulation.engine.divergence import advance_until_lost
 from echelon.simulation.engine.grid import ChunkGrid
 from echelon.simulation.engine.initial import Starts
 from echelon.simulation.engine.jax_stepper import JaxFormations
 from echelon.simulation.engine.law_drive import Laws, choose_engine, is_long, worth_native
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.engine.prepare import Prepared, channel_of, prepare
+from echelon.simulation.engine.prepare import Prepared, channel_of, prepare, sensors_of
 from echelon.simulation.engine.record import Recorder
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import result_of, sample_reference, simulate
@@ -167,10 +168,10 @@ def _fly(
     while not recorder.ended:
         done, grid = recorder.done, recorder.grid
         reference = sample_reference(first, done, grid.longest + 1)
-        chunk = stepper.advance(now, grid.counts(done), reference)
-        recorder.keep(chunk, reference, 0.0)
-        if isinstance(stepper, NativeStepper):
-            far |= stepper.inexact
+        planned = now, grid.counts(done), reference, len(far)
+        chunk, counts = advance_until_lost(stepper, *planned)
+        recorder.keep(chunk, counts, reference, 0.0)
+        far |= chunk.inexact
         now = chunk.now
         if progress is not None:
             progress(recorder.done, grid.steps)
@@ -205,12 +206,14 @@ def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _Ba
     assert loop is not None
     problem = prepared.problem._replace(settings=settings, states=states)
     world = prepared.parts.world
-    if world.disturbance is not None or world.network is not None:
+    if not world.ideal:
         # Draws of a seed of its own.
-        motion = Motion.of(problem.model, world, settings)
-        channel = channel_of(prepared.parts, settings)
-        problem = problem._replace(motion=motion, channel=channel)
-        loop = dataclasses.replace(loop, motion=motion, channel=channel)
+        drawn = {
+            "motion": Motion.of(problem.model, world, settings, len(states)),
+            "channel": channel_of(prepared.parts, settings),
+            "sensors": sensors_of(prepared.parts, settings),
+        }
+        problem, loop = problem._replace(**drawn), dataclasses.replace(loop, **drawn)
     return _BatchJob(place, prepared._replace(problem=problem), loop)
 
 

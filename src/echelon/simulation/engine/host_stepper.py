@@ -73,6 +73,11 @@ class HostStepper(Stepper):
         return self._work()
 
     @property
+    def repeats(self) -> bool:
+        """Whether steps can be taken again: no, since a pilot's plans are not part of a moment."""
+        return False
+
+    @property
     def longest(self) -> int:
         """Steps in which a few dozen plans are made."""
         return self.hold * max(1, _PLANS // len(self.states))

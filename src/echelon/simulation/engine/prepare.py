@@ -9,6 +9,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.formation import Formation
+from echelon.agents.world.sensing import Sensors
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.identity import digest
 from echelon.core.limits import excess_frames
@@ -82,17 +83,24 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
             model,
             graph,
             formation,
-            Motion.of(model, parts.world, settings),
+            Motion.of(model, parts.world, settings, graph.agents),
             Meter.of(model, graph, formation, settings),
             settings,
             initial_states(parts, settings.seed),
             channel_of(parts, settings),
+            sensors_of(parts, settings),
         )
         parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)
     warnings += formation_warnings(model, formation)
     # Model and drive may say the same; a dictionary keeps the first, and the order.
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
+
+
+def sensors_of(parts: Parts, settings: Settings) -> Sensors | None:
+    """Return the sensors of a run; None for exact ones."""
+    sensing = parts.world.sensing
+    return sensing and sensing.prepared(parts.model, settings.dt, settings.seed)
 
 
 def channel_of(parts: Parts, settings: Settings) -> Channel | None:

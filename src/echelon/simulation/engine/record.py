@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 
 from echelon.core.errors import Outcome
 from echelon.core.types import Array
+from echelon.simulation.engine.divergence import finite_formations
 from echelon.simulation.engine.grid import ChunkGrid
 from echelon.simulation.step.drive import Chunk, Problem, numbers
 from echelon.simulation.step.meter import ALWAYS, Meter, Sums, on_host, outside
@@ -122,14 +123,16 @@ class Recorder:
         stopped = bool(self.stretches) and self.stretches[-1].stopped is not None
         return self.complete or stopped or not self._finite.any()
 
-    def keep(self, chunk: Chunk, reference: Array | None, seconds: float) -> None:
-        """Keep the stretch of a chunk that followed a reference (S, n) step by step."""
-        first, counts = self.done, self.grid.counts(self.done)
+    def keep(self, chunk: Chunk, counts: Array, reference: Array | None, seconds: float) -> None:
+        """Keep the stretch of a chunk with so many steps after each point.
+
+        It followed a reference (S, n) step by step.
+        """
+        first = self.done
         # One that stopped has fewer points.
         points = (first + np.cumsum(counts) - counts)[: len(chunk.states)]
         frames = self.grid.stored(points)
-        parts = map(self._by_formation, (chunk.states, chunk.inputs))
-        finite = np.all([np.isfinite(part).all(axis=(2, 3)) for part in parts], axis=0)
+        finite = finite_formations(chunk, len(self.problems))
         # The point where a formation diverges is kept, also between frames: it gives the time.
         stored = frames | (~finite & self._finite).any(axis=1)
         sums = self.sums.plus(chunk.sums)

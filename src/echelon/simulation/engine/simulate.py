@@ -12,6 +12,7 @@ import numpy as np
 from echelon.core.errors import Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
+from echelon.simulation.engine.divergence import advance_until_lost
 from echelon.simulation.engine.grid import ChunkGrid
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared, prepare
@@ -194,8 +195,9 @@ class _ChunkLoop:
         # One more row, for a frame at a chunk's end, which no step follows. As many rows for the
         # last chunks, which have fewer steps, keep them from compiling anew.
         reference = self.reference.rows(first, grid.longest + 1)
-        chunk = self.stepper.advance(self.now, grid.counts(first), reference)
-        self.recorder.keep(chunk, reference, time.perf_counter() - self.began)
+        planned = self.now, grid.counts(first), reference, 1
+        chunk, counts = advance_until_lost(self.stepper, *planned)
+        self.recorder.keep(chunk, counts, reference, time.perf_counter() - self.began)
         self.now = chunk.now
 
     def _hand_over(self, keep: Keep | None) -> None:

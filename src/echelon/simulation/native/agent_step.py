@@ -68,6 +68,12 @@ class BlockRows(NamedTuple):
         """
         if loop.channel is not None:
             raise Unsupported("a network that is not ideal")
+        if loop.sensors is not None:
+            raise Unsupported("agents that measure their states late or with noise")
+        if not loop.motion.ideal:
+            raise Unsupported(
+                "substeps, actuators that lag, correlated wind, air, or agents that differ"
+            )
         n, m = len(loop.model.state_names), len(loop.model.input_names)
         wind, q = loop.motion.wind, len(loop.model.output_names)
         noisy = wind is not None and wind.noise is not None

@@ -245,7 +245,7 @@ class Backward:
             chunk = self._advance(now, first)
             now, more = chunk.now, chunk.sums.of(0)
             sums = more if sums is None else sums.plus(more)
-            if self.stepper.inexact.any():
+            if np.any(chunk.inexact):
                 self.moments.clear()
                 return None
         return sums

@@ -41,8 +41,8 @@ class NativeStepper(Stepper):
         loops: of the run, or of each formation.
         states: at its beginning, formation by formation.
         bits: 64 or 32, the precision.
-        fallback: repeats a chunk whose numbers are not what JAX computes; None if the caller looks
-            at `inexact`.
+        fallback: repeats a chunk whose numbers are not what JAX computes; None if the caller
+            does, by `Chunk.inexact`.
         pool: threads that step formations; None for the caller's only.
         make: returns the kernel; by default from the cache of all runs.
         variant: a loop of the same structure: `turn` may change the numbers in which it differs,
@@ -90,7 +90,7 @@ class NativeStepper(Stepper):
         # The moment in the blocks: a chunk that continues from it need not be written there.
         self._moment: Moment | None = None
         self._hold, self._fallback_step = -1, -1
-        self.inexact = np.zeros(len(loops), bool)
+        self._inexact = np.zeros(len(loops), bool)
         self._tape: Array | None = None
         self._draws_ahead = holds_at_once(len(states))
 
@@ -163,7 +163,7 @@ class NativeStepper(Stepper):
         if now is not self._moment:
             self._load(now)
         chunk = self._advance(now, counts, reference)
-        if self.fallback is None or not self.inexact.any():
+        if self.fallback is None or not np.any(chunk.inexact):
             return chunk
         self._moment = None
         self._fallback_step = int(now.step) if self._fallback_step < 0 else self._fallback_step
@@ -206,7 +206,7 @@ class NativeStepper(Stepper):
                 u[k] = u[k - 1]
         self._find_inexact()
         self._moment, sums = self._moment_and_sums(first, step)
-        return Chunk(self._moment, x, u, sums)
+        return Chunk(self._moment, x, u, sums, inexact=self._inexact)
 
     def _read_next_inputs(self, step: int, first: int, table: Array | None, out: Array) -> None:
         """Read the inputs of a step that is not taken."""
@@ -346,11 +346,11 @@ class NativeStepper(Stepper):
         row = self.rows.exception.start
         if self.blocks[:, row].any():
             positions = np.flatnonzero(self.blocks[:, row])
-            self.inexact[self.places.agents[positions] // len(self.loop.offsets)] = True
+            self._inexact[self.places.agents[positions] // len(self.loop.offsets)] = True
 
     def _clear_sums(self) -> None:
         rows = self.rows
-        self.inexact = np.zeros(len(self.loops), bool)
+        self._inexact = np.zeros(len(self.loops), bool)
         initial = np.zeros((rows.total, 1), self.dtype)
         initial[rows.unsettled.start], initial[rows.inside.start : rows.inside.stop] = -1.0, ALWAYS
         self.blocks[:, rows.errors.start :] = initial[rows.errors.start :]

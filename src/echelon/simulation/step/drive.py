@@ -16,6 +16,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel, Network
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
+from echelon.agents.world.sensing import Sensors
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.core.words import Feedforward, Frame
@@ -44,6 +45,7 @@ class Problem(NamedTuple):
         settings: horizon, step and the like.
         states: (N, n) at the beginning.
         channel: what the network does to messages; None for the ideal network.
+        sensors: of the agents' own states; None for exact ones.
     """
 
     model: ControlAffine
@@ -54,6 +56,7 @@ class Problem(NamedTuple):
     settings: Settings
     states: Array
     channel: Channel | None = None
+    sensors: Sensors | None = None
 
 
 class Chunk(NamedTuple):
@@ -65,6 +68,7 @@ class Chunk(NamedTuple):
         inputs: (T, F N, m) delivered from each of them on, float64.
         sums: over its steps, with an axis F in front; F is 1 for a run alone.
         stopped: why no further step can be taken, in words; None where one can.
+        inexact: (F,) the formations whose numbers are not those that JAX would compute.
     """
 
     now: Moment
@@ -72,6 +76,7 @@ class Chunk(NamedTuple):
     inputs: Array
     sums: Sums
     stopped: str | None = None
+    inexact: Array | bool = False
 
 
 def numbers(now: Moment) -> tuple[Array, ...]:
@@ -128,6 +133,11 @@ class Stepper(abc.ABC):
         if [np.shape(leaf) for leaf in numbers(like)] != [np.shape(leaf) for leaf in leaves]:
             raise SimulationError("the stored moment has another shape than this run's.")
         return tree.unflatten(map(_leaf, leaves, like))
+
+    @property
+    def repeats(self) -> bool:
+        """Whether steps can be taken again from a moment, with the same results."""
+        return True
 
     @property
     def work(self) -> SolverStats | None:

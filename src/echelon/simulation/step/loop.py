@@ -3,6 +3,7 @@
 This file sees only the interfaces of models and laws.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.graph import Graph
+from echelon.agents.world.sensing import Sensors
 from echelon.core.types import Array, PyTree, States
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law, Memory, without_certificates
@@ -41,6 +43,7 @@ class Loop(eqx.Module):
         order: (N,) from leaders and followers to the agents' own order.
         switches: when the graph switches; None where it does not.
         channel: what the network does to messages; None for the ideal network.
+        sensors: of the agents' own states; None for exact ones.
         share: of the feed-forward that followers use; None for all of it.
     """
 
@@ -59,7 +62,14 @@ class Loop(eqx.Module):
     order: Array
     switches: "Switches | None"
     channel: Channel | None = None
+    sensors: Sensors | None = None
     share: Array | None = None
+
+    def with_motion(self, row: PyTree) -> "Loop":
+        """Return the loop of one agent whose plant has the parameters of a row; None for no row."""
+        if row is None:
+            return self
+        return dataclasses.replace(self, motion=self.motion.of_row(row))
 
 
 class Switches(NamedTuple):
@@ -85,12 +95,14 @@ class WorldState(NamedTuple):
     Attributes:
         in_flight: the last messages that were sent, as `Posts` of the channel.
         inbox: what agents keep of those that they received, as `Inbox`.
-        actuators: where the actuators stand that do not follow their commands at once.
+        motion: what the plants remember besides their states, as `MotionState`.
+        measured: (d, N, n) the states of the last d steps, where agents measure theirs late.
     """
 
     in_flight: PyTree = None
     inbox: PyTree = None
-    actuators: PyTree = None
+    motion: PyTree = None
+    measured: PyTree = None
 
 
 class Moment(NamedTuple):
@@ -137,6 +149,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         order=np.argsort(np.concatenate([leaders, followers])),
         switches=_switches(problem),
         channel=problem.channel,
+        sensors=problem.sensors,
     )
 
 

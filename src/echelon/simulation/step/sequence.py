@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from echelon.agents.network.exchange import Difference, Exchange
 from echelon.core.compiled import cached_jit
-from echelon.core.types import Array, Inputs, State, States
+from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act, limit_sides
 from echelon.simulation.step.inbox import (
@@ -20,6 +20,7 @@ from echelon.simulation.step.inbox import (
 )
 from echelon.simulation.step.loop import Loop, Moment, WorldState
 from echelon.simulation.step.meter import Sums, reference_at
+from echelon.simulation.step.motion import MotionState
 
 
 @cached_jit
@@ -36,17 +37,25 @@ def begin(loop: Loop, states: States) -> Moment:
         follower_memory=remember(loop.follower, loop.followers),
         cut=jnp.zeros((len(states), len(loop.model.input_names)), jnp.int8),
     )
-    return moment if loop.channel is None else moment._replace(world=_begin_world(loop, moment))
+    world = WorldState()
+    memory = loop.motion.begin(moment.states)
+    if memory != (None, None):
+        world = world._replace(motion=memory)
+    if loop.sensors is not None:
+        world = world._replace(measured=loop.sensors.begin(moment.states))
+    if loop.channel is not None:
+        world = _begin_network(loop, moment, world)
+    return moment._replace(world=world)
 
 
-def _begin_world(loop: Loop, moment: Moment) -> WorldState:
-    """Return the state of a network before the first message."""
+def _begin_network(loop: Loop, moment: Moment, world: WorldState) -> WorldState:
+    """Return the state of the world with a network before the first message."""
     sent, _ = _sent(loop, moment)
     inbox = empty_inbox(loop, sent, _feedforward_size(loop, moment))
     agents = jnp.arange(len(sent), dtype=jnp.int32)
     assert loop.channel is not None
     posts = loop.channel.begin(Message(sent, agents, inbox.packet), len(inbox.stamp))
-    return WorldState(in_flight=posts, inbox=inbox)
+    return world._replace(in_flight=posts, inbox=inbox)
 
 
 def _feedforward_size(loop: Loop, moment: Moment) -> int:
@@ -67,6 +76,7 @@ class Control(NamedTuple):
 
 def control(loop: Loop, now: Moment) -> Control:
     """Return what all agents do from a moment on."""
+    now = _measured(loop, now)
     sent, difference = _sent(loop, now)
     exchange = _exchange_at(loop, now.step)
     knowledge = None
@@ -95,6 +105,14 @@ def control(loop: Loop, now: Moment) -> Control:
     return Control(u, limited.any(axis=1), cut.astype(jnp.int8), led.memory, followed.memory, world)
 
 
+def _measured(loop: Loop, now: Moment) -> Moment:
+    """Return the moment as the agents measure it: they know nothing of their true states."""
+    if loop.sensors is None:
+        return now
+    states, last = loop.sensors.read(now.world.measured, now.states, now.step)
+    return now._replace(states=states, world=now.world._replace(measured=last))
+
+
 def _lead(loop: Loop, now: Moment, z: Float[jax.Array, "N s"]) -> Action:
     """Return what the leaders do."""
     # Nobody is before a leader whose input it could be sent.
@@ -119,10 +137,14 @@ def _act_all(
     t = now.step.astype(x.dtype) * loop.motion.dt
 
     # One time for all; of everything else, an agent sees its own row and no other.
-    def one(x: State, offset: State, z: jax.Array, forward: jax.Array, memory: Memory) -> Action:
-        return act(loop, law, LocalView(t, x, offset, z, forward, loop.motion.dt), memory, leads)
+    def one(
+        x: State, offset: State, z: jax.Array, forward: jax.Array, memory: Memory, row: PyTree
+    ) -> Action:
+        view = LocalView(t, x, offset, z, forward, loop.motion.dt)
+        return act(loop.with_motion(row), law, view, memory, leads)
 
-    return jax.vmap(one)(x[agents], offsets[agents], z[agents], forward, memory)
+    rows = jax.tree.map(lambda leaf: leaf[agents], loop.motion.rows)
+    return jax.vmap(one)(x[agents], offsets[agents], z[agents], forward, memory, rows)
 
 
 def _by_depth(loop: Loop, now: Moment, led: Action, z: Float[jax.Array, "N s"]) -> Action:
@@ -198,9 +220,12 @@ def step(loop: Loop, now: Moment) -> Moment:
 
 def _move(loop: Loop, now: Moment, acted: Control) -> Moment:
     """Return the moment one dt later under what all agents do."""
-    states = loop.motion.advance(now.states, acted.inputs, now.step)
+    world = acted.world
+    own = MotionState() if world.motion is None else world.motion
+    states, own = loop.motion.advance(now.states, acted.inputs, now.step, own)
+    world = world if world.motion is None else world._replace(motion=own)
     memories = acted.leader_memory, acted.follower_memory
-    return Moment(now.step + 1, states, *memories, acted.cut, acted.world)
+    return Moment(now.step + 1, states, *memories, acted.cut, world)
 
 
 def measured_step(

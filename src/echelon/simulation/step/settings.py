@@ -27,6 +27,7 @@ class Settings(NamedTuple):
         devices: over how many of JAX's devices the agents are spread; more than one where JAX
             steps them.
         steady_window: the last part of the run that counts as steady, s; a fifth when left out.
+        substeps: steps of the integrator in each `dt`, over which the inputs are held.
     """
 
     horizon: float
@@ -39,6 +40,7 @@ class Settings(NamedTuple):
     engine: str = "auto"
     devices: int = 1
     steady_window: float | None = None
+    substeps: int = 1
 
     @property
     def steps(self) -> int:
@@ -95,6 +97,7 @@ class Settings(NamedTuple):
         for name, least, most in (
             ("seed", 0, 2**63 - 1),
             ("store_every", 1, MOST_STEPS),
+            ("substeps", 1, 1000),
             ("devices", 1, 2**31 - 1),
         ):
             value = getattr(self, name)

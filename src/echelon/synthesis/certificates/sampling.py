@@ -57,13 +57,21 @@ def sample_jacobians(
     for k in np.flatnonzero(~np.isfinite(domain.lower) | ~np.isfinite(domain.upper)):
         for far in _FAR:
             moved = base + both + np.where(np.arange(len(base)) == k, far, 0.0)
-            if (
-                np.abs(np.asarray(at(jnp.asarray(moved))) - samples).max()
-                > 1e-12 * abs(samples).max()
-            ):
+            there = np.asarray(at(jnp.asarray(moved)))
+            # Entry by entry, since their units may be decades apart.
+            size = np.maximum(np.abs(there), np.abs(samples)).max(axis=0)
+            if (np.abs(there - samples).max(axis=0) > 1e-12 * size).any():
                 raise unbounded_error(model, model.state_names[k])
-    _check_samples(model, base + inside, velocity)
+    _check_samples(model, base + inside, velocity, _units(domain))
     return samples
+
+
+def _units(domain: Domain) -> Array:
+    """Return (n + m,) half of the width of the domain in each state and input; 1 where open."""
+    low = np.concatenate([domain.lower, domain.input_lower])
+    high = np.concatenate([domain.upper, domain.input_upper])
+    wide = 0.5 * (high - low)
+    return np.where(np.isfinite(wide) & (wide > 0.0), wide, 1.0)
 
 
 def _check_finite(model: ControlAffine, points: Array, matrices: Array) -> None:
@@ -93,7 +101,7 @@ def _points(domain: Domain) -> tuple[Array, Array]:
     return both[:_SAMPLES], both[_SAMPLES:]
 
 
-def _check_samples(model: ControlAffine, points: Array, velocity: _OfState) -> None:
+def _check_samples(model: ControlAffine, points: Array, velocity: _OfState, units: Array) -> None:
     """Refuse a model whose Jacobians say less than its values, at points (K, n + m)."""
     n, name = len(model.state_names), type(model).__name__
 
@@ -110,7 +118,7 @@ def _check_samples(model: ControlAffine, points: Array, velocity: _OfState) -> N
             f"{jump.after[model.state_names.index(state)]:.4g}, and nothing is guaranteed across a "
             "jump; make the domain smaller, or the model continuous."
         )
-    gap = find_gap(entries, points[:_SEGMENTS])
+    gap = find_gap(entries, points[:_SEGMENTS], units)
     if gap is not None:
         raise GainError(
             f"the derivative of `{name}` inside the domain is {gap.derivative:.4g} by JAX and "

@@ -1,0 +1,117 @@
+"""Actuators that lag behind their commands, and motors with levels and a least thrust."""
+
+import dataclasses
+import math
+import numbers
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from echelon.agents.models.model import ControlAffine
+from echelon.core.errors import SimulationError
+from echelon.core.types import Array, Input
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Actuator:
+    """How the actuators of all agents differ from ideal ones; the laws know nothing of it.
+
+    Args:
+        lag: time constant with which every actuator follows its command, s; 0 at once.
+        levels: number of values that a motor can be commanded, from one limit to the other; 0 for
+            any value.
+        minimum: least thrust of a motor, in the units of the rows of the model's limits, mostly N;
+            None for the lower limit.
+
+    Raises:
+        SimulationError: a number is out of its range.
+    """
+
+    lag: float = 0.0
+    levels: int = 0
+    minimum: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check every number."""
+        for name, value in (("lag", self.lag), ("minimum", self.minimum or 0.0)):
+            if not (isinstance(value, numbers.Real) and 0.0 <= float(value) < math.inf):
+                raise SimulationError(
+                    f"`{name}` of the actuator is {value}, and must be finite and not negative."
+                )
+        if not isinstance(self.levels, int) or self.levels < 0 or self.levels == 1:
+            raise SimulationError(
+                f"`levels` of the actuator is {self.levels}, and must be 0 for any value, or a "
+                "whole number from 2 on."
+            )
+
+    def prepared(self, plant: ControlAffine) -> "Motors":
+        """Return the actuators of a plant as arrays.
+
+        Raises:
+            SimulationError: motors are asked for whose thrusts the plant does not limit.
+        """
+        lag = np.asarray(self.lag) if self.lag else None
+        limits = plant.input_limits
+        if not self.levels and self.minimum is None:
+            return Motors(lag, None, None, None, None, None)
+        mixing = np.zeros((0, 0)) if limits is None else np.asarray(limits.matrix, float)
+        square = mixing.ndim == 2 and mixing.shape[0] == mixing.shape[1] > 0
+        if limits is None or not square or not np.isfinite([limits.low, limits.high]).all():
+            key = "levels" if self.levels else "minimum"
+            raise SimulationError(
+                f"got `{key}` of the actuator, but `{type(plant).__name__}` has no motors: its "
+                "`input_limits` are not as many as its inputs, with finite bounds."
+            )
+        low, high = np.asarray(limits.low, float), np.asarray(limits.high, float)
+        step = (high - low) / (self.levels - 1) if self.levels else None
+        least = low if self.minimum is None else np.maximum(low, self.minimum)
+        return Motors(lag, mixing, np.linalg.inv(mixing), low, least, step)
+
+    def __str__(self) -> str:
+        """Return the actuators in words."""
+        parts = [f"lag {1e3 * self.lag:g} ms"] if self.lag else []
+        parts += [f"{self.levels} levels"] if self.levels else []
+        parts += [f"at least {self.minimum:g} a motor"] if self.minimum is not None else []
+        return ", ".join(parts) or "none"
+
+
+@final
+class Motors(eqx.Module):
+    """Actuators as arrays; a part without effect is None.
+
+    Attributes:
+        lag: time constant, s.
+        mixing, unmixing: (m, m) from inputs to thrusts, and back.
+        low, least: (m,) of the thrusts: the lower limits, and what a motor gives at least.
+        step: (m,) between two levels.
+    """
+
+    lag: Array | None
+    mixing: Array | None
+    unmixing: Array | None
+    low: Array | None
+    least: Array | None
+    step: Array | None
+
+    def command(self, u: Input) -> Input:
+        """Return the input that the motors are commanded for a delivered one."""
+        if self.mixing is None:
+            return u
+        f = jnp.asarray(self.mixing, u.dtype) @ u
+        if self.step is not None:
+            low, step = jnp.asarray(self.low, u.dtype), jnp.asarray(self.step, u.dtype)
+            f = low + step * jnp.round((f - low) / step)
+        f = jnp.maximum(f, jnp.asarray(self.least, u.dtype))
+        return jnp.asarray(self.unmixing, u.dtype) @ f
+
+    def after(self, start: Input, command: Input, time: Float[jax.Array, ""] | float) -> Input:
+        """Return the input that acts a time (s) after a command, from where the actuators stood."""
+        if self.lag is None:
+            return command
+        # Every motor has the same lag, and inputs are linear in thrusts.
+        return command + (start - command) * jnp.exp(-time / jnp.asarray(self.lag, start.dtype))

@@ -1,0 +1,98 @@
+"""What an agent measures of its own state: late, and with noise."""
+
+import dataclasses
+import math
+import numbers
+from collections.abc import Mapping
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from echelon.agents.models.model import ControlAffine
+from echelon.core.draws import Draw, key_of, normals
+from echelon.core.errors import SimulationError
+from echelon.core.types import Array, State, States
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Sensing:
+    """How all agents measure their own states; laws and messages use nothing else.
+
+    Args:
+        delay: age of the measurement, s; rounded to control steps.
+        noise: standard deviation of each measurement, by state or group, in the states' units;
+            independent from one control step to the next.
+        seed: of the noise; by default that of the run.
+
+    Raises:
+        SimulationError: a number is not finite, or negative.
+    """
+
+    delay: float = 0.0
+    noise: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check every number."""
+        for name, value in (("delay", self.delay), *self.noise.items()):
+            if not (isinstance(value, numbers.Real) and 0.0 <= float(value) < math.inf):
+                what = "`delay`" if name == "delay" else f"`noise` of `{name}`"
+                raise SimulationError(
+                    f"{what} of the sensing is {value}, and must be finite and not negative."
+                )
+
+    def prepared(self, model: ControlAffine, dt: float, seed: int) -> "Sensors":
+        """Return the sensing as arrays for a control step (s) and a run's seed.
+
+        Raises:
+            ModelError: a name is no state or group of the model.
+        """
+        std = model.per_state(self.noise)
+        return Sensors(
+            std if std.any() else None,
+            key_of(seed if self.seed is None else self.seed),
+            round(self.delay / dt),
+        )
+
+    def __str__(self) -> str:
+        """Return the sensing in words."""
+        parts = [f"{1e3 * self.delay:g} ms late"] if self.delay else []
+        parts += ["noise " + ", ".join(f"`{k}` {v:g}" for k, v in self.noise.items())] * bool(
+            self.noise
+        )
+        return "; ".join(parts) or "exact"
+
+
+@final
+class Sensors(eqx.Module):
+    """Sensing as arrays.
+
+    Attributes:
+        std: (n,); None without noise.
+        key: of the draws.
+        delay: steps.
+    """
+
+    std: Array | None
+    key: Array
+    delay: int = eqx.field(static=True)
+
+    def begin(self, states: States) -> jax.Array:
+        """Return the last states (delay, N, n), all as at the start."""
+        return jnp.repeat(states[None], self.delay, axis=0)
+
+    def read(self, last: jax.Array, states: States, step: jax.Array) -> tuple[States, jax.Array]:
+        """Return what agents measure at a step, and the last states afterwards."""
+        rows = jnp.concatenate([last, states[None]])
+        late = rows[0]
+        if self.std is None:
+            return late, rows[1:]
+
+        def one(x: State, agent: jax.Array) -> State:
+            draw = normals(self.key, Draw.SENSING, step, agent, size=len(x))
+            return x + jnp.asarray(self.std, x.dtype) * draw.astype(x.dtype)
+
+        return jax.vmap(one)(late, jnp.arange(len(late))), rows[1:]
