@@ -13,6 +13,7 @@ import numpy as np
 
 from echelon.agents.models.linearization import at_trim, linearize
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.straight_range import straight_range
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
@@ -133,12 +134,13 @@ def _contraction(
 def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCertificate | None:
     """Return what the metric promises on the claim's domain behind a relayed input."""
     model, spectrum, exact = parts.model, parts.graph.spectrum(), claim.kind is Kind.PROOF
+    domain = claim.domain.straight(model)
     if claim.theorem is Theorem.A5:
-        hull = jacobians(model, claim.domain)
+        hull = jacobians(model, domain)
         if not falls(gain.P, hull.matrices):
             return None
-        return drift_region(model, claim.domain, hull, gain.P, gain.coupling, spectrum)
-    return _contraction(parts, gain, pairs_on(model, claim.domain, gain.R), exact)
+        return drift_region(model, domain, hull, gain.P, gain.coupling, spectrum)
+    return _contraction(parts, gain, pairs_on(model, domain, gain.R), exact)
 
 
 def _strength(parts: Parts, gain: Gain) -> float:
@@ -193,11 +195,18 @@ def weaken(parts: Parts, region: Region, lines: Iterable[Statement]) -> Region:
     """Return a region no stronger than what its hypotheses say of the offsets on its domain."""
     [line] = (x for x in lines if x.statement is Hypothesis.SYMMETRY)
     certificate, needed = region.certificate, line.verdict is not Verdict.NOT_NEEDED
-    if certificate is None or not needed or line.kind.strength >= certificate.kind.strength:
+    if certificate is None:
         return region
-    why = "the offsets are tried at samples of the domain, and not proved"
-    certificate = dataclasses.replace(certificate, kind=line.kind, why=why)
-    return region._replace(certificate=certificate, line=_line(parts, certificate))
+    tried = {}
+    if needed:
+        tried["the offsets are tried at samples of the domain, and not proved"] = line.kind
+    if not straight_range(parts.model).proved:
+        tried["differences of states are x - y at samples, and not proved"] = Kind.SAMPLES
+    for why, kind in tried.items():
+        if kind.strength < certificate.kind.strength:
+            certificate = dataclasses.replace(certificate, kind=kind, why=why)
+            region = region._replace(certificate=certificate, line=_line(parts, certificate))
+    return region
 
 
 def _lost(text: str, remedy: str) -> Statement:
