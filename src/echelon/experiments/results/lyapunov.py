@@ -108,8 +108,8 @@ def _lyapunov(result: Result) -> Lyapunov | None:
         steps = np.rint(result.times / result.settings.dt).astype(np.int32)
         fields = _fields(result.drive, result.model, _motion(result), graph.leaders[0], x, u, steps)
         now, after = (
-            _in_metric_axes(result.model, each, np.asarray(each.states) - offsets)
-            for each in fields
+            _in_metric_axes(result.model, field, np.asarray(field.states) - offsets)
+            for field in fields
         )
         y, f, xdot = now
         later, f_after, _ = after
