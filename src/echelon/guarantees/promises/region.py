@@ -79,9 +79,7 @@ def region_of(parts: Parts, settings: Settings, leaders: Leaders) -> Region:
     return Region(certificate, certificate, _line(parts, certificate))
 
 
-def _region_at_bend(
-    parts: Parts, settings: Settings, leaders: Leaders, gain: Gain
-) -> Region:
+def _region_at_bend(parts: Parts, settings: Settings, leaders: Leaders, gain: Gain) -> Region:
     """Return what a metric promises about a trim at which the model bends.
 
     It has no linearization there, but a hull holds the slopes of all its sides nearby.
