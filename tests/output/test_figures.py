@@ -277,7 +277,9 @@ def test_axes_of_derivatives_say_when_v_rises_between_frames_that_fall(run):
 
 
 def test_a_figure_that_is_none_is_refused_with_a_guess(run):
-    with pytest.raises(OutputError, match="no figure `formaton` .did you mean `formation`"):
+    with pytest.raises(
+        OutputError, match="the figure is `formaton`, allowed are .* .did you mean `formation`"
+    ):
         figures(run, ["formaton"])
 
 

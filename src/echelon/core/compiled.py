@@ -41,17 +41,31 @@ class _Compiled(NamedTuple):
 
 
 class _CallArguments(NamedTuple):
-    """The arguments of a call: their arrays, and the tree with placeholders for them."""
+    """The arguments of a call, as arrays and a tree with placeholders; and the settings of JAX."""
 
     arrays: Sequence[jax.Array]
+    forms: tuple[object, ...]
     leaves: tuple[object, ...]
     tree: PyTree
+    settings: tuple[str, ...]
 
     def digest(self) -> bytes | None:
         """Return a digest that is equal for calls of one program; None if there is none."""
         # Arrays are traced, so only their shape and type matter; other leaves count by value.
         arguments = jax.tree.unflatten(self.tree, self.leaves)
-        return digest((arguments, tuple(map(_form, self.arrays)), disk_cache.jax_settings()))
+        return digest((arguments, self.forms, self.settings))
+
+    def repeats(self, before: "_CallArguments") -> bool:
+        """Return whether this is a call of the same program, as far as is seen at once."""
+        if (self.forms, self.settings) != (before.forms, before.settings):
+            return False
+        pairs = zip(self.leaves, before.leaves, strict=False)
+        if not all(a is b or isinstance(a, _Place) and isinstance(b, _Place) for a, b in pairs):
+            return False
+        try:
+            return bool(self.tree == before.tree)
+        except (TypeError, ValueError):  # arrays that are not traced have no single answer
+            return False
 
     def arguments(self, arrays: Sequence[jax.Array]) -> PyTree:
         """Return the arguments with other arrays in place of their own."""
@@ -71,17 +85,27 @@ class CompiledFunction(Generic[_R]):
         functools.update_wrapper(self, function)
         self._function, self._plain = function, eqx.filter_jit(function)
         self._programs = BoundedCache[_Compiled | None](_MOST)
+        self._last: tuple[_CallArguments, bytes | None] | None = None
 
     def __call__(self, *args: object, **named: object) -> _R:
         """Return what the function returns."""
         call = _call_of((args, named)) if disk_cache.is_open() else None
-        key = None if call is None else call.digest()
+        key = None if call is None else self._key(call)
         if call is None or key is None:
             return self._plain(*args, **named)
         compiled = self._programs.get_or_make(key, lambda: self._load_or_compile(call, key))
         if compiled is None:
             return self._plain(*args, **named)
         return _filled(compiled.tree, compiled.run(*call.arrays))
+
+    def _key(self, call: _CallArguments) -> bytes | None:
+        """Return the digest of a call, without a walk through a loop that takes its next chunk."""
+        last = self._last
+        if last is not None and call.repeats(last[0]):
+            return last[1]
+        key = call.digest()
+        self._last = call._replace(arrays=()), key
+        return key
 
     def _load_or_compile(self, call: _CallArguments, key: bytes) -> _Compiled | None:
         """Return what is stored for a call, or compile and store it; None if JAX compiles it."""
@@ -115,7 +139,11 @@ def _call_of(arguments: PyTree) -> _CallArguments | None:
     arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
     places = map(_Place, range(len(arrays)))
     return _CallArguments(
-        arrays, tuple(next(places) if eqx.is_array(x) else x for x in leaves), tree
+        arrays,
+        tuple(map(_form, arrays)),
+        tuple(next(places) if eqx.is_array(x) else x for x in leaves),
+        tree,
+        disk_cache.jax_settings(),
     )
 
 

@@ -72,6 +72,9 @@ def main() -> None:
 def _main() -> None:
     # Where the home folder is read-only, matplotlib prints two lines about its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    # Matrices are small here: more threads of linear algebra wait for each other, and no digit may
+    # depend on their number. NumPy reads this when it is imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     folder = keep_compiled_code(os.environ)
     with disk_cache.use_folder(folder), outlive_readers(), STOP.listen():
         try:

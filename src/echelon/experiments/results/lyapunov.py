@@ -1,7 +1,9 @@
 """The paper's Lyapunov function V = 1/2 z'(M kron P) z along a run, and the terms of V'."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias, final
+from weakref import WeakKeyDictionary
 
 import jax
 import jax.numpy as jnp
@@ -83,12 +85,21 @@ def fixed_metric(parts: Parts) -> Float[Array, "n n"] | None:
     return parts.drive.metric(parts.model)
 
 
+_COMPUTED: "WeakKeyDictionary[Result, Lyapunov | None]" = WeakKeyDictionary()
+
+
 def lyapunov(result: Result) -> Lyapunov | None:
-    """Return V along a run, in float64.
+    """Return V along a run, in float64, computed once.
 
     None where the followers' law has no P or no frame was stored, and on directed or switching
     graphs, where V is not a sum over edges and need not decrease (theory page, T7).
     """
+    if result not in _COMPUTED:
+        _COMPUTED[result] = _lyapunov(result)
+    return _COMPUTED[result]
+
+
+def _lyapunov(result: Result) -> Lyapunov | None:
     P, graph, offsets = result.drive.metric(result.model), result.graph, result.formation.offsets
     if P is None or not len(result.times) or not goes_both_ways(graph):
         return None
@@ -97,8 +108,8 @@ def lyapunov(result: Result) -> Lyapunov | None:
         steps = np.rint(result.times / result.settings.dt).astype(np.int32)
         fields = _fields(result.drive, result.model, _motion(result), graph.leaders[0], x, u, steps)
         now, after = (
-            _in_metric_axes(result.model, each, np.asarray(each.states) - offsets)
-            for each in fields
+            _in_metric_axes(result.model, field, np.asarray(field.states) - offsets)
+            for field in fields
         )
         y, f, xdot = now
         later, f_after, _ = after
@@ -244,14 +255,17 @@ class Deviations:
     """
 
     def __init__(self, graph: Graph, difference: _Difference) -> None:
-        """Factor the followers' Laplacian."""
+        """Build the differences along the edges."""
         i, j = graph.edges.T
         edge = np.arange(len(i))
         signs = np.concatenate([graph.weights, -graph.weights])
         places = (np.concatenate([i, j]), np.concatenate([edge, edge]))
         self._gather = sp.csr_array(sp.coo_array((signs, places), shape=(graph.agents, len(i))))
         self._graph, self._difference = graph, difference
-        self._solve = spla.splu(sp.csc_array(graph.grounded_laplacian())).solve
+
+    @functools.cached_property
+    def _solve(self) -> Callable[[Array], Array]:
+        return spla.splu(sp.csc_array(self._graph.grounded_laplacian())).solve
 
     def __call__(
         self, y: Float[Array, "T N n"]

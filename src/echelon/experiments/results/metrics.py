@@ -81,7 +81,7 @@ def _leaders(result: Result, exists: bool) -> tuple[LeaderMetrics, ...]:
 
 def _followers(result: Result, exists: bool) -> tuple[FollowerMetrics, ...]:
     sums, saturated = result.sums, result.saturated
-    last = result.formation_errors[-1] if exists and len(result.times) else None
+    last = result.goal_distances([-1])[0] if exists and len(result.times) else None
     nothing = FollowerMetrics(0, None, None, None, None, 0.0)
     return tuple(
         nothing._replace(agent=agent, saturated=float(saturated[agent]))

@@ -161,7 +161,8 @@ class Recording(FrameNumbers):
         disturbed = verdicts.get(Hypothesis.EXACT_STATES.value) == str(Verdict.FAILS)
         if self.saturated.any() or disturbed:
             return None
-        start = float(np.einsum("ia,ab,ib->", self.errors[0], self.metric, self.errors[0]))
+        first = self.deviations([0])[0]
+        start = float(np.einsum("ia,ab,ib->", first, self.metric, first))
         block = np.linalg.inv(self.metric)[np.ix_(self.measured, self.measured)]
         largest = float(np.linalg.eigvalsh(block)[-1])
         return np.sqrt(start * largest) * np.exp(-(self.rate or 0.0) * self.times)

@@ -60,7 +60,7 @@ class RunNumbers:
         compute = AGENT_NUMBERS[name].of
         if compute is not None:
             return compute(self)
-        return np.array([getattr(each, name) for each in self.metrics.followers], float)
+        return np.array([getattr(follower, name) for follower in self.metrics.followers], float)
 
     def worst(self, name: str) -> float:
         """Return the largest number of a follower; NaN if one does not exist."""
@@ -76,7 +76,7 @@ class RunNumbers:
         followers = list(self.result.graph.followers)
         if self.result.outcome is Outcome.DIVERGED or not len(self.result.times):
             return np.full((2, len(followers)), np.nan)
-        return self.result.formation_errors[[0, -1]][:, followers]
+        return self.result.goal_distances([0, -1])[:, followers]
 
     @property
     def certified_radius(self) -> float | None:

@@ -54,13 +54,13 @@ def _table(result: Result) -> str:
 
 def _cells(result: Result) -> Iterator[tuple[str, ...]]:
     """Yield the rows of leaders and followers, with the labels of the report."""
-    numbers, errors = metrics(result), result.formation_errors
+    numbers = metrics(result)
+    errors = result.goal_distances([0, -1] if len(result.times) else [])
     saturated = AGENT_NUMBERS["saturated"]
     for label, row in labelled("leader", numbers.leaders):
         yield label, "", "", saturated.cell(row.saturated)
     for label, row in labelled("follower", numbers.followers):
-        ends = errors[[0, -1], row.agent] if len(errors) else ()
-        cells = [f"{size:.3g}" for size in ends] or ["", ""]
+        cells = [f"{size:.3g}" for size in errors[:, row.agent]] or ["", ""]
         yield label, *cells, saturated.cell(row.saturated)
 
 

@@ -110,7 +110,7 @@ def _approach(runs: _Runs) -> "Figure | None":
     if len(axes) < 2:
         return None
     # All methods have the same starts, so that the first gives the follower.
-    follower = int(np.argmax(first.formation_errors[0]))
+    follower = int(np.argmax(first.goal_distances([0])))
     names, units = first.model.state_names, first.model.state_units
     figure, ax = draw.canvas([draw.label(f"{names[k]} error", units[k]) for k in axes])
     start, goal = first.errors[:1, follower][:, axes], np.zeros((1, 2))

@@ -97,9 +97,8 @@ def _angles(run: Recording, kind: str, names: tuple[str, ...]) -> tuple[tuple[in
 def clipped_places(run: Recording, axes: tuple[int, ...]) -> tuple[Array, bool]:
     """Return places (T, N, k) within ten times the extent of leaders and goals."""
     places, columns = run.states[:, :, list(axes)], list(axes)
-    goals = run.goals[:, :, columns]
-    leaders = goals[:, list(run.leaders)].reshape(-1, len(axes))
-    points = np.concatenate([leaders, goals[0], places[0]])
+    goals, leaders = run.goals([0])[0][:, columns], places[:, list(run.leaders)]
+    points = np.concatenate([leaders.reshape(-1, len(axes)), goals, places[0]])
     low, high = points.min(axis=0), points.max(axis=0)
     reach = max(1.0, float((high - low).max()))
     clipped = np.clip(places, low - _FAR * reach, high + _FAR * reach)
@@ -128,7 +127,7 @@ def _box(run: Recording, kind: str, axes: tuple[int, ...], places: Array) -> tup
 
 def _extent(run: Recording, axes: tuple[int, ...], places: Array) -> tuple[Array, Array]:
     """Return the corners of all places, limited to the goals of a formation that diverges."""
-    goals = places[0] - run.errors[0][:, list(axes)]
+    goals = places[0] - run.deviations([0])[0][:, list(axes)]
     leaders = places[:, list(run.leaders)]
     # Goals move with the leaders.
     motion = leaders[:, 0] - leaders[0, 0]
@@ -150,7 +149,7 @@ def body_width(run: Recording, space: Space) -> float:
     from scipy.spatial import KDTree
 
     reach = float((space.high - space.low)[: 3 if space.kind == "space" else 2].max())
-    goals = run.goals[0][:, list(space.axes)]
+    goals = run.goals([0])[0][:, list(space.axes)]
     apart = KDTree(goals).query(goals, k=2)[0][:, 1] if run.agents > 1 else np.zeros(1)
     apart = apart[np.isfinite(apart) & (apart > 0.0)]
     if space.kind not in ("space", "plane") or not apart.size:

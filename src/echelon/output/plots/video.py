@@ -203,7 +203,7 @@ def _curves(figure: Any, run: Recording) -> list[Any]:
     errors = figure.add_axes((left, 0.58, 0.985 - left, 0.34), facecolor="none")
     inputs = figure.add_axes((left, 0.1, 0.985 - left, 0.34), facecolor="none")
     keep, followers = draw.thin(len(run.times)), list(run.followers)
-    values = draw.above_zero(run.formation_errors[keep][:, followers])
+    values = draw.above_zero(run.goal_distances(keep)[:, followers])
     if run.agents > draw.NAMED:
         lines = {"worst": values.max(axis=1), "median": np.median(values, axis=1)}
         for name, colour in (("worst", 1), ("median", 0)):

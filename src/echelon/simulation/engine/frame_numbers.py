@@ -1,7 +1,8 @@
 """Numbers that follow from the stored frames of a run, computed now or read from its dataset."""
 
 import abc
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,6 +11,10 @@ from echelon.core.types import Array
 
 _FEW = 8
 """Agents up to which comparing all pairs is faster than a search for the nearest."""
+
+
+_Some: TypeAlias = slice | Sequence[int] | Int[Array, " F"]
+"""Which frames."""
 
 
 class _Frames(Protocol):
@@ -30,8 +35,9 @@ class _Frames(Protocol):
     @property
     def measured(self) -> tuple[int, ...]: ...
 
-    @property
-    def errors(self) -> Float[Array, "T N n"]: ...
+    def deviations(self, frames: _Some = slice(None)) -> Float[Array, "F N n"]: ...
+
+    def goal_distances(self, frames: _Some = slice(None)) -> Float[Array, "F N"]: ...
 
 
 class FrameNumbers(abc.ABC):
@@ -53,25 +59,30 @@ class FrameNumbers(abc.ABC):
 
         The leaders' rows are zero.
         """
-        # delta_i = y_i - y_0 (theory page), which V and the certified set are written in.
-        y = self.states - self.offsets
-        return y - y[:, self.nearest]
-
-    @property
-    def goals(self: _Frames) -> Float[Array, "T N n"]:
-        """The states that the agents would have without errors."""
-        return self.states - self.errors
+        return self.deviations()
 
     @property
     def formation_errors(self: _Frames) -> Float[Array, "T N"]:
         """Each agent's distance from its goal."""
+        return self.goal_distances()
+
+    def deviations(self: _Frames, frames: _Some = slice(None)) -> Float[Array, "F N n"]:
+        """Return `errors` in some frames."""
+        # delta_i = y_i - y_0 (theory page), which V and the certified set are written in.
+        y = self.states[frames] - self.offsets
+        return y - y[:, self.nearest]
+
+    def goals(self: _Frames, frames: _Some = slice(None)) -> Float[Array, "F N n"]:
+        """Return the states that the agents would have without errors, in some frames."""
+        return self.states[frames] - self.deviations(frames)
+
+    def goal_distances(self: _Frames, frames: _Some = slice(None)) -> Float[Array, "F N"]:
+        """Return `formation_errors` in some frames."""
         # Where a square overflows, the length is infinite.
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.linalg.norm(self.errors[:, :, list(self.measured)], axis=2)
+            return np.linalg.norm(self.deviations(frames)[:, :, list(self.measured)], axis=2)
 
-    def least_distances(
-        self: _Frames, frames: slice | Array = slice(None)
-    ) -> Float[Array, " F"] | None:
+    def least_distances(self: _Frames, frames: _Some = slice(None)) -> Float[Array, " F"] | None:
         """Return the smallest distance between two agents in frames, NaN if one is not finite.
 
         None without a position.

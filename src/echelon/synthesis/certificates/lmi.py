@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.fft
 import scipy.linalg
 
 from echelon.core.errors import GainError, MissingExtraError, listing
@@ -309,6 +308,9 @@ def _gaps(cp: Any, slopes: list[Array], x: Any) -> list[Any]:
     An unknown that enters few rows of many cones is eliminated first by the solver, which fills its
     matrix: unturned, 60 vertices of 12 states take ten times as long.
     """
+    # Here, since it takes long to load.
+    import scipy.fft
+
     turns = [np.asarray(scipy.fft.dct(np.eye(X.shape[1]), norm="ortho")) for X in slopes]
     return [_matrix(cp, U @ X @ U.T, x) for U, X in zip(turns, slopes, strict=True)]
 
