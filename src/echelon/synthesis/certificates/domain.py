@@ -82,8 +82,11 @@ class Domain:
             self.input_lower, self.input_upper, (count, len(self.input_lower))
         )
 
-    def in_words(self, model: ControlAffine) -> str:
-        """Return the bounds as text, deviations from the trim."""
+    def in_words(self, model: ControlAffine, varying: Array | None = None) -> str:
+        """Return the bounds as text, deviations from the trim.
+
+        Inputs (m,) whose column of g is `varying` are named without a bound too.
+        """
         names = (*model.state_names, *model.input_names)
         lower = np.concatenate([self.lower, self.input_lower])
         upper = np.concatenate([self.upper, self.input_upper])
@@ -92,6 +95,9 @@ class Domain:
             for name, low, high in zip(names, lower, upper, strict=True)
             if np.isfinite([low, high]).all() and low < high
         ]
+        if varying is not None:
+            held = varying & (self.input_lower == self.input_upper)
+            named += [f"{model.input_names[k]} at its trim" for k in np.flatnonzero(held)]
         return ", ".join(named) or "all states"
 
     def __eq__(self, other: object) -> bool:
