@@ -50,6 +50,7 @@ class Lyapunov(NamedTuple):
         """Return where V increases to the next frame by more than rounding."""
         return rises(self.value[:-1], self.value[1:], self.rounding)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def forbidden(self) -> Array:
         """Return (T,) booleans: where V increases over a step although theory excludes it.
 
@@ -64,6 +65,7 @@ class Lyapunov(NamedTuple):
         return falls & (self.drift_after <= slack) & increases
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def rises(
     before: Float[Array, " T"], after: Float[Array, " T"], rounding: float | None = None
 ) -> Bool[Array, " T"]:

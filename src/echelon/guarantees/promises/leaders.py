@@ -126,7 +126,8 @@ def apart(parts: Parts, settings: Settings, starts: Array) -> Apart:
     paths = own_paths(parts, settings, starts)
     paths = starts[None] if paths is None else paths
     gaps = paths[..., list(measured_states(parts.model))]
-    gaps = np.linalg.norm(gaps - gaps[:, :1], axis=2)
+    with np.errstate(over="ignore", invalid="ignore"):
+        gaps = np.linalg.norm(gaps - gaps[:, :1], axis=2)
     k = int(gaps.max(axis=0).argmax())
     start, *_, end = np.append(gaps[:1, k], gaps[:, k])
     return Apart(parts.graph.leaders[k], float(start), float(end), float(gaps[:, k].max()))
