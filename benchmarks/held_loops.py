@@ -1,4 +1,4 @@
-"""Linear loops in NumPy alone: held steps, modes and delays, which what is guaranteed must match."""
+"""Linear loops in NumPy alone: held steps, modes and delays, with which guarantees must agree."""
 
 import itertools
 

@@ -1,10 +1,10 @@
 """A zoo of awkward agents, each promised something or refused: no promise may be false.
 
 Run `python benchmarks/zoo.py` (2,000 specimens) or `--specimens 100`; `--family NAME` draws those
-that aim at one rule, of `zoo_linear.py`, `zoo_models.py` and `zoo_subclasses.py`. A specimen is written once,
-for any array module, so that NumPy flies what JAX promises of, from the edge of what is promised,
-by an integrator that is not the engine's. The other fault is counted too: what in truth holds and
-is refused, since silence is no honesty.
+that aim at one rule, of the other files `zoo_*.py`. A specimen is written once, for any array
+module, so that NumPy flies what JAX promises of, from the edge of what is promised, by an
+integrator that is not the engine's. The other fault is counted too: what in truth holds and is
+refused, since silence is no honesty.
 """
 
 import argparse
@@ -19,8 +19,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from zoo_changes import CHANGED
 from zoo_linear import LINEAR, Family, Finding
 from zoo_models import MODELS
+from zoo_paths import PATHS
 from zoo_subclasses import SUBCLASSES
 
 import echelon as ech
@@ -373,7 +375,7 @@ def violations(
         return  # what is promised is within the limits
     v, other = (np.einsum("tsia,ab,tsib->ts", e, flight.P, e) for e in (fine, rough))
     times = np.linspace(0.0, horizon, len(v))[:, None]
-    if promise.region.theorem is Theorem.A5:
+    if promise.theorem is Theorem.A5:
         bound = v[0] * flight_spread(flight, specimen)
     else:
         bound = v[0] * np.exp(-2.0 * rate * times)
@@ -429,7 +431,7 @@ def _task(pair: tuple[int, int]) -> dict[str, Any]:
 # ---- families that aim at one rule each ---------------------------------------------------------
 
 
-FAMILIES: dict[str, Family] = {**LINEAR, **MODELS, **SUBCLASSES}
+FAMILIES: dict[str, Family] = {**LINEAR, **CHANGED, **MODELS, **PATHS, **SUBCLASSES}
 
 
 def judge(family: str, seed: int, number: int) -> Finding:
@@ -464,7 +466,7 @@ def family_summary(findings: list[Finding]) -> dict[str, Any]:
 
 def main() -> None:
     """Study the specimens, or a family, and write the report."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--specimens", type=int, default=2000, help="how many")
     parser.add_argument("--family", choices=[*FAMILIES, ""], default="", help="of one family")
     parser.add_argument("--seed", type=int, default=0, help="of the specimens")

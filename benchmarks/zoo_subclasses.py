@@ -43,7 +43,7 @@ CHANGES = (
 )
 
 
-def changed(base: type, change: str, rng: np.random.Generator) -> ech.ControlAffine:
+def changed(base: Any, change: str, rng: np.random.Generator) -> Any:
     """Return an agent of a subclass that changes one thing."""
     size, n = float(rng.uniform(0.2, 3.0)), len(base().state_names)
     m, trim = len(base().input_names), [np.asarray(part, float) for part in base().trim]
