@@ -1,9 +1,11 @@
 """Exit codes of commands: one for each ending, with one sentence, never a bare traceback."""
 
+import io
 import json
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 from runs import simulate
 
 import echelon as ech
-from echelon.apps.cli import crash
+from echelon.apps.cli import crash, streams
 from echelon.core.errors import Outcome
 
 LEAVES = """
@@ -98,6 +100,32 @@ def test_details_that_no_disk_takes_are_shown(monkeypatch, capsys):
 def started(*arguments, **options):
     command = [sys.executable, "-m", "echelon", *arguments]
     return subprocess.Popen(command, text=True, **options)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_shows_that_the_program_runs_until_it_says_something(monkeypatch):
+    monkeypatch.setattr(streams, "_SOON", 0.01)
+    for screen, expected in (
+        (Terminal(), "echelon: loading ...\r\x1b[Kfirst\nsecond\n"),
+        (io.StringIO(), "first\nsecond\n"),
+    ):
+        monkeypatch.setattr(sys, "stderr", screen)
+        with streams.outlive_readers():
+            deadline = time.monotonic() + 10.0
+            while not screen.getvalue() and screen.isatty() and time.monotonic() < deadline:
+                time.sleep(0.01)
+            print("first", file=sys.stderr)
+            print("second", file=sys.stderr)
+        assert screen.getvalue() == expected
+    monkeypatch.setattr(streams, "_SOON", 60.0)
+    monkeypatch.setattr(sys, "stderr", quick := Terminal())
+    with streams.outlive_readers():
+        print("at once", file=sys.stderr)
+    assert quick.getvalue() == "at once\n"
 
 
 def test_a_screen_that_takes_no_more_is_told():

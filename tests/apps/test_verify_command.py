@@ -9,6 +9,7 @@ import xarray as xr
 from runs import OWN_PENDULUM
 
 import echelon as ech
+from echelon.experiments.scenario.scenario import bundled_scenarios
 
 SMALL = """
 name: small
@@ -184,6 +185,11 @@ FORGED = {
         in_data(promise=lambda text: text.replace('"rate": ', '"rate": 1')),
         1,
     ),
+    "the data's scenario twice": (
+        "alone",
+        in_data(scenario_text=lambda text: text + "seed: 0\nseed: 1\n"),
+        1,
+    ),
     "the data's graph": (
         "alone",
         in_data(scenario_text=lambda text: text.replace("agents: 4", "agents: 400")),
@@ -201,6 +207,16 @@ def test_no_forged_folder_is_verified(runs, echelon, here, what):
     assert found == code, out + err
     assert ("Verified" in out) is (code == 0) and ("Refused: " in out) is (code == 1)
     assert err.count("\n") == (code == 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", bundled_scenarios())
+def test_a_run_of_every_bundled_scenario_is_verified(echelon, here, name):
+    short = "simulation.horizon=0.5"
+    assert echelon("run", name, "--set", short, "--no-figures", "--out", "run")[0] == 0
+    code, out, _ = echelon("verify", "run")
+    assert code == 0, out
+    assert max(map(len, out.splitlines())) <= 80
 
 
 def test_what_another_version_made_is_refused_with_a_hint(runs, echelon, here):

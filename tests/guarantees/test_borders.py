@@ -10,8 +10,9 @@ import scipy.linalg
 
 import echelon as ech
 from echelon.agents.models.chains import chains_of
-from echelon.agents.models.model import FlatBound, FlatChains
+from echelon.agents.models.model import FlatBound, FlatChains, Flattened
 from echelon.core.errors import EchelonError
+from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.promise import promise
 from echelon.guarantees.stopping.chain_clearance import length_clearance_of
@@ -362,3 +363,88 @@ class Renamed(ech.models.Unicycle):
 )
 def test_a_word_on_borders_is_of_the_motion_that_it_was_given_with(model, known):
     assert (bounds_of(model, chains_of(model)) is not None) == known
+
+
+# ---- what a model declares, against its equations ------------------------------------------------
+
+
+class Sailing(ech.ControlAffine):
+    """A boat whose sail answers to where it is: x' = v - sin x."""
+
+    state_names, input_names = ("x", "v"), ("u",)
+    flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
+
+    def drift(self, x):
+        return jnp.stack([x[1] - jnp.sin(x[0]), jnp.zeros_like(x[0])])
+
+    def input_map(self, x):
+        return jnp.array([[0.0], [1.0]])
+
+
+class Located(Sailing):
+    """The same whose errors are those of its place."""
+
+    position = ("x",)
+
+
+class Hundredth(ech.models.DoubleIntegrator):
+    """A double integrator whose outputs are in hundreds of metres."""
+
+    flat_chains, flat_bounds = FlatChains((2, 2), (0, 0)), ()
+
+    def output(self, x):
+        return x[:2] / 100.0
+
+
+def afloat(model, **offsets):
+    drive = ech.Laws(StoppingLeader(), StoppingPoint())
+    goals = np.zeros((4, len(model.state_names)))
+    for k, name in enumerate(model.state_names):
+        goals[:, k] = np.arange(4.0) * offsets.get(name, 0.0)
+    initial = dict.fromkeys(model.state_names[:1], 1.0)
+    return ech.Parts(model, TREE, ech.Formation(goals), drive, initial=initial)
+
+
+def test_offsets_of_outputs_that_other_states_answer_to_are_not_kept():
+    # At rest v = sin x, so that boats at other places have other v for ever.
+    parts = afloat(Sailing(), x=1.0)
+    result = ech.simulate(parts, ech.Settings(horizon=6.0, dt=0.01))
+    errors = np.abs(result.states[-1] - parts.formation.offsets)
+    assert errors[:, 0].max() <= 1e-6 and errors[:, 1].max() > 0.5
+    assert "differ in other states" in promised(parts).hypotheses[Hypothesis.SYMMETRY].text
+    assert not promised(parts).promised and promised(afloat(Sailing())).promised
+    assert promised(afloat(Located(), x=1.0)).promised
+
+
+def test_a_time_within_1_cm_is_of_positions_that_are_outputs_in_metres():
+    assert promised(afloat(Located())).tube.arrival is not None
+    found = promised(afloat(Hundredth(2)))
+    assert found.promised and found.tube.arrival is None
+    assert not promised(afloat(Hundredth(2), x=1.0)).promised
+
+
+def test_declared_chains_hold_all_states():
+    class Adrift(Sailing):
+        state_names = ("x", "v", "w")
+        flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
+
+    with pytest.raises(EchelonError, match="2 integrators in all, and must be 1 chains, .* with 3"):
+        StoppingPoint().prepared(Adrift(), TREE)
+
+
+@pytest.mark.parametrize("drag", [0.0, 0.5])
+def test_declared_coordinates_change_as_the_equations_say(drag):
+    class Mapped(Swing):
+        flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
+
+        def drift(self, x):
+            return jnp.stack([x[1], -drag * x[1]])
+
+        def flatten(self, x, e):
+            return Flattened(x[:, None], lambda tops: tops / 2.0)
+
+    if drag == 0.0:
+        assert StoppingPoint().prepared(Mapped(), TREE).ready.chains.degrees == (2,)
+        return
+    with pytest.raises(EchelonError, match="`flatten` of `Mapped` is not of its motion"):
+        StoppingPoint().prepared(Mapped(), TREE)

@@ -13,6 +13,7 @@ from echelon.core.enclosure.over_time import enclose_derivatives
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
 from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.stopping.path_bounds import pieces_of
 from echelon.guarantees.stopping.path_smoothness import path_fault
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 
@@ -125,11 +126,44 @@ def test_waypoints_fit_together_as_their_class_says():
             ]
             assert np.allclose(*sides, atol=1e-5)
 
+    # Its parts are the path, whatever the run's length.
+    for horizon in (1.0, 4.0, 9.0):
+        begin, parts = 0.0, path.parts(horizon)
+        assert parts[-1][0] == horizon
+        with precision("float64"):
+            for end, part in parts:
+                for t in map(jnp.asarray, np.linspace(begin, end, 5)):
+                    assert np.allclose(part(t), path(t), rtol=0.0, atol=1e-12)
+                begin = end
+
     class Cut(ech.references.Waypoints):
         def __call__(self, t):
             return jnp.where(t < 1.0, 1.0, 2.0) * super().__call__(t)
 
     assert "bounded derivatives" in path_fault(Cut(times, points), chains_of(MODEL), 10.0)
+
+
+@pytest.mark.parametrize("horizon", [60.0, 1e5])
+def test_the_bounds_of_a_path_hold_between_samples_however_long_it_is(horizon):
+    # A moment in a long rest, which no sample of a run of a day would meet.
+    times, heights = [0.0, 20.0, 20.7, 21.4, 22.1, 40.0], [1.0, 1.0, 1.2, 1.0, 1.1, 1.0]
+    path = ech.references.Waypoints(times, [(0.0, 0.0, z) for z in heights])
+    pieces = pieces_of(leader_on(path), ech.models.Quadrotor(), horizon, ("z",), 2)
+    with precision("float64"):
+        clock = jnp.linspace(0.0, 40.0, 4001)
+        every = np.asarray(jax.vmap(lambda t: path.derivatives(t, 2, ("z",)))(clock))[:, :, 0]
+    for order in range(3):
+        low = float(min(rows[order][0].lo for rows in pieces.values))
+        high = float(max(rows[order][0].hi for rows in pieces.values))
+        size = np.ptp(every[:, order])
+        assert low <= every[:, order].min() <= low + 0.1 * size
+        assert high - 0.1 * size <= every[:, order].max() <= high
+    assert float(pieces.times[-1]) == horizon
+
+
+def leader_on(path):
+    """A leader under the law, prepared for a quadrotor."""
+    return StoppingLeader(reference=path).prepared(ech.models.Quadrotor(), ech.Graph([(0, 1)]))
 
 
 def test_derivatives_of_another_making_are_not_those_of_the_path():

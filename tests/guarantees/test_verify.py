@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forgeries import forged
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -162,6 +163,49 @@ def test_a_proof_that_holds_is_found_again_at_its_rate_and_not_far_above(files):
     assert first_unproved(*parts, region["rate"] * (1.0 + 1e-4)) is not None
 
 
+SAME = {
+    "model.parameters": "a parameter left out is its default; C is of outputs, which no gain reads",
+    "graph.leaders": "a leader twice",
+    "graph.edges": "another order",
+    "graph": "older files leave out what is false, and sums that are all 1",
+    "P": "an entry that B'P does not read: the claims hold of the other P too",
+    "inner": "an axis that is not the slowest: the claims hold of the other loop too",
+    "certificate.edge": "a larger one, which holds",
+    "certificate.region.domain.input": "inputs of which nothing depends",
+    "certificate.region.hull": "a corner twice, another order, an entry that corners replace",
+    "certificate.region.error": "another order of equal rows",
+}
+"""Places of a gain file where a change may leave all claims true, and why."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*FAST[:3], "riccati, pendulum"])
+def test_a_forged_field_of_a_gain_is_accepted_only_where_all_stays_true(name, tmp_path):
+    told, model = STUDY.saved(STUDY.SMALL[name], tmp_path), STUDY.own_model(STUDY.SMALL[name])
+    cases = [(what, false) for what, false in forged(told) if isinstance(false, dict)]
+    passed = [what for what, false in cases if accepted(false, tmp_path, model)]
+    odd = [what for what in passed if not what.startswith(tuple(SAME))]
+    assert len(cases) > 300 and odd == []
+    print(f"{name}: {len(cases)} forged, {len(passed)} of them say the same in another way")
+
+
+def accepted(told, folder, model):
+    (folder / "forged.json").write_text(json.dumps(told))
+    try:
+        return ech.verify(folder / "forged.json", model).holds
+    except ech.EchelonError:
+        return False
+
+
+def test_a_method_of_ones_own_is_open(files, tmp_path):
+    file = tmp_path / "gain.json"
+    file.write_text(json.dumps(files["contraction, pendulum, proof"] | {"method": "contraction."}))
+    found = ech.verify(file)
+    assert found.verdict == "incomplete" and [x.claim for x in found.findings if x.open] == [
+        "method"
+    ]
+
+
 # ---- bad input ----
 
 BROKEN = {
@@ -172,6 +216,12 @@ BROKEN = {
     "`Infinity` is not a finite number": lambda told: told | {"coupling": float("inf")},
     "`R` must be 1 x 1 finite numbers": lambda told: told | {"R": [["1.0"]]},
     "`coupling` must be a finite number (to 1e50)": lambda told: told | {"coupling": 1e60},
+    "`graph.directed` must be true or false": lambda told: (
+        told | {"graph": told["graph"] | {"directed": "false"}}
+    ),
+    "`model.parameters` must not hold numbers as text": lambda told: (
+        told | {"model": told["model"] | {"parameters": {"damping": "0.5"}}}
+    ),
     "`promise` is unknown": lambda told: told | {"promise": {"anywhere": {}}},
     "`coupl\\u0456ng` is unknown": lambda told: told | {"coupl\u0456ng": 1e9},
     "`certificate.region.hull.theorem` is unknown": lambda told: changed(

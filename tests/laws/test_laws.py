@@ -349,7 +349,7 @@ def test_a_domain_of_half_a_turn_is_refused_where_differences_wind():
         Domain.about(QUAD, {"yaw": 1.6})
     assert str(caught.value) == (
         "the domain of `yaw` is 3.2 wide, and `Quadrotor` takes differences of it the shorter way "
-        "round; allowed is less than half a turn in all."
+        "round; allowed is less than 3.142 in all."
     )
     Domain.about(QUAD, {"yaw": 1.5, "attitude": 0.5})
 

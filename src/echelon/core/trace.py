@@ -1,5 +1,6 @@
 """Checks of user functions by a JAX trace: shapes, types, casts and frozen values."""
 
+import hashlib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
@@ -44,6 +45,21 @@ def trace(function: Callable[..., PyTree], *arguments: PyTree) -> Trace:
         any(rounds for _, _, rounds in steps),
         [step[:2] for step in steps] != [step[:2] for step in _steps(once()[0])],
     )
+
+
+def trace_digest(function: Callable[..., PyTree], *arguments: PyTree) -> bytes:
+    """Return a digest of what a function computes at arguments of these shapes.
+
+    It is of the equations and the bits of all constants, so that it changes with whatever the
+    function reads, a number of its module too.
+
+    Raises:
+        Exception: whatever the function raises.
+    """
+    jaxpr = jax.make_jaxpr(lambda *a: function(*a))(*arguments)
+    numbers = (number for _, numbers, _ in _steps(jaxpr) for number in numbers)
+    parts = [str(jaxpr).encode(), *numbers]
+    return hashlib.sha256(b"".join(b"%d:" % len(part) + part for part in parts)).digest()
 
 
 def _steps(jaxpr: Jaxpr | ClosedJaxpr) -> Iterator[tuple[str, list[bytes], bool]]:

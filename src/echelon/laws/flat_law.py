@@ -14,7 +14,7 @@ from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ModelError, listing
 from echelon.core.types import Array, Input, State
-from echelon.laws.flat_loop import FlatLoop, FlatMemory
+from echelon.laws.flat_loop import FlatLoop, FlatMemory, Observer
 from echelon.laws.law import Law, LocalView
 
 Speed: TypeAlias = float | tuple[float, ...]
@@ -53,7 +53,8 @@ class FlatLaw(Law):
         coupling: c > 0.
         speed: s, of all outputs or one each, in their units per second; infinite is linear. By
             default what the model's bounds allow, computed by `prepared`.
-        observer: whether the acceleration that the model lacks is estimated and compensated.
+        observer: of the acceleration that the model lacks, which is compensated; True for the
+            default one, False for none.
         loop: of the model; computed by `prepared`.
     """
 
@@ -61,7 +62,7 @@ class FlatLaw(Law):
     rate: float | None = eqx.field(default=None, static=True)
     coupling: float | None = None
     speed: Speed | None = eqx.field(default=None, converter=plain_speeds)
-    observer: bool = eqx.field(default=True, static=True)
+    observer: Observer = eqx.field(default=Observer(), static=True, converter=Observer.of)
     loop: FlatLoop | None = None
 
     def __check_init__(self) -> None:
@@ -145,7 +146,7 @@ class FlatLaw(Law):
                 f"`speed` has {len(self.speed)} numbers, and must be one, or one for each of "
                 f"{listing(chains.outputs)}."
             )
-        return FlatLoop.of(chains, self.roots_for(needed), self.observer)
+        return FlatLoop.of(model, chains, self.roots_for(needed), self.observer)
 
     def speeds_within(
         self,

@@ -4,8 +4,9 @@ In flat coordinates q(D) y' = k0 zeta', where zeta = q(D) y / k0 is where the ag
 rest without messages (theory page, T5). Integrators before inputs are part of the loop's memory.
 """
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple, final
 
 import equinox as eqx
@@ -15,10 +16,59 @@ import numpy as np
 
 from echelon.agents.models.chains import Chains, flat_output, flatten
 from echelon.agents.models.model import ControlAffine
+from echelon.core.errors import LawError
 from echelon.core.types import Array, Input, Scalar, State
 
-_OBSERVER = (16.0, 64.0)
-"""Of the observer, 1/s and 1/s^2: both its modes at 8 1/s, twice as fast as a quick inner loop."""
+_LEAST_THRUST = 0.3
+"""Of the thrust at rest; below it the thrust scale changes no faster."""
+_SCALES = (0.5, 2.0)
+"""Between which the thrust scale is searched."""
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Observer:
+    """An estimate of what the model lacks, from an agent's own motion alone.
+
+    Args:
+        push: bandwidth of the estimated acceleration, 1/s: both modes of the observer are there; 0
+            for no observer.
+        scale: rate, 1/s, at which a push along the thrust is ascribed to the thrust: to an agent
+            that is heavier, or motors that are weaker, than the model has it; 0 for never.
+
+    Raises:
+        LawError: a number is not finite, or negative; or a scale without a push.
+    """
+
+    push: float = 8.0
+    scale: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check both numbers."""
+        for name in ("push", "scale"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not (0.0 <= value < math.inf):
+                raise LawError(
+                    f"`{name}` of the observer is {value}, and must be finite and not negative."
+                )
+        if self.scale and not self.push:
+            raise LawError("`scale` of the observer needs its `push`, which is 0.")
+
+    def __bool__(self) -> bool:
+        """Tell whether there is one."""
+        return self.push > 0.0
+
+    @classmethod
+    def of(cls, choice: "bool | Mapping[str, float] | Observer") -> "Observer":
+        """Return the observer of a choice: yes, no, or its numbers."""
+        if isinstance(choice, Observer):
+            return choice
+        return cls(**choice) if isinstance(choice, Mapping) else cls(cls().push * bool(choice))
+
+    @property
+    def gains(self) -> tuple[float, float]:
+        """2 L and L^2, 1/s and 1/s^2, of the bandwidth L."""
+        return 2.0 * self.push, self.push**2
 
 
 class FlatMemory(NamedTuple):
@@ -31,6 +81,7 @@ class FlatMemory(NamedTuple):
         base, push: of the observer (m,): the speed that the model predicts but for the last half
             step, and the acceleration that the model lacks.
         half: half of the step before, s; 0 at first.
+        scale: of the observer: the thrust relative to the model's; None where it is not estimated.
     """
 
     chain: jax.Array
@@ -39,6 +90,7 @@ class FlatMemory(NamedTuple):
     base: jax.Array
     push: jax.Array
     half: jax.Array
+    scale: jax.Array | None = None
 
 
 @final
@@ -49,35 +101,46 @@ class FlatLoop(eqx.Module):
         chains: of the model.
         weights: (r, m) k_l / k0 of each output, zero beyond its q.
         stiffness: (m,) k0.
-        observer: whether the acceleration that the model lacks is estimated and compensated.
+        observer: of the acceleration that the model lacks, which is compensated.
+        thrust: the number of the input whose scale is estimated; None for none.
     """
 
     chains: Chains = eqx.field(static=True)
     weights: Array
     stiffness: Array
-    observer: bool = eqx.field(static=True)
+    observer: Observer = eqx.field(static=True)
+    thrust: int | None = eqx.field(static=True, default=None)
 
     @classmethod
-    def of(cls, chains: Chains, roots: tuple[float, ...], observer: bool) -> "FlatLoop":
-        """Return the loop with the poles -roots; a shorter chain takes the first of them."""
+    def of(
+        cls, model: ControlAffine, chains: Chains, roots: tuple[float, ...], observer: Observer
+    ) -> "FlatLoop":
+        """Return the loop with the poles -roots; a shorter chain takes the first of them.
+
+        Raises:
+            LawError: the scale of the thrust is to be estimated, and the model has none.
+        """
         r, m = max(chains.degrees), len(chains.degrees)
         weights, stiffness = np.zeros((r, m)), np.ones(m)
         for k, degree in enumerate(chains.degrees):
             q = np.atleast_1d(np.poly(-np.array(roots[: degree - 1])))[::-1]
             weights[:degree, k], stiffness[k] = q / q[0], q[0]
-        return cls(chains, weights, stiffness, observer)
+        thrust = thrust_of(model, chains) if observer.scale else None
+        return cls(chains, weights, stiffness, observer, thrust)
 
     # ---- memory ----
 
     def zero_memory(self) -> FlatMemory:
         """Return a memory of zeros."""
         zero = jnp.zeros(len(self.stiffness))
-        return FlatMemory(jnp.zeros(self.chains.size), zero, zero, zero, zero, jnp.zeros(()))
+        scale = None if self.thrust is None else jnp.ones(())
+        return FlatMemory(jnp.zeros(self.chains.size), zero, zero, zero, zero, jnp.zeros(()), scale)
 
     def initial_memory(self, model: ControlAffine, x: State, chain: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x, with an exact model."""
         zero = jnp.zeros(len(self.stiffness), x.dtype)
-        memory = FlatMemory(chain, zero, zero, zero, zero, jnp.zeros((), x.dtype))
+        scale = None if self.thrust is None else jnp.ones((), x.dtype)
+        memory = FlatMemory(chain, zero, zero, zero, zero, jnp.zeros((), x.dtype), scale)
         return memory._replace(base=self._observed(model, x, memory.delivered)[0])
 
     # ---- coordinates ----
@@ -129,7 +192,8 @@ class FlatLoop(eqx.Module):
             tops = tops - jnp.where(degrees <= 2, memory.push, 0.0)
         w = flat.invert(tops)
         chain, mean = self._integrate(memory.chain, w, period)
-        return model.physical(mean), memory._replace(chain=chain, rate=rate)
+        command = self._scaled(model, mean, None if memory.scale is None else 1.0 / memory.scale)
+        return model.physical(command), memory._replace(chain=chain, rate=rate)
 
     def _integrate(self, e: jax.Array, w: Input, period: Scalar | float) -> tuple[jax.Array, Input]:
         """Return the integrators after a hold, and the mean (m,) of their outputs during it."""
@@ -151,9 +215,10 @@ class FlatLoop(eqx.Module):
         period: Scalar | float,
     ) -> FlatMemory:
         """Return the memory after the actuators delivered `delivered` of the `desired` input."""
-        v = model.normalized(delivered)
+        v = self._scaled(model, model.normalized(delivered), memory.scale)
         # An integrator that continues while an actuator is at its limit would wind up.
-        shortfall = jnp.where(delivered == desired, 0.0, v - model.normalized(desired))
+        asked = self._scaled(model, model.normalized(desired), memory.scale)
+        shortfall = jnp.where(delivered == desired, 0.0, v - asked)
         first = [(at[0], k) for k, at in enumerate(self.chains.indices) if at]
         chain = memory.chain
         for place, k in first:
@@ -163,11 +228,43 @@ class FlatLoop(eqx.Module):
         speed, pull = self._observed(model, x, v)
         error = self._speed_error(model, x, memory)
         half = 0.5 * period
-        base = speed - error + half * pull + period * (memory.push + _OBSERVER[0] * error)
-        push = memory.push + period * _OBSERVER[1] * error
-        return FlatMemory(chain, memory.rate, v, base, push, half + 0.0 * error[0])
+        first, second = self.observer.gains
+        base = speed - error + half * pull + period * (memory.push + first * error)
+        push = memory.push + period * second * error
+        after = FlatMemory(chain, memory.rate, v, base, push, half + 0.0 * error[0], memory.scale)
+        return after if self.thrust is None else self._ascribe(model, x, pull, period, after)
 
     # ---- the observer ----
+
+    def _scaled(self, model: ControlAffine, v: Input, scale: jax.Array | None) -> Input:
+        """Return normalized inputs with the whole thrust, that at rest included, times a scale."""
+        if scale is None or self.thrust is None:
+            return v
+        rest = _at_rest(model, v)[self.thrust]
+        return v.at[self.thrust].set(scale * (v[self.thrust] + rest) - rest)
+
+    def _ascribe(
+        self,
+        model: ControlAffine,
+        x: State,
+        pull: jax.Array,
+        period: Scalar | float,
+        memory: FlatMemory,
+    ) -> FlatMemory:
+        """Return the memory with a part of the push along the thrust ascribed to its scale.
+
+        Their sum stays: the scale times the thrust, and the push, do not jump.
+        """
+        assert self.thrust is not None and memory.scale is not None
+        v, rest = memory.delivered, _at_rest(model, memory.delivered)[self.thrust]
+        # What one more unit of thrust adds to y'': inputs enter affinely.
+        along = self._observed(model, x, v.at[self.thrust].add(1.0))[1] - pull
+        thrust = (v[self.thrust] + rest) / memory.scale
+        size = jnp.maximum(jnp.abs(thrust), _LEAST_THRUST * jnp.abs(rest))
+        rate = self.observer.scale * (along @ memory.push) * thrust / size**2
+        scale = jnp.clip(memory.scale + period * rate, *_SCALES)
+        push = memory.push - (scale - memory.scale) * thrust * along
+        return memory._replace(scale=scale, push=push)
 
     def _speed_error(self, model: ControlAffine, x: State, memory: FlatMemory) -> jax.Array:
         """Return the speed less what the model and the estimate predict, (m,)."""
@@ -177,7 +274,7 @@ class FlatLoop(eqx.Module):
 
     def _push_rate(self, model: ControlAffine, x: State, memory: FlatMemory) -> jax.Array:
         """Return the rate of the estimated push, (m,)."""
-        return _OBSERVER[1] * self._speed_error(model, x, memory)
+        return self.observer.gains[1] * self._speed_error(model, x, memory)
 
     def _observed(self, model: ControlAffine, x: State, v: Input) -> tuple[jax.Array, jax.Array]:
         """Return what the observer measures of each output, and its rate under an input v, (m,).
@@ -206,3 +303,25 @@ def _moved(tower: Sequence[jax.Array], period: Scalar | float, more: int) -> jax
     for i, y in enumerate(tower):
         total = total + y * (period**i / math.factorial(i + more))
     return total
+
+
+def _at_rest(model: ControlAffine, v: Input) -> Input:
+    """Return the normalized inputs at the trim, S^-1 u*."""
+    trim = jnp.asarray(model.trim[1], v.dtype)
+    return model.normalized(2.0 * trim)
+
+
+def thrust_of(model: ControlAffine, chains: Chains) -> int:
+    """Return the number of the input whose scale can be estimated: what holds an agent at rest.
+
+    Raises:
+        LawError: no input acts at rest.
+    """
+    trim = np.asarray(model.trim[1], float)
+    acting = [k for k in np.flatnonzero(trim).tolist() if chains.integrators[k]]
+    if not acting:
+        raise LawError(
+            f"got `scale` of the observer, but no input of `{type(model).__name__}` holds it at "
+            "rest, whose scale could be estimated; set it to 0."
+        )
+    return acting[0]

@@ -27,6 +27,8 @@ from echelon.core.types import Array, Input, State
 _SAMPLES = 16
 _RANK = 1e-8
 """Relative threshold of singular values and derivatives; what is smaller is rounding."""
+_MATCHED = 1e-6
+"""Relative; what rounding leaves between rates and what they are stated to be."""
 _MAX_INTEGRATORS = 4
 _MAX_CHOICES = 20
 """How many sets of outputs are tried."""
@@ -207,11 +209,15 @@ def chains_of(model: ControlAffine) -> Chains:
     """Return the chains of a model, as it states them or as computed at samples.
 
     Raises:
-        ModelError: no chains were found; the message names the condition that fails.
+        ModelError: no chains were found, and the message names the condition that fails; or what
+            the model declares of them does not fit its equations.
     """
     if model.flat_chains is not None:
         outputs = model.flat_outputs or model.output_names[: len(model.input_names)]
-        return Chains(tuple(outputs), *model.flat_chains, declared_of(model))
+        chains = Chains(tuple(outputs), *model.flat_chains, declared_of(model))
+        _check_size(model, chains)
+        _check_map(model, chains)
+        return chains
     with precision("float64"):
         failures = list[str]()
         for outputs in _candidates(model):
@@ -223,6 +229,49 @@ def chains_of(model: ControlAffine) -> Chains:
         f"`{type(model).__name__}` is not linearized by feedback, which the law `stopping-point` "
         f"needs: {failures[0]}; use `consensus`, or add suitable `flat_outputs` to the model."
     )
+
+
+def _check_size(model: ControlAffine, chains: Chains) -> None:
+    """Check that declared chains hold all states, so that no dynamics remain hidden."""
+    n, m = len(model.state_names) + chains.size, len(model.input_names)
+    each = {len(chains.outputs), len(chains.degrees), len(chains.integrators)}
+    if each != {m} or sum(chains.degrees) != n:
+        raise ModelError(
+            f"`flat_chains` of `{type(model).__name__}` are {listing(chains.outputs)} with "
+            f"{sum(chains.degrees)} integrators in all, and must be {m} chains, one for each "
+            f"input, with {n}: the states and the integrators before inputs."
+        )
+
+
+def _check_map(model: ControlAffine, chains: Chains) -> None:
+    """Check at samples that coordinates by a user's `flatten` are rates of each other."""
+    owner = next(kind for kind in type(model).__mro__ if "flatten" in vars(kind))
+    if "flatten" not in chains.declared or owner.__module__.startswith("echelon."):
+        return
+    n, m, draw = len(model.state_names), len(chains.outputs), np.random.default_rng(0)
+    x = np.asarray(model.trim[0], float) + draw.uniform(-0.5, 0.5, (_SAMPLES, n))
+    e, tops = draw.uniform(0.2, 0.8, (_SAMPLES, chains.size)), draw.normal(size=(_SAMPLES, m))
+    with precision("float64"):
+        moved, stated = jax.jit(jax.vmap(lambda *at: _rates_by_map(model, chains, *at)))(x, e, tops)
+    off = np.abs(np.asarray(moved - stated)).max() / (1.0 + np.abs(np.asarray(moved)).max())
+    if not off <= _MATCHED:
+        raise ModelError(
+            f"`flatten` of `{type(model).__name__}` is not of its motion: its values and what they "
+            f"change by under `invert` differ by {100.0 * float(off):.3g} % at samples."
+        )
+
+
+def _rates_by_map(
+    model: ControlAffine, chains: Chains, x: State, e: jax.Array, tops: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return outputs and the rates of flat coordinates, and the same as `flatten` states them."""
+    last = np.arange(max(chains.degrees))[:, None] == np.array(chains.degrees) - 1
+    w = model.flatten(x, e).invert(tops)  # pyright: ignore
+    field = model.velocity(x, model.physical(chains.acting_input(e, w))), chains.rate(e, w)
+    values, rates = jax.jvp(lambda x, e: model.flatten(x, e).values, (x, e), field)  # pyright: ignore
+    after = jnp.where(last, tops, jnp.concatenate([values[1:], 0.0 * values[:1]]))
+    outputs = flat_output(model, chains.outputs, x)
+    return jnp.concatenate([outputs[None], rates]), jnp.concatenate([values[:1], after])
 
 
 def _candidates(model: ControlAffine) -> Iterator[tuple[str, ...]]:

@@ -139,7 +139,9 @@ class Sides(NamedTuple):
         """Return (k, q) whether values differ between the sides at any distance."""
         sizes = np.maximum(np.abs(self.forward), np.abs(self.backward))
         # A jump over a step a hundred times shorter is a slope a hundred times steeper.
-        return np.any((sizes[1::2] > 50.0 * sizes[::2]) & self._seen(sizes[1::2]), axis=0)
+        with np.errstate(over="ignore"):
+            steeper = sizes[1::2] > 50.0 * sizes[::2]
+        return np.any(steeper & self._seen(sizes[1::2]), axis=0)
 
     def _stays(self, away: Array, least: Array) -> Array:
         wide, narrow = np.abs(away[::2]), np.abs(away[1::2])

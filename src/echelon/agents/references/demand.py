@@ -48,6 +48,7 @@ _NEAR = 1e-3
 
 
 @memoize
+@np.errstate(over="ignore", invalid="ignore")
 def reference_demand(
     model: ControlAffine, reference: Guide, horizon: float, samples: int = 1000
 ) -> ReferenceDemand:
@@ -175,4 +176,5 @@ def _motion(model: ControlAffine, x: Array, near: float) -> tuple[float | None, 
         return None, None
     before, now, after = x[..., axes]
     speed, bend = (after - before) / (2.0 * near), (after - 2.0 * now + before) / near**2
-    return tuple(float(np.linalg.norm(part, axis=1).max()) for part in (speed, bend))  # pyright: ignore
+    fastest, most = (float(np.linalg.norm(part, axis=1).max()) for part in (speed, bend))
+    return fastest, most

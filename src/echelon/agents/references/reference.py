@@ -1,7 +1,7 @@
 """The interface of a reference: a smooth path in space with a yaw, as functions of time."""
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar, Protocol
 
 import jax
@@ -26,9 +26,8 @@ _MAX_TIME = 10**9
 class Reference(Guide):
     """A path t -> (x, y, z, yaw), in metres and radians; t in seconds."""
 
-    joined: ClassVar[int | None] = None
-    """How many derivatives are continuous, with one more bounded, of a path that is joined of
-    pieces; None where its equations have none."""
+    joined: ClassVar[int] = 0
+    """How many derivatives are continuous where `parts` meet; one more is bounded."""
 
     @abc.abstractmethod
     def __call__(self, t: Scalar) -> jax.Array:
@@ -46,6 +45,13 @@ class Reference(Guide):
     def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return the state and the input by the model's flatness map."""
         return model.flat(self.derivatives(t, model.flat_order, model.flat_outputs))
+
+    def parts(self, horizon: float) -> Sequence[tuple[float, Callable[[Scalar], jax.Array]]]:
+        """Return the smooth paths that this one is joined of until the horizon, and their ends (s).
+
+        A class that defines parts states how they meet, by `joined`.
+        """
+        return ((horizon, self),)
 
     def heading(self, model: ControlAffine, t: Scalar) -> Scalar:
         """Return the heading (rad) at time t of a model that states one."""

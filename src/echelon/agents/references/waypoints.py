@@ -1,7 +1,8 @@
 """A smooth path through timed points."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -54,15 +55,38 @@ class Waypoints(Reference):
         # At the last knot there is no piece to the right, so the one to its left is used.
         piece = jnp.clip(jnp.searchsorted(knots, inside, side="right") - 1, 0, len(knots) - 2)
         s = inside - knots[piece]
-        value = jnp.zeros(3, t.dtype)
-        # Horner's scheme in the time since the knot: powers of t would lose digits late in a run.
-        for coefficient in jnp.asarray(self.coefficients, t.dtype)[:, piece]:
-            value = value * s + coefficient
-        return in_space(value, self.yaw)
+        return in_space(_horner(jnp.asarray(self.coefficients, t.dtype)[:, piece], s), self.yaw)
+
+    def parts(self, horizon: float) -> Sequence[tuple[float, Callable[[Scalar], jax.Array]]]:
+        """Return the polynomials between the points, and constants before and after."""
+        knots, powers = self.knots.tolist(), np.moveaxis(self.coefficients, 1, 0)
+        last = _horner(self.coefficients[:, -1], knots[-1] - knots[-2])
+
+        def polynomial(k: int) -> Callable[[Scalar], jax.Array]:
+            return lambda t: in_space(_horner(powers[k], t - knots[k]), self.yaw)
+
+        def rest(place: Array) -> Callable[[Scalar], jax.Array]:
+            return lambda t: in_space(jnp.asarray(place, t.dtype), self.yaw)
+
+        every = [(knots[0], rest(powers[0, -1]))]
+        every += [(knots[k + 1], polynomial(k)) for k in range(len(powers))]
+        every += [(math.inf, rest(last))]
+        count = sum(end < horizon for end, _ in every) + 1
+        begun = [(min(end, horizon), path) for end, path in every[:count]]
+        return [(end, path) for end, path in begun if end > 0.0]
 
     def turns(self, model: ControlAffine) -> bool:
         """Tell whether the constant yaw differs from the trim's; a spline has no enclosure."""
         return heading_of(model).state != "yaw" or self.yaw != rest_heading(model)
+
+
+def _horner(coefficients: Array | jax.Array, s: Scalar | float) -> Any:
+    """Return the value of polynomials with coefficients (8, 3), highest power first."""
+    value, *others = coefficients
+    # In the time since the knot: powers of t would lose digits late in a run.
+    for coefficient in others:
+        value = value * s + coefficient
+    return value
 
 
 def _read(times: Sequence[float], points: Sequence[Sequence[float]]) -> tuple[Array, Array]:

@@ -3,11 +3,53 @@
 import contextlib
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from typing import Any, Final, TextIO, final
 
 LEFT: Final = 141
 """Exit code of a success whose output was not read to its end: 128 + SIGPIPE, as in shells."""
+
+
+_LOADING: Final = "echelon: loading ..."
+_ERASE: Final = "\r\x1b[K"
+_SOON: Final = 0.5
+"""Seconds of silence after which a terminal shows that the program runs."""
+
+
+@final
+class Notice:
+    """A line on a terminal that disappears with the first output: libraries take seconds to load.
+
+    Args:
+        terminal: standard error; None, or what is no terminal, gets no line.
+    """
+
+    def __init__(self, terminal: TextIO | None) -> None:
+        """Wait for the first output."""
+        self._terminal, self._shown, self._lock = terminal, False, threading.Lock()
+        self._timer = threading.Timer(_SOON, self._show)
+        self._timer.daemon = True
+        if terminal is not None and terminal.isatty():
+            self._timer.start()
+
+    def _show(self) -> None:
+        with self._lock, contextlib.suppress(OSError):
+            if not self._timer.finished.is_set() and self._terminal is not None:
+                self._shown = True
+                self._terminal.write(_LOADING)
+                self._terminal.flush()
+
+    def end(self) -> None:
+        """Remove the line, or never show it."""
+        if self._timer.finished.is_set() and not self._shown:
+            return
+        self._timer.cancel()
+        with self._lock, contextlib.suppress(OSError):
+            if self._shown and self._terminal is not None:
+                self._shown = False
+                self._terminal.write(_ERASE)
+                self._terminal.flush()
 
 
 @final
@@ -18,8 +60,9 @@ class Stream:
     guaranteed, and a run would end between its report and its files.
     """
 
-    def __init__(self, stream: TextIO | None) -> None:
+    def __init__(self, stream: TextIO | None, notice: Notice) -> None:
         """Wrap a stream; Python gives None for a descriptor that was closed before it started."""
+        self._notice = notice
         self._stream = stream or open(os.devnull, "w")
         self.left = False
 
@@ -28,6 +71,7 @@ class Stream:
 
     def write(self, text: str) -> int:
         """Write text, to the null device if there is no reader, and return its length."""
+        self._notice.end()
         with self._survive():
             self._stream.write(text)
         return len(text)
@@ -56,7 +100,8 @@ def outlive_readers() -> Iterator[None]:
 
     Another exit code is kept, since it is right whether or not the output was read.
     """
-    out, error = Stream(sys.stdout), Stream(sys.stderr)
+    notice = Notice(sys.stderr)
+    out, error = Stream(sys.stdout, notice), Stream(sys.stderr, notice)
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
         try:
             yield
@@ -64,3 +109,5 @@ def outlive_readers() -> Iterator[None]:
             if not left.code and (out.left or error.left):
                 raise SystemExit(LEFT) from None
             raise
+        finally:
+            notice.end()

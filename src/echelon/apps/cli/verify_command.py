@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from echelon.guarantees.verifier.verify import Verification
     from echelon.output.archive.open_folder import ClaimFiles
 
-_SETTLED = {"graph spectrum": "graph.spectrum"}
-"""What independent code leaves open of large and of switching graphs, and what settles it."""
+_SETTLED = {"graph spectrum": "graph.spectrum", "method": "method"}
+"""What independent code leaves open of large and switching graphs and own methods, and what the
+scenario settles it by."""
 _EXIT_CODES = {"verified": 0, "refused": 1, "incomplete": 5}
 
 

@@ -9,6 +9,7 @@ import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +39,11 @@ from echelon.core.enclosure.series import (
 from echelon.core.errors import GainError
 from echelon.core.jaxpr import Algebra, Params, Rule, dot, entrywise, map_entries, reduction, walk
 from echelon.core.numerics import precision
+
+_SHORT = Fraction(1, 10**4)
+"""s; shorter pieces of time are not halved."""
+_HALVED = 2000
+"""Pieces that are looked at beside those asked for."""
 
 
 def enclose_derivatives(
@@ -79,6 +85,35 @@ def enclose_derivatives(
             [_near(*three, half) for three in zip(*rows, strict=True)]
             for rows in zip(there, all_over, all_over[1:], strict=False)
         ]
+
+
+class EnclosedPiece(NamedTuple):
+    """Enclosures of a function and its derivatives until the end (s) of a piece, [order][k]."""
+
+    end: Fraction
+    rows: list[list[Interval]]
+
+
+def enclose_finely(
+    function: Callable[[jax.Array], jax.Array], times: Sequence[Fraction], order: int
+) -> Iterator[EnclosedPiece]:
+    """Yield enclosures as `enclose_derivatives` does, of pieces halved where there are none.
+
+    Raises:
+        GainError: a piece of 0.1 ms has none, or so many pieces are not enough.
+    """
+    spans, count = list(zip(times, times[1:], strict=False))[::-1], 0
+    while spans:
+        low, high = spans.pop()
+        count += 1
+        try:
+            [rows] = enclose_derivatives(function, (low, high), order)
+        except GainError:
+            if high - low < _SHORT or count > len(times) + _HALVED:
+                raise
+            spans += [((low + high) / 2, high), (low, (low + high) / 2)]
+            continue
+        yield EnclosedPiece(high, rows)
 
 
 def _near(middle: Ends, all_over: Ends, slope: Ends, half: int) -> Interval:

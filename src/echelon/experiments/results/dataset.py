@@ -54,13 +54,13 @@ def dataset(result: Result) -> "xr.Dataset":
 
 def labelled(result: Result) -> Labelled:
     """Return the labelled arrays of `dataset`."""
-    known, per_agent = labelled_parts(result.parts, result.settings), ("time", "agent", "state")
+    fixed, per_agent = labelled_parts(result.parts, result.settings), ("time", "agent", "state")
     variables: Variables = {
         "states": (per_agent, result.states),
         "error": (per_agent, result.errors),
         "inputs": (("time", "agent", "input"), result.inputs),
         "saturated": ("agent", result.saturated),
-        **known.variables,
+        **fixed.variables,
         **_followed(result),
         **_poles(result),
     }
@@ -68,8 +68,8 @@ def labelled(result: Result) -> Labelled:
     if v is not None:
         variables |= {"lyapunov": ("time", v.value), "lyapunov_rate": ("time", v.rate)}
         variables["lyapunov_drift"] = ("time", v.drift)
-    coordinates = {"time": ("time", result.times, {"units": "s"}), **known.coordinates}
-    return Labelled(variables, coordinates, {**_attributes(result), **known.attributes})
+    coordinates = {"time": ("time", result.times, {"units": "s"}), **fixed.coordinates}
+    return Labelled(variables, coordinates, {**_attributes(result), **fixed.attributes})
 
 
 def recording_of(result: Result) -> Recording:
@@ -173,13 +173,11 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
         **statement(result.parts, result.settings, name),
         "outcome": {"name": result.outcome.name.lower(), "message": result.message},
         "leader": numbers.leader._asdict(),
-        "leaders": [each._asdict() for each in numbers.leaders],
-        "followers": [
-            _follower(each._asdict()) for each in _listed(numbers.followers, steady_error)
-        ],
+        "leaders": [leader._asdict() for leader in numbers.leaders],
+        "followers": [_follower(row._asdict()) for row in _listed(numbers.followers, steady_error)],
         "edges": [
-            {"edge": list(each.edge), "distance_rmse": each.distance_rmse}
-            for each in _listed(numbers.edges, _distance_error)
+            {"edge": list(row.edge), "distance_rmse": row.distance_rmse}
+            for row in _listed(numbers.edges, _distance_error)
         ],
         **RunNumbers(result, numbers, guarantee).json(Shown.SUMMARY),
         "steady_window_s": numbers.steady_window,

@@ -47,7 +47,7 @@ def foreseen(
         name: of the scenario.
         promise: as `Promise.as_mapping` returns it; none by default.
     """
-    model, known = parts.model, labelled_parts(parts, settings)
+    model, fixed = parts.model, labelled_parts(parts, settings)
     times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)
     ahead = _ahead(parts, states, times)
     trim, agents = np.asarray(model.trim[1], float), parts.graph.agents
@@ -59,7 +59,7 @@ def foreseen(
     }
     attributes = {"scenario": name, "outcome": "completed", "message": ""}
     attributes["promise"] = json.dumps(promise)
-    return recording(known.arrays() | frames, known.attributes | attributes)
+    return recording(fixed.arrays() | frames, fixed.attributes | attributes)
 
 
 def _ahead(

@@ -50,6 +50,7 @@ class Lyapunov(NamedTuple):
         """Return where V increases to the next frame by more than rounding."""
         return rises(self.value[:-1], self.value[1:], self.rounding)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def forbidden(self) -> Array:
         """Return (T,) booleans: where V increases over a step although theory excludes it.
 
@@ -64,6 +65,7 @@ class Lyapunov(NamedTuple):
         return falls & (self.drift_after <= slack) & increases
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def rises(
     before: Float[Array, " T"], after: Float[Array, " T"], rounding: float | None = None
 ) -> Bool[Array, " T"]:
@@ -108,8 +110,8 @@ def _lyapunov(result: Result) -> Lyapunov | None:
         steps = np.rint(result.times / result.settings.dt).astype(np.int32)
         fields = _fields(result.drive, result.model, _motion(result), graph.leaders[0], x, u, steps)
         now, after = (
-            _in_metric_axes(result.model, each, np.asarray(each.states) - offsets)
-            for each in fields
+            _in_metric_axes(result.model, field, np.asarray(field.states) - offsets)
+            for field in fields
         )
         y, f, xdot = now
         later, f_after, _ = after

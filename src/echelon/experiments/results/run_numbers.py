@@ -60,7 +60,7 @@ class RunNumbers:
         compute = AGENT_NUMBERS[name].of
         if compute is not None:
             return compute(self)
-        return np.array([getattr(each, name) for each in self.metrics.followers], float)
+        return np.array([getattr(follower, name) for follower in self.metrics.followers], float)
 
     def worst(self, name: str) -> float:
         """Return the largest number of a follower; NaN if one does not exist."""

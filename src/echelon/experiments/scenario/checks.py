@@ -111,8 +111,8 @@ def _taken(
     other = {"law", *SOURCES.get(path, ((), False))[0], *foreign}
     allowed = [key for key in kind.model_fields if key not in other]
     for key in (key for key in part if key in foreign):
-        said = f"allowed {is_or_are(allowed)}" if allowed else "it takes no keys"
-        yield (*path, str(key)), f"got a key that `{choice}` does not take, {said}."
+        message = f"allowed {is_or_are(allowed)}" if allowed else "it takes no keys"
+        yield (*path, str(key)), f"got a key that `{choice}` does not take, {message}."
 
 
 def _source(data: Part, path: KeyPath) -> str | None:
@@ -188,10 +188,10 @@ def _edges(document: Document) -> Iterator[Finding]:
             if pair in first:
                 at = document.place((*path, first[pair]))
                 per = "direction" if directed else "pair"
-                said = f"got a second edge of agents `{pair[0]}` and `{pair[1]}`"
+                message = f"got a second edge of agents `{pair[0]}` and `{pair[1]}`"
                 yield (
                     (*path, index),
-                    f"{said}, allowed is one for each {per}; the first is at {at}.",
+                    f"{message}, allowed is one for each {per}; the first is at {at}.",
                 )
             first.setdefault(pair, index)
             if agents is not None and max(pair) >= agents > 0:
@@ -229,14 +229,14 @@ def _weights(data: Part) -> Iterator[Finding]:
     listed: list[tuple[KeyPath, object]] = []
     if isinstance(edges, list) and isinstance(weights, list):
         if len(edges) != len(weights):
-            said = (
+            message = (
                 f"got {len(weights)} weights for {len(edges)} edges, allowed is one for each edge"
             )
-            yield ("graph", "weights"), f"{said}."
+            yield ("graph", "weights"), f"{message}."
         for index, edge in enumerate(edges):
             if isinstance(edge, list) and len(edge) == 3:
-                said = "got an edge with a weight, allowed with `weights` is `[i, j]`"
-                yield ("graph", "edges", index), f"{said}."
+                message = "got an edge with a weight, allowed with `weights` is `[i, j]`"
+                yield ("graph", "edges", index), f"{message}."
         listed += [(("graph", "weights", index), weight) for index, weight in enumerate(weights)]
     for path, items in _edge_lists(graph):
         triples = ((k, edge) for k, edge in enumerate(items) if _is_list(edge) and len(edge) == 3)
@@ -259,12 +259,12 @@ def _schedule(data: Part) -> Iterator[Finding]:
     for index, stretch in enumerate(stretches):
         at = number_of(stretch.get("at")) if isinstance(stretch, dict) else None
         if at is not None and 0.0 < at <= last:
-            said = f"got `{stretch['at']}`, allowed are ascending times, here above {last:g} s"
-            yield ("graph", "schedule", index, "at"), f"{said}."
+            message = f"got `{stretch['at']}`, allowed are ascending times, here above {last:g} s"
+            yield ("graph", "schedule", index, "at"), f"{message}."
         last = max(last, at or 0.0)
     if period is not None and 0.0 < period <= last:
-        said = f"got `{graph['period']}`, allowed is a time after the last of the schedule"
-        yield ("graph", "period"), f"{said}, {last:g} s."
+        message = f"got `{graph['period']}`, allowed is a time after the last of the schedule"
+        yield ("graph", "period"), f"{message}, {last:g} s."
 
 
 def _range(agents: int) -> str:
@@ -297,8 +297,8 @@ def _grid(data: Part) -> Iterator[Finding]:
     graph = section(data, "graph")
     agents, size = _whole(graph.get("agents")), _agents(graph)
     if graph.get("name") == "grid" and agents is not None and size is not None and agents != size:
-        said = f"got `{agents}`, allowed is rows times columns, `{size}`"
-        yield ("graph", "agents"), f"{said}; the key may be left out."
+        message = f"got `{agents}`, allowed is rows times columns, `{size}`"
+        yield ("graph", "agents"), f"{message}; the key may be left out."
 
 
 def _unknown(
@@ -340,16 +340,16 @@ def _following(data: Part) -> Iterator[Finding]:
     if entry is not None and entry.reference == "needed" and reference is None:
         yield ("leader", "law"), f"got `{law}` without a `reference`, this law needs one."
     if entry is not None and entry.reference == "none" and reference is not None:
-        said = f"got a reference, but the leader's law `{law}` takes none"
-        yield ("reference",), f"{said}; {listing(registry.TRACKING_LAWS)} take one."
+        message = f"got a reference, but the leader's law `{law}` takes none"
+        yield ("reference",), f"{message}; {listing(registry.TRACKING_LAWS)} take one."
 
 
 def _changed(data: Part) -> Iterator[Finding]:
     """Yield parameters of the plant that are both set and scaled."""
     values, factors = (section(data, "plant", key) for key in ("parameters", "scale"))
     for name in (name for name in factors if isinstance(name, str) and name in values):
-        said = "got a factor for a parameter that `plant.parameters` sets"
-        yield ("plant", "scale", name), f"{said}, allowed is one of them."
+        message = "got a factor for a parameter that `plant.parameters` sets"
+        yield ("plant", "scale", name), f"{message}, allowed is one of them."
 
 
 def _durations(data: Part) -> Iterator[Finding]:

@@ -17,6 +17,7 @@ from echelon.experiments.scenario.values import (
     MatrixOrIdentity,
     NameOrUserClass,
     NeededBy,
+    NotNegative,
     Numeric,
     OneOf,
     Positive,
@@ -114,7 +115,19 @@ _Speed = Annotated[Speed | None, Unit("the outputs' per s"), _STOPPING]
 def law_arguments(section: BaseModel) -> dict[str, object]:
     """Return the keys of a role that are arguments of its law, the gain excepted."""
     arguments = {key: getattr(section, key) for key in marked_keys(type(section)) if key != "gain"}
-    return {key: value for key, value in arguments.items() if value is not None}
+    plain = {k: x.model_dump() if isinstance(x, ObserverSpec) else x for k, x in arguments.items()}
+    return {key: value for key, value in plain.items() if value is not None}
+
+
+@final
+class ObserverSpec(BaseModel, **STRICT):
+    """The estimate of what the model lacks, from an agent's own motion."""
+
+    push: Annotated[NotNegative, Unit("1/s")] = 8.0
+    """Bandwidth of the estimated acceleration, 1/s; 0 for no observer."""
+    scale: Annotated[NotNegative, Unit("1/s")] = 0.0
+    """Rate, 1/s, at which a push along the thrust is ascribed to another mass or weaker motors;
+    0 for never."""
 
 
 @final
@@ -143,9 +156,9 @@ class LeaderSpec(BaseModel, **STRICT):
     speed: _Speed = None
     """Of the law `stopping-point`: the largest speed that agreement commands, of each flat output
     or of all, such as m/s; `inf` for no bound."""
-    observer: Annotated[bool | None, _STOPPING] = None
+    observer: Annotated[bool | ObserverSpec | None, _STOPPING] = None
     """Of the law `stopping-point`: whether disturbances and model errors are estimated and
-    compensated."""
+    compensated, or the numbers of the observer."""
     gain: Annotated[GainSpec | None, TakenBy("tracking", "optimal-tracking")] = None
     """Gain of the leader's tracking, under `tracking` and `optimal-tracking`; default the model's
     Riccati gain."""
@@ -180,9 +193,9 @@ class FollowerSpec(BaseModel, **STRICT):
     speed: _Speed = None
     """Of the law `stopping-point`: the largest speed that agreement commands, of each flat output
     or of all, such as m/s; `inf` for no bound."""
-    observer: Annotated[bool | None, _STOPPING] = None
+    observer: Annotated[bool | ObserverSpec | None, _STOPPING] = None
     """Of the law `stopping-point`: whether disturbances and model errors are estimated and
-    compensated."""
+    compensated, or the numbers of the observer."""
     hears: Annotated[Annotated[str, OneOf(map(str, NeighbourChoice))] | None, _STOPPING] = None
     """Of the law `stopping-point`: whether agents use the information of `all` neighbours, or only
     of those nearer to a leader (`leaderward`)."""

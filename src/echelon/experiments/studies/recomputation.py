@@ -108,9 +108,11 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
     value = _as_json(promise(parts, settings).as_mapping())
     yield from compare_values(f"{name}: promise", stored, value)
-    text = read_yaml(str(run.attributes.get("scenario_text", "")), str(file)).data
+    text = read_yaml(str(run.attributes.get("scenario_text", "")), str(file))
+    # A key twice is a fault; readers differ in which one they use.
+    theirs = None if text.faults else without_folders(text.data)
     ours = without_folders(scenario.data)
-    yield from compare_values(f"{name}: scenario_text", without_folders(text), ours)
+    yield from compare_values(f"{name}: scenario_text", theirs, ours)
     starts = initial_states(parts, settings.seed)[None][: len(run.states)]
     yield from compare_values(f"{name}: states", run.states[:1].tolist(), starts.tolist())
     P = None if parts.drive.gain is None else parts.drive.gain.P.tolist()

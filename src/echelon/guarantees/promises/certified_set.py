@@ -2,10 +2,8 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.model import ControlAffine
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
@@ -69,8 +67,7 @@ def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> C
     """Return the set that is left when the leader goes so far from the trim, (n,)."""
     gain, model = parts.drive.gain, parts.model
     assert gain is not None
-    # Of angles that wind, differences are those of T1 only where agents are less than pi apart.
-    margins = np.minimum(region.domain.margins(), np.where(winding(model), 0.5 * np.pi, np.inf))
+    margins = region.domain.margins()
     radii = np.maximum(margins - away, 0.0) / np.sqrt(np.diag(np.linalg.inv(gain.P)))
     if not np.isfinite(radii).any():
         return CertifiedSet(np.inf, region.kind, "everywhere: the domain bounds no state")
@@ -86,13 +83,6 @@ def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> C
     text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {wide:.3g}"
     text += f" less {away[j]:.3g} of the leader" if away.any() else ", leader at the trim"
     return CertifiedSet(float(shrink * radii[j]), kind, text)
-
-
-def winding(model: ControlAffine) -> Array:
-    """Return which states (n,) are angles, a whole turn of which is no difference."""
-    turns = 2.0 * np.pi * np.eye(len(model.state_names))
-    differences = np.stack([model.difference(jnp.asarray(x), jnp.zeros(len(x))) for x in turns])
-    return ~np.isclose(np.diag(differences), 2.0 * np.pi)
 
 
 def _constant(parts: Parts, region: RegionCertificate) -> bool:

@@ -68,8 +68,11 @@ class ModeMatrices(NamedTuple):
     gains: Array
 
     def modes(self) -> Array:
-        """Return the eigenvalues of all loops, (K, L, n)."""
-        return np.linalg.eigvals(self.A[:, None] - self.B[:, None] @ self.gains)
+        """Return the eigenvalues of all loops, (K, L, n); infinite where slopes overflow."""
+        loops = self.A[:, None] - self.B[:, None] @ self.gains
+        finite: Array = np.isfinite(loops).all(axis=(2, 3))  # pyright: ignore
+        modes = np.linalg.eigvals(np.where(finite[..., None, None], loops, 0.0))
+        return np.where(finite[..., None], modes, np.inf)
 
     def stable(self) -> "ModeMatrices":
         """Return those that decay if the input is not held: no step helps the others."""
@@ -93,6 +96,8 @@ class ModeMatrices(NamedTuple):
     def _exponent(self, span: float) -> float:
         """Return ln rho of the product of all flows over `span` (s), by the time that they take."""
         J = self.A[:, None] - self.B[:, None] @ self.gains
+        if not np.isfinite(J).all():
+            return np.inf
         # Without its slowest decay no flow becomes 0, however long its span is.
         slowest = np.real(np.linalg.eigvals(J)).max(axis=2)
         each = matrix_exponential(span * (J - slowest[..., None, None] * np.eye(J.shape[-1])))

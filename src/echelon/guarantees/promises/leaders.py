@@ -16,6 +16,7 @@ from echelon.guarantees.promises.closed_loop import all_alike
 from echelon.laws.law import Law
 from echelon.laws.trim_input import TrimInput
 from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import simulate
 from echelon.simulation.step.meter import measured_states
 from echelon.simulation.step.settings import Settings
@@ -90,7 +91,13 @@ def _slowest(model: ControlAffine, law: object) -> float | None:
 
 
 def own_paths(parts: Parts, settings: Settings, starts: Array) -> Array | None:
-    """Return the states (T, L, n) of the leaders in a run of their own; None if it diverges.
+    """Return the states (T, L, n) of the leaders in a run of their own; None if it diverges."""
+    run = own_run(parts, settings, starts)
+    return None if run is None else run.states[:, : len(starts)]
+
+
+def own_run(parts: Parts, settings: Settings, starts: Array) -> Result | None:
+    """Return a run of the leaders, the first L agents, by themselves; None if it diverges.
 
     Their offsets are left out of it.
     """
@@ -102,7 +109,7 @@ def own_paths(parts: Parts, settings: Settings, starts: Array) -> Array | None:
     alone = Parts(parts.model, graph, goals, parts.drive.with_follower(TrimInput()), initial=states)
     every = 1 + settings.steps // _FRAMES
     result = simulate(alone, settings._replace(store_every=every, precision="float64"))
-    return result.states[:, :count] if result.outcome.reached else None
+    return result if result.outcome.reached else None
 
 
 class Apart(NamedTuple):
@@ -119,7 +126,8 @@ def apart(parts: Parts, settings: Settings, starts: Array) -> Apart:
     paths = own_paths(parts, settings, starts)
     paths = starts[None] if paths is None else paths
     gaps = paths[..., list(measured_states(parts.model))]
-    gaps = np.linalg.norm(gaps - gaps[:, :1], axis=2)
+    with np.errstate(over="ignore", invalid="ignore"):
+        gaps = np.linalg.norm(gaps - gaps[:, :1], axis=2)
     k = int(gaps.max(axis=0).argmax())
     start, *_, end = np.append(gaps[:1, k], gaps[:, k])
     return Apart(parts.graph.leaders[k], float(start), float(end), float(gaps[:, k].max()))

@@ -27,7 +27,12 @@ from echelon.guarantees.promises.hypotheses import hypotheses
 from echelon.guarantees.promises.leaders import leaders_of
 from echelon.guarantees.promises.modes import sampling_line
 from echelon.guarantees.promises.promise import Promise, Promises
-from echelon.guarantees.promises.region import adjacent_slopes, region_of, weaken
+from echelon.guarantees.promises.region import (
+    adjacent_slopes,
+    domain_in_words,
+    region_of,
+    weaken,
+)
 from echelon.guarantees.promises.turning import slowest_in_turns, turns_in_words
 from echelon.simulation.engine.initial import Starts
 from echelon.simulation.engine.prepare import Prepared
@@ -55,7 +60,7 @@ class MetricPromise(Promise):
         """Return what is guaranteed of prepared parts."""
         parts, states = prepared.parts, prepared.problem.states
         leaders, loop = leaders_of(parts, states), loop_of(parts)
-        region = region_of(parts, leaders)
+        region = region_of(parts, settings, leaders)
         case = Case(
             parts,
             settings,
@@ -81,7 +86,7 @@ class MetricPromise(Promise):
             leader_mode=None if leaders.rest else leaders.slowest,
             region=certificate,
             certified=certified,
-            domain="" if certificate is None else certificate.domain.in_words(parts.model),
+            domain="" if certificate is None else domain_in_words(parts, certificate),
             case=case,
             turns=turns_in_words(case),
             slowest_turn=max(slowest_in_turns(case).values(), default=-math.inf),

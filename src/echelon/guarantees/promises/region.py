@@ -13,13 +13,15 @@ import numpy as np
 
 from echelon.agents.models.linearization import at_trim, linearize
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.straight_range import straight_range
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
-from echelon.guarantees.promises.leaders import Leaders
+from echelon.guarantees.promises.leaders import Leaders, own_run
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate
 from echelon.synthesis.certificates.domain import Domain
 from echelon.synthesis.certificates.domain_metrics import (
@@ -28,11 +30,12 @@ from echelon.synthesis.certificates.domain_metrics import (
     drift_region,
     pairs_on,
 )
-from echelon.synthesis.certificates.jacobians import jacobians
+from echelon.synthesis.certificates.jacobians import constant_inputs, jacobians
 from echelon.synthesis.certificates.lmi import falls
 from echelon.synthesis.gains.gain import Gain
 
 _NAME = Hypothesis.REGION
+_ROUNDED = 1e-9  # of a normalized input
 _NEAR = 1e-3
 """How far about a trim the slopes of its sides are looked at, in units of each state."""
 
@@ -51,11 +54,11 @@ class Region(NamedTuple):
     line: Statement
 
 
-def region_of(parts: Parts, leaders: Leaders) -> Region:
+def region_of(parts: Parts, settings: Settings, leaders: Leaders) -> Region:
     """Return what is promised on the domain that the gain of prepared parts was made for."""
     gain = parts.drive.gain
     if gain is not None and gain.certificate.region is None and at_trim(parts.model).bends.any():
-        return _region_at_bend(parts, leaders, gain)
+        return _region_at_bend(parts, settings, leaders, gain)
     if gain is None or gain.certificate.region is None:
         text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
         return Region(None, None, unneeded(_NAME, Kind.PROOF, text, number_text="none"))
@@ -70,13 +73,13 @@ def region_of(parts: Parts, leaders: Leaders) -> Region:
         strength = f"at coupling {gain.coupling:.4g}, 2 c lambda_min = {_strength(parts, gain):.4g}"
         text = f"P does not contract on the domain {strength}"
         return Region(None, None, _lost(text, "raise `coupling`, or shrink the `domain`"))
-    text, remedy = _withheld(parts, leaders, gain, certificate)
+    text, remedy = _withheld(parts, settings, leaders, gain, certificate)
     if text:
         return Region(None, certificate, _lost(text, remedy))
     return Region(certificate, certificate, _line(parts, certificate))
 
 
-def _region_at_bend(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
+def _region_at_bend(parts: Parts, settings: Settings, leaders: Leaders, gain: Gain) -> Region:
     """Return what a metric promises about a trim at which the model bends.
 
     It has no linearization there, but a hull holds the slopes of all its sides nearby.
@@ -91,7 +94,7 @@ def _region_at_bend(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
     if (
         certificate is None
         or certificate.kind is Kind.SAMPLES
-        or _not_the_law(parts, leaders, certificate)[0]
+        or _not_the_law(parts, settings, leaders, certificate)[0]
     ):
         return Region(None, None, none)
     return Region(certificate, None, _line(parts, certificate))
@@ -133,12 +136,13 @@ def _contraction(
 def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCertificate | None:
     """Return what the metric promises on the claim's domain behind a relayed input."""
     model, spectrum, exact = parts.model, parts.graph.spectrum(), claim.kind is Kind.PROOF
+    domain = claim.domain.straight(model)
     if claim.theorem is Theorem.A5:
-        hull = jacobians(model, claim.domain)
+        hull = jacobians(model, domain)
         if not falls(gain.P, hull.matrices):
             return None
-        return drift_region(model, claim.domain, hull, gain.P, gain.coupling, spectrum)
-    return _contraction(parts, gain, pairs_on(model, claim.domain, gain.R), exact)
+        return drift_region(model, domain, hull, gain.P, gain.coupling, spectrum)
+    return _contraction(parts, gain, pairs_on(model, domain, gain.R), exact)
 
 
 def _strength(parts: Parts, gain: Gain) -> float:
@@ -146,15 +150,17 @@ def _strength(parts: Parts, gain: Gain) -> float:
 
 
 def _withheld(
-    parts: Parts, leaders: Leaders, gain: Gain, certificate: RegionCertificate
+    parts: Parts, settings: Settings, leaders: Leaders, gain: Gain, certificate: RegionCertificate
 ) -> tuple[str, str]:
     """Return why the gain in the law that runs does not keep what the metric could, and a cure."""
     if gain.inner is not None:
         return "the hull is of the drift without the gain's inner loop", "remove the inner loop"
-    return _not_the_law(parts, leaders, certificate)
+    return _not_the_law(parts, settings, leaders, certificate)
 
 
-def _not_the_law(parts: Parts, leaders: Leaders, certificate: RegionCertificate) -> tuple[str, str]:
+def _not_the_law(
+    parts: Parts, settings: Settings, leaders: Leaders, certificate: RegionCertificate
+) -> tuple[str, str]:
     """Return why what is fed forward takes away what the metric could keep, and what would not."""
     if _turns_away(parts, leaders):
         text = (
@@ -177,7 +183,36 @@ def _not_the_law(parts: Parts, leaders: Leaders, certificate: RegionCertificate)
         return f"{text}with g, and is not enclosed", "set `feedforward: relay`"
     if not leaders.agree:
         return f"{theorem} covers one leader, or leaders that agree", "start them alike"
-    return "", ""
+    return _uncovered_input(parts, settings, leaders, certificate.domain)
+
+
+def _uncovered_input(
+    parts: Parts, settings: Settings, leaders: Leaders, domain: Domain
+) -> tuple[str, str]:
+    """Return which input of the leader is outside of a hull that inputs count in, and a cure.
+
+    The slopes of f + g u depend on u where g varies, and those in the hull are of the domain's u.
+    """
+    model, count = parts.model, len(leaders.starts)
+    varying = ~constant_inputs(model, domain)
+    if leaders.rest or not varying.any():
+        return "", ""
+    if leaders.answer:
+        text = "the leader reacts to followers, and its inputs depend on them"
+        return text, "set `leader.reacts: false`"
+    run = own_run(parts, settings, leaders.starts)
+    if run is None:
+        return "the leader alone diverges", "give `leader.gain` another method"
+    v = model.normalized(run.inputs[:, :count]).reshape(-1, len(model.input_names))
+    beyond = np.maximum(v - domain.input_upper, domain.input_lower - v) * varying
+    frame, k = np.unravel_index(beyond.argmax(), beyond.shape)
+    # A law that computes its trim is off by rounding.
+    if beyond[frame, k] <= _ROUNDED:
+        return "", ""
+    low, high, name = domain.input_lower[k], domain.input_upper[k], model.input_names[k]
+    text = f"the leader's own input reaches {v[frame, k]:.3g} in `{name}`, and the hull covers "
+    text += f"[{low:.3g}, {high:.3g}]"
+    return text, f"name `{name}` in the `domain`, or slow the reference"
 
 
 def _turns_away(parts: Parts, leaders: Leaders) -> bool:
@@ -193,11 +228,24 @@ def weaken(parts: Parts, region: Region, lines: Iterable[Statement]) -> Region:
     """Return a region no stronger than what its hypotheses say of the offsets on its domain."""
     [line] = (x for x in lines if x.statement is Hypothesis.SYMMETRY)
     certificate, needed = region.certificate, line.verdict is not Verdict.NOT_NEEDED
-    if certificate is None or not needed or line.kind.strength >= certificate.kind.strength:
+    if certificate is None:
         return region
-    why = "the offsets are tried at samples of the domain, and not proved"
-    certificate = dataclasses.replace(certificate, kind=line.kind, why=why)
-    return region._replace(certificate=certificate, line=_line(parts, certificate))
+    tried = {}
+    if needed:
+        tried["the offsets are tried at samples of the domain, and not proved"] = line.kind
+    if not straight_range(parts.model).proved:
+        tried["differences of states are x - y at samples, and not proved"] = Kind.SAMPLES
+    for why, kind in tried.items():
+        if kind.strength < certificate.kind.strength:
+            certificate = dataclasses.replace(certificate, kind=kind, why=why)
+            region = region._replace(certificate=certificate, line=_line(parts, certificate))
+    return region
+
+
+def domain_in_words(parts: Parts, certificate: RegionCertificate) -> str:
+    """Return the bounds of a region, with those of all inputs where its slopes depend on them."""
+    domain, model = certificate.domain, parts.model
+    return domain.in_words(model, ~constant_inputs(model, domain))
 
 
 def _lost(text: str, remedy: str) -> Statement:
@@ -206,7 +254,7 @@ def _lost(text: str, remedy: str) -> Statement:
 
 def _line(parts: Parts, certificate: RegionCertificate) -> Statement:
     theorem, kind = certificate.theorem, certificate.kind
-    text = f"{theorem}: {theorem.value} {certificate.domain.in_words(parts.model)}"
+    text = f"{theorem}: {theorem.value} {domain_in_words(parts, certificate)}"
     text += f"; no more than {kind}, since {certificate.why}" if certificate.why else ""
     skew = parts.graph.spectrum().skew
     if skew > 1.0:

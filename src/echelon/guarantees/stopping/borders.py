@@ -11,7 +11,6 @@ from echelon.agents.models.model import FlatBound
 from echelon.core.errors import GainError, listing
 from echelon.core.rational import root_bounds
 from echelon.core.types import Array
-from echelon.core.words import Kind
 from echelon.guarantees.stopping.chain_clearance import (
     Clearance,
     Push,
@@ -19,7 +18,7 @@ from echelon.guarantees.stopping.chain_clearance import (
     length_clearance_of,
 )
 from echelon.guarantees.stopping.chain_response import Chain
-from echelon.guarantees.stopping.path_bounds import Least, least_on_path
+from echelon.guarantees.stopping.path_bounds import least_on_path
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 
 _ROUNDED = Fraction(1, 10**6)
@@ -31,13 +30,12 @@ _STARTS = 64
 
 
 class Border(NamedTuple):
-    """A border of the chart: what is left to it, and by which kind of argument.
+    """A border of the chart, and what is left to it.
 
     Attributes:
         bound: what the model says of it.
         left: how far agents stay from it, at least.
         steepest: how far the outputs' speed may be off the leader's at the start.
-        kind: of the argument.
         path: what the leader's path takes the bounded derivative to, at least.
         fastest: the `speed` of each output at which agreement alone may lead to it.
         led: whether the leader starts on its path in these outputs, and so keeps to it.
@@ -49,7 +47,6 @@ class Border(NamedTuple):
     bound: FlatBound
     left: Fraction
     steepest: float
-    kind: Kind
     path: float
     fastest: float
     led: bool
@@ -88,13 +85,13 @@ def border_of(run: StoppingRun, bound: FlatBound) -> Border:
     places = [chains.outputs.index(name) for name in bound.outputs]
     chain = run.chain(places[0])
     least = least_on_path(run.leader, run.parts.model, run.settings.horizon, places, order + 1)
-    allowed = Fraction(least.value) - Fraction(bound.above) - _ROUNDED
+    allowed = Fraction(least) - Fraction(bound.above) - _ROUNDED
     fastest = float(allowed / chain.gain(order)) / math.sqrt(len(places))
     speeds = [run.own_speed(k) for k in places]
     own, s = _together(speeds), _together(map(run.speed, places))
     led = max(speeds) < _LEVEL and _is_on_path(run, places)
     none = Fraction(-1), 0.0
-    border = Border(bound, *none, least.kind, least.value, fastest, led, math.inf, {})
+    border = Border(bound, *none, least, fastest, led, math.inf, {})
     if own is None or s is None:
         return border
     case = _BorderCase(run, bound, places, chain, own, s, allowed)
@@ -141,13 +138,13 @@ def _together(speeds: Iterable[float]) -> Fraction | None:
     return exact[0] if len(exact) == 1 else root_bounds(sum((s**2 for s in exact), Fraction(0)))[1]
 
 
-def _data(case: _BorderCase, least: Least, left: Fraction) -> dict[str, object]:
+def _data(case: _BorderCase, least: float, left: Fraction) -> dict[str, object]:
     chain, p = case.chain, len(case.chain.powers)
     return {
         "outputs": list(case.bound.outputs),
         "derivative": case.bound.derivative,
         "above": case.bound.above,
-        "path": least.value,
+        "path": least,
         "roots": list(case.run.law.roots_for(p)),
         "speed": float(case.speed),
         "leader_speed": float(case.own),

@@ -95,8 +95,8 @@ def _missing_on_path(run: StoppingRun) -> _Missing:
         times = np.modf(_GOLDEN * np.arange(_TIMES))[0] * run.settings.horizon
         x, u = follow_at(model, leader.reference, times)
     path = np.asarray(_path(leader, model, jnp.asarray(times)))[:, :3]
-    plant = world.plant_for(model)
-    return _missing(model, plant, leader.ready, jnp.asarray(push), *map(jnp.asarray, (path, x, u)))
+    driven = _Driven(model, world.plant_for(model), leader.ready, jnp.asarray(push))
+    return _missing(driven, *map(jnp.asarray, (path, x, u)))
 
 
 @cached_jit
@@ -104,62 +104,85 @@ def _path(leader: StoppingLeader, model: ControlAffine, times: jax.Array) -> jax
     return jax.vmap(lambda t: leader.path(model, t))(times)
 
 
+class _Driven(NamedTuple):
+    """A plant under a push, driven through integrators; z = (x, e, w) are its states and inputs."""
+
+    model: ControlAffine
+    plant: ControlAffine
+    loop: FlatLoop
+    push: jax.Array
+
+    @property
+    def states(self) -> int:
+        """How many entries of z are the state."""
+        return len(self.model.state_names)
+
+    def beginning(self, x: State, u: jax.Array) -> jax.Array:
+        """Return z of a state and a physical input."""
+        v, e = self.model.normalized(u), jnp.zeros(self.loop.chains.size, x.dtype)
+        for k, at in enumerate(self.loop.chains.indices):
+            e, v = (e.at[at[0]].set(v[k]), v.at[k].set(0.0)) if at else (e, v)
+        return jnp.concatenate([x, e, v])
+
+    def parts(self, z: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+        """Return x, e and w."""
+        end = self.states + self.loop.chains.size
+        return z[: self.states], z[self.states : end], z[end:]
+
+    def input(self, z: jax.Array) -> jax.Array:
+        """Return the physical input."""
+        _, e, w = self.parts(z)
+        return self.model.physical(self.loop.chains.acting_input(e, w))
+
+    def output(self, x: State) -> jax.Array:
+        """Return the flat outputs (m,)."""
+        return flat_output(self.model, self.loop.chains.outputs, x)
+
+    def moved(self, z: jax.Array) -> jax.Array:
+        """Return the rate of z."""
+        x, e, w = self.parts(z)
+        pushed = self.plant.velocity(x, self.input(z)) + self.push
+        return jnp.concatenate([pushed, self.loop.chains.rate(e, w), jnp.zeros_like(w)])
+
+    def derivatives(self, z: jax.Array) -> jax.Array:
+        """Return the flat outputs with their first two derivatives, (3, m)."""
+
+        def along(z: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return jax.jvp(lambda z: self.output(z[: self.states]), (z,), (self.moved(z),))
+
+        (y, speed), (_, pull) = jax.jvp(along, (z,), (self.moved(z),))
+        return jnp.stack([y, speed, pull])
+
+    def lacks(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return what the model lacks of the outputs' speeds and accelerations, (m,) each."""
+        x, u = z[: self.states], self.input(z)
+
+        def speed(x: State) -> jax.Array:
+            return jax.jvp(self.output, (x,), (self.model.velocity(x, u),))[1]
+
+        more = self.plant.velocity(x, u) + self.push - self.model.velocity(x, u)
+        return jax.jvp(self.output, (x,), (more,))[1], jax.jvp(speed, (x,), (more,))[1]
+
+
 @cached_jit
-def _missing(
-    model: ControlAffine,
-    plant: ControlAffine,
-    loop: FlatLoop,
-    push: jax.Array,
-    path: jax.Array,
-    states: jax.Array,
-    inputs: jax.Array,
-) -> _Missing:
-    """Return what the model lacks where the plant has the derivatives of a path, (T, 3, m)."""
-    chains, n = loop.chains, len(model.state_names)
-    end = n + chains.size
+def _missing(driven: _Driven, path: jax.Array, states: jax.Array, inputs: jax.Array) -> _Missing:
+    """Return what the model lacks where the plant has the derivatives of a path, (T, r, m)."""
+    orders = path.shape[1]
     # Of an output that an input moves at once, its acceleration is any.
-    asked = np.arange(path.shape[1])[:, None] <= np.minimum(chains.degrees, 2)
+    asked = np.arange(orders)[:, None] <= np.minimum(driven.loop.chains.degrees, 2)
+    # With an observer currents alone matter, which are the same in a state nearby.
+    rounds = 0 if driven.loop.observer else _ROUNDS
 
-    def acting(z: jax.Array) -> jax.Array:
-        return model.physical(chains.acting_input(z[n:end], z[end:]))
-
-    def outputs(z: jax.Array) -> jax.Array:
-        return flat_output(model, chains.outputs, z[:n])
-
-    def moved(z: jax.Array) -> jax.Array:
-        rates = plant.velocity(z[:n], acting(z)) + push, chains.rate(z[n:end], z[end:])
-        return jnp.concatenate([*rates, jnp.zeros_like(z[end:])])
-
-    def along(z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return jax.jvp(outputs, (z,), (moved(z),))
-
-    def derivatives(z: jax.Array) -> jax.Array:
-        (y, speed), (_, pull) = jax.jvp(along, (z,), (moved(z),))
-        return jnp.stack([y, speed, pull])[: path.shape[1]]
-
-    def lacks(x: State, u: jax.Array, there: jax.Array) -> _Missing:
+    def one(x: State, u: jax.Array, there: jax.Array) -> _Missing:
         def off(z: jax.Array) -> jax.Array:
-            return jnp.where(asked, derivatives(z) - there, 0.0).ravel()
+            return jnp.where(asked, driven.derivatives(z)[:orders] - there, 0.0).ravel()
 
         def improved(_: int, z: jax.Array) -> jax.Array:
             # The least change, since rates of the attitude, say, are free.
             return z - jnp.linalg.pinv(jax.jacfwd(off)(z), rtol=1e-9) @ off(z)
 
-        v, e = model.normalized(u), jnp.zeros(chains.size, x.dtype)
-        for k, at in enumerate(chains.indices):
-            e, v = (e.at[at[0]].set(v[k]), v.at[k].set(0.0)) if at else (e, v)
-        z, rounds = jnp.concatenate([x, e, v]), 0 if loop.observer else _ROUNDS
-        # With an observer currents alone matter, which are the same in a state nearby.
+        z = driven.beginning(x, u)
         z = jax.lax.fori_loop(0, rounds, improved, z) if rounds else z
-        left = jnp.abs(off(z)).max() if rounds else jnp.zeros(())
-        u = acting(z)
+        return _Missing(*driven.lacks(z), jnp.abs(off(z)).max() if rounds else jnp.zeros(()))
 
-        def speed(x: State) -> jax.Array:
-            return jax.jvp(lambda x: outputs(x), (x,), (model.velocity(x, u),))[1]
-
-        more = plant.velocity(z[:n], u) + push - model.velocity(z[:n], u)
-        current = jax.jvp(lambda x: outputs(x), (z[:n],), (more,))[1]
-        force = jax.jvp(speed, (z[:n],), (more,))[1]
-        return _Missing(current, force, left)
-
-    return jax.vmap(lacks)(states, inputs, path)
+    return jax.vmap(one)(states, inputs, path)

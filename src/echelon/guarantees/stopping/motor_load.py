@@ -75,7 +75,6 @@ class MotorLoad(NamedTuple):
     """What the motors give from the starts of a run, and from which others they would do.
 
     Attributes:
-        kind: of the argument.
         least, largest: of a motor's thrust, N.
         most: that it has, N.
         tilt: the steepest, rad.
@@ -83,7 +82,6 @@ class MotorLoad(NamedTuple):
         data: what it was computed of; ready for JSON.
     """
 
-    kind: Kind
     least: float
     largest: float
     most: float
@@ -112,7 +110,6 @@ class _MotorCase(NamedTuple):
     Attributes:
         frame: of the agents.
         chain: of their position.
-        kind: of the argument about the leader's path.
         demands: of that path, on each slice of time.
         leader: its start off its path, and its speeds.
         speeds: of the agents.
@@ -122,7 +119,6 @@ class _MotorCase(NamedTuple):
 
     frame: Airframe
     chain: Chain
-    kind: Kind
     demands: tuple[MotorDemand, ...]
     leader: Pushed
     speeds: tuple[Fraction, Fraction, Fraction]
@@ -137,11 +133,11 @@ class _MotorCase(NamedTuple):
         off = run.flat[list(graph.leaders)] - run.ahead
         leader = _largest([_start(flat) for flat in off])
         leader = leader._replace(speeds=_speeds([run.own_speed(k) for k in range(4)]))
-        kind, demands = _path_demands(run.leader, run.parts.model, run.settings.horizon, chain)
+        demands = _path_demands(run.leader, run.parts.model, run.settings.horizon, chain)
         base = _pushed(chain, demands, leader, speeds)
         away = (run.flat - run.flat[list(graph.nearest_leader())])[list(graph.followers)]
         starts = [_start(flat) for flat in np.unique(away, axis=0)]
-        return cls(frame, chain, kind, demands, leader, speeds, base, starts)
+        return cls(frame, chain, demands, leader, speeds, base, starts)
 
 
 def motors_suffice_for(run: StoppingRun) -> bool:
@@ -160,7 +156,7 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
         return None, unneeded(Hypothesis.LIMITS, Kind.PROOF, reason or _UNKNOWN)
     case = _MotorCase.of(run, frame)
     motors, starts = _from(case)
-    kind, most = case.kind, Fraction(frame.motor_thrust)
+    most = Fraction(frame.motor_thrust)
     number = None if motors.slope is None else float(motors.least), _thrust_text(motors)
     if not motors.within(most):
         text = "the motors are not proved to suffice from these starts"
@@ -168,10 +164,9 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
         remedy += "to the leader's velocity and attitude; `echelon design` finds some"
         # Without a reason: a promise of agents without limits is one too.
-        return None, fails(Hypothesis.LIMITS, kind, text, *number, remedy=remedy)
+        return None, fails(Hypothesis.LIMITS, Kind.PROOF, text, *number, remedy=remedy)
     ahead = _ahead(frame, run.ahead)
     load = MotorLoad(
-        kind,
         float_below(motors.least),
         float_above(motors.largest),
         float(most),
@@ -180,7 +175,7 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
         _data(case, run.law.roots_for(3), starts, ahead),
     )
     text = "the motors suffice from these starts at all times"
-    return load, holds(Hypothesis.LIMITS, kind, text, *number)
+    return load, holds(Hypothesis.LIMITS, Kind.PROOF, text, *number)
 
 
 def _airframe(model: ControlAffine) -> Airframe | None:
@@ -212,11 +207,11 @@ def _thrust_text(motors: Motors) -> str:
 @memoize
 def _path_demands(
     leader: StoppingLeader, model: ControlAffine, horizon: float, chain: Chain
-) -> tuple[Kind, tuple[MotorDemand, ...]]:
-    """Return the demands of a leader's path on each slice of time, and the kind of argument."""
+) -> tuple[MotorDemand, ...]:
+    """Return the demands of a leader's path on each slice of time."""
     pieces = pieces_of(leader, model, horizon, _OUTPUTS, max(_DEGREES))
     spans = ((piece.begin, piece.end) for piece in slices_of(chain))
-    return pieces.kind, tuple(_demand(pieces, *span) for span in spans)
+    return tuple(_demand(pieces, *span) for span in spans)
 
 
 def _demand(pieces: Pieces, begin: Fraction, end: Fraction | None) -> MotorDemand:

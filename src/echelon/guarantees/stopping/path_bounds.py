@@ -1,10 +1,10 @@
 """Bounds on the derivatives of a leader's path, piece by piece of time."""
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple, TypeAlias
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,19 +12,17 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import COORDINATES, Reference
 from echelon.core.enclosure.interval import Interval, point
-from echelon.core.enclosure.over_time import enclose_derivatives
-from echelon.core.errors import GainError
+from echelon.core.enclosure.over_time import enclose_finely
 from echelon.core.memoize import memoize
 from echelon.core.rational import float_below, root_bounds
-from echelon.core.words import Kind
 from echelon.laws.stopping_point import StoppingLeader
 
 _PIECE, _MOST = Fraction(1, 20), 800
-"""Of time, s, and how many there are at most."""
+"""Of time, s, and about how many there are."""
+_FEW = 20
+"""Pieces of each part of a path that is joined of many."""
 _EXACT = Fraction(1, 10**9)
 """Of the highest derivative; one that is known so well in one piece is constant."""
-_SAMPLES = 10
-"""In each piece, where the path has no enclosure."""
 
 
 _Rows: TypeAlias = tuple[tuple[Interval, ...], ...]
@@ -34,12 +32,10 @@ class Pieces(NamedTuple):
     """What outputs of a path and their derivatives may be in pieces of time.
 
     Attributes:
-        kind: of the argument.
         times: the borders of the pieces, s; the path is looked at until the last.
         values: [piece][order][output].
     """
 
-    kind: Kind
     times: tuple[Fraction, ...]
     values: tuple[_Rows, ...]
 
@@ -57,14 +53,17 @@ def pieces_of(
 ) -> Pieces:
     """Return what outputs of a leader's path and their derivatives are until the horizon (s).
 
-    They are enclosed in rationals where the path has an enclosure, and else the range of samples. A
-    leader without a reference stays where its trim is, and nothing of it moves.
+    They are enclosed in rationals. A leader without a reference stays where its trim is, and
+    nothing of it moves.
+
+    Raises:
+        GainError: the path has no enclosure (`path_smoothness.py`).
     """
     if leader.reference is None:
         k = [leader.ready.chains.outputs.index(name) for name in outputs]
         there = np.asarray(leader.path(model, jnp.zeros(())))[0, k].tolist()
         rows = [[point(Fraction(x)) for x in there], *[[point(0)] * len(k)] * order]
-        return Pieces(Kind.PROOF, (Fraction(0), Fraction(horizon)), (tuple(map(tuple, rows)),))
+        return Pieces((Fraction(0), Fraction(horizon)), (tuple(map(tuple, rows)),))
     return _pieces(leader.reference, horizon, tuple(outputs), order)
 
 
@@ -72,48 +71,20 @@ def pieces_of(
 def _pieces(reference: Guide, horizon: float, outputs: tuple[str, ...], order: int) -> Pieces:
     assert isinstance(reference, Reference)
     picked = np.array([COORDINATES.index(name) for name in outputs])
-    count = min(_MOST, max(1, int(Fraction(horizon) / _PIECE)))
-    times = tuple(Fraction(horizon) * k / count for k in range(count + 1))
-    # Derivatives of another making than that of the path would be no part of the enclosure.
-    if type(reference).derivatives is Reference.derivatives:
-        try:
-            return _enclosed(lambda t: reference(t)[picked], times, order)
-        except GainError:
-            pass
-    fine = np.linspace(0.0, horizon, count * _SAMPLES + 1)
-    every = jax.jit(jax.vmap(lambda t: reference.derivatives(t, order, outputs)))
-    samples = np.asarray(every(jnp.asarray(fine)))
-    cut = [samples[k * _SAMPLES : (k + 1) * _SAMPLES + 1] for k in range(count)]
-    return Pieces(Kind.SAMPLES, times, tuple(map(_range_of, cut)))
-
-
-def _enclosed(
-    path: Callable[[jax.Array], jax.Array], times: tuple[Fraction, ...], order: int
-) -> Pieces:
-    """Return what a path is in pieces of time, or in one where that tells all.
-
-    Raises:
-        GainError: the path has no enclosure.
-    """
-    for cut in ((times[0], times[-1]), times):
-        values = tuple(tuple(map(tuple, rows)) for rows in enclose_derivatives(path, cut, order))
-        # What does not move is known at once.
-        if all(x.hi - x.lo < _EXACT for rows in values for x in rows[-1]):
-            break
-    return Pieces(Kind.PROOF, cut, values)
-
-
-def _range_of(values: np.ndarray) -> tuple[tuple[Interval, ...], ...]:
-    """Return the range of samples (T, order + 1, m)."""
-    both = np.stack([values.min(axis=0), values.max(axis=0)], axis=-1)
-    return tuple(tuple(Interval(*map(Fraction, pair)) for pair in row) for row in both.tolist())
-
-
-class Least(NamedTuple):
-    """The least value, and by which kind of argument."""
-
-    value: float
-    kind: Kind
+    times, values, parts = [Fraction(0)], list[_Rows](), reference.parts(horizon)
+    most = max(_FEW, _MOST // len(parts))
+    for until, path in parts:
+        span = Fraction(until) - times[-1]
+        count = min(most, math.ceil(span / _PIECE))
+        # What does not move is known in one piece, and so is what has a constant derivative.
+        for cut in (1, count):
+            ends = [times[-1] + span * k / cut for k in range(cut + 1)]
+            rows = list(enclose_finely(lambda t, path=path: path(t)[picked], ends, order))
+            if all(x.hi - x.lo < _EXACT for piece in rows for x in piece.rows[-1]):
+                break
+        times += [piece.end for piece in rows]
+        values += [tuple(map(tuple, piece.rows)) for piece in rows]
+    return Pieces(tuple(times), tuple(values))
 
 
 def least_on_path(
@@ -122,15 +93,17 @@ def least_on_path(
     horizon: float,
     outputs: Sequence[int],
     order: int,
-) -> Least:
+) -> float:
     """Return what a derivative on a leader's path is not below until the horizon.
 
     Of several outputs it is the length of the vector of their derivatives.
+
+    Raises:
+        GainError: the path has no enclosure.
     """
     names = [leader.ready.chains.outputs[k] for k in outputs]
     pieces = pieces_of(leader, model, horizon, names, order)
-    low = min(_least_of(rows[order]) for rows in pieces.values)
-    return Least(float_below(low), pieces.kind)
+    return float_below(min(_least_of(rows[order]) for rows in pieces.values))
 
 
 def _least_of(row: Sequence[Interval]) -> Fraction:

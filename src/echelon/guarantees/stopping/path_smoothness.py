@@ -10,15 +10,11 @@ import numpy as np
 from echelon.agents.models.chains import Chains
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import COORDINATES, Reference
-from echelon.core.enclosure.over_time import enclose_derivatives
+from echelon.core.enclosure.over_time import enclose_derivatives, enclose_finely
 from echelon.core.errors import GainError
 from echelon.core.memoize import memoize
 from echelon.core.numerics import derivatives, precision
 
-_SHORT = Fraction(1, 10**4)
-"""s; shorter spans of time are not cut further."""
-_MOST = 2000
-"""Spans of time that are looked at."""
 _TIMES = 8
 """At which handwritten derivatives are compared."""
 _SAME = 1e-6
@@ -52,37 +48,31 @@ def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: 
     """
     if type(reference).derivatives is not Reference.derivatives:
         raise GainError("a path replaces `derivatives`, which may be those of another path")
-    if _is_joined(reference, order):
-        return
     picked = np.array([COORDINATES.index(name) for name in outputs])
+    begin, parts = 0.0, reference.parts(horizon)
+    if len(parts) > 1 and not _fit_together(reference, order):
+        raise GainError("a path is joined of parts of which nothing says how they fit together")
+    for until, part in parts:
 
-    def path(t: jax.Array) -> jax.Array:
-        return reference(t)[picked]
+        def path(t: jax.Array, part: Callable[[jax.Array], jax.Array] = part) -> jax.Array:
+            return part(t)[picked]
 
-    spans, count = [(Fraction(0), Fraction(horizon))], 0
-    while spans:
-        low, high = spans.pop()
-        count += 1
-        try:
-            list(enclose_derivatives(path, (low, high), 0))
-        except GainError:
-            if high - low < _SHORT or count > _MOST:
-                raise
-            spans += [((low + high) / 2, high), (low, (low + high) / 2)]
-    _compare(path, order, horizon)
+        list(enclose_finely(path, (Fraction(begin), Fraction(until)), 0))
+        _compare(path, order, begin, until)
+        begin = until
 
 
-def _is_joined(reference: Reference, order: int) -> bool:
-    """Tell whether a class says of the path that it defines that its pieces fit together."""
+def _fit_together(reference: Reference, order: int) -> bool:
+    """Tell whether the class that defines a path says that its parts fit together."""
     kinds = type(reference).__mro__
-    said, moves = (
+    joined, parts, path = (
         next(k for k, kind in enumerate(kinds) if name in vars(kind))
-        for name in ("joined", "__call__")
+        for name in ("joined", "parts", "__call__")
     )
-    return said <= moves and reference.joined is not None and reference.joined >= order - 1
+    return max(joined, parts) <= path and reference.joined >= order - 1
 
 
-def _compare(path: Callable[[jax.Array], jax.Array], order: int, horizon: float) -> None:
+def _compare(path: Callable[[jax.Array], jax.Array], order: int, begin: float, end: float) -> None:
     """Check handwritten derivatives in a path, which the law uses, at a few times.
 
     Raises:
@@ -91,7 +81,7 @@ def _compare(path: Callable[[jax.Array], jax.Array], order: int, horizon: float)
     with precision("float64"):
         if "custom_" not in str(jax.make_jaxpr(path)(jnp.zeros(()))):
             return
-        for t in np.linspace(0.0, horizon, _TIMES):
+        for t in np.linspace(begin, end, _TIMES):
             values = np.asarray(derivatives(path, jnp.asarray(t), order)).ravel().tolist()
             [rows] = enclose_derivatives(path, (Fraction(t), Fraction(t)), order)
             for x, value in zip(sum(rows, []), values, strict=True):

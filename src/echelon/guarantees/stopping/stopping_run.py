@@ -17,6 +17,7 @@ from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind
 from echelon.guarantees.stopping.chain_response import Chain
+from echelon.guarantees.stopping.flat_states import flat_states_of
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
 from echelon.simulation.engine.law_drive import Laws
@@ -195,15 +196,20 @@ def _switching_line(run: StoppingRun) -> Statement:
 
 
 def _offsets_line(run: StoppingRun) -> Statement:
-    """Say whether all offsets are of flat outputs."""
-    names = run.parts.model.state_names
-    offset = np.flatnonzero(np.ptp(run.parts.formation.offsets, axis=0))
-    others = (names[k] for k in offset if names[k] not in run.law.ready.chains.outputs)
-    broken = next(others, None)
-    if broken is None:
+    """Say whether all offsets are of flat outputs, and leave the errors of other states alone."""
+    model = run.parts.model
+    names = [model.state_names[k] for k in np.flatnonzero(np.ptp(run.parts.formation.offsets, 0))]
+    flat, measured = flat_states_of(model, run.law.ready.chains), model.position
+    broken = next((name for name in names if name not in flat.outputs), None)
+    moving = next((name for name in names if name not in flat.free), None)
+    alone = {*measured} <= {*flat.outputs} and measured
+    if broken is None and (moving is None or alone):
         text = "offsets of flat outputs are symmetries"
         return holds(Hypothesis.SYMMETRY, _PROOF, text)
     text, remedy = f"the offset of `{broken}` is not of a flat output", "offset flat outputs only"
+    if broken is None:
+        text = f"agents that differ in `{moving}` and follow the same path differ in other states"
+        remedy = f"leave out the offset of `{moving}`, or give the model a `position`"
     reason = "an offset is no symmetry of the law"
     return fails(Hypothesis.SYMMETRY, _PROOF, text, remedy=remedy, reason=reason)
 

@@ -13,6 +13,7 @@ from echelon.core.words import Feedforward, Kind, Theorem
 from echelon.guarantees.stopping.arrival import arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
+from echelon.guarantees.stopping.flat_states import flat_states_of
 from echelon.guarantees.stopping.motor_load import MotorLoad, motor_load_of
 from echelon.guarantees.stopping.path_smoothness import path_fault
 from echelon.guarantees.stopping.stopping_run import StoppingRun
@@ -27,7 +28,6 @@ class Tube(NamedTuple):
     """What T5 guarantees.
 
     Attributes:
-        kind: of the argument.
         rate: at which errors decay eventually, 1/s.
         gains: of the longest chain, sup |v^(l)| over sup |w| for l = 0, 1, ...
         left: how far the nearest agent stays from the border of the chart, at least, in the unit of
@@ -41,7 +41,6 @@ class Tube(NamedTuple):
         graphs: which graphs are meant, and this one, in words.
     """
 
-    kind: Kind
     rate: float
     gains: tuple[float, ...]
     left: float
@@ -51,6 +50,11 @@ class Tube(NamedTuple):
     borders: tuple[dict[str, object], ...]
     motor_load: MotorLoad | None
     graphs: tuple[str, str] = _ANY
+
+    @property
+    def kind(self) -> Kind:
+        """Of the argument: the chains' responses and the path are enclosed in rationals."""
+        return _PROOF
 
     @property
     def theorem(self) -> Theorem:
@@ -109,13 +113,11 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
         text = f"{name} does not state where its flat coordinates end"
         return _nothing(text, "state `flat_chains` and `flat_bounds` in the model", inner)
     left = min((b.left for b in borders), default=Fraction(10**9))
-    kind = min((b.kind for b in borders), key=lambda kind: kind.strength, default=_PROOF)
     steepest = min((b.steepest for b in borders), default=math.inf)
-    lines = [inner, *_set_lines(run, borders, kind)]
+    lines = [inner, *_set_lines(run, borders)]
     if any(line.fails for line in lines):
         return None, lines
     tube = Tube(
-        kind,
         run.rate,
         gains,
         math.inf if not borders else float(left),
@@ -161,38 +163,38 @@ def _nothing(text: str, remedy: str, *before: Statement) -> tuple[None, list[Sta
 _NO_BORDER = "flat coordinates have no border"
 
 
-def _set_lines(run: StoppingRun, borders: Sequence[Border], kind: Kind) -> Iterator[Statement]:
+def _set_lines(run: StoppingRun, borders: Sequence[Border]) -> Iterator[Statement]:
     """Yield what set of starts is certified, and whether this run's lie in it."""
     if not borders:
         text = "its flat coordinates have no border: any start is allowed"
-        yield holds(Hypothesis.SET, kind, text, math.inf, "everywhere")
-        yield holds(Hypothesis.STARTS, kind, _NO_BORDER, 0.0, "inside")
+        yield holds(Hypothesis.SET, _PROOF, text, math.inf, "everywhere")
+        yield holds(Hypothesis.STARTS, _PROOF, _NO_BORDER, 0.0, "inside")
         return
     nearest = min(borders, key=lambda b: b.left)
-    yield _set_line(run, nearest, kind)
+    yield _set_line(run, nearest)
     if not nearest.steepest > 0.0:
-        yield unneeded(Hypothesis.STARTS, kind, "there is no set")
+        yield unneeded(Hypothesis.STARTS, _PROOF, "there is no set")
         return
     far, bound, where = float(nearest.left), nearest.bound, nearest.outputs
     number = far, f"{far:.3g} left"
     if nearest.left > 0:
         text = f"{nearest.what()} stays {far:.3g} above {bound.above:.4g}, with {bound.within}"
-        yield holds(Hypothesis.STARTS, kind, text, *number)
+        yield holds(Hypothesis.STARTS, _PROOF, text, *number)
         return
     text = f"from these starts {nearest.what()} is not proved to stay above {bound.above:.4g}"
     remedy = f"start nearer to the leader's speed in {where}, start the leader on its path there, "
     remedy += f"or lower `speed` of {where}, of the leader and the followers"
-    yield fails(Hypothesis.STARTS, kind, text, *number, remedy=remedy, reason=text)
+    yield fails(Hypothesis.STARTS, _PROOF, text, *number, remedy=remedy, reason=text)
 
 
-def _set_line(run: StoppingRun, border: Border, kind: Kind) -> Statement:
+def _set_line(run: StoppingRun, border: Border) -> Statement:
     """Say how far starts may be off behind a leader that keeps to its path."""
     bound, steepest = border.bound, border.steepest
     number = steepest, f"{steepest:.3g} off"
     if border.fastest > 0.0 and steepest > 0.0:
         text = f"any place, with {bound.within}, and {border.speeds} so far off the leader's, "
         text = f"{text}which keeps to its path in {border.outputs}"
-        return holds(Hypothesis.SET, kind, text, *number)
+        return holds(Hypothesis.SET, _PROOF, text, *number)
     if not border.fastest > 0.0:
         text = f"on the leader's path {border.what()} comes to {border.path:.3g}, and the chart "
         text, remedy = f"{text}ends at {bound.above:.3g}", "choose a path that keeps away from it"
@@ -203,7 +205,7 @@ def _set_line(run: StoppingRun, border: Border, kind: Kind) -> Statement:
         # What one link may have of a speed against the leader.
         least = border.fastest / run.links
         remedy = f"lower the `speed` of {border.outputs} below {least:.3g}"
-    return fails(Hypothesis.SET, kind, text, *number, remedy=remedy, reason=text)
+    return fails(Hypothesis.SET, _PROOF, text, *number, remedy=remedy, reason=text)
 
 
 def _who(run: StoppingRun, borders: Sequence[Border]) -> str:
@@ -230,6 +232,8 @@ def _angle(border: Border) -> str:
 
 
 def _positions(run: StoppingRun) -> tuple[int, ...]:
-    """Return which outputs are a position."""
-    outputs, position = run.law.ready.chains.outputs, run.parts.model.position
-    return tuple(k for k, name in enumerate(outputs) if name in position)
+    """Return which outputs are the position; none where a part of it is no output."""
+    chains, position = run.law.ready.chains, run.parts.model.position
+    if not set(position) <= {*flat_states_of(run.parts.model, chains).outputs}:
+        return ()
+    return tuple(map(chains.outputs.index, position))

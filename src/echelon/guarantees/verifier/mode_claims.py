@@ -6,8 +6,9 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.guarantees.verifier import algebra
-from echelon.guarantees.verifier.findings import DECIDED, Facts, Finding, compare, decide
+from echelon.guarantees.verifier.findings import DECIDED, Facts, Finding, compare, decide, unchecked
 
+_METHODS = ("given", "contraction")
 _EDGES = {"riccati": 0.5, "robust-lqr": 0.5, "inner-loop": 0.0, "monotone": 0.0}
 """Smallest c lambda_min for which each method guarantees a stable linearization."""
 _BETWEEN = 64
@@ -30,6 +31,8 @@ def check_linearization(facts: Facts) -> Iterator[Finding]:
         yield compare("slowest mode, 1/s", saved.abscissa, result, slack)
     yield from _check_between(facts)
     yield from _check_edge(facts)
+    if saved.method not in (*_EDGES, *_METHODS):
+        yield unchecked("method", saved.method, "the file holds nothing of a method of one's own")
     rank = algebra.observable(facts.closed, saved.model.B.T @ saved.P)
     yield decide("observability rank", saved.observable == rank, saved.observable, rank)
 

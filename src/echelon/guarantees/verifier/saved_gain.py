@@ -112,6 +112,23 @@ class _Part:
         """Return an entry that older files do not have; None where it is missing."""
         return self.entry(key)[0] if key in self.entries else None
 
+    def flag(self, key: str) -> bool:
+        """Return a truth, which is false where older files do not have it."""
+        value = self.later(key)
+        if not (value is None or isinstance(value, bool)):
+            raise self.fault(f"{self.name}.{key}", "must be true or false")
+        return value is True
+
+    def parameters(self, key: str) -> JsonObject | None:
+        """Return the parameters of a model; None where they could not be stored."""
+        value, name = self.entry(key)
+        if value is not None and not isinstance(value, dict):
+            raise self.fault(name, "must be a mapping")
+        # NumPy reads such a text as a number, and `true` as 1.
+        if not all(map(_is_plain, (value or {}).values())):
+            raise self.fault(name, "must not hold numbers as text, or truths in lists")
+        return value
+
     def part(self, key: str) -> "_Part":
         value, name = self.entry(key)
         return _Part(self.file, value, name, self)
@@ -188,6 +205,16 @@ def _is_number(value: object) -> TypeGuard[float]:
     return -_LARGEST <= value <= _LARGEST
 
 
+def _is_plain(value: object) -> bool:
+    """Return whether a parameter holds no number as text and no truth in a list."""
+    if isinstance(value, list):
+        return all(not isinstance(item, bool) and _is_plain(item) for item in value)
+    try:
+        return not isinstance(value, str) or math.isnan(float(value))
+    except ValueError:
+        return True
+
+
 def _array(value: object) -> Array | None:
     """Return nested lists of finite numbers as an array, otherwise None."""
 
@@ -248,12 +275,9 @@ def _model(section: _Part) -> SavedModel:
     if not isinstance(trim, list) or len(trim) != 2:
         raise section.fault(name, "must be a state and an input")
     point = _Part(section.file, {"0": trim[0], "1": trim[1]}, name)
-    parameters, name = section.entry("parameters")
-    if parameters is not None and not isinstance(parameters, dict):
-        raise section.fault(name, "must be a mapping")
     return SavedModel(
         path=section.text("class"),
-        parameters=parameters,
+        parameters=section.parameters("parameters"),
         state_names=states,
         input_names=inputs,
         state=point.array("0", n),
@@ -283,7 +307,7 @@ def _graph(section: _Part) -> SavedGraph:
     if not len(spectrum):
         raise section.fault("graph.spectrum", "must contain a number")
     leader_set = tuple(sorted({int(x) for x in leaders}))
-    directed, switches = (section.later(key) is True for key in ("directed", "switches"))
+    directed, switches = section.flag("directed"), section.flag("switches")
     sums = (
         section.array("sums", agents - len(leader_set))
         if section.later("sums") is not None

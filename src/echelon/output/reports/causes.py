@@ -59,11 +59,11 @@ def beyond(saturated: float, guarantee: Promise) -> Iterator[Cause]:
 
 def _slow(result: Result, guarantee: Promise) -> Iterator[Cause]:
     """Yield that the horizon is too short for the slowest mode."""
-    known = guarantee.slowest is not None
+    by_mode = guarantee.slowest is not None
     rate = -guarantee.slowest if guarantee.slowest is not None else guarantee.rate
     if guarantee.promised and rate and result.settings.horizon * rate < _SETTLES:
         yield Cause(
-            f"{'the slowest mode' if known else 'the guaranteed rate'} takes "
+            f"{'the slowest mode' if by_mode else 'the guaranteed rate'} takes "
             f"{_SETTLES / rate:.3g} s from 1 m to 1 cm, and the horizon is "
             f"{result.settings.horizon:g} s",
             "lengthen `simulation.horizon`, or let `echelon design` find a faster gain",

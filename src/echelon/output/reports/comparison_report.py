@@ -91,7 +91,7 @@ def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
         return
     for name in ("rmse", "steady_rmse"):
         cell, numbers = AGENT_NUMBERS[name].cell, row.flight.metrics
-        followers = [getattr(each, name) for each in numbers.followers]
+        followers = [getattr(follower, name) for follower in numbers.followers]
         errors = followers if named else [row.number(f"worst_{name}")]
         for error in [getattr(numbers.leader, name), *errors]:
             yield cell(error, 3)
@@ -286,7 +286,7 @@ def _row_mapping(row: ComparisonRow) -> JsonObject:
     return {
         "outcome": result.outcome.name.lower(),
         **{
-            f"follower_{name}": {str(each.agent): getattr(each, name) for each in followers}
+            f"follower_{name}": {str(f.agent): getattr(f, name) for f in followers}
             for name in ("rmse", "steady_rmse")
         },
         **row.flight.json(Shown.COMPARISON),

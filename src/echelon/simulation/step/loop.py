@@ -94,13 +94,13 @@ class WorldState(NamedTuple):
 
     Attributes:
         in_flight: the last messages that were sent, as `Posts` of the channel.
-        inbox: what agents keep of those that they received, as `Inbox`.
+        mail: what agents keep of those that they received, as `Mail`.
         motion: what the plants remember besides their states, as `MotionState`.
         measured: (d, N, n) the states of the last d steps, where agents measure theirs late.
     """
 
     in_flight: PyTree = None
-    inbox: PyTree = None
+    mail: PyTree = None
     motion: PyTree = None
     measured: PyTree = None
 

@@ -12,12 +12,7 @@ from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act, limit_sides
-from echelon.simulation.step.inbox import (
-    Message,
-    empty_inbox,
-    read_messages,
-    send_messages,
-)
+from echelon.simulation.step.knowledge import begin_network, read_messages, send_messages
 from echelon.simulation.step.loop import Loop, Moment, WorldState
 from echelon.simulation.step.meter import Sums, reference_at
 from echelon.simulation.step.motion import MotionState
@@ -44,18 +39,9 @@ def begin(loop: Loop, states: States) -> Moment:
     if loop.sensors is not None:
         world = world._replace(measured=loop.sensors.begin(moment.states))
     if loop.channel is not None:
-        world = _begin_network(loop, moment, world)
+        size = _feedforward_size(loop, moment)
+        world = begin_network(loop, world, _sent(loop, moment)[0], size)
     return moment._replace(world=world)
-
-
-def _begin_network(loop: Loop, moment: Moment, world: WorldState) -> WorldState:
-    """Return the state of the world with a network before the first message."""
-    sent, _ = _sent(loop, moment)
-    inbox = empty_inbox(loop, sent, _feedforward_size(loop, moment))
-    agents = jnp.arange(len(sent), dtype=jnp.int32)
-    assert loop.channel is not None
-    posts = loop.channel.begin(Message(sent, agents, inbox.packet), len(inbox.stamp))
-    return world._replace(in_flight=posts, inbox=inbox)
 
 
 def _feedforward_size(loop: Loop, moment: Moment) -> int:
@@ -79,26 +65,24 @@ def control(loop: Loop, now: Moment) -> Control:
     now = _measured(loop, now)
     sent, difference = _sent(loop, now)
     exchange = _exchange_at(loop, now.step)
-    knowledge = None
+    knowledge = mail = None
     if loop.channel is None:
         # The ideal network neither delays nor loses: what is sent is received.
         z = exchange(sent, exchange.along_edges(sent), difference)
     else:
-        knowledge = read_messages(loop, exchange, now, sent, difference)
+        knowledge, mail = read_messages(loop, exchange, now, sent, difference)
         z = knowledge.disagreement
     led = _lead(loop, now, z)
     if loop.levels is not None:
         followed = _by_depth(loop, now, led, z)
     else:
-        forward = (
-            led.message[loop.sender] if knowledge is None else knowledge.feedforward[loop.followers]
-        )
-        followed = _act_all(
-            loop, now, z, loop.follower, loop.followers, forward, now.follower_memory
-        )
+        broadcast = led.message[loop.sender]
+        forward = broadcast if knowledge is None else knowledge.feedforward[loop.followers]
+        rows = loop.followers, forward, now.follower_memory
+        followed = _act_all(loop, now, z, loop.follower, *rows)
     world = now.world
-    if knowledge is not None:
-        world = send_messages(loop, now, knowledge, sent, difference, led.message)
+    if knowledge is not None and mail is not None:
+        world = send_messages(loop, now, mail, knowledge, sent, difference, led.message)
     u = jnp.concatenate([led.input, followed.input])[loop.order]
     desired = jnp.concatenate([led.desired, followed.desired])[loop.order]
     limited, cut = limit_sides(u, desired)

@@ -66,12 +66,14 @@ def pairs_on(
             that the Jacobians depend on.
     """
     domain = the_domain(model, bounds)
+    # Slopes that no open angle changes are those of all of it, and a metric speaks of a part.
+    part = domain.straight(model)
     if has_constant_input_map(model, domain):
         hull = jacobians(model, domain)
-        return DomainPairs(domain, hull, hull.matrices, None)
+        return DomainPairs(part, hull, hull.matrices, None)
     hull = weighted_jacobians(model, domain, R)
     A, W = np.split(hull.matrices, 2, axis=2)
-    return DomainPairs(domain, hull, A, W)
+    return DomainPairs(part, hull, A, W)
 
 
 def contracting_region(
@@ -141,6 +143,7 @@ def drift_region(
     varies = not has_constant_input_map(model, domain)
     if not spectrum.proved > 0.0 or (varies and not spectrum.symmetric):
         return None
+    domain = domain.straight(model)
     reach = radius(domain, P, spectrum.skew)
     if reach is not None and varies:
         # Then S = sum delta_i'P delta_i may rise, V = delta'(L kron P) delta may not, and

@@ -106,15 +106,25 @@ def _freeze(result: Jacobians) -> Jacobians:
     return result
 
 
-@memoize
 def has_constant_input_map(model: ControlAffine, domain: Domain) -> bool:
     """Tell whether g is proved constant on the domain: the condition of the nonlocal theorem T1."""
+    return bool(constant_inputs(model, domain).all())
 
-    def entries(x: jax.Array, v: jax.Array) -> jax.Array:
-        return model.normalized_input_map(x).reshape(-1)
 
-    constant = _constant_columns(entries, *_boxes(model, domain))
-    return constant is not None and bool(constant.all())
+@memoize
+def constant_inputs(model: ControlAffine, domain: Domain) -> Array:
+    """Return (m,) for which normalized inputs the column of g is proved constant on the domain."""
+    boxes, m = _boxes(model, domain), len(model.input_names)
+    constant = np.zeros(m, bool)
+    for k in range(m):
+
+        def column(x: jax.Array, v: jax.Array, k: int = k) -> jax.Array:
+            return model.normalized_input_map(x)[:, k]
+
+        states = _constant_columns(column, *boxes)
+        constant[k] = states is not None and bool(states.all())
+    constant.setflags(write=False)
+    return constant
 
 
 def offsets_are_symmetries(model: ControlAffine, domain: Domain, offsets: Array) -> bool:

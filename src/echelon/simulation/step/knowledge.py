@@ -1,0 +1,360 @@
+"""What agents make of late and lost messages: where each expects its leader and its neighbours.
+
+An agent predicts the leader from the newest packet of it that reached anybody on the way, and takes
+each neighbour for the prediction plus the deviation that the neighbour last sent. So what is late
+is a deviation, which hardly changes, and never a place, which does.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
+
+from echelon.agents.network.channel import NEVER, Channel
+from echelon.agents.network.exchange import Difference, Exchange
+from echelon.core.types import Scalar, State
+from echelon.core.words import MessageContent, NeighbourChoice, Prediction
+from echelon.laws.law import Expected, LocalView, Memory
+from echelon.simulation.step.action import act
+from echelon.simulation.step.loop import Loop, Moment, WorldState
+
+NOBODY = 2**30
+"""The leader of an agent that has no packet, and more hops than any agent has."""
+_HOP_LIFE = 10
+"""Hop counts are used for this many times `forget`, so that losses do not change them."""
+
+
+class Packets(NamedTuple):
+    """What a leader last said of itself, passed on unchanged by everybody; the newest counts.
+
+    Attributes:
+        leader: its number.
+        stamp: the step at which it said so; `NEVER` for no packet.
+        content: a row of numbers, which depends on the prediction.
+    """
+
+    leader: Int[jax.Array, " N"]
+    stamp: Int[jax.Array, " N"]
+    content: Float[jax.Array, "N p"]
+
+
+class Letters(NamedTuple):
+    """What each agent sends: its deviation or its signal, its hops to a leader, and its packet."""
+
+    value: Float[jax.Array, "N s"]
+    hops: Int[jax.Array, " N"]
+    packet: Packets
+
+
+class Mail(NamedTuple):
+    """What agents keep of the messages that they received.
+
+    Attributes:
+        stamp: (K,) when the newest message of each link was sent; `NEVER` for none.
+        value: (K, s) its deviation or signal.
+        hops: (K,) of its sender.
+        packet: of each agent.
+    """
+
+    stamp: Int[jax.Array, " K"]
+    value: Float[jax.Array, "K s"]
+    hops: Int[jax.Array, " K"]
+    packet: Packets
+
+
+class Readers(NamedTuple):
+    """Agents that read their mail: their numbers (N,), and which of them lead (N,)."""
+
+    number: Int[jax.Array, " N"]
+    leads: Bool[jax.Array, " N"]
+
+
+class Knowledge(NamedTuple):
+    """What agents know from messages at a step.
+
+    Attributes:
+        disagreement: z (N, s).
+        feedforward: (N, k) that each expects of its leader.
+        leader: (N, s) the signal at which each expects its leader.
+        hops: (N,) to a leader.
+    """
+
+    disagreement: Float[jax.Array, "N s"]
+    feedforward: Float[jax.Array, "N k"]
+    leader: Float[jax.Array, "N s"]
+    hops: Int[jax.Array, " N"]
+
+
+# ---- one agent, or many --------------------------------------------------------------------------
+
+
+def no_mail(readers: Readers, links: int, sent: Float[jax.Array, "N s"], packet: int) -> Mail:
+    """Return the mail before the first message, for signals as sent and packets (packet,)."""
+    agents = len(readers.number)
+    return Mail(
+        jnp.full(links, NEVER, jnp.int32),
+        jnp.zeros((links, sent.shape[1]), sent.dtype),
+        jnp.full(links, NOBODY, jnp.int32),
+        Packets(
+            jnp.where(readers.leads, readers.number, NOBODY).astype(jnp.int32),
+            jnp.full(agents, NEVER, jnp.int32),
+            jnp.zeros((agents, packet), sent.dtype),
+        ),
+    )
+
+
+def packet_size(channel: Channel, s: int, forward: int) -> int:
+    """Return how many numbers a packet has, for signals (s,) and a feed-forward (forward,)."""
+    if channel.messages is MessageContent.STATE:
+        return forward
+    return s if channel.prediction is Prediction.PREVIEW else s + forward
+
+
+def understand(
+    loop: Loop,
+    exchange: Exchange,
+    readers: Readers,
+    step: jax.Array,
+    mail: Mail,
+    sent: Float[jax.Array, "N s"],
+    difference: Difference,
+) -> Knowledge:
+    """Return what agents know from their mail.
+
+    Args:
+        loop: with a channel.
+        exchange: the links of the agents, with the weights of this step.
+        readers: the agents.
+        step: its number.
+        mail: of the agents.
+        sent: their signals, from their own states.
+        difference: of two signals.
+    """
+    channel = loop.channel
+    assert channel is not None
+    leader, feedforward = _leaders(loop, readers, step, mail.packet, sent)
+    hops = _hops(loop, exchange, readers, mail, step)
+    knows = readers.leads | (mail.packet.stamp != NEVER)
+    receivers = jnp.asarray(exchange.receivers)
+    received, used = mail.value, mail.stamp != NEVER
+    fresh = used
+    if channel.messages is MessageContent.DEVIATION:
+        fresh = used & (step - mail.stamp <= channel.forget)
+        received = leader[receivers] + jnp.where(fresh[:, None], mail.value, 0.0)
+        # A leader is where it is expected, and its own message says no more.
+        used, fresh = knows[receivers], fresh | (used & (mail.hops == 0))
+    received = jnp.where(used[:, None], received, sent[receivers])
+    if channel.hears is NeighbourChoice.ALL:
+        z = exchange(sent, received, difference)
+    else:
+        nearer = fresh & used & (mail.hops < hops[receivers])
+        alone = jnp.where(knows[:, None], difference(sent, leader), 0.0)
+        z = exchange.mean(sent, received, nearer, alone, difference)
+    return Knowledge(z, feedforward, leader, hops)
+
+
+def write(
+    loop: Loop,
+    readers: Readers,
+    step: jax.Array,
+    mail: Mail,
+    knowledge: Knowledge,
+    sent: Float[jax.Array, "N s"],
+    difference: Difference,
+    content: Float[jax.Array, "N p"],
+) -> tuple[Letters, Bool[jax.Array, " N"]]:
+    """Return what agents send at a step, and which of them can.
+
+    `content` is what each would say of itself if it were a leader.
+    """
+    channel, packet = loop.channel, mail.packet
+    assert channel is not None
+    itself = readers.leads & (packet.leader == readers.number)
+    packet = packet._replace(
+        stamp=jnp.where(itself, step, packet.stamp),
+        content=jnp.where(itself[:, None], content, packet.content),
+    )
+    if channel.messages is MessageContent.STATE:
+        return Letters(sent, knowledge.hops, packet), jnp.ones(len(sent), bool)
+    deviation = jnp.where(itself[:, None], 0.0, difference(sent, knowledge.leader))
+    return Letters(deviation, knowledge.hops, packet), packet.stamp != NEVER
+
+
+def content_of(
+    loop: Loop,
+    t: Scalar,
+    x: State,
+    offset: State,
+    memory: Memory,
+    signal: Float[jax.Array, " s"],
+    forward: Float[jax.Array, " k"],
+) -> Float[jax.Array, " p"]:
+    """Return what a leader says of itself, before its memory changes in this step."""
+    channel = loop.channel
+    assert channel is not None
+    if channel.messages is MessageContent.STATE:
+        return forward
+    if channel.prediction is Prediction.NONE:
+        return jnp.concatenate([signal, forward])
+    deviation = loop.leader.deviation(loop.model, t, x, offset, memory)
+    assert deviation is not None, "a channel with a preview has a leader with a plan"
+    return deviation
+
+
+def _leaders(
+    loop: Loop,
+    readers: Readers,
+    step: jax.Array,
+    packet: Packets,
+    sent: Float[jax.Array, "N s"],
+) -> tuple[Float[jax.Array, "N s"], Float[jax.Array, "N k"]]:
+    """Return where each agent expects its leader, and the feed-forward that it expects of it."""
+    channel, dtype = loop.channel, sent.dtype
+    assert channel is not None
+    t = step.astype(dtype) * loop.motion.dt
+    if channel.messages is MessageContent.STATE:
+        signal, feedforward = sent, packet.content
+    elif channel.prediction is Prediction.NONE:
+        signal, feedforward = jnp.split(packet.content, [sent.shape[1]], axis=1)
+    else:
+        age = (step - packet.stamp).astype(dtype) * loop.motion.dt
+        signal, feedforward = jax.vmap(lambda c, T: _expected(loop, t, c, T))(packet.content, age)
+    knows = (packet.stamp != NEVER)[:, None]
+    own = (packet.leader == readers.number)[:, None]
+    return jnp.where(own | ~knows, sent, signal), jnp.where(knows, feedforward, 0.0)
+
+
+def _expected(
+    loop: Loop, t: Scalar, deviation: Float[jax.Array, " s"], age: Scalar
+) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
+    """Return the signal and the feed-forward of a leader, from its deviation of an age (s) ago."""
+    expected = loop.leader.expected(loop.model, t, deviation, age, loop.motion.dt)
+    assert isinstance(expected, Expected), "a channel with a preview has a leader with a plan"
+    x = expected.signal
+    if expected.feedforward is not None:
+        return x, expected.feedforward
+    # What the leader's law would do there, alone.
+    silence = jnp.zeros(len(loop.model.input_names), x.dtype)
+    view = LocalView(t, x, jnp.zeros_like(x), jnp.zeros_like(x), silence, loop.motion.dt)
+    memory = loop.leader.begin(loop.model, x)
+    return x, act(loop, loop.leader, view, memory, leads=True).message
+
+
+def _hops(
+    loop: Loop, exchange: Exchange, readers: Readers, mail: Mail, step: jax.Array
+) -> Int[jax.Array, " N"]:
+    """Return the hops to a leader, as counted by the messages that arrive."""
+    channel = loop.channel
+    assert channel is not None
+    lasting = (mail.stamp != NEVER) & (step - mail.stamp <= _HOP_LIFE * channel.forget)
+    of_link = jnp.where(lasting, mail.hops, NOBODY)
+    nearest = jax.ops.segment_min(of_link, jnp.asarray(exchange.receivers), len(readers.number))
+    # Agents that are cut off together would count each other up for ever.
+    hops = jnp.where(nearest + 1 >= len(loop.order), NOBODY, nearest + 1)
+    return jnp.where(readers.leads, 0, hops).astype(jnp.int32)
+
+
+# ---- all agents of a run -------------------------------------------------------------------------
+
+
+def _all(loop: Loop) -> Readers:
+    numbers = jnp.arange(len(loop.order), dtype=jnp.int32)
+    return Readers(numbers, jnp.zeros(len(loop.order), bool).at[loop.leaders].set(True))
+
+
+def begin_network(
+    loop: Loop, world: WorldState, sent: Float[jax.Array, "N s"], forward: int
+) -> WorldState:
+    """Return the world with a network before the first message, for a feed-forward (forward,)."""
+    channel, readers = loop.channel, _all(loop)
+    assert channel is not None
+    links, s = len(loop.exchange.receivers), sent.shape[1]
+    mail = no_mail(readers, links, sent, packet_size(channel, s, forward))
+    posts = channel.begin(Letters(sent, readers.number, mail.packet), links)
+    return world._replace(in_flight=posts, mail=mail)
+
+
+def read_messages(
+    loop: Loop,
+    exchange: Exchange,
+    now: Moment,
+    sent: Float[jax.Array, "N s"],
+    difference: Difference,
+) -> tuple[Knowledge, Mail]:
+    """Return what all agents know at a step, and their mail with what arrives at it."""
+    channel = loop.channel
+    assert channel is not None
+    mail = _take(channel, exchange, now)
+    rows = loop, exchange, _all(loop), now.step, mail, sent, difference
+    return understand(*rows), mail
+
+
+def _take(channel: Channel, exchange: Exchange, now: Moment) -> Mail:
+    """Return the mail with what arrives at a step."""
+    posts, mail = now.world.in_flight, now.world.mail
+    arrival = channel.arrivals(posts, now.step, mail.stamp)
+    places = arrival.slot, jnp.asarray(exchange.senders)
+    letter: Letters = jax.tree.map(lambda rows: rows[places], posts.content)
+    new = arrival.new
+    value = jnp.where(new[:, None], letter.value, mail.value)
+    hops = jnp.where(new, letter.hops, mail.hops)
+    packet = newest(mail.packet, letter.packet, new, jnp.asarray(exchange.receivers))
+    return Mail(arrival.stamp, value, hops, packet)
+
+
+def newest(own: Packets, others: Packets, new: jax.Array, receivers: jax.Array) -> Packets:
+    """Return the packet of each agent: of the leader with the lowest number, the newest one.
+
+    Args:
+        own: of the agents.
+        others: (K, ...) that messages contain.
+        new: (K,) which of these arrived.
+        receivers: (K,) of the messages.
+    """
+    count = len(own.stamp)
+    leaders = jnp.where(new & (others.stamp != NEVER), others.leader, NOBODY)
+    leader = jnp.minimum(own.leader, jax.ops.segment_min(leaders, receivers, count))
+    of_it = leaders == leader[receivers]
+    last = jnp.where(own.leader == leader, own.stamp, NEVER)
+    stamp = jax.ops.segment_max(jnp.where(of_it, others.stamp, NEVER), receivers, count)
+    stamp = jnp.maximum(last, stamp)
+    latest = of_it & (others.stamp == stamp[receivers])
+    places = jnp.where(latest, jnp.arange(len(receivers)), NEVER)
+    place = jax.ops.segment_max(places, receivers, count)
+    better = (place >= 0) & (stamp > last)
+    content = jnp.where(better[:, None], others.content[place], own.content)
+    return Packets(leader, stamp, content)
+
+
+def send_messages(
+    loop: Loop,
+    now: Moment,
+    mail: Mail,
+    knowledge: Knowledge,
+    sent: Float[jax.Array, "N s"],
+    difference: Difference,
+    forward: Float[jax.Array, "L k"],
+) -> WorldState:
+    """Return the world after a step in which agents may send.
+
+    Args:
+        loop: with a channel.
+        now: the moment at the beginning of the step.
+        mail: of the agents.
+        knowledge: of the agents.
+        sent: their signals.
+        difference: of two signals.
+        forward: of the leaders, from the inputs that they have just chosen.
+    """
+    channel, numbers = loop.channel, loop.leaders
+    assert channel is not None
+    t = now.step.astype(sent.dtype) * loop.motion.dt
+    offsets = jnp.asarray(loop.offsets, sent.dtype)
+    rows = now.states[numbers], offsets[numbers], now.leader_memory, sent[numbers], forward
+    content = jax.vmap(lambda *row: content_of(loop, t, *row))(*rows)
+    content = jnp.zeros_like(mail.packet.content).at[numbers].set(content)
+    letters, sends = write(loop, _all(loop), now.step, mail, knowledge, sent, difference, content)
+    links = loop.exchange.receivers, loop.exchange.senders
+    posts = channel.post(now.world.in_flight, now.step, letters, sends, *links)
+    return now.world._replace(in_flight=posts, mail=mail)

@@ -1,0 +1,73 @@
+"""What a varying g adds along the leader's path: a guarantee needs the leader's own inputs."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon.core.words import Theorem
+
+LINE = ech.Graph.path(4)
+
+
+class Growing(ech.ControlAffine):
+    """Two axes, each with a velocity input that acts more strongly the farther out it is."""
+
+    state_names, input_names = ("x", "y"), ("vx", "vy")
+    position = ("x", "y")
+
+    def drift(self, x):
+        return -0.1 * x
+
+    def input_map(self, x):
+        return jnp.diag(1.0 + 0.5 * x)
+
+    def flat_state(self, *derivatives):
+        return derivatives[0]
+
+
+def parts_of(domain, gain_of, leader):
+    model = Growing()
+    gain = ech.synthesize(model, LINE, gain_of(domain))
+    drive = ech.Laws(leader(gain), ech.laws.Consensus(gain, feedforward="relay"))
+    return ech.Parts(model, LINE, ech.Formation(np.zeros((4, 2))), drive)
+
+
+class Pushed(ech.Law):
+    """A leader with an input of its own, whatever it sees."""
+
+    push: float = 0.9
+
+    def update(self, model, view, memory):
+        swing = self.push * jnp.stack([jnp.sin(3.0 * view.t), jnp.cos(3.0 * view.t)])
+        return swing, memory
+
+
+@pytest.mark.parametrize("push", [0.9, 0.3])
+def test_small_errors_are_guaranteed_only_with_inputs_that_the_hull_covers(push):
+    chosen = ech.Settings(4.0, 0.01)
+    named = {"x": 0.5, "y": 0.5}
+
+    def promise(domain):
+        parts = parts_of(domain, ech.gains.RobustLQR, lambda gain: Pushed(push))
+        return ech.promise(parts, chosen)
+
+    bare = promise(named)
+    assert bare.region is None or bare.theorem is not Theorem.T2
+    line = " ".join(x.text for x in bare.hypotheses.values())
+    assert "the leader's own input reaches" in line and "`vy`" in line
+    covered = promise({**named, "vx": 0.5, "vy": 0.5})
+    if push < 0.5:
+        assert covered.theorem is Theorem.T2
+        assert "vx in [-0.5, 0.5], vy in [-0.5, 0.5]" in covered.domain
+    else:
+        assert covered.region is None
+
+
+def test_a_domain_says_which_inputs_stay_at_the_trim():
+    domain = {"x": 0.5, "y": 0.5, "vx": 0.5}
+    parts = parts_of(domain, ech.gains.RobustLQR, lambda _: ech.laws.TrimInput())
+    found = ech.promise(parts, ech.Settings(1.0, 0.01))
+    assert found.theorem is Theorem.T2
+    assert "vx in [-0.5, 0.5], vy at its trim" in found.domain
+    assert "vy at its trim" in found.sentence()
