@@ -97,6 +97,12 @@ REFUSED = {
         lambda: ech.tune(carts(Q=[[1.0, 0.1], [0.1, 1.0]])),
         "`follower.gain.Q` has off-diagonal entries",
     ),
+    "a run that diverges": (
+        lambda: ech.tune(
+            ech.scenario_from_mapping(CARTS | {"simulation": {"horizon": 4000.0, "dt": 2.0}})
+        ),
+        "the run diverges with the scenario's own weights",
+    ),
     "another cost": (lambda: cost_named("formatio"), "`cost` names `formatio`, .* \\(did you mean"),
     "no number": (lambda: cost_named("x*effort"), "`cost` has the weight `x` for `effort`"),
     "a negative weight": (

@@ -2,6 +2,7 @@
 
 import math
 
+import jax
 import numpy as np
 import pytest
 
@@ -102,7 +103,7 @@ def test_a_bad_message_is_rejected_with_a_reason_and_changes_nothing(pair):
     for k in range(3):
         (u, sent), (other, other_sent) = agent.step(0.01 * k, -X), twin.step(0.01 * k, -X)
         np.testing.assert_array_equal(u, other)
-        for mine, theirs in zip(sent[1:], other_sent[1:], strict=True):
+        for mine, theirs in zip(sent[1:3], other_sent[1:3], strict=True):
             np.testing.assert_array_equal(mine.values, theirs.values)
 
 
@@ -176,3 +177,101 @@ def test_what_a_caller_does_wrong_raises():
     for number in (4, -1, 1.0, "1", None):
         with pytest.raises(EchelonError, match="not in this graph"):
             ech.Agent(parts, number)
+
+
+# ---- over a network that is late -----------------------------------------------------------------
+
+POINTS = ech.models.DoubleIntegrator(dimension=2)
+LATE_TREE = ech.Graph([(0, 1), (1, 2), (1, 3)])
+
+
+def late_parts(law, **network):
+    offsets = {1: (1.0, 0.0), 2: (1.0, 0.8), 3: (1.0, -0.8)}
+    reference = ech.references.Circle(rate=0.5)
+    if law == "stopping-point":
+        drive = ech.Laws(ech.laws.StoppingLeader(reference=reference), ech.laws.StoppingPoint())
+    else:
+        gain = ech.synthesize(POINTS, LATE_TREE, ech.gains.Riccati())
+        drive = ech.Laws(ech.laws.Tracking(reference), ech.laws.Consensus(gain))
+    return ech.Parts(
+        POINTS,
+        LATE_TREE,
+        ech.Formation.from_offsets(POINTS, LATE_TREE, offsets),
+        drive,
+        initial={"position": 1.0},
+        start_error={"x": 0.7},
+        world=ech.World(network=ech.Network(rate=25.0, **network)),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("law", "network"),
+    [
+        ("stopping-point", {"delay": 0.05}),
+        ("stopping-point", {"delay": 0.05, "hears": "leaderward"}),
+        ("consensus", {"delay": 0.05}),
+        ("consensus", {"delay": 0.03, "prediction": "none"}),
+        ("stopping-point", {"delay": 0.03, "messages": "state"}),
+    ],
+)
+def test_agents_over_a_plain_queue_fly_as_simulated(law, network):
+    """A queue of one's own between single agents, against the channel of all together."""
+    parts, dt, steps = late_parts(law, **network), 0.01, 150
+    settings = ech.Settings(horizon=steps * dt, dt=dt, engine="jax", integrator="euler")
+    simulated = ech.simulate(parts, settings)
+    agents = [ech.Agent(parts, k, dt) for k in range(4)]
+    x, queue = simulated.states[0].copy(), []
+    delay = max(1, round(network["delay"] / dt))
+    for k in range(steps):
+        np.testing.assert_allclose(x, simulated.states[k], atol=1e-9)
+        for due, message in queue:
+            if due == k:
+                broadcast([a for a in agents if message.sender in a.neighbours], message)
+        inputs, messages = zip(*(a.step(k * dt, x[a.number]) for a in agents), strict=True)
+        if k % 4 == 0:
+            queue += [(k + delay, message) for message in messages if message is not None]
+        x = x + dt * np.array([plant(POINTS, *row) for row in zip(x, inputs, strict=True)])
+
+
+def plant(model, x, u):
+    with jax.enable_x64(True):
+        return np.asarray(model.velocity(jax.numpy.asarray(x), jax.numpy.asarray(u)))
+
+
+def test_late_damaged_and_forged_messages_change_nothing():
+    parts = late_parts("stopping-point", delay=0.05)
+    leader, agent, twin = (ech.Agent(parts, k, 0.01) for k in (0, 1, 1))
+    x = np.array([0.3, 0.1, 0.0, 0.2])
+    assert agent.step(0.0, x)[1] is None
+    twin.step(0.0, x)
+    _, first = leader.step(0.0, x)
+    _, message = leader.step(0.01, x + 0.1)
+    for one in (agent, twin):
+        assert str(one.receive(message)) == "taken"
+    packet = message.packet
+    for bad, word in (
+        (message, "late"),
+        (first, "late"),
+        (message._replace(time=math.nan), "no-message"),
+        (message._replace(time=None), "no-message"),
+        (message._replace(time=9.0), "ahead"),
+        (message._replace(time=0.02, packet=packet._replace(time=9.0)), "ahead"),
+        (message._replace(time=0.02, packet=packet._replace(leader=2)), "no-message"),
+        (
+            message._replace(time=0.02, packet=packet._replace(content=(math.nan, 0.0))),
+            "not-finite",
+        ),
+        (message._replace(time=0.02, packet=packet._replace(content=(0.0,))), "wrong-size"),
+        (message._replace(time=0.02, packet=(0, 0.0)), "no-message"),
+        (message._replace(time=0.02, packet=None), "no-message"),
+        (message._replace(time=0.02, hops="text"), "no-message"),
+    ):
+        assert str(agent.receive(bad)) == word, bad
+    for k in range(1, 4):
+        for mine, theirs in zip(agent.step(0.02 * k, x), twin.step(0.02 * k, x), strict=True):
+            assert (
+                np.array_equal(mine, theirs)
+                if isinstance(mine, np.ndarray)
+                else (mine.time == theirs.time and np.array_equal(mine.signal[1], theirs.signal[1]))
+            )

@@ -12,7 +12,7 @@ import jax
 from jax.core import Tracer
 
 from echelon.core import disk_cache
-from echelon.core.identity import digest
+from echelon.core.identity import digest, foreign_key
 from echelon.core.memoize import BoundedCache
 from echelon.core.plain_format import decode, encode
 from echelon.core.types import PyTree
@@ -84,11 +84,16 @@ class CompiledFunction(Generic[_R]):
         """Wrap a module-level function."""
         functools.update_wrapper(self, function)
         self._function, self._plain = function, eqx.filter_jit(function)
+        self._foreign = BoundedCache[Callable[..., _R]](_MOST)
         self._programs = BoundedCache[_Compiled | None](_MOST)
         self._last: tuple[_CallArguments, bytes | None] | None = None
 
     def __call__(self, *args: object, **named: object) -> _R:
         """Return what the function returns."""
+        foreign = foreign_key((args, named))
+        if foreign:
+            # JAX knows classes, and not what their code reads: each has a function of its own.
+            return self._foreign.get_or_make(foreign, self._renewed)(*args, **named)
         call = _call_of((args, named)) if disk_cache.is_open() else None
         key = None if call is None else self._key(call)
         if call is None or key is None:
@@ -106,6 +111,11 @@ class CompiledFunction(Generic[_R]):
         key = call.digest()
         self._last = call._replace(arrays=()), key
         return key
+
+    def _renewed(self) -> Callable[..., _R]:
+        """Return the function compiled as another one to JAX."""
+        function = self._function
+        return eqx.filter_jit(functools.wraps(function)(lambda *a, **named: function(*a, **named)))
 
     def _load_or_compile(self, call: _CallArguments, key: bytes) -> _Compiled | None:
         """Return what is stored for a call, or compile and store it; None if JAX compiles it."""

@@ -2,7 +2,7 @@
 
 Values with equal bits are the same in every process; object identity is useless, since arrays can
 be changed in place. A foreign class may be redefined or read changing data while a process runs:
-a value that contains one has no digest, only a key for this process.
+a value that contains one has no digest, only a key for this process, which has what its code reads.
 """
 
 import dataclasses
@@ -14,9 +14,11 @@ from collections.abc import Hashable, Sequence
 from types import FunctionType
 from typing import Any, Final, final
 
+from echelon.core.reads import is_installed, reads
+
 _LARGE: Final = 4096
 """Arrays of at least this many bytes are hashed in place and not copied."""
-_TRUSTED: Final = {"echelon", "builtins", "numpy", "jax"}
+_TRUSTED: Final = {"echelon", "builtins", "numpy", "jax", "jaxlib", "equinox", "scipy"}
 _PLAIN: Final = (bool, int, float, complex, str, bytes, type(None))
 
 
@@ -33,8 +35,8 @@ def digest(value: object) -> bytes | None:
 def process_key(value: object) -> Hashable | None:
     """Return a key, equal only for values of the same classes and bits, in this process.
 
-    A user's class is compared by identity, an object of unknown kind by its own equality. None if
-    such an object has no hash.
+    A user's class is compared by identity and by what its code reads, an object of unknown kind by
+    its own equality. None if such an object has no hash.
     """
     walk = _Walk()
     walk.visit(value)
@@ -46,6 +48,16 @@ def process_key(value: object) -> Hashable | None:
     except TypeError:
         return None
     return key
+
+
+def foreign_key(value: object) -> Hashable:
+    """Return a key of all foreign code in a value and of what it reads; empty without any."""
+    walk = _Walk(code_alone=True)
+    walk.visit(value)
+    if not walk.foreign:
+        return ()
+    kinds = [part if isinstance(part[1], Hashable) else id(part[1]) for part in walk.foreign]
+    return walk.digest(), *kinds
 
 
 def array_bits(array: object) -> bytes:
@@ -90,9 +102,15 @@ def _fields(kind: type) -> tuple[str, ...] | None:
 class _Walk:
     """A walk through a tree of values that collects its bits and its foreign parts."""
 
-    def __init__(self) -> None:
-        self.foreign: list[Hashable] = []
+    def __init__(self, code_alone: bool = False) -> None:
+        self.foreign: list[tuple[type, object]] = []
         self._bits: list[bytes] = []
+        self._collects, self._inside, self._seen = not code_alone, False, set[int]()
+
+    @property
+    def _counts(self) -> bool:
+        """Whether values count: all of them, or those that foreign code reads."""
+        return self._collects or self._inside
 
     def digest(self) -> bytes:
         """Return a digest of all bits."""
@@ -104,6 +122,8 @@ class _Walk:
         """Collect the parts of a value, each with its class."""
         kind = type(value)
         if kind in _PLAIN:
+            if not self._counts:
+                return
             # `repr` of a float keeps all digits and the sign of 0.
             self._bits.append(f"{kind.__name__} {value!r}".encode())
             return
@@ -128,12 +148,26 @@ class _Walk:
         if isinstance(value, type | FunctionType):
             self._name(value)
         elif hasattr(value, "dtype") and hasattr(value, "shape"):
-            self._array(value)
+            if self._counts:
+                self._array(value)
         elif isinstance(value, enum.Enum):
             self._name(kind)
             self._bits.append(value.name.encode())
+        elif isinstance(value, functools.partial):
+            self._inner(kind, [value.func, value.args, value.keywords])
         else:
-            self._unknown(value)
+            self._object(value, kind)
+
+    def _object(self, value: object, kind: type) -> None:
+        """Collect an object of unknown kind, and of a stranger's what its class reads."""
+        ours = kind.__module__.partition(".")[0] in _TRUSTED or is_installed(kind.__module__)
+        if not ours and id(value) not in self._seen:
+            self._seen.add(id(value))
+            self._name(kind)
+            before, self._inside = self._inside, True
+            self.visit(getattr(value, "__dict__", {}))
+            self._inside = before
+        self._unknown(value)
 
     def _array(self, array: Any) -> None:
         try:
@@ -149,13 +183,29 @@ class _Walk:
         place: object = sys.modules.get(home)
         for part in name.split("."):
             place = getattr(place, part, None)
+        ours = home.partition(".")[0] in _TRUSTED
         # A class that cannot be found by its name (defined in a function) counts as foreign.
-        if home.partition(".")[0] in _TRUSTED and place is named:
+        if ours and place is named:
             self._bits.append(f"{home}.{name}".encode())
-        else:
-            self._unknown(named)
+        elif self._collects or not ours:
+            self.foreign.append((type(named), named))
+            self._bits.append(b"foreign")
+            self._code(named)
+
+    def _code(self, named: type | FunctionType) -> None:
+        """Collect what foreign code reads, once."""
+        # Of what a stranger's code reads, what is installed does not change.
+        if id(named) in self._seen or self._inside and is_installed(named.__module__):
+            return
+        self._seen.add(id(named))
+        before, self._inside = self._inside, True
+        for value in reads(named):
+            self.visit(value)
+        self._inside = before
 
     def _unknown(self, value: object) -> None:
+        if not self._counts:
+            return
         # With the class, since numbers of different classes may compare equal.
         self.foreign.append((type(value), value))
         self._bits.append(b"foreign")

@@ -1,5 +1,6 @@
 """What one agent receives: messages that name their values, of each neighbour the last good one."""
 
+import math
 import numbers
 from collections.abc import Sequence
 from typing import NamedTuple, final
@@ -22,6 +23,8 @@ class Received(Word):
     NOT_HEARD = "its sender is not a neighbour of the receiver"
     WRONG_SIZE = "it has not one value for each name, or no name that the receiver uses"
     NOT_FINITE = "a value is not finite, or larger than 1e12"
+    LATE = "a newer one of the same sender was received before"
+    AHEAD = "its time is ahead of the receiver's clock"
 
 
 class NamedValues(NamedTuple):
@@ -31,18 +34,42 @@ class NamedValues(NamedTuple):
     values: Array
 
 
+class Packet(NamedTuple):
+    """What a leader last said of itself, passed on unchanged.
+
+    Attributes:
+        leader: its number.
+        time: when it said so, s.
+        content: its deviation from its plan, or what else the prediction needs (p,).
+        epoch: how often the leadership was handed over.
+    """
+
+    leader: int
+    time: float
+    content: tuple[float, ...]
+    epoch: int = 0
+
+
 class Message(NamedTuple):
     """What an agent sends.
 
     Attributes:
         sender: its number.
-        signal: what its neighbours use: its state less its offset, or the signal of its law.
-        feedforward: the feed-forward of its input, of the same step; None before it has acted.
+        signal: what its neighbours use: its state less its offset, or the signal of its law; over
+            a network that is late, its deviation from where it expects the leader.
+        feedforward: the feed-forward of its input, of the same step; None before it has acted, and
+            over a network that is late.
+        time: when it was sent, s; None in the ideal network.
+        hops: to a leader, as counted by messages.
+        packet: the newest of a leader; None before it has one.
     """
 
     sender: int
     signal: NamedValues
     feedforward: NamedValues | None = None
+    time: float | None = None
+    hops: int = 0
+    packet: Packet | None = None
 
 
 @final
@@ -54,6 +81,7 @@ class Inbox:
         source: whose feed-forward is used; None for nobody's.
         names: of the signal's values.
         forward_names: of the feed-forward's values.
+        stamps: over a network that is late, where times and packets of messages are stored.
 
     Attributes:
         signals: (K, s).
@@ -69,8 +97,10 @@ class Inbox:
         source: int | None,
         names: tuple[str, ...],
         forward_names: tuple[str, ...],
+        stamps: "Stamps | None" = None,
     ) -> None:
         """Receive nothing yet."""
+        self._post = stamps
         self._senders, self._source = tuple(senders), source
         self._names, self._forward_names = names, forward_names
         self.signals = np.full((len(senders), len(names)), np.nan)
@@ -80,7 +110,8 @@ class Inbox:
         """Store a message whose values are finite numbers with names that this agent uses."""
         if not isinstance(message, Message) or not isinstance(message.sender, numbers.Integral):
             return Received.NO_MESSAGE
-        if message.sender not in (*self._senders, self._source):
+        heard = self._senders if self._post is not None else (*self._senders, self._source)
+        if message.sender not in heard:
             return Received.NOT_HEARD
         # Both before either is stored, so that a message is taken as a whole.
         values = _read(message.signal)
@@ -89,11 +120,93 @@ class Inbox:
             return next(part for part in (values, forward) if isinstance(part, Received))
         if not {*self._names} & {*values}:
             return Received.WRONG_SIZE
+        if self._post is not None:
+            fault = self._post.take(message, self._senders.index(message.sender))
+            if fault is not None:
+                return fault
         place = [who == message.sender for who in self._senders]
         self.signals[place] = [values.get(name, np.nan) for name in self._names]
         if message.sender == self._source and forward:
             self.feedforward[:] = [forward.get(name, np.nan) for name in self._forward_names]
         return Received.TAKEN
+
+
+@final
+class Stamps:
+    """Times, hops and the newest packet of what an agent received over a network that is late.
+
+    Args:
+        links: how many neighbours it hears.
+        leaders: the numbers of those whose packets count; the lowest one first.
+        size: of a packet's content.
+        own: the agent's number, if it leads.
+        needs_packet: whether a message says nothing without one.
+
+    Attributes:
+        time: (K,) when the last message of each neighbour was sent, s; -inf for none.
+        hops: (K,) of its sender.
+        packet: the newest one; None before the first.
+        clock: the receiver's time, s.
+    """
+
+    def __init__(
+        self, links: int, leaders: Sequence[int], size: int, own: int | None, needs_packet: bool
+    ) -> None:
+        """Store nothing yet."""
+        self.needs_packet = needs_packet
+        self.time, self.hops = np.full(links, -np.inf), np.full(links, _FAR)
+        self.packet: Packet | None = None
+        self.clock = 0.0
+        self._leaders, self._size, self._own = frozenset(leaders), size, own
+
+    def take(self, message: Message, place: int) -> Received | None:
+        """Store the time, hops and packet of a message; return why it is not used, if so."""
+        packet = message.packet
+        if not (isinstance(packet, Packet) or packet is None and not self.needs_packet):
+            return Received.NO_MESSAGE
+        times = [message.time, *([] if packet is None else [packet.time])]
+        if not all(map(_is_time, times)) or not isinstance(message.hops, numbers.Integral):
+            return Received.NO_MESSAGE
+        if max(times) > self.clock + _AHEAD:  # pyright: ignore - numbers, as just checked
+            return Received.AHEAD
+        if packet is not None:
+            fault = self._fault(packet)
+            if fault is not None:
+                return fault
+            if self._wins(packet):
+                self.packet = packet
+        # A late message may yet bring a newer packet, by another way.
+        if not message.time > self.time[place]:  # pyright: ignore
+            return Received.LATE
+        self.time[place] = message.time
+        self.hops[place] = min(max(int(message.hops), 0), _FAR)
+        return None
+
+    def _fault(self, packet: Packet) -> Received | None:
+        """Return why a packet is not used; None if it is."""
+        if packet.leader not in self._leaders:
+            return Received.NO_MESSAGE
+        values = _read((tuple(map(str, range(self._size))), packet.content))
+        return values if isinstance(values, Received) else None
+
+    def _wins(self, packet: Packet) -> bool:
+        """Tell whether a packet is of a leader with a lower number, or newer."""
+        if self._own is not None and packet.leader >= self._own:
+            return False
+        if self.packet is None:
+            return True
+        rank = [(x.epoch, -x.leader, x.time) for x in (packet, self.packet)]
+        return rank[0] > rank[1]
+
+
+_FAR = 2**30
+"""Hops of a sender that no leader reaches."""
+_AHEAD = 0.05
+"""s; by so much clocks may differ."""
+
+
+def _is_time(value: object) -> bool:
+    return isinstance(value, numbers.Real) and math.isfinite(float(value))
 
 
 def _read(part: object) -> dict[str, float] | Received:

@@ -130,6 +130,11 @@ def tune(
             bounds=bounds,
             options={"maxiter": rounds},
         )
+    if not search.trials and search.lost:
+        raise EchelonError(
+            "the run diverges with the scenario's own weights, and so its cost has no gradient; "
+            "shorten `simulation.dt` or `simulation.horizon`."
+        )
     if not search.trials:
         raise EchelonError("the search was interrupted before the first trial.")
     before, after = search.trials[0], min(search.trials, key=lambda trial: trial.cost)
@@ -150,6 +155,7 @@ class _Search:
         _check_parameters(scenario, parameters)
         self.parts, self.settings = build(scenario)
         self.cost, self.progress, self.trials = cost, progress, list[TuneTrial]()
+        self.lost = 0
         self.names = [key for key in PARAMETERS if key in parameters]
         gain, spec = self.parts.drive.gain, scenario.follower.gain
         assert gain is not None
@@ -182,10 +188,9 @@ class _Search:
             cost = gradient(
                 with_gain(self.parts, gain), self.settings, self.cost, ("P", "R", "coupling")
             )
+            slopes = self._slopes(gain, cost, values) / max(cost.value, 1e-300)
         except GainError:
-            return _LOST, np.zeros_like(point)
-        slopes = self._slopes(gain, cost, values) / max(cost.value, 1e-300)
-        if not (np.isfinite(cost.value) and np.isfinite(slopes).all()):
+            self.lost += 1
             return _LOST, np.zeros_like(point)
         self.trials.append(TuneTrial(values, gain, cost.value))
         if self.progress is not None:
@@ -208,7 +213,13 @@ class _Search:
         return synthesize(self.parts.model, self.parts.graph, method)
 
     def _slopes(self, gain: Gain, cost: Gradient, values: Mapping[str, Any]) -> Array:
-        """Return the derivative of the cost with respect to the logarithm of each parameter."""
+        """Return the derivative of the cost with respect to the logarithm of each parameter.
+
+        Raises:
+            GainError: the run diverges, and has none.
+        """
+        if not all(np.isfinite(x).all() for x in (cost.value, *cost.slopes.values())):
+            raise GainError("the run diverges with this gain, and its cost has no slopes.")
         by_Q, by_R = through_riccati(*linearize(self.parts.model), gain.P, gain.R, cost.slopes["P"])
         by_R = by_R + cost.slopes["R"]
         along = dict(

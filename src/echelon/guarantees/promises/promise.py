@@ -8,11 +8,12 @@ feed-forward, limits and starts that run; what a gain claims of itself is only c
 import abc
 import dataclasses
 import importlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeAlias
 from weakref import WeakKeyDictionary
 
 from echelon.core.errors import EchelonError
+from echelon.core.identity import foreign_key
 from echelon.core.numerics import precision
 from echelon.core.statement import Cause, Hypothesis, Statement
 from echelon.core.types import Array
@@ -255,7 +256,8 @@ class Promise(abc.ABC):
 
 
 Promises: TypeAlias = Iterator[Promise | EchelonError]
-_cache: WeakKeyDictionary[Parts, dict[Settings, Promise]] = WeakKeyDictionary()
+_cache: WeakKeyDictionary[Parts, dict[Hashable, dict[Settings, Promise]]] = WeakKeyDictionary()
+"""By parts, by what foreign code in them reads now, and by settings."""
 
 
 def prover_of(drive: Drive) -> type[Promise]:
@@ -275,7 +277,7 @@ def promise(parts: Parts, settings: Settings) -> Promise:
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
-    stored = _cache.get(parts, {}).get(settings)
+    stored = _stored(parts).get(settings)
     return stored or _computed(prepare(parts, settings), parts, settings)
 
 
@@ -287,7 +289,7 @@ def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) ->
     for k, each in enumerate(settings):
         try:
             prepared, alike = prepare(parts, each), each._replace(seed=0)
-            stored = (p for s, p in _cache.get(parts, {}).items() if s._replace(seed=0) == alike)
+            stored = (p for s, p in _stored(parts).items() if s._replace(seed=0) == alike)
             first = next(stored, None) or _computed(prepared, parts, each, brief)
         except EchelonError as error:
             # Others may start where the laws have a meaning.
@@ -303,5 +305,10 @@ def _computed(prepared: Prepared, parts: Parts, settings: Settings, brief: bool 
         computed = prover_of(prepared.parts.drive).of(prepared, settings, brief)
     # A result holds the prepared parts, and asks again.
     for key in (parts, prepared.parts) if computed.complete else ():
-        _cache.setdefault(key, {})[settings] = computed
+        _stored(key)[settings] = computed
     return computed
+
+
+def _stored(parts: Parts) -> dict[Settings, Promise]:
+    """Return the guarantees of parts by settings, of what their code reads now."""
+    return _cache.setdefault(parts, {}).setdefault(foreign_key(parts), {})

@@ -2,6 +2,7 @@
 
 import math
 import numbers
+from collections.abc import Sequence
 from typing import NamedTuple, final
 
 import jax
@@ -10,17 +11,30 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from echelon.agents.network.inbox import Inbox, Message, NamedValues, Received
+from echelon.agents.network.exchange import Exchange
+from echelon.agents.network.inbox import Inbox, Message, NamedValues, Packet, Received, Stamps
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.numerics import precision
 from echelon.core.types import Array, PyTree, Scalar, State
-from echelon.core.words import Feedforward
+from echelon.core.words import Feedforward, MessageContent
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.action import Action, act, feedforward_of
+from echelon.simulation.step.knowledge import (
+    NOBODY,
+    Ages,
+    Letters,
+    Mail,
+    Packets,
+    Readers,
+    content_of,
+    packet_size,
+    understand,
+    write,
+)
 from echelon.simulation.step.loop import Loop, assemble
 from echelon.simulation.step.settings import Settings
 
@@ -32,6 +46,9 @@ class Agent:
     In every step each agent sends its `hello`, and then takes its `step` after it received the
     messages: leaders first, where their input is fed forward, and followers by their distance from
     the leaders where it is their parents'. Together they do what `simulate` does, to rounding.
+
+    Over the network of the parts' world, which is late, agents take their `step` in any order, and
+    send its message whenever the network's rate allows it; `hello` is not needed.
 
     A message may be missing: the last one of its sender is used, and a neighbour that sent none is
     left out. Agents of other models are heard in the outputs that both have. Nothing that is not
@@ -62,7 +79,9 @@ class Agent:
                 f"agent {agent!r} is not in this graph, whose agents are 0 to "
                 f"{parts.graph.agents - 1}."
             )
-        prepared = prepare(parts, Settings(horizon=dt, dt=dt, limits=limits))
+        network = parts.world.network
+        horizon = dt if network is None else dt * math.ceil(1.0 + network.delay / dt)
+        prepared = prepare(parts, Settings(horizon=horizon, dt=dt, limits=limits))
         drive = prepared.parts.drive
         assert isinstance(drive, Laws)
         with precision("float64"):
@@ -77,10 +96,23 @@ class Agent:
         self._schedule = graph.schedule
         with precision("float64"):
             self._names = _names(self._loop, self._law)
-        self._inbox = Inbox(self.neighbours, self._source_in(parts), *self._names)
+        self._stamps = self._stamps_of(graph.leaders)
+        self._inbox = Inbox(
+            self.neighbours, self._source_in(parts), *self._names, stamps=self._stamps
+        )
         self._memory: Memory | None = None
         self._begun, self._time, self.blind = False, -math.inf, 0
         self._last: tuple[Array, Message | None] = np.array(self._loop.model.trim[1], float), None
+
+    def _stamps_of(self, leaders: Sequence[int]) -> Stamps | None:
+        """Return where times and packets are stored; None in the ideal network."""
+        channel = self._loop.channel
+        if channel is None:
+            return None
+        size = packet_size(channel, *map(len, self._names))
+        own = self.number if self.leads else None
+        deviation = channel.messages is MessageContent.DEVIATION
+        return Stamps(len(self.neighbours), leaders, size, own, deviation)
 
     def _source_in(self, parts: Parts) -> int | None:
         """Return whose feed-forward this agent uses; None for nobody's."""
@@ -126,24 +158,67 @@ class Agent:
                 f"last step was at {self._time:g} s."
             )
         self._time = float(t)
+        if self._stamps is not None:
+            self._stamps.clock = self._time
         row = 0 if self._schedule is None else self._schedule.row(t)
         with precision("float64"):
-            step = _step(
-                self._loop,
-                self.leads,
-                jnp.asarray(self._time),
-                self._own(self._state(x)),
-                self._inbox.signals,
-                self._weights[row],
-                self._inbox.feedforward,
-            )
+            own, time = self._own(self._state(x)), jnp.asarray(self._time)
+            if self._stamps is None:
+                step = _step(
+                    self._loop,
+                    self.leads,
+                    time,
+                    own,
+                    self._inbox.signals,
+                    self._weights[row],
+                    self._inbox.feedforward,
+                )
+            else:
+                mail, ages = self._mail(self._stamps)
+                rows = self._reader, time, own, mail, ages, self._weights[row]
+                step = _late_step(self._loop, self.leads, *rows)
         if step.finite:
             self._memory, self._begun = step.action.memory, True
-            message = self._message(step.signal, step.action.message)
+            message = self._written(step)
             self._last = np.asarray(step.action.input), message
         else:
             self.blind += 1
         return self._last
+
+    @property
+    def _reader(self) -> Readers:
+        return Readers(jnp.array([self.number], jnp.int32), jnp.array([self.leads]))
+
+    def _mail(self, stamps: Stamps) -> tuple[Mail, Ages]:
+        """Return what the agent keeps of what it received, and its ages (s)."""
+        assert self._loop.channel is not None
+        packet, size = stamps.packet, packet_size(self._loop.channel, *map(len, self._names))
+        leader = self.number if self.leads else NOBODY
+        leader = leader if packet is None else packet.leader
+        content = np.zeros(size) if packet is None else np.asarray(packet.content)
+        since = math.inf if packet is None else max(0.0, self._time - packet.time)
+        stamps_unused = jnp.zeros(len(self.neighbours), jnp.int32)
+        packets = Packets(
+            jnp.array([leader], jnp.int32), jnp.zeros(1, jnp.int32), jnp.asarray(content)[None]
+        )
+        # Of an output that a sender does not have it is taken to be where the leader is.
+        value = jnp.nan_to_num(jnp.asarray(self._inbox.signals), nan=0.0)
+        mail = Mail(stamps_unused, value, jnp.asarray(stamps.hops, jnp.int32), packets)
+        link = jnp.asarray(np.maximum(0.0, self._time - stamps.time))
+        return mail, Ages(link, jnp.array([since]))
+
+    def _written(self, step: "_Step") -> Message | None:
+        """Return the message of a step; None of an agent that has heard of no leader."""
+        if self._stamps is None or step.letter is None:
+            return self._message(step.signal, step.action.message)
+        packet, leader = self._stamps.packet, int(step.letter.packet.leader[0])
+        if leader == self.number:
+            packet = Packet(leader, self._time, tuple(step.letter.packet.content[0].tolist()))
+        if packet is None and self._stamps.needs_packet:
+            return None
+        message = self._message(step.letter.value[0])
+        hops = int(step.letter.hops[0])
+        return message._replace(time=self._time, hops=hops, packet=packet)
 
     def _message(self, signal: ArrayLike, forward: ArrayLike | None = None) -> Message:
         names, forward_names = self._names
@@ -208,11 +283,15 @@ def _signal(loop: Loop, law: Law, own: _OwnState) -> Float[jax.Array, " s"]:
 
 
 class _Step(NamedTuple):
-    """The signal (s,) of an agent, what it does, and whether both and its state are finite."""
+    """The signal (s,) of an agent, what it does, and whether both and its state are finite.
+
+    `letter` is what it sends over a network that is late, as a row of one.
+    """
 
     signal: jax.Array
     action: Action
     finite: jax.Array
+    letter: Letters | None = None
 
 
 @cached_jit
@@ -246,3 +325,33 @@ def _step(
 def _finite(tree: PyTree) -> jax.Array:
     leaves = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     return jnp.all(jnp.array([jnp.isfinite(leaf).all() for leaf in leaves]))
+
+
+@cached_jit
+def _late_step(
+    loop: Loop,
+    leads: bool,
+    reader: Readers,
+    t: Scalar,
+    own: _OwnState,
+    mail: Mail,
+    ages: Ages,
+    weights: Float[jax.Array, " K"],
+) -> _Step:
+    """Return what the agent does and sends over a network that is late."""
+    law, model = loop.leader if leads else loop.follower, loop.model
+    signal, nobody = _signal(loop, law, own), np.zeros(len(weights), np.int32)
+    states = law.signal(model, *own) is None
+    difference = jax.vmap(model.difference if states else jnp.subtract)
+    rows = loop, Exchange(nobody, nobody, weights), reader, t, mail, ages, signal[None], difference
+    knowledge = understand(*rows)
+    forward = jnp.zeros(len(model.input_names)) if leads else knowledge.feedforward[0]
+    z = knowledge.disagreement[0]
+    view = LocalView(t, own.x, own.offset, z, forward, loop.motion.dt)
+    action = act(loop, law, view, own.memory, leads)
+    content = mail.packet.content
+    if leads:
+        content = content_of(loop, t, *own, signal, action.message)[None]
+    step = jnp.zeros((), jnp.int32)
+    letter, _ = write(loop, reader, step, mail, knowledge, signal[None], difference, content)
+    return _Step(signal, action, _finite((own.x, signal, action, letter)), letter)

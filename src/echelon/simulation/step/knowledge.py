@@ -63,6 +63,13 @@ class Mail(NamedTuple):
     packet: Packets
 
 
+class Ages(NamedTuple):
+    """How old mail is, s: of each link (K,) and each packet (N,); infinite for none."""
+
+    link: Float[jax.Array, " K"]
+    packet: Float[jax.Array, " N"]
+
+
 class Readers(NamedTuple):
     """Agents that read their mail: their numbers (N,), and which of them lead (N,)."""
 
@@ -115,8 +122,9 @@ def understand(
     loop: Loop,
     exchange: Exchange,
     readers: Readers,
-    step: jax.Array,
+    t: Scalar,
     mail: Mail,
+    ages: Ages,
     sent: Float[jax.Array, "N s"],
     difference: Difference,
 ) -> Knowledge:
@@ -126,21 +134,23 @@ def understand(
         loop: with a channel.
         exchange: the links of the agents, with the weights of this step.
         readers: the agents.
-        step: its number.
+        t: time, s.
         mail: of the agents.
+        ages: of what it contains.
         sent: their signals, from their own states.
         difference: of two signals.
     """
     channel = loop.channel
     assert channel is not None
-    leader, feedforward = _leaders(loop, readers, step, mail.packet, sent)
-    hops = _hops(loop, exchange, readers, mail, step)
-    knows = readers.leads | (mail.packet.stamp != NEVER)
+    leader, feedforward = _leaders(loop, readers, t, mail.packet, ages.packet, sent)
+    forget = channel.forget * loop.motion.dt
+    hops = _hops(loop, exchange, readers, mail.hops, ages.link <= _HOP_LIFE * forget)
+    knows = readers.leads | (ages.packet < jnp.inf)
     receivers = jnp.asarray(exchange.receivers)
-    received, used = mail.value, mail.stamp != NEVER
+    received, used = mail.value, ages.link < jnp.inf
     fresh = used
     if channel.messages is MessageContent.DEVIATION:
-        fresh = used & (step - mail.stamp <= channel.forget)
+        fresh = ages.link <= forget
         received = leader[receivers] + jnp.where(fresh[:, None], mail.value, 0.0)
         # A leader is where it is expected, and its own message says no more.
         used, fresh = knows[receivers], fresh | (used & (mail.hops == 0))
@@ -205,22 +215,21 @@ def content_of(
 def _leaders(
     loop: Loop,
     readers: Readers,
-    step: jax.Array,
+    t: Scalar,
     packet: Packets,
+    ages: Float[jax.Array, " N"],
     sent: Float[jax.Array, "N s"],
 ) -> tuple[Float[jax.Array, "N s"], Float[jax.Array, "N k"]]:
     """Return where each agent expects its leader, and the feed-forward that it expects of it."""
-    channel, dtype = loop.channel, sent.dtype
+    channel, knows = loop.channel, (ages < jnp.inf)[:, None]
     assert channel is not None
-    t = step.astype(dtype) * loop.motion.dt
     if channel.messages is MessageContent.STATE:
         signal, feedforward = sent, packet.content
     elif channel.prediction is Prediction.NONE:
         signal, feedforward = jnp.split(packet.content, [sent.shape[1]], axis=1)
     else:
-        age = (step - packet.stamp).astype(dtype) * loop.motion.dt
-        signal, feedforward = jax.vmap(lambda c, T: _expected(loop, t, c, T))(packet.content, age)
-    knows = (packet.stamp != NEVER)[:, None]
+        rows = packet.content, jnp.where(ages < jnp.inf, ages, 0.0)
+        signal, feedforward = jax.vmap(lambda c, age: _expected(loop, t, c, age))(*rows)
     own = (packet.leader == readers.number)[:, None]
     return jnp.where(own | ~knows, sent, signal), jnp.where(knows, feedforward, 0.0)
 
@@ -242,14 +251,16 @@ def _expected(
 
 
 def _hops(
-    loop: Loop, exchange: Exchange, readers: Readers, mail: Mail, step: jax.Array
+    loop: Loop,
+    exchange: Exchange,
+    readers: Readers,
+    of_senders: Int[jax.Array, " K"],
+    lasting: Bool[jax.Array, " K"],
 ) -> Int[jax.Array, " N"]:
-    """Return the hops to a leader, as counted by the messages that arrive."""
-    channel = loop.channel
-    assert channel is not None
-    lasting = (mail.stamp != NEVER) & (step - mail.stamp <= _HOP_LIFE * channel.forget)
-    of_link = jnp.where(lasting, mail.hops, NOBODY)
+    """Return the hops to a leader, as counted by the messages that are not too old."""
+    of_link = jnp.where(lasting, of_senders, NOBODY)
     nearest = jax.ops.segment_min(of_link, jnp.asarray(exchange.receivers), len(readers.number))
+    nearest = jnp.minimum(nearest, NOBODY)
     # Agents that are cut off together would count each other up for ever.
     hops = jnp.where(nearest + 1 >= len(loop.order), NOBODY, nearest + 1)
     return jnp.where(readers.leads, 0, hops).astype(jnp.int32)
@@ -286,8 +297,14 @@ def read_messages(
     channel = loop.channel
     assert channel is not None
     mail = _take(channel, exchange, now)
-    rows = loop, exchange, _all(loop), now.step, mail, sent, difference
-    return understand(*rows), mail
+    ages = Ages(*(_age(now.step, x, loop.motion.dt) for x in (mail.stamp, mail.packet.stamp)))
+    t = now.step.astype(sent.dtype) * loop.motion.dt
+    return understand(loop, exchange, _all(loop), t, mail, ages, sent, difference), mail
+
+
+def _age(step: jax.Array, stamp: Int[jax.Array, " K"], dt: float) -> Float[jax.Array, " K"]:
+    """Return the age (s) of what was sent at steps (K,)."""
+    return jnp.where(stamp == NEVER, jnp.inf, (step - stamp) * jnp.asarray(dt))
 
 
 def _take(channel: Channel, exchange: Exchange, now: Moment) -> Mail:
@@ -313,9 +330,10 @@ def newest(own: Packets, others: Packets, new: jax.Array, receivers: jax.Array) 
         receivers: (K,) of the messages.
     """
     count = len(own.stamp)
-    leaders = jnp.where(new & (others.stamp != NEVER), others.leader, NOBODY)
+    valid = new & (others.stamp != NEVER)
+    leaders = jnp.where(valid, others.leader, NOBODY)
     leader = jnp.minimum(own.leader, jax.ops.segment_min(leaders, receivers, count))
-    of_it = leaders == leader[receivers]
+    of_it = valid & (leaders == leader[receivers])
     last = jnp.where(own.leader == leader, own.stamp, NEVER)
     stamp = jax.ops.segment_max(jnp.where(of_it, others.stamp, NEVER), receivers, count)
     stamp = jnp.maximum(last, stamp)
