@@ -38,6 +38,7 @@ JOURNEYS = [
     slow("extending"),
     slow(*FIRST, "troubleshooting"),
     slow("recipes", "sweeps", "comparing"),
+    slow("networks"),
 ]
 
 FENCE = re.compile(

@@ -70,3 +70,16 @@ def test_passive_leaders_apart_come_together_by_their_own_drift():
         measured, found = shrinking(parts, *((10.0, 20.0) if rate else (0.5, 1.0)))
         assert found.rate == pytest.approx(rate or -found.loop.slowest)
         assert measured == pytest.approx(found.rate, rel=0.05) and found.slowest == -found.rate
+
+
+def test_agents_without_chains_are_promised_at_the_coupling_that_their_step_holds():
+    # Twice the root over lambda_min is more than the step holds, so that c d_max dt is 1.
+    graph = ech.Graph.from_edges([(k, k + 1) for k in range(9)], agents=10)
+    model = ech.models.SingleIntegrator(2)
+    states = np.zeros((10, 2))
+    states[1:] = np.random.default_rng(0).uniform(-1.0, 1.0, (9, 2))
+    drive = ech.Laws(StoppingLeader(), StoppingPoint())
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((10, 2))), drive, initial=states)
+    measured, found = shrinking(parts, 0.0, 2.0)
+    assert found.promised and found.coupling * 2.0 * 0.02 == pytest.approx(1.0)
+    assert measured > 0.0

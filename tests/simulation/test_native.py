@@ -18,7 +18,7 @@ from echelon.simulation import codegen as kernels
 from echelon.simulation.codegen import block_copy
 from echelon.simulation.engine.batch import Batch
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.native import agent_order, buffers, schedule, threads
+from echelon.simulation.native import agent_order, blocks, buffers, schedule, threads
 from echelon.simulation.native import kernel_cache as kernel_code
 from echelon.simulation.native import stepper as native_stepper
 from echelon.simulation.native.varying import VaryingNumbers
@@ -491,6 +491,34 @@ def test_both_engines_and_batches_say_the_same_time_of_a_divergence(store_every)
         messages += ["; ".join(run.message for run in runs) for runs in (alone, batch)]
         assert all(run.outcome is ech.Outcome.DIVERGED for run in alone)
     assert len(set(messages)) == 1 and "t = 0.08 s" in messages[0], messages
+
+
+@pytest.mark.parametrize(
+    ("graph", "shifts"),
+    [
+        (ech.Graph.ring(203), {-1, 1}),
+        (ech.Graph.path(90), {-1, 1}),
+        (ech.Graph.grid(20, 200), {-200, -1, 1, 200}),
+    ],
+)
+@pytest.mark.parametrize("spacing", [0.0, 1.0])
+def test_neighbours_that_are_as_far_in_all_blocks_are_read_without_a_list(
+    graph, shifts, spacing, monkeypatch
+):
+    model = ech.models.DoubleIntegrator(1)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=0.2))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    offsets = spacing * np.arange(graph.agents)[:, None] * [[1.0, 0.0]]
+    parts = ech.Parts(model, graph, ech.Formation(offsets), drive, initial={"position": 1.0})
+    usual, stepper = stepped(parts, run_settings(), (5, 40, 0), "native")
+    assert {*stepper.places.shifts[0]} == shifts
+    # Without any, the graph's lists are read; and by JAX.
+    monkeypatch.setattr(blocks, "mark_shifted", lambda *_: ())
+    listed, other = stepped(parts, run_settings(), (5, 40, 0), "native")
+    assert other.places.shifts == ((), ())
+    assert usual.states.tobytes() == listed.states.tobytes()
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(usual.sums, listed.sums, strict=True))
+    check_alike(parts, run_settings(), (5, 40, 0))
 
 
 def test_where_agents_stand_changes_no_bit(monkeypatch):

@@ -25,6 +25,8 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 
 _PROOF = Kind.PROOF
+_BELOW = 1.0 - 1e-9
+"""So little below a bound that nothing reaches; without chains a step at it has a radius of 1."""
 _TOGETHER = 1e-9
 """In flat coordinates; leaders that start nearer to each other differ by rounding."""
 
@@ -265,8 +267,9 @@ def _strengths(run: StoppingRun) -> Array:
     assert reach is not None
     if run.law.leaderward or graph.directed or graph.schedule is not None:
         return agreement_modes(graph, run.law)
-    # By Gershgorin none is larger than 2 d_max.
-    return np.array([reach.slowest, 2.0 * reach.heaviest])
+    # By Gershgorin none is larger than 2 d_max, nor as large where somebody hears a leader.
+    alone = max(run.law.ready.chains.degrees) == 1
+    return np.array([reach.slowest, 2.0 * reach.heaviest * (_BELOW if alone else 1.0)])
 
 
 def agreement_modes(graph: Graph, law: StoppingPoint) -> Array:

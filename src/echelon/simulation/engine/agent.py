@@ -191,6 +191,7 @@ class Agent:
 
     def _mail(self, stamps: Stamps) -> tuple[Mail, Ages]:
         """Return what the agent keeps of what it received, and its ages (s)."""
+        assert self._loop.channel is not None
         packet, size = stamps.packet, packet_size(self._loop.channel, *map(len, self._names))
         leader = self.number if self.leads else NOBODY
         leader = leader if packet is None else packet.leader
