@@ -474,6 +474,33 @@ def test_an_agent_that_is_lost_is_told_as_by_jax():
     assert found[0].message == found[1].message and "follower 1" in found[0].message
 
 
+class Turned(ech.ControlAffine):
+    """An angle, whose difference somebody writes with sine and cosine."""
+
+    state_names, input_names = ("angle",), ("rate",)
+
+    def drift(self, x):
+        return 0.0 * x
+
+    def input_map(self, x):
+        return jnp.ones((1, 1), x.dtype)
+
+    def difference(self, x, y):
+        return jnp.arctan2(jnp.sin(x - y), jnp.cos(x - y))
+
+
+@pytest.mark.parametrize(("size", "left"), [(1.0, False), (1e12, True)])
+def test_a_difference_with_sines_has_native_code_and_large_angles_are_left_to_jax(size, left):
+    model, graph = Turned(), ech.Graph.ring(40)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=0.3))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    start = size * np.random.default_rng(0).normal(size=(40, 1))
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((40, 1))), drive, initial=start)
+    check_alike(parts, run_settings(), (5, 40, 0))
+    _, stepper = stepped(parts, run_settings(), (5, 40, 0), "native")
+    assert bool(stepper.warnings) == left
+
+
 @pytest.mark.parametrize("store_every", [1, 7, 1000])
 def test_both_engines_and_batches_say_the_same_time_of_a_divergence(store_every):
     def parts(start):

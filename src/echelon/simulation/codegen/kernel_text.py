@@ -202,6 +202,8 @@ def _act(w: Writer, context: Context, body: Body, block: str) -> None:
             return (z if kind == "z" else contributions)[rest[0]]
         return _load(w, context, block, base, kind, rest)
 
+    # Without the differences, whose sums are computed before.
+    nodes = [*body.results(), *body.mirror_before]
     fast = find_fast_path(nodes, [*large_choices(body.results()), *_new_minima(body)])
     done, otherwise = w.fresh("done"), w.fresh("otherwise")
     if fast.levels:
