@@ -23,6 +23,7 @@ from typing import Any, TypeAlias
 
 try:
     import numpy as np
+    import plain_c
     import steppers as made
 except ImportError:
     # Not in the environment that `dev.py setup` makes.
@@ -57,6 +58,9 @@ _AT_LEAST: Row = {
     **{f"formations of 4, float{bits}, shared gains to C": 0.8 for bits in _BITS},
     "formations of 4, float32, own gains to C": 0.5,
     "formations of 4, float64, own gains to C": 0.6,
+    "ring of Van der Pol, float32, to plain C": 0.3,
+    "ring of Van der Pol, float64, to plain C": 0.3,
+    **{f"ring of masses with drag, float{bits}, to plain C": 0.7 for bits in _BITS},
     "degree 6, 10,000, float32, to C": 1.5,
     "degree 6, 10,000, float64, to C": 1.0,
     **{f"ring of 1,000,000, float{bits}, to C": 0.75 for bits in _BITS},
@@ -123,6 +127,16 @@ def _in_c(
     if yardstick is None:
         return {}
     return {"C": partial(yardstick.rate, make(yardstick), agents, steps)}
+
+
+def measure_plain(name: str, bits: int, _: Yardstick | None) -> Row:
+    """Return the rate of a ring of simple agents beside plain C without sums, if it compiles."""
+    parts = plain_c.ring(name)
+    side = made.steppers(parts, bits)
+    ways = {"native": partial(rate, side.native, plain_c.AGENTS, [plain_c.STEPS], None, bits)}
+    if plain_c.compiler() is not None:
+        ways["plain C"] = plain_c.beside(name, side.native, bits)
+    return turns(f"ring of {name}, float{bits}", ways)
 
 
 def measure_degree(bits: int, yardstick: Yardstick | None) -> Row:
@@ -367,6 +381,7 @@ GROUPS: dict[str, list[Measure]] = {
     "kernels": [
         *(partial(measure_ring, 10_000, bits) for bits in _BITS),
         *(partial(measure_ring, 10_000, bits, model=made.Newcomer()) for bits in _BITS),
+        *(partial(measure_plain, name, bits) for name in plain_c.MODELS for bits in _BITS),
         *(partial(measure, bits) for measure in _EACH.values() for bits in _BITS),
     ],
     "million": [partial(measure_ring, _MILLION, bits) for bits in _BITS],

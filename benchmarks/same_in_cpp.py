@@ -94,7 +94,7 @@ class Follower:
 
         after = body.map_nodes(rewritten(body.results(), read))
         graph = next(iter(after.stores.values())).graph
-        pairs = ((after.sums, "add"), (after.maxima, "max"), (after.minima, "min"))
+        pairs = ((after.sums, "add"), (after.minima, "min"))
         self.stores = dict(after.stores) | {
             row: graph.make(op, graph.leaf("row", row), node)
             for results, op in pairs

@@ -46,6 +46,7 @@ def text_of(function, count, bits=64, lanes=None):
         one_leader=False,
         weighted=False,
         edges=(),
+        apart=False,
         exception_row=count + len(results),
         table=0,
         dt=0.0,

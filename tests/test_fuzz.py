@@ -105,3 +105,11 @@ def test_numbers_beyond_all_squares_are_no_fault(here, echelon, recwarn, base, c
     code, _, fault = echelon("check", "s.yaml", "--set", change)
     assert code in (0, 1) or (code == 2 and fault.count("\n") == 1), fault
     assert not [str(each.message) for each in recwarn if each.category is RuntimeWarning]
+
+
+def test_agents_beyond_all_squares_of_each_other_run_without_a_warning(here, echelon, recwarn):
+    (here / "s.yaml").write_bytes(FUZZ.as_yaml(FUZZ.BASES[2]))
+    change = ["--set", "formation.spacing=1e200", "--set", "simulation.precision=float64"]
+    code, _, fault = echelon("run", "s.yaml", "--no-figures", "--out", "o", *change)
+    assert code in (0, 3), fault
+    assert not [str(each.message) for each in recwarn if each.category is RuntimeWarning]

@@ -274,10 +274,11 @@ def test_agents_by_themselves_are_those_of_the_simulation(directed):
     result = ech.simulate(parts, ech.Settings(0.2, 0.01))
     agents = [Agent(parts, k, 0.01) for k in range(3)]
     for k, x in enumerate(result.states[:-1]):
-        said = {a.number: a.hello(x[a.number]) for a in agents}
+        messages = [agent.hello(x[agent.number]) for agent in agents]
         for agent in agents:
-            heard = {j: said[j] for j in (*agent.neighbours, 0) if j != agent.number}
-            u, said[agent.number] = agent.step(0.01 * k, x[agent.number], heard)
+            for j in {*agent.neighbours, 0} - {agent.number}:
+                agent.receive(messages[j])
+            u, messages[agent.number] = agent.step(0.01 * k, x[agent.number])
             np.testing.assert_allclose(u, result.inputs[k, agent.number], atol=1e-9)
 
 

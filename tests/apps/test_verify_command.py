@@ -99,11 +99,16 @@ def in_data(**attributes):
     return act
 
 
-def moved_start(folder):
-    with xr.open_dataset(folder / "run.nc", engine="h5netcdf") as data:
-        data = data.load()
-    data["states"][0, 1, 0] += 0.5
-    data.to_netcdf(folder / "run.nc", engine="h5netcdf")
+def moved(name):
+    """Add to the first numbers of a variable in the dataset of a run."""
+
+    def act(folder):
+        with xr.open_dataset(folder / "run.nc", engine="h5netcdf") as data:
+            data = data.load()
+        data[name][:1] += 0.5
+        data.to_netcdf(folder / "run.nc", engine="h5netcdf")
+
+    return act
 
 
 def link(folder):
@@ -179,7 +184,11 @@ FORGED = {
     "another scenario": ("tube", in_text("scenario.yaml", "agents: 4", "agents: 3"), 1),
     "a scenario twice": ("tube", in_text("scenario.yaml", "agents: 4", "agents: 4, agents: 4"), 2),
     "another start": ("alone", in_text("scenario.yaml", "position: 1.0", "position: 2.0"), 1),
-    "a start in the data": ("alone", moved_start, 1),
+    "a start in the data": ("alone", moved("states"), 1),
+    "a weight in the data": ("alone", moved("edge_weight"), 1),
+    "an offset in the data": ("gain", moved("offset"), 1),
+    "a P in the data": ("gain", moved("P"), 1),
+    "a step in the data": ("alone", in_data(dt=lambda dt: 2.0 * dt), 1),
     "the data's promise": (
         "tube",
         in_data(promise=lambda text: text.replace('"rate": ', '"rate": 1')),

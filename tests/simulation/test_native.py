@@ -18,7 +18,7 @@ from echelon.simulation import codegen as kernels
 from echelon.simulation.codegen import block_copy
 from echelon.simulation.engine.batch import Batch
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.native import agent_order, buffers, schedule, threads
+from echelon.simulation.native import agent_order, blocks, buffers, schedule, threads
 from echelon.simulation.native import kernel_cache as kernel_code
 from echelon.simulation.native import stepper as native_stepper
 from echelon.simulation.native.varying import VaryingNumbers
@@ -474,6 +474,33 @@ def test_an_agent_that_is_lost_is_told_as_by_jax():
     assert found[0].message == found[1].message and "follower 1" in found[0].message
 
 
+class Turned(ech.ControlAffine):
+    """An angle, whose difference somebody writes with sine and cosine."""
+
+    state_names, input_names = ("angle",), ("rate",)
+
+    def drift(self, x):
+        return 0.0 * x
+
+    def input_map(self, x):
+        return jnp.ones((1, 1), x.dtype)
+
+    def difference(self, x, y):
+        return jnp.arctan2(jnp.sin(x - y), jnp.cos(x - y))
+
+
+@pytest.mark.parametrize(("size", "left"), [(1.0, False), (1e12, True)])
+def test_a_difference_with_sines_has_native_code_and_large_angles_are_left_to_jax(size, left):
+    model, graph = Turned(), ech.Graph.ring(40)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=0.3))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    start = size * np.random.default_rng(0).normal(size=(40, 1))
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((40, 1))), drive, initial=start)
+    check_alike(parts, run_settings(), (5, 40, 0))
+    _, stepper = stepped(parts, run_settings(), (5, 40, 0), "native")
+    assert bool(stepper.warnings) == left
+
+
 @pytest.mark.parametrize("store_every", [1, 7, 1000])
 def test_both_engines_and_batches_say_the_same_time_of_a_divergence(store_every):
     def parts(start):
@@ -491,6 +518,34 @@ def test_both_engines_and_batches_say_the_same_time_of_a_divergence(store_every)
         messages += ["; ".join(run.message for run in runs) for runs in (alone, batch)]
         assert all(run.outcome is ech.Outcome.DIVERGED for run in alone)
     assert len(set(messages)) == 1 and "t = 0.08 s" in messages[0], messages
+
+
+@pytest.mark.parametrize(
+    ("graph", "shifts"),
+    [
+        (ech.Graph.ring(203), {-1, 1}),
+        (ech.Graph.path(90), {-1, 1}),
+        (ech.Graph.grid(20, 200), {-200, -1, 1, 200}),
+    ],
+)
+@pytest.mark.parametrize("spacing", [0.0, 1.0])
+def test_neighbours_that_are_as_far_in_all_blocks_are_read_without_a_list(
+    graph, shifts, spacing, monkeypatch
+):
+    model = ech.models.DoubleIntegrator(1)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=0.2))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    offsets = spacing * np.arange(graph.agents)[:, None] * [[1.0, 0.0]]
+    parts = ech.Parts(model, graph, ech.Formation(offsets), drive, initial={"position": 1.0})
+    usual, stepper = stepped(parts, run_settings(), (5, 40, 0), "native")
+    assert {*stepper.places.shifts[0]} == shifts
+    # Without any, the graph's lists are read; and by JAX.
+    monkeypatch.setattr(blocks, "mark_shifted", lambda *_: ())
+    listed, other = stepped(parts, run_settings(), (5, 40, 0), "native")
+    assert other.places.shifts == ((), ())
+    assert usual.states.tobytes() == listed.states.tobytes()
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(usual.sums, listed.sums, strict=True))
+    check_alike(parts, run_settings(), (5, 40, 0))
 
 
 def test_where_agents_stand_changes_no_bit(monkeypatch):

@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 Precision: TypeAlias = Literal["float64", "float32"]
 Field: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
@@ -23,6 +24,10 @@ def precision(name: Precision) -> contextlib.AbstractContextManager[object]:
 
 def rk4(field: Field, x: jax.Array, u: jax.Array, dt: float | jax.Array) -> jax.Array:
     """Advance one step by the classical Runge-Kutta method with the input held; error O(dt^4)."""
+    if isinstance(x, Tracer):
+        # Traced once for its four calls, since tracing a model takes most of the time before a run;
+        # under a name of its own, as JAX would hand out the first trace of one function again.
+        field = jax.jit(lambda x, u, field=field: field(x, u), inline=True)
     # With u held the field is smooth within the step, which order 4 needs.
     k1 = field(x, u)
     k2 = field(x + 0.5 * dt * k1, u)

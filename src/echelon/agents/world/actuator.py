@@ -49,7 +49,7 @@ class Actuator:
                 "whole number from 2 on."
             )
 
-    def prepared(self, plant: ControlAffine) -> "Motors":
+    def prepared(self, plant: ControlAffine) -> "MotorArrays":
         """Return the actuators of a plant as arrays.
 
         Raises:
@@ -58,7 +58,7 @@ class Actuator:
         lag = np.asarray(self.lag) if self.lag else None
         limits = plant.input_limits
         if not self.levels and self.minimum is None:
-            return Motors(lag, None, None, None, None, None)
+            return MotorArrays(lag, None, None, None, None, None)
         mixing = np.zeros((0, 0)) if limits is None else np.asarray(limits.matrix, float)
         square = mixing.ndim == 2 and mixing.shape[0] == mixing.shape[1] > 0
         if limits is None or not square or not np.isfinite([limits.low, limits.high]).all():
@@ -70,7 +70,7 @@ class Actuator:
         low, high = np.asarray(limits.low, float), np.asarray(limits.high, float)
         step = (high - low) / (self.levels - 1) if self.levels else None
         least = low if self.minimum is None else np.maximum(low, self.minimum)
-        return Motors(lag, mixing, np.linalg.inv(mixing), low, least, step)
+        return MotorArrays(lag, mixing, np.linalg.inv(mixing), low, least, step)
 
     def __str__(self) -> str:
         """Return the actuators in words."""
@@ -81,7 +81,7 @@ class Actuator:
 
 
 @final
-class Motors(eqx.Module):
+class MotorArrays(eqx.Module):
     """Actuators as arrays; a part without effect is None.
 
     Attributes:

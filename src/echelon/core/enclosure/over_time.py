@@ -17,8 +17,8 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from echelon.core.enclosure import rules
-from echelon.core.enclosure.branches import BRANCHES
 from echelon.core.enclosure.interval import Interval
+from echelon.core.enclosure.piecewise import BRANCHES
 from echelon.core.enclosure.series import (
     FUNCTIONS,
     Ends,

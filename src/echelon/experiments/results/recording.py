@@ -179,13 +179,23 @@ def read_recording(file: Path) -> Recording:
     Raises:
         OutputError: the file cannot be read, is damaged, or has another format.
     """
+    return recording_with_arrays(file)[0]
+
+
+def recording_with_arrays(file: Path) -> tuple[Recording, dict[str, np.ndarray]]:
+    """Return the run in a netCDF file, and all its arrays by name.
+
+    Raises:
+        OutputError: the file cannot be read, is damaged, or has another format.
+    """
     import xarray as xr
 
     try:
         with xr.open_dataset(file, engine="h5netcdf") as data:
             data.load()
             arrays = {str(name): variable.values for name, variable in data.variables.items()}
-            return recording(arrays, {str(key): value for key, value in data.attrs.items()})
+            run = recording(arrays, {str(key): value for key, value in data.attrs.items()})
+            return run, arrays
     except OutputError as error:
         raise OutputError(f"`{file}`: {error}") from error
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:

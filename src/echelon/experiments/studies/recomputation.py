@@ -9,10 +9,13 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from echelon.core.errors import GainError
 from echelon.core.types import JsonObject
 from echelon.experiments.results.dataset import OBSERVED, statement
-from echelon.experiments.results.recording import read_recording
+from echelon.experiments.results.labelled_parts import labelled_parts
+from echelon.experiments.results.recording import recording_with_arrays
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.self_contained import without_folders
@@ -26,6 +29,7 @@ from echelon.guarantees.verifier.strict_json import parse_json, read_json
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.prepare import prepare
 from echelon.synthesis.gains.gain_file import gain_as_mapping, load_gain
 
 _SOLVED = 1e-3
@@ -103,8 +107,8 @@ def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Ite
 
 
 def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
-    """Compare guarantee, scenario, starts and P of a dataset."""
-    run, (parts, settings), name = read_recording(file), experiment, file.name
+    """Compare the guarantee, the scenario, the parts and the starts in a dataset."""
+    (run, arrays), (parts, settings), name = recording_with_arrays(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
     value = _as_json(promise(parts, settings).as_mapping())
     yield from compare_values(f"{name}: promise", stored, value)
@@ -115,8 +119,11 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
     yield from compare_values(f"{name}: scenario_text", theirs, ours)
     starts = initial_states(parts, settings.seed)[None][: len(run.states)]
     yield from compare_values(f"{name}: states", run.states[:1].tolist(), starts.tolist())
-    P = None if parts.drive.gain is None else parts.drive.gain.P.tolist()
-    yield from compare_values(f"{name}: P", None if run.metric is None else run.metric.tolist(), P)
+    fixed = labelled_parts(prepare(parts, settings).parts, settings)
+    stated = {**run.attributes, **arrays}
+    for key, part in {**fixed.attributes, **fixed.arrays()}.items():
+        theirs, ours = (np.asarray(each).tolist() for each in (stated.get(key), part))
+        yield from compare_values(f"{name}: parts.{key}", theirs, ours)
 
 
 def _as_json(value: JsonObject) -> JsonObject:

@@ -95,7 +95,8 @@ def _missing_on_path(run: StoppingRun) -> _Missing:
         times = np.modf(_GOLDEN * np.arange(_TIMES))[0] * run.settings.horizon
         x, u = follow_at(model, leader.reference, times)
     path = np.asarray(_path(leader, model, jnp.asarray(times)))[:, :3]
-    driven = _Driven(model, world.plant_for(model), leader.ready, jnp.asarray(push))
+    plant = world.plants.get(run.parts.graph.leaders[0], world.plant_for(model))
+    driven = _Driven(model, plant, leader.ready, jnp.asarray(push))
     return _missing(driven, *map(jnp.asarray, (path, x, u)))
 
 

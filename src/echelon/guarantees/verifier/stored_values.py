@@ -112,7 +112,10 @@ def _agree(stored: Array, value: Array, same: float) -> bool:
         return False
     size = np.maximum(np.abs(stored), np.abs(value))
     noise = _NOISE * max(1.0, float(np.abs(value).max())) if value.ndim else _NOISE
-    return bool(((np.abs(stored - value) <= same * size) | (size <= noise)).all())
+    with np.errstate(invalid="ignore"):
+        near = np.abs(stored - value) <= same * np.where(np.isfinite(size), size, 0.0)
+    # Infinite bounds are equal, and have no difference.
+    return bool((near | (stored == value) | (size <= noise)).all())
 
 
 def _same_text(stored: str, value: str) -> bool:

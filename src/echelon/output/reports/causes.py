@@ -112,7 +112,8 @@ def _falls(result: Result, steady: float) -> bool:
     assert result.reference is not None
     first = result.graph.leaders[0]
     away = result.states[-1, first] - result.formation.offsets[first] - result.reference[-1]
-    return float(np.linalg.norm(away[list(result.measured)])) < 0.5 * steady
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.linalg.norm(away[list(result.measured)])) < 0.5 * steady
 
 
 def _chatter(result: Result) -> Iterator[Cause]:

@@ -3,13 +3,14 @@
 from echelon.simulation.codegen.angle_differences import has_flag
 from echelon.simulation.codegen.block_copy import copy_rows
 from echelon.simulation.codegen.factoring import factored
-from echelon.simulation.codegen.kernel_plan import SLOTS, TASK, Body, Plan, stride
+from echelon.simulation.codegen.kernel_plan import SHIFTED, SLOTS, TASK, Body, Plan, stride
 from echelon.simulation.codegen.kernel_text import program
 from echelon.simulation.codegen.machine_code import Code, aligned, is_installed, vectors
 from echelon.simulation.codegen.scheduling import shared
 from echelon.simulation.codegen.tape import contribution_widths, from_tape
 
 __all__ = [
+    "SHIFTED",
     "SLOTS",
     "TASK",
     "Body",

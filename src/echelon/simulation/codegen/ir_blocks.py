@@ -1,7 +1,8 @@
 """Control flow and memory access that kernels are written with: loops, choices, addresses."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 from echelon.simulation.codegen.kernel_plan import Plan
@@ -23,6 +24,7 @@ class Context(NamedTuple):
         leader_messages: what they sent at this step.
         leader_count: the positions of leaders.
         tape: this step's part of the tape.
+        at_hand: place of a number that is the same for all agents -> the number, loaded before.
     """
 
     plan: Plan
@@ -36,6 +38,7 @@ class Context(NamedTuple):
     leader_messages: str = ""
     leader_count: str = ""
     tape: str = ""
+    at_hand: Mapping[int, str] = MappingProxyType({})
 
 
 @contextlib.contextmanager

@@ -6,6 +6,8 @@ from typing import NamedTuple, TypeAlias
 
 from echelon.simulation.scalars import Node, needed
 
+SHIFTED = 2
+"""Of a block in `contiguous`: its neighbours, or ends, are as far away as `Plan.shifts` says."""
 NO_MINIMUM = 2**31 - 1
 """The minimum in a row that has none yet: no step has that number."""
 _Part: TypeAlias = Mapping[int, Node] | Sequence[Node]
@@ -22,7 +24,6 @@ class Body(NamedTuple):
     Attributes:
         stores: row -> its new value.
         sums: row -> what is added to it.
-        maxima: row -> a value; the row keeps the largest so far.
         minima: row -> a value; the row keeps the smallest so far, beginning with `NO_MINIMUM`.
         on_request: row -> its new value at the step `input_step` only, since every store costs
             time.
@@ -40,7 +41,6 @@ class Body(NamedTuple):
 
     stores: Mapping[int, Node] = _NONE
     sums: Mapping[int, Node] = _NONE
-    maxima: Mapping[int, Node] = _NONE
     minima: Mapping[int, Node] = _NONE
     on_request: Mapping[int, Node] = _NONE
     mirror: Sequence[Node] = ()
@@ -102,8 +102,12 @@ class Plan(NamedTuple):
         one_source: whether one agent sends to all others, so that no sender is looked up.
         one_leader: whether all have the same leader.
         weighted: whether some weight of an edge is not 1.
+        shifts: how many positions the neighbours in the slots of most blocks are away, if that is
+            known and `row_major`.
+        edge_shifts: how many positions the two ends of the edges of most blocks are away.
         edges: entries that neighbours read of which distances are computed; none if no distances
             are.
+        apart: whether the goals of some neighbours differ; else distances are their own errors.
         exception_row: becomes 1 where one of `Body.exceptions` holds.
         table: numbers per step in the table.
         dt: s.
@@ -128,9 +132,12 @@ class Plan(NamedTuple):
     one_leader: bool
     weighted: bool
     edges: tuple[int, ...]
+    apart: bool
     exception_row: int
     table: int
     dt: float
+    shifts: tuple[int, ...] = ()
+    edge_shifts: tuple[int, ...] = ()
     leaders_ahead: bool = False
     tape_rows: int = 0
     backward: bool = False

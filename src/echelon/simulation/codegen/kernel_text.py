@@ -112,6 +112,7 @@ def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
         w.label(follow)
         if plan.edges:
             measure_edges(w, context, task["first_edge"], task["last_edge"])
+        context = _with_uniform(w, context, plan.others)
         with loop(w, task["start"], task["end"]) as (block, _, _):
             _act(w, context, plan.others, block)
         w.do(f"br label %{done}")
@@ -145,6 +146,20 @@ def _context(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers:
     mirror, messages = (w.part(slots[k], passed, n) for k, n in zip(names, sizes, strict=True))
     count = w.put(f"mul i64 {blocks}, {plan.lanes}")
     return context._replace(leader_mirror=mirror, leader_messages=messages, leader_count=count)
+
+
+_AT_HAND = 12
+"""Numbers that are the same for all agents and stay in registers while a task is done."""
+
+
+def _with_uniform(w: Writer, context: Context, body: Body) -> Context:
+    """Write the load of what is the same for all agents, before the loop over them.
+
+    In the loop, LLVM would load it again after every store, which might change it.
+    """
+    leaves = [n for n in needed(body.results()) if n.op == "leaf" and n.value[0] == "uniform"]
+    values = {n.value[1]: _load_uniform(w, context, *n.value) for n in leaves[:_AT_HAND]}
+    return context._replace(at_hand=values)
 
 
 def _lead(w: Writer, context: Context, task: dict[str, str]) -> None:
@@ -187,6 +202,8 @@ def _act(w: Writer, context: Context, body: Body, block: str) -> None:
             return (z if kind == "z" else contributions)[rest[0]]
         return _load(w, context, block, base, kind, rest)
 
+    # Without the differences, whose sums are computed before.
+    nodes = [*body.results(), *body.mirror_before]
     fast = find_fast_path(nodes, [*large_choices(body.results()), *_new_minima(body)])
     done, otherwise = w.fresh("done"), w.fresh("otherwise")
     if fast.levels:
@@ -244,7 +261,7 @@ def _write(
     with only_if(w, context.slots["input_step"]):
         for row, node in body.on_request.items():
             w.store_row(emitter.value(node), base, row)
-    for results, op in ((body.sums, "add"), (body.maxima, "max"), (body.minima, "min")):
+    for results, op in ((body.sums, "add"), (body.minima, "min")):
         for row, node in results.items():
             if _has_no_effect(op, node):
                 continue
@@ -289,6 +306,8 @@ def _load_uniform(w: Writer, context: Context, kind: str, *rest: int) -> str:
     if kind == "steady":
         late = w.put(f"icmp sge i64 {context.step}, {context.slots['first_steady']}")
         return w.put(f"uitofp i1 {late} to {w.scalar}")
+    if kind == "uniform" and rest[0] in context.at_hand:
+        return context.at_hand[rest[0]]
     if kind in ("table", "uniform"):
         start = context.table if kind == "table" else context.uniform_values
         return w.load(w.scalar, start, rest[0])

@@ -18,7 +18,7 @@ from echelon.simulation.codegen.ir_blocks import (
     load_places,
     loop,
 )
-from echelon.simulation.codegen.kernel_plan import Body, stride
+from echelon.simulation.codegen.kernel_plan import SHIFTED, Body, stride
 from echelon.simulation.codegen.vector_ir import Writer
 from echelon.simulation.scalars.scalar_graph import Node, needed
 
@@ -40,18 +40,28 @@ def exchange(
     plain = 0.0 not in plain_limits(plan).values()
     some = _AT_ONCE if plain else len(entries)
 
-    def add_up(contiguous: bool) -> list[str]:
+    def add_up(contiguous: bool, shifts: Sequence[int] = ()) -> list[str]:
         totals = list[str]()
         for part in (entries[k : k + some] for k in range(0, len(entries), some)):
             differences = [body.difference[k] for k in part]
             leaves = [n for n in needed(differences) if n.op == "leaf" and n.value[0] == "self"]
             shown = {leaf: body.mirror_before[leaf.value[1]] for leaf in leaves}
-            mine = _own_entries(w, context, shown, block, load)
-            totals += _sums(w, context, ends, differences, mine, contiguous)
+            mine: dict[Node | int, str] = {**_own_entries(w, context, shown, block, load)}
+            if shifts:
+                totals += _shifted_sums(w, context, block, ends[0], differences, mine)
+            else:
+                totals += _sums(w, context, ends, differences, mine, contiguous)
         return totals
 
-    if plan.row_major:
-        totals = either(w, flag(w, slots["contiguous"], block), add_up)
+    def add_up_listed() -> list[str]:
+        return either(w, flag(w, slots["contiguous"], block), add_up)
+
+    if plan.row_major and plan.shifts:
+        kind = w.load("i8", slots["contiguous"], block)
+        usual = w.put(f"icmp eq i8 {kind}, {SHIFTED}")
+        totals = either(w, usual, lambda so: add_up(so, plan.shifts) if so else add_up_listed())
+    elif plan.row_major:
+        totals = add_up_listed()
     elif plan.batched or not plain:
         totals = add_up(False)
     elif not (has_flag(plan) or plan.leaders_ahead):
@@ -75,28 +85,67 @@ def _sums(
     context: Context,
     ends: tuple[str, str],
     differences: Sequence[Node],
-    mine: dict[Node, str],
+    mine: dict[Node | int, str],
     contiguous: bool,
 ) -> list[str]:
     """Write the sums of some entries of the difference over the neighbours."""
-    plan = context.plan
-    leaves = [n for n in needed(differences) if n.op == "leaf"]
-    entries = sorted({n.value[1] for n in leaves if n.value[0] == "neighbour"})
+    entries = _read_entries(differences)
     zero = [(w.vector, "zeroinitializer")] * len(differences)
     with loop(w, *ends, zero) as (slot, totals, following):
-        place = w.put(f"mul i64 {slot}, {plan.lanes}")
         theirs = _listed_entries(w, context, "neighbours", slot, entries, contiguous)
-        emitter = Emitter(
-            w, lambda leaf: mine[leaf] if leaf.value[0] == "self" else theirs[leaf.value[1]]
-        )
-        emitter.emit(differences)
-        weight = w.load(w.vector, context.slots["weights"], place) if plan.weighted else None
-        for k, node in enumerate(differences):
-            value = emitter.value(node)
-            if weight is not None:
-                value = w.operation("mul", [value, weight])
-            following[k] = w.operation("add", [totals[k], value])
+        following[:] = _added(w, context, slot, differences, mine | theirs, totals)
     return totals
+
+
+def _shifted_sums(
+    w: Writer,
+    context: Context,
+    block: str,
+    first_slot: str,
+    differences: Sequence[Node],
+    mine: dict[Node | int, str],
+) -> list[str]:
+    """Write the same without a loop where each neighbour is as far away as in most blocks."""
+    totals = ["zeroinitializer"] * len(differences)
+    here = w.put(f"mul i64 {block}, {w.lanes}")
+    for number, shift in enumerate(context.plan.shifts):
+        place = w.put(f"add i64 {here}, {shift}")
+        theirs = {k: _row_part(w, context, k, place) for k in _read_entries(differences)}
+        slot = w.put(f"add i64 {first_slot}, {number}")
+        totals = _added(w, context, slot, differences, mine | theirs, totals)
+    return totals
+
+
+def _read_entries(differences: Sequence[Node]) -> list[int]:
+    """Return the entries of a neighbour that some differences depend on."""
+    leaves = [n for n in needed(differences) if n.op == "leaf"]
+    return sorted({n.value[1] for n in leaves if n.value[0] == "neighbour"})
+
+
+def _added(
+    w: Writer,
+    context: Context,
+    slot: str,
+    differences: Sequence[Node],
+    values: dict[Node | int, str],
+    totals: Sequence[str],
+) -> list[str]:
+    """Write sums with the differences to the neighbours of a slot; values are by leaf, or entry."""
+    emitter = Emitter(w, lambda leaf: values[leaf if leaf.value[0] == "self" else leaf.value[1]])
+    emitter.emit(differences)
+    read = [emitter.value(node) for node in differences]
+    if context.plan.weighted:
+        place = w.put(f"mul i64 {slot}, {w.lanes}")
+        weight = w.load(w.vector, context.slots["weights"], place)
+        read = [w.operation("mul", [value, weight]) for value in read]
+    return [w.operation("add", list(pair)) for pair in zip(totals, read, strict=True)]
+
+
+def _row_part(w: Writer, context: Context, row: int, place: str) -> str:
+    """Write the load of numbers that follow each other in a row of a row-major mirror."""
+    # Aligned for a number only: the first one is in any lane.
+    at = mirror_row(w, context, row, place)
+    return w.put(f"load {w.vector}, ptr {at}, align {w.bits // 8}")
 
 
 def _own_entries(
@@ -137,9 +186,7 @@ def _listed_entries(
     at = w.at("i32", slots[which], first)
     if plan.row_major and contiguous:
         place = w.load_place(at)
-        addresses = ((k, mirror_row(w, context, k, place)) for k in entries)
-        # Aligned for a number only: the first neighbour is in any lane.
-        return {k: w.put(f"load {w.vector}, ptr {a}, align {w.bits // 8}") for k, a in addresses}
+        return {k: _row_part(w, context, k, place) for k in entries}
     if plan.row_major:
         places = load_places(w, slots[which], first)
         addresses = ((k, mirror_row(w, context, k)) for k in entries)
@@ -322,19 +369,30 @@ def measure_edges(w: Writer, context: Context, start: str, end: str) -> None:
             ends = [_listed_entries(w, context, "edge_ends", k, axes, contiguous) for k in pair]
             return [end[axis] for axis in axes for end in ends]
 
-        ends = (
-            either(w, flag(w, slots["contiguous_edges"], block), read)
-            if plan.row_major
-            else read(False)
-        )
+        def read_listed() -> list[str]:
+            return either(w, flag(w, slots["contiguous_edges"], block), read)
+
+        def read_shifted() -> list[str]:
+            here = w.put(f"mul i64 {block}, {w.lanes}")
+            places = [w.put(f"add i64 {here}, {shift}") for shift in plan.edge_shifts]
+            return [_row_part(w, context, axis, place) for axis in axes for place in places]
+
+        if plan.row_major and plan.edge_shifts:
+            kind = w.load("i8", slots["contiguous_edges"], block)
+            usual = w.put(f"icmp eq i8 {kind}, {SHIFTED}")
+            ends = either(w, usual, lambda so: read_shifted() if so else read_listed())
+        else:
+            ends = read_listed() if plan.row_major else read(False)
         squares = "zeroinitializer"
         for k in range(len(axes)):
             difference = w.operation("sub", ends[2 * k : 2 * k + 2])
-            difference = w.operation("add", [difference, w.load_row(base, k)])
+            if plan.apart:
+                difference = w.operation("add", [difference, w.load_row(base, k)])
             square = w.operation("mul", [difference, difference])
             squares = w.operation("add", [squares, square])
-        distance = w.operation("sqrt", [squares])
-        error = w.operation("sub", [distance, w.load_row(base, len(axes))])
-        square = w.operation("mul", [error, error])
+        if plan.apart:
+            distance = w.operation("sqrt", [squares])
+            error = w.operation("sub", [distance, w.load_row(base, len(axes))])
+            squares = w.operation("mul", [error, error])
         total = w.load_row(base, len(axes) + 1)
-        w.store_row(w.operation("add", [total, square]), base, len(axes) + 1)
+        w.store_row(w.operation("add", [total, squares]), base, len(axes) + 1)

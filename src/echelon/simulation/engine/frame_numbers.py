@@ -99,7 +99,8 @@ class FrameNumbers(abc.ABC):
 def _least(places: Float[Array, "T N k"]) -> Float[Array, " T"]:
     if places.shape[1] <= _FEW:
         i, j = np.triu_indices(places.shape[1], 1)
-        return np.linalg.norm(places[:, i] - places[:, j], axis=2).min(axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.linalg.norm(places[:, i] - places[:, j], axis=2).min(axis=1)
     from scipy.spatial import KDTree
 
     return np.array([KDTree(points).query(points, k=2)[0][:, 1].min() for points in places])

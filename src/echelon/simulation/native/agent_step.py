@@ -257,7 +257,11 @@ def body_of(
     shapes = jax.tree.structure(StepOutputs(*[0] * 15)._replace(memory=law.init()))
     outputs: StepOutputs = shapes.unflatten([nodes(graph, part) for part in results])
     memory = jax.tree.leaves(outputs.memory, is_leaf=lambda part: isinstance(part, list))
-    stores = {"state": outputs.state, "cut": outputs.cut, "memory": sum(memory, start=[])}
+    stores = {"state": outputs.state, "memory": sum(memory, start=[])}
+    # Where no limit is, nothing was ever cut.
+    if any(node is not graph.constant(0.0) for node in outputs.cut):
+        stores["cut"] = outputs.cut
+    stores["unsettled"] = _last_steps(graph, rows.unsettled, outputs.unsettled)
     # Unless inputs are passed on from parents, nobody reads the message of a follower.
     if leads or loop.levels is not None:
         stores["message"] = outputs.message
@@ -270,7 +274,6 @@ def body_of(
     body = Body(
         stores=_placed(rows, stores),
         sums=_placed(rows, sums),
-        maxima=_placed(rows, {"unsettled": outputs.unsettled}),
         minima=_placed(rows, {"inside": outputs.inside}),
         on_request=_placed(rows, {"input": outputs.input}),
         mirror_before=[*subtract(inputs.x, inputs.offset), *outputs.signal],
@@ -279,6 +282,16 @@ def body_of(
     )
     body = body._replace(exceptions=exceptions_of(graph, body))
     return body.map_nodes(factored(body.all()))
+
+
+def _last_steps(graph: ScalarGraph, rows: range, steps: list[Node]) -> list[Node]:
+    """Return the last steps of which rows are the earlier ones; -1 is no step.
+
+    Steps ascend, so that the later one replaces the earlier one.
+    """
+    before = leaves_of(graph, "row", rows)
+    none = [graph.make("lt", step, 0.0) for step in steps]
+    return [graph.make("select", *each) for each in zip(none, before, steps, strict=True)]
 
 
 def _before_and_in_window(inputs: StepInputs, sums: list[Node]) -> list[Node]:

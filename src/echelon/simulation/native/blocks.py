@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import NamedTuple, final
+from typing import NamedTuple, TypeAlias, final
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from echelon.simulation.native.agent_order import (
     ordered,
     windows,
 )
+from echelon.simulation.native.contiguity import contiguous_blocks, follow, mark_shifted
 from echelon.simulation.native.schedule import BlockReach
 from echelon.simulation.step.loop import Loop
 
@@ -50,6 +51,10 @@ class Neighbourhood(NamedTuple):
     contiguous_edges: Array
 
 
+Shifts: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
+"""How many positions neighbours, and the ends of edges, are away in most blocks."""
+
+
 class Places(abc.ABC):
     """Positions in blocks of as many agents as a vector has lanes.
 
@@ -66,6 +71,7 @@ class Places(abc.ABC):
         batched: whether vectors hold agents of several formations.
         row_major: whether what neighbours read is stored row by row over all positions.
         reach: of blocks, if leaders may be ahead of all others and it was measured.
+        shifts: `shifts` and `edge_shifts` of `Plan`.
     """
 
     loop: Loop
@@ -77,6 +83,7 @@ class Places(abc.ABC):
     batched: bool
     row_major: bool
     reach: BlockReach | None = None
+    shifts: Shifts = ((), ())
 
     @property
     def edge_blocks(self) -> int:
@@ -110,8 +117,6 @@ class Places(abc.ABC):
         """Return the sums in rows of edges, one for each edge."""
 
 
-_MOSTLY = 0.75
-"""The share of blocks with contiguous neighbours from which on a row-major mirror is faster."""
 _SAMPLE = 1_000
 """Blocks from which the share of contiguous ones is estimated."""
 
@@ -140,11 +145,23 @@ class SwarmBlocks(Places):
             if not self._contiguous(neighbour_slots(loop, self, blocks=some))[1]:
                 self._place(near, degrees)
         self.slots = neighbour_slots(loop, self)
-        self.contiguous, self.row_major = self._contiguous(self.slots)
-        # Ends that are near in memory follow each other; leaders are near to all.
-        ends = self.position[np.asarray(loop.meter.edges)].T
+        contiguous, self.row_major = self._contiguous(self.slots)
+        self.contiguous = contiguous.astype(np.int8)
+        self._order_edges()
+        self.contiguous_edges = self._contiguous_edges()
+        if self.row_major:
+            starts = 2 * np.arange(self.edge_blocks + 1)
+            self.shifts = (
+                mark_shifted(*self.slots[:2], self.contiguous),
+                mark_shifted(starts, self.edge_ends(), self.contiguous_edges),
+            )
+
+    def _order_edges(self) -> None:
+        """Order the edges: ends that are near in memory follow each other."""
+        ends = self.position[np.asarray(self.loop.meter.edges)].T
         i, j = np.minimum(*ends), np.maximum(*ends)
-        leads, count = i < self.segments[1] * lanes, len(self.agents)
+        # Leaders are near to all.
+        leads, count = i < self.segments[1] * self.lanes, len(self.agents)
         order = grouped(np.where(leads, i, j), count)[1]
         self.edge_order = order[grouped(np.where(leads, j, i)[order], count)[1]]
 
@@ -176,14 +193,21 @@ class SwarmBlocks(Places):
             aligned_copy(weights, dtype),
             ((sources // lanes) * rows * lanes + sources % lanes).astype(np.int32),
             (self.position[nearest] * far).astype(np.int32),
-            *(edges := edge_blocks(loop, self, dtype, far)),
-            self.contiguous.astype(np.int8),
-            self._contiguous_edges(edges[1]),
+            *edge_blocks(loop, self, dtype, far),
+            self.contiguous,
+            self.contiguous_edges,
         )
 
-    def _contiguous_edges(self, ends: Array) -> Array:
+    def edge_ends(self) -> Array:
+        """Return the positions of the ends of edges, (2 edge blocks, lanes)."""
+        edges = np.asarray(self.loop.meter.edges)[self.edge_order]
+        ends = np.resize(self.position[edges], (self.edge_blocks * self.lanes, 2))
+        return ends.reshape(-1, self.lanes, 2).swapaxes(1, 2).reshape(-1, self.lanes)
+
+    def _contiguous_edges(self) -> Array:
+        ends = self.edge_ends().reshape(-1, 2, self.lanes)
         leads = (ends < self.segments[1] * self.lanes).any(axis=(1, 2))
-        return np.asarray(_follow(ends).all(axis=1) & ~leads, np.int8)
+        return np.asarray(follow(ends).all(axis=1) & ~leads, np.int8)
 
     def measure_reach(self, neighbourhood: Neighbourhood, far: int, bytes_: int) -> None:
         """Measure the reach of blocks of so many bytes, with agents `far` numbers apart."""
@@ -274,28 +298,6 @@ def aligned_copy(values: Array, dtype: np.dtype | type) -> Array:
     return copy
 
 
-def contiguous_blocks(starts: Array, positions: Array, leaders: int = 0) -> tuple[Array, bool]:
-    """Return which blocks have contiguous neighbours in all slots, and whether row-major is faster.
-
-    If it is not, return which blocks have no leader among their neighbours, of so many positions.
-    """
-    block = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-
-    def all_(slots: Array) -> Array:
-        return np.bincount(block, ~slots, len(starts) - 1) == 0
-
-    contiguous = all_(np.logical_and(_follow(positions), positions[:, 0] >= leaders))
-    # To gather a number lane by lane costs several times as much as to load contiguous ones.
-    if contiguous.mean() > _MOSTLY:
-        return contiguous, True
-    return all_(np.asarray((positions >= leaders).all(axis=1))), False
-
-
-def _follow(positions: Array) -> Array:
-    """Return which of some lists of positions (..., lanes) are consecutive numbers."""
-    return (np.diff(positions, axis=-1) == 1).all(axis=-1)
-
-
 def neighbour_slots(
     loop: Loop,
     places: Places,
@@ -353,6 +355,5 @@ def edge_blocks(loop: Loop, places: SwarmBlocks, dtype: np.dtype, far: int) -> t
     rows[:, :q] = differences.reshape(blocks, lanes, q).transpose(0, 2, 1)
     spacings = np.asarray(meter.spacings)[places.edge_order]
     rows[:, q] = np.resize(spacings, blocks * lanes).reshape(blocks, lanes)
-    ends = np.resize(places.position[edges] * far, (blocks * lanes, 2))
-    pairs = ends.reshape(blocks, lanes, 2).transpose(0, 2, 1)
-    return rows, np.ascontiguousarray(pairs, np.int32)
+    ends = places.edge_ends().reshape(blocks, 2, lanes) * far
+    return rows, np.ascontiguousarray(ends, np.int32)

@@ -11,6 +11,7 @@ from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
 from echelon.simulation.codegen import Code, Plan, has_flag, program, shared
 from echelon.simulation.native.agent_step import BlockRows, body_of, signal_size
+from echelon.simulation.native.blocks import Shifts
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.step.loop import Loop
 
@@ -51,8 +52,12 @@ def plan_of(
     row_major: bool,
     weighted: bool,
     in_table: bool,
+    apart: bool = True,
+    shifts: Shifts = ((), ()),
 ) -> Plan:
     """Return the plan of some loops; their varying numbers may be in the table (`in_table`).
+
+    `apart` is false if all agents of each loop have one goal; `shifts` are those of their places.
 
     Raises:
         Unsupported: a law or the model has no scalar operations.
@@ -74,6 +79,9 @@ def plan_of(
         one_leader=one_leader,
         weighted=weighted or bool((np.asarray(loop.exchange.weights) != 1.0).any()),
         edges=loop.meter.measured,
+        apart=apart,
+        shifts=shifts[0],
+        edge_shifts=shifts[1],
         exception_row=rows.exception.start,
         table=(n if tracks else 0) + (varying.count if in_table else 0),
         dt=loop.motion.dt,
@@ -94,7 +102,7 @@ def compiled(rows: BlockRows, plan: Plan, codes: BoundedCache[Code]) -> Kernel:
     return Kernel(code, rows, plan, len(shared(plan)))
 
 
-Make: TypeAlias = Callable[[VaryingNumbers, int, bool, bool, bool], Kernel]
+Make: TypeAlias = Callable[[VaryingNumbers, int, bool, bool, bool, bool, Shifts], Kernel]
 """Returns kernels, as `Kernels.of` does."""
 
 
@@ -121,19 +129,23 @@ class Kernels:
         batched: bool,
         row_major: bool = False,
         weighted: bool = False,
+        apart: bool = True,
+        shifts: Shifts = ((), ()),
     ) -> Kernel:
         """Return the kernel of some loops, `weighted` if the weights of their edges may change.
+
+        `apart` and `shifts` as in `plan_of`.
 
         Raises:
             Unsupported: a law or the model has no scalar operations.
         """
         # Also by wind and noise, which have rows only if they exist.
         wind, signature = jax.tree.structure(varying.loop.motion.wind), varying.signature
-        key = (signature, wind, bits, LANES[bits], batched, row_major, weighted)
+        key = (signature, wind, bits, LANES[bits], batched, row_major, weighted, apart, shifts)
 
         def make() -> Kernel:
             rows = BlockRows.of(varying.loop, varying.count)
-            plan = plan_of(varying, rows, bits, batched, row_major, weighted, False)
+            plan = plan_of(varying, rows, bits, batched, row_major, weighted, False, apart, shifts)
             return compiled(rows, plan, self.codes)
 
         return self._kernels.get_or_make(None if signature is None else key, make)

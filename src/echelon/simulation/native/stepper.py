@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from functools import cached_property
 from typing import Any, final
 
 import jax
@@ -80,7 +81,10 @@ class NativeStepper(Stepper):
         self.leaders = (first + self.loop.leaders).reshape(-1)
         self.followers = (first + self.loop.followers).reshape(-1)
         row_major, weights_change = self.places.row_major, variant is not None
-        kernel = (make or KERNELS.of)(self.varying, bits, batched, row_major, weights_change)
+        apart = weights_change or any(np.any(loop.meter.spacings) for loop in loops)
+        kernel = (make or KERNELS.of)(
+            self.varying, bits, batched, row_major, weights_change, apart, self.places.shifts
+        )
         self.code, self.rows, self.plan, self.uniform_count = kernel
         self._signals = signal_size(self.loop)
         # Once, because to call a law takes as long as many small steps.
@@ -95,6 +99,15 @@ class NativeStepper(Stepper):
         self._draws_ahead = holds_at_once(len(states))
 
     # ---- memory ----
+
+    @cached_property
+    def _no_sums(self) -> Array:
+        """The sums of no step, (rows, lanes)."""
+        rows = self.rows
+        # Whole vectors, because to repeat single numbers takes as long as many steps.
+        initial = np.zeros((rows.total, self.plan.lanes), self.dtype)
+        initial[rows.unsettled.start], initial[rows.inside.start : rows.inside.stop] = -1.0, ALWAYS
+        return initial[rows.errors.start :]
 
     def _reserve(self) -> None:
         """Allocate blocks and mirrors, and compute what does not change during a run."""
@@ -349,11 +362,8 @@ class NativeStepper(Stepper):
             self._inexact[self.places.agents[positions] // len(self.loop.offsets)] = True
 
     def _clear_sums(self) -> None:
-        rows = self.rows
         self._inexact = np.zeros(len(self.loops), bool)
-        initial = np.zeros((rows.total, 1), self.dtype)
-        initial[rows.unsettled.start], initial[rows.inside.start : rows.inside.stop] = -1.0, ALWAYS
-        self.blocks[:, rows.errors.start :] = initial[rows.errors.start :]
+        self.blocks[:, self.rows.errors.start :] = self._no_sums
         self.edges[..., -1, :] = 0.0
 
     def _sums(self, first: int, end: int, agent_sums: Array) -> Sums:

@@ -11,10 +11,10 @@ from echelon.simulation.codegen import contribution_widths, stride
 from echelon.simulation.native.blocks import (
     SwarmBlocks,
     aligned_copy,
-    contiguous_blocks,
     neighbour_slots,
     senders_of,
 )
+from echelon.simulation.native.contiguity import contiguous_blocks
 from echelon.simulation.native.kernel_cache import Kernel
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.loop import Loop, stretch_at

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.world.actuator import Motors
+from echelon.agents.world.actuator import MotorArrays
 from echelon.agents.world.disturbance import Wind, disturbed, draw
 from echelon.agents.world.world import World
 from echelon.core.errors import SimulationError
@@ -55,7 +55,7 @@ class Motion(eqx.Module):
     integrator: str = eqx.field(static=True)
     limits: bool = eqx.field(static=True)
     substeps: int = eqx.field(static=True, default=1)
-    motors: Motors | None = None
+    motors: MotorArrays | None = None
     rows: Row | None = None
 
     @classmethod
@@ -184,7 +184,7 @@ class Motion(eqx.Module):
         return at[:-1], own
 
 
-def _varied(modules: list[ControlAffine] | list[Motors | None]) -> PyTree:
+def _varied(modules: list[ControlAffine] | list[MotorArrays | None]) -> PyTree:
     """Return the leaves in which modules of one structure differ, as rows; None for the others."""
     flat = [jax.tree.leaves(module) for module in modules]
     tree = jax.tree.structure(modules[0])
