@@ -176,13 +176,20 @@ def other_plants(rng: np.random.Generator) -> Finding:
         force = model.mass * (root * (asked - u) + model.drag * u + g)
         return np.concatenate([u, force / plant.mass - plant.drag * u - g])
 
-    first = np.concatenate(path(0.0)[:2])
-    flown = integrate(rate, first, 160.0, 5_000)
-    times = np.linspace(0.0, 160.0, len(flown))
-    off = np.array([np.abs(x[:2] - path(t)[0]).max() for t, x in zip(times, flown)])
-    # A mean over windows of many turns, since it may swing for ever.
-    halves = [off[(times > a) & (times <= a + 40.0)].max() for a in (80.0, 120.0)]
-    drifts = not halves[1] - halves[0] < 0.02 * 40.0 * 0.1
+    def offs(end: float) -> list[float]:
+        """Return how far it is off in two quarters of a flight, in which it may swing."""
+        flown = integrate(rate, np.concatenate(path(0.0)[:2]), end, int(30.0 * end))
+        times = np.linspace(0.0, end, len(flown))
+        off = np.array([np.abs(x[:2] - path(t)[0]).max() for t, x in zip(times, flown)])
+        return [
+            float(off[(times > a * end) & (times <= a * end + 0.25 * end)].max())
+            for a in (0.5, 0.75)
+        ]
+
+    # Near the least speed it may take minutes to where it stays.
+    halves = offs(160.0)
+    halves = halves if halves[1] - halves[0] < 0.08 else offs(1600.0)
+    drifts = not halves[1] - halves[0] < 0.08
     share = speed / max(lacks, 1e-9)
     if not answer.promised:
         return silent(answer.reasons[0], not drifts)
