@@ -178,7 +178,7 @@ def other_plants(rng: np.random.Generator) -> Finding:
 
     def offs(end: float) -> list[float]:
         """Return how far it is off in two quarters of a flight, in which it may swing."""
-        flown = integrate(rate, np.concatenate(path(0.0)[:2]), end, int(30.0 * end))
+        flown = integrate(rate, np.concatenate(path(0.0)[:2]), end, int(10.0 * end))
         times = np.linspace(0.0, end, len(flown))
         off = np.array([np.abs(x[:2] - path(t)[0]).max() for t, x in zip(times, flown)])
         return [

@@ -8,7 +8,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 from zoo import FAMILIES, judge  # noqa: E402
 
-FEW = {"plants": 1, "paths": 1, "subclasses": 1, "units": 1, "leaders' inputs": 1}
+FEW = {"plants": 1, "paths": 1, "differences": 1, "subclasses": 1, "units": 1, "leaders' inputs": 1}
 
 
 @pytest.mark.parametrize("family", FAMILIES)
