@@ -1,5 +1,8 @@
 """Steps and margins of networks: true for every eigenvalue, by NumPy on drawn loops."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -10,28 +13,11 @@ from echelon.core.words import Verdict
 from echelon.synthesis.certificates.delays import delay_margin
 from echelon.synthesis.certificates.margins import ClosedLoop
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+from held_loops import delayed_growth, growth, radii  # noqa: E402
+
 STRENGTHS = np.geomspace(0.5, 5.0, 60)
 DT = 0.2
-
-
-def held_step(A, B, dt):
-    """F and G of a step of RK4 with inputs held, of many loops at once."""
-    one, M = np.eye(A.shape[-1]), A * dt
-    F = one + M @ (one + M @ (one + M @ (one + M / 4.0) / 3.0) / 2.0)
-    return F, dt * (one + M @ (one / 2.0 + M @ (one / 6.0 + M / 24.0))) @ B
-
-
-def radii(A, B, K, strengths, dt):
-    """Spectral radius of a step in each mode, (..., strengths)."""
-    F, G = held_step(A, B, dt)
-    steps = F[..., None, :, :] - strengths[:, None, None] * (G @ K)[..., None, :, :]
-    return np.abs(np.linalg.eigvals(steps)).max(axis=-1)
-
-
-def growth(A, B, K, strengths):
-    """Slowest mode in continuous time of each loop, (..., strengths)."""
-    modes = A[..., None, :, :] - strengths[:, None, None] * (B @ K)[..., None, :, :]
-    return np.linalg.eigvals(modes).real.max(axis=-1)
 
 
 def lost_between(seed, lost):
@@ -91,19 +77,6 @@ def test_a_step_that_one_follower_in_the_midst_does_not_bear_is_refused(count):
 def lost_if_stronger(A, B, K):
     """At which strengths the loop is lost in continuous time."""
     return growth(A, B, K, STRENGTHS) >= 0.0
-
-
-def delayed_growth(A, G, delay, nodes=16):
-    """Rightmost root of x' = A x - G x(t - delay), by Chebyshev collocation of its generator."""
-    n, k = len(A), np.arange(nodes + 1)
-    x = np.cos(np.pi * k / nodes)
-    c = np.where((k == 0) | (k == nodes), 2.0, 1.0) * (-1.0) ** k
-    D = np.outer(c, 1.0 / c) / (x[:, None] - x + np.eye(nodes + 1))
-    D = (D - np.diag(D.sum(axis=1))) * 2.0 / delay
-    M = np.kron(D, np.eye(n))
-    M[:n] = 0.0
-    M[:n, :n], M[:n, -n:] = A, -G
-    return np.linalg.eigvals(M).real.max()
 
 
 def within(A, K, B, lost, high):

@@ -234,6 +234,27 @@ def test_a_mode_that_an_input_moves_little_is_moved(reach, seen):
         assert np.abs(direction) == pytest.approx([0.0, 1.0], abs=1e-9)
 
 
+@pytest.mark.parametrize("units", [(1e-8, 1e-8), (1e8, 1e8), (1e-2, 1e-11), (1e3, 1e-8)])
+@pytest.mark.parametrize("slow", [1e-5, 1.0, 1e3])
+def test_a_gain_exists_in_all_units(units, slow):
+    # The same double integrator; weights state what counts as large, and R what time is.
+    D = np.array(units)
+
+    class Scaled(ControlAffine):
+        state_names, input_names = ("x", "v"), ("u",)
+        weights = (tuple((slow / D**2).tolist()), (1.0 / slow,))
+
+        def drift(self, x):
+            return jnp.stack([slow * D[0] / D[1] * x[1], 0.0 * x[1]])
+
+        def input_map(self, x):
+            return jnp.array([[0.0], [D[1]]])
+
+    gain = synthesize(Scaled(), LINE, Riccati())
+    expected = np.array([[np.sqrt(3.0), 1.0], [1.0, np.sqrt(3.0)]])
+    assert gain.P * np.outer(D, D) == pytest.approx(expected, rel=1e-6)
+
+
 def test_a_certificate_is_stable_below_zero_however_little():
     certificate = synthesize(SingleIntegrator(1), Graph.path(2), FixedGain()).certificate
     for abscissa, stable in ((-1e-12, True), (0.0, False), (1e-12, False)):

@@ -179,7 +179,7 @@ def uncontrollable_modes(A: np.ndarray, B: np.ndarray) -> list[tuple[complex, np
     This is the PBH test: a mode counts as uncontrollable when the smallest singular value of
     [s I - A, B] is below 1e-9 times the norm of the pair.
     """
-    scale = max(1.0, float(np.linalg.norm(A, 2)), float(np.linalg.norm(B, 2)))
+    scale = max(float(np.linalg.norm(A, 2)), float(np.linalg.norm(B, 2)))
     result = []
     for s in np.linalg.eigvals(A):
         pencil = np.hstack([s * np.eye(len(A)) - A, B])

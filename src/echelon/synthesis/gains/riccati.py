@@ -8,6 +8,7 @@ from echelon.agents.models.linearization import Linearization
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import GainError, listing
 from echelon.core.linear import Weight, eigenvalue_text, riccati, uncontrollable_modes
+from echelon.core.types import Array
 from echelon.synthesis.gains.gain import Feedback, Method
 from echelon.synthesis.gains.weights import weights_of
 
@@ -35,14 +36,24 @@ class Riccati(Method):
                 (named).
         """
         Q, R = weights_of(model, self.Q, self.R)
-        _check_stabilizable(model, linear)
+        _check_stabilizable(model, linear, Q, R)
         # P A + A'P - s P B R^-1 B'P = -Q - (s - 1) P B R^-1 B'P, never positive for s >= rho = 1.
         return Feedback(riccati(*linear, Q, R), R, rho=1.0)
 
 
-def _check_stabilizable(model: ControlAffine, linear: Linearization) -> None:
+def _in_units(linear: Linearization, Q: Array, R: Array) -> tuple[Array, Array]:
+    """Return A and B in units in which a state, or an input, of one has a weight of one."""
+    x, u = (np.sqrt(np.where(np.diag(M) > 0.0, np.diag(M), 1.0)) for M in (Q, R))
+    return x[:, None] * linear.A / x, x[:, None] * linear.B / u
+
+
+def _check_stabilizable(model: ControlAffine, linear: Linearization, Q: Array, R: Array) -> None:
     """Name the first mode that no input can move and that does not decay by itself."""
-    for eigenvalue, direction in uncontrollable_modes(*linear):
+    modes = uncontrollable_modes(*linear)
+    if modes and not uncontrollable_modes(*_in_units(linear, Q, R)):
+        # Only the units of the states make it seem so.
+        return
+    for eigenvalue, direction in modes:
         # A mode that decays needs no input: (A, B) need not be controllable.
         if eigenvalue.real >= 0.0:
             # The mode is a combination w'x; entries of the size of rounding are left out.

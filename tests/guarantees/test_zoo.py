@@ -1,0 +1,25 @@
+"""Unusual agents: families that aim at one rule each, judged by NumPy."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+from zoo import FAMILIES, judge  # noqa: E402
+
+FEW = {"plants": 1, "paths": 1, "subclasses": 1, "units": 1, "leaders' inputs": 1}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_nothing_false_is_guaranteed_of_a_few(family):
+    findings = [judge(family, 5, number) for number in range(FEW.get(family, 2))]
+    assert [finding.false for finding in findings if finding.false] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", FAMILIES)
+def test_nothing_false_is_guaranteed_of_many(family):
+    findings = [judge(family, 6, number) for number in range(10)]
+    assert [finding.false for finding in findings if finding.false] == []
+    assert any(finding.guaranteed for finding in findings)
