@@ -255,8 +255,8 @@ class Channel(eqx.Module):
         step: jax.Array,
         content: PyTree,
         sends: Bool[jax.Array, " K"],
-        receivers: Array,
-        senders: Array,
+        receivers: Array | jax.Array,
+        senders: Array | jax.Array,
     ) -> Posts:
         """Return the posts after a step; agents send at every `every`-th one.
 
@@ -279,8 +279,8 @@ class Channel(eqx.Module):
         number: jax.Array,
         step: jax.Array,
         out: Bool[jax.Array, " K"],
-        receivers: Array,
-        senders: Array,
+        receivers: Array | jax.Array,
+        senders: Array | jax.Array,
     ) -> tuple[Bool[jax.Array, " K"], Int[jax.Array, " K"], Bool[jax.Array, " K"]]:
         """Return which links lose a message, how late it is beyond the delay, and which are out."""
 
