@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 import echelon as ech
 from echelon.agents.network.channel import NEVER
 from echelon.core.errors import EchelonError, SimulationError
+from echelon.simulation.step.sequence import begin, step
 
 DT = 0.01
 SENDERS, RECEIVERS = np.array([0, 1, 1, 2, 0]), np.array([1, 0, 2, 1, 2])
@@ -32,7 +33,7 @@ def networks():
 def arrivals_of(channel, steps):
     """The newest stamp that each link has at each step, by the channel."""
     example = jnp.zeros((3, 1))
-    sends = jnp.ones(3, bool)
+    sends = jnp.ones(5, bool)
 
     def step(carry, k):
         posts, newest = carry
@@ -81,15 +82,17 @@ def test_draws_belong_to_a_message_and_its_ends_and_not_to_the_place_of_the_link
     network = ech.Network(rate=100.0, jitter=0.05, loss=0.4, bursts=ech.Bursts(0.3, 0.05))
     with jax.enable_x64(True):
         channel = network.prepared(DT, 10.0, 5)
-        example, sends = jnp.zeros((3, 1)), jnp.ones(3, bool)
+        example, sends = jnp.zeros((3, 1)), jnp.ones(5, bool)
 
         def posts(order):
-            state = channel.begin(example, 5)
-            for k in range(40):
-                state = channel.post(
-                    state, jnp.asarray(k), example, sends, RECEIVERS[order], SENDERS[order]
-                )
-            return np.asarray(state.arrival)
+            ends = RECEIVERS[order], SENDERS[order]
+
+            def one(state, k):
+                return channel.post(state, k, example, sends, *ends), None
+
+            steps = jnp.arange(40, dtype=jnp.int32)
+            run = jax.jit(lambda: jax.lax.scan(one, channel.begin(example, 5), steps)[0])
+            return np.asarray(run().arrival)
 
         order = np.array([3, 1, 4, 0, 2])
         np.testing.assert_array_equal(posts(np.arange(5))[:, order], posts(order))
@@ -198,6 +201,52 @@ def test_a_batch_draws_for_each_seed_what_a_run_alone_draws():
     together = [result.states for result in Batch(1).fly(runs)]
     np.testing.assert_allclose(together, alone, atol=1e-13)
     assert not np.allclose(alone[0], alone[1])
+
+
+def test_a_link_that_is_cut_carries_nothing_and_hops_heal():
+    """A follower that has lost its way to the leader is reached by another one."""
+    turns = [(0.0, [(0, 1), (1, 2)]), (0.5, [(0, 1), (0, 2)]), (1.0, [(0, 2), (2, 1)])]
+    graph = ech.Graph.switching(turns, directed=True)
+    law = ech.laws.StoppingPoint(hears="all", coupling=4.0)
+    drive = ech.Laws(ech.laws.StoppingLeader(), law)
+    carts = ech.models.DoubleIntegrator()
+    network = ech.Network(rate=100.0, hears="leaderward", forget=0.05)
+    made = ech.Parts(
+        carts,
+        graph,
+        ech.Formation.from_offsets(carts, graph, {1: [1.0, 0.0], 2: [2.0, 0.0]}),
+        drive,
+        world=ech.World(network=network),
+    )
+    loop = assembled(made)
+    with jax.enable_x64(True):
+
+        def one(now, _):
+            now = step(loop, now)
+            return now, hops_of(loop, now)
+
+        start = begin(loop, jnp.zeros((3, 4)))
+        hops = np.asarray(jax.jit(lambda now: jax.lax.scan(one, now, length=200)[1])(start))
+    # The last stretch begins at 1 s, and counts outlive ten times `forget`.
+    for k, expected in ((40, [0, 1, 2]), (45, [0, 1, 2]), (199, [0, 2, 1])):
+        assert hops[k].tolist() == expected
+
+
+def assembled(made):
+    from echelon.simulation.engine.prepare import prepare
+    from echelon.simulation.step.loop import assemble
+
+    prepared = prepare(made, ech.Settings(horizon=2.0, dt=DT, engine="jax"))
+    drive = prepared.parts.drive
+    with jax.enable_x64(True):
+        return assemble(prepared.problem, drive.leader, drive.follower)
+
+
+def hops_of(loop, now):
+    """The hops that agents sent last."""
+    posts = now.world.in_flight
+    last = (now.step - 1) // loop.channel.every
+    return posts.content.hops[last % loop.channel.slots]
 
 
 @pytest.mark.parametrize(

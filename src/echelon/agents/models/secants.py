@@ -126,14 +126,15 @@ class Sides(NamedTuple):
         What only bends between the axes is charged to the variable that moves first.
         """
         scale = _BENT * np.maximum(np.abs(self.forward), np.abs(self.backward))
-        bends = np.asarray(self._stays(self.forward - self.backward, scale) | self.jumps())
+        bends = self._stays(self.forward - self.backward, scale) | self.jumps()
         axes, oblique = self.forward[..., :n], self.forward[..., n:]
         sums = axes @ _oblique(n).T
         size = _BENT * (np.abs(axes) @ np.abs(_oblique(n)).T)
         with np.errstate(invalid="ignore"):
             crooked = self._stays(oblique - sums, size)
         first = np.eye(n, dtype=bool)[0]
-        return bends[:, :n] | (bends[:, n:] | crooked).any(axis=1)[:, None] & first
+        beside = np.any(bends[:, n:] | crooked, axis=1)
+        return bends[:, :n] | np.outer(beside, first)
 
     def jumps(self) -> Array:
         """Return (k, q) whether values differ between the sides at any distance."""

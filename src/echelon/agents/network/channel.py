@@ -254,18 +254,21 @@ class Channel(eqx.Module):
         posts: Posts,
         step: jax.Array,
         content: PyTree,
-        sends: Bool[jax.Array, " N"],
-        receivers: Array,
-        senders: Array,
+        sends: Bool[jax.Array, " K"],
+        receivers: Array | jax.Array,
+        senders: Array | jax.Array,
     ) -> Posts:
-        """Return the posts after a step; agents send at every `every`-th one, if `sends`."""
+        """Return the posts after a step; agents send at every `every`-th one.
+
+        Links (K,) along which nothing is sent, such as cut ones, lose the message.
+        """
         number = step // self.every
         slot = number % self.slots
 
         def put(posts: Posts) -> Posts:
             lost, late, out = self._draw(number, step, posts.out, receivers, senders)
             arrives = step + self.delay + late
-            arrival = jnp.where(lost | ~sends[jnp.asarray(senders)], NEVER, arrives)
+            arrival = jnp.where(lost | ~sends, NEVER, arrives)
             rows = jax.tree.map(lambda row, x: row.at[slot].set(x), posts.content, content)
             return Posts(rows, posts.arrival.at[slot].set(arrival.astype(jnp.int32)), out)
 
@@ -276,8 +279,8 @@ class Channel(eqx.Module):
         number: jax.Array,
         step: jax.Array,
         out: Bool[jax.Array, " K"],
-        receivers: Array,
-        senders: Array,
+        receivers: Array | jax.Array,
+        senders: Array | jax.Array,
     ) -> tuple[Bool[jax.Array, " K"], Int[jax.Array, " K"], Bool[jax.Array, " K"]]:
         """Return which links lose a message, how late it is beyond the delay, and which are out."""
 

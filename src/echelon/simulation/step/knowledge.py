@@ -347,6 +347,7 @@ def newest(own: Packets, others: Packets, new: jax.Array, receivers: jax.Array) 
 
 def send_messages(
     loop: Loop,
+    exchange: Exchange,
     now: Moment,
     mail: Mail,
     knowledge: Knowledge,
@@ -358,6 +359,7 @@ def send_messages(
 
     Args:
         loop: with a channel.
+        exchange: with the weights of this step.
         now: the moment at the beginning of the step.
         mail: of the agents.
         knowledge: of the agents.
@@ -373,6 +375,8 @@ def send_messages(
     content = jax.vmap(lambda *row: content_of(loop, t, *row))(*rows)
     content = jnp.zeros_like(mail.packet.content).at[numbers].set(content)
     letters, sends = write(loop, _all(loop), now.step, mail, knowledge, sent, difference, content)
-    links = loop.exchange.receivers, loop.exchange.senders
+    links = jnp.asarray(exchange.receivers), jnp.asarray(exchange.senders)
+    # Links that the graph does not have at this time carry nothing.
+    sends = sends[links[1]] & (jnp.asarray(exchange.weights) > 0.0)
     posts = channel.post(now.world.in_flight, now.step, letters, sends, *links)
     return now.world._replace(in_flight=posts, mail=mail)

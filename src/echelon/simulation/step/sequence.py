@@ -82,7 +82,7 @@ def control(loop: Loop, now: Moment) -> Control:
         followed = _act_all(loop, now, z, loop.follower, *rows)
     world = now.world
     if knowledge is not None and mail is not None:
-        world = send_messages(loop, now, mail, knowledge, sent, difference, led.message)
+        world = send_messages(loop, exchange, now, mail, knowledge, sent, difference, led.message)
     u = jnp.concatenate([led.input, followed.input])[loop.order]
     desired = jnp.concatenate([led.desired, followed.desired])[loop.order]
     limited, cut = limit_sides(u, desired)
