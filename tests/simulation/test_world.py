@@ -167,6 +167,9 @@ def test_air_drags_an_agent_along():
             lambda: ech.World(disturbance=ech.Disturbance(air=(1.0,), drag=1.0)),
             "`drag` with an `air` of 1 numbers",
         ),
+        (lambda: ech.World(disturbance=ech.Disturbance(air=(1.0, 0.0))), "`air` .* without `drag`"),
+        (lambda: ech.World(disturbance=ech.Disturbance(time=1.0)), "`time` .* without `rms`"),
+        (lambda: ech.World(network=ech.Network(bursts={"share": 0.1})), "`bursts` is a `dict`"),
     ],
 )
 def test_a_world_that_cannot_be_is_refused_in_one_sentence(world, message):
@@ -181,3 +184,33 @@ def test_the_printed_update_has_no_time_for_a_lag():
     parts = parts.replace(world=ech.World(actuator=Actuator(lag=0.1)))
     with pytest.raises(SimulationError, match="`printed`, which has no time"):
         ech.simulate(parts, settings._replace(integrator="printed"))
+
+
+def test_actuators_and_sensors_without_a_fault_are_the_ideal_ones():
+    world = ech.World(actuator=Actuator(), sensing=Sensing(noise={"x": 0.0}))
+    assert ech.World(actuator=Actuator(), sensing=Sensing()).ideal
+    parts, settings = ech.build(ech.load_scenario("integrators", ["simulation.horizon=1"]))
+    results = [
+        ech.simulate(parts.replace(world=each), settings._replace(integrator="rk4"))
+        for each in (ech.World(), world)
+    ]
+    np.testing.assert_array_equal(results[0].states, results[1].states)
+
+
+@pytest.mark.parametrize("name", ["network", "sensing"])
+def test_inputs_that_are_optimized_from_exact_states_refuse_others(name):
+    """A pilot reads the true states: a run would say what it does not simulate."""
+    parts, settings = ech.build(ech.load_scenario("planar-quadrotor", ["simulation.horizon=1"]))
+    world = ech.World(**{name: {"network": ech.Network(), "sensing": Sensing(delay=0.1)}[name]})
+    drive = ech.optimal.RecedingHorizon()
+    with pytest.raises(SimulationError, match=f"got `{name}`, but .* exact states"):
+        ech.simulate(parts.replace(world=world, drive=drive), settings)
+
+
+def test_a_plant_of_an_agent_that_is_not_there_is_refused_at_its_line(tmp_path):
+    file = tmp_path / "s.yaml"
+    text = "name: s\nmodel: {name: double-integrator}\ngraph: {name: path, agents: 3}\n"
+    text += "plant: {agents: {9: {scale: {}}}}\nfollower: {law: consensus, gain: {method: riccati}}"
+    file.write_text(text + "\nsimulation: {horizon: 1.0, dt: 0.01}\n", "utf-8")
+    with pytest.raises(EchelonError, match=r"s.yaml:4: plant.agents: got a plant for agent 9"):
+        ech.build(ech.load_scenario(file))

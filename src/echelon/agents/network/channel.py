@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from echelon.core.draws import Draw, key_of, uniform
-from echelon.core.errors import SimulationError, did_you_mean, listing
+from echelon.core.errors import SimulationError, check_kind, did_you_mean, listing
 from echelon.core.types import Array, PyTree
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction, Word
 
@@ -82,6 +82,7 @@ class Network:
 
     def __post_init__(self) -> None:
         """Check every number, and take words for their members."""
+        check_kind("bursts", self.bursts, Bursts)
         values = dataclasses.asdict(self)
         values |= {f"bursts.{name}": value for name, value in values.pop("bursts").items()}
         for names, (allowed, fits) in _RANGES.items():
@@ -140,6 +141,15 @@ class Network:
             prediction=self.prediction,
             hears=self.hears,
         )
+
+    @property
+    def information(self) -> str:
+        """What each agent receives, in words."""
+        if self.messages is MessageContent.STATE:
+            return "late: neighbours' signals, and the feed-forward of the leader"
+        leader = "the leader's plan, and its last deviation from it"
+        leader = leader if self.prediction is Prediction.PREVIEW else "the leader as it last was"
+        return f"late: neighbours' deviations from where they expect the leader; {leader}"
 
     def __str__(self) -> str:
         """Return the network in words."""

@@ -1,6 +1,5 @@
 """What one agent receives: messages that name their values, of each neighbour the last good one."""
 
-import math
 import numbers
 from collections.abc import Sequence
 from typing import NamedTuple, final
@@ -41,7 +40,7 @@ class Packet(NamedTuple):
         leader: its number.
         time: when it said so, s.
         content: its deviation from its plan, or what else the prediction needs (p,).
-        epoch: how often the leadership was handed over.
+        epoch: how often the leadership was handed over; 0, as it never is yet.
     """
 
     leader: int
@@ -100,7 +99,7 @@ class Inbox:
         stamps: "Stamps | None" = None,
     ) -> None:
         """Receive nothing yet."""
-        self._post = stamps
+        self._stamps = stamps
         self._senders, self._source = tuple(senders), source
         self._names, self._forward_names = names, forward_names
         self.signals = np.full((len(senders), len(names)), np.nan)
@@ -110,7 +109,7 @@ class Inbox:
         """Store a message whose values are finite numbers with names that this agent uses."""
         if not isinstance(message, Message) or not isinstance(message.sender, numbers.Integral):
             return Received.NO_MESSAGE
-        heard = self._senders if self._post is not None else (*self._senders, self._source)
+        heard = self._senders if self._stamps is not None else (*self._senders, self._source)
         if message.sender not in heard:
             return Received.NOT_HEARD
         # Both before either is stored, so that a message is taken as a whole.
@@ -120,8 +119,8 @@ class Inbox:
             return next(part for part in (values, forward) if isinstance(part, Received))
         if not {*self._names} & {*values}:
             return Received.WRONG_SIZE
-        if self._post is not None:
-            fault = self._post.take(message, self._senders.index(message.sender))
+        if self._stamps is not None:
+            fault = self._stamps.take(message, self._senders.index(message.sender))
             if fault is not None:
                 return fault
         place = [who == message.sender for who in self._senders]
@@ -184,7 +183,9 @@ class Stamps:
 
     def _fault(self, packet: Packet) -> Received | None:
         """Return why a packet is not used; None if it is."""
-        if packet.leader not in self._leaders:
+        whole = all(isinstance(x, numbers.Integral) for x in (packet.leader, packet.epoch))
+        # Nobody hands the leadership over yet, and a packet of a later epoch would win for ever.
+        if not whole or packet.leader not in self._leaders or packet.epoch != 0:
             return Received.NO_MESSAGE
         values = _read((tuple(map(str, range(self._size))), packet.content))
         return values if isinstance(values, Received) else None
@@ -206,7 +207,8 @@ _AHEAD = 0.05
 
 
 def _is_time(value: object) -> bool:
-    return isinstance(value, numbers.Real) and math.isfinite(float(value))
+    # Compared before it is a float, which a whole number of 400 digits cannot be.
+    return isinstance(value, numbers.Real) and bool(-LARGEST < value < LARGEST)  # pyright: ignore
 
 
 def _read(part: object) -> dict[str, float] | Received:

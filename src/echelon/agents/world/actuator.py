@@ -49,12 +49,14 @@ class Actuator:
                 "whole number from 2 on."
             )
 
-    def prepared(self, plant: ControlAffine) -> "MotorArrays":
-        """Return the actuators of a plant as arrays.
+    def prepared(self, plant: ControlAffine) -> "MotorArrays | None":
+        """Return the actuators of a plant as arrays; None if they are ideal.
 
         Raises:
             SimulationError: motors are asked for whose thrusts the plant does not limit.
         """
+        if self == Actuator():
+            return None
         lag = np.asarray(self.lag) if self.lag else None
         limits = plant.input_limits
         if not self.levels and self.minimum is None:

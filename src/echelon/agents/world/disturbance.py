@@ -86,6 +86,16 @@ class Disturbance:
             raise SimulationError(
                 f"`air` of the disturbance is {list(self.air)}, and must be finite."
             )
+        if self.air and not self.drag:
+            raise SimulationError(
+                f"got `air` {list(self.air)} of the disturbance without `drag`, by which it acts; "
+                "give a `drag` above 0."
+            )
+        if self.time is not None and not self.rms:
+            raise SimulationError(
+                f"got `time` {self.time} of the disturbance without `rms`, the size of the gusts; "
+                "give an `rms`."
+            )
         if self.seed is not None and (self.seed != int(self.seed) or self.seed < 0):
             raise SimulationError(
                 f"`seed` of the disturbance is {self.seed}, and must be a whole number from 0 on."

@@ -44,18 +44,17 @@ class Sensing:
                     f"{what} of the sensing is {value}, and must be finite and not negative."
                 )
 
-    def prepared(self, model: ControlAffine, dt: float, seed: int) -> "Sensors":
-        """Return the sensing as arrays for a control step (s) and a run's seed.
+    def prepared(self, model: ControlAffine, dt: float, seed: int) -> "Sensors | None":
+        """Return the sensing as arrays for a control step (s) and a run's seed; None if exact.
 
         Raises:
             ModelError: a name is no state or group of the model.
         """
-        std = model.per_state(self.noise)
-        return Sensors(
-            std if std.any() else None,
-            key_of(seed if self.seed is None else self.seed),
-            round(self.delay / dt),
-        )
+        std, late = model.per_state(self.noise), round(self.delay / dt)
+        if not late and not std.any():
+            return None
+        key = key_of(seed if self.seed is None else self.seed)
+        return Sensors(std if std.any() else None, key, late)
 
     def __str__(self) -> str:
         """Return the sensing in words."""

@@ -47,8 +47,8 @@ class World:
             "wind or noise acts on the agents": self.disturbance is not None,
             "the agents differ from the model": self.plant is not None or bool(self.plants),
             "messages are late or lost": self.network is not None,
-            "the actuators lag or have levels": self.actuator is not None,
-            "agents measure their states late or with noise": self.sensing is not None,
+            "the actuators lag or have levels": self.actuator not in (None, Actuator()),
+            "agents measure their states late or with noise": self.sensing not in (None, Sensing()),
         }
 
     def plant_for(self, model: ControlAffine) -> ControlAffine:

@@ -50,7 +50,7 @@ def _attributes(parts: Parts, settings: Settings) -> JsonObject:
         **{key: int(v) if isinstance(v, bool) else v for key, v in numbers.items()},
         **{
             f"{role}_needs": "; ".join(received) or "nothing"
-            for role, received in parts.drive.information._asdict().items()
+            for role, received in parts.information._asdict().items()
         },
         "model": type(parts.model).__name__,
         "position": " ".join(parts.model.position),

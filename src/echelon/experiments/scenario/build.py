@@ -31,6 +31,7 @@ from echelon.experiments.scenario.user_code import as_scenario_error
 from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.world_parts import (
     actuator_of,
+    check_world,
     disturbance_of,
     network_of,
     plants_of,
@@ -123,7 +124,6 @@ def _parts(
     leader = faults.part(
         lambda: _leader(scenario, faults, model, graph, reference, reaction), "leader"
     )
-    network = network_of(scenario, faults, graph, leader, follower)
     for place, named in (
         (("initial", "spread"), scenario.initial.spread or {}),
         (("leader", "start_error"), scenario.leader.start_error),
@@ -144,12 +144,14 @@ def _parts(
         world=World(
             plant,
             disturbance,
-            network,
+            network_of(scenario, faults),
             actuator_of(scenario, faults, model),
             sensing_of(scenario, faults, model),
             plants,
         ),
     )
+    faults.settle()
+    check_world(faults, parts, scenario.simulation.dt)
     with faults.at("initial"):
         initial_states(parts, scenario.seed)
     faults.settle()

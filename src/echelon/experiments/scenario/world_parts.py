@@ -5,7 +5,6 @@ from typing import Any
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Bursts, Network
-from echelon.agents.network.graph import Graph
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.plant import check_plant, vary_parameters
@@ -13,8 +12,7 @@ from echelon.agents.world.sensing import Sensing
 from echelon.experiments.scenario.fault_list import FaultList
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.sections import PlantSpec, VariationSpec
-from echelon.laws.law import Law
-from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
 
 
 def plants_of(
@@ -76,10 +74,8 @@ def sensing_of(scenario: Scenario, faults: FaultList, model: ControlAffine) -> S
     return sensing
 
 
-def network_of(
-    scenario: Scenario, faults: FaultList, graph: Graph, leader: Law | None, follower: Law | None
-) -> Network | None:
-    """Return the network, checked against the laws; None for the ideal one."""
+def network_of(scenario: Scenario, faults: FaultList) -> Network | None:
+    """Return the network; None for the ideal one."""
     spec, simulation = scenario.network, scenario.simulation
     if spec is None:
         return None
@@ -89,6 +85,12 @@ def network_of(
         numbers["bursts"] = Bursts(**numbers["bursts"])
         network = Network(**numbers)
         network.prepared(simulation.dt, simulation.horizon, scenario.seed)
-        if leader is not None and follower is not None:
-            Laws(leader, follower).check_network(network, graph, simulation.dt)
     return network
+
+
+def check_world(faults: FaultList, parts: Parts, dt: float) -> None:
+    """Record what of a world does not suit the agents or their laws."""
+    with faults.at("plant", "agents"):
+        parts.world.check_agents(parts.model, parts.graph.agents)
+    with faults.at("network"):
+        parts.drive.check_world(parts.world, parts.graph, dt)

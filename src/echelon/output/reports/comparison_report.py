@@ -113,7 +113,7 @@ def _costs_table(comparison: Comparison) -> "Table":
             row.label,
             *(_cell(row.flight, name) for name in costs),
             _guaranteed(row.flight.promise),
-            ", ".join(row.flight.result.drive.information.follower) or "none",
+            ", ".join(row.flight.result.parts.information.follower) or "none",
         )
     return table
 
@@ -291,6 +291,6 @@ def _row_mapping(row: ComparisonRow) -> JsonObject:
         },
         **row.flight.json(Shown.COMPARISON),
         "promise": row.flight.promise.as_mapping(),
-        "told": list(result.drive.information.follower),
+        "told": list(result.parts.information.follower),
         "solver": None if result.work is None else result.work._asdict(),
     }

@@ -81,7 +81,7 @@ def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
     yield from coverage(result, guarantee)
     if len(result.graph.leaders) > 1:
         yield f"Leaders: {who_hears_whom(result.graph)}; goals are relative to the nearest leader."
-    information = "; ".join(result.drive.information.follower) or "nothing from others"
+    information = "; ".join(result.parts.information.follower) or "nothing from others"
     yield f"Information used by each follower: {information}."
 
 

@@ -197,13 +197,14 @@ class Agent:
         leader = leader if packet is None else packet.leader
         content = np.zeros(size) if packet is None else np.asarray(packet.content)
         since = math.inf if packet is None else max(0.0, self._time - packet.time)
-        stamps_unused = jnp.zeros(len(self.neighbours), jnp.int32)
+        # Single agents know ages in seconds, and no steps at which messages were sent.
+        stamp = jnp.zeros(len(self.neighbours), jnp.int32)
         packets = Packets(
             jnp.array([leader], jnp.int32), jnp.zeros(1, jnp.int32), jnp.asarray(content)[None]
         )
         # Of an output that a sender does not have it is taken to be where the leader is.
         value = jnp.nan_to_num(jnp.asarray(self._inbox.signals), nan=0.0)
-        mail = Mail(stamps_unused, value, jnp.asarray(stamps.hops, jnp.int32), packets)
+        mail = Mail(stamp, value, jnp.asarray(stamps.hops, jnp.int32), packets)
         link = jnp.asarray(np.maximum(0.0, self._time - stamps.time))
         return mail, Ages(link, jnp.array([since]))
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, TypeVar, final
 import jax
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.network.channel import Network
 from echelon.agents.network.graph import Graph
+from echelon.agents.world.world import World
 from echelon.core.errors import (
     EchelonError,
     LawError,
@@ -91,18 +91,21 @@ class Laws(Drive):
         same = leader is self.leader and follower is self.follower
         return self if same else Laws(leader, follower)
 
-    def check_network(self, network: Network, graph: Graph, dt: float) -> None:
+    def check_world(self, world: World, graph: Graph, dt: float) -> None:
         """Check that both laws work with messages that are late.
 
         Raises:
-            SimulationError: a follower needs others' inputs of the same step, the leader has no
-                plan, or a step is too long for the coupling.
+            EchelonError: a follower needs others' inputs of the same step, the leader has no plan,
+                or a step is too long for the coupling.
         """
+        network = world.network
+        if network is None:
+            return
         word = self.follower.feedforward
         if word in (Feedforward.PARENT, Feedforward.RELAY_VELOCITY):
             raise SimulationError(
                 f"`feedforward` of the follower is `{word}`, {word.value}, and a network delivers "
-                f"nothing in the same step; use `relay`, which is predicted."
+                "nothing in the same step; use `relay`, which is predicted."
             )
         preview = network.prediction is Prediction.PREVIEW
         if network.messages is MessageContent.DEVIATION and preview and not self.leader.plans:

@@ -11,7 +11,7 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.world import World
 from echelon.core.errors import check_kind
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Drive, Information
 
 Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.ndarray | None
 """Spreads by state or group, or states (n,) by agent, or the states (N, n) of all."""
@@ -51,6 +51,12 @@ class Parts:
         kinds = {"graph": Graph, "formation": Formation, "drive": Drive, "world": World}
         for place, kind in kinds.items():
             check_kind(place, getattr(self, place), kind)
+
+    @property
+    def information(self) -> Information:
+        """What leaders and followers receive from others, over the network that there is."""
+        ideal, network = self.drive.information, self.world.network
+        return ideal if network is None else ideal._replace(follower=(network.information,))
 
     def replace(self, **changes: object) -> "Parts":
         """Return a copy with some parts changed."""

@@ -79,6 +79,10 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         drive = parts.drive.prepare(model, graph)
         # A complete drive stays the same object, since caches use its identity.
         parts = parts if drive is parts.drive else parts.replace(drive=drive)
+        parts.world.check_agents(model, graph.agents)
+        # Its own numbers first: whether they suit the laws is asked of a network that can be.
+        channel = channel_of(parts, settings)
+        drive.check_world(parts.world, graph, settings.dt)
         problem = Problem(
             model,
             graph,
@@ -87,7 +91,7 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
             Meter.of(model, graph, formation, settings),
             settings,
             initial_states(parts, settings.seed),
-            channel_of(parts, settings),
+            channel,
             sensors_of(parts, settings),
         )
         parts.drive.accept(problem)
@@ -104,17 +108,9 @@ def sensors_of(parts: Parts, settings: Settings) -> Sensors | None:
 
 
 def channel_of(parts: Parts, settings: Settings) -> Channel | None:
-    """Return the channel of a run whose drive is complete; None for the ideal network.
-
-    Raises:
-        EchelonError: the network does not suit the drive or the settings.
-    """
+    """Return the channel of a run; None for the ideal network."""
     network = parts.world.network
-    if network is None:
-        return None
-    channel = network.prepared(settings.dt, settings.horizon, settings.seed)
-    parts.drive.check_network(network, parts.graph, settings.dt)
-    return channel
+    return network and network.prepared(settings.dt, settings.horizon, settings.seed)
 
 
 def check_given(parts: Parts, settings: Settings) -> None:

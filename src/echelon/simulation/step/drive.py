@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.network.channel import Channel, Network
+from echelon.agents.network.channel import Channel
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.sensing import Sensors
+from echelon.agents.world.world import World
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.core.words import Feedforward, Frame
@@ -220,16 +221,18 @@ class Drive(eqx.Module):
         """Return what is allowed but probably not meant, a sentence each."""
         return ()
 
-    def check_network(self, network: Network, graph: Graph, dt: float) -> None:
-        """Check that a network that is not ideal suits the drive, at a step dt (s).
+    def check_world(self, world: World, graph: Graph, dt: float) -> None:
+        """Check that a world suits the drive, at a step dt (s).
 
         Raises:
-            SimulationError: it does not.
+            EchelonError: it does not.
         """
-        raise SimulationError(
-            f"got a network, but `{type(self).__name__}` optimizes inputs, whose exchange over a "
-            "network is not simulated; use control laws, or remove `network`."
-        )
+        for name in ("network", "sensing"):
+            if getattr(world, name) is not None:
+                raise SimulationError(
+                    f"got `{name}`, but `{type(self).__name__}` optimizes inputs from exact states "
+                    f"that arrive at once; use control laws, or remove `{name}`."
+                )
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of a run under a drive that is prepared.

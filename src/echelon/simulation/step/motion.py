@@ -78,7 +78,6 @@ class Motion(eqx.Module):
         if world.plants:
             plants = [world.plants.get(k, plant) for k in range(agents)]
             motors_of = [world.actuator and world.actuator.prepared(x) for x in plants]
-            world.check_agents(model, agents)
             rows = _varied(plants), _varied(motors_of)
         return cls(
             plant,
