@@ -80,21 +80,19 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
             sheet.line("median", np.median(rows, axis=1), 0, True),
         ]
     if run.reference is not None:
-        away = off_reference(run.states, run.reference[:, None], run).max(axis=1)
-        lines.append(sheet.line("leaders" if len(run.leaders) > 1 else "leader", away, "leader", True))
+        away, name = _off_reference(run, run.reference), "leaders" if len(run.leaders) > 1 else "leader"
+        lines.append(sheet.line(name, away, "leader", True))
     lines += _slope(run, errors[0].max(), 1.0)
     marks = [{"value": SETTLED, "name": "1 cm" if run.length_unit else "0.01"}]
     return _chart("formation error", run.length_unit, True, lines, marks)
 
 
-def off_reference(
-    states: Float[Array, "... N n"], reference: Float[Array, "... n"], run: Recording
-) -> Float[Array, "... L"]:
-    """Return the distance of each leader from its place beside the reference."""
+def _off_reference(run: Recording, reference: Float[Array, "T n"]) -> Float[Array, " T"]:
+    """Return the largest distance of a leader from its place beside the reference."""
     leaders, measured = list(run.leaders), list(run.measured)
-    away = states[..., leaders, :] - run.offsets[leaders] - reference
+    away = run.states[:, leaders] - run.offsets[leaders] - reference[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.linalg.norm(away[..., measured], axis=-1)
+        return np.linalg.norm(away[:, :, measured], axis=2).max(axis=1)
 
 
 def _slope(run: Recording, begin: float, times: float) -> list[JsonObject]:

@@ -170,9 +170,14 @@ class Chart {
     return [Math.max(0, upper(this.times, low) - 2), Math.min(this.times.length, upper(this.times, high) + 1)];
   }
 
-  // The limits of the value axis; of a logarithmic one as exponents.
+  // The limits of the value axis; of a logarithmic one as exponents. Two runs have one scale.
   reach() {
     if (this.values) return this.values;
+    const twins = [this, this.twin].flatMap((chart) => chart?.ownReach() ?? []);
+    return [Math.min(...twins), Math.max(...twins)];
+  }
+
+  ownReach() {
     let [low, high] = [Infinity, -Infinity];
     const take = (y) => Number.isFinite(y) && ((low = Math.min(low, y)), (high = Math.max(high, y)));
     const [start, end] = this.shown();

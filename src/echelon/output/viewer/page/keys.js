@@ -23,7 +23,7 @@ function listenKeys(keys) {
   const help = () => (dialog.open ? dialog.close() : dialog.showModal());
   $("#keys").addEventListener("click", help);
   addEventListener("keydown", (event) => {
-    if (event.target.matches("select, input:not([type=range]), dialog *") || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target.matches("select, input:not([type=range])") || event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.key === "?") return void help();
     const action = keys[event.key];
     // A slider and a button have keys of their own.

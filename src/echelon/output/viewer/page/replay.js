@@ -35,7 +35,9 @@ class Player {
     document.body.classList.toggle("flat", runs[0].space.kind !== "space");
     this.window = new TimeWindow(() => this.charts.forEach((chart) => chart.draw()));
     const parts = makeParts(runs);
+    if (runs.length > 1 && runs[0].space.kind === runs[1].space.kind) joinBoxes(runs);
     this.panes = runs.map((run, k) => new Pane(run, ...parts[k], this.window, (time) => this.seekTime(time)));
+    for (const chart of this.charts) chart.twin = this.charts.find((other) => other !== chart && other.title === chart.title && other.unit === chart.unit);
     this.leading = this.panes.reduce((a, b) => (b.run.clock.last > a.run.clock.last ? b : a));
     this.run = this.leading.run;
     this.view = this.panes[0].view;
@@ -176,6 +178,12 @@ function makeParts(runs) {
   title.replaceChildren(make("h1", {}, runs.map((run) => run.title).join(" and ")));
   document.body.classList.add("beside");
   return parts.map((each, k) => [each, titles[k]]);
+}
+
+// Gives two runs the box around both, so that their cameras begin alike.
+function joinBoxes([one, other]) {
+  const join = (end, choose) => one.box[end].map((value, k) => choose(value, other.box[end][k]));
+  one.box = other.box = { low: join("low", Math.min), high: join("high", Math.max) };
 }
 
 function readRun(data) {

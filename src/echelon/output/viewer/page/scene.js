@@ -302,7 +302,7 @@ class View {
       for (let k = 0; k < 4; k++) (state[at + 4 + k] = q[4 * i + k]), (state[at + 8 + k] = m[4 * i + k]);
       at += 16;
       state[at] = g[3 * i], state[at + 1] = g[3 * i + 1], state[at + 2] = g[3 * i + 2];
-      state[at + 3] = run.nearest[i] === i && !run.referenced ? 0 : 1;
+      state[at + 3] = (run.nearest[i] === i && !run.referenced) || !Number.isFinite(g[3 * i]) ? 0 : 1;
     }
     this.texture.needsUpdate = true;
     this.halo.visible = this.selected >= 0;

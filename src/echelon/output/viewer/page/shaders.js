@@ -13,7 +13,7 @@ vec4 texel(float agent, int k) {
 // Greys, which no agent has, and a red towards the limit; darker with thrust for colour-blind readers.
 const THRUST = `
 vec3 thrust(float s) {
-  vec3 a = vec3(0.86, 0.88, 0.91), b = vec3(0.50, 0.54, 0.60), c = vec3(0.74, 0.08, 0.20);
+  vec3 a = vec3(0.78, 0.81, 0.86), b = vec3(0.46, 0.50, 0.57), c = vec3(0.74, 0.08, 0.20);
   s = clamp(s, 0.0, 1.0);
   return s < 0.7 ? mix(a, b, s / 0.7) : mix(b, c, (s - 0.7) / 0.3);
 }`;
@@ -152,10 +152,10 @@ out float place;
 uniform float goals;
 void main() {
   place = along;
-  gl_Position = goals > 0.0 ? ribbon(first, second, corner, 0.9) : vec4(2.0, 2.0, 2.0, 1.0);
+  gl_Position = goals > 0.0 ? ribbon(first, second, corner, 0.7) : vec4(2.0, 2.0, 2.0, 1.0);
 }`,
   fragmentShader: `in float place; out vec4 colour; uniform vec3 goalColour;
-void main() { if (mod(place, 2.0) > 0.5) discard; colour = vec4(goalColour, 0.8); }`,
+void main() { if (mod(place, 2.0) > 0.5) discard; colour = vec4(goalColour, 0.55); }`,
 };
 
 // The path of an agent, paler with age.
