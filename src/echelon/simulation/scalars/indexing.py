@@ -31,6 +31,8 @@ from echelon.simulation.scalars.traced_entries import (
 
 def at_index(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return what is read or written at indices that differ between agents: each place is tried."""
+    if equation.params.get("update_jaxpr") is not None:
+        raise Unsupported(f"`{equation.primitive.name}` of a function{where(equation)}")
     rows, ends = _rows(equation, operands), _ends(equation, operands)
     drops = _drops(equation)
     if not drops:
