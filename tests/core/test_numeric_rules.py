@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxpr_as_fun
 
 from echelon.core import jaxpr
 from echelon.core.jaxpr import Algebra, walk
@@ -45,7 +46,7 @@ CASES = {
 def test_numbers_are_those_of_jax_to_the_bit_without_jax(name, monkeypatch):
     with precision("float64"):
         closed = jax.make_jaxpr(CASES[name])(jnp.asarray(X))
-        [expected] = jax.core.eval_jaxpr(closed.jaxpr, closed.consts, jnp.asarray(X))
+        [expected] = jaxpr_as_fun(closed)(jnp.asarray(X))
         monkeypatch.setattr(jaxpr, "_by_jax", None)
         [result] = walk(closed.jaxpr, closed.consts, [X], NUMBERS)
     assert result.dtype == expected.dtype and result.tobytes() == np.asarray(expected).tobytes()
@@ -65,7 +66,7 @@ OTHERS = {
 def test_what_numpy_has_no_rule_for_is_left_to_jax(name):
     with precision("float64"):
         closed = jax.make_jaxpr(OTHERS[name])(jnp.asarray(X))
-        [expected] = jax.core.eval_jaxpr(closed.jaxpr, closed.consts, jnp.asarray(X))
+        [expected] = jaxpr_as_fun(closed)(jnp.asarray(X))
         for _ in range(2):  # the second time from memory
             [result] = walk(closed.jaxpr, closed.consts, [X], NUMBERS)
             assert result.tobytes() == np.asarray(expected).tobytes()

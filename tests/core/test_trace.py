@@ -58,11 +58,12 @@ def test_a_public_call_traces_a_model_once_and_a_second_time_to_find_clocks(prec
 
 
 def test_an_array_that_is_changed_in_place_between_calls_counts():
-    agent, other = Counted(np.array([2.0])), Counted(np.array([3.0]))
+    pull = np.array([2.0])
+    agent, other = Counted(pull), Counted(np.array([3.0]))
     gain = ech.synthesize(agent, GRAPH, ech.gains.Riccati())
     settings = ech.Settings(horizon=1.0, dt=0.01)
     first = ech.simulate(parts_of(agent, gain), settings).states
-    agent.pull[0] = 3.0
+    pull[0] = 3.0
     then = ech.simulate(parts_of(agent, gain), settings).states
     assert (then[-1] != first[-1]).any()
     np.testing.assert_array_equal(then, ech.simulate(parts_of(other, gain), settings).states)
@@ -71,11 +72,12 @@ def test_an_array_that_is_changed_in_place_between_calls_counts():
 def test_shared_traces_are_those_of_what_the_code_reads_now():
     from jax import make_jaxpr
 
-    agent, x = Counted(np.array([2.0])), jnp.zeros(2)
+    now = np.array([2.0])
+    agent, x = Counted(now), jnp.zeros(2)
     with shared_traces():
         texts = []
         for pull in (2.0, 5.0, 2.0):
-            agent.pull[0] = pull
+            now[0] = pull
             make = make_jaxpr(lambda x: call_once_traced(agent.drift, x))
             texts.append(make(x).jaxpr.pretty_print() + str(make(x).consts))
     assert texts[0] == texts[2] != texts[1]

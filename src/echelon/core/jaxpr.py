@@ -133,12 +133,7 @@ def apply(equation: JaxprEqn, operands: list[np.ndarray], algebra: Algebra) -> l
     # It only keeps XLA from reordering, and nothing is reordered here.
     if name == "optimization_barrier":
         return operands
-    # `at[..].apply` is a `scatter` with a function of its entries.
-    if name in PLACED | ADDED and (
-        _is_open(equation, operands)
-        or name == "scatter"
-        and equation.params["update_jaxpr"] is not None
-    ):
+    if name in PLACED | ADDED and (_is_open(equation, operands) or has_function(equation)):
         return algebra.unknown(equation, operands)
     if name in PLACED:
         return _place(equation, operands, algebra.outside)
@@ -198,6 +193,11 @@ def _inner_jaxpr(equation: JaxprEqn) -> Jaxpr | ClosedJaxpr:
     return next(
         equation.params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in equation.params
     )
+
+
+def has_function(equation: JaxprEqn) -> bool:
+    """Tell whether an equation replaces entries by a function of them, as `at[..].apply` does."""
+    return equation.primitive.name == "scatter" and equation.params["update_jaxpr"] is not None
 
 
 def _is_open(equation: JaxprEqn, operands: list[np.ndarray]) -> bool:

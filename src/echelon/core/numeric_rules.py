@@ -47,8 +47,8 @@ def _window(
     sizes: Sequence[int],
     axes: Sequence[int],
     batches: tuple[Sequence[int], Sequence[int]],
-) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the places that windows of an array cover, and where a window begins outside.
+) -> tuple[list[np.ndarray], bool]:
+    """Return the places that windows of an array cover, and whether one was not within it.
 
     Args:
         shape: of the array, k axes.
@@ -58,8 +58,7 @@ def _window(
         batches: axes of the array that go along with axes of the indices.
 
     Returns:
-        The places along each axis, which broadcast to (..., *sizes), clipped into the array; and
-        (...) whether a window was not within it.
+        The places along each axis, which broadcast to (..., *sizes), clipped into the array.
     """
     before, k = indices.shape[:-1], len(shape)
     starts = np.zeros((k, *before), int)
@@ -68,7 +67,7 @@ def _window(
         rows = [-1 if j == along else 1 for j in range(len(before))]
         starts[axis] = np.arange(shape[axis]).reshape(rows)
     last = (np.array(shape) - np.array(sizes)).reshape(-1, *(1 for _ in before))
-    outside = ((starts < 0) | (starts > last)).any(axis=0)
+    outside = bool(((starts < 0) | (starts > last)).any())
     places = []
     for axis, start in enumerate(np.clip(starts, 0, last)):
         along = np.arange(sizes[axis]).reshape([-1 if j == axis else 1 for j in range(k)])
@@ -87,7 +86,7 @@ def _gather(params: Params, x: np.ndarray, indices: np.ndarray) -> np.ndarray | 
     places, outside = _window(x.shape, indices, sizes, numbers.start_index_map, batches)
     before = indices.ndim - 1
     gone = {*numbers.collapsed_slice_dims, *numbers.operand_batching_dims}
-    if outside.any() and _is_filled(params):
+    if outside and _is_filled(params):
         return None
     read = x[tuple(places)].squeeze(tuple(before + axis for axis in gone))
     offsets = numbers.offset_dims
@@ -107,8 +106,7 @@ def _scatter(
     places, outside = _window(
         x.shape, indices, updates.shape[before:], numbers.scatter_dims_to_operand_dims, batches
     )
-    # `at[..].apply` is a `scatter` with a function of its entries.
-    if params["update_jaxpr"] is not None or outside.any():
+    if params["update_jaxpr"] is not None or outside:
         return None
     result = x.copy()
     result[tuple(places)] = updates

@@ -69,9 +69,9 @@ def trace(function: Callable[..., PyTree], *arguments: PyTree) -> Trace:
     Raises:
         Exception: whatever the function raises.
     """
-    first, result = jax.make_jaxpr(
-        lambda *a: call_once_traced(function, *a), return_shape=True
-    )(*arguments)
+    first, result = jax.make_jaxpr(lambda *a: call_once_traced(function, *a), return_shape=True)(
+        *arguments
+    )
     # Under a name of its own, since JAX would hand out the first trace of one function again.
     second = jax.make_jaxpr(lambda *a: function(*a))(*arguments)
     steps = list(_steps(first))
