@@ -101,6 +101,7 @@ class Recording(FrameNumbers):
         promise: as `Promise.as_mapping` returns it.
         horizon, dt: s.
         attributes: provenance and settings, as stored.
+        radius: of an agent, m; None without a size.
     """
 
     name: str
@@ -133,6 +134,7 @@ class Recording(FrameNumbers):
     horizon: float
     dt: float
     attributes: JsonObject
+    radius: float | None = None
 
     @property
     def agents(self) -> int:
@@ -264,6 +266,7 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         horizon=float(attributes["horizon"]),
         dt=float(attributes["dt"]),
         attributes=dict(attributes),
+        radius=float(attributes["radius"]) if "radius" in attributes else None,
     )
 
 
