@@ -227,6 +227,13 @@ def test_keys_the_slider_and_a_chart_move_the_time_and_play_lets_it_run(browser,
         assert not page.evaluate("echelon.player.playing") and stopped < 300
 
 
+TURN = """([place, shift]) => {
+    const { orbit } = echelon.player.views.views[place];
+    orbit.target.x += shift;
+    orbit.update();
+}"""
+
+
 def shown_span(page):
     return page.evaluate("echelon.player.window.span")
 
@@ -280,7 +287,7 @@ def test_agents_that_leave_the_picture_are_counted_and_shown_again(browser, file
     with opened(browser, file) as page:
         hint = page.locator(".away")
         assert not hint.is_visible()
-        page.evaluate("(echelon.player.view.orbit.target.x += 50, echelon.player.view.orbit.update())")
+        page.evaluate(TURN, [0, 50])
         until(lambda: hint.is_visible())
         assert hint.inner_text().startswith("4 agents out of view")
         hint.click()
@@ -338,8 +345,8 @@ def test_two_runs_have_one_clock_one_scale_and_one_camera(browser, run, tmp_path
             assert page.evaluate(moments) == pytest.approx(shown)
         limits = page.evaluate("echelon.player.charts.map((chart) => chart.limits)")
         assert limits[:3] == limits[3:]
-        page.evaluate("(echelon.player.views.views[1].orbit.target.x += 1, echelon.player.views.views[1].orbit.update())")
-        targets = page.evaluate("echelon.player.views.views.map((view) => view.orbit.target.toArray())")
+        page.evaluate(TURN, [1, 1])
+        targets = page.evaluate("echelon.player.views.views.map((v) => v.orbit.target.toArray())")
         assert targets[0] == pytest.approx(targets[1])
         page.keyboard.press("n")
         assert page.locator(".card").count() == 2 and page.locator(".card").last.is_visible()
@@ -355,7 +362,8 @@ def test_a_phone_shows_scene_and_controls_on_one_screen_with_room_for_fingers(br
         for target in page.locator("button:visible, select:visible, input:visible").all():
             assert target.bounding_box()["height"] >= 44
         # A finger that moves up scrolls the charts, and seeks no time.
-        assert page.locator(".area").first.evaluate("(e) => getComputedStyle(e).touchAction") == "pan-y"
+        touch = page.locator(".area").first.evaluate("(e) => getComputedStyle(e).touchAction")
+        assert touch == "pan-y"
 
 
 def test_the_camera_follows_an_agent(browser, file):

@@ -30,7 +30,6 @@ def live(
     from echelon.apps.cli.view_command import keep_serving
     from echelon.apps.live.server import live as make_ready
     from echelon.apps.live.server import serve_live
-
     from echelon.output.archive.open_folder import open_run
 
     session, html = make_ready(loaded, None if folder is None else open_run(folder))

@@ -108,7 +108,8 @@ def show_address(
     if preferred not in (actual, 0):
         print(f"echelon: port {preferred} is in use; using {actual}.", file=sys.stderr)
     opened = browser and open_browser(address)
-    hint = "" if opened or not browser else " No browser could be started: open this address in one."
+    failed = browser and not opened
+    hint = " No browser could be started: open this address in one." if failed else ""
     print(f"echelon: serving {address}.{hint} Ctrl-C quits.", file=sys.stderr, flush=True)
 
 

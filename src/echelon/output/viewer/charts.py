@@ -80,7 +80,8 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
             sheet.line("median", np.median(rows, axis=1), 0, True),
         ]
     if run.reference is not None:
-        away, name = _off_reference(run, run.reference), "leaders" if len(run.leaders) > 1 else "leader"
+        away = _off_reference(run, run.reference)
+        name = "leaders" if len(run.leaders) > 1 else "leader"
         lines.append(sheet.line(name, away, "leader", True))
     lines += _slope(run, errors[0].max(), 1.0)
     marks = [{"value": SETTLED, "name": "1 cm" if run.length_unit else "0.01"}]
