@@ -21,7 +21,7 @@ from echelon.simulation.step.loop import Loop, Moment, WorldState
 
 NOBODY = 2**30
 """The leader of an agent that has no packet, and more hops than any agent has."""
-_HOP_LIFE = 10
+HOP_LIFE = 10
 """Hop counts are used for this many times `forget`, so that losses do not change them."""
 
 
@@ -144,7 +144,7 @@ def understand(
     assert channel is not None
     leader, feedforward = _leaders(loop, readers, t, mail.packet, ages.packet, sent)
     forget = channel.forget * loop.motion.dt
-    hops = _hops(loop, exchange, readers, mail.hops, ages.link <= _HOP_LIFE * forget)
+    hops = _hops(loop, exchange, readers, mail.hops, ages.link <= HOP_LIFE * forget)
     knows = readers.leads | (ages.packet < jnp.inf)
     receivers = jnp.asarray(exchange.receivers)
     received, used = mail.value, ages.link < jnp.inf
