@@ -113,6 +113,40 @@ def test_longer_steps_than_the_condition_allows_let_it_grow():
     assert abs(held[0]) > 1.0
 
 
+def off_plan_ratio(seed):
+    """How far agents end off a leader that leaves its plan by at most d, over the bound."""
+    draw = np.random.default_rng(seed)
+    n, dt, c0, d = int(draw.integers(1, 6)), 0.002, 0.5, 0.3
+    heard, led = random_graph(draw, n)
+    L, own = laplacian(heard, led), heard.sum(axis=1) + led
+    c, s, oldest, most = draw.uniform(1.0, 20.0), draw.uniform(0.4, 3.0), 60, 150
+    kept, steps = 1.0 - c0 * dt, 6000
+    lead, zeta, stamps = np.zeros(steps + 1), draw.normal(size=n), np.zeros(n, int)
+    past, worst = np.zeros((steps, n)), 0.0
+    for k in range(steps):
+        # Packets that are as old as allowed, or drawn; a push that lasts, or turns.
+        fresh = draw.random(n) < 0.01 * (seed % 3 == 0)
+        stamps = np.where((k - stamps >= most) | fresh, k, stamps)
+        hat = lead[stamps] * kept ** (k - stamps)
+        past[k] = zeta - hat
+        ages = draw.integers(0, min(oldest, k) + 1, (n, n))
+        z = own * past[k] - (heard * past[k - ages, np.arange(n)[None]]).sum(axis=1)
+        if k > steps // 2:
+            w = np.linalg.solve(L, np.ones(n))
+            pull = d / np.sqrt(1.0 - (d / s) ** 2) / c
+            bound = w * (pull + own.max() * d * (most + 1) * dt)
+            worst = max(worst, (np.abs(zeta - lead[k]) / bound).max())
+        zeta = zeta + dt * (-c0 * hat - sigma(c * z, s))
+        push = d if seed % 2 else d * np.sign(np.sin(0.7 * k * dt))
+        lead[k + 1] = kept * lead[k] + dt * push
+    return worst
+
+
+def test_a_leader_off_its_plan_costs_no_more_than_stated():
+    worst = max(map(off_plan_ratio, range(6)))
+    assert 0.2 < worst <= 1.0
+
+
 # ---- 2: the rate for messages of any age ---------------------------------------------------------
 
 
@@ -208,6 +242,61 @@ def test_where_followers_hear_each_other_the_arrival_is_later_than_that():
     ways = np.array([1, 2, 2])
     ratio = arrival_ratio(draw, heard, led, 29.86, 1e9, 0.01, 30, "fixed", ways)
     assert ratio > 1.5
+
+
+def leaderward(draw, hops, weights, c, s, dt, steps, oldest, heard_by):
+    """|zeta~| where the mean over those heard with fewer hops is taken; `heard_by` says of whom."""
+    n = len(hops)
+    past = np.tile(draw.uniform(-3.0, 3.0, n), (steps + 1 + oldest, 1))
+    for k in range(oldest, oldest + steps):
+        ages = draw.integers(0, oldest + 1, (n, n))
+        values = past[k - ages, np.arange(n)[None]]
+        used = heard_by(k) * weights
+        total = used.sum(axis=1)
+        mean = (used * values).sum(axis=1) / np.where(total > 0.0, total, 1.0)
+        past[k + 1] = past[k] - dt * sigma(c * (past[k] - mean), s)
+    return np.abs(past[oldest:])
+
+
+def leaderward_ratio(flown, hops, c, s, dt, oldest):
+    ways = hops[None] - 1
+    times = np.maximum(dt * (np.arange(len(flown))[:, None] - ways * oldest), 0.0)
+    start = (flown[0] / hops).max()
+    bounds = [h * _falling(start, c, hops.max(), s, times[:, i]) for i, h in enumerate(hops)]
+    return (flown / np.stack(bounds, axis=1)).max()
+
+
+def test_leaderward_any_part_of_the_nearer_neighbours_may_be_heard():
+    worst, dt = 0.0, 0.01
+    for seed in range(30):
+        draw = np.random.default_rng(seed)
+        n, oldest = int(draw.integers(2, 7)), int(draw.integers(0, 30))
+        hops = np.sort(draw.integers(1, 4, n)).astype(float)
+        hops[0] = 1.0
+        c, s = draw.uniform(1.0, 99.0), draw.uniform(0.3, 3.0)
+        nearer, weights = hops[:, None] > hops[None], draw.uniform(0.3, 3.0, (n, n))
+
+        def part(_, draw=draw, nearer=nearer, n=n):
+            return nearer & (draw.random((n, n)) < 0.5)
+
+        flown = leaderward(draw, hops, weights, c, s, dt, 300, oldest, part)
+        worst = max(worst, leaderward_ratio(flown, hops, c, s, dt, oldest))
+    assert 0.5 < worst <= 1.0 + 1e-9
+
+
+def test_while_hops_change_the_bound_is_false():
+    # Three hear each other, and the first the leader every .32 s, which it forgets after .185 s:
+    # in between everybody may be the nearer one of another, and they wait for each other.
+    draw, dt, c, oldest = np.random.default_rng(0), 0.005, 8.0, 37
+    hops = np.array([1.0, 2.0, 2.0])
+
+    def heard_by(k):
+        ring = np.roll(np.eye(3), k // 5 % 2 + 1, axis=1)
+        led = (k - oldest) % 64 < 37
+        return np.array([[0, 0, 0], [1, 0, 0], [1, 0, 0]]) if led else ring
+
+    flown = leaderward(draw, hops, np.ones((3, 3)), c, 1e9, dt, 600, oldest, heard_by)
+    assert leaderward_ratio(flown, hops, c, 1e9, dt, oldest) > 1.5
 
 
 # ---- how old messages become ---------------------------------------------------------------------

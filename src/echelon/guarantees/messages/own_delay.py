@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
+import scipy.sparse.linalg as spla
 from jax.flatten_util import ravel_pytree
 
 from echelon.agents.world.actuator import MotorArrays
@@ -166,8 +167,10 @@ def _decays(case: OwnCase, step: LateStep, delay: int) -> bool:
     sums = case.heard.diagonal()
     passed = {d: step.passed_on(d, delay) for d in np.unique(sums).tolist()}
     gains = sp.diags_array([passed[d] / d for d in sums.tolist()])
-    whole = gains @ (sp.diags_array(sums) - case.heard)
-    return float(np.abs(np.linalg.eigvals(whole.toarray())).max()) < _EDGE
+    # Their radius is below 1 exactly if (1 - gains) x = 1 has a positive solution.
+    whole = sp.csc_array(sp.eye_array(len(sums)) - gains @ (sp.diags_array(sums) - case.heard))
+    x = spla.splu(whole).solve(np.ones(len(sums)))
+    return bool((x > 0.0).all() and (whole @ x > 0.0).all())
 
 
 def late_step(problem: Problem, law: StoppingPoint, lag: float) -> LateStep | None:
@@ -176,9 +179,13 @@ def late_step(problem: Problem, law: StoppingPoint, lag: float) -> LateStep | No
     motors = MotorArrays(np.asarray(lag), *[None] * 5) if lag else None
     how = settings.dt, settings.integrator, settings.limits, settings.substeps, motors
     loop = assemble(problem._replace(motion=Motion(model, None, *how)), law, law)
-    parts = [np.asarray(part, float) for part in _slopes(loop, law)]
-    finite = all(np.isfinite(part).all() for part in parts)
-    return LateStep(*parts, states=len(model.state_names)) if finite else None
+    A, B, E, G, F = (np.asarray(part, float) for part in _slopes(loop, law))
+    if not all(np.isfinite(part).all() for part in (A, B, E, G, F)):
+        return None
+    # A memory that is not used keeps its value for ever.
+    moves = (np.hstack([A - np.eye(len(A)), B, E]) != 0.0).any(axis=1)
+    moves[: B.shape[1]] = True
+    return LateStep(A[moves][:, moves], B[moves], E[moves], G[:, moves], F, B.shape[1])
 
 
 @cached_jit
