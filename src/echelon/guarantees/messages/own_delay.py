@@ -79,7 +79,7 @@ class LateStep(NamedTuple):
         """
         whole = sp.csr_array(self.loop(own, delay))
         n, size, m = self.states, len(self.A), self.E.shape[1]
-        x, total = np.zeros((whole.shape[0], m)), np.zeros((m, m))
+        x, total = np.zeros((size + n * delay, m)), np.zeros((m, m))
         x[:size] = -own * self.E
         first = largest = 0.0
         while largest >= _DECAYED * first or not first:
