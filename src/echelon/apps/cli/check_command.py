@@ -6,6 +6,7 @@ import typer
 
 from echelon.apps.cli import tables
 from echelon.apps.cli.options import JsonOption, ScenarioArgument, SetOption
+from echelon.apps.cli.status import STATUS
 
 
 def check(scenario: ScenarioArgument, set_: SetOption = None, as_json: JsonOption = False) -> None:
@@ -13,6 +14,7 @@ def check(scenario: ScenarioArgument, set_: SetOption = None, as_json: JsonOptio
     from echelon.experiments.scenario.scenario import load_scenario
 
     loaded = load_scenario(scenario, set_ or [])
+    STATUS.begin(f"checking {loaded.name}", not as_json)
     # Not above: an error in the file is reported without the wait for JAX.
     from echelon.experiments.scenario.build import build
     from echelon.experiments.studies.check import check as examine

@@ -1,11 +1,13 @@
 """`echelon doctor`: versions, devices and self-checks."""
 
 import json
+from typing import TYPE_CHECKING
 
 import typer
 
 from echelon.apps.cli import tables
 from echelon.apps.cli.options import JsonOption
+from echelon.apps.cli.status import STATUS
 
 
 def doctor(as_json: JsonOption = False) -> None:

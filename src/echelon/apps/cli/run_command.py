@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from echelon.apps.cli import options, tables
-from echelon.apps.cli.console import foretell, print_folder, show_progress
+from echelon.apps.cli.console import foretell, print_folder
 from echelon.apps.cli.job import Job, check_inputs
+from echelon.apps.cli.status import STATUS
 from echelon.apps.cli.stop import STOP
 from echelon.core.errors import Outcome, OutputError
 
@@ -123,10 +124,12 @@ def _simulate(
     if watched is not None:
         for stretch in stored:
             watched.add(stretch)
-    with job.cleanup(), show_progress(quiet) as show:
+    horizon = f"{experiment.settings.horizon:g} s of {experiment.parts.graph.agents} agents"
+    STATUS.begin(f"simulating {scenario.name}, {horizon}", not quiet)
+    with job.cleanup():
 
         def progress(run: "RunSoFar") -> None:
-            show(run.done, run.steps)
+            STATUS.count(run.done, run.steps, "steps")
             STOP.check()
 
         return build.run(scenario, progress, experiment, store, stored)
@@ -149,6 +152,7 @@ def _write(job: Job, result: "Result", figures: bool, quiet: bool) -> None:
     """Write all output; the chunks stay until the run is complete and everything is written."""
     from echelon.output.archive.run_folder import write_findings
 
+    STATUS.begin("drawing and writing" if figures else "writing", log=False)
     try:
         write_findings(result, job.folder, figures)
     except OutputError as error:

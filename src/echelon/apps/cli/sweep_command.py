@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from echelon.apps.cli import options
-from echelon.apps.cli.console import print_folder, show_progress
+from echelon.apps.cli.console import print_folder
 from echelon.apps.cli.job import Job, check_inputs
+from echelon.apps.cli.status import STATUS
 from echelon.apps.cli.stop import STOP, Ended
 
 if TYPE_CHECKING:
@@ -108,19 +109,18 @@ def _compute(
         batches.write(batch)
         results.append(batch)
 
-    with show_progress(quiet, "runs") as show:
+    def progress(done: int, runs: int) -> None:
+        STATUS.count(done, runs, "runs")
+        STOP.check()
 
-        def progress(done: int, runs: int) -> None:
-            show(done, runs)
-            STOP.check()
-
-        stored = tuple(results)
-        try:
-            STOP.aside(lambda: compute(plan, store, progress, stored, threads, cluster))
-        except KeyboardInterrupt:
-            # What is computed by then is stored, and the report says so.
-            if not results:
-                raise Ended from None
+    stored = tuple(results)
+    STATUS.begin(f"simulating {plan.scenario.name}, {plan.count} runs", not quiet)
+    try:
+        STOP.aside(lambda: compute(plan, store, progress, stored, threads, cluster))
+    except KeyboardInterrupt:
+        # What is computed by then is stored, and the report says so.
+        if not results:
+            raise Ended from None
     # A copy, as a thread that goes on may add to them.
     return [*results]
 

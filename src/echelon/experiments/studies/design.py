@@ -98,7 +98,11 @@ class Designs(NamedTuple):
     law_design: LawDesign | None = None
 
 
-def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = None) -> Designs:
+def design(
+    scenario: Scenario | tuple[Parts, Settings],
+    method: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Designs:
     """Apply the gain methods to a scenario, and recommend one.
 
     Args:
