@@ -1,6 +1,7 @@
 """`echelon live`: a closed loop in real time, with controls in the browser."""
 
 from echelon.apps.cli.options import BrowserOption, PortOption, ScenarioArgument, SetOption
+from echelon.apps.cli.status import STATUS
 
 
 def live(
@@ -15,11 +16,12 @@ def live(
 
     loaded = load_scenario(scenario, set_ or [])
     check_page()
+    STATUS.begin(f"preparing {loaded.name} for the browser, which takes up to a minute")
     from echelon.apps.cli.view_command import keep_serving
     from echelon.apps.live.server import live as make_ready
     from echelon.apps.live.server import serve_live
 
-    session, html = make_ready(loaded)
+    session, html = make_ready(loaded, STATUS.counter("parts"))
     server = serve_live(session, html, port)
     session.start()
     try:

@@ -75,6 +75,7 @@ def _new_run(
     from echelon.experiments.scenario.scenario import load_scenario
 
     scenario = load_scenario(name, changes)
+    STATUS.begin(f"preparing {scenario.name}", not quiet)
     from echelon.experiments.scenario.build import build
     from echelon.output.archive.chunks import Chunks
     from echelon.output.archive.folder import claim_folder
@@ -96,6 +97,7 @@ def _unfinished_run(folder: Path) -> "tuple[Scenario, Experiment, Job]":
     job = Job("run", Chunks(folder))
     job.resume("summary.json")
     scenario = load_scenario(folder / SCENARIO_FILE)
+    STATUS.begin(f"preparing {scenario.name}")
     from echelon.experiments.scenario.build import build
 
     return scenario, build(scenario), job

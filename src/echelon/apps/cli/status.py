@@ -54,6 +54,7 @@ class Status:
 
     def _clear(self) -> None:
         self._text, self._counted, self._drawn, self._terminal = "", "", False, False
+        self._paused = False
         self._since, self._written, self._first = 0.0, 0.0, (0.0, -1)
 
     @contextlib.contextmanager
@@ -85,20 +86,20 @@ class Status:
         Called before libraries are loaded, which takes seconds.
         """
         with self._lock:
-            self._text = text if log or self._terminal else ""
+            self._text, self._paused = text if log or self._terminal else "", False
             self._since, self._counted, self._first = time.monotonic(), "", (0.0, -1)
             self._write(0.0)
 
-    def count(self, done: int, total: int, unit: str) -> None:
+    def count(self, done: float, total: int, unit: str) -> None:
         """Show how much of the work is done, and the time that the rest will take."""
         with self._lock:
-            now, (begun, before) = time.monotonic(), self._first
+            now, (begun, before), self._paused = time.monotonic(), self._first, False
             if before < 0:
                 self._first = (now, done)
             left = ""
             if 0 <= before < done:
                 left = f", {duration((total - done) * (now - begun) / (done - before))} left"
-            self._counted = f": {done} of {total} {unit}{left if done < total else ''}"
+            self._counted = f": {int(done)} of {total} {unit}{left if done < total else ''}"
             self._write(_DRAWN if self._terminal else _PLAIN)
 
     def counter(self, unit: str) -> Callable[[int, int], None]:
@@ -106,9 +107,9 @@ class Status:
         return lambda done, total: self.count(done, total, unit)
 
     def pause(self) -> None:
-        """End the line before other output, until something begins again."""
+        """Remove the line before other output, until something begins or is counted."""
         with self._lock:
-            self._text = ""
+            self._paused = True
             if self._drawn and self._stream is not None:
                 self._drawn = False
                 self._stream.put(_ERASE)
@@ -125,7 +126,9 @@ class Status:
     def _write(self, apart: float) -> None:
         """Write the line if it has changed nothing for so many seconds."""
         now = time.monotonic()
-        if not self._text or self._stream is None or (apart and now - self._written < apart):
+        if not self._text or self._paused or self._stream is None:
+            return
+        if apart and now - self._written < apart:
             return
         self._written, took = now, now - self._since
         text = f"echelon: {self._text}{self._counted} ..."

@@ -34,6 +34,10 @@ class Stream:
         self.put(text)
         return len(text)
 
+    def isatty(self) -> bool:
+        """Return whether it is a terminal."""
+        return self._stream.isatty()
+
     def put(self, text: str) -> None:
         """Write text beside the line of the status."""
         with self._survive():

@@ -71,6 +71,7 @@ def _new_sweep(
 
     axes = read_axes(over)
     scenario = load_scenario(name, changes)
+    STATUS.begin(f"preparing {scenario.name}", log=False)
     from echelon.experiments.sweeps.plan import Sweep
     from echelon.output.archive.folder import BATCHES, claim_folder
     from echelon.output.archive.sweep_folder import Batches

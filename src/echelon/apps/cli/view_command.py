@@ -9,6 +9,7 @@ import typer
 
 from echelon.apps.cli.console import write_file
 from echelon.apps.cli.options import BrowserOption, OverwriteOption, PortOption, RunArgument
+from echelon.apps.cli.status import STATUS
 from echelon.apps.cli.stop import STOP
 from echelon.output.archive.folder import claim_file
 
@@ -32,6 +33,7 @@ def view(
     check_page()
     if html is not None:
         claim_file(html, force)
+    STATUS.begin(f"reading {run}")
     from echelon.output.archive.open_folder import open_run
     from echelon.output.viewer.replay import replay_page
 
