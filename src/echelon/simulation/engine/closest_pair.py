@@ -2,6 +2,9 @@
 
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Float
+
 
 class ClosestPair(NamedTuple):
     """Two agents when they were closest to each other.
@@ -15,6 +18,18 @@ class ClosestPair(NamedTuple):
     distance: float
     agents: tuple[int, int]
     time: float
+
+    @classmethod
+    def of(cls, places: Float[np.ndarray, "N k"], time: float) -> "ClosestPair":
+        """Return the closest of two agents or more at places (m), at a time (s)."""
+        from scipy.spatial import KDTree
+
+        away, near = map(np.asarray, KDTree(places).query(places, k=2))
+        first = int(away[:, 1].argmin())
+        # Agents in one place come in any order.
+        other = next(int(agent) for agent in near[first] if agent != first)
+        distance = float(np.linalg.norm(places[first] - places[other]))
+        return cls(distance, (min(first, other), max(first, other)), time)
 
     def touch(self, radius: float | None) -> bool:
         """Return whether agents of a radius (m) touched; None has no size."""
