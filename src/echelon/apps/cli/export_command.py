@@ -7,6 +7,7 @@ import typer
 
 from echelon.apps.cli.console import write_file
 from echelon.apps.cli.options import OverwriteOption, RunArgument
+from echelon.apps.cli.status import STATUS
 from echelon.output.archive.folder import claim_file
 
 
@@ -19,6 +20,7 @@ def export(
     force: OverwriteOption = False,
 ) -> None:
     """Write a run's states, inputs and errors for pandas, NumPy, MATLAB or a spreadsheet."""
+    STATUS.begin(f"reading {run}")
     from echelon.output.archive.export import content_of
 
     content = content_of(to)

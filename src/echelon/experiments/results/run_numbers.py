@@ -42,15 +42,19 @@ class RunNumbers:
     computing: float | None = None
 
     def number(self, name: str) -> float | None:
-        """Return a number of `RUN_NUMBERS`; None if it does not exist."""
+        """Return a number of `RUN_NUMBERS`; None if it does not exist or is more than one."""
+        value = self._value(name)
+        return None if isinstance(value, tuple) else value
+
+    def _value(self, name: str) -> float | tuple[int, ...] | None:
         compute = RUN_NUMBERS[name].of
         value = None if compute is None else compute(self)
-        return None if value is None or np.isnan(value) else value
+        return None if value is None or np.isnan(value).any() else value
 
     def json(self, where: Shown) -> "JsonObject":
         """Return the numbers that appear somewhere, under their names in JSON."""
         return {
-            quantity.key or name: self.number(name)
+            quantity.key or name: self._value(name)
             for name, quantity in RUN_NUMBERS.items()
             if where in quantity.shown
         }
@@ -69,6 +73,10 @@ class RunNumbers:
     def root_mean(self, name: str) -> float:
         """Return the root mean square of a number of the followers."""
         return float(np.sqrt(np.mean(self.followers(name) ** 2)))
+
+    def of_network(self, name: str) -> float | None:
+        """Return a number of the messages; None in the ideal network."""
+        return None if self.result.traffic is None else getattr(self.result.traffic, name)
 
     @functools.cached_property
     def first_and_last(self) -> Float[np.ndarray, "2 F"]:
@@ -106,6 +114,7 @@ AGENT_NUMBERS: Mapping[str, Quantity] = quantities(FollowerMetrics) | {
         of=lambda run: run.first_and_last[1],
     ),
 }
+_OF_NETWORK = Shown.SWEEP | Shown.COMPARISON | Shown.SUMMARY
 RUN_NUMBERS: Mapping[str, Quantity] = {
     "formation_rmse": Quantity(
         "root mean square of the followers' errors, over all steps and followers",
@@ -178,6 +187,24 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         of=lambda run: run.metrics.minimum_distance,
         shown=Shown.COMPARISON | Shown.SUMMARY,
     ),
+    "minimum_distance_time": Quantity(
+        "time of the stored frame in which two agents were closest to each other",
+        "s",
+        of=lambda run: getattr(run.metrics.closest, "time", None),
+        shown=Shown.SUMMARY,
+        key="minimum_distance_time_s",
+    ),
+    "closest_agents": Quantity(
+        "the two agents that were closest to each other",
+        of=lambda run: getattr(run.metrics.closest, "agents", None),
+        shown=Shown.SUMMARY,
+    ),
+    "vehicle_radius": Quantity(
+        "radius of an agent; closer than twice of it, two agents touch",
+        "m",
+        of=lambda run: run.result.radius,
+        shown=Shown.SUMMARY,
+    ),
     "computing": Quantity(
         "computing time for one agent and one second of the run",
         "s",
@@ -186,6 +213,37 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         shown=Shown.COMPARISON,
         key="computing_s_per_agent_s",
         scale=1e3,
+    ),
+    "largest_age": Quantity(
+        "largest age of a message in use, over all steps and links",
+        "s",
+        column="oldest message\nin use, s",
+        of=lambda run: run.of_network("largest"),
+        shown=_OF_NETWORK,
+        key="largest_age_s",
+    ),
+    "mean_age": Quantity(
+        "mean age of the messages in use, over all steps and links",
+        "s",
+        of=lambda run: run.of_network("mean"),
+        shown=_OF_NETWORK,
+        key="mean_age_s",
+    ),
+    "messages_sent": Quantity(
+        "messages sent, each counted for every agent that uses it",
+        of=lambda run: run.of_network("sent"),
+        shown=_OF_NETWORK,
+    ),
+    "messages_lost": Quantity(
+        "messages that were lost",
+        column="messages\nlost",
+        of=lambda run: run.of_network("lost"),
+        shown=_OF_NETWORK,
+    ),
+    "messages_late": Quantity(
+        "messages that arrived after a newer one of the same sender",
+        of=lambda run: run.of_network("late"),
+        shown=_OF_NETWORK,
     ),
     "promise_rate": Quantity(
         "rate at which errors are guaranteed to decay",

@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,19 +15,21 @@ if TYPE_CHECKING:
 
 NAMES = (
     *("leader_3d", "trajectories", "top_view", "tracking", "formation", "inputs"),
-    *("states", "distances", "lyapunov", "modes", "network"),
+    *("states", "distances", "lyapunov", "modes", "network", "ages"),
 )
 """All figures of a run."""
 
 
-def check_names(names: Sequence[str]) -> None:
-    """Check that these are figures of a run.
+def check_names(what: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the names of figures, of one or several.
 
     Raises:
         OutputError: there is no figure of a name.
     """
+    names = (what,) if isinstance(what, str) else tuple(what)
     for name in names:
         check_name("the figure is", name, NAMES, OutputError)
+    return names
 
 
 def html_image(figure: "Figure", name: str, dpi: int) -> str:
@@ -43,8 +45,11 @@ def save(
     folder: Path,
     kinds: Sequence[str] = ("png", "pdf"),
     dpi: int = 150,
+    progress: Callable[[int, int], None] = lambda done, files: None,
 ) -> list[Path]:
     """Write each figure as PNG and PDF into a folder, and return the paths.
+
+    `progress` is called with how many files are written, and of how many.
 
     Raises:
         OSError: the folder or a file cannot be written.
@@ -63,4 +68,5 @@ def save(
                     path, lambda part: figure.savefig(part, format=kind, dpi=dpi, metadata=metadata)
                 )
             paths.append(path)
+            progress(len(paths), len(figures) * len(kinds))
     return paths

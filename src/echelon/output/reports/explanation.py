@@ -20,6 +20,7 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
     guarantee = promise(result.parts, result.settings)
     return (
         *_outcome(result, numbers),
+        *_closest(result, numbers),
         *(cause.sentence() for cause in causes(result, numbers, guarantee)),
         *_world(result),
         *_guarantee(result, guarantee),
@@ -53,6 +54,12 @@ def _outcome(result: Result, numbers: Metrics) -> Iterator[str]:
         )
 
 
+def _closest(result: Result, numbers: Metrics) -> Iterator[str]:
+    """Yield which agents came closest to each other, and whether vehicles would have touched."""
+    if numbers.closest is not None and result.outcome is not Outcome.DIVERGED:
+        yield numbers.closest.sentence(result.radius)
+
+
 def _world(result: Result) -> Iterator[str]:
     """Yield what the laws and gains do not know."""
     world = result.world.describe(result.model)
@@ -62,10 +69,26 @@ def _world(result: Result) -> Iterator[str]:
         yield f"Disturbance: {world['disturbance']}; unknown to the laws."
     if world["network"]:
         yield f"Network: {world['network']}."
+        yield from _messages(result)
     if world["actuator"]:
         yield f"Actuators: {world['actuator']}; unknown to the laws."
     if world["sensing"]:
         yield f"Sensing of own states: {world['sensing']}."
+
+
+def _messages(result: Result) -> Iterator[str]:
+    """Yield what became of the messages, if there were any."""
+    traffic = result.traffic
+    if traffic is None or not traffic.sent:
+        return
+    late = f", {traffic.late} arrived after a newer one" * (traffic.late > 0)
+    ages = ""
+    if np.isfinite(traffic.mean):
+        ages = (
+            f"; those in use were {1e3 * traffic.mean:.3g} ms old on average and "
+            f"{1e3 * traffic.largest:.4g} ms at most"
+        )
+    yield f"Messages: {traffic.sent} sent, {traffic.lost} lost{late}{ages}."
 
 
 def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from echelon.core.types import Array
+from echelon.simulation.engine.closest_pair import ClosestPair
 
 _FEW = 8
 """Agents up to which comparing all pairs is faster than a search for the nearest."""
@@ -19,6 +20,9 @@ _Some: TypeAlias = slice | Sequence[int] | Int[Array, " F"]
 
 class _Frames(Protocol):
     """What the numbers are computed from."""
+
+    @property
+    def times(self) -> Float[Array, " T"]: ...
 
     @property
     def states(self) -> Float[Array, "T N n"]: ...
@@ -38,6 +42,10 @@ class _Frames(Protocol):
     def deviations(self, frames: _Some = slice(None)) -> Float[Array, "F N n"]: ...
 
     def goal_distances(self, frames: _Some = slice(None)) -> Float[Array, "F N"]: ...
+
+    def least_distances(self, frames: _Some = slice(None)) -> Float[Array, " F"] | None: ...
+
+    def approaches(self, last: int = 0) -> list[ClosestPair]: ...
 
 
 class FrameNumbers(abc.ABC):
@@ -94,6 +102,24 @@ class FrameNumbers(abc.ABC):
         finite = np.isfinite(places).all(axis=(1, 2))
         least[finite] = _least(places[finite])
         return least
+
+    def closest_pair(self: _Frames) -> ClosestPair | None:
+        """Return which agents were closest to each other in the stored frames, and when.
+
+        None without a position, a second agent or a frame of finite numbers.
+        """
+        pairs = self.approaches(1)
+        return pairs[-1] if pairs else None
+
+    def approaches(self: _Frames, last: int = 0) -> list[ClosestPair]:
+        """Return the pairs that were closer than any in a frame before, all or the last ones."""
+        least = self.least_distances() if self.states.shape[1] > 1 else None
+        if least is None:
+            return []
+        least = np.where(np.isfinite(least), least, np.inf)
+        before = np.minimum.accumulate(np.concatenate([[np.inf], least[:-1]]))
+        frames, columns = np.flatnonzero(least < before)[-last:], list(self.position)
+        return [ClosestPair.of(self.states[k][:, columns], float(self.times[k])) for k in frames]
 
 
 def _least(places: Float[Array, "T N k"]) -> Float[Array, " T"]:

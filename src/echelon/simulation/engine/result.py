@@ -1,6 +1,7 @@
 """The result of a run: everything that metrics, figures and files read, in float64 NumPy."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import final
 
@@ -15,6 +16,7 @@ from echelon.core.pages import notebook_page
 from echelon.core.types import Array
 from echelon.simulation.engine.frame_numbers import FrameNumbers
 from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.traffic import Traffic, traffic
 from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.settings import Settings
@@ -92,6 +94,12 @@ class Result(FrameNumbers):
         """How many times (N,) an input jumped from one limit to the opposite one in a step."""
         return self.sums.chatter
 
+    @functools.cached_property
+    def traffic(self) -> Traffic | None:
+        """What became of the messages; None in the ideal network."""
+        steps = int(self.sums.steps[0])
+        return traffic(self.parts, self.settings, self.times, steps)
+
     @property
     def offsets(self) -> Array:
         """The goal offsets, (N, n)."""
@@ -106,6 +114,11 @@ class Result(FrameNumbers):
     def position(self) -> tuple[int, ...]:
         """Indices of the states that are the position; none of an abstract agent."""
         return self.model.position_indices()
+
+    @property
+    def radius(self) -> float | None:
+        """The radius of an agent, m; None without a position or a size."""
+        return self.model.radius if self.position else None
 
     @property
     def unit(self) -> str:
