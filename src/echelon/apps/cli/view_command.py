@@ -32,10 +32,10 @@ def view(
     check_page()
     if html is not None:
         claim_file(html, force)
-    from echelon.output.archive.open_folder import open_run
+    from echelon.output.archive.load_folder import load
     from echelon.output.viewer.replay import replay_page
 
-    page = replay_page(open_run(run)).encode()
+    page = replay_page(load(run)).encode()
     if html is None:
         show_page(page, port, browser)
         return

@@ -7,12 +7,14 @@ import numpy as np
 
 from echelon.core.errors import OutputError
 from echelon.core.types import Array, JsonObject
+from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
 from echelon.output.plots.style import raised
 from echelon.output.viewer.charts import charts_of
 from echelon.output.viewer.pack import BYTE, COARSE, Group, pack
 from echelon.output.viewer.page import page
+from echelon.simulation.engine.result import Result
 
 FLOCK = 200
 """With more agents than this, bodies are flat, and a motor load takes one byte."""
@@ -22,12 +24,13 @@ _MOST = 20_000_000
 """Numbers in one file, which take some 25 MB."""
 
 
-def replay_page(run: Recording) -> str:
+def replay_page(run: Result | Recording) -> str:
     """Return a run as one self-contained HTML page.
 
     Raises:
         OutputError: the run has no frame or is too large, or the page's three.js is not built.
     """
+    run = recording_of(run)
     return page(run.name, replay_data(run))
 
 
