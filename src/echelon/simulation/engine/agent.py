@@ -354,5 +354,8 @@ def _late_step(
     if leads:
         content = content_of(loop, t, *own, signal, action.message)[None]
     step = jnp.zeros((), jnp.int32)
-    letter, _ = write(loop, reader, step, mail, knowledge, signal[None], difference, content)
+    assert loop.channel is not None
+    letter, _ = write(
+        loop.channel, reader, step, mail, knowledge, signal[None], difference, content
+    )
     return _Step(signal, action, _finite((own.x, signal, action, letter)), letter)
