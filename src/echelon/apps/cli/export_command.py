@@ -12,7 +12,9 @@ from echelon.output.archive.folder import claim_file
 
 def export(
     run: RunArgument,
-    to: Annotated[str, typer.Option("--to", help="csv, parquet, npz, mat, nc or json.")] = "csv",
+    to: Annotated[
+        str, typer.Option("--to", help="csv, parquet, npz, mat, nc, json or html.")
+    ] = "csv",
     out: Annotated[
         Path | None, typer.Option("--out", help="Output file (default: run.csv, run.npz, ...).")
     ] = None,

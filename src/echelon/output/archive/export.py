@@ -68,7 +68,8 @@ def export(run: "Result", path: "PathLike", force: bool = False) -> Path:
     """Write a run as a file for other programs, and return its path.
 
     The ending chooses the format: `.csv`, `.parquet` and `.json` have the columns of `table`,
-    `.npz` and `.mat` (MATLAB) arrays (times, agents, states), `.nc` is the `run.nc` of a folder.
+    `.npz` and `.mat` (MATLAB) arrays (times, agents, states), `.nc` is the `run.nc` of a folder,
+    and `.html` the page that `echelon view` shows. Videos are written by `save_video`.
 
     Args:
         run: a result.
@@ -77,7 +78,7 @@ def export(run: "Result", path: "PathLike", force: bool = False) -> Path:
 
     Raises:
         OutputError: there is no such format, the file exists, or it cannot be written.
-        MissingExtraError: Parquet is asked for, and pyarrow is not installed.
+        MissingExtraError: pyarrow, of Parquet, or the page's three.js is not installed.
     """
     from echelon.output.archive.folder import claim_file, write_errors
 
@@ -174,6 +175,15 @@ def _netcdf(run: "Result") -> bytes:
     return run_file(run)
 
 
+def _page(run: "Result") -> bytes:
+    from echelon.experiments.results.dataset import recording_of
+    from echelon.output.viewer.page import check_page
+    from echelon.output.viewer.replay import replay_page
+
+    check_page()
+    return replay_page(recording_of(run)).encode()
+
+
 _WRITERS: "dict[str, Callable[[Result], bytes]]" = {
     "csv": _csv,
     "parquet": _parquet,
@@ -181,4 +191,5 @@ _WRITERS: "dict[str, Callable[[Result], bytes]]" = {
     "mat": _mat,
     "nc": _netcdf,
     "json": _json,
+    "html": _page,
 }

@@ -7,14 +7,12 @@ import numpy as np
 
 from echelon.core.errors import OutputError
 from echelon.core.types import Array, JsonObject
-from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
 from echelon.output.plots.style import raised
 from echelon.output.viewer.charts import charts_of
 from echelon.output.viewer.pack import BYTE, COARSE, Group, pack
 from echelon.output.viewer.page import page
-from echelon.simulation.engine.result import Result
 
 FLOCK = 200
 """With more agents than this, bodies are flat, and a motor load takes one byte."""
@@ -24,15 +22,14 @@ _MOST = 20_000_000
 """Numbers in one file, which take some 25 MB."""
 
 
-def replay_page(*runs: Result | Recording) -> str:
+def replay_page(*runs: Recording) -> str:
     """Return one run, or two beside each other with the same clock, as a self-contained HTML page.
 
     Raises:
         OutputError: a run has no frame or is too large.
         MissingExtraError: the page's three.js is not built.
     """
-    opened = [*map(recording_of, runs)]
-    return page(" and ".join(run.name for run in opened), *map(replay_data, opened))
+    return page(" and ".join(run.name for run in runs), *map(replay_data, runs))
 
 
 def replay_data(run: Recording) -> bytes:
