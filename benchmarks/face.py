@@ -179,7 +179,7 @@ def measure_replay(agents: int, run: Path) -> None:
     """Tell how large a page is, how long it takes to be made, and how it scrubs."""
     result = load(run)
     began = time.perf_counter()
-    html = replay_page(result)
+    html = replay_page(recording_of(result))
     took = time.perf_counter() - began
     file = run / "page.html"
     file.write_text(html, "utf-8")

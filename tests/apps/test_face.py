@@ -106,7 +106,8 @@ def test_an_unknown_format_is_refused_with_those_there_are(echelon, file):
     assert code == 2
     assert (
         fault
-        == "echelon: `--to` is `xls`, allowed are `csv`, `parquet`, `npz`, `mat`, `nc`, `json`.\n"
+        == "echelon: `--to` is `xls`, allowed are `csv`, `parquet`, `npz`, `mat`, `nc`, `json`, "
+        "`html`.\n"
     )
 
 

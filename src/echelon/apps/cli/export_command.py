@@ -7,13 +7,14 @@ import typer
 
 from echelon.apps.cli.console import write_file
 from echelon.apps.cli.options import OverwriteOption, RunArgument
+from echelon.apps.cli.status import STATUS
 from echelon.output.archive.folder import claim_file
 
 
 def export(
     run: RunArgument,
     to: Annotated[
-        str, typer.Option("--to", help="csv, parquet, npz, mat, nc, json or html.")
+        str, typer.Option("--to", help="csv, parquet, npz, mat, nc, json, html.")
     ] = "csv",
     out: Annotated[
         Path | None, typer.Option("--out", help="Output file (default: run.csv, run.npz, ...).")
@@ -21,6 +22,7 @@ def export(
     force: OverwriteOption = False,
 ) -> None:
     """Write a run's states, inputs and errors for pandas, NumPy, MATLAB or a spreadsheet."""
+    STATUS.begin(f"reading {run}")
     from echelon.output.archive.export import content_of
 
     content = content_of(to)
