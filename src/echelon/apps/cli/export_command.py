@@ -13,7 +13,9 @@ from echelon.output.archive.folder import claim_file
 
 def export(
     run: RunArgument,
-    to: Annotated[str, typer.Option("--to", help="csv, parquet, npz or mat.")] = "csv",
+    to: Annotated[
+        str, typer.Option("--to", help="csv, parquet, npz, mat, nc, json, html.")
+    ] = "csv",
     out: Annotated[
         Path | None, typer.Option("--out", help="Output file (default: run.csv, run.npz, ...).")
     ] = None,
@@ -26,6 +28,6 @@ def export(
     content = content_of(to)
     file = Path(f"run.{to}") if out is None else out
     claim_file(file, force)
-    from echelon.output.archive.open_folder import open_run
+    from echelon.output.archive.load_folder import load
 
-    write_file(file, content(open_run(run)))
+    write_file(file, content(load(run)))

@@ -32,9 +32,10 @@ def live(
     from echelon.apps.cli.view_command import keep_serving
     from echelon.apps.live.server import live as make_ready
     from echelon.apps.live.server import serve_live
-    from echelon.output.archive.open_folder import open_run
+    from echelon.experiments.results.dataset import recording_of
+    from echelon.output.archive.load_folder import load
 
-    run = None if folder is None else open_run(folder)
+    run = None if folder is None else recording_of(load(folder))
     session, html = make_ready(loaded, run, STATUS.counter("parts"))
     server = serve_live(session, html, port)
     session.start()

@@ -37,11 +37,11 @@ def plot(
     names = NAMES if what is None else tuple(filter(None, map(str.strip, what.split(","))))
     check_names(names)
     STATUS.begin(f"reading {run}")
-    from echelon.output.archive.open_folder import open_run
+    from echelon.output.archive.load_folder import load
     from echelon.output.plots.run_figures import figures
     from echelon.output.plots.style import ONE_COLUMN, SCREEN, TWO_COLUMNS
 
-    recording = open_run(run)
+    recording = load(run)
     folder = (run if run.is_dir() else run.parent) / "figures" if out is None else out
     pages = {"_one_column": ONE_COLUMN, "_two_columns": TWO_COLUMNS} if paper else {"": SCREEN}
     drawings = {

@@ -19,8 +19,8 @@ def report(
     """Write a run as one HTML page: table, guarantee, figures, scenario, versions, citation."""
     claim_file(out, force)
     STATUS.begin(f"reading {run}")
-    from echelon.output.archive.open_folder import open_run
+    from echelon.output.archive.load_folder import load
     from echelon.output.archive.report_page import report_page
 
-    page = report_page(open_run(run), run if run.is_dir() else None)
+    page = report_page(load(run), run if run.is_dir() else None)
     write_file(out, page, "{}, one self-contained file")

@@ -23,11 +23,11 @@ def video(
         raise OutputError(f"`--speed` is {speed:g}, and must be from 0.01 to 100.")
     claim_file(file, force, endings=(".mp4", ".gif"))
     STATUS.begin(f"reading {run}")
-    from echelon.output.archive.open_folder import open_run
+    from echelon.output.archive.load_folder import load
     from echelon.output.plots.video import encoder, save_video
 
     # Before the run is read, so that a missing ffmpeg is reported at once.
     encoder()
     with write_errors(file):
-        pictures = save_video(open_run(run), file, speed)
+        pictures = save_video(load(run), file, speed)
     print_file(file, f"{pictures} pictures, {{}}")

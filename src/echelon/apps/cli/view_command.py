@@ -52,10 +52,11 @@ def view(
         claim_file(html, force)
     paths = runs or [_newest()]
     STATUS.begin(f"reading {' and '.join(map(str, paths))}")
-    from echelon.output.archive.open_folder import open_run
+    from echelon.experiments.results.dataset import recording_of
+    from echelon.output.archive.load_folder import load
     from echelon.output.viewer.replay import replay_page
 
-    opened = [open_run(path) for path in paths]
+    opened = [recording_of(load(path)) for path in paths]
     if len(paths) > 1:
         # Both may be of one scenario.
         opened = [replace(run, name=_label(path)) for run, path in zip(opened, paths, strict=True)]
