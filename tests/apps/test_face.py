@@ -14,6 +14,7 @@ from recordings import as_file, flown
 from runs import made_up
 
 import echelon as ech
+from echelon.apps.cli.explain_command import _names_and_keys
 from echelon.core.errors import MissingExtraError
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.recording import FORMAT, read_recording
@@ -246,7 +247,7 @@ seed sensing settled speed step switching symmetry trim tube V wind
 
 def test_every_word_of_a_message_is_explained():
     for word in WORDS.split():
-        assert explain_term(word), word
+        assert explain_term(word, _names_and_keys()), word
 
 
 def test_messages_use_no_word_of_the_field_that_is_not_tried_here():
@@ -259,10 +260,11 @@ def test_messages_use_no_word_of_the_field_that_is_not_tried_here():
 
 
 def test_every_key_and_name_of_a_scenario_is_explained():
-    terms = glossary()
+    terms = glossary(_names_and_keys())
     for path, text in key_meanings().items():
         assert terms[path] and text, path
-        assert path in explain_term(path) and path in explain_term(path.rpartition(".")[2])
+        for term in (path, path.rpartition(".")[2]):
+            assert path in explain_term(term, terms)
     for names in families().values():
         assert names.keys() <= terms.keys()
 

@@ -1,14 +1,13 @@
 """The glossary of the documentation for `echelon explain`."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from echelon.core.errors import OutputError, did_you_mean
 from echelon.experiments.results.quantity import ERROR
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS
-from echelon.experiments.scenario.registry import families
-from echelon.experiments.scenario.scenario import key_meanings
 
 _PLACES: Final = (
     Path(__file__).with_name("glossary.md"),  # in a wheel
@@ -17,8 +16,8 @@ _PLACES: Final = (
 _LINK: Final = re.compile(r"\[([^\]]*)\]\([^)]*\)")
 
 
-def glossary() -> dict[str, str]:
-    """Return every term with its definition: keys and names of scenarios, numbers, and words.
+def glossary(more: Mapping[str, str]) -> dict[str, str]:
+    """Return every term with its definition, and `more` terms, those of scenarios.
 
     Raises:
         OutputError: the glossary is missing, as in a copy without `docs/`.
@@ -32,8 +31,7 @@ def glossary() -> dict[str, str]:
         name, _, text = block.split("\n\n")[0].partition("**: ")
         plain = _LINK.sub(r"\1", " ".join(text.split()))
         terms[name.strip("* ").replace("**", "")] = plain.replace("*", "")
-    named = {name: text for family in families().values() for name, text in family.items()}
-    return {**named, **_numbers(), **key_meanings(), **terms}
+    return {**_numbers(), **more, **terms}
 
 
 def _numbers() -> dict[str, str]:
@@ -44,19 +42,17 @@ def _numbers() -> dict[str, str]:
     }
 
 
-def explain_term(term: str) -> dict[str, str]:
+def explain_term(term: str, more: Mapping[str, str]) -> dict[str, str]:
     """Return the definitions of a term with those of its keys; else of all that contain it.
 
     Raises:
         OutputError: there is none.
     """
-    terms, key = glossary(), term.strip().lower()
+    terms, key = glossary(more), term.strip().lower()
     exact = {
         name: text for name, text in terms.items() if key in (name.lower(), name.split(".")[-1])
     }
     matches = exact or {k: text for k, text in terms.items() if key and key in k.lower()}
-    word = re.compile(rf"\b{re.escape(key)}\b", re.IGNORECASE)
-    matches = matches or {k: text for k, text in terms.items() if key and word.search(text)}
     if not matches:
         close = did_you_mean(key, [name.lower() for name in terms])
         raise OutputError(
