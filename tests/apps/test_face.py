@@ -104,7 +104,11 @@ def test_a_row_is_of_an_agent_at_a_time(run):
 def test_an_unknown_format_is_refused_with_those_there_are(echelon, file):
     code, _, fault = echelon("export", file, "--to", "xls")
     assert code == 2
-    assert fault == "echelon: `--to` is `xls`, allowed are `csv`, `parquet`, `npz`, `mat`.\n"
+    assert (
+        fault
+        == "echelon: `--to` is `xls`, allowed are `csv`, `parquet`, `npz`, `mat`, `nc`, `json`, "
+        "`html`.\n"
+    )
 
 
 # ---- pages and videos -------------------------------------------------------------------------
@@ -239,7 +243,7 @@ def test_a_result_is_a_table_in_a_notebook_with_its_pictures():
     assert page.count("<tr>") == 4 and page.count('src="data:image/png;base64,') == 2
     assert "<td>follower 1</td><td>2</td><td>0.5</td>" in page
     assert "<td>leader 0</td><td></td><td></td>" in page
-    assert repr(made_up(states, model, graph)).startswith("Result(3 x SingleIntegrator, 2 frames, ")
+    assert repr(made_up(states, model, graph)).startswith("Result(3 agents, 2 frames, ")
 
 
 def test_of_a_flock_a_notebook_shows_the_best_the_median_and_the_worst_and_why_it_failed():

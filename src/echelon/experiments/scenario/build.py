@@ -1,5 +1,6 @@
 """Builds the parts of a checked scenario, and runs them."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -27,6 +28,7 @@ from echelon.experiments.scenario.named_class import (
     offered,
 )
 from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.self_contained import self_contained
 from echelon.experiments.scenario.user_code import as_scenario_error
 from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.world_parts import (
@@ -174,13 +176,19 @@ def run(
     """
     _check_scenario(scenario)
     parts = build(scenario) if built is None else built
-    return note_origin(simulate(*parts, progress, keep, before), scenario)
+    # Before the run, during which a file may change.
+    origin = origin_of(scenario)
+    return dataclasses.replace(simulate(*parts, progress, keep, before), **origin)
 
 
-def note_origin(result: Result, scenario: Scenario) -> Result:
-    """Return a result with its scenario and the versions of what computed it."""
-    software = {f"version_{name}": text for name, text in versions().items()}
-    return result.with_provenance(scenario=scenario.name, scenario_text=scenario.text, **software)
+def origin_of(scenario: Scenario) -> dict[str, Any]:
+    """Return the fields of a result that state its scenario, its files and the versions."""
+    text, files = self_contained(scenario)
+    software = {f"version_{name}": version for name, version in versions().items()}
+    return {
+        "provenance": {"scenario": scenario.name, "scenario_text": text, **software},
+        "files": {name: file.read_bytes() for name, file in files.items()},
+    }
 
 
 def _model(scenario: Scenario) -> ControlAffine:

@@ -243,6 +243,15 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     return _scenario(document, text, file)
 
 
+def scenario_from_text(text: str, file: Path) -> Scenario:
+    """Check a scenario given as YAML; paths in it are relative to the folder of `file`.
+
+    Raises:
+        ScenarioError: It has faults, as in `load_scenario`.
+    """
+    return _scenario(read_yaml(text, str(file)), text, file)
+
+
 def with_overrides(scenario: Scenario, overrides: Sequence[str]) -> Scenario:
     """Return a scenario in which texts such as `simulation.horizon=10` replace keys.
 
