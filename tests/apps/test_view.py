@@ -601,6 +601,28 @@ def test_view_writes_one_file_and_replaces_none_unasked(echelon, stored):
     assert echelon("view", stored[1].parent, "--html", "out.html", "--force")[0] == 0
 
 
+def test_view_without_a_run_takes_the_newest_and_at_most_two(echelon, here, stored):
+    import os
+
+    code, _, fault = echelon("view", "--html", "out.html")
+    assert code == 2 and fault == (
+        "echelon: there is no run in `runs/`; give the folder of a run.\n"
+    )
+    for age, name in enumerate(("newer", "older")):
+        (here / "runs" / name).mkdir(parents=True)
+        copy = here / "runs" / name / "run.nc"
+        copy.write_bytes(stored[1].read_bytes())
+        os.utime(copy, (1e9 - age, 1e9 - age))
+    (here / "runs" / "empty").mkdir()
+    code, _, told = echelon("view", "--html", "out.html")
+    assert code == 0 and "echelon: showing `runs/newer`, the newest run.\n" in told
+    assert echelon("view", "runs/newer", "runs/older", "--html", "two.html")[0] == 0
+    text = (here / "two.html").read_text("utf-8")
+    assert text.count('class="data"') == 2 and "newer and older" in text
+    code, _, fault = echelon("view", "runs/newer", "runs/older", "runs/newer")
+    assert code == 2 and "got 3 runs; a page shows one, or two beside each other." in fault
+
+
 BAD = {
     "nothing": ("none", "`none` does not exist; give the folder of a run, or its `run.nc`."),
     "no run": (".", "the folder `.` holds no run: it has no `run.nc`."),

@@ -1,4 +1,4 @@
-"""What a user writes in Python: scenarios by name, changes, graphs of matrices, checked arguments."""
+"""What a user writes in Python: scenarios by name, changes, matrices, checked arguments."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -197,6 +197,10 @@ def _model(scenario: Scenario) -> ControlAffine:
         raise ModelError(f"`allow_unphysical` is not a parameter of `{part.name}`; leave it out.")
     parameters = spec.parameters or {}
     arguments = {"set": parameters} if isinstance(parameters, str) else {**parameters}
+    if spec.file is not None:
+        model = _read(part._replace(arguments={**arguments, **extra}), scenario.folder / spec.file)
+        check_model(model)
+        return model
     if "set" in arguments and "set" not in accepted(part.cls):
         model = _named_set(part, arguments.pop("set"), {**arguments, **extra})
     else:
@@ -238,21 +242,23 @@ def _reference(scenario: Scenario, model: ControlAffine | None) -> Guide | None:
         scenario, Reference, registry.REFERENCES, spec.name, spec.python, spec.parameters
     )
     reference = (
-        part.create() if spec.file is None else _read(part, scenario.folder / spec.file, model)
+        part.create()
+        if spec.file is None
+        else _read(part, scenario.folder / spec.file, model=model)
     )
     check_reference(reference)
     return reference
 
 
-def _read(part: NamedClass, file: Path, model: ControlAffine) -> Guide:
-    """Return a reference from its file."""
+def _read(part: NamedClass, file: Path, **offers: object) -> Any:
+    """Return a part from its file, with those of the offers that its class takes."""
     read = getattr(part.cls, "read", None)
     if read is None:
         raise ScenarioError(f"`{part.name}` does not read files; leave `file` out.")
     surplus = [name for name in part.arguments if name not in accepted(read)]
     if surplus:
         raise ScenarioError(f"got `file` and {listing(surplus)}, allowed is the file or the keys.")
-    return read(file, model, **part.arguments)
+    return read(file, **offered(read, offers), **part.arguments)
 
 
 def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Formation:

@@ -4,9 +4,9 @@ All faults of a file are reported at once, a line each: `file:line: field: got .
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeAlias, final, get_args
+from typing import Annotated, Any, NoReturn, TypeAlias, final
 
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
@@ -14,6 +14,7 @@ from pydantic_core import ErrorDetails
 from echelon.core.errors import ScenarioError, did_you_mean, listing
 from echelon.experiments.scenario import law_sections, sections
 from echelon.experiments.scenario.checks import cross_faults, law_of, number_of, section
+from echelon.experiments.scenario.key_paths import key_paths, meant, sections_in
 from echelon.experiments.scenario.override import settle_overrides
 from echelon.experiments.scenario.values import STRICT, FolderName, Seed
 from echelon.experiments.scenario.yaml import (
@@ -126,16 +127,8 @@ def _keys(path: KeyPath) -> list[str]:
     for key in path:
         # The place in a list of sections has the keys of any other.
         if isinstance(key, str):
-            part = next(_sections(part.model_fields[key].annotation))
+            part = next(sections_in(part.model_fields[key].annotation))
     return list(part.model_fields)
-
-
-def _sections(annotation: object) -> Iterator[type[BaseModel]]:
-    """Yield the sections in the annotation of a key: its own, or those of its list."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for inner in get_args(annotation):
-        yield from _sections(inner)
 
 
 def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
@@ -148,7 +141,10 @@ def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
         return path, "got nothing, this key is required."
     if kind in ("extra_forbidden", "invalid_key"):
         keys = _keys(path[:-1])
-        return path, f"got an unknown key, allowed {is_or_are(keys)}{did_you_mean(path[-1], keys)}."
+        return (
+            path,
+            f"got an unknown key, allowed {is_or_are(keys)}{meant(path[-1], keys, Scenario)}.",
+        )
     got = context.get("got", error["input"])
     allowed = _ALLOWED[kind].format(**context) if kind in _ALLOWED else error["msg"]
     close = did_you_mean(got, context.get("names", "").split())
@@ -328,3 +324,8 @@ def json_schema() -> dict[str, Any]:
     """Return the JSON schema of the scenario file, for checks and completion in editors."""
     draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     return draft | Scenario.model_json_schema()
+
+
+def key_meanings() -> dict[str, str]:
+    """Return what every key of the file means, by its path, such as `network.delay`."""
+    return dict(key_paths(Scenario))

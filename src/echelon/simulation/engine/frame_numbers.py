@@ -45,7 +45,7 @@ class _Frames(Protocol):
 
     def least_distances(self, frames: _Some = slice(None)) -> Float[Array, " F"] | None: ...
 
-    def approaches(self, last: int = 0) -> list[ClosestPair]: ...
+    def approaches(self) -> list[ClosestPair]: ...
 
 
 class FrameNumbers(abc.ABC):
@@ -108,18 +108,35 @@ class FrameNumbers(abc.ABC):
 
         None without a position, a second agent or a frame of finite numbers.
         """
-        pairs = self.approaches(1)
+        pairs = self.approaches()
         return pairs[-1] if pairs else None
 
-    def approaches(self: _Frames, last: int = 0) -> list[ClosestPair]:
-        """Return the pairs that were closer than any in a frame before, all or the last ones."""
-        least = self.least_distances() if self.states.shape[1] > 1 else None
-        if least is None:
+    def approaches(self: _Frames) -> list[ClosestPair]:
+        """Return the pairs that were closer than any in a frame before, in the order of time."""
+        if not self.position or self.states.shape[1] < 2 or not len(self.times):
             return []
-        least = np.where(np.isfinite(least), least, np.inf)
-        before = np.minimum.accumulate(np.concatenate([[np.inf], least[:-1]]))
-        frames, columns = np.flatnonzero(least < before)[-last:], list(self.position)
-        return [ClosestPair.of(self.states[k][:, columns], float(self.times[k])) for k in frames]
+        places, pairs = self.states[:, :, list(self.position)], list[ClosestPair]()
+        least, bound = np.inf, -np.inf
+        for k, motion in enumerate(_approach(places)):
+            # No pair is closer than the closest of an earlier frame less what two agents moved.
+            bound = bound - motion if np.isfinite(motion) else -np.inf
+            if bound > least or not np.isfinite(places[k]).all():
+                continue
+            pair = ClosestPair.of(places[k], float(self.times[k]))
+            bound = pair.distance
+            if bound < least:
+                least = bound
+                pairs.append(pair)
+        return pairs
+
+
+def _approach(places: Float[Array, "T N k"]) -> Float[Array, " T"]:
+    """Return by how much a distance between two agents can shrink up to each frame, at most."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        # What all agents do together changes no distance.
+        steps = np.diff(places - places.mean(axis=1, keepdims=True), axis=0, prepend=places[:1])
+        steps[0] = 0.0
+        return 2.0 * np.linalg.norm(steps, axis=2).max(axis=1)
 
 
 def _least(places: Float[Array, "T N k"]) -> Float[Array, " T"]:
