@@ -95,7 +95,8 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     longest = int(np.argmax(chains.degrees))
     fault = path_fault(run.leader.reference, chains, run.settings.horizon)
     if fault:
-        return _nothing(fault, "choose a smooth path, such as one of sines, or `waypoints`")
+        remedy = "choose a smooth path: sines of time need no remainder, and `waypoints` pass "
+        return _nothing(fault, f"{remedy}smoothly through the entries of a table")
     try:
         chain = run.chain(longest)
         gains = tuple(float(chain.gain(k)) for k in range(max(1, len(chain.powers) + 1)))
