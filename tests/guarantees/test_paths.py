@@ -69,7 +69,7 @@ ROUGH = {
     "another line": shifted(),
 }
 REASONS = {
-    "mod": "a path uses `ne` (of `//`, `%` or a comparison), and passes from one branch of it to "
+    "mod": "a path uses `ne` (of `//`, `%` or a comparison), and passes from one branch",
     "interp": "a number that is not finite, as a table does that is read by `interp`",
     "integer": "a path converts time to a whole number, which has no enclosure",
 }

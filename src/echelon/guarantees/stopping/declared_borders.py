@@ -75,9 +75,7 @@ def _on_segments(
     return jax.vmap(jax.vmap(one))(x, e)
 
 
-def _is_within(
-    model: ControlAffine, chains: Chains, x: Array, values: Array
-) -> Bool[Array, "K L"]:
+def _is_within(model: ControlAffine, chains: Chains, x: Array, values: Array) -> Bool[Array, "K L"]:
     """Return whether points of segments are within the borders and the chart."""
     within = np.asarray(np.isfinite(values).all(axis=(2, 3)))
     for bound in model.flat_bounds or ():
