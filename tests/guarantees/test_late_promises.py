@@ -10,7 +10,7 @@ import scipy.linalg
 import echelon as ech
 from echelon.agents.world.sensing import Sensing
 from echelon.core.statement import Hypothesis
-from echelon.core.words import NeighbourChoice, Theorem, Verdict
+from echelon.core.words import Theorem, Verdict
 from echelon.guarantees.promises.promise import promise
 
 CART = ech.models.DoubleIntegrator(2)
