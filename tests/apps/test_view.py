@@ -680,6 +680,25 @@ def test_a_page_that_is_served_is_drawn_too(browser, run):
         assert page.evaluate("echelon.last") == 300
 
 
+def test_a_notebook_shows_the_replay_in_a_cell_without_a_guarantee(browser, stored):
+    result, _ = stored
+    shown = result.view(height=400)
+    assert "a notebook shows it" in repr(shown)
+
+    class Notebook(Handler):
+        head = "<link rel='icon' href='data:,'><script>window.echelon = 1</script>"
+        page = (head + shown._repr_html_()).encode()
+
+    with serving(serve(Notebook, 0)) as address, opened(browser, address) as page:
+        cell = page.frames[1]
+        until(lambda: cell.evaluate("Boolean(window.echelon)"))
+        cell.evaluate("echelon.seek(echelon.last)")
+        place = result.states[-1, 1, :2]
+        assert cell.evaluate("echelon.position(1)")[:2] == pytest.approx(place, abs=1e-4)
+        assert not cell.locator(".promise").is_visible()
+        assert "Lyapunov function V" in cell.locator("#side").inner_text()
+
+
 def test_the_badge_says_which_rate_it_has_and_is_not_green_over_a_run_that_was_lost(run):
     told = {"promised": True, "sentence": "Promised.", "theorem": None, "kind": "linearization"}
     slow = promise_badge(told | {"rate": 0.5, "slowest_mode": -0.5})
