@@ -7,6 +7,7 @@ formulas, theorems in frames, lists of tests folded away.
 
 import re
 import xml.etree.ElementTree as etree
+from typing import Any
 
 from markdown import Markdown
 from markdown.extensions import Extension
@@ -40,7 +41,20 @@ _SIGNS = {
     "*": r"\cdot ",
 }
 _PLAIN = "+-=<>()[]|,;:./!"
-_FUNCTIONS = {"sin", "cos", "tan", "exp", "log", "ln", "max", "min", "det", "diag", "rank", "arsinh"}
+_FUNCTIONS = {
+    "sin",
+    "cos",
+    "tan",
+    "exp",
+    "log",
+    "ln",
+    "max",
+    "min",
+    "det",
+    "diag",
+    "rank",
+    "arsinh",
+}
 _FUNCTIONS |= {"arg", "Re", "Im", "sign"}
 _WORDS = {"roll", "pitch", "yaw", "edge", "hover", "noise", "wind", "mean", "edges", "followers"}
 _WORDS |= {"free", "model"}
@@ -50,7 +64,14 @@ _WORD = re.compile(r"[A-Za-z]{2,}")
 _NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?(?:e-?\d+)?")
 _HALF = re.compile(r"(\d+)/(\d+)(?![\w.(])")
 _INDEX = re.compile(r"_(\{[^}]*\}|[A-Za-z0-9]+|[α-ωΑ-Ω]+)")
+_SYMBOL = re.compile(
+    r"(?<![\w./'-])(?:[A-Za-zα-ωΑ-Ω][~^]?_(?:[a-z0-9]{1,2}|min|max|FL)'*|[α-ωΓΔΘΛΞΦΨΩ][~^]?'*)(?!\w)"
+)
+"""A letter with an index, or a Greek one, in the text."""
 _POWER = re.compile(r"-?(?:\d+(?:/\d+)?|[A-Za-zα-ω])")
+
+
+_THEOREM = re.compile(r"[TA]\d")
 
 
 class NotMath(ValueError):
@@ -67,6 +88,8 @@ def tex(text: str, words: bool = False) -> str:
     Raises:
         NotMath: the text contains what is no mathematics.
     """
+    if text in _FUNCTIONS | _WORDS or _THEOREM.fullmatch(text):
+        raise NotMath(text)
     return _Scanner(text, words).all()
 
 
@@ -239,9 +262,14 @@ class _Typesetter(Treeprocessor):
             return
         for parent in list(root.iter()):
             for child in list(parent):
-                if child.tag == "code" and parent.tag != "pre":
+                inequality = child.tag == "strong" and re.search("[<>]=", child.text or "")
+                if (child.tag == "code" and parent.tag != "pre") or (inequality and not len(child)):
                     _replace(child, child.text or "")
         _fold_tests(root)
+        for element in list(root.iter()):
+            if element.tag not in ("code", "pre", "details") and not element.get("class"):
+                _set_symbols(element)
+        _split_proofs(root)
         _frame_statements(root)
 
 
@@ -275,6 +303,44 @@ def _replace(code: etree.Element, text: str) -> None:
     code.set("class", "formula")
 
 
+def _set_symbols(element: etree.Element) -> None:
+    """Typeset the symbols in the text of an element, and between its parts."""
+    for place in range(len(element), -1, -1):
+        before = element[place - 1] if place else None
+        text = (element.text if before is None else before.tail) or ""
+        first, *parts = _cut(text)
+        if before is None:
+            element.text = first
+        else:
+            before.tail = first
+        element[place:place] = parts if not isinstance(text, AtomicString) else []
+
+
+def _cut(text: str) -> list[Any]:
+    """Return the text before the first symbol, then an element for each with its text after it."""
+    if isinstance(text, AtomicString):
+        return [text]
+    pieces, end = list[Any]([text]), len(text)
+    for found in reversed(list(_SYMBOL.finditer(text))):
+        part = etree.Element("span", {"class": "formula"})
+        part.text, part.tail = rf"\({tex(found[0])}\)", text[found.end() : end]
+        pieces[1:1] = [part]
+        pieces[0], end = text[: found.start()], found.start()
+    return pieces
+
+
+def _split_proofs(root: etree.Element) -> None:
+    """Let proofs begin a paragraph."""
+    for element in list(root):
+        marks = [k for k, part in enumerate(element) if part.tag == "em" and part.text == "Proof."]
+        if element.tag != "p" or not marks or _starts(element, "em", "Proof"):
+            continue
+        proof = etree.Element("p")
+        proof.extend(element[marks[0] :])
+        del element[marks[0] :]
+        root.insert(list(root).index(element) + 1, proof)
+
+
 def _plain(text: str) -> str:
     """Return the text that HTML's escapes stand for."""
     return text.replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")
@@ -301,6 +367,7 @@ def _fold_tests(root: etree.Element) -> None:
 
 def _frame_statements(root: etree.Element) -> None:
     """Put what states a theorem into a frame, with the list that it ends in."""
+    _frame_until_proofs(root)
     kinds = r"(Definition|Theorem|Assumption \d|Lemma|Remark|The corollary|Algorithm)\b"
     expected, framed, previous = False, list[etree.Element](), root
     for element in root:
@@ -318,6 +385,20 @@ def _frame_statements(root: etree.Element) -> None:
             framed.append(element)
             previous = element
     root[:] = framed
+
+
+def _frame_until_proofs(root: etree.Element) -> None:
+    """Frame what stands between the heading of a theorem and its proof, where that is short."""
+    for element in list(root):
+        title = "".join(element.itertext()) if element.tag == "h3" else ""
+        if not re.match(r"T\d:", title):
+            continue
+        begin = list(root).index(element) + 1
+        proofs = [j for j in range(1, 5) if _starts(root[begin + j], "em", "Proof")]
+        if proofs:
+            frame = etree.Element("div", {"class": "statement"})
+            frame.extend(root[begin : begin + proofs[0]])
+            root[begin : begin + proofs[0]] = [frame]
 
 
 class Formulas(Extension):
