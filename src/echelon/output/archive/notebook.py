@@ -4,6 +4,7 @@ import dataclasses
 import html
 from collections.abc import Iterator
 
+from echelon.experiments.results.dataset import STORED, recording_of
 from echelon.experiments.results.foreseen import foreseen
 from echelon.experiments.results.metrics import metrics
 from echelon.experiments.results.recording import Recording
@@ -24,9 +25,11 @@ def result_page(result: Result) -> str:
 
     Of many agents the table has the best, the median and the worst, like the report.
     """
-    title = result.provenance.get("scenario") or type(result.model).__name__
+    title = result.provenance.get("scenario") or _recorded(result).model
     head = f"<b>{html.escape(title)}</b>: {html.escape(result.message)}"
-    return f"<p>{head}</p>{_causes(result)}{_table(result)}{_pictures(result)}"
+    # Of a run from disk no part is built, which executes code, only to display it.
+    numbers = "" if result in STORED else f"{_causes(result)}{_table(result)}"
+    return f"<p>{head}</p>{numbers}{_pictures(result)}"
 
 
 def _causes(result: Result) -> str:
@@ -65,7 +68,9 @@ def _cells(result: Result) -> Iterator[tuple[str, ...]]:
 
 
 def _recorded(result: Result) -> Recording:
-    """Return the recording of a run without its promise, which takes seconds to compute."""
+    """Return the recording of a run, computed without its promise, which takes seconds."""
+    if result in STORED:
+        return recording_of(result)
     states = result.states
     return dataclasses.replace(
         foreseen(result.parts, result.settings, states[0], ""),
