@@ -69,8 +69,8 @@ def opened(browser, address, width=1280, height=720, **options):
         raise
     finally:
         context.close()
-    home = address.split("?")[0]
-    outside = [x for x in events.requests if not x.startswith((home, "blob:", "data:"))]
+    home = address.split("?")[0].split("#")[0]
+    outside = [x for x in events.requests if not x.startswith((home, "blob:", "data:", "about:"))]
     assert events.errors == [] and outside == []
 
 

@@ -16,6 +16,7 @@ from echelon.core.errors import EchelonError
 from echelon.core.identity import foreign_key
 from echelon.core.numerics import precision
 from echelon.core.statement import Cause, Hypothesis, Statement
+from echelon.core.trace import shared_traces
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem, Verdict
 from echelon.guarantees.promises.certified_set import CertifiedSet
@@ -38,6 +39,8 @@ REQUIRED = (
     Hypothesis.CLAIMS,
 )
 """Hypotheses that every guarantee has a line on, beside those on agents and leaders."""
+_NOTED = (Hypothesis.CLAIMS, Hypothesis.MESSAGES, Hypothesis.OWN_STATE)
+"""What a sentence adds where it fails and leaves a guarantee."""
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLING)
 
 
@@ -224,8 +227,9 @@ class Promise(abc.ABC):
         text = self.guarantee() if self.promised else self._against()
         if self.promised and self.without:
             text += f" The guarantee ignores that {self.without}."
-        claims = self.hypotheses[Hypothesis.CLAIMS]
-        return f"{text} Note: {claims.explanation}." if claims.fails else text
+        noted = (self.hypotheses.get(name) for name in _NOTED)
+        notes = (f" Note: {x.explanation}." for x in noted if x and x.fails and not x.reason)
+        return text + "".join(notes)
 
     def _against(self) -> str:
         """Return all that stands against a guarantee, and what would help."""
@@ -268,6 +272,7 @@ def prover_of(drive: Drive) -> type[Promise]:
     return getattr(importlib.import_module(module), name)
 
 
+@shared_traces()
 def promise(parts: Parts, settings: Settings) -> Promise:
     """Return what is guaranteed of parts under settings; computed once while the parts exist.
 

@@ -1,5 +1,6 @@
 """The tube of theorem T5: how far agents go, from which starts, and when they arrive."""
 
+import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -7,9 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.words import Feedforward, Kind, Theorem
+from echelon.guarantees.messages.late_messages import LateMessages
 from echelon.guarantees.stopping.arrival import arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
@@ -39,6 +42,9 @@ class Tube(NamedTuple):
         borders: what is claimed of each border, and of what it was computed; ready for JSON.
         motor_load: None where motors have no limits, may not suffice, or were left out.
         graphs: which graphs are meant, and this one, in words.
+        network: what T9 says; None for the ideal network.
+        kind: of the argument: the chains' responses and the path are enclosed in rationals; what
+            somebody's class states of its flat coordinates or its motors was seen at samples.
     """
 
     rate: float
@@ -50,26 +56,31 @@ class Tube(NamedTuple):
     borders: tuple[dict[str, object], ...]
     motor_load: MotorLoad | None
     graphs: tuple[str, str] = _ANY
-
-    @property
-    def kind(self) -> Kind:
-        """Of the argument: the chains' responses and the path are enclosed in rationals."""
-        return _PROOF
+    network: LateMessages | None = None
+    kind: Kind = _PROOF
 
     @property
     def theorem(self) -> Theorem:
-        """T5."""
-        return Theorem.T5
+        """T5, and over a network T9."""
+        return Theorem.T5 if self.network is None else Theorem.T9
 
     def sentence(self) -> str:
         """Return what is promised, in one sentence."""
         text = f"{self.kind.value}: errors converge to zero from {self.who}, for any number of "
-        text += f"agents and {self.graphs[0]}, if the model is exact and zeta' is received at all "
-        text += f"times (T5). On {self.graphs[1]} they decay at {self.rate:.3g} 1/s or faster "
-        text += "eventually"
+        text += f"agents and {self.graphs[0]}, if the model is exact and {self._received()}. "
+        text += f"On {self.graphs[1]} they decay at {self.rate:.3g} 1/s or faster eventually"
+        text += "" if self.network is None else self.network.faster()
         if self.arrival is not None:
             text += f"; from these starts all stay within 1 cm after {self.arrival:.3g} s"
+        text += "" if self.network is None else f". {self.network.sentence()}"
         return f"{text}." if self.motor_load is None else f"{text}. {self.motor_load.sentence()}"
+
+    def _received(self) -> str:
+        """Return what agents must receive, in words."""
+        if self.network is None:
+            return "zeta' is received at all times (T5)"
+        text = "every agent receives one packet of a leader that follows its plan; all messages "
+        return f"{text}after it may be late, lost or out of order (T9)"
 
     def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON."""
@@ -83,6 +94,7 @@ class Tube(NamedTuple):
             "within_1_cm_from": self.arrival,
             "borders": list(self.borders),
             "motors": None if self.motor_load is None else self.motor_load.as_mapping(),
+            **({} if self.network is None else {"network": self.network.as_mapping()}),
         }
 
 
@@ -95,12 +107,13 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     longest = int(np.argmax(chains.degrees))
     fault = path_fault(run.leader.reference, chains, run.settings.horizon)
     if fault:
-        return _nothing(fault, "choose a smooth path, such as one of sines, or `waypoints`")
+        remedy = "choose a smooth path: sines of time need no remainder, and `waypoints` pass "
+        return _nothing(fault, f"{remedy}smoothly through the entries of a table")
     try:
         chain = run.chain(longest)
         gains = tuple(float(chain.gain(k)) for k in range(max(1, len(chain.powers) + 1)))
-        bounds = bounds_of(model, chains)
-        borders = None if bounds is None else [border_of(run, b) for b in bounds]
+        known = bounds_of(model, chains)
+        borders = None if known.bounds is None else [border_of(run, b) for b in known.bounds]
     except GainError as error:
         text = str(error).rstrip(".")
         remedy = "choose `roots` of a larger common unit" if "unit" in text else "use equal starts"
@@ -109,12 +122,11 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     number = gains[-1], ", ".join(f"{gain:.4g}" for gain in gains)
     inner = holds(Hypothesis.REGION, _PROOF, f"{text}size of the formation", *number)
     if borders is None:
-        name = f"`{type(model).__name__}`"
-        text = f"{name} does not state where its flat coordinates end"
-        return _nothing(text, "state `flat_chains` and `flat_bounds` in the model", inner)
+        remedy = "state `flat_chains` and `flat_bounds` in the model"
+        return _nothing(known.fault, remedy, inner)
     left = min((b.left for b in borders), default=Fraction(10**9))
     steepest = min((b.steepest for b in borders), default=math.inf)
-    lines = [inner, *_set_lines(run, borders)]
+    lines = [inner, *(_by(known.kind, model, line) for line in _set_lines(run, borders))]
     if any(line.fails for line in lines):
         return None, lines
     tube = Tube(
@@ -127,12 +139,25 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
         tuple(border.data for border in borders),
         None,
         _graphs(run),
+        run.network,
+        known.kind,
     )
     if brief:
         return tube, lines
     arrival = arrival_of(run, _positions(run))
     motor_load, line = motor_load_of(run)
-    return tube._replace(arrival=arrival, motor_load=motor_load), [*lines, line]
+    tube = tube._replace(arrival=arrival, motor_load=motor_load)
+    if motor_load is not None and line.kind is Kind.SAMPLES:
+        tube = tube._replace(kind=line.kind)
+    return tube, [*lines, line]
+
+
+def _by(kind: Kind, model: ControlAffine, line: Statement) -> Statement:
+    """Return a line that rests on what a model states of its flat coordinates."""
+    if kind is Kind.PROOF:
+        return line
+    text = f"{line.text}, if its borders are those that `{type(model).__name__}` states"
+    return dataclasses.replace(line, kind=kind, text=text)
 
 
 def _graphs(run: StoppingRun) -> tuple[str, str]:
@@ -205,6 +230,9 @@ def _set_line(run: StoppingRun, border: Border) -> Statement:
         # What one link may have of a speed against the leader.
         least = border.fastest / run.links
         remedy = f"lower the `speed` of {border.outputs} below {least:.3g}"
+        if run.network is not None:
+            text += "; before their first packet agents stand still against the leader's path"
+            remedy += ", or choose a slower path"
     return fails(Hypothesis.SET, _PROOF, text, *number, remedy=remedy, reason=text)
 
 
