@@ -35,6 +35,7 @@ def main() -> None:
         session.start()
         with serving(serve_live(session, html, 0)) as address, opened(browser, address) as page:
             until(lambda: page.evaluate("echelon.time") > 8.0, 90.0)
+            until(lambda: page.evaluate("echelon.promise.state") == "holds", 90.0)
             page.evaluate("echelon.ask('kick', 2)")
             page.wait_for_timeout(900)
             page.screenshot(path=HERE / "assets" / "live.png")
