@@ -59,6 +59,7 @@ from .guarantees.promises.promise import Promise as Promise
 from .guarantees.promises.promise import promise as promise
 from .guarantees.verifier.verify import verify as verify
 from .laws.law import Law as Law
+from .laws.safety import Safety as Safety
 from .output.archive.open_folder import open_run as open_run
 from .output.archive.run_folder import (
     load_run as load_run,

@@ -97,12 +97,14 @@ class WorldState(NamedTuple):
         mail: what agents keep of those that they received, as `Mail`.
         motion: what the plants remember besides their states, as `MotionState`.
         measured: (d, N, n) the states of the last d steps, where agents measure theirs late.
+        seen: messages about places, as `Sightings`, where agents keep away from each other.
     """
 
     in_flight: PyTree = None
     mail: PyTree = None
     motion: PyTree = None
     measured: PyTree = None
+    seen: PyTree = None
 
 
 class Moment(NamedTuple):
