@@ -39,6 +39,7 @@ JOURNEYS = [
     slow(*FIRST, "troubleshooting"),
     slow("recipes", "sweeps", "comparing"),
     slow("networks"),
+    slow("crazyflie"),
 ]
 
 FENCE = re.compile(

@@ -14,6 +14,7 @@ from echelon.agents.references import (
     Hover,
     Lemniscate,
     Line,
+    Polynomials,
     Reference,
     StatePath,
     Waypoints,
@@ -31,6 +32,7 @@ FAMILY = {
     "hover": Hover(position=(1.0, 2.0, 3.0), yaw=-0.5),
     "line": Line(start=(1.0, 2.0, 3.0), velocity=(0.5, -0.25, 0.125), yaw=0.1),
     "waypoints": Waypoints(TIMES, POINTS, yaw=0.7),
+    "polynomials": Polynomials.of(Waypoints(TIMES, POINTS, yaw=0.7), 4.0),
 }
 every_reference = pytest.mark.parametrize("reference", FAMILY.values(), ids=FAMILY)
 
@@ -84,7 +86,8 @@ def test_references_compute_in_the_precision_of_the_time(reference, name):
 def test_yaw_is_constant(reference):
     with numerics.precision("float64"):
         yaws = np.asarray(jax.vmap(reference)(jnp.linspace(0.0, 9.0, 7)))[:, 3]
-    assert yaws == pytest.approx(np.full(7, reference.yaw), abs=0.0)
+    yaw = getattr(reference, "yaw", 0.7)
+    assert yaws == pytest.approx(np.full(7, yaw), abs=0.0)
 
 
 @given(st.floats(0.0, 50.0))

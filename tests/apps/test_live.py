@@ -11,11 +11,12 @@ import pytest
 from browser import chromium, opened, until
 
 import echelon as ech
+from echelon.apps.live import promiser
 from echelon.apps.live import server as served
 from echelon.apps.live import swarm as looked
 from echelon.apps.live.guarantee_status import GuaranteeStatus
 from echelon.apps.live.panel import Panel
-from echelon.apps.live.promiser import badge_of, first_look
+from echelon.apps.live.promiser import Promiser, badge_of, first_look
 from echelon.apps.live.server import live, serve_live
 from echelon.apps.live.session import Session
 from echelon.apps.live.swarm import LiveLoop, Picture
@@ -178,7 +179,7 @@ def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
     # Few periods are foreseen at a time, so that the loop must look ahead again.
     monkeypatch.setattr(looked, "_AHEAD", 0.2)
     swarm = LiveLoop(*panel.experiment, panel.live)
-    assert len(swarm.loop.switches.steps) == 10 and panel.live.slowest(panel.start) is None
+    assert len(swarm.loop.switches.steps) == 10 and panel.live.loop(panel.start) is None
     for knobs in (panel.start, panel.start._replace(cut=frozenset({2}))):
         parts, settings = build(panel.scenario_at(knobs))
         settings = settings._replace(horizon=1.2)
@@ -322,11 +323,63 @@ LOOKS = [
 
 
 @pytest.mark.parametrize("change", LOOKS)
-def test_the_first_look_is_the_slowest_mode_that_the_promise_then_tells(panel, change):
+def test_the_first_look_is_the_loop_that_the_promise_then_judges(panel, change):
     knobs = panel.start._replace(**change)
-    found = ech.promise(*build(panel.scenario_at(knobs)))
-    assert panel.live.slowest(knobs) == pytest.approx(found.slowest, rel=1e-9)
-    assert first_look(panel, knobs)["state"] == "pending"
+    parts, settings = build(panel.scenario_at(knobs))
+    found, seen = ech.promise(parts, settings).loop, panel.live.loop(knobs)
+    assert seen.slowest == pytest.approx(found.slowest, rel=1e-9)
+    assert seen.radius(settings) == pytest.approx(found.radius(settings), rel=1e-9)
+    rate = -np.log(found.radius(settings)) / settings.dt
+    look = first_look(panel, knobs)
+    assert look["state"] == "pending" and look["short"].startswith(f"slowest mode {-rate:.3g} 1/s")
+
+
+def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_computed(
+    panel, monkeypatch
+):
+    """In continuous time every mode decays; errors grow because inputs are held."""
+    fast = panel.start._replace(coupling=40.0)
+    assert panel.live.loop(fast).slowest < 0.0
+    steps = np.array([step_of(panel, fast, value) for value in eigenvalues(panel)])
+    radius = np.abs(np.linalg.eigvals(steps)).max()
+    short = f"no guarantee: errors grow {radius:.3g}-fold in each step of 10 ms"
+    # A guarantee of an earlier position, which is still being computed, is not shown any more.
+    began, ended, told = threading.Event(), threading.Event(), []
+
+    def slow(_, knobs):
+        if knobs != fast:
+            began.set()
+            ended.wait(10.0)
+        return {"state": "holds", "short": str(knobs.coupling)}
+
+    monkeypatch.setattr(promiser, "badge_of", slow)
+    answers = Promiser(told.append)
+    answers.ask(panel, panel.start)
+    assert began.wait(10.0)
+    answers.ask(panel, fast)
+    until(lambda: told[-1]["short"] == short)
+    assert told[-1]["state"] == "lost"
+    ended.set()
+    until(lambda: told[-1]["short"] == str(fast.coupling))
+    answers.end()
+    assert str(panel.start.coupling) not in [each["short"] for each in told]
+    monkeypatch.undo()
+    assert badge_of(panel, fast)["short"] == short
+
+
+def eigenvalues(panel):
+    followers = [1, 2, 3]
+    graph = panel.experiment.parts.graph
+    return np.linalg.eigvalsh(graph.laplacian().toarray()[np.ix_(followers, followers)])
+
+
+def step_of(panel, knobs, value):
+    """A step of 10 ms of x'' = u with the gain's input held, by series; in each axis alike."""
+    gain, dt = panel.live.gain(knobs), panel.experiment.settings.dt
+    K = knobs.coupling * value * (np.linalg.inv(gain.R) @ gain.P[2:])
+    eye, none = np.eye(2), np.zeros((2, 2))
+    free = np.block([[eye, dt * eye], [none, eye]])
+    return free - np.vstack([0.5 * dt**2 * eye, dt * eye]) @ K
 
 
 def test_a_growing_mode_is_told_at_once(panel):

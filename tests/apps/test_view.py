@@ -170,6 +170,31 @@ def test_the_charts_tell_the_error_and_v_at_the_cursor(browser, run, file):
         assert "guaranteed slope, \u22121 1/s" in told[1]
 
 
+def test_what_is_not_finite_is_a_dash_and_a_word_and_never_a_zero(browser, run, tmp_path):
+    states, V = run.states.copy(), run.lyapunov.copy()
+    # Frame 100: no number; 150: infinite; 200: an error and V that are exactly 0.
+    states[100, 2], states[150, 2], V[100], V[150], V[200] = np.nan, np.inf, np.nan, np.inf, 0.0
+    states[200, 1] = states[200, 0] - run.offsets[0] + run.offsets[1]
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(dataclasses.replace(run, states=states, lyapunov=V)), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        for frame in (100, 150):
+            seek(page, frame)
+            shown = page.locator("#side").inner_text().replace("\n", " ")
+            assert "2 \u2013 not finite" in shown and "V \u2013 not finite" in shown
+            assert f"1 {run.formation_errors[frame, 1]:.3g}" in shown
+        seek(page, 100)
+        assert page.evaluate("echelon.whereOnScreen(2)") is None
+        labels = page.locator(".label").all()
+        assert [label.is_visible() for label in labels] == [True, True, False, True]
+        page.evaluate("(echelon.player.view.selected = 2, echelon.seek(100))")
+        assert page.locator(".card").inner_text().count("\u2013 not finite") == 2
+        seek(page, 200)
+        shown = page.locator("#side").inner_text().replace("\n", " ")
+        assert "1 < 1.0\u00b710\u207b\u00b9\u2077" in shown
+        assert "V < 1.0\u00b710\u207b\u00b3\u2074" in shown
+
+
 def test_a_click_on_an_agent_tells_its_place_its_error_and_whom_it_hears(browser, run, file):
     with opened(browser, file) as page:
         seek(page, 60)

@@ -8,6 +8,7 @@ from runs import made_up, simulate
 
 import echelon as ech
 from echelon.core.errors import Outcome
+from echelon.experiments.results.dataset import recording_of, summary
 from echelon.experiments.results.metrics import metrics, output_errors
 
 
@@ -168,3 +169,65 @@ def test_the_relay_is_a_fixed_point_of_the_formation():
     )
     assert result.formation_errors.max() < 1e-13
     assert result.saturated[0] > 0.0
+
+
+# ---- the smallest distance --------------------------------------------------------------------
+
+
+def passing(agents=12, offset=1e3):
+    """Agents in a row far apart; the second and the fifth pass each other in the sixth frame."""
+    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(agents)
+    states = np.zeros((11, agents, 12))
+    states[:, :, 1] = offset * np.arange(agents)
+    times = np.arange(11.0)
+    states[:, 4, 1] = offset + 0.1
+    states[:, 4, 0] = 0.5 * (times - 5.0)
+    return made_up(states, model, graph)
+
+
+@pytest.mark.parametrize("agents", [5, 12])
+def test_the_closest_pair_is_who_was_closest_and_when(agents):
+    result = passing(agents)
+    closest = metrics(result).closest
+    assert closest.agents == (1, 4) and closest.time == 5.0
+    assert closest.distance == pytest.approx(0.1)
+    again = recording_of(result)
+    assert again.closest_pair() == closest and again.radius == pytest.approx(0.07)
+    told = summary(result)
+    assert told["minimum_distance"] == closest.distance and told["closest_agents"] == (1, 4)
+    assert told["minimum_distance_time_s"] == 5.0
+    assert told["vehicle_radius"] == pytest.approx(0.07)
+
+
+def test_agents_in_one_place_and_frames_without_numbers_have_a_closest_pair_too():
+    model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(12)
+    states = np.zeros((3, 12, 2))
+    states[0] = np.nan
+    result = made_up(states, model, graph)
+    one, other = metrics(result).closest.agents
+    assert one < other and metrics(result).closest[::2] == (0.0, 1.0)
+    assert result.radius is None and not metrics(result).closest.touch(None)
+
+
+@pytest.mark.parametrize(("apart", "touch"), [(0.1399, True), (0.1401, False)])
+def test_a_report_warns_of_agents_closer_than_two_radii(apart, touch):
+    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(2)
+    states = np.zeros((2, 2, 12))
+    states[:, 1, 0] = apart
+    text = " ".join(ech.report(made_up(states, model, graph)).split())
+    assert ("Warning: agents 0 and 1 came within 0.14 m at 0 s" in text) == touch
+    assert ("Smallest distance: 0.14 m, agents 0 and 1 at 0 s" in text) != touch
+
+
+@pytest.mark.parametrize(
+    "model", [ech.models.Quadrotor(arm=0.065), ech.models.PlanarQuadrotor(arm=0.065)]
+)
+def test_a_larger_vehicle_has_a_larger_radius(model):
+    assert model.radius == pytest.approx(0.14)
+
+
+def test_an_abstract_agent_may_call_a_parameter_radius():
+    class Wheel(ech.models.Pendulum):
+        radius: float = -1.0
+
+    assert made_up(np.zeros((2, 2, 2)), Wheel(), ech.Graph.path(2)).radius is None

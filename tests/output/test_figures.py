@@ -302,3 +302,32 @@ def test_plot_draws_png_pdf_and_svg_from_the_file_and_loses_no_other(echelon, he
     assert code == 2 and fault == "echelon: `--dpi` is 9, and must be from 30 to 1200.\n"
     code, _, fault = echelon("plot", "run.nc", "--what", "netwrk")
     assert code == 2 and "(did you mean `network`?)" in fault
+
+
+# ---- axes of the caller ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["formation", "modes", "network", "trajectories"])
+def test_a_figure_of_one_axes_is_drawn_into_those_of_the_caller(run, name):
+    from matplotlib.figure import Figure
+
+    own = Figure((9.0, 3.0))
+    left, right = own.subplots(1, 2)
+    shown = run if name != "trajectories" else swinging(("x", "y"), (0, 1), n=2)
+    assert figures(shown, name, ax=left) == {name: own}
+    assert tuple(own.get_size_inches()) == (9.0, 3.0) and not right.has_data()
+    theirs = figures(shown, [name])[name].axes[0]
+    assert left.has_data() and left.get_xlabel() == theirs.get_xlabel()
+    for mine, line in zip(left.get_lines(), theirs.get_lines(), strict=True):
+        np.testing.assert_array_equal(mine.get_xydata(), line.get_xydata())
+
+
+@pytest.mark.parametrize(
+    ("what", "sentence"),
+    [("inputs", "has several axes"), ("leader_3d", "in space"), (("states", "modes"), "2 names")],
+)
+def test_other_figures_refuse_axes(run, what, sentence):
+    from matplotlib.figure import Figure
+
+    with pytest.raises(OutputError, match=sentence):
+        figures(run, what, ax=Figure().add_subplot())

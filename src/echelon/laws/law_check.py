@@ -42,7 +42,7 @@ def leader_warnings(
     # A flat reference is an exact motion, which only limits can make infeasible.
     exact = isinstance(reference, Reference) and not (limits and model.input_limits)
     if reference is None or exact:
-        return ()
+        return () if reference is None else reference.remarks()
     return reference_warnings(model, reference, horizon, limits)
 
 

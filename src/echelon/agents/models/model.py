@@ -139,6 +139,12 @@ class ControlAffine(eqx.Module):
     position: ClassVar[tuple[str, ...]] = ()
     """Names of the position coordinates, in metres; none for an agent without a position."""
 
+    radius: ClassVar[float | None] = None
+    """Radius (m) of the sphere around its position that holds the agent; None if it has no size.
+
+    Two agents closer than twice the radius touch. The simulation lets them pass through each other,
+    and a run reports it."""
+
     trim: ClassVar[Pair] = default(
         lambda self: (_repeat(0.0, self.state_names), _repeat(0.0, self.input_names))
     )

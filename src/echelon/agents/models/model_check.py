@@ -1,5 +1,6 @@
 """The checks of a model, run once for each model in `synthesize` and `simulate`."""
 
+import numbers
 from typing import NamedTuple
 
 import jax
@@ -137,8 +138,21 @@ def _check_constants(model: ControlAffine, name: str) -> tuple[np.ndarray, np.nd
     # At a condition number near 1/eps = 4.5e15 no digit of the inverse is right.
     if np.linalg.cond(scale) > 1e15:
         raise ModelError(f"`input_scale` of `{name}` is singular, and must be invertible.")
+    _check_radius(model, name)
     _check_limits(model, name, m)
     return x, u
+
+
+def _check_radius(model: ControlAffine, name: str) -> None:
+    """Check the size of an agent that has a position; of others the name means something else."""
+    radius = model.radius
+    if radius is None or not model.position:
+        return
+    if isinstance(radius, bool) or not isinstance(radius, numbers.Real) or not 0 < radius < np.inf:
+        raise ModelError(
+            f"`radius` of `{name}` is {radius!r}, and must be None or a positive finite number of "
+            "metres."
+        )
 
 
 def _check_limits(model: ControlAffine, name: str, m: int) -> None:

@@ -11,7 +11,7 @@ from echelon.agents.models.model import (
     check_positive,
     diagonal,
 )
-from echelon.agents.models.rotors import attitude_priority, fits
+from echelon.agents.models.rotors import attitude_priority, fits, outer_radius
 from echelon.core.types import Input, InputMap, Output, State
 
 # Right and left pairs of motors; each pair counts as one rotor with twice the thrust.
@@ -56,6 +56,11 @@ class PlanarQuadrotor(ControlAffine):
         """Refuse parameters that are not positive."""
         names = ("mass", "inertia", "gravity", "arm", "motor_thrust")
         check_positive(self, **{name: getattr(self, name) for name in names})
+
+    @property
+    def radius(self) -> float:
+        """The propellers' outer edge, 0.07 m of a Crazyflie."""
+        return outer_radius(self.arm)
 
     @property
     def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:

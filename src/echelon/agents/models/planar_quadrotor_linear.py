@@ -25,6 +25,7 @@ class LinearPlanarQuadrotor(ControlAffine):
     input_units = ("N", "N m")
     output_names = ("y", "z")
     position = ("y", "z")
+    radius = 0.07  # of the Crazyflie with its propellers
     state_groups = {"position": ("y", "z"), "velocity": ("vy", "vz")}
 
     def __check_init__(self) -> None:

@@ -24,7 +24,7 @@ from echelon.agents.models.rigid_body import (
     thrust_axis,
 )
 from echelon.agents.models.rigid_vehicle import THRUST_TWICE, UPRIGHT, RigidVehicle
-from echelon.agents.models.rotors import attitude_priority, fits
+from echelon.agents.models.rotors import attitude_priority, fits, outer_radius
 from echelon.core.errors import ModelError, check_name
 from echelon.core.types import Input, InputMap, State
 
@@ -131,6 +131,11 @@ class Quadrotor(RigidVehicle):
         check_moments(self, self.inertia)
         if not self.allow_unphysical:
             check_inertia(self.inertia)
+
+    @property
+    def radius(self) -> float:
+        """The propellers' outer edge, 0.07 m of a Crazyflie, whose motors are at 0.046 m."""
+        return outer_radius(self.arm)
 
     @property
     def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -28,6 +28,7 @@ class PrintedQuadrotor(ControlAffine):
     input_names, input_units = Quadrotor.input_names, Quadrotor.input_units
     output_names, position = Quadrotor.output_names, Quadrotor.position
     state_groups, chart = Quadrotor.state_groups, Quadrotor.chart
+    radius = 0.07  # of the Crazyflie with its propellers
 
     def __check_init__(self) -> None:
         """Refuse a mass or inertia that is not positive.

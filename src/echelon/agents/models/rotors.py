@@ -10,6 +10,14 @@ import jax.numpy as jnp
 
 from echelon.core.types import Input, Scalar
 
+_REACH = 0.07 / 0.0325
+"""Outer edge of the propellers over the motors' distance along a body axis, of a Crazyflie."""
+
+
+def outer_radius(arm: float) -> float:
+    """Return the radius (m) of a vehicle with propellers, from `arm` (m) along each body axis."""
+    return _REACH * arm
+
 
 def _largest_share(base: Input, extra: Input, maximum: float) -> Scalar:
     """Return the largest s in [0, 1] for which thrusts base + s extra span at most `maximum`."""

@@ -1,6 +1,7 @@
 """References for leaders: the interface `Reference` and the bundled members."""
 
 from echelon.agents.references.periodic import Circle, FigureEight, Lemniscate
+from echelon.agents.references.polynomials import Polynomials
 from echelon.agents.references.reference import Reference
 from echelon.agents.references.state_path import StatePath
 from echelon.agents.references.straight import Hover, Line
@@ -12,6 +13,7 @@ __all__ = [
     "Hover",
     "Lemniscate",
     "Line",
+    "Polynomials",
     "Reference",
     "StatePath",
     "Waypoints",

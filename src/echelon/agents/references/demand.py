@@ -1,5 +1,6 @@
 """The demand of a reference on a model: speed, acceleration, share of the limits, feasibility."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.flatness import follow_at
 from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import Reference
 from echelon.core.compiled import cached_jit
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
@@ -43,6 +45,7 @@ class ReferenceDemand(NamedTuple):
 
 _FEASIBLE = 0.05
 """Knots a tenth of the fastest period apart leave 0.02; a path of another model leaves 1."""
+_SAMPLES = 1000
 _NEAR = 1e-3
 """Time step of differences, s: errors of rounding and of curvature are 1e-6 each."""
 
@@ -50,7 +53,7 @@ _NEAR = 1e-3
 @memoize
 @np.errstate(over="ignore", invalid="ignore")
 def reference_demand(
-    model: ControlAffine, reference: Guide, horizon: float, samples: int = 1000
+    model: ControlAffine, reference: Guide, horizon: float, samples: int = _SAMPLES
 ) -> ReferenceDemand:
     """Return the demand of a reference on a model that can be led along it.
 
@@ -98,7 +101,7 @@ def reference_warnings(
         limits: whether the actuators' limits apply.
     """
     required, model_name = reference_demand(model, reference, horizon), type(model).__name__
-    name, warnings = type(reference).__name__, list[str]()
+    name, warnings = type(reference).__name__, [*reference.remarks()]
     if limits and required.share > 1.0:
         warnings.append(
             f"the reference `{name}` is too fast for `{model_name}`: {too_fast(model, required)}; "
@@ -108,7 +111,27 @@ def reference_warnings(
         warnings.append(
             f"the reference `{name}` is no motion of `{model_name}`: {infeasible(model, required)}."
         )
-    return tuple(warnings)
+    return (*warnings, *_turned_over(model, reference, horizon))
+
+
+def _turned_over(model: ControlAffine, reference: Guide, horizon: float) -> Iterator[str]:
+    """Yield where a derivative of a path passes a bound of the model, as a tilt beyond 90 deg."""
+    # A bound on a length of several outputs is one on the speed, and holds at rest for no path.
+    bounds = [bound for bound in model.flat_bounds or () if len(bound.outputs) == 1]
+    if not isinstance(reference, Reference):
+        return
+    for bound in bounds:
+        times = np.linspace(0.0, horizon, _SAMPLES)
+        with precision("float64"):
+            values = np.asarray(_derivative(reference, times, bound.outputs, bound.derivative))
+        k = int(np.argmin(values))
+        if values[k] <= bound.above:
+            name = bound.outputs[0] + "'" * bound.derivative
+            yield (
+                f"the reference `{type(reference).__name__}` leaves the range of "
+                f"`{type(model).__name__}`: at t = {times[k]:.3g} s `{name}` is {values[k]:.3g}, "
+                f"and must be above {bound.above:.3g} ({bound.within})."
+            )
 
 
 def too_fast(model: ControlAffine, required: ReferenceDemand) -> str:
@@ -167,6 +190,14 @@ def _rate(
 @cached_jit
 def _velocities(model: ControlAffine, states: jax.Array, inputs: jax.Array) -> jax.Array:
     return jax.vmap(model.velocity)(states, inputs)
+
+
+@cached_jit
+def _derivative(
+    reference: Reference, times: jax.Array, names: tuple[str, ...], order: int
+) -> jax.Array:
+    """Return one derivative (T,) of one output of a path."""
+    return jax.vmap(lambda t: reference.derivatives(t, order, names)[order, 0])(times)
 
 
 def _motion(model: ControlAffine, x: Array, near: float) -> tuple[float | None, float | None]:

@@ -24,6 +24,10 @@ class Guide(eqx.Module):
         """Tell whether the heading may differ from the trim's at some time."""
         return True
 
+    def remarks(self) -> tuple[str, ...]:
+        """Return what is probably not meant, a sentence each."""
+        return ()
+
     @abc.abstractmethod
     def check(self) -> None:
         """Check the values that the reference returns.

@@ -1,9 +1,6 @@
 """A reference for any model: its states and inputs over time, as knots."""
 
-import csv
-import io
 from collections.abc import Sequence
-from pathlib import Path
 from typing import final
 
 import jax.numpy as jnp
@@ -11,9 +8,10 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.guide import Guide
+from echelon.agents.references.path_file import read_columns
 from echelon.agents.references.reference import numbers_of
 from echelon.core.errors import LawError, ReferenceError, listing
-from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.types import Array, Input, PathLike, Scalar, State
 
 _Rows = Sequence[Sequence[float]]
 
@@ -53,34 +51,16 @@ class StatePath(Guide):
         )
 
     @classmethod
-    def read(cls, file: str | Path, model: ControlAffine) -> "StatePath":
+    def read(cls, file: PathLike, model: ControlAffine) -> "StatePath":
         """Return the path in a CSV file, whose first line names `t`, the states and the inputs.
 
         The columns may be in any order.
 
         Raises:
-            ReferenceError: the file cannot be read, or lacks a column or has one too many.
+            ReferenceError: the file cannot be read, or a line is wrong; the message names it.
         """
-        names = ("t", *model.state_names, *model.input_names)
-        try:
-            # The byte order mark that spreadsheets write is no part of the first name.
-            head, *rows = csv.reader(io.StringIO(Path(file).read_text("utf-8-sig")))
-            table = np.array([[float(cell) for cell in row] for row in rows if row])
-        except (OSError, ValueError) as error:
-            raise ReferenceError(
-                f"the path `{file}` cannot be read: {error}; it must have a line of names and "
-                "lines of numbers below it."
-            ) from None
-        head = [name.strip() for name in head]
-        if sorted(head) != sorted(names):
-            raise ReferenceError(
-                f"the path `{file}` has the columns {listing(head)}, and "
-                f"`{type(model).__name__}` needs {listing(names)}."
-            )
-        if table.shape[1:] != (len(names),):
-            raise ReferenceError(f"the path `{file}` needs {len(names)} numbers on each line.")
-        columns = table[:, [head.index(name) for name in names]]
-        times, states, inputs = np.split(columns, [1, 1 + len(model.state_names)], axis=1)
+        values, _ = read_columns(file, ("t", *model.state_names, *model.input_names))
+        times, states, inputs = np.split(values, [1, 1 + len(model.state_names)], axis=1)
         return cls(times[:, 0], states, inputs)  # pyright: ignore[reportArgumentType]
 
     def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:

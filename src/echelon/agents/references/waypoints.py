@@ -1,22 +1,21 @@
 """A smooth path through timed points."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from echelon.agents.models.heading_symmetry import heading_of, rest_heading
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.reference import Reference, check_finite, in_space, numbers_of
+from echelon.agents.references.path_file import read_columns
+from echelon.agents.references.polynomial_path import PolynomialPath
+from echelon.agents.references.reference import COORDINATES, numbers_of
 from echelon.core.errors import ReferenceError
-from echelon.core.types import Array, Scalar
+from echelon.core.types import Array, PathLike
 
 
-class Waypoints(Reference):
+class Waypoints(PolynomialPath):
     """The spline of degree 7 through `points` at `times`, at rest at both ends.
 
     Before the first and after the last time the path is constant. Its derivatives are continuous up
@@ -26,70 +25,65 @@ class Waypoints(Reference):
     Args:
         times: K >= 2 increasing times, s.
         points: K points (x, y, z), m.
-        yaw: constant yaw, rad.
+        yaw: of all points, or of each; rad. A turn is as large as the numbers say: from 3 to -3 the
+            path turns by 6 rad.
+        degrees: whether the yaw is in degrees.
 
     Raises:
-        ReferenceError: the times do not increase or the points do not match them.
+        ReferenceError: the times do not increase, or points or yaw do not match them.
     """
 
     knots: Array
     coefficients: Array
-    yaw: float = eqx.field()
+    degrees: bool = eqx.field(static=True)
 
     # Six inside; at rest at both ends up to the third.
     joined = 3
 
     def __init__(
-        self, times: Sequence[float], points: Sequence[Sequence[float]], yaw: float = 0.0
+        self,
+        times: Sequence[float] | Array,
+        points: Sequence[Sequence[float]] | Array,
+        yaw: float | Sequence[float] | Array = 0.0,
+        degrees: bool = False,
     ) -> None:
         """Fit the spline."""
-        t, p = _read(times, points)
-        self.yaw = yaw
-        check_finite(self, yaw=(yaw, None))
-        self.knots, self.coefficients = _fit(t, p)
+        t, p = _checked(times, points)
+        self.degrees = degrees
+        self.knots, self.coefficients = t, _fit(t, np.column_stack([p, _yaws(yaw, degrees, t)]))
 
-    def __call__(self, t: Scalar) -> jax.Array:
-        """Return the point at time t."""
-        knots = jnp.asarray(self.knots, t.dtype)
-        inside = jnp.clip(t, knots[0], knots[-1])
-        # At the last knot there is no piece to the right, so the one to its left is used.
-        piece = jnp.clip(jnp.searchsorted(knots, inside, side="right") - 1, 0, len(knots) - 2)
-        s = inside - knots[piece]
-        return in_space(_horner(jnp.asarray(self.coefficients, t.dtype)[:, piece], s), self.yaw)
+    @classmethod
+    def read(
+        cls, file: PathLike, model: ControlAffine | None = None, degrees: bool = False
+    ) -> "Waypoints":
+        """Return the path through the points of a CSV file.
 
-    def parts(self, horizon: float) -> Sequence[tuple[float, Callable[[Scalar], jax.Array]]]:
-        """Return the polynomials between the points, and constants before and after."""
-        knots, powers = self.knots.tolist(), np.moveaxis(self.coefficients, 1, 0)
-        last = _horner(self.coefficients[:, -1], knots[-1] - knots[-2])
+        Args:
+            file: its first line names the columns `t`, `x`, `y`, `z` and `yaw`, in any order; s, m
+                and rad. Without `yaw` it is 0.
+            model: not used; a path in space does not depend on it.
+            degrees: whether the yaw is in degrees.
 
-        def polynomial(k: int) -> Callable[[Scalar], jax.Array]:
-            return lambda t: in_space(_horner(powers[k], t - knots[k]), self.yaw)
+        Raises:
+            ReferenceError: the file cannot be read, or a line is wrong; the message names it.
+        """
+        values, _ = read_columns(file, ("t", *COORDINATES), optional=("yaw",))
+        return cls(values[:, 0], values[:, 1:4], values[:, 4], degrees)
 
-        def rest(place: Array) -> Callable[[Scalar], jax.Array]:
-            return lambda t: in_space(jnp.asarray(place, t.dtype), self.yaw)
-
-        every = [(knots[0], rest(powers[0, -1]))]
-        every += [(knots[k + 1], polynomial(k)) for k in range(len(powers))]
-        every += [(math.inf, rest(last))]
-        count = sum(end < horizon for end, _ in every) + 1
-        begun = [(min(end, horizon), path) for end, path in every[:count]]
-        return [(end, path) for end, path in begun if end > 0.0]
-
-    def turns(self, model: ControlAffine) -> bool:
-        """Tell whether the constant yaw differs from the trim's; a spline has no enclosure."""
-        return heading_of(model).state != "yaw" or self.yaw != rest_heading(model)
+    def remarks(self) -> tuple[str, ...]:
+        """Return what is probably wrong with the yaw: degrees that count as radians."""
+        most = float(np.abs(self.coefficients[-1, :, 3]).max())
+        if self.degrees or most <= 2.0 * math.pi:
+            return ()
+        return (
+            f"the yaw of `Waypoints` reaches {most:.3g} rad, more than a turn; if it is in "
+            "degrees, add `degrees: true`.",
+        )
 
 
-def _horner(coefficients: Array | jax.Array, s: Scalar | float) -> Any:
-    """Return the value of polynomials with coefficients (8, 3), highest power first."""
-    value, *others = coefficients
-    # In the time since the knot: powers of t would lose digits late in a run.
-    for coefficient in others:
-        value = value * s + coefficient
-    return value
-
-
-def _read(times: Sequence[float], points: Sequence[Sequence[float]]) -> tuple[Array, Array]:
+def _checked(
+    times: Sequence[float] | Array, points: Sequence[Sequence[float]] | Array
+) -> tuple[Array, Array]:
     """Return times (K,) and points (K, 3), after checking both."""
     t, p = numbers_of(times), numbers_of(points)
     if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
@@ -106,15 +100,29 @@ def _read(times: Sequence[float], points: Sequence[Sequence[float]]) -> tuple[Ar
     return t, p
 
 
-def _fit(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the knots (K,) and the coefficients (8, K - 1, 3), highest power first."""
+def _yaws(yaw: float | Sequence[float] | Array, degrees: bool, times: Array) -> Float[Array, " K"]:
+    """Return the yaw (rad) at each time."""
+    values = numbers_of(yaw)
+    if values.shape not in ((), times.shape) or not np.isfinite(values).all():
+        raise ReferenceError(
+            f"`yaw` of `Waypoints` is {yaw}, and must be a finite number, or {len(times)} of them, "
+            "one for each time."
+        )
+    return np.broadcast_to(np.radians(values) if degrees else values, times.shape)
+
+
+def _fit(times: Float[Array, " K"], points: Float[Array, "K 4"]) -> Float[Array, "8 K-1 4"]:
+    """Return the coefficients of the pieces, highest power first."""
     # Imported here: splines load slowly, and only this reference needs them.
     from scipy.interpolate import make_interp_spline
 
     # A spline of degree 7 through K points has K + 6 coefficients: three conditions more at each
     # end.
-    rest = [(order, np.zeros(3)) for order in (1, 2, 3)]
+    rest = [(order, np.zeros(4)) for order in (1, 2, 3)]
     spline = make_interp_spline(times, points, k=7, bc_type=(rest, rest))
     # Taylor's coefficients at each knot, which JAX evaluates without SciPy.
     powers = [spline.derivative(k)(times[:-1]) / math.factorial(k) for k in range(7, 0, -1)]
-    return times, np.stack([*powers, points[:-1]])
+    coefficients = np.stack([*powers, points[:-1]])
+    # Rounding would let a constant coordinate move.
+    coefficients[:-1, :, (points == points[0]).all(axis=0)] = 0.0
+    return coefficients

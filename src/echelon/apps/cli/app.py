@@ -26,6 +26,7 @@ from echelon.apps.cli.export_command import export
 from echelon.apps.cli.init_command import init
 from echelon.apps.cli.list_command import list_, schema
 from echelon.apps.cli.live_command import live
+from echelon.apps.cli.path_command import path
 from echelon.apps.cli.plot_command import plot
 from echelon.apps.cli.report_command import report
 from echelon.apps.cli.run_command import run
@@ -134,7 +135,7 @@ def _guarded(command: Callable[..., None]) -> Callable[..., None]:
 
 # Listed here instead of decorated in their files, so that the order is that of `--help`.
 _COMMANDS: tuple[Callable[..., None], ...] = (
-    *(init, run, sweep, view, live, plot, video, report, export),
+    *(init, run, sweep, view, live, plot, video, report, export, path),
     *(check, design, tune, compare, verify, list_, explain, doctor, schema),
 )
 for _command in _COMMANDS:

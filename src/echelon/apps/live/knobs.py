@@ -1,10 +1,11 @@
 """The knobs of a live loop, and the gain, formation, graph and wind that they stand for."""
 
 import copy
+import dataclasses
 from typing import Any, NamedTuple, final
 
+import equinox as eqx
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Float
 
 from echelon.agents.models.linearization import linearize
@@ -12,8 +13,10 @@ from echelon.agents.network.graph import Graph
 from echelon.apps.live.choices import shapes_of
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
+from echelon.core.words import Feedforward
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
+from echelon.guarantees.promises.closed_loop import LinearLoop, loop_of
 from echelon.simulation.engine.law_drive import Laws
 from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.riccati import Riccati
@@ -148,29 +151,28 @@ class LiveParts:
         graph = self.parts.graph
         return Graph(self.edges(knobs, graph.weights), graph.leaders, graph.agents, graph.directed)
 
-    def slowest(self, knobs: Knobs) -> float | None:
-        """Return the real part (1/s) of the slowest mode, linearized at the trim.
+    def loop(self, knobs: Knobs) -> LinearLoop | None:
+        """Return the closed loop near the trim, as a guarantee judges it.
 
-        None without a gain, and on a switching graph, whose modes are not those of one matrix.
+        None without a gain, on a switching graph, whose modes are not those of one matrix, and with
+        late messages.
+
+        Raises:
+            GraphError: the cut links disconnect the graph.
         """
-        gain, graph = self.gain(knobs), self.parts.graph
-        if gain is None or knobs.coupling is None or graph.schedule is not None:
+        gain, parts = self.gain(knobs), self.parts
+        if gain is None or parts.graph.schedule is not None or parts.world.network is not None:
             return None
-        rows = [k for k in range(len(graph.edges)) if k not in knobs.cut]
-        i, j = graph.edges[rows].T
-        shape = (graph.agents, graph.agents)
-        A = sp.coo_array((graph.weights[rows], (j, i)), shape=shape).toarray()
-        A = A if graph.directed else A + A.T
-        followers = list(graph.followers)
-        L = (np.diag(A.sum(axis=1)) - A)[np.ix_(followers, followers)]
-        values = np.linalg.eigvals(L) if graph.directed else np.linalg.eigvalsh(L)
+        gain = eqx.tree_at(lambda gain: gain.coupling, gain, knobs.coupling)
+        assert isinstance(parts.drive, Laws)
+        law: Any = parts.drive.follower
+        law = dataclasses.replace(law, gain=gain)
+        if not knobs.feedforward:
+            law = dataclasses.replace(law, feedforward=Feedforward.NONE)
+        # Without a cut the same object, whose eigenvalues are known.
+        graph = self.graph(knobs) if knobs.cut else parts.graph
         with precision("float64"):
-            A, B = linearize(self.parts.model).with_inner(gain.inner)
-        K = gain.R_inverse @ B.T @ gain.P
-        # The extreme ones and some between, since a thousand would take seconds.
-        sample = values[np.unique(np.linspace(0, len(values) - 1, 40).astype(int))]
-        poles = np.linalg.eigvals(A - knobs.coupling * sample[:, None, None] * (B @ K))
-        return float(poles.real.max())
+            return loop_of(parts.replace(drive=Laws(parts.drive.leader, law), graph=graph))
 
 
 def _coupling(experiment: Experiment) -> float | None:

@@ -1,42 +1,44 @@
-"""The guarantee of a live loop, computed in a thread while the loop runs."""
+"""The guarantee of a live loop, computed in threads while the loop runs."""
 
 import threading
 from collections.abc import Callable
-from typing import final
+from typing import NamedTuple, final
 
 from echelon.apps.live.knobs import Knobs
 from echelon.apps.live.panel import Panel
-from echelon.core.errors import EchelonError
+from echelon.core.errors import EchelonError, GraphError
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import build
+from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.output.reports.causes import beyond
 from echelon.output.viewer.replay import promise_badge
+from echelon.simulation.step.settings import Settings
 
 _NEAR = 1.1
 """Below this multiple of the smallest guaranteed coupling the badge warns of the edge."""
 
 
 @final
-class Promiser:
-    """Computes guarantees in its own thread; of several requests only the last is answered.
+class _Newest:
+    """A thread that works on requests; of several that wait only the last is worked on.
 
     Args:
-        answer: called with the badge of the page.
+        work: called with the request.
     """
 
-    def __init__(self, answer: Callable[[JsonObject], None]) -> None:
+    def __init__(self, work: Callable[["_Request"], None]) -> None:
         """Start the thread, which waits for a request."""
-        self.answer = answer
-        self.request: tuple[Panel, Knobs] | None = None
+        self.work = work
+        self.request: _Request | None = None
         self.changed, self.ended = threading.Condition(), False
-        self.thread = threading.Thread(target=self._work, daemon=True)
+        self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
 
-    def ask(self, panel: Panel, knobs: Knobs) -> None:
-        """Request the guarantee at a position of the knobs."""
+    def ask(self, request: "_Request") -> None:
+        """Replace the request that waits."""
         with self.changed:
-            self.request = panel, knobs
+            self.request = request
             self.changed.notify()
 
     def end(self) -> None:
@@ -47,7 +49,7 @@ class Promiser:
         # An interpreter that ends while XLA compiles in a thread is aborted by it.
         self.thread.join()
 
-    def _work(self) -> None:
+    def _run(self) -> None:
         while True:
             with self.changed:
                 self.changed.wait_for(lambda: self.ended or self.request is not None)
@@ -55,11 +57,58 @@ class Promiser:
                     return
                 request, self.request = self.request, None
             assert request is not None
-            # The eigenvalues first, since a guarantee takes seconds.
-            self.answer(first_look(*request))
-            badge = badge_of(*request)
-            # After another change of the knobs the badge is out of date.
-            if self.request is None and not self.ended:
+            self.work(request)
+
+
+class _Request(NamedTuple):
+    """A position of the knobs, by the number of its change."""
+
+    number: int
+    panel: Panel
+    knobs: Knobs
+
+
+@final
+class Promiser:
+    """Computes guarantees while the loop runs, and before each a first look at the loop.
+
+    A guarantee takes seconds. The first look at another position of the knobs does not wait for it:
+    each has a thread, and no answer about an earlier position is given.
+
+    Args:
+        answer: called with the badge of the page.
+    """
+
+    def __init__(self, answer: Callable[[JsonObject], None]) -> None:
+        """Start the threads, which wait for a request."""
+        self.answer, self.lock = answer, threading.Lock()
+        self.number = self.complete = 0
+        self.workers = _Newest(self._look), _Newest(self._judge)
+
+    def ask(self, panel: Panel, knobs: Knobs) -> None:
+        """Request the guarantee at a position of the knobs; until then none is shown."""
+        with self.lock:
+            self.number += 1
+            self.answer(pending_badge())
+        for worker in self.workers:
+            worker.ask(_Request(self.number, panel, knobs))
+
+    def end(self) -> None:
+        """End the threads."""
+        for worker in self.workers:
+            worker.end()
+
+    def _look(self, request: _Request) -> None:
+        badge = first_look(request.panel, request.knobs)
+        with self.lock:
+            if self.complete < request.number == self.number:
+                self.answer(badge)
+
+    def _judge(self, request: _Request) -> None:
+        badge = badge_of(request.panel, request.knobs)
+        with self.lock:
+            if request.number == self.number:
+                self.complete = request.number
                 self.answer(badge)
 
 
@@ -81,8 +130,9 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
     badge["beyond"] = [cause.sentence() for cause in beyond(0.0, guarantee)]
     if guarantee.promised and _near_edge(guarantee, knobs):
         badge |= {"state": "edge", "short": f"{badge['short']}, near its edge"}
-    elif not guarantee.promised and guarantee.slowest is not None and guarantee.slowest >= 0.0:
-        badge["short"] = _growth(guarantee.slowest)
+    elif not guarantee.promised and guarantee.slowest is not None:
+        growth = _growth(panel.live.loop(knobs), panel.experiment.settings)
+        badge["short"] = growth or badge["short"]
     return badge
 
 
@@ -93,17 +143,33 @@ def pending_badge(short: str = "guarantee \u2026") -> JsonObject:
 
 
 def first_look(panel: Panel, knobs: Knobs) -> JsonObject:
-    """Return a badge with the slowest mode at the trim; a growing mode rules out a guarantee."""
-    slowest = panel.live.slowest(knobs)
-    if slowest is None:
+    """Return a badge with the slowest mode at the trim in steps with held inputs.
+
+    A mode that grows rules out a guarantee.
+    """
+    settings = panel.experiment.settings
+    try:
+        loop = panel.live.loop(knobs)
+    except GraphError as error:
+        return pending_badge() | {"state": "lost", "short": "no guarantee", "causes": [str(error)]}
+    growth = _growth(loop, settings)
+    if growth:
+        return pending_badge() | {"state": "lost", "short": growth}
+    if loop is None:
         return pending_badge()
-    if slowest < 0.0:
-        return pending_badge(f"slowest mode {slowest:.3g} 1/s; guarantee \u2026")
-    return pending_badge() | {"state": "lost", "short": _growth(slowest)}
+    return pending_badge(f"slowest mode {-loop.held_rate(settings):.3g} 1/s; guarantee \u2026")
 
 
-def _growth(slowest: float) -> str:
-    return f"no guarantee: a mode grows at {slowest:.3g} 1/s"
+def _growth(loop: LinearLoop | None, settings: Settings) -> str:
+    """Return that errors grow in the steps of a loop; empty where that is not known."""
+    radius = 0.0 if loop is None else loop.radius(settings)
+    # Exactly 1 stands for an interval of eigenvalues of which nothing is shown.
+    if loop is None or not radius > 1.0:
+        return ""
+    if loop.slowest > 0.0:
+        return f"no guarantee: a mode grows at {loop.slowest:.3g} 1/s"
+    step = f"{1e3 * settings.dt:.3g} ms"
+    return f"no guarantee: errors grow {radius:.3g}-fold in each step of {step}"
 
 
 def _near_edge(guarantee: Promise, knobs: Knobs) -> bool:

@@ -6,6 +6,7 @@ from typing import Annotated, NamedTuple, TypeVar
 import numpy as np
 
 from echelon.experiments.results.quantity import ERROR, Quantity
+from echelon.simulation.engine.frame_numbers import ClosestPair
 
 
 class LeaderMetrics(NamedTuple):
@@ -77,13 +78,13 @@ class Metrics(NamedTuple):
     """All numbers of a run; what does not exist is None, never NaN.
 
     Errors are of the position (m) where the model has one, else of the whole state. A run that
-    diverged has no errors. The least distance is over the stored frames.
+    diverged has no errors. The closest pair is that of the stored frames.
     """
 
     leaders: tuple[LeaderMetrics, ...]
     followers: tuple[FollowerMetrics, ...]
     edges: tuple[EdgeMetrics, ...]
-    minimum_distance: float | None
+    closest: ClosestPair | None
     saturation_fraction: float
     steady_window: float
 
@@ -91,6 +92,11 @@ class Metrics(NamedTuple):
     def leader(self) -> LeaderMetrics:
         """The numbers of the first leader."""
         return self.leaders[0]
+
+    @property
+    def minimum_distance(self) -> float | None:
+        """The smallest distance between two agents in the stored frames, m."""
+        return None if self.closest is None else self.closest.distance
 
     @property
     def worst_steady(self) -> float | None:

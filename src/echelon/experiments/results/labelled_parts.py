@@ -45,7 +45,10 @@ def _attributes(parts: Parts, settings: Settings) -> JsonObject:
     """Return parts and settings as attributes that netCDF can hold."""
     numbers = {**settings._asdict(), "steady_window": settings.window}
     world = parts.world.describe(parts.model)
+    model = parts.model
+    radius = model.radius if model.position else None
     return {
+        **({} if radius is None else {"radius": float(radius)}),
         **{key: text for key, text in world.items() if text is not None},
         **{key: int(v) if isinstance(v, bool) else v for key, v in numbers.items()},
         **{

@@ -22,13 +22,12 @@ from echelon.simulation.step.meter import SETTLED, output_error
 def metrics(result: Result) -> Metrics:
     """Return the numbers of a run; means are over all its steps, whatever frames were stored."""
     exists = result.outcome is not Outcome.DIVERGED and bool(result.sums.steps[0] > 0)
-    least = result.least_distances() if len(result.times) else None
     with np.errstate(over="ignore", invalid="ignore"):
         return Metrics(
             leaders=_leaders(result, exists),
             followers=_followers(result, exists),
             edges=_edges(result, exists),
-            minimum_distance=None if least is None else finite_or_none(least.min()),
+            closest=result.closest_pair(),
             saturation_fraction=float(result.saturated.mean()),
             steady_window=result.settings.window,
         )

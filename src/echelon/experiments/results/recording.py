@@ -84,6 +84,7 @@ class Recording(FrameNumbers):
         promise: as `Promise.as_mapping` returns it.
         horizon, dt: s.
         attributes: provenance and settings, as stored.
+        radius: of an agent, m; None without a size.
     """
 
     name: str
@@ -115,6 +116,7 @@ class Recording(FrameNumbers):
     horizon: float
     dt: float
     attributes: JsonObject
+    radius: float | None = None
 
     @property
     def agents(self) -> int:
@@ -245,6 +247,7 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         horizon=float(attributes["horizon"]),
         dt=float(attributes["dt"]),
         attributes=dict(attributes),
+        radius=float(attributes["radius"]) if "radius" in attributes else None,
     )
 
 

@@ -42,15 +42,19 @@ class RunNumbers:
     computing: float | None = None
 
     def number(self, name: str) -> float | None:
-        """Return a number of `RUN_NUMBERS`; None if it does not exist."""
+        """Return a number of `RUN_NUMBERS`; None if it does not exist or is more than one."""
+        value = self._value(name)
+        return None if isinstance(value, tuple) else value
+
+    def _value(self, name: str) -> float | tuple[int, ...] | None:
         compute = RUN_NUMBERS[name].of
         value = None if compute is None else compute(self)
-        return None if value is None or np.isnan(value) else value
+        return None if value is None or np.isnan(value).any() else value
 
     def json(self, where: Shown) -> "JsonObject":
         """Return the numbers that appear somewhere, under their names in JSON."""
         return {
-            quantity.key or name: self.number(name)
+            quantity.key or name: self._value(name)
             for name, quantity in RUN_NUMBERS.items()
             if where in quantity.shown
         }
@@ -177,6 +181,24 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         column="smallest\ndistance",
         of=lambda run: run.metrics.minimum_distance,
         shown=Shown.COMPARISON | Shown.SUMMARY,
+    ),
+    "minimum_distance_time": Quantity(
+        "time of the stored frame in which two agents were closest to each other",
+        "s",
+        of=lambda run: getattr(run.metrics.closest, "time", None),
+        shown=Shown.SUMMARY,
+        key="minimum_distance_time_s",
+    ),
+    "closest_agents": Quantity(
+        "the two agents that were closest to each other",
+        of=lambda run: getattr(run.metrics.closest, "agents", None),
+        shown=Shown.SUMMARY,
+    ),
+    "vehicle_radius": Quantity(
+        "radius of an agent; closer than twice of it, two agents touch",
+        "m",
+        of=lambda run: run.result.radius,
+        shown=Shown.SUMMARY,
     ),
     "computing": Quantity(
         "computing time for one agent and one second of the run",

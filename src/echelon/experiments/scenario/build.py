@@ -243,11 +243,10 @@ def _read(part: NamedClass, file: Path, model: ControlAffine) -> Guide:
     read = getattr(part.cls, "read", None)
     if read is None:
         raise ScenarioError(f"`{part.name}` does not read files; leave `file` out.")
-    if part.arguments:
-        raise ScenarioError(
-            f"got `file` and {listing(part.arguments)}, allowed is the file or the keys."
-        )
-    return read(file, model)
+    surplus = [name for name in part.arguments if name not in accepted(read)]
+    if surplus:
+        raise ScenarioError(f"got `file` and {listing(surplus)}, allowed is the file or the keys.")
+    return read(file, model, **part.arguments)
 
 
 def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Formation:

@@ -61,7 +61,8 @@ REFERENCES = _family(
     circle=("Circle", "circle at constant height"),
     hover=("Hover", "one fixed point"),
     line=("Line", "straight line at constant velocity"),
-    waypoints=("Waypoints", "smooth polynomials through timed points"),
+    waypoints=("Waypoints", "smooth path through timed points, from the scenario or a CSV file"),
+    polynomials=("Polynomials", "pieces of degree 7, from a CSV file as Crazyswarm2 reads it"),
     states=("StatePath", "states and inputs over time, from a CSV file, of any model"),
 )
 

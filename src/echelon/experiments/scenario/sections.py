@@ -163,13 +163,16 @@ class ReferenceSpec(BaseModel):
     python: ClassInFile | None = None
     """`file.py:Class`, the file relative to the scenario file."""
     file: str | None = None
-    """CSV file of the reference `states`, relative to the scenario file: its first line names `t`,
-    the states and the inputs."""
+    """CSV file of the path, relative to the scenario file; its first line names the columns, in any
+    order. `waypoints` has `t`, `x`, `y`, `z`, `yaw`; `states` has `t`, the states and the inputs;
+    `polynomials` has `duration`, `x^0` to `x^7`, and likewise for `y`, `z`, `yaw`."""
+    degrees: bool = False
+    """Whether the yaw of `waypoints` is in degrees."""
 
     @property
     def parameters(self) -> Mapping[str, object]:
         """The reference's parameters: numbers or nested tuples of numbers, in m, s and rad."""
-        return dict(self.__pydantic_extra__ or {})
+        return {**(self.__pydantic_extra__ or {}), **({"degrees": True} if self.degrees else {})}
 
 
 @final

@@ -19,8 +19,8 @@ from echelon.laws.stopping_point import StoppingLeader
 
 _PIECE, _MOST = Fraction(1, 20), 800
 """Of time, s, and about how many there are."""
-_FEW = 20
-"""Pieces of each part of a path that is joined of many."""
+_FEW, _ALL = 20, 4000
+"""Pieces of each part of a path that is joined of many, and about how many of all parts."""
 _EXACT = Fraction(1, 10**9)
 """Of the highest derivative; one that is known so well in one piece is constant."""
 
@@ -72,7 +72,7 @@ def _pieces(reference: Guide, horizon: float, outputs: tuple[str, ...], order: i
     assert isinstance(reference, Reference)
     picked = np.array([COORDINATES.index(name) for name in outputs])
     times, values, parts = [Fraction(0)], list[_Rows](), reference.parts(horizon)
-    most = max(_FEW, _MOST // len(parts))
+    most = max(1, min(max(_FEW, _MOST // len(parts)), _ALL // len(parts)))
     for until, path in parts:
         span = Fraction(until) - times[-1]
         count = min(most, math.ceil(span / _PIECE))

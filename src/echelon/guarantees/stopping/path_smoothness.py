@@ -50,8 +50,8 @@ def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: 
         raise GainError("a path replaces `derivatives`, which may be those of another path")
     picked = np.array([COORDINATES.index(name) for name in outputs])
     begin, parts = 0.0, reference.parts(horizon)
-    if len(parts) > 1 and not _fit_together(reference, order):
-        raise GainError("a path is joined of parts of which nothing says how they fit together")
+    if len(parts) > 1:
+        _check_joints(reference, order)
     for until, part in parts:
 
         def path(t: jax.Array, part: Callable[[jax.Array], jax.Array] = part) -> jax.Array:
@@ -62,14 +62,24 @@ def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: 
         begin = until
 
 
-def _fit_together(reference: Reference, order: int) -> bool:
-    """Tell whether the class that defines a path says that its parts fit together."""
+def _check_joints(reference: Reference, order: int) -> None:
+    """Check that the class of a path says that its parts fit together.
+
+    Raises:
+        GainError: it does not.
+    """
     kinds = type(reference).__mro__
     joined, parts, path = (
         next(k for k, kind in enumerate(kinds) if name in vars(kind))
         for name in ("joined", "parts", "__call__")
     )
-    return max(joined, parts) <= path and reference.joined >= order - 1
+    if max(joined, parts) > path:
+        raise GainError("a path is joined of parts of which nothing says how they fit together")
+    if reference.joined < order - 1:
+        raise GainError(
+            f"its parts meet with {reference.joined} continuous derivatives, and {order - 1} are "
+            "needed"
+        )
 
 
 def _compare(path: Callable[[jax.Array], jax.Array], order: int, begin: float, end: float) -> None:

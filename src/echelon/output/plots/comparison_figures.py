@@ -9,6 +9,7 @@ from echelon.core.types import Array
 from echelon.experiments.results.metrics import SETTLED, output_errors
 from echelon.experiments.studies.compare import Comparison
 from echelon.output.plots import style as draw
+from echelon.output.plots.canvas import canvas, frame
 from echelon.output.plots.figure_files import save
 from echelon.simulation.engine.result import Result
 
@@ -112,7 +113,7 @@ def _approach(runs: _Runs) -> "Figure | None":
     # All methods have the same starts, so that the first gives the follower.
     follower = int(np.argmax(first.goal_distances([0])))
     names, units = first.model.state_names, first.model.state_units
-    figure, ax = draw.canvas([draw.label(f"{names[k]} error", units[k]) for k in axes])
+    figure, ax = canvas([draw.label(f"{names[k]} error", units[k]) for k in axes])
     start, goal = first.errors[:1, follower][:, axes], np.zeros((1, 2))
     drawn, cut = [start, goal], False
     for k, label, run in runs:
@@ -125,7 +126,7 @@ def _approach(runs: _Runs) -> "Figure | None":
         cut |= over
     draw.plot(ax, start, label=f"start, F{follower}", **draw.dots("o", draw.LEADER, hollow=True))
     draw.plot(ax, goal, label="goal", **draw.dots("s", draw.LEADER))
-    draw.frame(ax, np.concatenate(drawn))
+    frame(ax, np.concatenate(drawn))
     return draw.finish(figure, cut)
 
 

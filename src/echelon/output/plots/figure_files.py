@@ -20,14 +20,16 @@ NAMES = (
 """All figures of a run."""
 
 
-def check_names(names: Sequence[str]) -> None:
-    """Check that these are figures of a run.
+def check_names(what: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the names of figures, of one or several.
 
     Raises:
         OutputError: there is no figure of a name.
     """
+    names = (what,) if isinstance(what, str) else tuple(what)
     for name in names:
         check_name("the figure is", name, NAMES, OutputError)
+    return names
 
 
 def html_image(figure: "Figure", name: str, dpi: int) -> str:

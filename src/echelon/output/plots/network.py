@@ -9,6 +9,7 @@ from echelon.core.types import Array
 from echelon.experiments.results.recording import LoopPoles, Recording
 from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import MOST, count_title, pen_of
+from echelon.output.plots.canvas import canvas
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,14 +29,11 @@ def modes(run: Recording) -> "Figure | None":
 def poles(loop: LoopPoles) -> "Figure":
     """Return poles in the complex plane, coloured by the eigenvalue of the graph."""
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
     # The real part of complex eigenvalues, by which couplings are chosen.
     values = np.real(loop.eigenvalues)
     real, imaginary = np.real(loop.poles), np.imag(loop.poles)
-    width = draw.page().width
-    figure = Figure((width, 0.6 * width), layout="constrained")
-    ax = figure.add_subplot()
+    figure, ax = canvas(["real part (1/s)", "imaginary part (rad/s)"])
     colour = np.repeat(values, real.shape[1])
     norm = LogNorm(values[0], values[-1] if values[-1] > values[0] else 1.01 * values[0])
     look = {"norm": norm, "cmap": "viridis", "edgecolors": "white", "linewidths": 0.4, "zorder": 3}
@@ -44,8 +42,6 @@ def poles(loop: LoopPoles) -> "Figure":
     slowest = float(real.max())
     ax.axvline(slowest, color=draw.COLOURS[1], linewidth=0.9, linestyle=(0, (4, 2)), zorder=2)
     _wide_axis(ax, real, imaginary)
-    ax.set_xlabel("real part (1/s)")
-    ax.set_ylabel("imaginary part (rad/s)")
     _name_slowest(ax, slowest)
     # A single eigenvalue needs no colour scale.
     if len(np.unique(values)) > 1:
@@ -114,8 +110,6 @@ def network(run: Recording) -> "Figure":
     inactive. A switching graph has a panel for each of its first six graphs. Of a huge swarm the
     figure shows the agents closest to the leaders.
     """
-    from matplotlib.figure import Figure
-
     whole, run = run, _near_leaders(run)
     places, units = _places(run)
     stretches = _stretches(run)
@@ -129,8 +123,8 @@ def network(run: Recording) -> "Figure":
     lines = curves_of(places, run.edges, least)
     size = np.ptp(np.concatenate([places, *lines]), axis=0)
     tall = float(np.clip(size[1] / max(size[0], 1e-9), 0.3, 0.8))
-    figure = Figure((width, rows * (0.75 + available * tall)), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    figure, lattice = draw.sheet(rows * (0.75 + available * tall), rows, columns)
+    panels = [ax for line in lattice for ax in line]
     for ax, (title, weights) in zip(panels, stretches, strict=False):
         _agents_and_links(ax, run, places, lines, weights, columns)
         _finish_network(ax, np.concatenate([places, *lines]), units)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from echelon.core.errors import OutputError
 from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import curves, network, trajectories
@@ -12,6 +13,7 @@ from echelon.output.plots.figure_files import NAMES, check_names, save
 from echelon.simulation.engine.result import Result
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _MAKERS: "dict[str, Callable[[Recording], Figure | None]]" = dict(
@@ -30,7 +32,10 @@ DEFAULT = ("leader_3d", "trajectories", "tracking", "formation", "inputs", "lyap
 
 
 def figures(
-    run: Result | Recording, what: Sequence[str] = DEFAULT, page: draw.FigureSize = draw.SCREEN
+    run: Result | Recording,
+    what: str | Sequence[str] = DEFAULT,
+    page: draw.FigureSize = draw.SCREEN,
+    ax: "Axes | None" = None,
 ) -> "dict[str, Figure]":
     """Return figures of a run, by name; those that do not apply to it are missing.
 
@@ -50,30 +55,35 @@ def figures(
 
     Args:
         run: a result, or a recording of one.
-        what: names of figures.
+        what: the name of a figure, or names.
         page: size of the figures, such as `echelon.output.plots.style.ONE_COLUMN`.
+        ax: axes of matplotlib into which the one named figure is drawn, such as `formation`,
+            `modes`, or the paths of agents in the plane; the figure returned is then theirs.
 
     Raises:
-        OutputError: a name is unknown.
+        OutputError: a name is unknown; or `ax` is given, and `what` are several figures or one that
+            has several axes or is in space.
     """
-    check_names(what)
+    names = check_names(what)
+    if ax is not None and len(names) != 1:
+        raise OutputError(f"`ax` takes one figure, and `what` has {len(names)} names.")
     if not len(run.times):
         return {}
     data = recording_of(run) if isinstance(run, Result) else run
-    with draw.style(page):
-        drawings = {name: make(data) for name, make in _MAKERS.items() if name in what}
+    with draw.style(page, ax):
+        drawings = {name: make(data) for name, make in _MAKERS.items() if name in names}
     return {name: figure for name, figure in drawings.items() if figure is not None}
 
 
 def save_figures(
-    run: Result | Recording, folder: str | Path, what: Sequence[str] = DEFAULT
+    run: Result | Recording, folder: str | Path, what: str | Sequence[str] = DEFAULT
 ) -> list[Path]:
     """Write figures of a run as PNG (150 dpi) and PDF under `folder`/figures; return the paths.
 
     Args:
         run: a result, or a recording of one.
         folder: that gets a folder `figures`.
-        what: names of figures, as `figures` has them.
+        what: the name of a figure, or names, as `figures` has them.
 
     Raises:
         OSError: the folder or a file cannot be written.

@@ -95,14 +95,23 @@ def _angles(run: Recording, kind: str, names: tuple[str, ...]) -> tuple[tuple[in
 
 
 def clipped_places(run: Recording, axes: tuple[int, ...]) -> tuple[Array, bool]:
-    """Return places (T, N, k) within ten times the extent of leaders and goals."""
+    """Return places (T, N, k) within ten times the extent of leaders and goals.
+
+    Places that are not finite are NaN. The second value is whether others were farther away.
+    """
     places, columns = run.states[:, :, list(axes)], list(axes)
     goals, leaders = run.goals([0])[0][:, columns], places[:, list(run.leaders)]
     points = np.concatenate([leaders.reshape(-1, len(axes)), goals, places[0]])
-    low, high = points.min(axis=0), points.max(axis=0)
-    reach = max(1.0, float((high - low).max()))
+    low, high = _corners(points)
+    reach, finite = max(1.0, float((high - low).max())), np.isfinite(places)
     clipped = np.clip(places, low - _FAR * reach, high + _FAR * reach)
-    return clipped, bool((clipped != places).any())
+    return np.where(finite, clipped, np.nan), bool(((clipped != places) & finite).any())
+
+
+def _corners(points: Array) -> tuple[Array, Array]:
+    """Return the corners of the box around points (K, k), without those that are not finite."""
+    points = points[np.isfinite(points).all(axis=1)]
+    return points.min(axis=0), points.max(axis=0)
 
 
 def _box(run: Recording, kind: str, axes: tuple[int, ...], places: Array) -> tuple[Array, Array]:
@@ -133,14 +142,14 @@ def _extent(run: Recording, axes: tuple[int, ...], places: Array) -> tuple[Array
     motion = leaders[:, 0] - leaders[0, 0]
     points = np.concatenate(
         [leaders.reshape(-1, len(axes)), goals, places[0]]
-        + [goals + motion.min(axis=0), goals + motion.max(axis=0)]
+        + [goals + shift for shift in _corners(motion)]
     )
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = _corners(points)
     margin = 0.15 * float((high - low).max()) or 1.0
-    everything = places.reshape(-1, len(axes))
+    least, most = _corners(places.reshape(-1, len(axes)))
     return (
-        np.maximum(np.minimum(low, everything.min(axis=0)), low - margin),
-        np.minimum(np.maximum(high, everything.max(axis=0)), high + margin),
+        np.maximum(np.minimum(low, least), low - margin),
+        np.minimum(np.maximum(high, most), high + margin),
     )
 
 

@@ -1,13 +1,13 @@
 """The style of figures, and their canvases, axes and lines; without pyplot and its state."""
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
+from echelon.core.errors import OutputError
 from echelon.core.types import Array
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ ONE_COLUMN, TWO_COLUMNS = FigureSize(3.5, 2.6, 8.0), FigureSize(7.16, 4.4, 8.0)
 """Widths of a journal page."""
 
 _page: ContextVar[FigureSize] = ContextVar("page", default=SCREEN)
+_target: "ContextVar[Axes | None]" = ContextVar("target", default=None)
 _STYLE: dict[Any, Any] = {
     "font.family": "STIXGeneral",
     "mathtext.fontset": "stix",
@@ -74,25 +75,34 @@ _STYLE: dict[Any, Any] = {
 
 
 @contextmanager
-def style(page: FigureSize = SCREEN) -> Iterator[None]:
-    """Use echelon's style for a page, and restore matplotlib's settings."""
+def style(page: FigureSize = SCREEN, ax: "Axes | None" = None) -> Iterator[None]:
+    """Use echelon's style for a page, and restore matplotlib's settings.
+
+    With axes `ax`, figures are drawn into these and not into figures of their own.
+    """
     import matplotlib
 
     large, small = ("font.size", "axes.labelsize"), ("xtick", "ytick")
     letters: dict[Any, Any] = dict.fromkeys(large, page.letters)
     letters |= {f"{axis}.labelsize": page.letters - 1.0 for axis in small}
     letters["legend.fontsize"] = page.letters - 1.0
-    token = _page.set(page)
+    token, into = _page.set(page), _target.set(ax)
     try:
         with matplotlib.rc_context(_STYLE | letters), np.errstate(over="ignore", invalid="ignore"):
             yield
     finally:
         _page.reset(token)
+        _target.reset(into)
 
 
 def page() -> FigureSize:
     """Return the present page."""
     return _page.get()
+
+
+def target() -> "Axes | None":
+    """Return the caller's axes, if figures are drawn into these."""
+    return _target.get()
 
 
 # ---- lines ------------------------------------------------------------------------------------
@@ -183,18 +193,36 @@ def raised(unit: str) -> str:
     return unit.replace("^2", "\u00b2").replace("^3", "\u00b3")
 
 
+def sheet(
+    height: float, rows: int = 1, columns: int = 1, **share: Any
+) -> "tuple[Figure, list[list[Axes]]]":
+    """Return a figure `height` inches high with its axes, or the caller's `ax` and its figure.
+
+    Raises:
+        OutputError: the figure has several axes, and the caller gave one.
+    """
+    from matplotlib.figure import Figure
+
+    ax = target()
+    if ax is None:
+        figure = Figure((page().width, height), layout="constrained")
+        axes = figure.subplots(rows, columns, squeeze=False, **share)
+        return figure, [list(row) for row in axes]
+    if rows * columns > 1:
+        raise OutputError("this figure has several axes; leave `ax` out.")
+    return cast("Figure", ax.figure), [[ax]]
+
+
 def panels(
     times: Array, horizon: float, count: int, height: float, columns: int = 1
 ) -> "tuple[Figure, list[Axes]]":
     """Return panels row by row with a common time axis, `height` inches each if they fit."""
-    from matplotlib.figure import Figure
-
     rows = -(-count // columns)
     # Smaller letters need less height.
     height *= page().letters / 10.0 if page().narrow else 1.0
     tall = float(np.clip(height * rows, 2.3 if page().narrow else 3.2, _HIGHEST))
-    figure = Figure((page().width, tall), layout="constrained")
-    axes = list(figure.subplots(rows, columns, sharex=True, squeeze=False).ravel())
+    figure, lines = sheet(tall, rows, columns, sharex=True)
+    axes = [ax for line in lines for ax in line]
     # A margin for a single frame, whose dot the axis would cut in half.
     axes[0].set_xlim((0.0, times[-1]) if len(times) > 1 else (-0.02 * horizon, horizon))
     for ax in axes[count:]:
@@ -207,93 +235,8 @@ def panels(
 
 def grid(rows: int, columns: int, height: float) -> "tuple[Figure, list[list[Axes]]]":
     """Return panels with a common value axis per row and a common time axis per column."""
-    from matplotlib.figure import Figure
-
     height *= page().letters / 10.0 if page().narrow else 1.0
-    figure = Figure((page().width, max(2.3, height * rows)), layout="constrained")
-    axes = figure.subplots(rows, columns, sharex="col", sharey="row", squeeze=False)
-    return figure, [list(row) for row in axes]
-
-
-def canvas(labels: Sequence[str]) -> "tuple[Figure, Axes]":
-    """Return axes in the plane or in space, for two or three labels."""
-    from matplotlib.figure import Figure
-
-    if len(labels) == 2:
-        figure = Figure((page().width, 0.6 * page().width), layout="constrained")
-        ax: Any = figure.add_subplot()
-    else:
-        figure = Figure((page().width, page().width))
-        ax = figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d", computed_zorder=False)
-        ax.view_init(elev=30.0, azim=-60.0)
-        for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
-            axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
-            axis.line.set_color("0.5")
-    for name, text in zip("xyz", labels, strict=False):
-        getattr(ax, f"set_{name}label")(text)
-    return figure, ax
-
-
-def frame(ax: "Axes", points: Array, alike: bool = True) -> None:
-    """Fit axes around points (..., 2 or 3), with one scale for all directions if `alike`."""
-    points = points.reshape(-1, points.shape[-1])
-    points = points[np.isfinite(points).all(axis=1)]
-    low, high = points.min(axis=0), points.max(axis=0)
-    size = high - low
-    # A flat path needs a box of some height, a single point one of any size.
-    least = np.full_like(size, 0.25 * size.max()) if alike else 0.05 * np.abs(high)
-    half = 0.54 * np.maximum(size, np.where(least > 0.0, least, 1.0))
-    for name, middle, reach in zip("xyz", 0.5 * low + 0.5 * high, half, strict=False):
-        getattr(ax, f"set_{name}lim")(middle - reach, middle + reach)
-    if len(half) == 3:
-        _fit_box(ax, half)
-    elif alike:
-        ax.set_aspect("equal")
-        wide, figure = page().width / 1.4, cast("Figure", ax.figure)
-        figure.set_figheight(np.clip(0.7 + wide * half[1] / half[0], 2.0, 1.04 * wide))
-
-
-def _fit_box(ax: Any, half: Array) -> None:
-    """Scale the box of a space to the width or height of the figure, and fit the figure to it."""
-    width, side = page().width, page().side
-    available, left = np.array([side, side]), 0.07 * width
-    ax.set_position((0.0, 0.0, side / width, side / width))
-    ax.set_box_aspect(half / half.max())
-    zoom = 1.0
-    # Under perspective the size is not quite proportional to the zoom, so it is corrected once.
-    for _ in range(2):
-        low, high = _box_on_paper(ax)
-        zoom *= (available / (high - low)).min()
-        ax.set_box_aspect(half / half.max(), zoom=zoom)
-    low, high = _box_on_paper(ax)
-    height = high[1] - low[1] + 0.75
-    corner = np.array([left + 0.5 * (available[0] - high[0] + low[0]), 0.45]) - low
-    ax.figure.set_figheight(height)
-    ax.set_position((corner[0] / width, corner[1] / height, side / width, side / height))
-    _label_box(ax, half)
-
-
-def _label_box(ax: Any, half: Array) -> None:
-    """Choose the ticks of a box, with the same distance of labels for any box."""
-    from matplotlib.ticker import MaxNLocator
-
-    for k, name in enumerate("xyz"):
-        axis, count = getattr(ax, f"{name}axis"), 5 if half[k] > 0.4 * half.max() else 3
-        axis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10]))
-        # Matplotlib measures these distances in widths of the box.
-        stretch = page().side / 5.6 * half.max() / np.delete(half, k).max()
-        axis.labelpad = 24.5 * stretch - (15.0 if page().narrow else 21.0)
-        ax.tick_params(axis=name, pad=11.0 * stretch - 8.0)
-
-
-def _box_on_paper(ax: Any) -> tuple[Array, Array]:
-    """Return the lower left and upper right corners of a space's box, in inches."""
-    ax.apply_aspect()
-    corners = list(itertools.product(ax.get_xlim(), ax.get_ylim(), ax.get_zlim(), [1.0]))
-    x, y, _, scale = ax.get_proj() @ np.array(corners).T
-    pixels = ax.transData.transform(np.column_stack([x, y]) / scale[:, None]) - ax.bbox.p0
-    inches = pixels / ax.figure.dpi
-    return inches.min(axis=0), inches.max(axis=0)
+    return sheet(max(2.3, height * rows), rows, columns, sharex="col", sharey="row")
 
 
 def above_zero(values: Array) -> Array:
@@ -327,8 +270,12 @@ def logarithmic(ax: "Axes", *values: Array) -> None:
 def finish(figure: "Figure", cut: bool = False, once: bool = False, corner: Any = None) -> "Figure":
     """Add legends (only the first if `once`, or one at `corner`) and a note on missing parts.
 
-    The layout is computed here, once for all file formats.
+    The layout is computed here, once for all file formats. In the caller's `ax` it is the caller's.
     """
+    if (ax := target()) is not None:
+        if ax.get_legend_handles_labels()[1]:
+            ax.legend()
+        return figure
     first = figure.axes[:1] if corner is None or page().narrow else [corner]
     for ax in first if once else figure.axes:
         if ax.get_legend_handles_labels()[1]:

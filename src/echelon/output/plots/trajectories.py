@@ -10,6 +10,7 @@ from echelon.experiments.results.recording import Recording
 from echelon.output.plots import agent_style
 from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import label, name_of, pen_of, reference_of
+from echelon.output.plots.canvas import canvas, frame
 from echelon.output.plots.curves import states_over_time
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ def leader(run: Recording) -> "Figure":
         for name, place, shape in (("start", path[:1], "o"), ("end", path[-1:], "s")):
             look = draw.dots(shape, draw.LEADER, hollow=name == "start")
             draw.plot(ax, place, label=name if first else None, **look)
-    draw.frame(ax, np.concatenate([*paths, *references]), alike=len(run.position) > 1)
+    frame(ax, np.concatenate([*paths, *references]), alike=len(run.position) > 1)
     return draw.finish(figure, cut)
 
 
@@ -67,7 +68,7 @@ def _paths(run: Recording, axes: list[int]) -> "Figure":
         look = pen_of(run, agent)
         draw.plot(ax, path, label=name_of(run, agent, short=True), **look)
     _snapshots(ax, run, agents, paths)
-    draw.frame(ax, paths, alike=bool(run.position))
+    frame(ax, paths, alike=bool(run.position))
     ax.set_title(agent_style.count_title(run, len(agents)), size=draw.page().letters)
     return draw.finish(figure, cut)
 
@@ -130,4 +131,4 @@ def _space(run: Recording) -> list[int]:
 
 
 def _canvas(run: Recording, axes: Sequence[int]) -> "tuple[Figure, Axes]":
-    return draw.canvas([label(run, k) for k in axes])
+    return canvas([label(run, k) for k in axes])

@@ -20,6 +20,7 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
     guarantee = promise(result.parts, result.settings)
     return (
         *_outcome(result, numbers),
+        *_closest(result, numbers),
         *(cause.sentence() for cause in causes(result, numbers, guarantee)),
         *_world(result),
         *_guarantee(result, guarantee),
@@ -51,6 +52,12 @@ def _outcome(result: Result, numbers: Metrics) -> Iterator[str]:
             f"{len(times) - len(settled)} of {len(times)} followers have not settled to 0.01{unit} "
             f"by {result.times[-1]:g} s."
         )
+
+
+def _closest(result: Result, numbers: Metrics) -> Iterator[str]:
+    """Yield which agents came closest to each other, and whether vehicles would have touched."""
+    if numbers.closest is not None and result.outcome is not Outcome.DIVERGED:
+        yield numbers.closest.sentence(result.radius)
 
 
 def _world(result: Result) -> Iterator[str]:

@@ -49,7 +49,9 @@ def print_report(console: "Console", result: Result, numbers: Metrics) -> None:
 
 def say(console: "Console", sentence: str) -> None:
     """Print a sentence as an item of a list, on one line where the output is no terminal."""
-    console.print(f"- {sentence}", highlight=False, markup=False, soft_wrap=not console.is_terminal)
+    look = "bold red" if sentence.startswith("Warning: ") else None
+    wrap = not console.is_terminal
+    console.print(f"- {sentence}", style=look, highlight=False, markup=False, soft_wrap=wrap)
 
 
 def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":

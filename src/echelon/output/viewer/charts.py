@@ -42,9 +42,11 @@ class _Sheet:
         curve = np.asarray(values, np.float64)[self.frames]
         if log:
             # A logarithm has no 0, and values below the floor are rounding errors.
-            curve = np.log10(np.where(curve > floor, curve, np.nan))
-        self.columns.append(np.where(np.isfinite(curve), curve, np.nan))
-        return {"name": name, "colour": colour, "series": len(self.columns) - 1}
+            with np.errstate(divide="ignore", invalid="ignore"):
+                curve = np.where(curve <= floor, -np.inf, np.log10(curve))
+        self.columns.append(np.where(curve == np.inf, np.nan, curve))
+        line: JsonObject = {"name": name, "colour": colour, "series": len(self.columns) - 1}
+        return line | ({"floor": floor} if log else {})
 
 
 def charts_of(run: Recording) -> Charts:

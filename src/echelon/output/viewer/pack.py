@@ -13,8 +13,8 @@ import numpy as np
 from echelon.core.types import Array, JsonObject
 
 FINE, COARSE, BYTE = 65535, 1023, 255
-GAP = 65535
-"""The code of a missing number in a series, which has one level less."""
+GAP, BELOW = 65535, 65534
+"""Codes in groups with gaps, which have two levels less: no finite number, and -inf."""
 
 
 class Group(NamedTuple):
@@ -24,7 +24,7 @@ class Group(NamedTuple):
         values: (T, C).
         levels: between the extremes of a channel; 255 or less takes one byte.
         limits: the extremes; None for each channel's own.
-        gaps: whether a number may be missing (NaN).
+        gaps: whether numbers may be missing: NaN, or -inf for what is below the axis.
     """
 
     values: Array
@@ -51,13 +51,15 @@ def pack(header: JsonObject, groups: dict[str, Group]) -> bytes:
 def _pack_group(group: Group) -> tuple[bytes, JsonObject]:
     values = np.asarray(group.values, np.float64)
     low, high = _extremes(values, group.limits)
-    levels = group.levels - 1 if group.gaps else group.levels
+    levels = group.levels - 2 if group.gaps else group.levels
     # Rounded before use, so that page and Python compute with the same numbers.
     low = np.array([float(f"{value:.9g}") for value in low])
     step = np.array([float(f"{value:.9g}") for value in np.maximum((high - low) / levels, 0.0)])
     safe = np.where(step > 0.0, step, 1.0)
-    scaled = np.round((values - low) / safe)
-    q = np.where(np.isnan(scaled), GAP, np.clip(np.nan_to_num(scaled), 0, levels)).astype(np.int64)
+    scaled = np.nan_to_num(np.round((values - low) / safe))
+    q = np.clip(scaled, 0, levels).astype(np.int64)
+    if group.gaps:
+        q = np.where(np.isfinite(values), q, np.where(values == -np.inf, BELOW, GAP))
     differences = np.diff(q.T, axis=1, prepend=0)
     wide = group.levels > BYTE
     # Modulo 2^16 or 2^8, as the page adds them up.
@@ -66,7 +68,8 @@ def _pack_group(group: Group) -> tuple[bytes, JsonObject]:
     if wide:
         block += (d >> 8).astype(np.uint8).tobytes()
     ranges = {"low": low.tolist(), "step": step.tolist()}
-    return block, {**ranges, "frames": len(values), "bytes": 2 if wide else 1}
+    numbers = {"frames": len(values), "bytes": 2 if wide else 1, "gaps": group.gaps}
+    return block, ranges | numbers
 
 
 def _extremes(values: Array, limits: tuple[float, float] | None) -> tuple[Array, Array]:

@@ -41,10 +41,11 @@ def replay_data(run: Recording) -> bytes:
         raise OutputError("the run has no stored frame; a page needs at least one.")
     space, charts = space_of(run), charts_of(run)
     frames = frames_of(run)
-    groups = {"positions": Group(_flat(clipped_places(run, space.axes)[0][frames]))}
+    groups = {"positions": Group(_flat(clipped_places(run, space.axes)[0][frames]), gaps=True)}
     if space.angles:
         # Without jumps, so that the page can interpolate.
-        angles = space.sign * np.unwrap(run.states[:, :, list(space.angles)], axis=0)
+        angles = run.states[:, :, list(space.angles)]
+        angles = space.sign * np.unwrap(np.where(np.isfinite(angles), angles, 0.0), axis=0)
         groups["angles"] = Group(_flat(angles[frames]))
     loads, many = motor_loads(run, space), run.agents > FLOCK
     if loads is not None:

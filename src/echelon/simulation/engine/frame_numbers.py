@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,12 +13,47 @@ _FEW = 8
 """Agents up to which comparing all pairs is faster than a search for the nearest."""
 
 
+class ClosestPair(NamedTuple):
+    """Two agents when they were closest to each other.
+
+    Attributes:
+        distance: between them, m.
+        agents: their numbers, ascending.
+        time: of the stored frame, s.
+    """
+
+    distance: float
+    agents: tuple[int, int]
+    time: float
+
+    def touch(self, radius: float | None) -> bool:
+        """Return whether agents of a radius (m) touched; None has no size."""
+        return radius is not None and self.distance < 2.0 * radius
+
+    def sentence(self, radius: float | None) -> str:
+        """Return who was closest, how close and when, beside the size of agents of a radius (m)."""
+        one, other = self.agents
+        size = "" if radius is None else f"agents of radius {radius:.2g} m touch below"
+        if radius is not None and self.touch(radius):
+            return (
+                f"Warning: agents {one} and {other} came within {self.distance:.3g} m at "
+                f"{self.time:.4g} s; {size} {2.0 * radius:.3g} m, and the simulation lets them "
+                "pass through each other."
+            )
+        text = f"Smallest distance: {self.distance:.3g} m, agents {one} and {other} at "
+        text += f"{self.time:.4g} s"
+        return f"{text}; {size} {2.0 * radius:.3g} m." if radius is not None else f"{text}."
+
+
 _Some: TypeAlias = slice | Sequence[int] | Int[Array, " F"]
 """Which frames."""
 
 
 class _Frames(Protocol):
     """What the numbers are computed from."""
+
+    @property
+    def times(self) -> Float[Array, " T"]: ...
 
     @property
     def states(self) -> Float[Array, "T N n"]: ...
@@ -38,6 +73,8 @@ class _Frames(Protocol):
     def deviations(self, frames: _Some = slice(None)) -> Float[Array, "F N n"]: ...
 
     def goal_distances(self, frames: _Some = slice(None)) -> Float[Array, "F N"]: ...
+
+    def least_distances(self, frames: _Some = slice(None)) -> Float[Array, " F"] | None: ...
 
 
 class FrameNumbers(abc.ABC):
@@ -94,6 +131,28 @@ class FrameNumbers(abc.ABC):
         finite = np.isfinite(places).all(axis=(1, 2))
         least[finite] = _least(places[finite])
         return least
+
+    def closest_pair(self: _Frames) -> ClosestPair | None:
+        """Return which agents were closest to each other in the stored frames, and when.
+
+        None without a position, a second agent or a frame of finite numbers.
+        """
+        least = self.least_distances() if self.states.shape[1] > 1 else None
+        if least is None or not np.isfinite(least).any():
+            return None
+        frame = int(np.nanargmin(least))
+        agents = _nearest_two(self.states[frame][:, list(self.position)])
+        return ClosestPair(float(least[frame]), agents, float(self.times[frame]))
+
+
+def _nearest_two(places: Float[Array, "N k"]) -> tuple[int, int]:
+    from scipy.spatial import KDTree
+
+    away, near = map(np.asarray, KDTree(places).query(places, k=2))
+    first = int(away[:, 1].argmin())
+    # Agents in one place come in any order.
+    other = next(int(agent) for agent in near[first] if agent != first)
+    return min(first, other), max(first, other)
 
 
 def _least(places: Float[Array, "T N k"]) -> Float[Array, " T"]:

@@ -108,6 +108,11 @@ class Result(FrameNumbers):
         return self.model.position_indices()
 
     @property
+    def radius(self) -> float | None:
+        """The radius of an agent, m; None without a position or a size."""
+        return self.model.radius if self.position else None
+
+    @property
     def unit(self) -> str:
         """The unit of errors: m for a position, `state` for abstract states."""
         return self.length_unit or "state"

@@ -4,9 +4,11 @@ const RAISED = "\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079";
 const raise = (k) => "10" + (k < 0 ? "\u207b" : "") + [...String(Math.abs(k))].map((digit) => RAISED[digit]).join("");
 const MARGIN = { left: 46, right: 14, top: 6, bottom: 20 };
 
-// A number with three digits.
+const NOT_FINITE = "\u2013 not finite";
+
+// A number with three digits; a dash and the reason for what is none.
 function brief(value) {
-  if (!Number.isFinite(value)) return "\u2013";
+  if (!Number.isFinite(value)) return NOT_FINITE;
   const size = Math.abs(value);
   if (!size) return "0";
   if (size < 1e-3 || size >= 1e5) {
@@ -173,10 +175,12 @@ class Chart {
     const k = Math.max(0, Math.min(this.times.length - 1, upper(this.times, time) - 1));
     // Values far below the axis are rounding errors.
     const most = Math.max(...this.reach().map(Math.abs));
+    const words = (value, floor) => {
+      if (this.log) return value === -Infinity ? `< ${brief(floor)}` : brief(10 ** value);
+      return brief(Math.abs(value) < 1e-9 * most ? 0 : value);
+    };
     this.lines.forEach((line, place) => {
-      const value = line.values[k];
-      if (this.readouts[place] && !line.mute)
-        this.readouts[place].textContent = Number.isFinite(value) ? brief(this.log ? 10 ** value : Math.abs(value) < 1e-9 * most ? 0 : value) : this.log ? "0" : "";
+      if (this.readouts[place] && !line.mute && this.times.length) this.readouts[place].textContent = words(line.values[k], line.floor);
     });
   }
 }

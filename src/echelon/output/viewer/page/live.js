@@ -1,6 +1,6 @@
 // The live page: scene and charts of a stream, and the controls of the loop.
 
-const CHART_SECONDS = 30;
+const CHART_SECONDS = 30, FLOOR = 1e-17;
 
 // Reads blocks from a stream; each follows its length.
 async function* blocksOf(response) {
@@ -44,7 +44,8 @@ class Live {
   // ---- pictures ----
 
   makeCharts() {
-    const { run } = this, line = (name, colour) => ({ name, colour, values: [] });
+    // V is a square of errors.
+    const { run } = this, line = (name, colour) => ({ name, colour, values: [], floor: name === "V" ? FLOOR ** 2 : FLOOR });
     const charts = [{ title: "formation error", unit: run.unit, log: true, lines: [line("worst", 1), line("median", 0)], marks: [{ value: 0.01, name: run.unit ? "1 cm" : "0.01" }] }];
     if (run.limited) charts.push({ title: run.loads ? "motors" : "inputs", unit: "% of limit", log: false, lines: [line("largest", 1), line("smallest", 0)], marks: [{ value: 100, name: "limit", below: true }, { value: 0, name: "limit" }] });
     if (run.lyapunov) charts.splice(1, 0, { title: "Lyapunov function V", unit: "", log: true, lines: [line("V", 0)], marks: [] });
@@ -73,9 +74,8 @@ class Live {
     moment.time = time;
     this.numbers = { worst, median, lyapunov, factor, wind };
     // A logarithm has no 0, and values below the floor are rounding errors.
-    const log = (value, floor = 1e-17) => (value > floor ? Math.log10(value) : NaN);
-    // V is a square of errors.
-    this.chart(time, [[log(worst), log(median)], ...(run.lyapunov ? [[log(lyapunov, 1e-34)]] : []), [100 * most, 100 * least]]);
+    const log = (value, floor = FLOOR) => (value <= floor ? -Infinity : Math.log10(value));
+    this.chart(time, [[log(worst), log(median)], ...(run.lyapunov ? [[log(lyapunov, FLOOR ** 2)]] : []), [100 * most, 100 * least]]);
     this.clock.innerHTML = `<b>${time.toFixed(1)}</b> s${factor < 0.95 ? ` \u00b7 ${factor.toFixed(2)} \u00d7 real time` : ""}`;
     this.show();
   }

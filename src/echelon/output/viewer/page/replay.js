@@ -104,14 +104,10 @@ class Player {
   }
 }
 
-// Charts with their curves; the largest 16-bit number stands for a gap.
+// Charts with their curves.
 function readCharts(run) {
   if (!run.series) return [];
-  const { values, low, step, frames } = run.series;
-  const curve = (c) => Array.from({ length: frames }, (_, k) => {
-    const value = values[c * frames + k];
-    return value === 65535 ? NaN : low[c] + step[c] * value;
-  });
+  const curve = (c) => Array.from({ length: run.series.frames }, (_, k) => valueOf(run.series, c, k, 0));
   return run.charts.map((chart) => ({
     ...chart,
     times: run.chartTimes,

@@ -8,8 +8,8 @@ async function inflate(text) {
 }
 
 // A group of channels: differences in time, channel by channel, low bytes before high ones.
-function readGroup(raw, start, group, frames) {
-  const channels = group.low.length, size = channels * frames;
+function readGroup(raw, start, group) {
+  const { frames } = group, channels = group.low.length, size = channels * frames;
   const wide = group.bytes === 2, values = new Uint16Array(size);
   for (let c = 0, at = 0; c < channels; c++) {
     let sum = 0;
@@ -18,14 +18,17 @@ function readGroup(raw, start, group, frames) {
       values[at] = sum &= wide ? 0xffff : 0xff;
     }
   }
-  return { values, low: group.low, step: group.step, frames, end: start + size * group.bytes };
+  return { ...group, values, end: start + size * group.bytes };
 }
+
+// Codes of no finite number, and of one below the axis.
+const GAP = 65535, BELOW = 65534;
 
 // The value of channel c between frames k and k + 1.
 function valueOf(group, c, k, part) {
-  const at = c * group.frames + k, first = group.values[at];
-  const value = part > 0 ? first + part * (group.values[at + 1] - first) : first;
-  return group.low[c] + group.step[c] * value;
+  const at = c * group.frames + k, first = group.values[at], second = part > 0 ? group.values[at + 1] : first;
+  if (group.gaps && (first >= BELOW || second >= BELOW)) return first === second && first === BELOW ? -Infinity : NaN;
+  return group.low[c] + group.step[c] * (first + part * (second - first));
 }
 
 // The state at one time, filled by a replay or a stream and drawn by the scene.
@@ -66,7 +69,7 @@ class Replay {
     this.offsets = expand(header.offsets, header.agents, header.space);
     let at = 0;
     for (const [name, group] of Object.entries(header.groups)) {
-      const read = readGroup(raw, at, group, group.frames);
+      const read = readGroup(raw, at, group);
       at = read.end;
       this[name] = read;
     }

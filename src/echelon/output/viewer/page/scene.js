@@ -303,8 +303,9 @@ class View {
     const { state, run } = this, { position: p, turn: q, motors: m, goal: g } = moment;
     for (let i = 0; i < run.agents; i++) {
       let at = 4 * this.texel(i, 0);
-      state[at] = p[3 * i], state[at + 1] = p[3 * i + 1], state[at + 2] = p[3 * i + 2];
-      state[at + 3] = i === this.selected ? 1 : 0;
+      const exists = Number.isFinite(p[3 * i] + p[3 * i + 1] + p[3 * i + 2]);
+      for (let k = 0; k < 3; k++) state[at + k] = exists ? p[3 * i + k] : 0;
+      state[at + 3] = !exists ? -1 : i === this.selected ? 1 : 0;
       for (let k = 0; k < 4; k++) (state[at + 4 + k] = q[4 * i + k]), (state[at + 8 + k] = m[4 * i + k]);
       at += 16;
       state[at] = g[3 * i], state[at + 1] = g[3 * i + 1], state[at + 2] = g[3 * i + 2];
@@ -351,10 +352,10 @@ class View {
     if (this.targetSharpness < 1) this.rest = setTimeout(() => ((this.targetSharpness = 1), this.draw()), 400);
   }
 
-  // The pixel of a place in the scene; null behind the camera.
+  // The pixel of a place in the scene; null behind the camera, and where the place is no number.
   project(x, y, z) {
     const v = new THREE.Vector3(x, y, z).project(this.camera);
-    if (v.z > 1 && !this.flat) return null;
+    if ((v.z > 1 && !this.flat) || !Number.isFinite(v.x + v.y)) return null;
     return [(0.5 + 0.5 * v.x) * this.element.clientWidth, (0.5 - 0.5 * v.y) * this.element.clientHeight];
   }
 

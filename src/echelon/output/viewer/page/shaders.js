@@ -1,5 +1,5 @@
 // Shaders. The state of all agents is one texture with five texels per agent:
-// 0 place and mark, 1 attitude, 2 motors, 3 colour and size, 4 goal and its visibility.
+// 0 place and mark (1 selected, -1 without a finite place), 1 attitude, 2 motors, 3 colour and size, 4 goal and its visibility.
 
 const COLUMNS = 64, TEXELS = 5;
 
@@ -51,7 +51,7 @@ void main() {
   } else {
     p = place.xyz + p * place.w;
   }
-  gl_Position = projectionMatrix * modelViewMatrix * vec4(p, 1.0);
+  gl_Position = place.w < -0.5 ? vec4(2.0, 2.0, 2.0, 1.0) : projectionMatrix * modelViewMatrix * vec4(p, 1.0);
 }`,
   fragmentShader: `in vec3 shade; out vec4 colour; void main() { colour = vec4(shade, 1.0); }`,
 };
@@ -114,7 +114,7 @@ void main() {
     shade = kind < 4.5 ? vec4(goalColour, 0.75 * goals * goal.w) : vec4(shadow, 1.0);
   }
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-  if (shade.a <= 0.0) return;
+  if (shade.a <= 0.0 || min(texel(ends.x, 0).w, texel(ends.y, 0).w) < -0.5) return;
   if (kind > 2.5 && kind < 3.5) gl_Position = head(first, second, corner, 0.62 * texel(ends.y, 3).w);
   else gl_Position = ribbon(first, second, corner, wide);
 }`,

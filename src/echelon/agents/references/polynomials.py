@@ -1,0 +1,221 @@
+"""Polynomial pieces as Crazyswarm2 and the Crazyflie's firmware fly them, and their files."""
+
+import math
+from collections.abc import Iterator, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.references.path_file import read_columns
+from echelon.agents.references.polynomial_path import PolynomialPath
+from echelon.agents.references.reference import COORDINATES, Reference, numbers_of
+from echelon.core.errors import ReferenceError
+from echelon.core.numerics import precision
+from echelon.core.types import Array, PathLike
+
+_COLUMNS = ("duration", *(f"{name}^{k}" for name in COORDINATES for k in range(8)))
+_ORDERS = 4
+"""The value and three derivatives at both ends determine a polynomial of degree 7."""
+_SAME = 1e-3
+"""Largest jump, in m or rad and their derivatives, that counts as rounding of a file's digits."""
+_CLOSE, _MANY = 1e-4, 4096
+"""Largest distance of written pieces from their path, m or rad, and their largest number."""
+_LONG = 4.0
+"""Duration of the first pieces that are tried, s; then there are more."""
+_BETWEEN = np.linspace(0.0, 1.0, 9)[1:-1]
+
+
+class Polynomials(PolynomialPath):
+    """Polynomial pieces of degree 7, one after the other from time 0; then the path is constant.
+
+    Files have few digits, with which pieces do not quite meet: where value or one of the first
+    three derivatives jump by at most 1e-3 (m or rad, s), both sides get their mean, and at the end
+    derivatives below it become 0.
+
+    Args:
+        durations: (P,) of the pieces, s.
+        coefficients: (P, 4, 8) of x, y, z, yaw over the time since the beginning of the piece, the
+            constant first; m and rad.
+
+    Raises:
+        ReferenceError: a number is not finite, a duration not positive, or the place or the yaw
+            jumps between two pieces.
+    """
+
+    knots: Array
+    coefficients: Array
+    # How many derivatives are continuous is a property of the pieces.
+    joined: int = eqx.field(static=True, default=0)  # pyright: ignore
+
+    def __init__(
+        self,
+        durations: Sequence[float] | Array,
+        coefficients: Sequence[Sequence[Sequence[float]]] | Array,
+    ) -> None:
+        """Join the pieces."""
+        spans, powers = _checked(durations, coefficients)
+        for piece, fault in _faults(spans, powers):
+            raise ReferenceError(f"piece {piece} of `Polynomials` {fault}.")
+        ends, self.joined = _joined(_ends(spans, powers))
+        self.knots = np.concatenate([[0.0], np.cumsum(spans)])
+        self.coefficients = np.moveaxis(_between(spans, ends), 2, 0)[::-1]
+
+    @classmethod
+    def read(cls, file: PathLike, model: ControlAffine | None = None) -> "Polynomials":
+        """Return the path in a CSV file of Crazyswarm2.
+
+        Args:
+            file: its first line names the columns `duration`, `x^0` to `x^7`, and likewise for `y`,
+                `z` and `yaw`.
+            model: not used; a path in space does not depend on it.
+
+        Raises:
+            ReferenceError: the file cannot be read, or a line is wrong; the message names it.
+        """
+        values, lines = read_columns(file, _COLUMNS)
+        spans, powers = values[:, 0], values[:, 1:].reshape(len(values), len(COORDINATES), 8)
+        for piece, fault in _faults(spans, powers):
+            raise ReferenceError(f"the piece of the path at `{file}:{lines[piece]}` {fault}.")
+        return cls(spans, powers)
+
+    @classmethod
+    def of(cls, path: Reference, horizon: float) -> "Polynomials":
+        """Return pieces that follow a path to 0.1 mm and 1e-4 rad.
+
+        Paths of polynomials, such as `Waypoints`, are returned whole and exactly; of any other the
+        pieces have equal durations, and the same value and three derivatives where they meet.
+
+        Args:
+            path: the path.
+            horizon: its length, s.
+
+        Raises:
+            ReferenceError: the path is not smooth enough for 4096 pieces.
+        """
+        if isinstance(path, PolynomialPath):
+            return _of_polynomials(path)
+        count = math.ceil(horizon / _LONG)
+        while count <= _MANY:
+            times = np.linspace(0.0, horizon, count + 1)
+            with precision("float64"):
+                rows = np.asarray(_sampled(path, times))
+            spans = np.diff(times)
+            powers = _between(spans, np.stack([rows[:-1], rows[1:]], axis=1))
+            if _distance(path, times[:-1], spans, powers) <= _CLOSE:
+                return cls(spans, powers)
+            count += 1 + count // 4
+        raise ReferenceError(
+            f"the path `{type(path).__name__}` is more than {_CLOSE:g} m from {_MANY} polynomials; "
+            "it must be smooth."
+        )
+
+    def moved(self, offset: Sequence[float]) -> "Polynomials":
+        """Return the same path an offset (x, y, z, yaw) away, m and rad."""
+        return eqx.tree_at(
+            lambda path: path.coefficients,
+            self,
+            self.coefficients + np.eye(8)[-1][:, None, None] * np.asarray(offset),
+        )
+
+    def text(self) -> str:
+        """Return the CSV file that Crazyswarm2 reads; every number as read back exactly."""
+        powers = np.moveaxis(self.coefficients[::-1], 0, 2)
+        rows = np.column_stack([np.diff(self.knots), powers.reshape(len(powers), -1)])
+        lines = [",".join(map(repr, row)) for row in rows.tolist()]
+        return "\n".join([",".join(_COLUMNS), *lines, ""])
+
+
+def _checked(durations: object, coefficients: object) -> tuple[Array, Array]:
+    spans, powers = numbers_of(durations), numbers_of(coefficients)
+    count = len(spans) if spans.ndim == 1 else 0
+    if not count or powers.shape != (count, len(COORDINATES), 8) or not np.isfinite(powers).all():
+        raise ReferenceError(
+            f"`coefficients` of `Polynomials` has shape {powers.shape}, and must be finite numbers "
+            f"of shape ({count or 'P'}, 4, 8) for {count or 'P'} durations."
+        )
+    return spans, powers
+
+
+def _faults(spans: Array, powers: Array) -> Iterator[tuple[int, str]]:
+    """Yield the pieces that last no time or begin away from the end of the one before."""
+    for k in np.flatnonzero(~((spans > 0.0) & np.isfinite(spans))):
+        yield int(k), f"lasts {spans[k]:g} s, and must last a positive time"
+    ends = _ends(spans, powers)
+    jumps = np.abs(ends[:-1, 1, 0] - ends[1:, 0, 0])
+    for k in np.flatnonzero((jumps > _SAME).any(axis=1)):
+        where = f"{jumps[k, :3].max():.3g} m and {jumps[k, 3]:.3g} rad"
+        yield int(k) + 1, f"begins {where} from the end of the one before, and must begin there"
+
+
+def _falling(s: float) -> Float[Array, "4 8"]:
+    """Return the derivatives of order 0 to 3 of the powers 0 to 7 at s."""
+    powers = np.arange(8)
+    factors = [[math.perm(p, order) for p in powers] for order in range(_ORDERS)]
+    exponents = np.maximum(powers - np.arange(_ORDERS)[:, None], 0)
+    return np.array(factors) * float(s) ** exponents
+
+
+def _ends(spans: Float[Array, " P"], powers: Float[Array, "P 4 8"]) -> Float[Array, "P 2 4 4"]:
+    """Return the derivatives [order, coordinate] of pieces at their beginning and end."""
+    at = np.array([[_falling(0.0), _falling(span)] for span in spans])
+    return np.einsum("peok,pck->peoc", at, powers)
+
+
+def _joined(ends: Float[Array, "P 2 4 4"]) -> tuple[Float[Array, "P 2 4 4"], int]:
+    """Return the derivatives of pieces that meet, and how many of them are continuous."""
+    left, right = ends[:, 1], np.roll(ends[:, 0], -1, axis=0)
+    right[-1] = 0.0
+    right[-1, 0] = left[-1, 0]
+    near = np.abs(left - right) <= _SAME
+    middle = 0.5 * (left + right)
+    middle[-1] = right[-1]
+    ends = ends.copy()
+    ends[:, 1] = np.where(near, middle, left)
+    ends[1:, 0] = np.where(near, middle, right)[:-1]
+    return ends, int(near.all(axis=(0, 2)).cumprod().sum()) - 1
+
+
+def _between(spans: Float[Array, " P"], ends: Float[Array, "P 2 4 4"]) -> Float[Array, "P 4 8"]:
+    """Return the pieces with these derivatives [order, coordinate] at beginning and end."""
+    # Over a duration of 1, since powers of others would cost digits.
+    scale = spans[:, None] ** np.arange(8)
+    conditions = np.concatenate([_falling(0.0), _falling(1.0)])
+    rows = (ends * scale[:, None, :_ORDERS, None]).reshape(len(spans), 2 * _ORDERS, -1)
+    return np.swapaxes(np.linalg.solve(conditions, rows), 1, 2) / scale[:, None]
+
+
+def _of_polynomials(path: PolynomialPath) -> Polynomials:
+    """Return the pieces of a path of polynomials from time 0 on."""
+    knots, powers = path.knots, np.moveaxis(path.coefficients[::-1], 0, 2)
+    ahead = knots[1:] > 0.0
+    begin = np.maximum(knots[:-1], 0.0) - knots[:-1]
+    low, high = (
+        np.stack([_falling(s) for s in at]) for at in (begin[ahead], np.diff(knots)[ahead])
+    )
+    ends = np.stack([np.einsum("pok,pck->poc", at, powers[ahead]) for at in (low, high)], axis=1)
+    spans = (np.diff(knots) - begin)[ahead]
+    pieces = _between(spans, ends)
+    if knots[0] > 0.0:
+        waiting = np.zeros((1, *pieces.shape[1:]))
+        waiting[..., 0] = pieces[0, :, 0]
+        pieces, spans = np.concatenate([waiting, pieces]), np.concatenate([knots[:1], spans])
+    return Polynomials(spans, pieces)
+
+
+def _sampled(path: Reference, times: Array) -> jax.Array:
+    """Return value and three derivatives (T, 4, 4) of a path."""
+    return jax.vmap(lambda t: path.derivatives(t, _ORDERS - 1, COORDINATES))(jnp.asarray(times))
+
+
+def _distance(path: Reference, begins: Array, spans: Array, powers: Float[Array, "P 4 8"]) -> float:
+    """Return the largest distance of pieces from their path, at points between their ends."""
+    times = begins[:, None] + spans[:, None] * _BETWEEN
+    with precision("float64"):
+        exact = np.asarray(jax.vmap(path)(jnp.asarray(times.ravel())))
+    since = (spans[:, None] * _BETWEEN)[..., None] ** np.arange(8)
+    pieces = np.einsum("psk,pck->psc", since, powers)
+    return float(np.abs(pieces.reshape(exact.shape) - exact).max())
