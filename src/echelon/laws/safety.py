@@ -94,7 +94,7 @@ class Safety:
             raise LawError(f"`safety` needs a position in x, y or z, and `{name}` has {what}.")
         if self.radii is not None:
             return self
-        radius = getattr(model, "radius", None)
+        radius = model.radius
         if radius is None:
             raise LawError(f"`safety` needs `radii`, since `{name}` has no `radius`.")
         return dataclasses.replace(self, radii=(radius, radius, _DOWNWASH * radius))

@@ -175,6 +175,7 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
         text = "the agreement over a period, or eventually"
     text += ", and the leaders' own coupling" * run.apart
     text = f"the slowest of the roots, {text}; far away the `speed` limits it"
+    text += ", and not while agents hold each other back" * (run.law.safety is not None)
     yield holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, -run.rate, f"{-run.rate:.3g} 1/s")
     text = "the law is linear in flat coordinates everywhere"
     yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)

@@ -390,7 +390,7 @@ class NativeStepper(Stepper):
             unsettled=of(rows.unsettled)[:, 0],
             inside=np.minimum(of(rows.inside), ALWAYS),
             chatter=of(rows.chatter)[:, 0],
-            **dict.fromkeys(("nearest", "active"), np.zeros((len(agent_sums), 0))),
+            **dict.fromkeys(("separation", "avoidance"), np.zeros((len(agent_sums), 0))),
         )
         return Sums(*(np.asarray(part, np.float64) for part in sums)).split(len(self.loops))
 

@@ -51,9 +51,9 @@ class Sums(NamedTuple):
         inside: (N, k) the first step at which each of the k states that the model's chart bounds
             was not inside; `ALWAYS` if there is none.
         chatter: (N,) number of steps in which an input went from one limit to the opposite one.
-        nearest: (N, B) where agents keep apart, the least scaled distance to another agent, m, in
+        separation: (N, B) where agents keep apart, the least scaled distance to another agent, m, in
             each of B slices of the run; infinite before.
-        active: (N, B) sum over the steps of a slice of how many others changed the agent's rate.
+        avoidance: (N, B) sum over the steps of a slice of how many others changed the agent's rate.
     """
 
     steps: Total
@@ -66,13 +66,13 @@ class Sums(NamedTuple):
     unsettled: Total
     inside: Total
     chatter: Total
-    nearest: Total
-    active: Total
+    separation: Total
+    avoidance: Total
 
     def plus(self, more: "Sums") -> "Sums":
         """Return the sums of two stretches of a run."""
         total = Sums(*(a + b for a, b in zip(self, more, strict=True)))
-        total = total._replace(nearest=self.nearest.clip(None, more.nearest))
+        total = total._replace(separation=self.separation.clip(None, more.separation))
         # The maximum, and below the minimum; written so that NumPy on the host and JAX within a
         # chunk both have it.
         last = self.unsettled + (more.unsettled - self.unsettled).clip(0)
@@ -199,8 +199,8 @@ class Meter(eqx.Module):
             unsettled=xp.full(agents, -1, np.int32),
             inside=xp.full((agents, len(self.charted)), ALWAYS, np.int32),
             chatter=xp.zeros(agents, np.int32),
-            nearest=xp.full((agents, self.slices), jnp.inf, dtype),
-            active=xp.zeros((agents, self.slices), dtype),
+            separation=xp.full((agents, self.slices), jnp.inf, dtype),
+            avoidance=xp.zeros((agents, self.slices), dtype),
         )
 
     def read(
@@ -242,21 +242,21 @@ class Meter(eqx.Module):
             unsettled=rows.unsettled.astype(jnp.int32),
             inside=rows.inside.astype(jnp.int32),
             chatter=chatter.astype(jnp.int32),
-            nearest=jnp.full((len(states), self.slices), jnp.inf, states.dtype),
-            active=jnp.zeros((len(states), self.slices), states.dtype),
+            separation=jnp.full((len(states), self.slices), jnp.inf, states.dtype),
+            avoidance=jnp.zeros((len(states), self.slices), states.dtype),
         )
 
-    def separation(
+    def of_slice(
         self, step: jax.Array, states: States, active: Float[jax.Array, " N"]
     ) -> dict[str, jax.Array]:
-        """Return the terms `nearest` and `active` of a step, where agents keep apart."""
+        """Return the terms `separation` and `avoidance` of a step, where agents keep apart."""
         nothing, at = self.zero_sums(), step // jnp.asarray(self.per_slice)
         places = states[:, np.array(self.measured)] * jnp.asarray(self.scales, states.dtype)
         squares = ((places[:, None] - places) ** 2).sum(axis=2)
         others = jnp.where(jnp.eye(len(states), dtype=bool), jnp.inf, squares)
         return {
-            "nearest": nothing.nearest.at[:, at].set(jnp.sqrt(others.min(axis=1))),
-            "active": nothing.active.at[:, at].set(active),
+            "separation": nothing.separation.at[:, at].set(jnp.sqrt(others.min(axis=1))),
+            "avoidance": nothing.avoidance.at[:, at].set(active),
         }
 
     def of_agent(

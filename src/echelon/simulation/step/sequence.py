@@ -239,7 +239,7 @@ def measured_step(
     active = loop.follower.active(acted.follower_memory)
     if active is not None:
         every = jnp.zeros(len(now.states), active.dtype).at[loop.followers].set(active)
-        read = read._replace(**loop.meter.separation(now.step, now.states, every))
+        read = read._replace(**loop.meter.of_slice(now.step, now.states, every))
     return _move(loop, now, acted), read
 
 
