@@ -126,7 +126,8 @@ class Safety:
         Returns:
             The rate (d,), and how many rows act on it.
         """
-        corners = near.gaps * scales
+        # Of who is not known nothing is a number.
+        corners = jnp.where(near.known[:, None, None], near.gaps, 0.0) * scales
         nearest = nearest_point(corners)
         far = jnp.sqrt((nearest * nearest).sum(axis=1))
         normals = nearest / jnp.maximum(far, jnp.finfo(far.dtype).tiny)[:, None]

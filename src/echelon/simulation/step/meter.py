@@ -51,9 +51,9 @@ class Sums(NamedTuple):
         inside: (N, k) the first step at which each of the k states that the model's chart bounds
             was not inside; `ALWAYS` if there is none.
         chatter: (N,) number of steps in which an input went from one limit to the opposite one.
-        separation: (N, B) where agents keep apart, the least scaled distance to another agent, m, in
-            each of B slices of the run; infinite before.
-        avoidance: (N, B) sum over the steps of a slice of how many others changed the agent's rate.
+        separation: (N, B) where agents keep apart, the least scaled distance to another agent, m,
+            in each of B slices of the run; infinite before.
+        avoidance: (N, B) how many others changed the agent's rate, summed over the steps of each.
     """
 
     steps: Total
