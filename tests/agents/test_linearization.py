@@ -178,7 +178,7 @@ def in_units(drift, sizes, weigh):
 
 @pytest.mark.parametrize("place", [0, 1])
 @pytest.mark.parametrize(
-    "size", [1e-8, *(pytest.param(10.0**k, marks=pytest.mark.slow) for k in (-4, -2, 2, 4)), 1e8]
+    "size", [1e-8, *(pytest.param(10.0**k, marks=pytest.mark.study) for k in (-4, -2, 2, 4)), 1e8]
 )
 def test_a_bend_at_the_trim_is_seen_in_any_units_and_nothing_else(size, place):
     sizes = (size, 1.0) if place == 0 else (1.0, size)

@@ -53,7 +53,7 @@ def test_one_more_leader_or_edge_is_the_best_of_all(drawn):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.study) for k in (1, 2))])
 def test_the_best_edge_is_among_those_that_are_tried_of_many(seed):
     random, agents = np.random.default_rng(seed), 40
     edges = [(int(random.integers(max(0, k - 3), k)), k, 1.0) for k in range(1, agents)]

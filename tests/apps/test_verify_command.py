@@ -218,8 +218,15 @@ def test_no_forged_folder_is_verified(runs, echelon, here, what):
     assert err.count("\n") == (code == 2)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", bundled_scenarios())
+# Another law, a model of another kind, a late network; the rest is a study.
+DRAWN = {"unicycle", "van-der-pol", "paper-radio"}
+EVERY = [
+    pytest.param(name, marks=pytest.mark.slow if name in DRAWN else pytest.mark.study)
+    for name in sorted(bundled_scenarios())
+]
+
+
+@pytest.mark.parametrize("name", EVERY)
 def test_a_run_of_every_bundled_scenario_is_verified(echelon, here, name):
     short = "simulation.horizon=0.5"
     assert echelon("run", name, "--set", short, "--no-figures", "--out", "run")[0] == 0

@@ -643,6 +643,7 @@ def test_the_edge_of_the_chart_is_named(pitch):
         (jax.scipy.special.erf, "uses `erf`, which the hull of Jacobians does not know"),
         (jnp.floor, "uses `floor`"),
         (lambda x: jax.lax.fori_loop(0, 3, lambda k, y: y * x, x), "uses `scan`"),
+        (lambda x: jnp.stack([x, x]).at[1].apply(jnp.sin)[1], "uses `scatter`"),
         (jnp.log, "takes `log` of an expression of `x[0]`"),
         (jnp.sqrt, "must not be negative"),
         (lambda x: jnp.tan(2 * x), "two odd multiples of 90 degrees"),

@@ -93,15 +93,28 @@ CASES |= {"paper-global, motors": MOTORS, "van-der-pol, proved": PROVED}
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("case", ["yaw-turn", "paper-global, motors", "van-der-pol, proved"])
+def test_no_forged_field_of_a_guarantee_agrees_with_its_scenario(case):
+    assert forgeries_of(case, sample(200)) == 200
+
+
+@pytest.mark.study
 @pytest.mark.parametrize("case", CASES)
-def test_no_forged_field_of_any_guarantee_agrees_with_its_scenario(case, tmp_path):
+def test_no_forged_field_of_any_guarantee_agrees_with_its_scenario(case):
+    count = forgeries_of(case, list)
+    assert count > 500
+    print(f"{case}: {count} forged summaries, none accepted")
+
+
+def forgeries_of(case, pick):
+    """Check that the forged fields picked are all refused; return how many there are."""
     name = case.partition(",")[0]
     experiment = ech.build(ech.load_scenario(name, CASES[case]))
     document = stated(experiment, name)
     assert not refused(compare_claims(document, experiment, name))
-    count, missed = accepted(document, experiment, name, list)
-    assert count > 500 and missed == []
-    print(f"{case}: {count} forged summaries, {len(missed)} accepted")
+    count, missed = accepted(document, experiment, name, pick)
+    assert missed == []
+    return count
 
 
 def test_all_that_a_check_prints_is_compared():
@@ -191,7 +204,14 @@ def test_which_values_agree(stored, value, agree):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "case", ["paper-global, motors", "van-der-pol, proved", "yaw-turn", "unicycle"]
+    "case",
+    [
+        "yaw-turn",
+        *(
+            pytest.param(case, marks=pytest.mark.study)
+            for case in ("paper-global, motors", "van-der-pol, proved", "unicycle")
+        ),
+    ],
 )
 def test_a_run_is_verified_where_libraries_round_in_another_way(case, tmp_path):
     """BLAS without vectors of a later processor, and XLA without its optimizer."""

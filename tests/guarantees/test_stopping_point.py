@@ -600,7 +600,7 @@ def test_drag_that_turns_with_the_path_demands_nothing_that_lasts():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [0.7, 1.3])
+@pytest.mark.parametrize("factor", [pytest.param(0.7, marks=pytest.mark.study), 1.3])
 @pytest.mark.parametrize("share", [0.95, 1.05])
 def test_a_plant_of_another_mass_demands_what_it_needs_at_rest(factor, share):
     k0, k1 = np.poly(-np.array([4.0, 4.5, 5.0]))[:1:-1]

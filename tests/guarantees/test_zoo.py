@@ -20,6 +20,6 @@ def test_nothing_false_is_guaranteed_of_a_few(family):
 @pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_nothing_false_is_guaranteed_of_many(family):
-    findings = [judge(family, 6, number) for number in range(10)]
+    findings = [judge(family, 6, number) for number in range(3)]
     assert [finding.false for finding in findings if finding.false] == []
     assert any(finding.guaranteed for finding in findings)

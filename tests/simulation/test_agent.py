@@ -209,8 +209,10 @@ def late_parts(law, **network):
     ("law", "network"),
     [
         ("stopping-point", {"delay": 0.05}),
-        ("stopping-point", {"delay": 0.05, "hears": "leaderward"}),
-        ("consensus", {"delay": 0.05}),
+        pytest.param(
+            "stopping-point", {"delay": 0.05, "hears": "leaderward"}, marks=pytest.mark.study
+        ),
+        pytest.param("consensus", {"delay": 0.05}, marks=pytest.mark.study),
         ("consensus", {"delay": 0.03, "prediction": "none"}),
         ("stopping-point", {"delay": 0.03, "messages": "state"}),
     ],

@@ -570,6 +570,7 @@ def ends_by_itself(v):
         (ends_by_itself, "a `while` loop"),
         (lambda v: jnp.abs(jnp.fft.fft(v)), "`convert_element_type` to complex128"),
         (lambda v: jax.lax.fori_loop(0, 999, lambda k, x: jnp.sin(x), v), "a loop of 999 rounds"),
+        (lambda v: v.at[1].apply(jnp.sin), "`scatter` of a function"),
         (lambda v: jnp.linalg.eigvalsh(jnp.outer(v, v)), "`eigh`"),
     ],
 )

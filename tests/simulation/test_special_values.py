@@ -241,10 +241,12 @@ def drawn_parts(seed):
     return ech.Parts(model, graph, formation, drive, initial=start)
 
 
+def rare(seed):
+    return pytest.mark.slow if seed < 4 else pytest.mark.study
+
+
 @pytest.mark.parametrize("bits", BITS)
-@pytest.mark.parametrize(
-    "seed", [pytest.param(k, marks=[] if k < 1 else pytest.mark.slow) for k in range(20)]
-)
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=rare(k)) for k in range(1, 20))])
 def test_drawn_models_move_as_by_jax(seed, bits):
     parts, ends = drawn_parts(seed), []
     for engine in ("native", "jax"):

@@ -4,6 +4,7 @@ No draw depends on earlier ones, nor on the engine, the batch, the chunk or the 
 """
 
 import enum
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -29,10 +30,10 @@ def key_of(seed: int) -> UInt32[np.ndarray, "2"]:
     return np.array([seed >> 32 & 0xFFFFFFFF, seed & 0xFFFFFFFF], np.uint32)
 
 
-def _fold(key: np.ndarray, kind: Draw, numbers: tuple[jax.Array, ...]) -> jax.Array:
+def _fold(key: np.ndarray, kind: Draw | jax.Array, numbers: tuple[jax.Array, ...]) -> jax.Array:
     # By name, since the default generator of JAX is a setting of the user.
     folded = jax.random.wrap_key_data(jnp.asarray(key), impl="threefry2x32")
-    for number in (int(kind), *numbers):
+    for number in (kind, *numbers):
         folded = jax.random.fold_in(folded, number)
     return folded
 
@@ -43,6 +44,11 @@ def normals(key: np.ndarray, kind: Draw, *numbers: jax.Array, size: int) -> Floa
     return jax.random.normal(_fold(key, kind, numbers), (size,), jnp.float32).astype(float)
 
 
-def uniform(key: np.ndarray, kind: Draw, *numbers: jax.Array) -> Float[jax.Array, ""]:
-    """Return a draw from [0, 1)."""
-    return jax.random.uniform(_fold(key, kind, numbers), (), jnp.float32).astype(float)
+def uniforms(key: np.ndarray, kinds: Sequence[Draw], *numbers: jax.Array) -> Float[jax.Array, " k"]:
+    """Return a draw from [0, 1) of each kind."""
+
+    # The code of a draw is long to compile: there is one for all kinds.
+    def one(kind: jax.Array) -> jax.Array:
+        return jax.random.uniform(_fold(key, kind, numbers), (), jnp.float32).astype(float)
+
+    return jax.vmap(one)(jnp.array([int(kind) for kind in kinds]))

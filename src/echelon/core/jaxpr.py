@@ -18,17 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
+from echelon.core.identity import process_key
+from echelon.core.memoize import BoundedCache
+from echelon.core.numeric_rules import MOVES, NUMERIC, Params, Rule
 from echelon.core.numerics import precision
 from echelon.core.types import PyTree
 
 Entry: TypeAlias = Any
 """An entry of an algebra: a number, a polynomial, a symbol; it adds and multiplies."""
-
-Params: TypeAlias = Mapping[str, Any]
-"""The parameters of a primitive; each primitive has its own names and types."""
-
-Rule: TypeAlias = Callable[..., np.ndarray]
-"""(parameters of the primitive, operands) -> result, of which operands may be plain numbers."""
 
 
 class Algebra(NamedTuple):
@@ -136,7 +133,7 @@ def apply(equation: JaxprEqn, operands: list[np.ndarray], algebra: Algebra) -> l
     # It only keeps XLA from reordering, and nothing is reordered here.
     if name == "optimization_barrier":
         return operands
-    if name in PLACED | ADDED and _is_open(equation, operands):
+    if name in PLACED | ADDED and (_is_open(equation, operands) or has_function(equation)):
         return algebra.unknown(equation, operands)
     if name in PLACED:
         return _place(equation, operands, algebra.outside)
@@ -198,6 +195,11 @@ def _inner_jaxpr(equation: JaxprEqn) -> Jaxpr | ClosedJaxpr:
     )
 
 
+def has_function(equation: JaxprEqn) -> bool:
+    """Tell whether an equation replaces entries by a function of them, as `at[..].apply` does."""
+    return equation.primitive.name == "scatter" and equation.params["update_jaxpr"] is not None
+
+
 def _is_open(equation: JaxprEqn, operands: list[np.ndarray]) -> bool:
     """Tell whether an index is an entry, so that where it points is not known."""
     first = _INDICES.get(equation.primitive.name)
@@ -212,11 +214,22 @@ def map_entries(function: Callable[..., object], *arrays: np.ndarray) -> np.ndar
 
 def compute(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the results of an equation for plain numbers."""
-    rule = _NUMERIC.get(equation.primitive.name)
-    if rule is not None:
-        return [np.asarray(rule(equation.params, *map(np.asarray, operands)))]
-    results = equation.primitive.bind(*(jnp.asarray(a) for a in operands), **equation.params)
+    name, arrays = equation.primitive.name, [np.asarray(a) for a in operands]
+    rule = NUMERIC.get(name)
+    result = None if rule is None else rule(equation.params, *arrays)
+    if result is not None:
+        return [np.asarray(result)]
+    key = process_key((name, equation.params, arrays))
+    return _COMPUTED.get_or_make(key, lambda: _by_jax(equation, arrays))
+
+
+def _by_jax(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
+    results = equation.primitive.bind(*map(jnp.asarray, operands), **equation.params)
     return [np.asarray(r) for r in (results if equation.primitive.multiple_results else [results])]
+
+
+_COMPUTED = BoundedCache[list[np.ndarray]](256, lambda of: sum(a.nbytes for a in of), 10**7)
+"""Results of JAX, which takes up to 60 ms for one; stages of an integrator compute them again."""
 
 
 def _place(
@@ -325,20 +338,6 @@ def _matrix_form(
     )
 
 
-def _broadcast(params: Params, x: np.ndarray, *_: np.ndarray) -> np.ndarray:
-    shape = [1] * len(params["shape"])
-    for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
-        shape[axis] = size
-    return np.broadcast_to(x.reshape(shape), params["shape"])
-
-
-def _slice(params: Params, x: np.ndarray) -> np.ndarray:
-    starts, ends = params["start_indices"], params["limit_indices"]
-    # JAX leaves strides out where all of them are 1.
-    steps = params["strides"] or [1] * x.ndim
-    return x[tuple(slice(*cut) for cut in zip(starts, ends, steps, strict=True))]
-
-
 COMMON: dict[str, Rule] = {
     "add": entrywise(operator.add),
     "add_any": entrywise(operator.add),
@@ -346,13 +345,7 @@ COMMON: dict[str, Rule] = {
     "mul": entrywise(operator.mul),
     "neg": entrywise(operator.neg),
     "square": entrywise(lambda entry: entry * entry),
-    "broadcast_in_dim": _broadcast,
-    "slice": _slice,
-    "reshape": lambda params, x: x.reshape(params["new_sizes"]),
-    "squeeze": lambda params, x: np.squeeze(x, tuple(params["dimensions"])),
-    "transpose": lambda params, x: x.transpose(params["permutation"]),
-    "concatenate": lambda params, *xs: np.concatenate(xs, axis=params["dimension"]),
-    "stack": lambda params, *xs: np.stack(xs, axis=params["axis"]),
+    **MOVES,
     # Exact entries have no memory, no precision and, once traced, no derivative.
     **{
         name: lambda params, x: x
@@ -360,30 +353,3 @@ COMMON: dict[str, Rule] = {
     },
 }
 """What Python's operators and NumPy's moves do to entries of any kind."""
-
-
-def _numeric(name: str) -> Rule:
-    return lambda params, *arrays: getattr(np, name)(*arrays)
-
-
-# To the bit what JAX makes of them, without compiling each shape anew, which takes it 60 ms.
-_NUMERIC: dict[str, Rule] = {
-    **{name: COMMON[name] for name in ("broadcast_in_dim", "slice", "reshape", "squeeze")},
-    **{name: COMMON[name] for name in ("transpose", "concatenate", "stack", "copy")},
-    **{
-        name: _numeric(full)
-        for name, full in {
-            **{"add": "add", "sub": "subtract", "mul": "multiply", "neg": "negative"},
-            **{"lt": "less", "le": "less_equal", "gt": "greater", "ge": "greater_equal"},
-            **{"eq": "equal", "ne": "not_equal", "max": "maximum", "min": "minimum"},
-        }.items()
-    },
-    "select_n": lambda params, which, *cases: np.choose(which.astype(int), cases),
-    "convert_element_type": lambda params, x: x.astype(params["new_dtype"]),
-    "iota": lambda params: np.broadcast_to(
-        np.arange(params["shape"][params["dimension"]], dtype=params["dtype"]).reshape(
-            [-1 if k == params["dimension"] else 1 for k in range(len(params["shape"]))]
-        ),
-        params["shape"],
-    ),
-}

@@ -275,19 +275,40 @@ def check_definite(name: str, matrix: np.ndarray) -> None:
     if not np.isfinite(matrix).all():
         raise GainError(f"`{name}` holds a number that is not finite.")
     _check_size(name, matrix)
-    gap = np.abs(matrix - matrix.T)
-    if gap.max() > 1e-9 * np.abs(matrix).max():
+    scaled = with_unit_diagonal(matrix)
+    gap = np.abs(scaled - scaled.T)
+    if gap.max() > 1e-9 * np.abs(scaled).max():
         i, j = np.unravel_index(np.argmax(gap), gap.shape)
         raise GainError(
             f"`{name}` is not symmetric: entry [{i}, {j}] is {matrix[i, j]:.6g} "
             f"and entry [{j}, {i}] is {matrix[j, i]:.6g}."
         )
     # `eigvalsh` reads one triangle, which is why symmetry comes first.
-    least = float(np.linalg.eigvalsh(matrix)[0])
-    if least <= 0.0:
-        raise GainError(
-            f"`{name}` is not positive definite: its smallest eigenvalue is {least:.6g}."
-        )
+    check_eigenvalues(name, "positive definite", matrix, 0.0)
+
+
+def check_eigenvalues(name: str, what: str, matrix: Array, bound: float) -> None:
+    """Check that the eigenvalues of a symmetric matrix exceed a bound, in any units of states.
+
+    Raises:
+        GainError: they do not, so that the matrix is not `what`.
+    """
+    scaled, raw = (np.linalg.eigvalsh(m)[0] for m in (with_unit_diagonal(matrix), matrix))
+    if not scaled > bound:
+        least = raw if raw < 0.0 else scaled
+        raise GainError(f"`{name}` is not {what}: its smallest eigenvalue is {least:.6g}.")
+
+
+def with_unit_diagonal(matrix: Array) -> Array:
+    """Return D M D with a diagonal of 1/2 to 2 in size, where that of M is not 0.
+
+    D is diagonal and of powers of two, so that nothing is rounded. What is definite stays so, and
+    the rounding of what has large units no longer hides it.
+    """
+    diagonal = np.abs(np.diag(matrix))
+    halves = np.log2(diagonal, out=np.zeros(len(matrix)), where=diagonal > 0.0)
+    places = -np.round(0.5 * halves).astype(int)
+    return np.ldexp(matrix, places[:, None] + places)
 
 
 def as_matrix(name: str, value: Weight, size: int) -> Array:

@@ -5,12 +5,13 @@ None of them depends on an agent model.
 
 import contextlib
 from collections.abc import Callable
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+_R = TypeVar("_R")
 Precision: TypeAlias = Literal["float64", "float32"]
 Field: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 """A right-hand side (x, u) -> xdot."""
@@ -22,12 +23,17 @@ def precision(name: Precision) -> contextlib.AbstractContextManager[object]:
     return jax.enable_x64(name == "float64")
 
 
+def inlined(function: Callable[..., _R]) -> Callable[..., _R]:
+    """Return a function that JAX traces once for all its calls inside other traces."""
+    # Under a name of its own, as JAX would hand out the first trace of one function again.
+    return jax.jit(lambda *arguments: function(*arguments), inline=True)
+
+
 def rk4(field: Field, x: jax.Array, u: jax.Array, dt: float | jax.Array) -> jax.Array:
     """Advance one step by the classical Runge-Kutta method with the input held; error O(dt^4)."""
     if isinstance(x, Tracer):
-        # Traced once for its four calls, since tracing a model takes most of the time before a run;
-        # under a name of its own, as JAX would hand out the first trace of one function again.
-        field = jax.jit(lambda x, u, field=field: field(x, u), inline=True)
+        # Traced once for its four calls.
+        field = inlined(field)
     # With u held the field is smooth within the step, which order 4 needs.
     k1 = field(x, u)
     k2 = field(x + 0.5 * dt * k1, u)

@@ -1,16 +1,26 @@
-"""Checks of user functions by a JAX trace: shapes, types, casts and frozen values."""
+"""Checks of user functions by a JAX trace: shapes, types, casts and frozen values.
 
+Tracing somebody's model takes much of the time before a run, so one public call does it once.
+"""
+
+import contextlib
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from contextvars import ContextVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from echelon.core.errors import EchelonError
-from echelon.core.identity import array_bits
+from echelon.core.identity import array_bits, process_key
+from echelon.core.numerics import inlined
 from echelon.core.types import PyTree
+
+_R = TypeVar("_R")
+_TRACES = ContextVar[dict[Hashable, Callable[..., Any]] | None]("traces", default=None)
 
 
 class Trace(NamedTuple):
@@ -27,23 +37,48 @@ class Trace(NamedTuple):
     frozen: bool
 
 
+@contextlib.contextmanager
+def shared_traces() -> Iterator[None]:
+    """Share traces by `call_once_traced` within this context: a public call, or one inside it."""
+    # Not from one call to the next, as arrays that somebody's code reads may be changed in place.
+    before = _TRACES.get()
+    token = _TRACES.set({} if before is None else before)
+    try:
+        yield
+    finally:
+        _TRACES.reset(token)
+
+
+def call_once_traced(function: Callable[..., _R], *arguments: PyTree) -> _R:
+    """Return what a function returns; inside other traces it is traced once for equal shapes."""
+    traces = _TRACES.get()
+    if traces is None or not any(isinstance(leaf, Tracer) for leaf in arguments):
+        return function(*arguments)
+    # By what its code reads, too; a model with numbers that are traced has no key.
+    key = process_key(function)
+    if key is None:
+        return function(*arguments)
+    if key not in traces:
+        traces[key] = inlined(function)
+    return traces[key](*arguments)
+
+
 def trace(function: Callable[..., PyTree], *arguments: PyTree) -> Trace:
     """Trace a function twice at arguments of these shapes; nothing is compiled or computed.
 
     Raises:
         Exception: whatever the function raises.
     """
-
-    def once() -> tuple[ClosedJaxpr, PyTree]:
-        # Under a name of its own, since JAX would hand out the first trace of one function again.
-        return jax.make_jaxpr(lambda *a: function(*a), return_shape=True)(*arguments)
-
-    first, result = once()
+    first, result = jax.make_jaxpr(lambda *a: call_once_traced(function, *a), return_shape=True)(
+        *arguments
+    )
+    # Under a name of its own, since JAX would hand out the first trace of one function again.
+    second = jax.make_jaxpr(lambda *a: function(*a))(*arguments)
     steps = list(_steps(first))
     return Trace(
         result,
         any(rounds for _, _, rounds in steps),
-        [step[:2] for step in steps] != [step[:2] for step in _steps(once()[0])],
+        [step[:2] for step in steps] != [step[:2] for step in _steps(second)],
     )
 
 

@@ -1,5 +1,6 @@
 """The linearization of a model at its trim, in normalized inputs."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ from echelon.agents.models.secants import Gap, Sides, sides, stencil, units_at
 from echelon.core.compiled import cached_jit
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
+from echelon.core.trace import call_once_traced
 from echelon.core.types import Array, Input, State, States
 
 
@@ -79,11 +81,14 @@ def _units(model: ControlAffine) -> Array:
 
 @cached_jit
 def _evaluate(model: ControlAffine, x: State, u: Input, points: States) -> list[jax.Array]:
-    functions = (model.drift, model.input_map, model.output)
+    functions = [
+        functools.partial(call_once_traced, function)
+        for function in (model.drift, model.input_map, model.output)
+    ]
     slopes = [jax.jacfwd(function)(x) for function in functions]
 
     def entries(x: State) -> jax.Array:
-        return jnp.concatenate([model.drift(x), model.input_map(x).reshape(-1)])
+        return jnp.concatenate([functions[0](x), functions[1](x).reshape(-1)])
 
     # Values around the trim show kinks and jumps, which the derivatives of a trace do not.
     around = jax.vmap(entries)(points)

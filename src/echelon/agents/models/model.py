@@ -19,6 +19,7 @@ from jax.core import Tracer
 from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.heading import Heading
 from echelon.core.errors import ModelError, did_you_mean, listing
+from echelon.core.trace import call_once_traced
 from echelon.core.types import Input, InputMap, Output, State
 
 Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
@@ -260,7 +261,7 @@ class ControlAffine(eqx.Module):
 
     def velocity(self, x: State, u: Input) -> State:
         """Return f(x) + g(x) u."""
-        return self.drift(x) + self.input_map(x) @ u
+        return call_once_traced(self.drift, x) + call_once_traced(self.input_map, x) @ u
 
     def normalized_drift(self, x: State) -> State:
         """Return f(x) + g(x) u*, the drift about the trim."""
@@ -268,7 +269,7 @@ class ControlAffine(eqx.Module):
 
     def normalized_input_map(self, x: State) -> InputMap:
         """Return g(x) S, the input map of the normalized input."""
-        return self.input_map(x) @ jnp.asarray(self.input_scale, x.dtype)
+        return call_once_traced(self.input_map, x) @ jnp.asarray(self.input_scale, x.dtype)
 
     def physical(self, v: _Inputs, trim: bool = True) -> _Inputs:
         """Return u = u* + S v of normalized inputs (..., m), NumPy's or JAX's, in their precision.

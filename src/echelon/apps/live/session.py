@@ -19,7 +19,6 @@ from echelon.apps.live.promiser import Promiser
 from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.core.types import Array, JsonObject
-from echelon.experiments.results.labelled_parts import heard_in
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.viewer.replay import heard_by
 
@@ -221,7 +220,7 @@ class Session:
 
     def _panel_message(self) -> JsonObject:
         """Return the controls and the information flow of the present law."""
-        panel, heard = self.panel, heard_by(heard_in(self.swarm.parts))
+        panel, heard = self.panel, heard_by(self.swarm.parts.receives)
         return {"panel": panel.sliders(), "choices": panel.choices(), "heard": heard}
 
     # ---- changes --------------------------------------------------------------------------------

@@ -46,8 +46,10 @@ def dataset(result: Result) -> "xr.Dataset":
     (infinite without repetition), the gain's `P`, `R` and `coupling`, the poles of the checked
     modes (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`, for directed graphs with the
     imaginary part `mode_eigenvalue_imaginary`), and the limits of the inputs u, `limit_low` <=
-    `limit_matrix` u <= `limit_high`. The attribute `promise` is JSON, and `format` the version of
-    this list.
+    `limit_matrix` u <= `limit_high`. Over a network that is late also `age` (of the oldest message
+    that an agent has of a neighbour, NaN before the first), `edge_age` (of the newest one at each
+    end of an edge), `edge_lost` (messages lost since the frame before) and `forget`. The attribute
+    `promise` is JSON, and `format` the version of this list.
     """
     return labelled(result).dataset()
 
@@ -63,6 +65,7 @@ def labelled(result: Result) -> Labelled:
         **fixed.variables,
         **_followed(result),
         **_poles(result),
+        **_messages(result),
     }
     v = lyapunov(result)
     if v is not None:
@@ -88,6 +91,21 @@ def _followed(result: Result) -> Variables:
     if errors:
         variables["tracking_error"] = (("time", "leader", "output"), np.stack(errors, axis=1))
     return variables
+
+
+def _messages(result: Result) -> Variables:
+    """Return the ages and losses of messages; nothing in the ideal network."""
+    network, traffic = result.world.network, result.traffic
+    if network is None or traffic is None:
+        return {}
+    link, seconds = ("time", "edge", "end"), {"units": "s"}
+    ages = traffic.of_agents(result.graph.edges, result.graph.agents)
+    return {
+        "age": (("time", "agent"), ages, seconds),
+        "edge_age": (link, traffic.ages, seconds),
+        "edge_lost": (link, traffic.losses),
+        "forget": ((), network.forget, seconds),
+    }
 
 
 def _poles(result: Result) -> Variables:

@@ -1,11 +1,9 @@
 """Labelled arrays of the parts of a run, which are known before it starts."""
 
 import numpy as np
-from jaxtyping import Bool
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.network.hearing import heard_along
-from echelon.core.types import Array, JsonObject
+from echelon.core.types import JsonObject
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.recording import FORMAT
 from echelon.simulation.engine.parts import Parts
@@ -68,7 +66,7 @@ def _edges(parts: Parts) -> Variables:
     variables: Variables = {
         "edge_agents": (("edge", "end"), graph.edges),
         "edge_weight": ("edge", graph.weights),
-        "edge_heard": (("edge", "end"), heard_in(parts).astype(np.int8)),
+        "edge_heard": (("edge", "end"), parts.receives.astype(np.int8)),
     }
     if schedule is not None:
         variables["stretch_start"] = ("stretch", schedule.starts, {"units": "s"})
@@ -82,15 +80,6 @@ def _output_units(model: ControlAffine) -> list[str]:
     """Return the units of the outputs, known for those that are states."""
     units = dict(zip(model.state_names, model.state_units, strict=True))
     return [units.get(name, "") for name in model.output_names]
-
-
-def heard_in(parts: Parts) -> Bool[Array, "E 2"]:
-    """Return whether each end of each edge receives from the other under the laws."""
-    drive = parts.drive
-    reacts = drive.reacts or "neighbours' states" in drive.information.leader
-    # A drive without laws, such as plans, uses all neighbours.
-    leaderward = getattr(getattr(drive, "follower", None), "leaderward", False)
-    return heard_along(parts.graph, leaderward, reacts)
 
 
 def _gain(parts: Parts) -> Variables:

@@ -54,6 +54,22 @@ class LoopPoles(NamedTuple):
     eigenvalues: Float[np.ndarray, " K"]
 
 
+class MessageAges(NamedTuple):
+    """Messages over a network that is late.
+
+    Attributes:
+        agents: age of the oldest message that an agent has of a neighbour, s; NaN before the first.
+        edges: age of the newest message at each end of an edge, s.
+        lost: at each end of an edge, since the frame before.
+        forget: age beyond which messages are not used, s.
+    """
+
+    agents: Float[np.ndarray, "T N"]
+    edges: Float[np.ndarray, "T E 2"]
+    lost: Int[np.ndarray, "T E 2"]
+    forget: float
+
+
 @final
 @dataclasses.dataclass(frozen=True, eq=False)
 class Recording(FrameNumbers):
@@ -81,6 +97,7 @@ class Recording(FrameNumbers):
         saturated: fraction of steps in which a limit changed the agent's input.
         tracking: of the leaders; None without a reference.
         modes: None where the laws have no linearization.
+        messages: over a network; None in the ideal one.
         promise: as `Promise.as_mapping` returns it.
         horizon, dt: s.
         attributes: provenance and settings, as stored.
@@ -112,6 +129,7 @@ class Recording(FrameNumbers):
     saturated: Float[np.ndarray, " N"]
     tracking: TrackingErrors | None
     modes: LoopPoles | None
+    messages: MessageAges | None
     promise: JsonObject
     horizon: float
     dt: float
@@ -243,6 +261,7 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         saturated=arrays["saturated"],
         tracking=_tracking(arrays),
         modes=_modes(arrays),
+        messages=_messages(arrays),
         promise=json.loads(attributes["promise"]),
         horizon=float(attributes["horizon"]),
         dt=float(attributes["dt"]),
@@ -295,3 +314,10 @@ def _modes(values: Mapping[str, np.ndarray]) -> LoopPoles | None:
         return None
     poles = values["pole_real"] + 1j * values["pole_imaginary"]
     return LoopPoles(poles, values["mode_eigenvalue"])
+
+
+def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:
+    if "edge_age" not in values:
+        return None
+    rows = values["age"], values["edge_age"], values["edge_lost"].astype(int)
+    return MessageAges(*rows, float(values["forget"]))

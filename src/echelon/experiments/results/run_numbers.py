@@ -74,6 +74,10 @@ class RunNumbers:
         """Return the root mean square of a number of the followers."""
         return float(np.sqrt(np.mean(self.followers(name) ** 2)))
 
+    def of_network(self, name: str) -> float | None:
+        """Return a number of the messages; None in the ideal network."""
+        return None if self.result.traffic is None else getattr(self.result.traffic, name)
+
     @functools.cached_property
     def first_and_last(self) -> Float[np.ndarray, "2 F"]:
         """The followers' formation errors in the first and the last frame."""
@@ -110,6 +114,7 @@ AGENT_NUMBERS: Mapping[str, Quantity] = quantities(FollowerMetrics) | {
         of=lambda run: run.first_and_last[1],
     ),
 }
+_OF_NETWORK = Shown.SWEEP | Shown.COMPARISON | Shown.SUMMARY
 RUN_NUMBERS: Mapping[str, Quantity] = {
     "formation_rmse": Quantity(
         "root mean square of the followers' errors, over all steps and followers",
@@ -208,6 +213,37 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         shown=Shown.COMPARISON,
         key="computing_s_per_agent_s",
         scale=1e3,
+    ),
+    "largest_age": Quantity(
+        "largest age of a message in use, over all steps and links",
+        "s",
+        column="oldest message\nin use, s",
+        of=lambda run: run.of_network("largest"),
+        shown=_OF_NETWORK,
+        key="largest_age_s",
+    ),
+    "mean_age": Quantity(
+        "mean age of the messages in use, over all steps and links",
+        "s",
+        of=lambda run: run.of_network("mean"),
+        shown=_OF_NETWORK,
+        key="mean_age_s",
+    ),
+    "messages_sent": Quantity(
+        "messages sent, each counted for every agent that uses it",
+        of=lambda run: run.of_network("sent"),
+        shown=_OF_NETWORK,
+    ),
+    "messages_lost": Quantity(
+        "messages that were lost",
+        column="messages\nlost",
+        of=lambda run: run.of_network("lost"),
+        shown=_OF_NETWORK,
+    ),
+    "messages_late": Quantity(
+        "messages that arrived after a newer one of the same sender",
+        of=lambda run: run.of_network("late"),
+        shown=_OF_NETWORK,
     ),
     "promise_rate": Quantity(
         "rate at which errors are guaranteed to decay",

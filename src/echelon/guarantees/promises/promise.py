@@ -16,6 +16,7 @@ from echelon.core.errors import EchelonError
 from echelon.core.identity import foreign_key
 from echelon.core.numerics import precision
 from echelon.core.statement import Cause, Hypothesis, Statement
+from echelon.core.trace import shared_traces
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem, Verdict
 from echelon.guarantees.promises.certified_set import CertifiedSet
@@ -268,6 +269,7 @@ def prover_of(drive: Drive) -> type[Promise]:
     return getattr(importlib.import_module(module), name)
 
 
+@shared_traces()
 def promise(parts: Parts, settings: Settings) -> Promise:
     """Return what is guaranteed of parts under settings; computed once while the parts exist.
 

@@ -31,6 +31,7 @@ _CAPTIONS = {
     "formation": "Distances of the followers from their goals, with the guaranteed rate.",
     "inputs": "Actuator loads and their limits.",
     "lyapunov": "Lyapunov function V and its derivative.",
+    "ages": "Age of the oldest message of each follower.",
 }
 
 

@@ -313,6 +313,25 @@ def distances(run: Recording) -> "Figure | None":
     return draw.finish(figure)
 
 
+def ages(run: Recording) -> "Figure | None":
+    """Return the age of the oldest message of each follower; None in the ideal network."""
+    if run.messages is None:
+        return None
+    followers = list(run.followers)
+    keep = draw.thin(len(run.times), len(followers))
+    times, values = run.times[keep], run.messages.agents[keep][:, followers]
+    figure, (ax,) = _panels(run, 1, 2.6)
+    if run.agents > draw.NAMED:
+        _bands(ax, times, values)
+    for agent, line in zip(followers if run.agents <= draw.NAMED else (), values.T, strict=False):
+        draw.plot(ax, times, line, label=name_of(run, agent), **pen_of(run, agent))
+    look = {"color": "0.5", "linewidth": 0.8, "linestyle": ":", "zorder": 1}
+    ax.axhline(run.messages.forget, label="not used beyond", **look)
+    ax.set_ylabel(draw.label("age of the oldest message", "s"))
+    ax.set_ylim(bottom=0.0)
+    return draw.finish(figure)
+
+
 def _edges(ax: "Axes", run: Recording, times: Array, apart: Array, desired: Array) -> None:
     """Draw the distance of each edge, or quantiles of the errors of many."""
     if len(run.edges) > draw.NAMED:

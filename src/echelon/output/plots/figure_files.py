@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 NAMES = (
     *("leader_3d", "trajectories", "top_view", "tracking", "formation", "inputs"),
-    *("states", "distances", "lyapunov", "modes", "network"),
+    *("states", "distances", "lyapunov", "modes", "network", "ages"),
 )
 """All figures of a run."""
 

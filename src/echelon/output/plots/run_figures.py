@@ -22,12 +22,12 @@ _MAKERS: "dict[str, Callable[[Recording], Figure | None]]" = dict(
         (
             *(trajectories.leader, trajectories.trajectories, trajectories.top_view),
             *(curves.tracking, curves.formation, curves.inputs, curves.states, curves.distances),
-            *(curves.lyapunov, network.modes, network.network),
+            *(curves.lyapunov, network.modes, network.network, curves.ages),
         ),
         strict=True,
     )
 )
-DEFAULT = ("leader_3d", "trajectories", "tracking", "formation", "inputs", "lyapunov")
+DEFAULT = ("leader_3d", "trajectories", "tracking", "formation", "inputs", "lyapunov", "ages")
 """Figures that a run writes into its folder."""
 
 
@@ -49,6 +49,7 @@ def figures(
     - `lyapunov`: V with its derivative
     - `modes`: the closed-loop poles
     - `network`: the communication graph
+    - `ages`: of the oldest message of each follower, over a network
 
     A run without a stored frame has no figures. Parts of a diverging run a million times beyond its
     start and reference are not drawn, and the figure says so.

@@ -100,7 +100,12 @@ def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
 
 def _costs_table(comparison: Comparison) -> "Table":
     """Return the costs, one row per method: effort, computing, information."""
-    costs = {k: q.column for k, q in shown_in(RUN_NUMBERS, Shown.COMPARISON).items() if q.column}
+    runs = [row.flight for row in comparison.rows if row.flight is not None]
+    costs = {
+        name: quantity.column
+        for name, quantity in shown_in(RUN_NUMBERS, Shown.COMPARISON).items()
+        if quantity.column and (quantity.absent != "-" or _in_some(runs, name))
+    }
     heads = [*costs.values(), RUN_NUMBERS["promise_rate"].column, "information"]
     table = _table("costs", heads)
     table.columns[-1].justify = "left"
@@ -116,6 +121,11 @@ def _costs_table(comparison: Comparison) -> "Table":
             ", ".join(row.flight.result.parts.information.follower) or "none",
         )
     return table
+
+
+def _in_some(runs: Sequence[RunNumbers], name: str) -> bool:
+    """Tell whether a run has a number, as none in the ideal network has ages of messages."""
+    return any(run.number(name) is not None for run in runs)
 
 
 def _cell(run: RunNumbers, name: str) -> str:

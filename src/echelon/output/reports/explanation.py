@@ -69,10 +69,26 @@ def _world(result: Result) -> Iterator[str]:
         yield f"Disturbance: {world['disturbance']}; unknown to the laws."
     if world["network"]:
         yield f"Network: {world['network']}."
+        yield from _messages(result)
     if world["actuator"]:
         yield f"Actuators: {world['actuator']}; unknown to the laws."
     if world["sensing"]:
         yield f"Sensing of own states: {world['sensing']}."
+
+
+def _messages(result: Result) -> Iterator[str]:
+    """Yield what became of the messages, if there were any."""
+    traffic = result.traffic
+    if traffic is None or not traffic.sent:
+        return
+    late = f", {traffic.late} arrived after a newer one" * (traffic.late > 0)
+    ages = ""
+    if np.isfinite(traffic.mean):
+        ages = (
+            f"; those in use were {1e3 * traffic.mean:.3g} ms old on average and "
+            f"{1e3 * traffic.largest:.4g} ms at most"
+        )
+    yield f"Messages: {traffic.sent} sent, {traffic.lost} lost{late}{ages}."
 
 
 def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:

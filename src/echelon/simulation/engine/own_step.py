@@ -13,9 +13,16 @@ from echelon.core.compiled import cached_jit
 from echelon.core.types import PyTree, Scalar, State
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act
-from echelon.simulation.step.knowledge import Ages, Mail, Readers, understand
+from echelon.simulation.step.knowledge import (
+    Ages,
+    Letters,
+    Mail,
+    Readers,
+    content_of,
+    understand,
+    write,
+)
 from echelon.simulation.step.loop import Loop
-from echelon.simulation.step.messages import Letters
 from echelon.simulation.step.nearby import less_expected
 
 
@@ -129,5 +136,8 @@ def step_over_network(
     if leads:
         content = content_of(loop, t, *own, signal, action.message)[None]
     step = jnp.zeros((), jnp.int32)
-    letter, _ = write(loop, reader, step, mail, knowledge, signal[None], difference, content)
+    assert loop.channel is not None
+    letter, _ = write(
+        loop.channel, reader, step, mail, knowledge, signal[None], difference, content
+    )
     return Step(signal, action, is_finite((own.x, signal, action, letter, hull)), letter, hull)

@@ -5,10 +5,12 @@ from collections.abc import Mapping, Sequence
 from typing import TypeAlias, final
 
 import numpy as np
+from jaxtyping import Bool
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
+from echelon.agents.network.hearing import heard_along
 from echelon.agents.world.world import World
 from echelon.core.errors import check_kind
 from echelon.simulation.step.drive import Drive, Information
@@ -57,6 +59,18 @@ class Parts:
         """What leaders and followers receive from others, over the network that there is."""
         ideal, network = self.drive.information, self.world.network
         return ideal if network is None else ideal._replace(follower=(network.information,))
+
+    @property
+    def leaderward(self) -> bool:
+        """Whether agents use only messages of neighbours that are nearer to a leader."""
+        # A drive without laws, such as plans, uses all neighbours.
+        return getattr(getattr(self.drive, "follower", None), "leaderward", False)
+
+    @property
+    def receives(self) -> Bool[np.ndarray, "E 2"]:
+        """Whether each end of each edge receives from the other."""
+        reacts = self.drive.reacts or "neighbours' states" in self.drive.information.leader
+        return heard_along(self.graph, self.leaderward, reacts)
 
     def replace(self, **changes: object) -> "Parts":
         """Return a copy with some parts changed."""

@@ -1,6 +1,7 @@
 """The result of a run: everything that metrics, figures and files read, in float64 NumPy."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import final
 
@@ -15,6 +16,7 @@ from echelon.core.pages import notebook_page
 from echelon.core.types import Array
 from echelon.simulation.engine.frame_numbers import FrameNumbers
 from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.traffic import Traffic, traffic
 from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.settings import Settings
@@ -91,6 +93,12 @@ class Result(FrameNumbers):
     def chatter(self) -> Array:
         """How many times (N,) an input jumped from one limit to the opposite one in a step."""
         return self.sums.chatter
+
+    @functools.cached_property
+    def traffic(self) -> Traffic | None:
+        """What became of the messages; None in the ideal network."""
+        steps = int(self.sums.steps[0])
+        return traffic(self.parts, self.settings, self.times, steps)
 
     @property
     def offsets(self) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 
 from echelon.core.errors import Outcome, SimulationError
 from echelon.core.numerics import precision
+from echelon.core.trace import shared_traces
 from echelon.core.types import Array
 from echelon.simulation.engine.divergence import advance_until_lost
 from echelon.simulation.engine.grid import ChunkGrid
@@ -70,6 +71,7 @@ _SECONDS = 2.0
 """Wall time of a stretch, s: the most that is lost when the process is killed."""
 
 
+@shared_traces()
 def simulate(
     parts: Parts,
     settings: Settings,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from echelon.core.jaxpr import Algebra, apply, map_entries, walk
+from echelon.core.jaxpr import Algebra, apply, has_function, map_entries, walk
 from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph
 from echelon.simulation.scalars.traced_entries import (
     LARGEST,
@@ -31,6 +31,8 @@ from echelon.simulation.scalars.traced_entries import (
 
 def at_index(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return what is read or written at indices that differ between agents: each place is tried."""
+    if has_function(equation):
+        raise Unsupported(f"`scatter` of a function{where(equation)}")
     rows, ends = _rows(equation, operands), _ends(equation, operands)
     drops = _drops(equation)
     if not drops:

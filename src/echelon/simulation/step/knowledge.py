@@ -9,19 +9,20 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from echelon.agents.network.channel import NEVER, Channel
 from echelon.agents.network.exchange import Difference, Exchange
-from echelon.core.types import Scalar, State
+from echelon.core.types import Array, Scalar, State
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 from echelon.laws.law import Expected, LocalView, Memory
 from echelon.simulation.step.action import act
-from echelon.simulation.step.loop import Loop, Moment, WorldState
+from echelon.simulation.step.loop import Loop
 
 NOBODY = 2**30
 """The leader of an agent that has no packet, and more hops than any agent has."""
-_HOP_LIFE = 10
+HOP_LIFE = 10
 """Hop counts are used for this many times `forget`, so that losses do not change them."""
 
 
@@ -143,14 +144,13 @@ def understand(
     channel = loop.channel
     assert channel is not None
     leader, feedforward = _leaders(loop, readers, t, mail.packet, ages.packet, sent)
-    forget = channel.forget * loop.motion.dt
-    hops = _hops(loop, exchange, readers, mail.hops, ages.link <= _HOP_LIFE * forget)
+    lasting = ages.link <= HOP_LIFE * channel.forget * loop.motion.dt
+    hops = count_hops(exchange, readers, mail.hops, lasting, len(loop.order))
     knows = readers.leads | (ages.packet < jnp.inf)
     receivers = jnp.asarray(exchange.receivers)
     received, used = mail.value, ages.link < jnp.inf
-    fresh = used
+    fresh = ages.link <= usable_age(channel, loop.motion.dt)
     if channel.messages is MessageContent.DEVIATION:
-        fresh = ages.link <= forget
         received = leader[receivers] + jnp.where(fresh[:, None], mail.value, 0.0)
         # A leader is where it is expected, and its own message says no more.
         used, fresh = knows[receivers], fresh | (used & (mail.hops == 0))
@@ -164,8 +164,15 @@ def understand(
     return Knowledge(z, feedforward, leader, hops)
 
 
+def usable_age(channel: Channel, dt: Array | float) -> jax.Array:
+    """Return the age (s) beyond which what a neighbour sent is not used."""
+    deviations = channel.messages is MessageContent.DEVIATION
+    # Of a state there is no better guess than the last one, but never that of no message.
+    return jnp.asarray(channel.forget * dt if deviations else np.finfo(np.float32).max)
+
+
 def write(
-    loop: Loop,
+    channel: Channel,
     readers: Readers,
     step: jax.Array,
     mail: Mail,
@@ -178,8 +185,7 @@ def write(
 
     `content` is what each would say of itself if it were a leader.
     """
-    channel, packet = loop.channel, mail.packet
-    assert channel is not None
+    packet = mail.packet
     itself = readers.leads & (packet.leader == readers.number)
     packet = packet._replace(
         stamp=jnp.where(itself, step, packet.stamp),
@@ -250,133 +256,17 @@ def _expected(
     return x, act(loop, loop.leader, view, memory, leads=True).message
 
 
-def _hops(
-    loop: Loop,
+def count_hops(
     exchange: Exchange,
     readers: Readers,
     of_senders: Int[jax.Array, " K"],
     lasting: Bool[jax.Array, " K"],
+    agents: int,
 ) -> Int[jax.Array, " N"]:
     """Return the hops to a leader, as counted by the messages that are not too old."""
     of_link = jnp.where(lasting, of_senders, NOBODY)
     nearest = jax.ops.segment_min(of_link, jnp.asarray(exchange.receivers), len(readers.number))
     nearest = jnp.minimum(nearest, NOBODY)
     # Agents that are cut off together would count each other up for ever.
-    hops = jnp.where(nearest + 1 >= len(loop.order), NOBODY, nearest + 1)
+    hops = jnp.where(nearest + 1 >= agents, NOBODY, nearest + 1)
     return jnp.where(readers.leads, 0, hops).astype(jnp.int32)
-
-
-# ---- all agents of a run -------------------------------------------------------------------------
-
-
-def _all(loop: Loop) -> Readers:
-    numbers = jnp.arange(len(loop.order), dtype=jnp.int32)
-    return Readers(numbers, jnp.zeros(len(loop.order), bool).at[loop.leaders].set(True))
-
-
-def begin_network(
-    loop: Loop, world: WorldState, sent: Float[jax.Array, "N s"], forward: int
-) -> WorldState:
-    """Return the world with a network before the first message, for a feed-forward (forward,)."""
-    channel, readers = loop.channel, _all(loop)
-    assert channel is not None
-    links, s = len(loop.exchange.receivers), sent.shape[1]
-    mail = no_mail(readers, links, sent, packet_size(channel, s, forward))
-    posts = channel.begin(Letters(sent, readers.number, mail.packet), links)
-    return world._replace(in_flight=posts, mail=mail)
-
-
-def read_messages(
-    loop: Loop,
-    exchange: Exchange,
-    now: Moment,
-    sent: Float[jax.Array, "N s"],
-    difference: Difference,
-) -> tuple[Knowledge, Mail]:
-    """Return what all agents know at a step, and their mail with what arrives at it."""
-    channel = loop.channel
-    assert channel is not None
-    mail = _take(channel, exchange, now)
-    ages = Ages(*(_age(now.step, x, loop.motion.dt) for x in (mail.stamp, mail.packet.stamp)))
-    t = now.step.astype(sent.dtype) * loop.motion.dt
-    return understand(loop, exchange, _all(loop), t, mail, ages, sent, difference), mail
-
-
-def _age(step: jax.Array, stamp: Int[jax.Array, " K"], dt: float) -> Float[jax.Array, " K"]:
-    """Return the age (s) of what was sent at steps (K,)."""
-    return jnp.where(stamp == NEVER, jnp.inf, (step - stamp) * jnp.asarray(dt))
-
-
-def _take(channel: Channel, exchange: Exchange, now: Moment) -> Mail:
-    """Return the mail with what arrives at a step."""
-    posts, mail = now.world.in_flight, now.world.mail
-    arrival = channel.arrivals(posts, now.step, mail.stamp)
-    places = arrival.slot, jnp.asarray(exchange.senders)
-    letter: Letters = jax.tree.map(lambda rows: rows[places], posts.content)
-    new = arrival.new
-    value = jnp.where(new[:, None], letter.value, mail.value)
-    hops = jnp.where(new, letter.hops, mail.hops)
-    packet = newest(mail.packet, letter.packet, new, jnp.asarray(exchange.receivers))
-    return Mail(arrival.stamp, value, hops, packet)
-
-
-def newest(own: Packets, others: Packets, new: jax.Array, receivers: jax.Array) -> Packets:
-    """Return the packet of each agent: of the leader with the lowest number, the newest one.
-
-    Args:
-        own: of the agents.
-        others: (K, ...) that messages contain.
-        new: (K,) which of these arrived.
-        receivers: (K,) of the messages.
-    """
-    count = len(own.stamp)
-    valid = new & (others.stamp != NEVER)
-    leaders = jnp.where(valid, others.leader, NOBODY)
-    leader = jnp.minimum(own.leader, jax.ops.segment_min(leaders, receivers, count))
-    of_it = valid & (leaders == leader[receivers])
-    last = jnp.where(own.leader == leader, own.stamp, NEVER)
-    stamp = jax.ops.segment_max(jnp.where(of_it, others.stamp, NEVER), receivers, count)
-    stamp = jnp.maximum(last, stamp)
-    latest = of_it & (others.stamp == stamp[receivers])
-    places = jnp.where(latest, jnp.arange(len(receivers)), NEVER)
-    place = jax.ops.segment_max(places, receivers, count)
-    better = (place >= 0) & (stamp > last)
-    content = jnp.where(better[:, None], others.content[place], own.content)
-    return Packets(leader, stamp, content)
-
-
-def send_messages(
-    loop: Loop,
-    exchange: Exchange,
-    now: Moment,
-    mail: Mail,
-    knowledge: Knowledge,
-    sent: Float[jax.Array, "N s"],
-    difference: Difference,
-    forward: Float[jax.Array, "L k"],
-) -> WorldState:
-    """Return the world after a step in which agents may send.
-
-    Args:
-        loop: with a channel.
-        exchange: with the weights of this step.
-        now: the moment at the beginning of the step.
-        mail: of the agents.
-        knowledge: of the agents.
-        sent: their signals.
-        difference: of two signals.
-        forward: of the leaders, from the inputs that they have just chosen.
-    """
-    channel, numbers = loop.channel, loop.leaders
-    assert channel is not None
-    t = now.step.astype(sent.dtype) * loop.motion.dt
-    offsets = jnp.asarray(loop.offsets, sent.dtype)
-    rows = now.states[numbers], offsets[numbers], now.leader_memory, sent[numbers], forward
-    content = jax.vmap(lambda *row: content_of(loop, t, *row))(*rows)
-    content = jnp.zeros_like(mail.packet.content).at[numbers].set(content)
-    letters, sends = write(loop, _all(loop), now.step, mail, knowledge, sent, difference, content)
-    links = jnp.asarray(exchange.receivers), jnp.asarray(exchange.senders)
-    # Links that the graph does not have at this time carry nothing.
-    sends = sends[links[1]] & (jnp.asarray(exchange.weights) > 0.0)
-    posts = channel.post(now.world.in_flight, now.step, letters, sends, *links)
-    return now.world._replace(in_flight=posts, mail=mail)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
@@ -21,6 +22,7 @@ from echelon.laws.law import Law, Memory, without_certificates
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.meter import Meter
 from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.settings import Settings
 
 
 class Loop(eqx.Module):
@@ -77,6 +79,20 @@ class Switches(NamedTuple):
 
     steps: Array
     rows: Array
+
+    @classmethod
+    def of(cls, graph: Graph, settings: Settings) -> "Switches | None":
+        """Return when a graph switches; None where it does not."""
+        schedule = graph.schedule
+        return None if schedule is None else cls(*schedule.switches(settings.dt, settings.horizon))
+
+
+def exchange_at(exchange: Exchange, switches: Switches | None, step: jax.Array) -> Exchange:
+    """Return an exchange with the weights that hold at a step."""
+    if switches is None:
+        return exchange
+    steps, rows = map(jnp.asarray, switches)
+    return exchange.during(rows[jnp.searchsorted(steps, step, side="right") - 1])
 
 
 def stretch_at(loop: Loop, step: int) -> tuple[int, int]:
@@ -149,16 +165,10 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         levels=_levels(graph) if by_depth else None,
         # Leaders act first, and this puts what all did back into the agents' own order.
         order=np.argsort(np.concatenate([leaders, followers])),
-        switches=_switches(problem),
+        switches=Switches.of(graph, problem.settings),
         channel=problem.channel,
         sensors=problem.sensors,
     )
-
-
-def _switches(problem: Problem) -> Switches | None:
-    """Return when the graph of a problem switches; None where it does not."""
-    schedule, settings = problem.graph.schedule, problem.settings
-    return None if schedule is None else Switches(*schedule.switches(settings.dt, settings.horizon))
 
 
 def _levels(graph: Graph) -> Array:

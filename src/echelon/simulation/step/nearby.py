@@ -17,6 +17,7 @@ from echelon.core.types import Array, States
 from echelon.laws.law import Law, Memory
 from echelon.simulation.step.knowledge import Knowledge, Mail
 from echelon.simulation.step.loop import Loop, Moment
+from echelon.simulation.step.messages import all_readers
 
 
 class Sightings(NamedTuple):
@@ -59,7 +60,7 @@ def look_around(
         return None, None
     hulls, agents = all_hulls(loop, now), len(loop.order)
     receivers, senders = _links(agents)
-    leads = jnp.zeros(agents, bool).at[loop.leaders].set(True)
+    leads = all_readers(agents, loop.leaders).leads
     points, known, seen = hulls[senders], jnp.ones(len(senders), bool), None
     if knowledge is not None and mail is not None:
         t = now.step.astype(hulls.dtype) * loop.motion.dt

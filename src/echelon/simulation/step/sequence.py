@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from echelon.agents.network.exchange import Difference, Exchange
+from echelon.agents.network.exchange import Difference
 from echelon.agents.network.near import Near
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act, limit_sides
-from echelon.simulation.step.knowledge import begin_network, read_messages, send_messages
-from echelon.simulation.step.loop import Loop, Moment, WorldState
+from echelon.simulation.step.loop import Loop, Moment, WorldState, exchange_at
+from echelon.simulation.step.messages import begin_network, read_messages, send_messages
 from echelon.simulation.step.meter import Sums, reference_at
 from echelon.simulation.step.motion import MotionState
 from echelon.simulation.step.nearby import begin_sightings, look_around
@@ -67,7 +67,7 @@ def control(loop: Loop, now: Moment) -> Control:
     """Return what all agents do from a moment on."""
     now = _measured(loop, now)
     sent, difference = _sent(loop, now)
-    exchange = _exchange_at(loop, now.step)
+    exchange = exchange_at(loop.exchange, loop.switches, now.step)
     knowledge = mail = None
     if loop.channel is None:
         # The ideal network neither delays nor loses: what is sent is received.
@@ -196,14 +196,6 @@ def _sent(loop: Loop, now: Moment) -> tuple[Float[jax.Array, "N s"], Difference]
     if sent is not None:
         return sent, operator.sub
     return now.states - offsets, jax.vmap(loop.model.difference)
-
-
-def _exchange_at(loop: Loop, step: jax.Array) -> Exchange:
-    """Return the exchange with the weights that hold at a step."""
-    if loop.switches is None:
-        return loop.exchange
-    steps, rows = map(jnp.asarray, loop.switches)
-    return loop.exchange.during(rows[jnp.searchsorted(steps, step, side="right") - 1])
 
 
 # ---- steps ---------------------------------------------------------------------------------------

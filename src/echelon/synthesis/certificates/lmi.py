@@ -23,6 +23,7 @@ from echelon.core.linear import (
     riccati,
     symmetric_basis,
     symmetric_part,
+    with_unit_diagonal,
     without_warnings,
 )
 from echelon.core.types import Array
@@ -69,7 +70,8 @@ def rate_of(
     Raises:
         GainError: P is not symmetric positive definite, or a number is not finite.
     """
-    if not (np.isfinite(P).all() and np.allclose(P, P.T, 1e-9, 0.0) and _condition(P) < np.inf):
+    fine = np.isfinite(P).all() and np.allclose(P, P.T, 1e-9, 0.0)
+    if not (fine and np.linalg.eigvalsh(with_unit_diagonal(P))[0] > 0.0):
         raise GainError("`P` must be a symmetric positive definite matrix of finite numbers.")
     return _rate(P, vertices_of(As), None if B is None else _weigh_inputs(B, R), strength)
 

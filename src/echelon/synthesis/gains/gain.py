@@ -27,6 +27,7 @@ from echelon.agents.network.spectrum import Spectrum
 from echelon.core.errors import GainError, GraphError, check_kind
 from echelon.core.linear import check_definite
 from echelon.core.numerics import precision
+from echelon.core.trace import shared_traces
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.synthesis.certificates.certificate import Certificate, RegionCertificate, certify
 
@@ -250,6 +251,7 @@ def check_coupling(coupling: float) -> None:
         raise GainError(f"`coupling` is {coupling}, and must be positive and finite.")
 
 
+@shared_traces()
 def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
     """Return the gain of the consensus law for agents `model` on `graph`, with its certificate.
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import GainError
-from echelon.core.linear import Weight, as_matrix, check_definite
+from echelon.core.linear import Weight, as_matrix, check_definite, check_eigenvalues
 from echelon.core.types import Array
 
 
@@ -34,9 +34,5 @@ def weights_of(
 def _check_semidefinite(Q: Array) -> None:
     if not np.isfinite(Q).all() or not np.allclose(Q, Q.T, rtol=1e-9, atol=0.0):
         raise GainError("`Q` must be a symmetric matrix of finite numbers.")
-    least = float(np.linalg.eigvalsh(Q)[0])
     # Rounding makes zero eigenvalues of a Q of lower rank, such as C'C, slightly negative.
-    if least < -1e-12 * max(1.0, float(np.abs(Q).max())):
-        raise GainError(
-            f"`Q` is not positive semidefinite: its smallest eigenvalue is {least:.6g}."
-        )
+    check_eigenvalues("Q", "positive semidefinite", Q, -1e-12 * len(Q))

@@ -1,0 +1,149 @@
+"""The messages of all agents of a run: what each sends, what arrives, and what it keeps of it."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
+
+from echelon.agents.network.channel import NEVER, Channel, Posts
+from echelon.agents.network.exchange import Difference, Exchange
+from echelon.core.types import Array
+from echelon.simulation.step.knowledge import (
+    NOBODY,
+    Ages,
+    Knowledge,
+    Letters,
+    Mail,
+    Packets,
+    Readers,
+    content_of,
+    no_mail,
+    packet_size,
+    understand,
+    write,
+)
+from echelon.simulation.step.loop import Loop, Moment, WorldState
+
+
+def all_readers(agents: int, leaders: Array) -> Readers:
+    """Return all agents of a run as readers."""
+    numbers = jnp.arange(agents, dtype=jnp.int32)
+    return Readers(numbers, jnp.zeros(agents, bool).at[leaders].set(True))
+
+
+def _all(loop: Loop) -> Readers:
+    return all_readers(len(loop.order), loop.leaders)
+
+
+def begin_network(
+    loop: Loop, world: WorldState, sent: Float[jax.Array, "N s"], forward: int
+) -> WorldState:
+    """Return the world with a network before the first message, for a feed-forward (forward,)."""
+    channel, readers = loop.channel, _all(loop)
+    assert channel is not None
+    links, s = len(loop.exchange.receivers), sent.shape[1]
+    mail = no_mail(readers, links, sent, packet_size(channel, s, forward))
+    posts = channel.begin(Letters(sent, readers.number, mail.packet), links)
+    return world._replace(in_flight=posts, mail=mail)
+
+
+def read_messages(
+    loop: Loop,
+    exchange: Exchange,
+    now: Moment,
+    sent: Float[jax.Array, "N s"],
+    difference: Difference,
+) -> tuple[Knowledge, Mail]:
+    """Return what all agents know at a step, and their mail with what arrives at it."""
+    channel = loop.channel
+    assert channel is not None
+    mail = take(channel, exchange, now.step, now.world.in_flight, now.world.mail)
+    ages = Ages(*(age_of(now.step, x, loop.motion.dt) for x in (mail.stamp, mail.packet.stamp)))
+    t = now.step.astype(sent.dtype) * loop.motion.dt
+    return understand(loop, exchange, _all(loop), t, mail, ages, sent, difference), mail
+
+
+def age_of(
+    step: jax.Array, stamp: Int[jax.Array, " K"], dt: Array | float
+) -> Float[jax.Array, " K"]:
+    """Return the age (s) of what was sent at steps (K,)."""
+    return jnp.where(stamp == NEVER, jnp.inf, (step - stamp) * jnp.asarray(dt))
+
+
+def take(channel: Channel, exchange: Exchange, step: jax.Array, posts: Posts, mail: Mail) -> Mail:
+    """Return the mail with what arrives at a step."""
+    arrival = channel.arrivals(posts, step, mail.stamp)
+    places = arrival.slot, jnp.asarray(exchange.senders)
+    letter: Letters = jax.tree.map(lambda rows: rows[places], posts.content)
+    new = arrival.new
+    value = jnp.where(new[:, None], letter.value, mail.value)
+    hops = jnp.where(new, letter.hops, mail.hops)
+    packet = newest(mail.packet, letter.packet, new, jnp.asarray(exchange.receivers))
+    return Mail(arrival.stamp, value, hops, packet)
+
+
+def newest(own: Packets, others: Packets, new: jax.Array, receivers: jax.Array) -> Packets:
+    """Return the packet of each agent: of the leader with the lowest number, the newest one.
+
+    Args:
+        own: of the agents.
+        others: (K, ...) that messages contain.
+        new: (K,) which of these arrived.
+        receivers: (K,) of the messages.
+    """
+    count = len(own.stamp)
+    valid = new & (others.stamp != NEVER)
+    leaders = jnp.where(valid, others.leader, NOBODY)
+    leader = jnp.minimum(own.leader, jax.ops.segment_min(leaders, receivers, count))
+    of_it = valid & (leaders == leader[receivers])
+    last = jnp.where(own.leader == leader, own.stamp, NEVER)
+    stamp = jax.ops.segment_max(jnp.where(of_it, others.stamp, NEVER), receivers, count)
+    stamp = jnp.maximum(last, stamp)
+    latest = of_it & (others.stamp == stamp[receivers])
+    places = jnp.where(latest, jnp.arange(len(receivers)), NEVER)
+    place = jax.ops.segment_max(places, receivers, count)
+    better = (place >= 0) & (stamp > last)
+    content = jnp.where(better[:, None], others.content[place], own.content)
+    return Packets(leader, stamp, content)
+
+
+def send_messages(
+    loop: Loop,
+    exchange: Exchange,
+    now: Moment,
+    mail: Mail,
+    knowledge: Knowledge,
+    sent: Float[jax.Array, "N s"],
+    difference: Difference,
+    forward: Float[jax.Array, "L k"],
+) -> WorldState:
+    """Return the world after a step in which agents may send.
+
+    Args:
+        loop: with a channel.
+        exchange: with the weights of this step.
+        now: the moment at the beginning of the step.
+        mail: of the agents.
+        knowledge: of the agents.
+        sent: their signals.
+        difference: of two signals.
+        forward: of the leaders, from the inputs that they have just chosen.
+    """
+    channel, numbers = loop.channel, loop.leaders
+    assert channel is not None
+    t = now.step.astype(sent.dtype) * loop.motion.dt
+    offsets = jnp.asarray(loop.offsets, sent.dtype)
+    rows = now.states[numbers], offsets[numbers], now.leader_memory, sent[numbers], forward
+    content = jax.vmap(lambda *row: content_of(loop, t, *row))(*rows)
+    content = jnp.zeros_like(mail.packet.content).at[numbers].set(content)
+    letters, sends = write(
+        channel, _all(loop), now.step, mail, knowledge, sent, difference, content
+    )
+    carried = links_with(exchange, sends)
+    links = exchange.receivers, exchange.senders
+    posts = channel.post(now.world.in_flight, now.step, letters, carried, *links)
+    return now.world._replace(in_flight=posts, mail=mail)
+
+
+def links_with(exchange: Exchange, sends: Bool[jax.Array, " N"]) -> Bool[jax.Array, " K"]:
+    """Return the links along which messages leave; those that the graph lacks carry nothing."""
+    return sends[jnp.asarray(exchange.senders)] & (jnp.asarray(exchange.weights) > 0.0)
