@@ -127,7 +127,7 @@ class Safety:
             The rate (d,), and how many rows act on it.
         """
         # Of who is not known nothing is a number.
-        corners = jnp.where(near.known[:, None, None], near.gaps, 0.0) * scales
+        corners = jnp.where(near.known[:, None, None], near.gaps, 0.0) * scales[None, None]
         nearest = nearest_point(corners)
         far = jnp.sqrt((nearest * nearest).sum(axis=1))
         normals = nearest / jnp.maximum(far, jnp.finfo(far.dtype).tiny)[:, None]

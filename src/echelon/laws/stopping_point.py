@@ -375,7 +375,7 @@ class StoppingLeader(FlatLaw):
     def expected_hull(self, model: ControlAffine, t: Scalar, signal: jax.Array) -> jax.Array:
         """Return the hull of the path, moved so that it ends at the signal."""
         hull = self.hull_of(model, self.path(model, t)[:-1])
-        return hull - hull[-1] + signal[np.array(self.places(model))]
+        return hull - hull[-1:] + signal[None, np.array(self.places(model))]
 
 
 @memoize

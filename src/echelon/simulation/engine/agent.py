@@ -132,8 +132,8 @@ class Agent:
         safety, model = self._loop.follower.safety, self._loop.model
         if safety is None:
             return None
-        x = jnp.zeros(len(model.state_names))
         with precision("float64"):
+            x = jnp.zeros(len(model.state_names))
             hull = jax.eval_shape(lambda: self._law.hull(model, x, self._law.begin(model, x)))
         assert hull is not None
         names = tuple(f"{name}{k}" for k in range(len(hull)) for name in model.position)
@@ -150,11 +150,12 @@ class Agent:
 
     def receive(self, message: object) -> Received:
         """Take a message of another agent, or return why it is not used. It never raises."""
-        clock = None if self._stamps is None else self._stamps.clock
-        seen = self._others is not None and self._others.take(message, clock)
         received = self._inbox.receive(message)
+        if self._others is None or received not in (Received.TAKEN, Received.NOT_HEARD):
+            return received
         # Of others than neighbours the place alone is used.
-        return Received.TAKEN if seen and received is Received.NOT_HEARD else received
+        clock = None if self._stamps is None else self._stamps.clock
+        return Received.TAKEN if self._others.take(message, clock) else received
 
     def hello(self, x: ArrayLike) -> Message | None:
         """Return the message of the agent at a state (n,), before it acts.

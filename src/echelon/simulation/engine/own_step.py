@@ -55,7 +55,7 @@ def hull_of(loop: Loop, law: Law, own: OwnState) -> Float[jax.Array, "r d"] | No
 
 def _gaps(near: Near | None, hull: Float[jax.Array, "r d"] | None) -> Near | None:
     """Return what an agent knows of others, from their hulls and its own."""
-    return None if near is None or hull is None else near._replace(gaps=hull - near.gaps)
+    return None if near is None or hull is None else near._replace(gaps=hull[None] - near.gaps)
 
 
 class Step(NamedTuple):

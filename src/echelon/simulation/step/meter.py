@@ -251,8 +251,8 @@ class Meter(eqx.Module):
     ) -> dict[str, jax.Array]:
         """Return the terms `separation` and `avoidance` of a step, where agents keep apart."""
         nothing, at = self.zero_sums(), step // jnp.asarray(self.per_slice)
-        places = states[:, np.array(self.measured)] * jnp.asarray(self.scales, states.dtype)
-        squares = ((places[:, None] - places) ** 2).sum(axis=2)
+        places = states[:, np.array(self.measured)] * jnp.asarray(self.scales[None], states.dtype)
+        squares = ((places[:, None] - places[None]) ** 2).sum(axis=2)
         others = jnp.where(jnp.eye(len(states), dtype=bool), jnp.inf, squares)
         return {
             "separation": nothing.separation.at[:, at].set(jnp.sqrt(others.min(axis=1))),
