@@ -26,7 +26,7 @@ import echelon as ech
 from echelon.agents.models.chains import chains_of, flatten
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.guarantees.stopping.stopping_run import stopping_of
+from echelon.guarantees.stopping.stopping_run import stopping_run_of
 from echelon.guarantees.stopping.tube import tube_of
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.prepare import prepare
@@ -118,7 +118,7 @@ def vehicles(draw: np.random.Generator, count: int) -> Iterator[str]:
             x.append(far(draw, prepared.problem.states))
         least, up = fly(loop, jnp.asarray(np.array(rows)), jnp.asarray(np.array(x)), DT)
         for state in x:
-            run = stopping_of(prepared.parts, settings, state)
+            run = stopping_run_of(prepared.parts, settings, state)
             tube = None if run is None else tube_of(run).tube
             bounds.append(tube.left - loop.model.gravity if tube else -np.inf)
         weights, starts = weights + rows, starts + x

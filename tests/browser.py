@@ -69,7 +69,7 @@ def opened(browser, address, width=1280, height=720, **options):
         raise
     finally:
         context.close()
-    home = address.split("?")[0]
+    home = address.split("?")[0].split("#")[0]
     outside = [x for x in events.requests if not x.startswith((home, "blob:", "data:"))]
     assert events.errors == [] and outside == []
 

@@ -413,7 +413,7 @@ def badges_of(model, errors, pitch=None, begins=None):
         if pitch is not None:
             states[1, names.index("pitch")] = pitch[second]
         size, none = np.array([0.0, error]), np.zeros(2, bool)
-        status.look(Picture(float(second), states, states, size, states, np.nan, none))
+        status.look(Picture(float(second), states, states, size, states, None, np.nan, none))
     return told
 
 

@@ -227,6 +227,145 @@ def test_keys_the_slider_and_a_chart_move_the_time_and_play_lets_it_run(browser,
         assert not page.evaluate("echelon.player.playing") and stopped < 300
 
 
+TURN = """([place, shift]) => {
+    const { orbit } = echelon.player.views.views[place];
+    orbit.target.x += shift;
+    orbit.update();
+}"""
+
+
+def shown_span(page):
+    return page.evaluate("echelon.player.window.span")
+
+
+def test_a_chart_is_zoomed_and_moved_with_its_numbers_and_a_double_click_shows_all(browser, file):
+    with opened(browser, file) as page:
+        seek(page, 150)
+        page.locator("h1").click()
+        box = page.locator(".chart .area").first.bounding_box()
+        middle, height = box["x"] + 46 + 0.5 * (box["width"] - 60), box["y"] + 0.5 * box["height"]
+        page.mouse.move(middle, height)
+        page.mouse.wheel(0, -600)
+        until(lambda: shown_span(page)[1] < 6.0)
+        low, high = shown_span(page)
+        # The time under the mouse stays.
+        assert high - low == pytest.approx(6.0 * 1.0015**-600, rel=1e-3)
+        assert 0.5 * (low + high) == pytest.approx(3.0, abs=0.05)
+        reach = page.evaluate("echelon.player.charts.map((c) => c.limits)")
+        page.mouse.move(middle + 80, height)
+        page.mouse.down()
+        page.mouse.move(middle - 20, height)
+        page.mouse.up()
+        assert shown_span(page)[0] > low and page.evaluate("echelon.frame") == 150
+        # Over the numbers at the left it is the values that are stretched.
+        page.mouse.move(box["x"] + 20, height)
+        page.mouse.wheel(0, 300)
+        until(lambda: page.evaluate("echelon.player.charts[0].limits") != reach[0])
+        assert page.locator(".reset").first.is_visible()
+        page.mouse.dblclick(middle, height)
+        assert shown_span(page) == [0, 6] and not page.locator(".reset").first.is_visible()
+
+
+def test_keys_choose_an_agent_and_are_listed_and_the_address_is_a_link_to_the_time(browser, file):
+    with opened(browser, file + "#t=1.5") as page:
+        assert page.evaluate("echelon.run.moment.time") == pytest.approx(1.5)
+        for key, agent in (("n", 0), ("n", 1), ("p", 0), ("p", 3), ("Escape", -1)):
+            page.keyboard.press(key)
+            assert page.evaluate("echelon.player.view.selected") == agent
+        page.keyboard.press("?")
+        told = page.locator("#help").inner_text()
+        assert "select the next agent" in told and "play, pause" in told
+        page.keyboard.press("?")
+        assert not page.locator("#help").is_visible()
+        page.keyboard.press("ArrowRight")
+        until(lambda: page.evaluate("location.hash") == "#t=1.6")
+        page.evaluate("location.hash = 't=2.25'")
+        until(lambda: page.evaluate("echelon.run.moment.time") == pytest.approx(2.25))
+
+
+def test_agents_that_leave_the_picture_are_counted_and_shown_again(browser, file):
+    with opened(browser, file) as page:
+        hint = page.locator(".away")
+        assert not hint.is_visible()
+        page.evaluate(TURN, [0, 50])
+        until(lambda: hint.is_visible())
+        assert hint.inner_text().startswith("4 agents out of view")
+        hint.click()
+        until(lambda: not hint.is_visible())
+
+
+def test_the_smallest_distance_so_far_has_its_pair_its_time_and_the_size_of_vehicles(
+    browser, run, tmp_path
+):
+    states = run.states.copy()
+    # Nobody is closer before frame 120, where 2 meets 3.
+    states[120, 2, :3] = states[120, 3, :3] + [0.0, 0.1, 0.0]
+    met = dataclasses.replace(run, states=states, radius=0.07)
+    places = states[:, :, :3]
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(met), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        for frame in (40, 119, 120, 300):
+            seek(page, frame)
+            pairs = itertools.combinations(range(4), 2)
+            apart = {(i, j): np.linalg.norm(places[:, i] - places[:, j], axis=1) for i, j in pairs}
+            i, j = min(apart, key=lambda pair: apart[pair][: frame + 1].min())
+            least = apart[i, j][: frame + 1]
+            shown = page.locator(".closest")
+            number = f"{least.min():#.3g}"
+            words = f"so far {number} m, agents {i} and {j} at {run.times[least.argmin()]:.2f} s"
+            assert words in shown.inner_text() and "touch below 0.140 m" in shown.inner_text()
+            assert ("touch" in shown.get_attribute("class").split()) == (frame >= 120)
+
+
+def test_the_reference_is_drawn_and_the_leader_s_error_told(browser, run, tmp_path):
+    reference = run.states[:, 0].copy()
+    reference[:, 1] += 0.25
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(dataclasses.replace(run, reference=reference)), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        seek(page, 90)
+        assert page.evaluate("echelon.goal(0)") == pytest.approx(reference[90, :3], abs=1e-4)
+        assert "leader 0.250" in page.locator(".chart").first.inner_text().replace("\n", " ")
+        page.keyboard.press("n")
+        assert "0.250 m from its reference" in page.locator(".card").inner_text()
+        places = page.evaluate("echelon.run.path")
+        np.testing.assert_allclose(places[90], reference[90, :3], atol=1e-4)
+
+
+def test_two_runs_have_one_clock_one_scale_and_one_camera(browser, run, tmp_path):
+    other = flown(seconds=3.0, rate=25.0)
+    path = tmp_path / "runs.html"
+    path.write_text(replay_page(other, dataclasses.replace(run, name="second")), "utf-8")
+    moments = "echelon.player.panes.map((pane) => pane.run.moment.time)"
+    with opened(browser, path.as_uri()) as page:
+        assert page.locator("header h1").inner_text() == "made up and second"
+        for time, shown in ((2.0, [2.0, 2.0]), (5.0, [3.0, 5.0])):
+            page.evaluate(f"echelon.player.seekTime({time})")
+            assert page.evaluate(moments) == pytest.approx(shown)
+        limits = page.evaluate("echelon.player.charts.map((chart) => chart.limits)")
+        assert limits[:3] == limits[3:]
+        page.evaluate(TURN, [1, 1])
+        targets = page.evaluate("echelon.player.views.views.map((v) => v.orbit.target.toArray())")
+        assert targets[0] == pytest.approx(targets[1])
+        page.keyboard.press("n")
+        assert page.locator(".card").count() == 2 and page.locator(".card").last.is_visible()
+
+
+def test_a_phone_shows_scene_and_controls_on_one_screen_with_room_for_fingers(browser, file):
+    with opened(browser, file, 390, 844, has_touch=True, is_mobile=True) as page:
+        assert page.evaluate("document.documentElement.scrollHeight") <= 844
+        boxes = {name: page.locator(name).bounding_box() for name in ("#scene", "#side", "footer")}
+        assert boxes["#scene"]["y"] + boxes["#scene"]["height"] <= boxes["#side"]["y"] + 0.5
+        assert boxes["#side"]["y"] + boxes["#side"]["height"] <= boxes["footer"]["y"] + 0.5
+        assert boxes["footer"]["y"] + boxes["footer"]["height"] <= 844.5
+        for target in page.locator("button:visible, select:visible, input:visible").all():
+            assert target.bounding_box()["height"] >= 44
+        # A finger that moves up scrolls the charts, and seeks no time.
+        touch = page.locator(".area").first.evaluate("(e) => getComputedStyle(e).touchAction")
+        assert touch == "pan-y"
+
+
 def test_the_camera_follows_an_agent(browser, file):
     with opened(browser, file) as page:
         page.get_by_label("target of the camera").select_option("3")

@@ -1,25 +1,38 @@
 """`echelon live`: a closed loop in real time, with controls in the browser."""
 
-from echelon.apps.cli.options import BrowserOption, PortOption, ScenarioArgument, SetOption
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from echelon.apps.cli.options import BrowserOption, PortOption, SetOption
 
 
 def live(
-    scenario: ScenarioArgument,
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            help="The name of a bundled scenario, a YAML file, or the folder of a run, which goes "
+            "on from its last state."
+        ),
+    ],
     set_: SetOption = None,
     port: PortOption = None,
     browser: BrowserOption = True,
 ) -> None:
     """Run a scenario in real time in the browser, with controls that show what is guaranteed."""
-    from echelon.experiments.scenario.scenario import load_scenario
+    from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
     from echelon.output.viewer.page import check_page
 
-    loaded = load_scenario(scenario, set_ or [])
+    folder = Path(scenario) if Path(scenario).is_dir() else None
+    loaded = load_scenario(scenario if folder is None else folder / SCENARIO_FILE, set_ or [])
     check_page()
     from echelon.apps.cli.view_command import keep_serving
     from echelon.apps.live.server import live as make_ready
     from echelon.apps.live.server import serve_live
+    from echelon.output.archive.open_folder import open_run
 
-    session, html = make_ready(loaded)
+    session, html = make_ready(loaded, None if folder is None else open_run(folder))
     server = serve_live(session, html, port)
     session.start()
     try:

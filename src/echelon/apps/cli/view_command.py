@@ -2,22 +2,39 @@
 
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from echelon.apps.cli.console import write_file
-from echelon.apps.cli.options import BrowserOption, OverwriteOption, PortOption, RunArgument
+from echelon.apps.cli.options import BrowserOption, OverwriteOption, PortOption
 from echelon.apps.cli.stop import STOP
-from echelon.output.archive.folder import claim_file
+from echelon.core.errors import OutputError
+from echelon.output.archive.folder import DATA, check_exists, claim_file
 
 if TYPE_CHECKING:
     from http.server import ThreadingHTTPServer
 
 
+def _check_runs(runs: list[Path] | None) -> list[Path] | None:
+    if runs and len(runs) > 2:
+        raise OutputError(f"got {len(runs)} runs; a page shows one, or two beside each other.")
+    for run in runs or ():
+        check_exists(run)
+    return runs
+
+
 def view(
-    run: RunArgument,
+    runs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[RUN] [RUN]",
+            help="One run or two: their folders, or their `run.nc` (default: the newest in runs/).",
+            callback=_check_runs,
+        ),
+    ] = None,
     html: Annotated[
         Path | None, typer.Option(help="Write a self-contained page to this file instead.")
     ] = None,
@@ -25,7 +42,7 @@ def view(
     browser: BrowserOption = True,
     force: OverwriteOption = False,
 ) -> None:
-    """Show a run in the browser: motion, errors, V and inputs; or write the page to a file."""
+    """Show a run in the browser, or two with the same clock; or write the page to a file."""
     from echelon.output.viewer.page import check_page
 
     # Before the run is read, which takes longer.
@@ -35,11 +52,30 @@ def view(
     from echelon.output.archive.open_folder import open_run
     from echelon.output.viewer.replay import replay_page
 
-    page = replay_page(open_run(run)).encode()
+    paths = runs or [_newest()]
+    opened = [open_run(path) for path in paths]
+    if len(paths) > 1:
+        # Both may be of one scenario.
+        opened = [replace(run, name=_label(path)) for run, path in zip(opened, paths, strict=True)]
+    page = replay_page(*opened).encode()
     if html is None:
         show_page(page, port, browser)
         return
     write_file(html, page, "{}, one self-contained file")
+
+
+def _label(path: Path) -> str:
+    path = path.resolve()
+    return path.parent.name if path.name == DATA else path.name
+
+
+def _newest() -> Path:
+    """Return the newest run in the folder of runs, and say which it is."""
+    from echelon.output.archive.folder import newest_run
+
+    run = newest_run()
+    print(f"echelon: showing `{run}`, the newest run.", file=sys.stderr)
+    return run
 
 
 def show_page(page: bytes, port: int | None, browser: bool) -> None:
@@ -72,8 +108,9 @@ def show_address(
     if preferred not in (actual, 0):
         print(f"echelon: port {preferred} is in use; using {actual}.", file=sys.stderr)
     opened = browser and open_browser(address)
-    hint = "" if opened or not browser else " (no browser could be opened; open it yourself)"
-    print(f"echelon: serving {address}{hint}. Ctrl-C quits.", file=sys.stderr, flush=True)
+    failed = browser and not opened
+    hint = " No browser could be started: open this address in one." if failed else ""
+    print(f"echelon: serving {address}.{hint} Ctrl-C quits.", file=sys.stderr, flush=True)
 
 
 def wait() -> None:

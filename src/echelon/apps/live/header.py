@@ -11,6 +11,9 @@ from echelon.output.plots.space import Space, space_of
 from echelon.output.viewer.replay import header, motor_loads
 from echelon.simulation.step.settings import Settings
 
+_AHEAD, _APART = 60.0, 0.1
+"""Seconds of the reference that are drawn, and seconds between two places of it."""
+
 
 def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: JsonObject) -> JsonObject:
     """Return the header of a loop's page."""
@@ -29,9 +32,25 @@ def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: JsonObject) -> 
         "turns": len(space.angles),
         "loads": 0 if loads is None else loads.shape[2],
         "thrust": loads is not None,
+        "path": _path(swarm, space),
         "unit": run.length_unit,
         "limited": run.loads is not None,
     }
+
+
+def _path(swarm: LiveLoop, space: Space) -> list[list[float]]:
+    """Return places along the reference as they are drawn; none without a reference."""
+    times = np.arange(0.0, _AHEAD, _APART)
+    states = swarm.reference_at(times)
+    if states is None:
+        return []
+    places = np.zeros((len(times), 3))
+    if space.kind == "time":
+        places[:, :2] = np.column_stack([times, states[:, space.axes[0]]])
+    else:
+        places[:, : len(space.axes)] = states[:, list(space.axes)]
+    places[:, :2] *= space.stretch
+    return np.round(places, 4).tolist()
 
 
 def scene(swarm: LiveLoop, settings: Settings) -> tuple[Space, InputBounds | None]:

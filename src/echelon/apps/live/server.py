@@ -7,6 +7,8 @@ import time
 from http.server import ThreadingHTTPServer
 from typing import Final
 
+import numpy as np
+
 from echelon.apps.live.header import live_header
 from echelon.apps.live.panel import Panel
 from echelon.apps.live.promiser import pending_badge
@@ -14,6 +16,7 @@ from echelon.apps.live.session import Session
 from echelon.apps.live.swarm import LiveLoop
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.core.types import JsonObject
+from echelon.experiments.results.recording import Recording
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.viewer.pack import pack
@@ -26,8 +29,12 @@ _SLOWEST: Final = 4.0
 """A loop that is more times slower than real time is refused."""
 
 
-def live(scenario: Scenario) -> tuple[Session, str]:
+def live(scenario: Scenario, run: Recording | None = None) -> tuple[Session, str]:
     """Return a session that is ready to start, and its page.
+
+    Args:
+        scenario: of the loop.
+        run: of that scenario, whose last state the loop starts from; laws begin without memory.
 
     Raises:
         EchelonError: a part is invalid, or the loop is too slow for real time.
@@ -38,9 +45,28 @@ def live(scenario: Scenario) -> tuple[Session, str]:
         raise SimulationError("only agents under laws can run live; use `echelon run` instead.")
     panel = Panel(scenario, experiment)
     swarm = LiveLoop(parts, settings, panel.live)
+    name = scenario.name
+    if run is not None:
+        _continue(swarm, run)
+        name = f"{name}, from {run.times[-1]:.4g} s on"
     _check_speed(swarm)
-    header = live_header(swarm, panel, scenario.name, pending_badge())
-    return Session(scenario, panel, swarm), page(f"{scenario.name}, live", pack(header, {}))
+    header = live_header(swarm, panel, name, pending_badge())
+    return Session(scenario, panel, swarm), page(f"{name}, live", pack(header, {}))
+
+
+def _continue(swarm: LiveLoop, run: Recording) -> None:
+    """Let a loop start from the last state of a run.
+
+    Raises:
+        SimulationError: the run has no state of these agents.
+    """
+    shape = np.shape(swarm.states)
+    if not len(run.times) or run.states.shape[1:] != shape:
+        got = "no state" if not len(run.times) else f"{run.agents} agents"
+        raise SimulationError(
+            f"the run has {got}, and its scenario {shape[0]} agents of {shape[1]} states."
+        )
+    swarm.states, swarm.first = run.states[-1], round(run.times[-1] / swarm.settings.dt)
 
 
 def _check_speed(swarm: LiveLoop) -> None:

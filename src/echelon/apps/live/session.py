@@ -21,6 +21,7 @@ from echelon.core.errors import EchelonError, SimulationError
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.viewer.replay import heard_by
+from echelon.simulation.engine.frame_numbers import ClosestPair
 
 if TYPE_CHECKING:
     from echelon.experiments.scenario.sections import LiveSpec
@@ -51,9 +52,9 @@ class Session:
         self.future = sorted(map(_as_event, scenario.live), key=lambda event: event["at"])
         self.picture, self.number, self.messages = b"", 0, list[bytes]()
         self.changed, self.lost, self.factor = threading.Condition(), False, 1.0
+        self.closest: ClosestPair | None = None
         # Loops by law; events are saved for the scenario of the first.
         self.first, self.loops = panel, {panel.law: (panel, swarm)}
-        self.origin = swarm.states
         self._check()
         model, graph = swarm.parts.model, swarm.parts.graph
         self.status = GuaranteeStatus(model, graph, lambda badge: self.send({"promise": badge}))
@@ -143,21 +144,30 @@ class Session:
             self.status.lose()
             return
         self.status.look(picture)
+        self._look_for_closest(picture)
         block = self._packed(picture)
         with self.changed:
             self.picture, self.number = block, self.number + 1
             self.changed.notify_all()
 
+    def _look_for_closest(self, picture: Picture) -> None:
+        axes = self.panel.live.axes
+        if axes and len(picture.states) > 1:
+            pair = ClosestPair.of(picture.states[:, axes], picture.time)
+            if self.closest is None or pair.distance < self.closest.distance:
+                self.closest = pair
+
     def _packed(self, picture: Picture) -> bytes:
-        space, swarm = self.space, self.swarm
+        space, swarm, pair = self.space, self.swarm, self.closest
         followers = list(swarm.parts.graph.followers)
         errors = picture.errors[followers]
         loads = self._loads(picture)
         ends = (loads.max(), loads.min()) if loads.size else (np.nan, np.nan)
-        goals = (picture.states[swarm.nearest] - picture.offsets[swarm.nearest]) + picture.offsets
+        goals = swarm.goals(picture)
         parts = [
-            np.array([errors.max(), np.median(errors), *ends, picture.lyapunov]),
-            np.array([self.factor, self.knobs.wind]),
+            np.array([errors.max(), np.median(errors), swarm.off_reference(picture)]),
+            np.array([*ends, picture.lyapunov, self.factor, self.knobs.wind]),
+            np.array(4 * [np.nan] if pair is None else [pair.time, pair.distance, *pair.agents]),
             picture.states[:, list(space.axes)],
             goals[:, list(space.axes)],
             space.sign * picture.states[:, list(space.angles)],
@@ -233,7 +243,7 @@ class Session:
         """
         name, value = request.get("name"), request.get("value")
         if name == "save":
-            return {"text": self.first.saved(self.events)}
+            return self._saved()
         if name in ("pause", "reset"):
             self._later(lambda: self._pause(bool(value)) if name == "pause" else self._reset())
             return {}
@@ -247,6 +257,11 @@ class Session:
             event = self._event(str(name), value)
         self._later(lambda: self.apply(event))
         return event
+
+    def _saved(self) -> JsonObject:
+        if self.swarm.first:
+            return {"fault": "A scenario begins at 0 s, so a continued run is not saved as one."}
+        return {"text": self.first.saved(self.events)}
 
     def _later(self, action: Callable[[], None]) -> None:
         with self.changed:
@@ -325,7 +340,8 @@ class Session:
         self.prepare(law)
         before = self.swarm
         self.panel, self.swarm = self.loops[law]
-        self.swarm.restart(np.asarray(before.now.states, float), before.steps)
+        self.swarm.states, self.swarm.first = before.states, before.first
+        self.swarm.proceed(np.asarray(before.now.states, float), before.steps)
         self.status.begin()
         self.send(self._panel_message())
         names = {"shape", "cut", *self.panel.ranges} - {"coupling"}
@@ -337,8 +353,9 @@ class Session:
 
     def _reset(self) -> None:
         """Restart from the initial states, with the knobs as they are."""
-        self.swarm.restart(self.origin)
+        self.swarm.restart()
         self.status.restart()
+        self.closest = None
         self.lost, self.events, self.future = False, [], []
         start: JsonObject = {} if self.panel is self.first else {"law": self.panel.law}
         for name in ("method", "shape", *self.panel.ranges):

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.hearing import edges_of
@@ -39,7 +40,8 @@ _AHEAD = 60.0
 class Picture(NamedTuple):
     """The swarm at a time (s): states (N, n), inputs (N, m), errors (N,), offsets (N, n).
 
-    `lyapunov` is V, NaN if it does not exist; `beyond` (N,) marks the agents whose states or inputs
+    `reference` (n,) is that of the leaders, None if they follow nothing; `lyapunov` is V, NaN if
+    it does not exist; `beyond` (N,) marks the agents whose states or inputs
     are not finite, or are too large for the stepper.
     """
 
@@ -48,6 +50,7 @@ class Picture(NamedTuple):
     inputs: Array
     errors: Array
     offsets: Array
+    reference: Array | None
     lyapunov: float
     beyond: Array
 
@@ -85,7 +88,8 @@ class LiveLoop:
         self.loop: Loop = dataclasses.replace(loop, follower=law, share=np.asarray(1.0))
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
         self.potentials: dict[Hashable, Callable[[Array], Array]] = {}
-        self.states, self.measured = problem.states, list(problem.meter.measured)
+        self.states, self.first = problem.states, 0
+        self.measured = list(problem.meter.measured)
         self.nearest = np.array(parts.graph.nearest_leader())
         self.weights = np.asarray(loop.exchange.weights, np.float64)
         self.edge = edges_of(parts.graph, loop.exchange)[0]
@@ -132,10 +136,14 @@ class LiveLoop:
         """Seconds from a picture to the next."""
         return self.count * self.settings.dt
 
-    def restart(self, states: Array | None = None, step: int = 0) -> None:
-        """Restart from the initial states, or from other ones (N, n), with the same knobs."""
+    def restart(self) -> None:
+        """Restart from the initial states, with the same knobs."""
+        self.proceed(self.states, self.first)
+
+    def proceed(self, states: Float[Array, "N n"], step: int) -> None:
+        """Proceed from states at a step, with the same knobs; laws begin without memory."""
         with precision(self.precision):
-            now = begin(self.loop, jnp.asarray(self.states if states is None else states))
+            now = begin(self.loop, jnp.asarray(states))
             self.now: Moment = now._replace(step=jnp.asarray(step, jnp.int32))
 
     @property
@@ -201,8 +209,9 @@ class LiveLoop:
             self.stepper.replace_loop(self.loop)
         # A frame at the beginning, from which all steps are taken, and one at the end.
         counts = np.array([0 if still else self.count, 0], np.int32)
+        reference = self.reference_at(self.settings.dt * (self.steps + np.arange(self.count + 1)))
         with precision(self.precision):
-            chunk = self.stepper.advance(self.now, counts, self._reference())
+            chunk = self.stepper.advance(self.now, counts, reference)
         self.now, states, inputs = chunk.now, chunk.states[-1], chunk.inputs[-1]
         y = states - self.offsets
         with np.errstate(over="ignore", invalid="ignore"):
@@ -213,13 +222,32 @@ class LiveLoop:
         valid &= not np.any(chunk.inexact)
         time = self.steps * self.settings.dt
         V = float(self.potential(y[None])[0]) if valid.all() and self.potential else np.nan
-        return Picture(time, states, inputs, errors, self.offsets, V, np.logical_not(valid))
+        desired = None if reference is None else reference[counts[0]]
+        beyond = np.logical_not(valid)
+        return Picture(time, states, inputs, errors, self.offsets, desired, V, beyond)
 
-    def _reference(self) -> Array | None:
-        """Return the leaders' reference states, which the stepper's meter requires."""
-        times = self.loop.motion.dt * (self.steps + jnp.arange(self.count + 1))
-        reference = _reference_states(self.loop.leader, self.loop.model, times)
-        return None if reference is None else np.asarray(reference, np.float64)
+    def goals(self, picture: Picture) -> Float[Array, "N n"]:
+        """Return the goals: of leaders relative to the reference, NaN if they follow nothing."""
+        y = picture.states - picture.offsets
+        goals = y[self.nearest] + picture.offsets
+        leaders = list(self.parts.graph.leaders)
+        if picture.reference is None:
+            goals[leaders] = np.nan
+        else:
+            goals[leaders] = picture.reference + picture.offsets[leaders]
+        return goals
+
+    def off_reference(self, picture: Picture) -> float:
+        """Return the largest distance of a leader from the reference, NaN if there is none."""
+        leaders = list(self.parts.graph.leaders)
+        away = (picture.states - self.goals(picture))[leaders][:, self.measured]
+        return float(np.linalg.norm(away, axis=1).max())
+
+    def reference_at(self, times: Float[Array, " T"]) -> Float[Array, "T n"] | None:
+        """Return the leaders' reference states at times (s); None if they follow nothing."""
+        with precision("float64"):
+            states = _reference_states(self.loop.leader, self.loop.model, jnp.asarray(times))
+        return None if states is None else np.asarray(states, np.float64)
 
 
 @cached_jit

@@ -49,7 +49,7 @@ def foreseen(
     """
     model, fixed = parts.model, labelled_parts(parts, settings)
     times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)
-    ahead = _ahead(parts, states, times)
+    ahead, reference = _ahead(parts, states, times)
     trim, agents = np.asarray(model.trim[1], float), parts.graph.agents
     frames = {
         "time": times,
@@ -57,6 +57,7 @@ def foreseen(
         "inputs": np.broadcast_to(trim, (_PLACES, agents, len(trim))),
         "saturated": np.zeros(agents),
     }
+    frames |= {} if reference is None else {"reference": reference}
     attributes = {"scenario": name, "outcome": "completed", "message": ""}
     attributes["promise"] = json.dumps(promise)
     return recording(fixed.arrays() | frames, fixed.attributes | attributes)
@@ -64,15 +65,16 @@ def foreseen(
 
 def _ahead(
     parts: Parts, start: Float[Array, "N n"], times: Float[Array, " T"]
-) -> Float[Array, "T N n"]:
-    """Return the states at the start, and the goals from then on."""
+) -> tuple[Float[Array, "T N n"], Float[Array, "T n"] | None]:
+    """Return the states at the start and the goals from then on, and the reference if any."""
     with precision("float64"):
         path = parts.drive.reference_states(parts.model, jnp.asarray(times))
     if path is None:
-        return np.broadcast_to(start, (len(times), *np.shape(start))).copy()
-    states = np.asarray(path)[:, None] + parts.formation.offsets
+        return np.broadcast_to(start, (len(times), *np.shape(start))).copy(), None
+    reference = np.asarray(path, float)
+    states = reference[:, None] + parts.formation.offsets
     states[0] = start
-    return states
+    return states, reference
 
 
 def so_far(
@@ -90,6 +92,7 @@ def so_far(
         times=stretch.times,
         states=stretch.states,
         inputs=stretch.inputs,
+        reference=stretch.reference,
         lyapunov=None if potential is None else _in_blocks(potential, stretch.states - run.offsets),
     )
 

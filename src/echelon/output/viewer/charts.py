@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.metrics import SETTLED
@@ -78,9 +79,21 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
             sheet.line("worst", rows.max(axis=1), 1, True),
             sheet.line("median", np.median(rows, axis=1), 0, True),
         ]
+    if run.reference is not None:
+        away = _off_reference(run, run.reference)
+        name = "leaders" if len(run.leaders) > 1 else "leader"
+        lines.append(sheet.line(name, away, "leader", True))
     lines += _slope(run, errors[0].max(), 1.0)
     marks = [{"value": SETTLED, "name": "1 cm" if run.length_unit else "0.01"}]
     return _chart("formation error", run.length_unit, True, lines, marks)
+
+
+def _off_reference(run: Recording, reference: Float[Array, "T n"]) -> Float[Array, " T"]:
+    """Return the largest distance of a leader from its place beside the reference."""
+    leaders, measured = list(run.leaders), list(run.measured)
+    away = run.states[:, leaders] - run.offsets[leaders] - reference[:, None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.linalg.norm(away[:, :, measured], axis=2).max(axis=1)
 
 
 def _slope(run: Recording, begin: float, times: float) -> list[JsonObject]:

@@ -71,7 +71,7 @@ class Growing:
 
 def _joined(before: Recording, stretch: Recording) -> Recording:
     """Return a part with the last frame of the previous one, for interpolation."""
-    names = ("times", "states", "inputs", "lyapunov")
+    names = ("times", "states", "inputs", "lyapunov", "reference")
     parts = {
         name: np.concatenate([getattr(before, name)[-1:], getattr(stretch, name)])
         for name in names

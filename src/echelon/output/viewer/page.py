@@ -19,14 +19,15 @@ _SCRIPTS = (
     "scene.js",
     "chart.js",
     "controls.js",
+    "keys.js",
     "live.js",
     "growing.js",
     "replay.js",
 )
 
 
-def page(title: str, data: bytes) -> str:
-    """Return the page of compressed data, as `pack` returns it.
+def page(title: str, *data: bytes) -> str:
+    """Return the page of one run or more in compressed data, as `pack` returns them.
 
     Raises:
         MissingExtraError: three.js is not built, as in a fresh clone.
@@ -36,7 +37,7 @@ def page(title: str, data: bytes) -> str:
         title=escape(f"{title} \u00b7 echelon"),
         style=_read("page.css"),
         code=_text(zlib.compress(_code().encode(), 9)),
-        data=_text(data),
+        data="\n".join(f'<script type="text/plain" class="data">{_text(x)}</script>' for x in data),
     )
 
 

@@ -22,13 +22,14 @@ _MOST = 20_000_000
 """Numbers in one file, which take some 25 MB."""
 
 
-def replay_page(run: Recording) -> str:
-    """Return a run as one self-contained HTML page.
+def replay_page(*runs: Recording) -> str:
+    """Return one run, or two beside each other with the same clock, as a self-contained HTML page.
 
     Raises:
-        OutputError: the run has no frame or is too large, or the page's three.js is not built.
+        OutputError: a run has no frame or is too large.
+        MissingExtraError: the page's three.js is not built.
     """
-    return page(run.name, replay_data(run))
+    return page(" and ".join(run.name for run in runs), *map(replay_data, runs))
 
 
 def replay_data(run: Recording) -> bytes:
@@ -47,6 +48,9 @@ def replay_data(run: Recording) -> bytes:
         angles = run.states[:, :, list(space.angles)]
         angles = space.sign * np.unwrap(np.where(np.isfinite(angles), angles, 0.0), axis=0)
         groups["angles"] = Group(_flat(angles[frames]))
+    if run.reference is not None:
+        path = run.reference[frames][:, list(space.axes)]
+        groups["reference"] = Group(path, gaps=True)
     loads, many = motor_loads(run, space), run.agents > FLOCK
     if loads is not None:
         groups["motors"] = Group(_flat(loads[frames]), BYTE if many else COARSE, (0.0, 1.0))
@@ -55,6 +59,7 @@ def replay_data(run: Recording) -> bytes:
         **header(run, space),
         "frames": len(frames),
         "clock": _clock(run, frames),
+        "closest": _closest(run),
         "thrust": loads is not None,
         "charts": charts.descriptions,
         "chartTimes": charts.times,
@@ -78,6 +83,15 @@ def _clock(run: Recording, frames: Array) -> dict[str, float]:
     times = run.times[frames]
     step = float(times[1] - times[0]) if len(times) > 1 else 1.0
     return {"start": float(times[0]), "step": step, "last": float(times[-1])}
+
+
+def _closest(run: Recording) -> list[list[float]]:
+    """Return each time at which two agents were closer than any before, how close, and who."""
+    return [[*map(_rounded, (pair.time, pair.distance)), *pair.agents] for pair in run.approaches()]
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
 
 
 def motor_loads(run: Recording, space: Space) -> Array | None:
@@ -118,6 +132,8 @@ def header(run: Recording, space: Space) -> JsonObject:
         "edges": run.edges.tolist(),
         "heard": heard_by(run.heard),
         "schedule": _schedule(run),
+        "radius": run.radius,
+        "referenced": run.reference is not None,
         "offsets": [[float(f"{x:.7g}") for x in row] for row in run.offsets[:, list(space.axes)]],
         "space": {
             "kind": space.kind,

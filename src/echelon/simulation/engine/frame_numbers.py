@@ -26,6 +26,18 @@ class ClosestPair(NamedTuple):
     agents: tuple[int, int]
     time: float
 
+    @classmethod
+    def of(cls, places: Float[Array, "N k"], time: float) -> "ClosestPair":
+        """Return the closest of two agents or more at places (m), at a time (s)."""
+        from scipy.spatial import KDTree
+
+        away, near = map(np.asarray, KDTree(places).query(places, k=2))
+        first = int(away[:, 1].argmin())
+        # Agents in one place come in any order.
+        other = next(int(agent) for agent in near[first] if agent != first)
+        distance = float(np.linalg.norm(places[first] - places[other]))
+        return cls(distance, (min(first, other), max(first, other)), time)
+
     def touch(self, radius: float | None) -> bool:
         """Return whether agents of a radius (m) touched; None has no size."""
         return radius is not None and self.distance < 2.0 * radius
@@ -75,6 +87,8 @@ class _Frames(Protocol):
     def goal_distances(self, frames: _Some = slice(None)) -> Float[Array, "F N"]: ...
 
     def least_distances(self, frames: _Some = slice(None)) -> Float[Array, " F"] | None: ...
+
+    def approaches(self, last: int = 0) -> list[ClosestPair]: ...
 
 
 class FrameNumbers(abc.ABC):
@@ -137,22 +151,18 @@ class FrameNumbers(abc.ABC):
 
         None without a position, a second agent or a frame of finite numbers.
         """
+        pairs = self.approaches(1)
+        return pairs[-1] if pairs else None
+
+    def approaches(self: _Frames, last: int = 0) -> list[ClosestPair]:
+        """Return the pairs that were closer than any in a frame before, all or the last ones."""
         least = self.least_distances() if self.states.shape[1] > 1 else None
-        if least is None or not np.isfinite(least).any():
-            return None
-        frame = int(np.nanargmin(least))
-        agents = _nearest_two(self.states[frame][:, list(self.position)])
-        return ClosestPair(float(least[frame]), agents, float(self.times[frame]))
-
-
-def _nearest_two(places: Float[Array, "N k"]) -> tuple[int, int]:
-    from scipy.spatial import KDTree
-
-    away, near = map(np.asarray, KDTree(places).query(places, k=2))
-    first = int(away[:, 1].argmin())
-    # Agents in one place come in any order.
-    other = next(int(agent) for agent in near[first] if agent != first)
-    return min(first, other), max(first, other)
+        if least is None:
+            return []
+        least = np.where(np.isfinite(least), least, np.inf)
+        before = np.minimum.accumulate(np.concatenate([[np.inf], least[:-1]]))
+        frames, columns = np.flatnonzero(least < before)[-last:], list(self.position)
+        return [ClosestPair.of(self.states[k][:, columns], float(self.times[k])) for k in frames]
 
 
 def _least(places: Float[Array, "T N k"]) -> Float[Array, " T"]:

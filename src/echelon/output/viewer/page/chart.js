@@ -19,21 +19,60 @@ function brief(value) {
   return (size >= 1e3 ? value.toFixed(0) : value.toPrecision(3)).replace("-", "\u2212");
 }
 
+// The part of time that all charts show: all of it, or a stream's last seconds, until it is zoomed.
+class TimeWindow {
+  // `latest` is the length (s) that a stream shows; without it all is shown.
+  constructor(draw, latest = Infinity) {
+    Object.assign(this, { draw, latest, whole: null, range: null });
+  }
+
+  // Takes the times for which there are values. A window that ends at the newest time keeps to it.
+  extend(times) {
+    if (times.length < 2) return;
+    const before = this.whole?.[1], [low, high] = [times[0], times[times.length - 1]];
+    // Two runs beside each other have one window.
+    this.whole = this.whole && this.latest === Infinity ? [Math.min(this.whole[0], low), Math.max(before, high)] : [low, high];
+    if (this.range) this.set(this.range.map((t) => t + (this.range[1] >= before ? high - before : 0)));
+  }
+
+  get span() {
+    const [low, high] = this.whole ?? [0, 1];
+    return this.range ?? [Math.max(low, high - this.latest), high];
+  }
+
+  set([low, high]) {
+    const [first, last] = this.whole, length = Math.max(1e-4 * (last - first), Math.min(high - low, last - first));
+    const start = Math.max(first, Math.min(last - length, low));
+    this.range = length >= last - first && this.latest === Infinity ? null : [start, start + length];
+  }
+
+  // Stretches time by a factor about a time that stays, then moves it by seconds.
+  change(factor, at, shift = 0) {
+    this.set(this.span.map((t) => at + factor * (t - at) + shift));
+    this.draw();
+  }
+
+  reset() {
+    this.range = null;
+    this.draw();
+  }
+}
+
 class Chart {
   // The chart has title, unit, log, lines and marks; `seek` is called with a selected time.
-  constructor(element, chart, seek) {
-    Object.assign(this, chart);
+  constructor(element, chart, window, seek) {
+    Object.assign(this, chart, { window, seek, fingers: new Map() });
     this.element = document.createElement("figure");
     this.element.className = "chart";
     this.element.innerHTML = `<figcaption><b></b><span class="legend"></span></figcaption>
-      <div class="area"><canvas></canvas><div class="cursor"></div></div>`;
+      <div class="area"><canvas></canvas><div class="cursor"></div><button class="reset" hidden>reset zoom</button></div>`;
     this.element.querySelector("b").textContent = this.unit ? `${this.title}, ${this.unit}` : this.title;
     element.append(this.element);
     this.canvas = this.element.querySelector("canvas");
     this.cursor = this.element.querySelector(".cursor");
     this.area = this.element.querySelector(".area");
     this.makeLegend();
-    if (seek) this.listen(seek);
+    this.listen();
     new ResizeObserver(() => this.draw()).observe(this.area);
   }
 
@@ -54,30 +93,95 @@ class Chart {
     return typeof colour === "number" ? PALETTE[colour % PALETTE.length] : `var(--${colour})`;
   }
 
-  listen(seek) {
-    const choose = (event) => {
-      const box = this.area.getBoundingClientRect();
-      const part = (event.clientX - box.left - MARGIN.left) / (box.width - MARGIN.left - MARGIN.right);
-      const [low, high] = this.span();
-      seek(low + Math.max(0, Math.min(1, part)) * (high - low));
-    };
-    this.area.addEventListener("pointerdown", (event) => {
-      this.area.setPointerCapture(event.pointerId);
-      choose(event);
+  // A click selects a time, and so does a drag, unless a part is shown: then it moves that part.
+  listen() {
+    const { area, fingers } = this;
+    area.addEventListener("pointerdown", (event) => {
+      if (event.target.closest(".reset")) return;
+      area.setPointerCapture(event.pointerId);
+      fingers.set(event.pointerId, event.clientX);
+      this.moved = 0;
+      this.pans = !this.seek || (this.window.range && Math.abs(this.across(event) - this.x(this.now)) > 12);
+      // A finger may be about to scroll.
+      if (!this.pans && event.pointerType !== "touch") this.seek(this.timeAt(event));
     });
-    this.area.addEventListener("pointermove", (event) => event.buttons && choose(event));
+    area.addEventListener("pointermove", (event) => fingers.has(event.pointerId) && this.drag(event));
+    area.addEventListener("pointerup", (event) => {
+      if (this.seek && fingers.size === 1 && this.moved < 4) this.seek(this.timeAt(event));
+    });
+    for (const end of ["pointerup", "pointercancel"]) area.addEventListener(end, (event) => fingers.delete(event.pointerId));
+    area.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom(1.0015 ** event.deltaY, event);
+    }, { passive: false });
+    area.addEventListener("dblclick", () => this.reset());
+    area.querySelector(".reset").addEventListener("click", () => this.reset());
   }
 
-  span() {
-    const { times } = this;
-    return times.length > 1 ? [times[0], times[times.length - 1]] : [0, 1];
+  // One finger or the mouse moves time or the part that is shown; two fingers stretch it.
+  drag(event) {
+    const { fingers, window } = this, before = [...fingers.values()], second = 1 / this.perSecond();
+    this.moved += Math.abs(event.clientX - fingers.get(event.pointerId));
+    fingers.set(event.pointerId, event.clientX);
+    const now = [...fingers.values()];
+    if (fingers.size > 1) {
+      const apart = ([a, b]) => Math.max(20, Math.abs(a - b)), middle = ([a, b]) => (a + b) / 2;
+      this.pans = true;
+      window.change(apart(before) / apart(now), this.timeAt({ clientX: middle(now) }), (middle(before) - middle(now)) * second);
+    } else if (this.pans) window.change(1, 0, (before[0] - now[0]) * second);
+    else this.seek(this.timeAt(event));
   }
 
-  // The limits of the value axis; of a logarithmic one as exponents.
+  // Over the numbers at the left the value axis is stretched, else time.
+  zoom(factor, event) {
+    if (this.across(event) >= MARGIN.left) return void this.window.change(factor, this.timeAt(event));
+    const { height, top } = this.area.getBoundingClientRect(), [low, high] = this.limits;
+    const part = (height - MARGIN.bottom - event.clientY + top) / (height - MARGIN.top - MARGIN.bottom);
+    const at = low + part * (high - low);
+    // A logarithmic axis has numbers at whole powers of ten alone.
+    if (this.log && factor * (high - low) < 1) return;
+    this.values = [low, high].map((v) => at + factor * (v - at));
+    this.draw();
+  }
+
+  reset() {
+    this.values = null;
+    this.draw();
+    this.window.reset();
+  }
+
+  across(event) {
+    return event.clientX - this.area.getBoundingClientRect().left;
+  }
+
+  perSecond() {
+    const [low, high] = this.window.span;
+    return (this.area.clientWidth - MARGIN.left - MARGIN.right) / (high - low || 1);
+  }
+
+  timeAt(event) {
+    const [low, high] = this.window.span, time = low + (this.across(event) - MARGIN.left) / this.perSecond();
+    return Math.max(low, Math.min(high, time));
+  }
+
+  // The places in `times` of the part that is shown, and one more on each side.
+  shown() {
+    const [low, high] = this.window.span;
+    return [Math.max(0, upper(this.times, low) - 2), Math.min(this.times.length, upper(this.times, high) + 1)];
+  }
+
+  // The limits of the value axis; of a logarithmic one as exponents. Two runs have one scale.
   reach() {
+    if (this.values) return this.values;
+    const twins = [this, this.twin].flatMap((chart) => chart?.ownReach() ?? []);
+    return [Math.min(...twins), Math.max(...twins)];
+  }
+
+  ownReach() {
     let [low, high] = [Infinity, -Infinity];
     const take = (y) => Number.isFinite(y) && ((low = Math.min(low, y)), (high = Math.max(high, y)));
-    for (const line of this.lines) if (!line.bound) line.values.forEach(take);
+    const [start, end] = this.shown();
+    for (const line of this.lines) if (!line.bound) for (let k = start; k < end; k++) take(line.values[k]);
     for (const mark of this.marks) take(this.log ? Math.log10(mark.value) : mark.value);
     if (!(low <= high)) return this.log ? [-1, 0] : [0, 1];
     if (this.log) return high - low > 2 ? [low - 0.15, high + 0.25] : [Math.floor(low - 0.05), Math.ceil(high + 0.05)];
@@ -89,12 +193,13 @@ class Chart {
     const [w, h] = [this.area.clientWidth, this.area.clientHeight], ratio = Math.min(2, devicePixelRatio);
     if (!w || !h) return;
     Object.assign(this.canvas, { width: Math.round(w * ratio), height: Math.round(h * ratio) });
-    const pen = this.canvas.getContext("2d"), [low, high] = this.reach(), [first, last] = this.span();
+    const pen = this.canvas.getContext("2d"), [first, last] = this.window.span, [low, high] = (this.limits = this.reach());
     pen.scale(ratio, ratio);
     pen.font = "11px system-ui, sans-serif";
     this.x = (t) => MARGIN.left + ((t - first) / (last - first || 1)) * (w - MARGIN.left - MARGIN.right);
     this.y = (v) => h - MARGIN.bottom - ((v - low) / (high - low)) * (h - MARGIN.top - MARGIN.bottom);
     this.drawGrid(pen, low, high, first, last, w, h);
+    this.area.querySelector(".reset").hidden = !this.window.range && !this.values;
     pen.save();
     pen.beginPath();
     pen.rect(MARGIN.left, MARGIN.top - 2, w - MARGIN.left - MARGIN.right, h - MARGIN.top - MARGIN.bottom + 4);
@@ -155,14 +260,13 @@ class Chart {
     Object.assign(pen, { strokeStyle: name ? themeColour(name) : style, lineWidth: line.dash ? 1.3 : 1.5, lineJoin: "round" });
     pen.setLineDash(line.dash ? [5, 3] : []);
     pen.beginPath();
-    let up = true;
-    line.values.forEach((value, k) => {
-      if (!Number.isFinite(value)) return void (up = true);
-      const at = [this.x(this.times[k]), this.y(value)];
-      if (up) pen.moveTo(...at);
-      pen.lineTo(...at);
-      up = false;
-    });
+    const [start, end] = this.shown();
+    for (let k = start, up = true; k < end; k++) {
+      const value = line.values[k], [x, y] = [this.x(this.times[k]), this.y(value)];
+      if (up || !Number.isFinite(value)) pen.moveTo(x, y);
+      else pen.lineTo(x, y);
+      up = !Number.isFinite(value);
+    }
     pen.stroke();
     pen.setLineDash([]);
   }
@@ -171,10 +275,12 @@ class Chart {
   point(time) {
     this.now = time;
     if (!this.x) return;
-    this.cursor.style.transform = `translateX(${this.x(time).toFixed(1)}px)`;
+    const [low, high] = this.window.span, x = this.x(time);
+    this.cursor.hidden = time < low - 1e-9 || time > high + 1e-9;
+    this.cursor.style.transform = `translateX(${x.toFixed(1)}px)`;
     const k = Math.max(0, Math.min(this.times.length - 1, upper(this.times, time) - 1));
     // Values far below the axis are rounding errors.
-    const most = Math.max(...this.reach().map(Math.abs));
+    const most = Math.max(...this.limits.map(Math.abs));
     const words = (value, floor) => {
       if (this.log) return value === -Infinity ? `< ${brief(floor)}` : brief(10 ** value);
       return brief(Math.abs(value) < 1e-9 * most ? 0 : value);

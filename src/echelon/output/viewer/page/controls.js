@@ -23,58 +23,95 @@ function icon(name) {
   return svg;
 }
 
-function showGuarantee({ state, short, whole }) {
-  const badge = $(".promise");
+function showGuarantee({ state, short, whole }, title = document) {
+  const badge = title.querySelector(".promise");
   badge.classList.remove("holds", "edge", "lost", "pending");
   badge.classList.add(state);
   badge.querySelector("b").textContent = short;
   badge.querySelector(".whole").replaceChildren(...prose(whole));
 }
 
-function showHeader(run) {
-  $("h1").textContent = run.title;
-  $(".facts").textContent = run.facts.join(" \u00b7 ");
-  $(".notes").replaceChildren(...prose(run.notes.join(" ")));
-  if (run.promise) showGuarantee(run.promise);
-  else $(".promise").hidden = true;
-  const key = $(".key"), add = (look, words) => key.append(make("span", {}, look, words));
+// Shows the texts of a run in its part of the page, and its name in an element.
+function showHeader(run, part, title) {
+  title.querySelector("h1").textContent = run.title;
+  title.querySelector(".facts").textContent = run.facts.join(" \u00b7 ");
+  part.querySelector(".notes").replaceChildren(...prose(run.notes.join(" ")));
+  if (run.promise) showGuarantee(run.promise, title);
+  else title.querySelector(".promise").hidden = true;
+  const key = part.querySelector(".key"), add = (look, words) => key.append(make("span", {}, look, words));
   if (run.thrust) add(make("i"), ""), key.lastChild.append("motor thrust 0", make("i", { class: "thrust" }), "limit");
-  if (run.agents > run.leaders.length) add(make("i", { class: "ring" }), "goal");
+  if (run.agents > run.leaders.length || run.referenced) add(make("i", { class: "ring" }), run.referenced ? "goal, and reference of a leader" : "goal");
   if (run.heard.some((who) => who === 1 || who === 2)) add(make("i", { class: run.agents > 200 ? "taper" : "arrow" }), "from sender to receiver");
   key.append(make("span", {}, run.drawn));
+}
+
+// Shows which agents were closest to each other so far, beside the size of the vehicles.
+function showClosest(element, closest, { radius }) {
+  element.hidden = !closest;
+  if (!closest) return;
+  const [time, distance, i, j] = closest, touch = radius && distance < 2 * radius;
+  element.classList.toggle("touch", Boolean(touch));
+  const size = radius ? ` (vehicles touch below ${brief(2 * radius)} m)` : "";
+  element.textContent = `${touch ? "overlap: " : ""}smallest distance so far ${brief(distance)} m, agents ${i} and ${j} at ${time.toFixed(2)} s${size}`;
 }
 
 function setDark(dark) {
   document.documentElement.classList.toggle("dark", dark);
 }
 
-// The buttons of the view.
+// The buttons of one view, or of two beside each other, whose cameras move together.
 class ViewControls {
-  constructor(view, charts, show) {
-    this.view = view;
-    this.show = show;
-    this.target = null;
-    this.box = make("div", { class: "toggles" });
-    for (const name of ["links", "goals", "trails"]) this.toggle(name, (on) => (view.shared[name].value = on ? shares(view.run)[name] : 0));
-    if (view.labels.all.length) this.toggle("names", (on) => (view.labels.visible = on));
+  constructor(views, charts, show) {
+    Object.assign(this, { views, show, target: null, box: make("div", { class: "toggles" }) });
+    for (const name of ["links", "goals", "trails"]) this.toggle(name, (on) => views.forEach((view) => (view.shared[name].value = on ? opacities(view.run)[name] : 0)));
+    if (views.some((view) => view.labels.all.length)) this.toggle("names", (on) => views.forEach((view) => (view.labels.visible = on)));
     this.makeFollow();
     const home = make("button", { title: "show all (h)" }, "show all");
     home.addEventListener("click", () => this.home());
     this.box.append(home);
     setDark(matchMedia("(prefers-color-scheme: dark)").matches);
-    view.setTheme();
     $("#theme").addEventListener("click", () => {
       setDark(!document.documentElement.classList.contains("dark"));
-      view.setTheme();
+      views.forEach((view) => view.setTheme());
       for (const chart of charts()) chart.draw();
     });
-    this.handleClicks();
+    for (const view of views) {
+      view.setTheme();
+      view.away.onshow = () => this.home();
+      view.onturn = () => views.forEach((other) => other !== view && other.turnLike(view));
+      this.handleClicks(view);
+    }
+  }
+
+  // Keys that both pages have.
+  get keys() {
+    return {
+      n: ["select the next agent", () => this.select(1)],
+      p: ["select the previous agent", () => this.select(-1)],
+      Escape: ["select none", () => this.select(0)],
+      f: ["follow the selected agent with the camera, or stop", () => this.follow(this.target === null && this.views[0].selected >= 0 ? this.views[0].selected : null)],
+      h: ["show all", () => this.home()],
+    };
+  }
+
+  select(step) {
+    for (const view of this.views) {
+      const { agents } = view.run, first = view.selected < 0 && step < 0 ? 0 : view.selected;
+      view.selected = step ? (first + step + agents) % agents : -1;
+    }
+    this.show();
   }
 
   home() {
-    this.target = null;
-    this.select.value = "";
-    this.view.home();
+    this.follow(null);
+    for (const view of this.views) view.home();
+  }
+
+  follow(target) {
+    this.target = target;
+    this.chooser.value = target ?? "";
+    for (const view of this.views) view.moved = null;
+    this.show();
   }
 
   toggle(name, action) {
@@ -83,30 +120,28 @@ class ViewControls {
       const on = button.getAttribute("aria-pressed") !== "true";
       button.setAttribute("aria-pressed", on);
       action(on);
-      this.view.draw();
+      for (const view of this.views) view.draw();
     });
     this.box.append(button);
   }
 
   makeFollow() {
-    const { run } = this.view, leads = new Set(run.leaders);
-    this.select = make("select", { title: "target of the camera", "aria-label": "target of the camera" });
-    const option = (value, words) => this.select.append(make("option", { value }, words));
+    const run = this.views.map((view) => view.run).reduce((a, b) => (a.agents <= b.agents ? a : b)), leads = new Set(run.leaders);
+    this.chooser = make("select", { title: "target of the camera", "aria-label": "target of the camera" });
+    const option = (value, words) => this.chooser.append(make("option", { value }, words));
     option("", "fixed camera");
     option("all", "follow all");
     for (const i of run.agents <= 30 ? Array(run.agents).keys() : run.leaders.slice(0, 12)) option(i, leads.has(i) ? `follow leader ${i}` : `follow ${i}`);
-    this.select.addEventListener("change", () => {
-      const { value } = this.select;
-      this.target = value === "" ? null : value === "all" ? "all" : Number(value);
-      this.view.moved = null;
-      this.show();
+    this.chooser.addEventListener("change", () => {
+      const { value } = this.chooser;
+      this.follow(value === "" ? null : value === "all" ? "all" : Number(value));
     });
-    this.box.append(this.select);
+    this.box.append(this.chooser);
   }
 
   // A click selects the agent or link under it; a drag moves the camera.
-  handleClicks() {
-    const { view } = this, canvas = view.renderer.domElement;
+  handleClicks(view) {
+    const canvas = view.renderer.domElement;
     let from = null;
     canvas.addEventListener("pointerdown", (event) => (from = [event.clientX, event.clientY]));
     canvas.addEventListener("pointerup", (event) => {
@@ -120,19 +155,19 @@ class ViewControls {
   }
 
   // Updates the camera and the card of the selected agent.
-  update(moment) {
-    this.view.follow(moment, this.target);
-    const card = $(".card"), { run, selected } = this.view;
+  update(view, moment) {
+    view.follow(moment, this.target);
+    const card = view.element.querySelector(".card"), { run, selected } = view;
     card.hidden = selected < 0;
     if (selected < 0) return;
     const leads = run.leaders.includes(selected), p = moment.position, g = moment.goal, at = 3 * selected;
     const away = Math.hypot(...[0, 1, 2].map((k) => (p[at + k] - g[at + k]) / [...run.space.stretch, 1][k]));
-    const senders = this.view.sendersOf(selected);
+    const senders = view.sendersOf(selected), from = leads ? "reference" : "goal";
     const information = senders.length ? `receives from ${senders.slice(0, 8).join(", ")}${senders.length > 8 ? " \u2026" : ""}` : "receives from nobody";
     const place = run.space.kind === "time" ? [p[at + 1] / run.space.stretch[1]] : [0, 1, 2].slice(0, run.space.names.length).map((k) => p[at + k] / [...run.space.stretch, 1][k]);
     const unit = run.space.units[run.space.kind === "time" ? 1 : 0];
     card.replaceChildren(make("b", {}, `${leads ? "leader" : "follower"} ${selected}`), make("span", {}, `at ${place.every(Number.isFinite) ? `${place.map((v) => v.toFixed(2)).join(", ")} ${unit}` : NOT_FINITE}`), make("br"));
-    if (!leads) card.append(make("span", {}, Number.isFinite(away) ? `${brief(away)} ${unit} from its goal` : `error ${NOT_FINITE}`), make("br"));
+    if (!leads || run.referenced) card.append(make("span", {}, Number.isFinite(away) ? `${brief(away)} ${unit} from its ${from}` : `error ${NOT_FINITE}`), make("br"));
     card.append(make("span", {}, information));
   }
 }

@@ -2,7 +2,7 @@
 
 class Growing {
   constructor(header) {
-    Object.assign(this, header, { parts: [], starts: [], frames: 1, charts: [], chartTimes: [] });
+    Object.assign(this, header, { parts: [], starts: [], frames: 1, charts: [], chartTimes: [], path: [], closest: [] });
     this.offsets = expand(header.offsets, header.agents, header.space);
     this.moment = new Moment(header.agents);
     this.moment.setGoals(this);
@@ -18,13 +18,14 @@ class Growing {
   }
 
   add(data) {
-    const length = new DataView(data).getUint32(0, true);
-    const part = new Replay(JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length))), new Uint8Array(data, 4 + length));
+    const part = readRun(data);
     const first = !this.parts.length;
     part.moment = this.moment;
     this.starts.push(first ? 0 : this.frames - 1);
     this.parts.push(part);
     this.frames = this.starts[this.starts.length - 1] + part.frames;
+    this.path.push(...(part.path ?? []));
+    this.closest.push(...part.closest.filter(([, distance]) => !(distance >= this.closest.at(-1)?.[1])));
     const charts = readCharts(part), from = first ? 0 : 1;
     if (first) this.charts = charts.map((chart) => ({ ...chart, times: this.chartTimes, lines: chart.lines.map((line) => ({ ...line, values: [] })) }));
     this.chartTimes.push(...part.chartTimes.slice(from));

@@ -1,6 +1,7 @@
 // The live page: scene and charts of a stream, and the controls of the loop.
 
-const CHART_SECONDS = 30, FLOOR = 1e-17;
+// Seconds that charts show, and that they remember.
+const CHART_SECONDS = 30, MEMORY = 600, FLOOR = 1e-17;
 
 // Reads blocks from a stream; each follows its length.
 async function* blocksOf(response) {
@@ -27,13 +28,15 @@ class Live {
     Object.assign(this, { run: { ...header, offsets: expand(header.offsets, header.agents, header.space) }, paused: false, pictures: 0 });
     const { run } = this;
     document.body.classList.toggle("flat", run.space.kind !== "space");
-    showHeader(run);
+    document.body.classList.add("live");
+    showHeader(run, $("main"), $(".title"));
     this.moment = new Moment(run.agents);
     this.panel = make("div", { class: "panel" });
     $("#side").append(this.panel);
     this.view = new View($("#scene"), run);
+    this.window = new TimeWindow(() => this.charts.forEach((chart) => chart.draw()), CHART_SECONDS);
     this.makeCharts();
-    this.views = new ViewControls(this.view, () => this.charts, () => this.show());
+    this.views = new ViewControls([this.view], () => this.charts, () => this.show());
     this.views.onlink = (edge) => this.ask(this.view.cut[edge] ? "restore" : "cut", run.edges[edge]);
     this.makeControls(run.knobs, run.choices);
     this.makeFooter();
@@ -46,10 +49,10 @@ class Live {
   makeCharts() {
     // V is a square of errors.
     const { run } = this, line = (name, colour) => ({ name, colour, values: [], floor: name === "V" ? FLOOR ** 2 : FLOOR });
-    const charts = [{ title: "formation error", unit: run.unit, log: true, lines: [line("worst", 1), line("median", 0)], marks: [{ value: 0.01, name: run.unit ? "1 cm" : "0.01" }] }];
+    const charts = [{ title: "formation error", unit: run.unit, log: true, lines: [line("worst", 1), line("median", 0), ...(run.referenced ? [line("leader", "leader")] : [])], marks: [{ value: 0.01, name: run.unit ? "1 cm" : "0.01" }] }];
     if (run.limited) charts.push({ title: run.loads ? "motors" : "inputs", unit: "% of limit", log: false, lines: [line("largest", 1), line("smallest", 0)], marks: [{ value: 100, name: "limit", below: true }, { value: 0, name: "limit" }] });
     if (run.lyapunov) charts.splice(1, 0, { title: "Lyapunov function V", unit: "", log: true, lines: [line("V", 0)], marks: [] });
-    this.charts = charts.map((chart) => new Chart($("#side"), { ...chart, times: [] }));
+    this.charts = charts.map((chart) => new Chart($("#side"), { ...chart, times: [] }, this.window));
   }
 
   take(block) {
@@ -61,8 +64,8 @@ class Live {
 
   fill(time, numbers) {
     const { run, moment } = this, { agents, axes, turns, loads } = run;
-    const [worst, median, most, least, lyapunov, factor, wind] = numbers;
-    let at = 7;
+    const [worst, median, off, most, least, lyapunov, factor, wind, ...closest] = numbers.subarray(0, 12);
+    let at = 12;
     at = this.places(numbers, at, axes, moment.position, time);
     at = this.places(numbers, at, axes, moment.goal, time);
     for (let i = 0; i < agents; i++, at += turns)
@@ -72,10 +75,11 @@ class Live {
     if (this.pictures++ && time < moment.time) this.view.trail.clear();
     this.view.trail.push(moment.position, time);
     moment.time = time;
-    this.numbers = { worst, median, lyapunov, factor, wind };
+    this.numbers = { worst, median, off, lyapunov, factor, wind, closest };
+    showClosest($(".closest"), Number.isNaN(closest[0]) ? null : closest, run);
     // A logarithm has no 0, and values below the floor are rounding errors.
     const log = (value, floor = FLOOR) => (value <= floor ? -Infinity : Math.log10(value));
-    this.chart(time, [[log(worst), log(median)], ...(run.lyapunov ? [[log(lyapunov, FLOOR ** 2)]] : []), [100 * most, 100 * least]]);
+    this.chart(time, [[log(worst), log(median), log(off)], ...(run.lyapunov ? [[log(lyapunov, FLOOR ** 2)]] : []), [100 * most, 100 * least]]);
     this.clock.innerHTML = `<b>${time.toFixed(1)}</b> s${factor < 0.95 ? ` \u00b7 ${factor.toFixed(2)} \u00d7 real time` : ""}`;
     this.show();
   }
@@ -93,20 +97,22 @@ class Live {
 
   show() {
     this.view.show(this.moment);
-    this.views.update(this.moment);
+    this.views.update(this.view, this.moment);
   }
 
   chart(time, rows) {
     this.charts.forEach((chart, place) => {
-      if (chart.times.length && time <= chart.times[chart.times.length - 1]) (chart.times.length = 0), chart.lines.forEach((line) => (line.values.length = 0));
+      if (chart.times.length && time < chart.times[chart.times.length - 1]) (chart.times.length = 0), chart.lines.forEach((line) => (line.values.length = 0)), (this.window.range = null);
+      if (time === chart.times[chart.times.length - 1]) return;
       chart.times.push(time);
       chart.lines.forEach((line, k) => line.values.push(rows[place][k]));
-      while (chart.times[0] < time - CHART_SECONDS) (chart.times.shift(), chart.lines.forEach((line) => line.values.shift()));
+      while (chart.times[0] < time - MEMORY) (chart.times.shift(), chart.lines.forEach((line) => line.values.shift()));
     });
     // Charts are drawn a few times a second, which leaves time for the scene.
     const now = performance.now();
     if (now - (this.chartTime ?? 0) < 180) return;
     this.chartTime = now;
+    this.window.extend(this.charts[0].times);
     for (const chart of this.charts) (chart.draw(), chart.point(time));
   }
 
@@ -187,7 +193,7 @@ class Live {
       return element;
     };
     this.panel.append(make("div", { class: "buttons" },
-      button("kick", "push the selected agent (default: the first follower)", () => this.ask("kick", this.view.selected >= 0 ? this.view.selected : this.firstFollower)),
+      button("kick", "push the selected agent, else the first follower (k)", () => this.kick()),
       button("reset", "restart with the present controls", () => this.ask("reset")),
       button("save as scenario", "download a scenario file that repeats this session", () => this.save())));
     this.panel.append(make("p", { class: "hint" }, "click a link to cut or restore it, or an agent to select it"));
@@ -220,11 +226,16 @@ class Live {
     this.pauseButton.addEventListener("click", () => this.ask("pause", !this.paused));
     this.clock = make("span", { class: "time" });
     $("footer").append(this.pauseButton, this.clock, make("span", { class: "gap" }), this.views.box);
-    addEventListener("keydown", (event) => {
-      if (event.key !== " " || event.target.matches("select, input, button")) return;
-      event.preventDefault();
-      this.ask("pause", !this.paused);
+    listenKeys({
+      " ": ["pause, continue", () => this.ask("pause", !this.paused)],
+      k: ["kick the selected agent, else the first follower", () => this.kick()],
+      r: ["restart with the present controls", () => this.ask("reset")],
+      ...this.views.keys,
     });
+  }
+
+  kick() {
+    this.ask("kick", this.view.selected >= 0 ? this.view.selected : this.firstFollower);
   }
 
   async listen() {

@@ -1,29 +1,64 @@
-// The replay page: play, pause and scrub, with charts whose cursors follow.
+// The replay page: play, pause and scrub one run, or two at the same time, with charts whose cursors follow.
 
-class Player {
-  constructor(run) {
-    this.run = run;
-    this.frame = 0;
-    this.speed = 1;
-    this.playing = false;
-    document.body.classList.toggle("flat", run.space.kind !== "space");
-    showHeader(run);
-    this.view = new View($("#scene"), run);
+// A run in its part of the page: the scene, and the charts.
+class Pane {
+  constructor(run, part, title, window, seek) {
+    Object.assign(this, { run, part, window, seek, charts: [] });
+    showHeader(run, part, title);
+    this.view = new View(part.querySelector(".scene"), run);
+    this.closest = part.querySelector(".closest");
     this.makeCharts(run.growing ? run.charts : readCharts(run));
-    this.views = new ViewControls(this.view, () => this.charts, () => this.seek(this.frame));
-    this.makeFooter();
-    this.listen();
-    this.seek(0);
   }
 
   makeCharts(charts) {
-    this.charts = charts.map((chart) => new Chart($("#side"), chart, (time) => this.seek(this.run.frameOf(time))));
+    this.charts = charts.map((chart) => new Chart(this.part.querySelector(".side"), chart, this.window, this.seek));
+    this.extend();
+  }
+
+  extend() {
+    if (this.charts.length) this.window.extend(this.charts[0].times);
+  }
+
+  show(frame) {
+    const { run } = this, moment = run.at(frame);
+    this.view.show(moment);
+    showClosest(this.closest, run.closest[upper(run.closest.map(([time]) => time), moment.time) - 1], run);
+    for (const chart of this.charts) chart.point(moment.time);
+    return moment;
+  }
+}
+
+class Player {
+  // The first run sets the title; the one that ends last sets the frames.
+  constructor(runs) {
+    Object.assign(this, { frame: 0, speed: 1, playing: false });
+    document.body.classList.toggle("flat", runs[0].space.kind !== "space");
+    this.window = new TimeWindow(() => this.charts.forEach((chart) => chart.draw()));
+    const parts = makeParts(runs);
+    if (runs.length > 1 && runs[0].space.kind === runs[1].space.kind) joinBoxes(runs);
+    this.panes = runs.map((run, k) => new Pane(run, ...parts[k], this.window, (time) => this.seekTime(time)));
+    for (const chart of this.charts) chart.twin = this.charts.find((other) => other !== chart && other.title === chart.title && other.unit === chart.unit);
+    this.leading = this.panes.reduce((a, b) => (b.run.clock.last > a.run.clock.last ? b : a));
+    this.run = this.leading.run;
+    this.view = this.panes[0].view;
+    this.views = new ViewControls(this.panes.map((pane) => pane.view), () => this.charts, () => this.seek(this.frame));
+    this.makeFooter();
+    this.listen();
+    this.seek(0);
+    addEventListener("hashchange", () => this.seekLink());
+    this.seekLink();
+  }
+
+  get charts() {
+    return this.panes.flatMap((pane) => pane.charts);
   }
 
   // Takes more frames of a run that is being computed.
   grow(newest) {
-    const { run } = this;
-    if (!this.charts.length) this.makeCharts(run.charts);
+    const { run, leading } = this;
+    if (!this.charts.length) leading.makeCharts(run.charts);
+    leading.extend();
+    if (run.path) this.view.path?.place(run.path);
     this.scrub.max = run.frames - 1;
     this.showNote(`Computed until ${run.reached.toFixed(1)} of ${run.horizon} s.`);
     this.seek(newest ? run.frames - 1 : this.frame);
@@ -36,8 +71,26 @@ class Player {
 
   // Loads the complete run instead of its parts, at the same time.
   reload() {
-    sessionStorage.setItem("echelon", JSON.stringify([this.run.title, this.run.at(this.frame).time]));
+    this.link();
     location.reload();
+  }
+
+  // Puts the time into the address, which is then a link to it.
+  link() {
+    try {
+      history.replaceState(null, "", `#t=${Number(this.run.at(this.frame).time.toFixed(3))}`);
+    } catch {
+      // A page inside of another one may have no address.
+    }
+  }
+
+  seekLink() {
+    const time = Number(new URLSearchParams(location.hash.slice(1)).get("t") ?? NaN);
+    if (Number.isFinite(time)) this.seekTime(time);
+  }
+
+  seekTime(time) {
+    this.seek(this.run.frameOf(time));
   }
 
   makeFooter() {
@@ -54,19 +107,13 @@ class Player {
   }
 
   listen() {
-    const keys = {
-      " ": () => this.play(!this.playing),
-      ArrowRight: (fast) => this.step(fast ? 1 : 0.1),
-      ArrowLeft: (fast) => this.step(fast ? -1 : -0.1),
-      Home: () => this.seek(0),
-      End: () => this.seek(this.run.frames - 1),
-      h: () => this.views.home(),
-    };
-    addEventListener("keydown", (event) => {
-      if (!keys[event.key] || event.target.matches("select, input") || event.ctrlKey || event.metaKey) return;
-      if (event.key === " " && event.target.matches("button")) return;
-      event.preventDefault();
-      keys[event.key](event.shiftKey);
+    listenKeys({
+      " ": ["play, pause", () => this.play(!this.playing)],
+      ArrowRight: ["0.1 s ahead, with shift 1 s", (fast) => this.step(fast ? 1 : 0.1)],
+      ArrowLeft: ["0.1 s back, with shift 1 s", (fast) => this.step(fast ? -1 : -0.1)],
+      Home: ["first frame", () => this.seek(0)],
+      End: ["last frame", () => this.seek(this.run.frames - 1)],
+      ...this.views.keys,
     });
   }
 
@@ -76,20 +123,24 @@ class Player {
   }
 
   seek(frame) {
-    const { run } = this;
+    const { run, leading } = this;
     this.frame = Math.max(0, Math.min(run.frames - 1, frame));
-    const moment = run.at(this.frame);
-    this.view.show(moment);
-    this.views.update(moment);
+    const { time } = leading.show(this.frame);
+    for (const pane of this.panes) {
+      if (pane !== leading) pane.show(pane.run.frameOf(time));
+      this.views.update(pane.view, pane.run.moment);
+    }
     this.scrub.value = this.frame;
-    this.clock.innerHTML = `<b>${moment.time.toFixed(2)}</b> / ${run.clock.last.toFixed(run.clock.last < 100 ? 1 : 0)} s`;
-    for (const chart of this.charts) chart.point(moment.time);
+    this.clock.innerHTML = `<b>${time.toFixed(2)}</b> / ${run.clock.last.toFixed(run.clock.last < 100 ? 1 : 0)} s`;
+    clearTimeout(this.rest);
+    if (!this.playing && time > 0) this.rest = setTimeout(() => this.link(), 400);
   }
 
   play(on) {
     if (on === this.playing) return;
     if (on && this.frame >= this.run.frames - 1) this.seek(0);
     this.playing = on;
+    if (!on) this.link();
     this.button.replaceChildren(icon(on ? "pause" : "play"));
     if (on) requestAnimationFrame((now) => this.tick(now, now));
   }
@@ -115,14 +166,37 @@ function readCharts(run) {
   }));
 }
 
-export async function start(data) {
+// The part of the page and the title of each run; a second run has a copy of both beside the first.
+function makeParts(runs) {
+  const part = $("main"), title = $(".title");
+  if (runs.length === 1) return [[part, title]];
+  const parts = runs.map((_, k) => (k ? part.cloneNode(true) : part)), titles = runs.map(() => title.cloneNode(true));
+  parts.forEach((each, k) => {
+    each.prepend(titles[k]);
+    if (k) (each.querySelectorAll("[id]").forEach((element) => element.removeAttribute("id")), part.after(each));
+  });
+  title.replaceChildren(make("h1", {}, runs.map((run) => run.title).join(" and ")));
+  document.body.classList.add("beside");
+  return parts.map((each, k) => [each, titles[k]]);
+}
+
+// Gives two runs the box around both, so that their cameras begin alike.
+function joinBoxes([one, other]) {
+  const join = (end, choose) => one.box[end].map((value, k) => choose(value, other.box[end][k]));
+  one.box = other.box = { low: join("low", Math.min), high: join("high", Math.max) };
+}
+
+function readRun(data) {
   const length = new DataView(data).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
-  if (header.stream) return startLive(header);
-  const run = header.growing ? new Growing(header) : new Replay(header, new Uint8Array(data, 4 + length));
-  const player = new Player(run);
-  if (header.growing) player.showNote("Computing the first part."), loadParts(run, player);
-  else restoreTime(player);
+  return header.stream ? header : header.growing ? new Growing(header) : new Replay(header, new Uint8Array(data, 4 + length));
+}
+
+export async function start(...data) {
+  const runs = data.map(readRun), [run] = runs;
+  if (run.stream) return startLive(run);
+  const player = new Player(runs);
+  if (run.growing) player.showNote("Computing the first part."), loadParts(run, player);
   // For the tests of the page.
   globalThis.echelon = {
     run, player,
@@ -136,16 +210,4 @@ export async function start(data) {
     get links() { return run.edges.filter((_, k) => player.view.alive[k]); },
     whereOnScreen: (agent) => player.view.projectAgent(agent),
   };
-}
-
-// Continues at the time before the page was reloaded.
-function restoreTime(player) {
-  let before = null;
-  try {
-    before = JSON.parse(sessionStorage.getItem("echelon"));
-    sessionStorage.removeItem("echelon");
-  } catch {
-    // A local file may have no storage.
-  }
-  if (before && before[0] === player.run.title) player.seek(player.run.frameOf(before[1]));
 }

@@ -39,6 +39,7 @@ class Moment {
     this.turn = new Float32Array(4 * agents).fill(0);
     this.motors = new Float32Array(4 * agents).fill(-1);
     this.goal = new Float32Array(3 * agents);
+    this.reference = new Float32Array(3);
     for (let i = 0; i < agents; i++) this.turn[4 * i + 3] = 1;
   }
 
@@ -53,12 +54,12 @@ class Moment {
     q[at + 3] = cr * cp * cy + sr * sp * sy;
   }
 
-  // The goal of an agent is its offset from its nearest leader.
+  // The goal of a follower is its offset from its nearest leader, that of a leader from the reference.
   setGoals(run) {
-    const { position: p, goal } = this, { nearest, offsets } = run;
+    const { position: p, goal, reference } = this, { nearest, offsets } = run;
     for (let i = 0; i < run.agents; i++)
-      for (let k = 0; k < 3; k++)
-        goal[3 * i + k] = p[3 * nearest[i] + k] + offsets[3 * i + k] - offsets[3 * nearest[i] + k];
+      for (let k = 0, to = nearest[i]; k < 3; k++)
+        goal[3 * i + k] = to === i && run.referenced ? reference[k] + offsets[3 * i + k] : p[3 * to + k] + offsets[3 * i + k] - offsets[3 * to + k];
     if (run.space.kind === "time") for (let i = 0; i < run.agents; i++) goal[3 * i] = p[3 * i];
   }
 }
@@ -74,6 +75,16 @@ class Replay {
       this[name] = read;
     }
     this.moment = new Moment(this.agents);
+    if (this.reference) this.path = this.referencePlaces();
+  }
+
+  // Places along the reference, at most 400.
+  referencePlaces() {
+    const every = Math.ceil(this.frames / 400), place = new Float32Array(3);
+    return Array.from({ length: Math.ceil(this.frames / every) }, (_, k) => {
+      this.fill(place, this.reference, k * every, 0, this.timeOf(k * every));
+      return [...place];
+    });
   }
 
   timeOf(frame) {
@@ -92,7 +103,8 @@ class Replay {
   at(frame) {
     const now = this.moment, k = Math.min(Math.floor(frame), this.frames - 1), part = frame - k;
     now.time = this.timeOf(k) + (part > 0 ? part * (this.timeOf(k + 1) - this.timeOf(k)) : 0);
-    this.fillPositions(now.position, k, part, now.time);
+    this.fill(now.position, this.positions, k, part, now.time);
+    if (this.reference) this.fill(now.reference, this.reference, k, part, now.time);
     if (this.angles) this.fillTurns(now, k, part);
     if (this.motors)
       for (let c = 0, wide = this.motors.low.length / this.agents; c < this.motors.low.length; c++)
@@ -101,10 +113,11 @@ class Replay {
     return now;
   }
 
-  fillPositions(out, k, part, time) {
-    const axes = this.positions.low.length / this.agents, [sx, sy] = this.space.stretch;
-    for (let i = 0; i < this.agents; i++) {
-      const value = (axis) => valueOf(this.positions, axes * i + axis, k, part);
+  // Fills places in the scene from a group of coordinates.
+  fill(out, group, k, part, time) {
+    const agents = out.length / 3, axes = group.low.length / agents, [sx, sy] = this.space.stretch;
+    for (let i = 0; i < agents; i++) {
+      const value = (axis) => valueOf(group, axes * i + axis, k, part);
       if (this.space.kind === "time") {
         out[3 * i] = sx * time;
         out[3 * i + 1] = sy * value(0);

@@ -2,26 +2,6 @@
 
 const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"];
 
-// Whether graphics are rendered in software.
-function isSoftware() {
-  const gl = document.createElement("canvas").getContext("webgl2");
-  if (!gl) throw new Error("this browser has no WebGL 2");
-  const info = gl.getExtension("WEBGL_debug_renderer_info");
-  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
-  gl.getExtension("WEBGL_lose_context")?.loseContext();
-  return /swiftshader|llvmpipe|software/i.test(name);
-}
-
-function rgb(colour) {
-  const c = new THREE.Color(colour);
-  c.convertLinearToSRGB();
-  return [c.r, c.g, c.b];
-}
-
-function themeColour(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
-
 // Opacities, lower for large swarms.
 function opacities(run) {
   return run.agents > 200 ? { links: 0.3, goals: 1, trails: 0.5 } : { links: 1, goals: 1, trails: 0.95 };
@@ -43,6 +23,7 @@ class View {
     this.makeMeshes();
     this.makeCamera();
     this.labels = new Labels(this);
+    this.away = new Away(this);
     this.selected = -1;
     new ResizeObserver(() => this.resize()).observe(element);
     this.setTheme();
@@ -93,6 +74,7 @@ class View {
     this.halo = this.add(halo(this.flat), this.material(VEHICLE), 3);
     this.makeLinks(lines);
     this.makeTrails(lines);
+    if (run.referenced) this.path = new Path(this, lines);
   }
 
   makeLinks(lines) {
@@ -113,7 +95,7 @@ class View {
       if (receivers === 1 || receivers === 2) (this.heads.set(edge, ends.length), ends.push(ends[edge]), kinds.push(3));
     });
     if (few) for (let i = 0; i < run.agents; i++) {
-      if (run.nearest[i] !== i) (ends.push([i, i]), kinds.push(4));
+      if (run.nearest[i] !== i || run.referenced) (ends.push([i, i]), kinds.push(4));
       if (!this.flat) (ends.push([i, i]), kinds.push(5));
     }
     return ribbons(ends.length, {
@@ -186,7 +168,7 @@ class View {
     if (this.flat) this.orbit.mouseButtons = { LEFT: 2, MIDDLE: 1, RIGHT: 2 };
     if (this.flat) this.orbit.touches = { ONE: 1, TWO: 2 };
     this.orbit.maxPolarAngle = 0.495 * Math.PI;
-    this.orbit.addEventListener("change", () => this.draw());
+    this.orbit.addEventListener("change", () => (this.draw(), this.onturn?.()));
     this.home();
   }
 
@@ -239,6 +221,17 @@ class View {
     }
     this.orbit.target.add(right.multiplyScalar(x)).add(high.multiplyScalar(y));
     this.camera.position.copy(this.orbit.target).add(back.multiplyScalar(away));
+  }
+
+  // Takes the camera of another view; not between a plane and space.
+  turnLike(view) {
+    const [from, to] = [view.camera, this.camera];
+    if (this.flat !== view.flat || (to.position.equals(from.position) && to.zoom === from.zoom)) return;
+    to.position.copy(from.position);
+    this.orbit.target.copy(view.orbit.target);
+    to.zoom = from.zoom;
+    to.updateProjectionMatrix();
+    this.orbit.update();
   }
 
   // Keeps an agent, or the mean of all, at its place on the screen; null stops.
@@ -309,7 +302,7 @@ class View {
       for (let k = 0; k < 4; k++) (state[at + 4 + k] = q[4 * i + k]), (state[at + 8 + k] = m[4 * i + k]);
       at += 16;
       state[at] = g[3 * i], state[at + 1] = g[3 * i + 1], state[at + 2] = g[3 * i + 2];
-      state[at + 3] = run.nearest[i] === i ? 0 : 1;
+      state[at + 3] = (run.nearest[i] === i && !run.referenced) || !Number.isFinite(g[3 * i]) ? 0 : 1;
     }
     this.texture.needsUpdate = true;
     this.halo.visible = this.selected >= 0;
@@ -338,6 +331,7 @@ class View {
     this.backdrop.draw();
     this.renderer.render(this.scene, this.camera);
     this.labels.place();
+    this.away.count(start);
     this.adapt(performance.now() - start, start);
   }
 

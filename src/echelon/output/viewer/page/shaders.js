@@ -10,13 +10,33 @@ vec4 texel(float agent, int k) {
   return texelFetch(state, ivec2((i % ${COLUMNS}) * ${TEXELS} + k, i / ${COLUMNS}), 0);
 }`;
 
-// Blue over green and yellow to red, with different lightness for colour-blind readers.
+// Greys, which no agent has, and a red towards the limit; darker with thrust for colour-blind readers.
 const THRUST = `
 vec3 thrust(float s) {
-  vec3 a = vec3(0.13, 0.29, 0.53), b = vec3(0.11, 0.60, 0.62), c = vec3(0.95, 0.77, 0.25), d = vec3(0.84, 0.27, 0.05);
-  s = clamp(s, 0.0, 1.0) * 3.0;
-  return s < 1.0 ? mix(a, b, s) : s < 2.0 ? mix(b, c, s - 1.0) : mix(c, d, s - 2.0);
+  vec3 a = vec3(0.78, 0.81, 0.86), b = vec3(0.46, 0.50, 0.57), c = vec3(0.74, 0.08, 0.20);
+  s = clamp(s, 0.0, 1.0);
+  return s < 0.7 ? mix(a, b, s / 0.7) : mix(b, c, (s - 0.7) / 0.3);
 }`;
+
+// Whether graphics are rendered in software.
+function isSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) throw new Error("this browser has no WebGL 2");
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software/i.test(name);
+}
+
+function rgb(colour) {
+  const c = new THREE.Color(colour);
+  c.convertLinearToSRGB();
+  return [c.r, c.g, c.b];
+}
+
+function themeColour(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+}
 
 // kind: 0 body, 1 to 4 a rotor, 5 shadow, 6 ring of the goal, 7 ring of selection, 8 dark part.
 const VEHICLE = {
@@ -120,6 +140,22 @@ void main() {
 }`,
   fragmentShader: `in vec4 shade; in float along; out vec4 colour;
 void main() { if (along > 0.0 && fract(along * 14.0) > 0.5) discard; colour = shade; }`,
+};
+
+// The path that a leader should follow, dashed.
+const PATH = {
+  vertexShader: `${RIBBON}
+in vec3 first, second;
+in float along;
+in vec2 corner;
+out float place;
+uniform float goals;
+void main() {
+  place = along;
+  gl_Position = goals > 0.0 ? ribbon(first, second, corner, 0.7) : vec4(2.0, 2.0, 2.0, 1.0);
+}`,
+  fragmentShader: `in float place; out vec4 colour; uniform vec3 goalColour;
+void main() { if (mod(place, 2.0) > 0.5) discard; colour = vec4(goalColour, 0.55); }`,
 };
 
 // The path of an agent, paler with age.

@@ -83,6 +83,56 @@ class Trail {
   }
 }
 
+// The paths that leaders should follow: all of a recorded one, the first minute of a stream.
+class Path {
+  constructor(view, lines) {
+    Object.assign(this, { view, mesh: view.add(new THREE.BufferGeometry(), view.material(PATH, lines), 0) });
+    this.place(view.run.path ?? []);
+  }
+
+  // Draws lines through places of the reference, each of three numbers.
+  place(places) {
+    const { run } = this.view, segments = [];
+    for (const leader of run.leaders.slice(0, 12)) {
+      const at = (k) => places[k].map((value, axis) => value + (run.space.kind === "time" && !axis ? 0 : run.offsets[3 * leader + axis]));
+      for (let k = 1; k < places.length; k++) segments.push([at(k - 1), at(k), k]);
+    }
+    this.mesh.geometry.dispose();
+    this.mesh.geometry = ribbons(segments.length, {
+      first: [3, (r) => segments[r][0]],
+      second: [3, (r) => segments[r][1]],
+      along: [1, (r) => [segments[r][2]]],
+    });
+  }
+}
+
+// Tells how many agents are outside of the picture, with a way to show them.
+class Away {
+  constructor(view) {
+    Object.assign(this, { view, checked: -1e9, button: make("button", { class: "away", hidden: "" }) });
+    this.button.addEventListener("click", () => this.onshow?.());
+    view.element.append(this.button);
+  }
+
+  // A few times a second is enough.
+  count(now) {
+    const { view } = this, { agents } = view.run;
+    clearTimeout(this.later);
+    if (now - this.checked < 200) return void (this.later = setTimeout(() => this.count(performance.now()), 220));
+    this.checked = now;
+    if (!view.moment) return;
+    const [w, h] = [view.element.clientWidth, view.element.clientHeight];
+    let out = 0;
+    for (let i = 0; i < agents; i++) {
+      const at = view.projectAgent(i), p = view.moment.position;
+      if (!Number.isFinite(p[3 * i])) continue;
+      if (!at || at[0] < 0 || at[1] < 0 || at[0] > w || at[1] > h) out++;
+    }
+    this.button.hidden = !out;
+    this.button.textContent = `${out} ${out > 1 ? "agents" : "agent"} out of view \u00b7 show all`;
+  }
+}
+
 // The number of sorted values up to a limit.
 function upper(sorted, value) {
   let [low, high] = [0, sorted.length];
