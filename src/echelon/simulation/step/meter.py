@@ -160,7 +160,7 @@ class Meter(eqx.Module):
         scales: Array | None = None,
     ) -> "Meter":
         """Return the meter of a run, in which agents that keep apart have `scales` (d,)."""
-        per_slice = -(-settings.steps // SLICES)
+        per_slice = steps_per_slice(settings)
         measured = measured_states(model)
         i, j = graph.edges.T
         goals = formation.offsets[:, list(measured)]
@@ -345,6 +345,11 @@ def outside(bounded: _Numbers, low: _Numbers, high: _Numbers) -> _Numbers:
 def reference_at(reference: Array | None, k: jax.Array, states: States) -> jax.Array | None:
     """Return row k of a reference (S, n) in the precision of the states; None without one."""
     return None if reference is None else jnp.asarray(reference, states.dtype)[k]
+
+
+def steps_per_slice(settings: Settings) -> int:
+    """Return of how many steps each slice of a run is, for which distances are stored."""
+    return -(-settings.steps // SLICES)
 
 
 def measured_states(model: ControlAffine) -> tuple[int, ...]:
