@@ -12,6 +12,8 @@ MOST_POINTS = 4
 """Of more points there would be too many faces to try them all."""
 _FLAT = 5e4
 """Times the rounding of 1; a flatter triangle is left to its edges."""
+_NOISE = 64.0
+"""Times the rounding of 1 and the size cubed; what rounding makes of a volume of 0."""
 
 _Row: TypeAlias = Float[jax.Array, " K"]
 _Point: TypeAlias = Sequence[_Row]
@@ -59,7 +61,10 @@ def _around(a: _Point, b: _Point, c: _Point, d: _Point) -> Bool[jax.Array, " K"]
     """Return which tetrahedra contain the origin."""
     parts = _volume(b, d, c), _volume(a, c, d), _volume(a, d, b), _volume(a, b, c)
     low, high = (pick(pick(parts[0], parts[1]), pick(parts[2], parts[3])) for pick in _ENDS)
-    return (low > 0.0) | (high < 0.0)
+    # Of points that nearly coincide the volumes are rounding, with any signs.
+    size = jnp.maximum(jnp.maximum(_dot(a, a), _dot(b, b)), jnp.maximum(_dot(c, c), _dot(d, d)))
+    least = _NOISE * jnp.finfo(size.dtype).eps * size * jnp.sqrt(size)
+    return (low > least) | (high < -least)
 
 
 _ENDS = jnp.minimum, jnp.maximum
