@@ -24,7 +24,7 @@ import numpy as np
 import echelon as ech
 from echelon.apps.live.server import live, serve_live
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
-from echelon.output.archive.open_folder import open_run
+from echelon.output.archive.load_folder import load
 from echelon.output.plots.video import save_video
 from echelon.output.viewer.replay import replay_page
 from echelon.output.viewer.serve import serving
@@ -177,9 +177,9 @@ def stored(agents: int, folder: Path) -> Path:
 
 def measure_replay(agents: int, run: Path) -> None:
     """Tell how large a page is, how long it takes to be made, and how it scrubs."""
-    recording = open_run(run)
+    result = load(run)
     began = time.perf_counter()
-    html = replay_page(recording)
+    html = replay_page(recording_of(result))
     took = time.perf_counter() - began
     file = run / "page.html"
     file.write_text(html, "utf-8")
@@ -193,9 +193,9 @@ def measure_replay(agents: int, run: Path) -> None:
 
 def measure_video(agents: int, run: Path) -> None:
     """Tell how long a picture of a video takes, drawing and encoding."""
-    recording = open_run(run)
+    result = load(run)
     began, used = time.perf_counter(), time.process_time()
-    pictures = save_video(recording, run / "run.mp4", 1.0 if agents <= 4 else 2.0)
+    pictures = save_video(result, run / "run.mp4", 1.0 if agents <= 4 else 2.0)
     took = time.perf_counter() - began
     told(f"video, {agents} agents: a picture", 1e3 * took / pictures, 30.0, "ms")
     print(

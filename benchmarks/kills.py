@@ -18,8 +18,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import xarray as xr
+from echelon.experiments.results.labelled import read_labelled
 
 RUN = ["run", "paper", "--set", "simulation.horizon=300.0", "--no-figures", "--out"]
 STEP = 0.002
@@ -49,8 +48,8 @@ def begun(process: subprocess.Popen[bytes], folder: Path) -> None:
 
 def content(folder: Path) -> dict[str, Any]:
     """Return the names of a folder's files, and all bits of the run."""
-    with xr.open_dataset(folder / "run.nc", engine="h5netcdf") as data:
-        arrays = {f"run.nc {name}": np.asarray(data[name].values) for name in data.variables}
+    data = read_labelled(folder / "run.nc").arrays()
+    arrays = {f"run.nc {name}": values for name, values in data.items()}
     told = json.loads((folder / "summary.json").read_text("utf-8"))
     told.pop("wall_time_s")
     # The commit of a checkout that is worked in meanwhile.

@@ -15,6 +15,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
+from processes import without_status  # noqa: E402
 from shapes import check_shapes  # noqa: E402
 
 # The command line's own cache is another matter, which its own tests turn on.
@@ -123,7 +124,7 @@ def echelon(here, monkeypatch, capsys):
         with pytest.raises(SystemExit) as left:
             main()
         told = capsys.readouterr()
-        return left.value.code or 0, told.out, told.err
+        return left.value.code or 0, told.out, without_status(told.err)
 
     return call
 

@@ -1,9 +1,15 @@
-"""Helper that runs the command line in a process of its own, to be ended by signals."""
+"""Helpers that run the command line in a process of its own, and read its log."""
 
 import contextlib
+import re
 import subprocess
 import sys
 import time
+
+
+def without_status(text):
+    """A log without the lines that say what the program is doing."""
+    return re.sub(r"^echelon: [^\n]* \.\.\.( [^\n]*)?\n", "", text, flags=re.MULTILINE)
 
 
 @contextlib.contextmanager

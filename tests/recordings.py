@@ -148,6 +148,8 @@ def as_file(run, version):
             "dt": run.dt,
             "outcome": "completed",
             "message": "The run reached its horizon.",
+            "warnings": "",
+            "settings": json.dumps({"horizon": run.horizon, "dt": run.dt}),
         },
     )
     return bytes(data.to_netcdf(None, engine="h5netcdf"))

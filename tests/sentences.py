@@ -16,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import networkx as nx
 import numpy as np
+from processes import without_status
 from runs import simulate
 
 import echelon as ech
@@ -159,7 +160,7 @@ def groups():
 def answer(title, text):
     """What echelon answers now to an input of a group, as it stands in the file."""
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        lines = ANSWERS[title.partition(":")[0]](text).splitlines()
+        lines = without_status(ANSWERS[title.partition(":")[0]](text)).splitlines()
     return "\n".join(f"{INDENT}{line.rstrip()}" for line in lines if line.strip())
 
 

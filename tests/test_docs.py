@@ -40,6 +40,7 @@ JOURNEYS = [
     slow("recipes", "sweeps", "comparing"),
     slow("networks"),
     slow("crazyflie"),
+    slow("matlab"),
 ]
 
 FENCE = re.compile(

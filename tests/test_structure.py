@@ -306,7 +306,8 @@ def test_every_dependency_is_imported_or_has_its_reason():
         for target in targets(module, node)
     }
     assert required - found == set(not_imported)
-    assert set(extras) == {*optional, "all", "dev"}
+    # What shows notebooks is a program of its own.
+    assert set(extras) == {*optional, "notebook", "all", "dev"}
 
 
 def test_every_advice_to_install_names_this_distribution():

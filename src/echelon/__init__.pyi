@@ -54,21 +54,28 @@ from .experiments.studies.compare import compare as compare
 from .experiments.studies.design import design as design
 from .experiments.studies.finite_condition import finite_condition as finite_condition
 from .experiments.studies.speedup import speedup as speedup
+from .experiments.studies.state_space import state_space as state_space
 from .experiments.studies.tune import tune as tune
 from .guarantees.promises.promise import Promise as Promise
 from .guarantees.promises.promise import promise as promise
 from .guarantees.verifier.verify import verify as verify
 from .laws.law import Law as Law
 from .laws.safety import Safety as Safety
-from .output.archive.open_folder import open_run as open_run
-from .output.archive.run_folder import (
+from .output.archive.export import export as export
+from .output.archive.export import table as table
+from .output.archive.load_folder import (
+    load as load,
+)
+from .output.archive.load_folder import (
     load_run as load_run,
 )
-from .output.archive.run_folder import (
-    save_run as save_run,
+from .output.archive.load_folder import (
+    open_run as open_run,
 )
+from .output.archive.run_folder import save_run as save_run
 from .output.plots.run_figures import figures as figures
 from .output.plots.run_figures import save_figures as save_figures
+from .output.plots.video import save_video as save_video
 from .output.reports.comparison_report import comparison_report as comparison_report
 from .output.reports.run_report import report as report
 from .simulation import (

@@ -13,7 +13,7 @@ main()
 """
 PORT = "`--port` is {}, and must be from 0 to 65535."
 GONE = "`gone` does not exist; give the folder of a run, or its `run.nc`."
-KINDS = "`csv`, `parquet`, `npz`, `mat`"
+KINDS = "`csv`, `parquet`, `npz`, `mat`, `nc`, `json`, `html`"
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import warnings
 from pathlib import Path
 
 import pytest
+from processes import without_status
 
 from echelon.apps.cli import app
 from echelon.apps.cli.cache import cache_folder, keep_compiled_code
@@ -32,7 +33,7 @@ def run(folder, where, **environment):
         timeout=300,
     )
     assert done.returncode == 0
-    return done.stdout, done.stderr
+    return done.stdout, without_status(done.stderr)
 
 
 @pytest.mark.slow

@@ -1,19 +1,18 @@
 """Exit codes of commands: one for each ending, with one sentence, never a bare traceback."""
 
-import io
 import json
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import without_status
 from runs import simulate
 
 import echelon as ech
-from echelon.apps.cli import crash, streams
+from echelon.apps.cli import crash
 from echelon.core.errors import Outcome
 
 LEAVES = """
@@ -102,32 +101,6 @@ def started(*arguments, **options):
     return subprocess.Popen(command, text=True, **options)
 
 
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def test_a_terminal_shows_that_the_program_runs_until_it_says_something(monkeypatch):
-    monkeypatch.setattr(streams, "_SOON", 0.01)
-    for screen, expected in (
-        (Terminal(), "echelon: loading ...\r\x1b[Kfirst\nsecond\n"),
-        (io.StringIO(), "first\nsecond\n"),
-    ):
-        monkeypatch.setattr(sys, "stderr", screen)
-        with streams.outlive_readers():
-            deadline = time.monotonic() + 10.0
-            while not screen.getvalue() and screen.isatty() and time.monotonic() < deadline:
-                time.sleep(0.01)
-            print("first", file=sys.stderr)
-            print("second", file=sys.stderr)
-        assert screen.getvalue() == expected
-    monkeypatch.setattr(streams, "_SOON", 60.0)
-    monkeypatch.setattr(sys, "stderr", quick := Terminal())
-    with streams.outlive_readers():
-        print("at once", file=sys.stderr)
-    assert quick.getvalue() == "at once\n"
-
-
 def test_a_screen_that_takes_no_more_is_told():
     with (
         open("/dev/full", "w") as full,
@@ -142,7 +115,7 @@ def left_by_reader(here, *arguments):
     with started(*arguments, cwd=here, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
         said = process.stderr.read()
-    return process.returncode, said
+    return process.returncode, without_status(said)
 
 
 def test_a_reader_that_has_left_is_no_fault(tmp_path):

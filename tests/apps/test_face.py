@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,13 +14,17 @@ from recordings import as_file, flown
 from runs import made_up
 
 import echelon as ech
+from echelon.apps.cli.explain_command import _names_and_keys
 from echelon.core.errors import MissingExtraError
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.recording import FORMAT, read_recording
+from echelon.experiments.scenario.registry import families
+from echelon.experiments.scenario.scenario import key_meanings
 from echelon.output.archive.export import table
 from echelon.output.plots import animation, video
 from echelon.output.plots.camera import camera_for
 from echelon.output.plots.space import space_of
+from echelon.output.reports.glossary import explain_term, glossary
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +110,11 @@ def test_a_row_is_of_an_agent_at_a_time(run):
 def test_an_unknown_format_is_refused_with_those_there_are(echelon, file):
     code, _, fault = echelon("export", file, "--to", "xls")
     assert code == 2
-    assert fault == "echelon: `--to` is `xls`, allowed are `csv`, `parquet`, `npz`, `mat`.\n"
+    assert (
+        fault
+        == "echelon: `--to` is `xls`, allowed are `csv`, `parquet`, `npz`, `mat`, `nc`, `json`, "
+        "`html`.\n"
+    )
 
 
 # ---- pages and videos -------------------------------------------------------------------------
@@ -225,6 +235,40 @@ def test_explain_says_what_a_word_means(echelon):
     assert code == 0 and len(told.splitlines()) > 20
 
 
+WORDS = """
+actuator age agreement angle bursts certified collision coupling delay directed
+disturbance diverged domain error feedforward follower formation gain graph guaranteed
+horizon input jitter lag law leader limit linearization loss message mismatch mode motor
+network noise offset outage parent plant radio rate reference relay saturated saturation
+seed sensing settled speed step switching symmetry trim tube V wind
+"""
+"""Words that reports and messages use beyond everyday English."""
+
+
+def test_every_word_of_a_message_is_explained():
+    for word in WORDS.split():
+        assert explain_term(word, _names_and_keys()), word
+
+
+def test_messages_use_no_word_of_the_field_that_is_not_tried_here():
+    """What the messages say of radios, wind and collisions stands in the list above."""
+    text = (Path(__file__).parents[1] / "sentences.txt").read_text("utf-8").lower()
+    field = set(
+        re.findall(r"\b(?:radio|wind|noise|delay|jitter|loss|collision|outage|mismatch)\b", text)
+    )
+    assert field and field <= set(WORDS.lower().split())
+
+
+def test_every_key_and_name_of_a_scenario_is_explained():
+    terms = glossary(_names_and_keys())
+    for path, text in key_meanings().items():
+        assert terms[path] and text, path
+        for term in (path, path.rpartition(".")[2]):
+            assert path in explain_term(term, terms)
+    for names in families().values():
+        assert names.keys() <= terms.keys()
+
+
 def test_quiet_prints_nothing_and_does_the_same(echelon, here, file):
     assert echelon("-q", "export", file) == (0, "", "")
     assert (here / "run.csv").is_file()
@@ -239,7 +283,7 @@ def test_a_result_is_a_table_in_a_notebook_with_its_pictures():
     assert page.count("<tr>") == 4 and page.count('src="data:image/png;base64,') == 2
     assert "<td>follower 1</td><td>2</td><td>0.5</td>" in page
     assert "<td>leader 0</td><td></td><td></td>" in page
-    assert repr(made_up(states, model, graph)).startswith("Result(3 x SingleIntegrator, 2 frames, ")
+    assert repr(made_up(states, model, graph)).startswith("Result(3 agents, 2 frames, ")
 
 
 def test_of_a_flock_a_notebook_shows_the_best_the_median_and_the_worst_and_why_it_failed():

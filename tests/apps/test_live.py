@@ -1,6 +1,8 @@
 """The live loop: it equals the loop of a run, its controls are scenario keys, the page shows it."""
 
 import copy
+import dataclasses
+import itertools
 import json
 import threading
 import urllib.error
@@ -21,6 +23,7 @@ from echelon.apps.live.server import live, serve_live
 from echelon.apps.live.session import Session
 from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import SimulationError
+from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import scenario_from_mapping
@@ -186,6 +189,43 @@ def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
         wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
         swarm.apply(knobs)
         np.testing.assert_allclose(flown(swarm, 30), wanted.states[1:], atol=1e-11)
+
+
+def test_a_loop_goes_on_from_the_last_state_of_a_run(swarm):
+    whole = ech.run(scenario(simulation=GIVEN["simulation"] | {"horizon": 0.8}))
+    session, _ = live(scenario(), recording_of(ech.run(scenario())))
+    assert session.swarm.advance(still=True).time == pytest.approx(0.4)
+    shown = [session.swarm.advance() for _ in range(10)]
+    np.testing.assert_allclose([each.states for each in shown], whole.states[11:], atol=1e-11)
+    desired = whole.reference[11:] + whole.offsets[0]
+    np.testing.assert_allclose([each.reference for each in shown], desired, atol=1e-12)
+    away = np.linalg.norm(whole.states[-1, 0, :2] - desired[-1, :2])
+    assert session.swarm.off_reference(shown[-1]) == pytest.approx(away, rel=1e-9)
+    session.ask({"name": "reset"})
+    session.settle()
+    assert session.swarm.steps == 40
+    assert session.ask({"name": "save"})["fault"].startswith("A scenario begins at 0 s")
+    session.promiser.end()
+    other = dataclasses.replace(recording_of(whole), states=whole.states[:, :3])
+    with pytest.raises(SimulationError, match="the run has 3 agents, and its scenario 4 agents of"):
+        live(scenario(), other)
+
+
+def test_who_was_closest_is_kept_until_a_reset(session, swarm):
+    places = []
+    for _ in range(5):
+        picture = swarm.advance()
+        session.show(picture)
+        places.append(picture.states[:, :2])
+    pairs = list(itertools.combinations(range(4), 2))
+    apart = np.array([[np.linalg.norm(p[i] - p[j]) for i, j in pairs] for p in places])
+    frame, pair = np.unravel_index(apart.argmin(), apart.shape)
+    assert session.closest.distance == pytest.approx(apart.min(), rel=1e-12)
+    assert session.closest.agents == pairs[pair]
+    assert session.closest.time == pytest.approx(0.04 * (frame + 1))
+    session.ask({"name": "reset"})
+    session.settle()
+    assert session.closest.time == 0.0
 
 
 def test_a_page_that_comes_before_the_first_picture_is_sent_none(session):

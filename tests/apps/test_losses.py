@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import xarray as xr
 from processes import started, wait_for
 from runs import OWN_PENDULUM
 
 import echelon as ech
 from echelon.core import files
 from echelon.core.files import write_atomic
+from echelon.experiments.results.labelled import read_labelled
 from echelon.laws.law import Law
 from echelon.output.archive.chunks import Chunks
 from echelon.simulation.engine import simulate as engine
@@ -57,8 +57,7 @@ def here(here):
 
 
 def stored(folder):
-    with xr.open_dataset(folder / "run.nc", engine="h5netcdf") as data:
-        return {name: np.asarray(data[name].values) for name in data}
+    return read_labelled(folder / "run.nc").arrays()
 
 
 def numbers(folder):
@@ -71,6 +70,7 @@ def assert_same(one, other):
     for name, values in stored(one).items():
         np.testing.assert_array_equal(values, stored(other)[name], err_msg=name)
     assert numbers(one) == numbers(other)
+    assert (one / "run.nc").read_bytes() == (other / "run.nc").read_bytes()
 
 
 # ---- the engine hands over what it computed, and goes on from it ----
@@ -160,7 +160,7 @@ def test_a_killed_run_opens_as_stopped_and_goes_on_to_the_same_bits(here, echelo
     assert process.returncode == -signal.SIGKILL and not (here / "o" / "run.nc").exists()
     # What the scenario names is kept with it, and so may change or go.
     shutil.rmtree(here / "models")
-    result = ech.load_run("o")
+    result = ech.load("o")
     assert result.outcome is ech.Outcome.STOPPED and 3 < len(result.times) < 401
     assert result.message.startswith("The run was ended from outside at t = ")
     assert result.sums.steps[0] > 750 and result.provenance["scenario"] == "mine"
@@ -209,7 +209,7 @@ def test_sigterm_is_an_interrupt(here):
 @pytest.mark.study
 def test_a_second_interrupt_ends_at_once_and_keeps_the_chunks(here, echelon):
     code, out, _ = interrupted(here, signal.SIGINT, presses=2)
-    assert code == 130 and ech.load_run("o").outcome is ech.Outcome.STOPPED
+    assert code == 130 and ech.load("o").outcome is ech.Outcome.STOPPED
     assert echelon("run", "--resume", "o", "--no-figures")[0] == 0
 
 

@@ -601,6 +601,28 @@ def test_view_writes_one_file_and_replaces_none_unasked(echelon, stored):
     assert echelon("view", stored[1].parent, "--html", "out.html", "--force")[0] == 0
 
 
+def test_view_without_a_run_takes_the_newest_and_at_most_two(echelon, here, stored):
+    import os
+
+    code, _, fault = echelon("view", "--html", "out.html")
+    assert code == 2 and fault == (
+        "echelon: there is no run in `runs/`; give the folder of a run.\n"
+    )
+    for age, name in enumerate(("newer", "older")):
+        (here / "runs" / name).mkdir(parents=True)
+        copy = here / "runs" / name / "run.nc"
+        copy.write_bytes(stored[1].read_bytes())
+        os.utime(copy, (1e9 - age, 1e9 - age))
+    (here / "runs" / "empty").mkdir()
+    code, _, told = echelon("view", "--html", "out.html")
+    assert code == 0 and "echelon: showing `runs/newer`, the newest run.\n" in told
+    assert echelon("view", "runs/newer", "runs/older", "--html", "two.html")[0] == 0
+    text = (here / "two.html").read_text("utf-8")
+    assert text.count('class="data"') == 2 and "newer and older" in text
+    code, _, fault = echelon("view", "runs/newer", "runs/older", "runs/newer")
+    assert code == 2 and "got 3 runs; a page shows one, or two beside each other." in fault
+
+
 BAD = {
     "nothing": ("none", "`none` does not exist; give the folder of a run, or its `run.nc`."),
     "no run": (".", "the folder `.` holds no run: it has no `run.nc`."),
@@ -611,13 +633,12 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_what_is_no_run_is_refused_in_a_sentence(echelon, here, stored, name):
-    import xarray as xr
+    import h5py
 
     (here / "junk.nc").write_bytes(stored[1].read_bytes()[:3000])
-    with xr.open_dataset(stored[1], engine="h5netcdf") as data:
-        old = data.load()
-    del old.attrs["format"]
-    old.to_netcdf(here / "old.nc", engine="h5netcdf")
+    (here / "old.nc").write_bytes(stored[1].read_bytes())
+    with h5py.File(here / "old.nc", "r+") as old:
+        del old.attrs["format"]
     given, sentence = BAD[name]
     code, _, fault = echelon("view", given, "--html", "out.html")
     assert code == 2 and fault.startswith(f"echelon: {sentence}") and fault.count("\n") == 1
@@ -657,6 +678,25 @@ def test_a_page_that_is_served_is_drawn_too(browser, run):
 
     with serving(serve(Page, 0)) as address, opened(browser, address) as page:
         assert page.evaluate("echelon.last") == 300
+
+
+def test_a_notebook_shows_the_replay_in_a_cell_without_a_guarantee(browser, stored):
+    result, _ = stored
+    shown = result.view(height=400)
+    assert "a notebook shows it" in repr(shown)
+
+    class Notebook(Handler):
+        head = "<link rel='icon' href='data:,'><script>window.echelon = 1</script>"
+        page = (head + shown._repr_html_()).encode()
+
+    with serving(serve(Notebook, 0)) as address, opened(browser, address) as page:
+        cell = page.frames[1]
+        until(lambda: cell.evaluate("Boolean(window.echelon)"))
+        cell.evaluate("echelon.seek(echelon.last)")
+        place = result.states[-1, 1, :2]
+        assert cell.evaluate("echelon.position(1)")[:2] == pytest.approx(place, abs=1e-4)
+        assert not cell.locator(".promise").is_visible()
+        assert "Lyapunov function V" in cell.locator("#side").inner_text()
 
 
 def test_the_badge_says_which_rate_it_has_and_is_not_green_over_a_run_that_was_lost(run):

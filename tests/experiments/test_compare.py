@@ -106,7 +106,7 @@ def test_a_number_of_the_table_is_in_every_table_that_it_names(planar, monkeypat
     for label, result in flown(planar).items():
         assert rows[label]["largest_state"] == np.abs(result.states).max()
     assert "largest" in comparison_report(planar)
-    assert glossary()["largest_state"] == "largest state, m"
+    assert glossary({})["largest_state"] == "largest state, m"
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from sentences import LINES
 
 import echelon.experiments.scenario.scenario
 from echelon.core.errors import ScenarioError, listing
-from echelon.experiments.scenario import registry
+from echelon.experiments.scenario import key_paths, registry
 from echelon.experiments.scenario.checks import ROLES
 from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
 from echelon.experiments.scenario.named_class import accepted, resolve
@@ -23,6 +23,7 @@ from echelon.experiments.scenario.scenario import (
     Fault,
     bundled_scenarios,
     json_schema,
+    key_meanings,
     load_scenario,
     scenario_from_mapping,
 )
@@ -442,6 +443,28 @@ def test_a_mapping_is_checked_like_a_file():
 def test_a_scenario_cannot_be_changed(load):
     with pytest.raises(ValueError, match="frozen"):
         load().seed = 3
+
+
+@pytest.mark.parametrize(
+    ("change", "meant"),
+    [
+        ("radio={delay: 1}", "`network`"),
+        ("graph.delay=1", "`network.delay` or `sensing.delay`"),
+        ("disturbance.loss=0.1", "`network.loss`"),
+        ("network.latency=1", "`network.delay`"),
+        ("graph.offsets={}", "`formation.offsets`"),
+        ("wind=1", "`disturbance`"),
+        ("simulation.duration=1", "`simulation.horizon`"),
+        ("simulation.hroizon=1", "`horizon`"),
+    ],
+)
+def test_a_key_of_another_section_is_named(change, meant):
+    with pytest.raises(ScenarioError, match=re.escape(f"(did you mean {meant}?).")):
+        load_scenario("paper", [change])
+
+
+def test_what_unknown_keys_may_mean_exists():
+    assert set(key_paths._COMMON_NAMES) <= set(key_meanings())
 
 
 @pytest.mark.parametrize("name", bundled_scenarios())

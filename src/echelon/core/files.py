@@ -4,6 +4,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+INPUTS = "inputs"
+"""The folder, beside a scenario, of the files that it names."""
 PART = ".part"
 """Suffix of unfinished files."""
 

@@ -88,6 +88,14 @@ def excess_frames(frames: int, numbers: int, every: int) -> str | None:
     )
 
 
+def excess_rows(rows: int, columns: int) -> str | None:
+    """Return why a table of numbers does not fit in memory, of which it may use a quarter."""
+    size, room = 8 * rows * columns, memory() // 4
+    if size <= room:
+        return None
+    return f"{rows} rows of {columns} columns need {_bytes(size)}, and {_bytes(room)} fit"
+
+
 def memory() -> int:
     """Return the memory in bytes that this process may use."""
     result = [limit for limit in (_machine(), _group()) if limit is not None]

@@ -17,6 +17,8 @@ class Hypothesis(Word):
     SMOOTH = "smooth at the trim"
     DETECTABLE = "detectability of (A, g'P)"
     MATCHED_MOTION = "leader's motion is matched"
+    MESSAGES = "late or lost messages"
+    OWN_STATE = "own state late, motors lag"
     COUPLING = "coupling"
     DISAGREEMENT_DECAY = "disagreement decays"
     ALONG_PATH = "law along the leader's path"

@@ -6,9 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.agents.models.matlab_file import read_matrices
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import ModelError
-from echelon.core.types import Array, InputMap, Output, State
+from echelon.core.types import Array, InputMap, Output, PathLike, State
+
+_EXACT = 1e-9
+"""Relative; what remains of a discrete-time model when it is sampled again."""
 
 
 class Linear(ControlAffine):
@@ -55,6 +59,58 @@ class Linear(ControlAffine):
                 "and must be A (n, n), B (n, m), C (q, n) with n names."
             )
 
+    @classmethod
+    def discrete(
+        cls,
+        A: Sequence[Sequence[float]] | Array,
+        B: Sequence[Sequence[float]] | Array,
+        step: float,
+        C: Sequence[Sequence[float]] | Array | None = None,
+        names: Sequence[str] = (),
+    ) -> "Linear":
+        """Return the system in continuous time that x+ = A x + B u samples, as MATLAB's `d2c`.
+
+        With inputs held over `step` its states at the samples are those of the given system; it is
+        the slowest such system. A run with `dt` equal to `step` repeats them up to the error of the
+        integrator, which `substeps` reduce.
+
+        Args:
+            A: (n, n).
+            B: (n, m).
+            step: the sampling time, s.
+            C: (q, n), the identity when left out.
+            names: n state names.
+
+        Raises:
+            ModelError: there is no such system, since A has an eigenvalue that is zero or negative;
+                or as for `Linear`.
+        """
+        sampled = cls(A, B, C, names)
+        if not (np.isfinite(step) and step > 0.0):
+            raise ModelError(f"the step of `Linear.discrete` is {step}, and must be positive.")
+        return cls(*_continuous(sampled.A, sampled.B, float(step)), C, names)
+
+    @classmethod
+    def read(cls, file: PathLike, names: Sequence[str] = ()) -> "Linear":
+        """Return the model in a MATLAB file: A and B, and where given C, D and the step Ts.
+
+        With a positive Ts (s) it is a discrete-time model, see `discrete`.
+
+        Raises:
+            ModelError: the file cannot be read, lacks A or B, or D is not zero.
+        """
+        found = read_matrices(file)
+        if found.get("D", np.zeros(1)).any():
+            raise ModelError(
+                f"`D` of `{file}` is not zero, and the output of an agent depends on its state "
+                "only; leave `D` out, or add the input's filter to the states."
+            )
+        step = float(np.max(found.get("Ts", np.zeros(1)), initial=0.0))
+        matrices = found["A"], found["B"]
+        if step > 0.0:
+            return cls.discrete(*matrices, step, found.get("C"), names)
+        return cls(*matrices, found.get("C"), names)
+
     @property
     def state_names(self) -> tuple[str, ...]:
         """The given names."""
@@ -81,6 +137,35 @@ class Linear(ControlAffine):
     def output(self, x: State) -> Output:
         """Return C x."""
         return jnp.asarray(self.C, x.dtype) @ x
+
+
+def _continuous(A: Array, B: Array, step: float) -> tuple[Array, Array]:
+    """Return the continuous-time (A, B) that (A, B) sample with inputs held over a step (s).
+
+    Raises:
+        ModelError: there is none.
+    """
+    from scipy.linalg import expm, logm
+
+    eigenvalues = np.linalg.eigvals(A)
+    for value in eigenvalues[(np.real(eigenvalues) <= 0.0) & (np.imag(eigenvalues) == 0.0)][:1]:
+        raise ModelError(
+            f"the discrete-time model has no equivalent in continuous time, since A has the "
+            f"eigenvalue {np.real(value):.3g}, and must have none that is zero or negative."
+        )
+    n, m = B.shape
+    rate = np.real(np.asarray(logm(A))) / step
+    # B is the integral of exp(A s) over the step, times the continuous one.
+    flow = expm(step * np.block([[rate, np.eye(n)], [np.zeros((n, 2 * n))]]))
+    entry = np.linalg.solve(flow[:n, n:], B)
+    both = np.block([[rate, entry], [np.zeros((m, n + m))]])
+    error = np.abs(expm(step * both)[:n] - np.hstack([A, B])).max()
+    if not error <= _EXACT * max(1.0, np.abs(A).max(), np.abs(B).max()):
+        raise ModelError(
+            "the discrete-time model has no equivalent in continuous time: the logarithm of A is "
+            f"only known to {error:.2g}."
+        )
+    return rate, entry
 
 
 def _matrix(name: str, value: Sequence[Sequence[float]] | Array) -> Array:

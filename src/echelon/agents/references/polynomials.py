@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.path_file import read_columns
 from echelon.agents.references.polynomial_path import PolynomialPath
 from echelon.agents.references.reference import COORDINATES, Reference, numbers_of
@@ -65,13 +64,12 @@ class Polynomials(PolynomialPath):
         self.coefficients = np.moveaxis(_between(spans, ends), 2, 0)[::-1]
 
     @classmethod
-    def read(cls, file: PathLike, model: ControlAffine | None = None) -> "Polynomials":
+    def read(cls, file: PathLike) -> "Polynomials":
         """Return the path in a CSV file of Crazyswarm2.
 
         Args:
             file: its first line names the columns `duration`, `x^0` to `x^7`, and likewise for `y`,
                 `z` and `yaw`.
-            model: not used; a path in space does not depend on it.
 
         Raises:
             ReferenceError: the file cannot be read, or a line is wrong; the message names it.

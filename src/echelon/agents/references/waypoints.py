@@ -7,7 +7,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.path_file import read_columns
 from echelon.agents.references.polynomial_path import PolynomialPath
 from echelon.agents.references.reference import COORDINATES, numbers_of
@@ -53,15 +52,12 @@ class Waypoints(PolynomialPath):
         self.knots, self.coefficients = t, _fit(t, np.column_stack([p, _yaws(yaw, degrees, t)]))
 
     @classmethod
-    def read(
-        cls, file: PathLike, model: ControlAffine | None = None, degrees: bool = False
-    ) -> "Waypoints":
+    def read(cls, file: PathLike, degrees: bool = False) -> "Waypoints":
         """Return the path through the points of a CSV file.
 
         Args:
             file: its first line names the columns `t`, `x`, `y`, `z` and `yaw`, in any order; s, m
                 and rad. Without `yaw` it is 0.
-            model: not used; a path in space does not depend on it.
             degrees: whether the yaw is in degrees.
 
         Raises:

@@ -13,6 +13,8 @@ from echelon.agents.world.plant import check_plant, differences
 from echelon.agents.world.sensing import Sensing
 from echelon.core.errors import SimulationError
 
+LATE = "messages are late or lost"
+
 
 @final
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +48,7 @@ class World:
         return {
             "wind or noise acts on the agents": self.disturbance is not None,
             "the agents differ from the model": self.plant is not None or bool(self.plants),
-            "messages are late or lost": self.network is not None,
+            LATE: self.network is not None,
             "the actuators lag or have levels": self.actuator not in (None, Actuator()),
             "agents measure their states late or with noise": self.sensing not in (None, Sensing()),
         }

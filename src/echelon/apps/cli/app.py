@@ -30,6 +30,7 @@ from echelon.apps.cli.path_command import path
 from echelon.apps.cli.plot_command import plot
 from echelon.apps.cli.report_command import report
 from echelon.apps.cli.run_command import run
+from echelon.apps.cli.status import STATUS
 from echelon.apps.cli.stop import NOTHING, STOP, Ended
 from echelon.apps.cli.streams import outlive_readers
 from echelon.apps.cli.sweep_command import sweep
@@ -110,6 +111,7 @@ def _about(
     quiet: Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.")] = False,
 ) -> None:
     if quiet:
+        STATUS.silence()
         nowhere = context.with_resource(open(os.devnull, "w"))
         context.with_resource(contextlib.redirect_stdout(nowhere))
     if version:

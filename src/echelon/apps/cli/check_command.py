@@ -1,26 +1,38 @@
-"""`echelon check`: the paper's assumptions, tested on a scenario."""
+"""`echelon check`: what is guaranteed of a scenario, and the paper's claims about it."""
 
 import json
+from typing import Annotated
 
 import typer
 
 from echelon.apps.cli import tables
 from echelon.apps.cli.options import JsonOption, ScenarioArgument, SetOption
+from echelon.apps.cli.status import STATUS
 
 
-def check(scenario: ScenarioArgument, set_: SetOption = None, as_json: JsonOption = False) -> None:
-    """Test the paper's assumptions on a scenario; exit code 0 if anything is guaranteed."""
+def check(
+    scenario: ScenarioArgument,
+    set_: SetOption = None,
+    every: Annotated[
+        bool, typer.Option("--all", help="Print every line, with its reason, as a table.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """State what is guaranteed of a scenario, and why; exit code 0 if anything is."""
     from echelon.experiments.scenario.scenario import load_scenario
 
     loaded = load_scenario(scenario, set_ or [])
+    STATUS.begin(f"checking {loaded.name}", not as_json)
     # Not above: an error in the file is reported without the wait for JAX.
     from echelon.experiments.scenario.build import build
     from echelon.experiments.studies.check import check as examine
+    from echelon.output.reports.check_report import check_report, grouped
 
     assumptions = examine(*build(loaded))
-    promise = assumptions.promise
     if as_json:
         print(json.dumps(assumptions.as_mapping(), indent=2))
+    elif every:
+        tables.print_statements(grouped(assumptions.lines), assumptions.promise.sentence())
     else:
-        tables.print_table(tables.statements_table(assumptions.lines), promise.sentence())
+        print(check_report(assumptions))
     raise typer.Exit(0 if assumptions.promised else 1)

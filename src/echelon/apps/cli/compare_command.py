@@ -1,7 +1,6 @@
 """`echelon compare`: consensus laws and optimization-based methods from the same starts."""
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +8,7 @@ import typer
 
 from echelon.apps.cli import options, tables
 from echelon.apps.cli.console import print_folder
+from echelon.apps.cli.status import STATUS
 from echelon.apps.cli.stop import STOP
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ def compare(
     # First, so that `--set simulation.horizon` wins over it.
     changes = [f"simulation.horizon={horizon!r}", *(set_ or [])]
     loaded = [load_scenario(name, changes) for name in scenarios]
+    names = ", ".join(scenario.name for scenario in loaded)
+    STATUS.begin(f"comparing methods on {names}, which takes minutes", not as_json)
     from echelon.experiments.scenario.build import build
     from echelon.experiments.studies.compare import known_labels
     from echelon.output.archive.folder import claim_folders
@@ -74,12 +76,13 @@ def _compare(
         print_comparison,
     )
 
-    def announce(label: str) -> None:
-        if not quiet and sys.stderr.isatty():
-            print(f"simulating {label} ...", file=sys.stderr)
+    def progress(label: str, done: float, methods: int) -> None:
+        STATUS.count(done, methods, f"methods, now {label}")
+        STOP.check()
 
     flights = Flights(folder)
-    comparison = simulate(scenario, experiment, labels, announce, STOP.check, flights.write)
+    STATUS.begin(f"comparing on {scenario.name}", not quiet)
+    comparison = simulate(scenario, experiment, labels, progress, flights.write)
     # Printed before anything more is written, so that a full disk loses nothing of it.
     if not quiet:
         print_comparison(tables.console(), comparison)

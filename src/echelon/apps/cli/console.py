@@ -1,8 +1,6 @@
-"""Output shared by commands: progress, the guarantee of a run, and the files written."""
+"""Output shared by commands: the guarantee of a run, and the files written."""
 
-import contextlib
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,37 +8,7 @@ from echelon.core.files import write_atomic
 from echelon.output.archive.folder import write_errors
 
 if TYPE_CHECKING:
-    from rich.progress import ProgressColumn
-
     from echelon.experiments.scenario.build import Experiment
-
-
-@contextlib.contextmanager
-def show_progress(quiet: bool, unit: str = "steps") -> Iterator[Callable[[int, int], None]]:
-    """Show steps and time left on standard error, if it is a terminal and not `quiet`."""
-    if quiet or not sys.stderr.isatty():
-        yield lambda done, total: None
-        return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    columns: tuple[ProgressColumn, ...] = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn(f"{unit}, left"),
-        TimeRemainingColumn(),
-    )
-    # Standard error, so that the bar is visible while the report goes into a file.
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("simulating", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def foretell(experiment: "Experiment", quiet: bool) -> None:

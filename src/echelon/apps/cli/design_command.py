@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from echelon.apps.cli import options, tables
+from echelon.apps.cli.status import STATUS
 from echelon.output.archive.folder import claim_design, write_errors
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def design(
     from echelon.experiments.scenario.scenario import load_scenario
 
     loaded = load_scenario(scenario, set_ or [])
+    STATUS.begin(f"designing gains for {loaded.name}", not as_json)
     from echelon.experiments.scenario.self_contained import files_of
 
     # Before the study, which takes seconds.
@@ -41,7 +43,7 @@ def design(
     from echelon.experiments.studies.design import design as study
     from echelon.synthesis.gains.gain_file import save_gain
 
-    report = study(loaded, method)
+    report = study(loaded, method, STATUS.counter("methods"))
     sentence, best, law_design = report.because, report.recommended, report.law_design
     summary: JsonObject = {"recommended": None}
     if best is not None and best.gain is not None and best.parts is not None:

@@ -7,12 +7,15 @@ import typer
 
 from echelon.apps.cli.console import write_file
 from echelon.apps.cli.options import OverwriteOption, RunArgument
+from echelon.apps.cli.status import STATUS
 from echelon.output.archive.folder import claim_file
 
 
 def export(
     run: RunArgument,
-    to: Annotated[str, typer.Option("--to", help="csv, parquet, npz or mat.")] = "csv",
+    to: Annotated[
+        str, typer.Option("--to", help="csv, parquet, npz, mat, nc, json, html.")
+    ] = "csv",
     out: Annotated[
         Path | None, typer.Option("--out", help="Output file (default: run.csv, run.npz, ...).")
     ] = None,
@@ -24,6 +27,7 @@ def export(
     content = content_of(to)
     file = Path(f"run.{to}") if out is None else out
     claim_file(file, force)
-    from echelon.output.archive.open_folder import open_run
+    STATUS.begin(f"reading {run}")
+    from echelon.output.archive.load_folder import load
 
-    write_file(file, content(open_run(run)))
+    write_file(file, content(load(run)))

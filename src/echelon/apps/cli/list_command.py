@@ -10,20 +10,7 @@ def list_(as_json: JsonOption = False) -> None:
     from echelon.experiments.scenario import registry
     from echelon.experiments.scenario.scenario import bundled_scenarios
 
-    families: dict[str, dict[str, str]] = {"scenarios": bundled_scenarios()}
-    for title, entries in (
-        ("models", registry.MODELS),
-        ("references", registry.REFERENCES),
-        ("leader laws", registry.LEADER_LAWS),
-        ("follower laws", registry.FOLLOWER_LAWS),
-        ("gain methods", registry.METHODS),
-    ):
-        families[title] = {name: entry.summary for name, entry in entries.items()}
-    families |= {
-        "graphs": registry.GRAPHS,
-        "formations": registry.FORMATIONS,
-        "integrators": registry.INTEGRATORS,
-    }
+    families = {"scenarios": bundled_scenarios(), **registry.families()}
     if as_json:
         print(json.dumps(families, indent=2))
         return

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from echelon.apps.cli.options import BrowserOption, PortOption, SetOption
+from echelon.apps.cli.status import STATUS
 
 
 def live(
@@ -27,12 +28,15 @@ def live(
     folder = Path(scenario) if Path(scenario).is_dir() else None
     loaded = load_scenario(scenario if folder is None else folder / SCENARIO_FILE, set_ or [])
     check_page()
+    STATUS.begin(f"preparing {loaded.name} for the browser, which takes up to a minute")
     from echelon.apps.cli.view_command import keep_serving
     from echelon.apps.live.server import live as make_ready
     from echelon.apps.live.server import serve_live
-    from echelon.output.archive.open_folder import open_run
+    from echelon.experiments.results.dataset import recording_of
+    from echelon.output.archive.load_folder import load
 
-    session, html = make_ready(loaded, None if folder is None else open_run(folder))
+    run = None if folder is None else recording_of(load(folder))
+    session, html = make_ready(loaded, run, STATUS.counter("parts"))
     server = serve_live(session, html, port)
     session.start()
     try:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from echelon.apps.cli import options
+from echelon.apps.cli.status import STATUS
 from echelon.core.files import write_atomic
 from echelon.output.archive.folder import claim_file, write_errors
 
@@ -29,6 +30,7 @@ def path(
     from echelon.experiments.scenario.scenario import load_scenario
 
     loaded = load_scenario(scenario, set_ or [])
+    STATUS.begin(f"fitting the path of {loaded.name}")
     from echelon.experiments.scenario.self_contained import files_of
 
     claim_file(out, force, files_of(loaded))

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from echelon.apps.cli.options import OverwriteOption, RunArgument
+from echelon.apps.cli.status import STATUS
 from echelon.core.errors import OutputError
 from echelon.output.archive.folder import claim_files, write_errors
 from echelon.output.plots.figure_files import NAMES, check_names, save
@@ -35,23 +36,26 @@ def plot(
         raise OutputError(f"`--dpi` is {dpi}, and must be from {_LEAST} to {_MOST}.")
     names = NAMES if what is None else tuple(filter(None, map(str.strip, what.split(","))))
     check_names(names)
-    from echelon.output.archive.open_folder import open_run
+    STATUS.begin(f"reading {run}")
+    from echelon.output.archive.load_folder import load
     from echelon.output.plots.run_figures import figures
     from echelon.output.plots.style import ONE_COLUMN, SCREEN, TWO_COLUMNS
 
-    recording = open_run(run)
+    result = load(run)
     folder = (run if run.is_dir() else run.parent) / "figures" if out is None else out
     pages = {"_one_column": ONE_COLUMN, "_two_columns": TWO_COLUMNS} if paper else {"": SCREEN}
     drawings = {
         f"{name}{suffix}": figure
         for suffix, page in pages.items()
-        for name, figure in figures(recording, names, page).items()
+        for name, figure in figures(result, names, page).items()
     }
     if not drawings:
         raise OutputError("the run has no data for these figures.")
     # Figures in a run's own folder are replaced without a question.
     claim_files(folder, [f"{n}.{kind}" for n in drawings for kind in _KINDS], force or out is None)
     with write_errors(folder):
-        paths = save(drawings, folder, _KINDS, dpi or (300 if paper else 150))
+        STATUS.begin("drawing figures")
+        show = STATUS.counter("files")
+        paths = save(drawings, folder, _KINDS, dpi or (300 if paper else 150), show)
     stems = ", ".join(dict.fromkeys(path.stem for path in paths))
     print(f"- Written to {folder}: {stems}, each as {', '.join(k.upper() for k in _KINDS)}.")

@@ -7,6 +7,7 @@ import typer
 
 from echelon.apps.cli.console import write_file
 from echelon.apps.cli.options import OverwriteOption, RunArgument
+from echelon.apps.cli.status import STATUS
 from echelon.output.archive.folder import claim_file
 
 
@@ -17,8 +18,9 @@ def report(
 ) -> None:
     """Write a run as one HTML page: table, guarantee, figures, scenario, versions, citation."""
     claim_file(out, force)
-    from echelon.output.archive.open_folder import open_run
+    STATUS.begin(f"reading {run}")
+    from echelon.output.archive.load_folder import load
     from echelon.output.archive.report_page import report_page
 
-    page = report_page(open_run(run), run if run.is_dir() else None)
+    page = report_page(load(run), run if run.is_dir() else None)
     write_file(out, page, "{}, one self-contained file")

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from echelon.apps.cli import options, tables
-from echelon.apps.cli.console import foretell, print_folder, show_progress
+from echelon.apps.cli.console import foretell, print_folder
 from echelon.apps.cli.job import Job, check_inputs
+from echelon.apps.cli.status import STATUS
 from echelon.apps.cli.stop import STOP
 from echelon.core.errors import Outcome, OutputError
 
@@ -74,6 +75,7 @@ def _new_run(
     from echelon.experiments.scenario.scenario import load_scenario
 
     scenario = load_scenario(name, changes)
+    STATUS.begin(f"preparing {scenario.name}", not quiet)
     from echelon.experiments.scenario.build import build
     from echelon.output.archive.chunks import Chunks
     from echelon.output.archive.folder import claim_folder
@@ -95,6 +97,7 @@ def _unfinished_run(folder: Path) -> "tuple[Scenario, Experiment, Job]":
     job = Job("run", Chunks(folder))
     job.resume("summary.json")
     scenario = load_scenario(folder / SCENARIO_FILE)
+    STATUS.begin(f"preparing {scenario.name}")
     from echelon.experiments.scenario.build import build
 
     return scenario, build(scenario), job
@@ -123,10 +126,12 @@ def _simulate(
     if watched is not None:
         for stretch in stored:
             watched.add(stretch)
-    with job.cleanup(), show_progress(quiet) as show:
+    horizon = f"{experiment.settings.horizon:g} s of {experiment.parts.graph.agents} agents"
+    STATUS.begin(f"simulating {scenario.name}, {horizon}", not quiet)
+    with job.cleanup():
 
         def progress(run: "RunSoFar") -> None:
-            show(run.done, run.steps)
+            STATUS.count(run.done, run.steps, "steps")
             STOP.check()
 
         return build.run(scenario, progress, experiment, store, stored)
@@ -149,6 +154,7 @@ def _write(job: Job, result: "Result", figures: bool, quiet: bool) -> None:
     """Write all output; the chunks stay until the run is complete and everything is written."""
     from echelon.output.archive.run_folder import write_findings
 
+    STATUS.begin("drawing and writing" if figures else "writing", log=False)
     try:
         write_findings(result, job.folder, figures)
     except OutputError as error:

@@ -12,10 +12,6 @@ from typing import NoReturn, final
 NOTHING = "stopped; there were no results to save."
 _MESSAGE = "echelon: stopping and saving results. Press Ctrl-C again to quit immediately."
 
-_CURSOR = "\x1b[?25h\n"
-"""Shows the cursor again, which the progress bar hides."""
-
-
 _PATIENCE = 1.0
 """Seconds after which a signal ends the process although Python has not yet handled it."""
 _GRACE = 0.2
@@ -160,7 +156,7 @@ class Stop:
                     print(self._message, file=sys.stderr, flush=True)
 
     def _quit(self, sentence: str = "") -> NoReturn:
-        sys.stderr.write(_CURSOR * sys.stderr.isatty() + sentence)
+        sys.stderr.write("\n" * sys.stderr.isatty() + sentence)
         sys.stderr.flush()
         os._exit(self.exit_code)
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from echelon.apps.cli import options
-from echelon.apps.cli.console import print_folder, show_progress
+from echelon.apps.cli.console import print_folder
 from echelon.apps.cli.job import Job, check_inputs
+from echelon.apps.cli.status import STATUS
 from echelon.apps.cli.stop import STOP, Ended
 
 if TYPE_CHECKING:
@@ -70,6 +71,7 @@ def _new_sweep(
 
     axes = read_axes(over)
     scenario = load_scenario(name, changes)
+    STATUS.begin(f"preparing {scenario.name}", log=False)
     from echelon.experiments.sweeps.plan import Sweep
     from echelon.output.archive.folder import BATCHES, claim_folder
     from echelon.output.archive.sweep_folder import Batches
@@ -108,19 +110,18 @@ def _compute(
         batches.write(batch)
         results.append(batch)
 
-    with show_progress(quiet, "runs") as show:
+    def progress(done: int, runs: int) -> None:
+        STATUS.count(done, runs, "runs")
+        STOP.check()
 
-        def progress(done: int, runs: int) -> None:
-            show(done, runs)
-            STOP.check()
-
-        stored = tuple(results)
-        try:
-            STOP.aside(lambda: compute(plan, store, progress, stored, threads, cluster))
-        except KeyboardInterrupt:
-            # What is computed by then is stored, and the report says so.
-            if not results:
-                raise Ended from None
+    stored = tuple(results)
+    STATUS.begin(f"simulating {plan.scenario.name}, {plan.count} runs", not quiet)
+    try:
+        STOP.aside(lambda: compute(plan, store, progress, stored, threads, cluster))
+    except KeyboardInterrupt:
+        # What is computed by then is stored, and the report says so.
+        if not results:
+            raise Ended from None
     # A copy, as a thread that goes on may add to them.
     return [*results]
 

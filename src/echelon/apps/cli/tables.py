@@ -2,7 +2,7 @@
 
 import enum
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -32,13 +32,6 @@ def pairs(facts: dict[str, str]) -> "Table":
     for name, text in facts.items():
         table.add_row(name, escape(text))
     return table
-
-
-def print_table(table: "Table", sentence: str) -> None:
-    """Print a table and a sentence, each row on one line where the output is no terminal."""
-    out = console()
-    out.print(table, soft_wrap=not out.is_terminal)
-    out.print(sentence, highlight=False, markup=False, soft_wrap=not out.is_terminal)
 
 
 _DESIGN: dict[str, tuple[str, Callable[[Any], Any]]] = {
@@ -123,12 +116,16 @@ def _cell(value: object) -> str:
     return "-" if value is None else str(value)
 
 
-def statements_table(lines: "Iterable[Statement]") -> "Table":
-    """Return the statements of a check as a table."""
-    rows = ((x.name, str(x.verdict), str(x.kind), x.number_text, x.explanation) for x in lines)
-    return plain_table(
-        ("statement", "verdict", "kind", "number", "reason, or what to change"), rows
-    )
+def print_statements(groups: "Mapping[str, Iterable[Statement]]", sentence: str) -> None:
+    """Print a sentence and all statements, each on one line where the output is no terminal."""
+    out = console()
+    flat = not out.is_terminal
+    out.print(sentence, highlight=False, markup=False, soft_wrap=flat)
+    heads = ("statement", "verdict", "kind", "number", "reason, or what to change")
+    for title, lines in groups.items():
+        rows = ((x.name, str(x.verdict), str(x.kind), x.number_text, x.explanation) for x in lines)
+        out.print(f"\n{title}:", highlight=False, markup=False)
+        out.print(plain_table(heads, rows), soft_wrap=flat)
 
 
 def plain_table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> "Table":

@@ -1,13 +1,13 @@
 """`echelon tune`: the weights of a gain, optimized for the cost of a run."""
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from echelon.apps.cli import options, tables
+from echelon.apps.cli.status import STATUS
 from echelon.output.archive.folder import claim_design
 
 if TYPE_CHECKING:
@@ -35,14 +35,18 @@ def tune(
     from echelon.experiments.scenario.scenario import load_scenario
 
     loaded = load_scenario(scenario, set_ or [])
+    STATUS.begin(f"tuning {loaded.name}", not as_json)
     from echelon.experiments.scenario.self_contained import files_of
 
     claim_design(out, None, force, files_of(loaded))
     from echelon.experiments.studies.tune import tune as study
 
     names = [name.strip() for name in params.split(",") if name.strip()]
-    watched = sys.stderr.isatty() and not as_json
-    tuned = study(loaded, names, cost, rounds, _show_trial if watched else None)
+
+    def show(trial: int, lowest: float) -> None:
+        STATUS.count(min(trial, rounds), rounds, f"rounds at most, lowest cost {lowest:.6g}")
+
+    tuned = study(loaded, names, cost, rounds, show)
     if out is not None:
         _save(tuned, loaded, out)
     summary = _as_mapping(tuned, names)
@@ -51,10 +55,6 @@ def tune(
     else:
         _print(summary)
     raise typer.Exit(0 if tuned.promised_after.promised else 1)
-
-
-def _show_trial(trial: int, cost: float) -> None:
-    print(f"\rtrial {trial}, lowest cost {cost:.6g} ", end="", file=sys.stderr, flush=True)
 
 
 def _save(tuned: "TuneResult", scenario: "Scenario", out: Path) -> None:
@@ -86,8 +86,6 @@ def _print(summary: "JsonObject") -> None:
     for name in summary["before"]:
         if name != "promise":
             table.add_row(name, *(_numbers(summary[when][name]) for when in ("before", "after")))
-    if sys.stderr.isatty():
-        print(file=sys.stderr)
     tables.console().print(table)
     trials = len(summary["costs"])
     print(f"{trials} trial{'s' * (trials != 1)}. {summary['after']['promise']['sentence']}")

@@ -1,7 +1,6 @@
 """`echelon verify`: whether a gain and the guarantee of a run are as their files state."""
 
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from echelon.apps.cli.options import JsonOption
+from echelon.apps.cli.status import STATUS
 
 if TYPE_CHECKING:
     from echelon.experiments.scenario.scenario import Scenario
@@ -37,6 +37,7 @@ def verify(
 
     Exit code 0 if all claims hold, 1 if one does not, 5 if one could not be checked.
     """
+    STATUS.begin(f"verifying {file}", not as_json)
     from echelon.output.archive.open_folder import claim_files
 
     files = claim_files(file)
@@ -98,9 +99,7 @@ def _recomputed(scenario: "Scenario", files: "ClaimFiles") -> "list[Finding]":
     """Return what the scenario gives; nothing for a gain file by itself."""
     if files.claims is None and files.data is None:
         return []
-    if sys.stderr.isatty():
-        text = "computing the guarantee again; what is not in the cache takes up to a minute"
-        print(f"echelon: {text}", file=sys.stderr, flush=True)
+    STATUS.begin("computing the guarantee again, which takes up to a minute", log=False)
     from echelon.experiments.studies.recomputation import recompute
 
     return list(recompute(scenario, files.claims, files.gain, files.data))

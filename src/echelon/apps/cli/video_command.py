@@ -7,6 +7,7 @@ import typer
 
 from echelon.apps.cli.console import print_file
 from echelon.apps.cli.options import OverwriteOption, RunArgument
+from echelon.apps.cli.status import STATUS
 from echelon.core.errors import OutputError
 from echelon.output.archive.folder import claim_file, write_errors
 
@@ -21,11 +22,12 @@ def video(
     if not 0.01 <= speed <= 100.0:
         raise OutputError(f"`--speed` is {speed:g}, and must be from 0.01 to 100.")
     claim_file(file, force, endings=(".mp4", ".gif"))
-    from echelon.output.archive.open_folder import open_run
+    STATUS.begin(f"reading {run}")
+    from echelon.output.archive.load_folder import load
     from echelon.output.plots.video import encoder, save_video
 
     # Before the run is read, so that a missing ffmpeg is reported at once.
     encoder()
     with write_errors(file):
-        pictures = save_video(open_run(run), file, speed)
+        pictures = save_video(load(run), file, speed)
     print_file(file, f"{pictures} pictures, {{}}")

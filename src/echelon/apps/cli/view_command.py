@@ -10,6 +10,7 @@ import typer
 
 from echelon.apps.cli.console import write_file
 from echelon.apps.cli.options import BrowserOption, OverwriteOption, PortOption
+from echelon.apps.cli.status import STATUS
 from echelon.apps.cli.stop import STOP
 from echelon.core.errors import OutputError
 from echelon.output.archive.folder import DATA, check_exists, claim_file
@@ -49,11 +50,13 @@ def view(
     check_page()
     if html is not None:
         claim_file(html, force)
-    from echelon.output.archive.open_folder import open_run
+    paths = runs or [_newest()]
+    STATUS.begin(f"reading {' and '.join(map(str, paths))}")
+    from echelon.experiments.results.dataset import recording_of
+    from echelon.output.archive.load_folder import load
     from echelon.output.viewer.replay import replay_page
 
-    paths = runs or [_newest()]
-    opened = [open_run(path) for path in paths]
+    opened = [recording_of(load(path)) for path in paths]
     if len(paths) > 1:
         # Both may be of one scenario.
         opened = [replace(run, name=_label(path)) for run, path in zip(opened, paths, strict=True)]

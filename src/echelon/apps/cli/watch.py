@@ -53,10 +53,11 @@ class WatchedRun:
 
     def show_all(self, folder: Path) -> None:
         """Show the complete run until Ctrl-C."""
-        from echelon.output.archive.open_folder import open_run
+        from echelon.experiments.results.dataset import recording_of
+        from echelon.output.archive.load_folder import load
 
         with STOP.hold(message=""):
-            self.page.finish(open_run(folder))
+            self.page.finish(recording_of(load(folder)))
             print(
                 "echelon: complete; the page is still served. Ctrl-C quits.",
                 file=sys.stderr,

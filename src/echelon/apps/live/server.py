@@ -4,6 +4,7 @@ import abc
 import contextlib
 import json
 import time
+from collections.abc import Callable
 from http.server import ThreadingHTTPServer
 from typing import Final
 
@@ -29,12 +30,17 @@ _SLOWEST: Final = 4.0
 """A loop that is more times slower than real time is refused."""
 
 
-def live(scenario: Scenario, run: Recording | None = None) -> tuple[Session, str]:
+def live(
+    scenario: Scenario,
+    run: Recording | None = None,
+    progress: Callable[[int, int], None] = lambda done, parts: None,
+) -> tuple[Session, str]:
     """Return a session that is ready to start, and its page.
 
     Args:
         scenario: of the loop.
         run: of that scenario, whose last state the loop starts from; laws begin without memory.
+        progress: called with how many parts are ready, and of how many.
 
     Raises:
         EchelonError: a part is invalid, or the loop is too slow for real time.
@@ -43,13 +49,16 @@ def live(scenario: Scenario, run: Recording | None = None) -> tuple[Session, str
     parts, settings = experiment
     if not isinstance(parts.drive, Laws):
         raise SimulationError("only agents under laws can run live; use `echelon run` instead.")
+    progress(1, 4)
     panel = Panel(scenario, experiment)
+    progress(2, 4)
     swarm = LiveLoop(parts, settings, panel.live)
     name = scenario.name
     if run is not None:
         _continue(swarm, run)
         name = f"{name}, from {run.times[-1]:.4g} s on"
     _check_speed(swarm)
+    progress(3, 4)
     header = live_header(swarm, panel, name, pending_badge())
     return Session(scenario, panel, swarm), page(f"{name}, live", pack(header, {}))
 

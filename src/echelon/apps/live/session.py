@@ -21,7 +21,7 @@ from echelon.core.errors import EchelonError, SimulationError
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.viewer.replay import heard_by
-from echelon.simulation.engine.frame_numbers import ClosestPair
+from echelon.simulation.engine.closest_pair import ClosestPair
 
 if TYPE_CHECKING:
     from echelon.experiments.scenario.sections import LiveSpec

@@ -1,14 +1,16 @@
 """The dataset of a run with units and provenance (netCDF), and its summary (JSON)."""
 
+import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from echelon.core.files import write_atomic
-from echelon.core.types import JsonObject
+from echelon.core.types import Array, JsonObject, PathLike
 from echelon.experiments.results.agent_metrics import (
     EdgeMetrics,
     Metrics,
@@ -22,6 +24,7 @@ from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import metrics, output_errors
 from echelon.experiments.results.quantity import Shown
 from echelon.experiments.results.recording import Recording, recording
+from echelon.experiments.results.run_groups import SUM, group_of
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
 from echelon.guarantees.promises.promise import promise
 from echelon.simulation.engine.parts import Parts
@@ -57,8 +60,18 @@ def dataset(result: Result) -> "xr.Dataset":
     return labelled(result).dataset()
 
 
+STORED: "WeakKeyDictionary[Result, Labelled]" = WeakKeyDictionary()
+"""The labelled arrays of runs from disk."""
+
+
 def labelled(result: Result) -> Labelled:
-    """Return the labelled arrays of `dataset`."""
+    """Return the labelled arrays of `dataset`: as they are stored, of a run from disk."""
+    stored = STORED.get(result)
+    return _labelled(result) if stored is None else stored
+
+
+def _labelled(result: Result) -> Labelled:
+    """Return the labelled arrays of `dataset`, computed."""
     fixed, per_agent = labelled_parts(result.parts, result.settings), ("time", "agent", "state")
     variables: Variables = {
         "states": (per_agent, result.states),
@@ -79,9 +92,11 @@ def labelled(result: Result) -> Labelled:
     return Labelled(variables, coordinates, {**_attributes(result), **fixed.attributes})
 
 
-def recording_of(result: Result) -> Recording:
-    """Return a run as figures draw it."""
-    data = labelled(result)
+def recording_of(run: Result | Recording) -> Recording:
+    """Return a run as figures draw it; of a run from disk no part is built."""
+    if isinstance(run, Recording):
+        return run
+    data = labelled(run)
     return recording(data.arrays(), data.attributes)
 
 
@@ -147,6 +162,9 @@ def _attributes(result: Result) -> JsonObject:
     solver = {} if result.work is None else {"solver": json.dumps(result.work._asdict())}
     return {
         **result.provenance,
+        "provenance": " ".join(result.provenance),
+        "computed_by": result.engine,
+        "inputs": digest_of(result.files),
         "outcome": result.outcome.name.lower(),
         "message": result.message,
         "warnings": "\n".join(result.warnings),
@@ -155,18 +173,42 @@ def _attributes(result: Result) -> JsonObject:
     }
 
 
-def save_dataset(run: "Result | Labelled | xr.Dataset", path: Path) -> None:
-    """Write the dataset of a run as netCDF, atomically.
+def digest_of(files: Mapping[str, bytes]) -> str:
+    """Return a digest of the files that a scenario names; empty of none."""
+    digests = (f"{name}:{hashlib.sha256(files[name]).hexdigest()}" for name in sorted(files))
+    return " ".join(digests)
+
+
+def save_dataset(run: "Result | xr.Dataset", path: PathLike) -> None:
+    """Write the dataset of a run as netCDF, atomically, in the groups of `run.nc`.
 
     Raises:
         OSError: it cannot be written.
     """
     # In memory first: on a full disk the netCDF library ends the whole process.
-    data = labelled(run) if isinstance(run, Result) else run
-    if isinstance(data, Labelled):
-        write_atomic(path, data.netcdf())
+    if isinstance(run, Result):
+        write_atomic(Path(path), run_file(run))
     else:
-        write_atomic(path, bytes(data.to_netcdf(None, engine="h5netcdf")))
+        write_atomic(Path(path), bytes(run.to_netcdf(None, engine="h5netcdf")))
+
+
+def run_file(result: Result, data: Labelled | None = None) -> bytes:
+    """Return `run.nc`: the dataset in groups, and the sums over all steps.
+
+    Args:
+        result: the run.
+        data: its labelled arrays, computed if None.
+    """
+    data = labelled(result) if data is None else data
+    sums = {
+        SUM + name: _numbered(SUM + name, total) for name, total in result.sums._asdict().items()
+    }
+    return data._replace(variables=data.variables | sums).netcdf(group_of)
+
+
+def _numbered(name: str, values: Array) -> tuple[tuple[str, ...], Array]:
+    """Return an array with dimensions of its own."""
+    return tuple(f"{name}_{axis}" for axis in range(np.ndim(values))), np.asarray(values)
 
 
 def statement(parts: Parts, settings: Settings, name: str) -> JsonObject:

@@ -1,6 +1,8 @@
 """Labelled arrays: as plain arrays, as netCDF, or as an `xarray.Dataset`, which is slow to load."""
 
 import io
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -14,6 +16,8 @@ if TYPE_CHECKING:
 
 Variables: TypeAlias = dict[str, Any]
 """Arrays with the names of their dimensions, by name."""
+GroupOf: TypeAlias = Callable[[str, tuple[str, ...]], str]
+"""Returns the group of a variable in its file, by its name and dimensions."""
 
 
 class Labelled(NamedTuple):
@@ -40,24 +44,51 @@ class Labelled(NamedTuple):
         parts = {**self.variables, **self.coordinates}
         return {name: _whole(name, part)[1] for name, part in parts.items()}
 
-    def netcdf(self) -> bytes:
-        """Return the same file that `xarray` writes of the dataset."""
+    def netcdf(self, group_of: "GroupOf | None" = None) -> bytes:
+        """Return the file that `xarray` writes of the dataset.
+
+        Args:
+            group_of: the group of a variable, by its name and dimensions; the root by default. A
+                group has the coordinates of its dimensions too, so that it is a dataset by itself.
+        """
         # Here, since it is slow to load; `xarray` takes five times as long.
         import h5netcdf
 
-        file, labels = io.BytesIO(), set(self._labels())
+        file = io.BytesIO()
         with h5netcdf.File(file, "w") as written:
-            for name, part in {**self.variables, **self.coordinates}.items():
-                dimensions, values, attributes = _whole(name, part)
-                if name in self.variables and (own := self._labels(dimensions)):
-                    attributes["coordinates"], labels = " ".join(own), labels - {*own}
-                _write(written, name, dimensions, values, attributes)
-            # Labels that no variable names are attributes of the dataset.
-            rest = {"coordinates": " ".join(sorted(labels))} if labels else {}
-            for name, value in {**self.attributes, **rest}.items():
+            for name, part in self._split(group_of or (lambda *_: "")).items():
+                part._write(written.create_group(name) if name else written)
+            for name, value in self.attributes.items():
                 plain = value if isinstance(value, str) else _numeric(name, np.atleast_1d(value))
                 written.attrs[name] = plain
         return file.getvalue()
+
+    def _split(self, group_of: "GroupOf") -> "dict[str, Labelled]":
+        """Return the arrays of each group, the root first."""
+        groups, used = {"": Labelled({}, {}, {})}, dict[str, set[str]]()
+        for name, part in self.variables.items():
+            over = _whole(name, part)[0]
+            group = group_of(name, over)
+            groups.setdefault(group, Labelled({}, {}, {})).variables[name] = part
+            used.setdefault(group, set()).update(over)
+        for name, part in self.coordinates.items():
+            over = _whole(name, part)[0]
+            places = [group for group, names in used.items() if names.issuperset(over)]
+            for group in places or [group_of(name, over)]:
+                groups.setdefault(group, Labelled({}, {}, {})).coordinates[name] = part
+        return groups
+
+    def _write(self, place: "h5netcdf.Group") -> None:
+        """Write all variables and coordinates into a group."""
+        labels = set(self._labels())
+        for name, part in {**self.variables, **self.coordinates}.items():
+            dimensions, values, attributes = _whole(name, part)
+            if name in self.variables and (own := self._labels(dimensions)):
+                attributes["coordinates"], labels = " ".join(own), labels - {*own}
+            _write(place, name, dimensions, values, attributes)
+        # Labels that no variable names are an attribute of the group.
+        if labels:
+            place.attrs["coordinates"] = " ".join(sorted(labels))
 
     def _labels(self, dimensions: tuple[str, ...] | None = None) -> list[str]:
         """Return the coordinates whose name is not that of their dimension, of these dimensions."""
@@ -67,6 +98,52 @@ class Labelled(NamedTuple):
             for name, over in labels.items()
             if name not in over and (dimensions is None or set(over) <= set(dimensions))
         ]
+
+
+def read_labelled(file: Path) -> Labelled:
+    """Return the arrays of all groups of a netCDF file, and the attributes of its root.
+
+    Raises:
+        OSError: the file cannot be read; a damaged one may also raise other errors.
+    """
+    import h5netcdf
+
+    result = Labelled({}, {}, {})
+    with h5netcdf.File(file, "r") as stored:
+        for group in _groups(stored):
+            named = [group.attrs, *(each.attrs for each in group.variables.values())]
+            labels = {label for each in named for label in str(each.get("coordinates", "")).split()}
+            for name, variable in group.variables.items():
+                is_label = name in labels or variable.dimensions == (name,)
+                place = result.coordinates if is_label else result.variables
+                attributes = {k: v for k, v in variable.attrs.items() if k not in _OF_FORMAT}
+                place[name] = (variable.dimensions, _values(variable[...]), attributes)
+        result.attributes.update((k, _plain(v)) for k, v in stored.attrs.items())
+    result.attributes.pop("coordinates", None)
+    return result
+
+
+_OF_FORMAT = ("coordinates", "_FillValue")
+"""Attributes of variables that belong to the format of the file."""
+
+
+def _groups(group: "h5netcdf.Group") -> "Iterator[h5netcdf.Group]":
+    yield group
+    for inner in group.groups.values():
+        yield from _groups(inner)
+
+
+def _values(stored: Array) -> Array:
+    """Return an array as it was written; texts are stored as bytes."""
+    values = np.asarray(stored)
+    if values.dtype.kind != "O":
+        return values
+    texts = (x.decode() if isinstance(x, bytes) else str(x) for x in values.ravel())
+    return np.array([*texts], str).reshape(values.shape)
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def labelled(data: "xr.Dataset") -> Labelled:
@@ -85,7 +162,7 @@ def _whole(name: str, part: Any) -> tuple[tuple[str, ...], Array, JsonObject]:
 
 
 def _write(
-    file: "h5netcdf.File",
+    file: "h5netcdf.Group",
     name: str,
     dimensions: tuple[str, ...],
     values: Array,

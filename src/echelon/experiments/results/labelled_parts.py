@@ -1,5 +1,7 @@
 """Labelled arrays of the parts of a run, which are known before it starts."""
 
+import json
+
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
@@ -49,6 +51,7 @@ def _attributes(parts: Parts, settings: Settings) -> JsonObject:
         **({} if radius is None else {"radius": float(radius)}),
         **{key: text for key, text in world.items() if text is not None},
         **{key: int(v) if isinstance(v, bool) else v for key, v in numbers.items()},
+        "settings": json.dumps(settings._asdict(), default=lambda number: number.item()),
         **{
             f"{role}_needs": "; ".join(received) or "nothing"
             for role, received in parts.information._asdict().items()

@@ -19,10 +19,11 @@ from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
 from echelon.core.words import Verdict
 from echelon.experiments.results.avoidance import Avoidance
+from echelon.experiments.results.labelled import Labelled, read_labelled
 from echelon.simulation.engine.frame_numbers import FrameNumbers
 
-FORMAT = 3
-"""Version of the format of `run.nc`; files of other versions are refused."""
+FORMAT, READ = 4, (3, 4)
+"""Version of the format of `run.nc`, and those that are read; others are refused."""
 
 
 class InputBounds(NamedTuple):
@@ -202,26 +203,21 @@ def read_recording(file: Path) -> Recording:
     Raises:
         OutputError: the file cannot be read, is damaged, or has another format.
     """
-    return recording_with_arrays(file)[0]
+    return recording_with_data(file)[0]
 
 
-def recording_with_arrays(file: Path) -> tuple[Recording, dict[str, np.ndarray]]:
-    """Return the run in a netCDF file, and all its arrays by name.
+def recording_with_data(file: Path) -> tuple[Recording, Labelled]:
+    """Return the run in a netCDF file, and all that the file contains.
 
     Raises:
         OutputError: the file cannot be read, is damaged, or has another format.
     """
-    import xarray as xr
-
     try:
-        with xr.open_dataset(file, engine="h5netcdf") as data:
-            data.load()
-            arrays = {str(name): variable.values for name, variable in data.variables.items()}
-            run = recording(arrays, {str(key): value for key, value in data.attrs.items()})
-            return run, arrays
+        data = read_labelled(file)
+        return recording(data.arrays(), data.attributes), data
     except OutputError as error:
         raise OutputError(f"`{file}`: {error}") from error
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         raise OutputError(
             f"`{file}` cannot be read as a run: it is damaged, or was not written by echelon "
             f"({str(error).splitlines()[0] if str(error) else type(error).__name__})."
@@ -278,12 +274,12 @@ def _check_format(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> N
     if "states" not in arrays or "model" not in attributes:
         raise KeyError("it has no states of agents")
     version = int(attributes.get("format", 1))
-    if version != FORMAT:
+    if version not in READ:
         by = attributes.get("version_echelon", "an unknown version")
         raise OutputError(
             f"the run was written in format {version} by echelon {by}, but this version reads "
-            f"format {FORMAT}; `echelon run FOLDER --out OTHER` computes it again from its "
-            "scenario."
+            f"formats {READ[0]} and {READ[1]}; `echelon run FOLDER --out OTHER` computes it again "
+            "from its scenario."
         )
 
 

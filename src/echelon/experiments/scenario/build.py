@@ -1,5 +1,6 @@
 """Builds the parts of a checked scenario, and runs them."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -26,7 +27,8 @@ from echelon.experiments.scenario.named_class import (
     named_class,
     offered,
 )
-from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.scenario import Scenario, ScenarioLike, as_scenario
+from echelon.experiments.scenario.self_contained import self_contained
 from echelon.experiments.scenario.user_code import as_scenario_error
 from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.world_parts import (
@@ -59,18 +61,18 @@ class Experiment(NamedTuple):
     settings: Settings
 
 
-def build(scenario: Scenario, to_run: bool = False) -> Experiment:
+def build(scenario: ScenarioLike, to_run: bool = False) -> Experiment:
     """Return the parts and the settings of a scenario.
 
     Args:
-        scenario: a checked scenario.
+        scenario: a scenario, its name, its file, the folder of a run, or a mapping of its keys.
         to_run: also check that a run of it would fit in memory and has no `live` events, which
             `echelon run` cannot repeat.
 
     Raises:
         ScenarioError: one line for each part that cannot be built, with its place in the file.
     """
-    _check_scenario(scenario)
+    scenario = as_scenario(scenario)
     faults = FaultList(scenario)
     # Gains are computed here, and would have 7 digits under float32.
     with precision("float64"):
@@ -100,13 +102,6 @@ def _check_run(
     with faults.at("simulation"):
         check_memory(model, graph.agents, settings)
     faults.settle()
-
-
-def _check_scenario(scenario: object) -> None:
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError(
-            f"`scenario` is {scenario!r}, and must be a `Scenario`, as returned by `load_scenario`."
-        )
 
 
 def _parts(
@@ -160,7 +155,7 @@ def _parts(
 
 
 def run(
-    scenario: Scenario,
+    scenario: ScenarioLike,
     progress: Progress | None = None,
     built: Experiment | None = None,
     keep: Keep | None = None,
@@ -168,20 +163,31 @@ def run(
 ) -> Result:
     """Simulate a scenario, and record in the result what it was computed from.
 
-    `built` are its parts, built if None; `progress`, `keep` and `before` are those of `simulate`.
+    Args:
+        scenario: a scenario, its name, its file, the folder of a run, or a mapping of its keys.
+        progress: as in `simulate`.
+        built: its parts and settings, built if None.
+        keep: as in `simulate`.
+        before: as in `simulate`.
 
     Raises:
-        ScenarioError: a part cannot be built.
+        ScenarioError: there is no such scenario, it has faults, or a part cannot be built.
     """
-    _check_scenario(scenario)
+    scenario = as_scenario(scenario)
     parts = build(scenario) if built is None else built
-    return note_origin(simulate(*parts, progress, keep, before), scenario)
+    # Before the run, during which a file may change.
+    origin = origin_of(scenario)
+    return dataclasses.replace(simulate(*parts, progress, keep, before), **origin)
 
 
-def note_origin(result: Result, scenario: Scenario) -> Result:
-    """Return a result with its scenario and the versions of what computed it."""
-    software = {f"version_{name}": text for name, text in versions().items()}
-    return result.with_provenance(scenario=scenario.name, scenario_text=scenario.text, **software)
+def origin_of(scenario: Scenario) -> dict[str, Any]:
+    """Return the fields of a result that state its scenario, its files and the versions."""
+    text, files = self_contained(scenario)
+    software = {f"version_{name}": version for name, version in versions().items()}
+    return {
+        "provenance": {"scenario": scenario.name, "scenario_text": text, **software},
+        "files": {name: file.read_bytes() for name, file in files.items()},
+    }
 
 
 def _model(scenario: Scenario) -> ControlAffine:
@@ -192,6 +198,10 @@ def _model(scenario: Scenario) -> ControlAffine:
         raise ModelError(f"`allow_unphysical` is not a parameter of `{part.name}`; leave it out.")
     parameters = spec.parameters or {}
     arguments = {"set": parameters} if isinstance(parameters, str) else {**parameters}
+    if spec.file is not None:
+        model = _read(part._replace(arguments={**arguments, **extra}), scenario.folder / spec.file)
+        check_model(model)
+        return model
     if "set" in arguments and "set" not in accepted(part.cls):
         model = _named_set(part, arguments.pop("set"), {**arguments, **extra})
     else:
@@ -233,21 +243,23 @@ def _reference(scenario: Scenario, model: ControlAffine | None) -> Guide | None:
         scenario, Reference, registry.REFERENCES, spec.name, spec.python, spec.parameters
     )
     reference = (
-        part.create() if spec.file is None else _read(part, scenario.folder / spec.file, model)
+        part.create()
+        if spec.file is None
+        else _read(part, scenario.folder / spec.file, model=model)
     )
     check_reference(reference)
     return reference
 
 
-def _read(part: NamedClass, file: Path, model: ControlAffine) -> Guide:
-    """Return a reference from its file."""
+def _read(part: NamedClass, file: Path, **offers: object) -> Any:
+    """Return a part from its file, with those of the offers that its class takes."""
     read = getattr(part.cls, "read", None)
     if read is None:
         raise ScenarioError(f"`{part.name}` does not read files; leave `file` out.")
     surplus = [name for name in part.arguments if name not in accepted(read)]
     if surplus:
         raise ScenarioError(f"got `file` and {listing(surplus)}, allowed is the file or the keys.")
-    return read(file, model, **part.arguments)
+    return read(file, **offered(read, offers), **part.arguments)
 
 
 def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Formation:
@@ -355,6 +367,4 @@ def _leader(
 
 def _settings(scenario: Scenario) -> Settings:
     numbers, window = scenario.simulation.model_dump(), scenario.report.steady_window
-    settings = Settings(**numbers, seed=scenario.seed, steady_window=window)
-    settings.check()
-    return settings
+    return Settings(**numbers, seed=scenario.seed, steady_window=window)

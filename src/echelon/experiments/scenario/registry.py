@@ -155,3 +155,20 @@ INTEGRATORS = {
     "euler": "x + dt (f + g u)",
     "printed": "literal: Algorithm 1 as printed, x <- f + g u, no dt",
 }
+
+
+def families() -> dict[str, dict[str, str]]:
+    """Return all names, each with its summary, under the titles of their families."""
+    classes = {
+        "models": MODELS,
+        "references": REFERENCES,
+        "leader laws": LEADER_LAWS,
+        "follower laws": FOLLOWER_LAWS,
+        "gain methods": METHODS,
+    }
+    summaries = {
+        title: {name: entry.summary for name, entry in entries.items()}
+        for title, entries in classes.items()
+    }
+    texts = {"graphs": GRAPHS, "formations": FORMATIONS, "integrators": INTEGRATORS}
+    return summaries | {title: dict(entries) for title, entries in texts.items()}

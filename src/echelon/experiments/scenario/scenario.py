@@ -4,9 +4,9 @@ All faults of a file are reported at once, a line each: `file:line: field: got .
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, final, get_args
+from typing import Annotated, Any, NoReturn, TypeAlias, final
 
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
@@ -14,6 +14,7 @@ from pydantic_core import ErrorDetails
 from echelon.core.errors import ScenarioError, did_you_mean, listing
 from echelon.experiments.scenario import law_sections, sections
 from echelon.experiments.scenario.checks import cross_faults, law_of, number_of, section
+from echelon.experiments.scenario.key_paths import key_paths, meant, sections_in
 from echelon.experiments.scenario.override import settle_overrides
 from echelon.experiments.scenario.values import STRICT, FolderName, Seed
 from echelon.experiments.scenario.yaml import (
@@ -22,6 +23,7 @@ from echelon.experiments.scenario.yaml import (
     KeyPath,
     apply_overrides,
     dump_yaml,
+    inline_yaml,
     is_or_are,
     joined,
     quoted,
@@ -83,6 +85,23 @@ class Scenario(BaseModel, **STRICT):
         """The file that it was read from; of a mapping, a file that does not exist."""
         return self._file
 
+    def with_(self, *changes: str, **values: Any) -> "Scenario":
+        """Return the scenario with changed keys, as `--set` changes them.
+
+        Args:
+            *changes: texts such as `simulation.horizon=10`.
+            **values: values by key, such as `seed=3`, or `simulation__horizon=10` with two
+                underscores for the dot.
+
+        Raises:
+            ScenarioError: the changed scenario has faults, as in `load_scenario`.
+        """
+        named = (
+            f"{key.replace('__', '.')}={inline_yaml(_plain(value))}"
+            for key, value in values.items()
+        )
+        return with_overrides(self, [*changes, *named])
+
     def place(self, *path: str | int) -> str:
         """Return the place of a key, as in `paper.yaml:4`; else its parent's."""
         return self._document.place(path)
@@ -109,16 +128,8 @@ def _keys(path: KeyPath) -> list[str]:
     for key in path:
         # The place in a list of sections has the keys of any other.
         if isinstance(key, str):
-            part = next(_sections(part.model_fields[key].annotation))
+            part = next(sections_in(part.model_fields[key].annotation))
     return list(part.model_fields)
-
-
-def _sections(annotation: object) -> Iterator[type[BaseModel]]:
-    """Yield the sections in the annotation of a key: its own, or those of its list."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for inner in get_args(annotation):
-        yield from _sections(inner)
 
 
 def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
@@ -131,7 +142,10 @@ def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
         return path, "got nothing, this key is required."
     if kind in ("extra_forbidden", "invalid_key"):
         keys = _keys(path[:-1])
-        return path, f"got an unknown key, allowed {is_or_are(keys)}{did_you_mean(path[-1], keys)}."
+        return (
+            path,
+            f"got an unknown key, allowed {is_or_are(keys)}{meant(path[-1], keys, Scenario)}.",
+        )
     got = context.get("got", error["input"])
     allowed = _ALLOWED[kind].format(**context) if kind in _ALLOWED else error["msg"]
     close = did_you_mean(got, context.get("names", "").split())
@@ -244,6 +258,15 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     return _scenario(document, text, file)
 
 
+def scenario_from_text(text: str, file: Path) -> Scenario:
+    """Check a scenario given as YAML; paths in it are relative to the folder of `file`.
+
+    Raises:
+        ScenarioError: It has faults, as in `load_scenario`.
+    """
+    return _scenario(read_yaml(text, str(file)), text, file)
+
+
 def with_overrides(scenario: Scenario, overrides: Sequence[str]) -> Scenario:
     """Return a scenario in which texts such as `simulation.horizon=10` replace keys.
 
@@ -277,7 +300,33 @@ def scenario_from_mapping(data: Mapping[str, Any], folder: str | Path = ".") -> 
     return _scenario(Document(plain, {(): "mapping"}), dump_yaml(plain), Path(folder) / "mapping")
 
 
+ScenarioLike: TypeAlias = Scenario | str | Path | Mapping[str, Any]
+"""A scenario, its name, its file, the folder of a run, or a mapping with the keys of the file."""
+
+
+def as_scenario(source: ScenarioLike) -> Scenario:
+    """Return a scenario, loaded if it is given by its name, its file or its keys.
+
+    Raises:
+        ScenarioError: it is none of these, or has faults, as in `load_scenario`.
+    """
+    if isinstance(source, Scenario):
+        return source
+    if isinstance(source, Mapping):
+        return scenario_from_mapping(source)
+    if isinstance(source, str | Path):
+        return load_scenario(source)
+    raise ScenarioError(
+        f"the scenario is {source!r}, and must be a `Scenario`, a name, a file, or a mapping."
+    )
+
+
 def json_schema() -> dict[str, Any]:
     """Return the JSON schema of the scenario file, for checks and completion in editors."""
     draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     return draft | Scenario.model_json_schema()
+
+
+def key_meanings() -> dict[str, str]:
+    """Return what every key of the file means, by its path, such as `network.delay`."""
+    return dict(key_paths(Scenario))

@@ -47,6 +47,9 @@ class ModelSpec(BaseModel, **_either("name", "python")):
     parameters: Parameters = None
     """Name of a set of parameters, or the parameters in the model's units; with the key `set` they
     change those of the named set."""
+    file: str | None = None
+    """MATLAB file of the model `linear`, relative to the scenario file: A and B, and where given C
+    and the step `Ts` of a discrete-time model."""
     allow_unphysical: bool = False
     """Whether parameters that no rigid body can have are accepted."""
 

@@ -4,12 +4,13 @@ import copy
 from pathlib import Path
 from typing import Any
 
+from echelon.core.files import INPUTS
 from echelon.experiments.scenario.override import named_files, rename_files
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.yaml import dump_yaml
 
 
-def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]]:
+def self_contained(scenario: Scenario, place: str = INPUTS) -> tuple[str, dict[str, Path]]:
     """Return the YAML in which every named file is in the folder `place` next to it.
 
     The second value maps each name there to the file to copy. The text of a scenario that names no
@@ -26,6 +27,11 @@ def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]
 
     rename_files(data, copied)
     return (dump_yaml(data) if files else scenario.text), files
+
+
+def names_files(scenario: Scenario) -> bool:
+    """Tell whether a scenario needs files besides its own."""
+    return any(True for _ in named_files(scenario.data, ()))
 
 
 def names_code(scenario: Scenario) -> bool:

@@ -13,7 +13,7 @@ from echelon.experiments.results.metrics import metrics
 from echelon.experiments.results.run_numbers import RunNumbers
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
-from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
 from echelon.guarantees.promises.promise import promise
 from echelon.laws.consensus import Consensus
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
@@ -127,22 +127,22 @@ def known_labels(requested: Sequence[str] | None) -> tuple[str, ...]:
 
 
 def compare(
-    scenario: Scenario,
+    scenario: ScenarioLike,
     built: Experiment | None = None,
     only: tuple[str, ...] = (*LABELS, OWN),
-    began: Callable[[str], None] = lambda label: None,
-    check: Callable[[], None] = lambda: None,
+    progress: Callable[[str, float, int], None] = lambda label, done, methods: None,
     landed: Callable[[ComparisonRow], None] = lambda row: None,
 ) -> Comparison:
     """Run each method on a scenario from the same starts, under the same limits and wind.
 
     Args:
-        scenario: the agents, their graph, formation, starts, conditions and horizon.
+        scenario: the agents, their graph, formation, starts, conditions and horizon; a scenario,
+            its name, its file, or a mapping.
         built: its parts and settings; built if None.
         only: the labels of the methods; `own` for the scenario's drive.
-        began: called with each method's label before its run.
-        check: called between chunks of steps and between runs; if it raises KeyboardInterrupt, the
-            remaining methods have a row with that reason.
+        progress: called between chunks of steps and between runs, with the label of the method,
+            how many methods are done (with a part of this one), and how many there are; if it
+            raises KeyboardInterrupt, the remaining methods have a row with that reason.
         landed: called with each row as soon as it is complete.
 
     A method that does not apply, or whose solver is missing, has a row with the reason. The
@@ -151,15 +151,18 @@ def compare(
     Raises:
         ScenarioError: a part cannot be built.
     """
+    scenario = as_scenario(scenario)
     parts, settings = build(scenario) if built is None else built
     scene = _with_starts(parts, settings)
     rows = list[ComparisonRow]()
 
     def fly(label: str, drive: DriveOf) -> None:
+        def part(done: float) -> None:
+            progress(label, len(rows) + done, len(only))
+
         try:
-            check()
-            began(label)
-            rows.append(_row(label, drive, scene, settings, check))
+            part(0.0)
+            rows.append(_row(label, drive, scene, settings, part))
         except KeyboardInterrupt:
             rows.append(ComparisonRow(label, None, "it was not run because of an interruption."))
         landed(rows[-1])
@@ -175,10 +178,10 @@ def compare(
 
 
 def _row(
-    label: str, drive: DriveOf, parts: Parts, settings: Settings, check: Callable[[], None]
+    label: str, drive: DriveOf, parts: Parts, settings: Settings, part: Callable[[float], None]
 ) -> ComparisonRow:
     try:
-        return ComparisonRow(label, _fly(parts.replace(drive=drive(parts)), settings, check))
+        return ComparisonRow(label, _fly(parts.replace(drive=drive(parts)), settings, part))
     except EchelonError as error:
         return ComparisonRow(label, None, str(error))
 
@@ -198,9 +201,9 @@ def _conditions(parts: Parts) -> tuple[str, ...]:
     return tuple(f"{name}: {text}" for name, text in described.items() if text)
 
 
-def _fly(parts: Parts, settings: Settings, check: Callable[[], None]) -> RunNumbers:
+def _fly(parts: Parts, settings: Settings, part: Callable[[float], None]) -> RunNumbers:
     """Run a method, and measure the time of solving, or of the compiled steps."""
-    watch = _Watch(check)
+    watch = _Watch(part)
     result = simulate(parts, settings, watch)
     seconds = watch.seconds if result.work is None else result.work.seconds
     computing = seconds / (parts.graph.agents * settings.horizon)
@@ -210,13 +213,13 @@ def _fly(parts: Parts, settings: Settings, check: Callable[[], None]) -> RunNumb
 class _Watch:
     """Measures the time of a run's steps, without the first chunk, which includes compilation."""
 
-    def __init__(self, check: Callable[[], None]) -> None:
+    def __init__(self, part: Callable[[float], None]) -> None:
         self.ticks: list[tuple[float, int, int]] = []
-        self.check = check
+        self.part = part
 
     def __call__(self, run: RunSoFar) -> None:
         self.ticks.append((time.perf_counter(), run.done, run.steps))
-        self.check()
+        self.part(run.done / run.steps)
 
     @property
     def seconds(self) -> float:

@@ -1,7 +1,7 @@
 """Compares all gain methods on a scenario, and recommends one of them."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -98,13 +98,18 @@ class Designs(NamedTuple):
     law_design: LawDesign | None = None
 
 
-def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = None) -> Designs:
+def design(
+    scenario: Scenario | tuple[Parts, Settings],
+    method: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Designs:
     """Apply the gain methods to a scenario, and recommend one.
 
     Args:
         scenario: a scenario, or its parts and settings. A method uses its keys in the scenario and
             the domain there; with parts, the domain of their gain.
         method: the only method, all by default.
+        progress: called before each method with the number of those that are done, and of all.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others. A method that does not apply
@@ -116,12 +121,13 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
     built = _built(scenario) if isinstance(scenario, Scenario) else Experiment(*scenario)
     names = registry.METHODS if method is None else [method]
     methods = [resolve(registry.METHODS[name]) for name in names]
-    designs = tuple(
-        _design(cls, _arguments(cls, spec, built.parts), built)
-        for cls in methods
-        # A method that needs a P, for example, does not compute a gain by itself.
-        if method is not None or {*cls.needs} <= {"domain", *cls.defaults}
-    )
+    # A method that needs a P, for example, does not compute a gain by itself.
+    able = [cls for cls in methods if method or {*cls.needs} <= {"domain", *cls.defaults}]
+    designs = list[Design]()
+    for cls in able:
+        progress(len(designs), len(able))
+        designs.append(_design(cls, _arguments(cls, spec, built.parts), built))
+    designs = tuple(designs)
     best, dt = recommended(designs, built.settings.dt), built.settings.dt
     reason = "No method gives a stable loop here." if best is None else because(best, designs, dt)
     law_design = prover_of(built.parts.drive).design(*built) if method is None else None

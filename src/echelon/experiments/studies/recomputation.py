@@ -15,7 +15,7 @@ from echelon.core.errors import GainError
 from echelon.core.types import JsonObject
 from echelon.experiments.results.dataset import OBSERVED, statement
 from echelon.experiments.results.labelled_parts import labelled_parts
-from echelon.experiments.results.recording import recording_with_arrays
+from echelon.experiments.results.recording import recording_with_data
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.self_contained import without_folders
@@ -108,7 +108,7 @@ def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Ite
 
 def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
     """Compare the guarantee, the scenario, the parts and the starts in a dataset."""
-    (run, arrays), (parts, settings), name = recording_with_arrays(file), experiment, file.name
+    (run, data), (parts, settings), name = recording_with_data(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
     value = _as_json(promise(parts, settings).as_mapping())
     yield from compare_values(f"{name}: promise", stored, value)
@@ -120,7 +120,7 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
     starts = initial_states(parts, settings.seed)[None][: len(run.states)]
     yield from compare_values(f"{name}: states", run.states[:1].tolist(), starts.tolist())
     fixed = labelled_parts(prepare(parts, settings).parts, settings)
-    stated = {**run.attributes, **arrays}
+    stated = {**run.attributes, **data.arrays()}
     for key, part in {**fixed.attributes, **fixed.arrays()}.items():
         theirs, ours = (np.asarray(each).tolist() for each in (stated.get(key), part))
         yield from compare_values(f"{name}: parts.{key}", theirs, ours)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
 from echelon.experiments.sweeps.axes import axes_of
 from echelon.experiments.sweeps.plan import Sweep
 from echelon.experiments.sweeps.sweep_dataset import dataset_of
@@ -19,12 +19,12 @@ Keep: TypeAlias = Callable[[SweepBatch], None]
 
 
 def sweep(
-    scenario: Scenario, over: Mapping[str, Iterable[Any]], threads: int | None = None
+    scenario: ScenarioLike, over: Mapping[str, Iterable[Any]], threads: int | None = None
 ) -> "xr.Dataset":
     """Run a scenario with all combinations of values of some of its keys.
 
     Args:
-        scenario: the keys that do not vary.
+        scenario: the keys that do not vary: a scenario, its name, its file, or a mapping.
         over: the values of each key, such as `{"seed": range(100), "follower.gain.coupling": [1,
             2]}`; a key's parts are joined by dots.
         threads: threads of native code; by default one for each processor. No number depends on
@@ -37,7 +37,7 @@ def sweep(
     Raises:
         ScenarioError: a key is unknown, a value is not allowed, or there are too many runs.
     """
-    plan = Sweep(scenario, axes_of(over))
+    plan = Sweep(as_scenario(scenario), axes_of(over))
     batches = list[SweepBatch]()
     compute(plan, batches.append, threads=threads)
     return dataset_of(plan, batches)

@@ -4,6 +4,7 @@ import math
 from typing import NamedTuple
 
 from echelon.agents.models.linearization import at_trim
+from echelon.agents.world.world import LATE
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
 from echelon.guarantees.promises.closed_loop import LinearLoop
@@ -27,6 +28,7 @@ class Case(NamedTuple):
         slopes: (K, n, n) the slopes of the drift on all sides of the trim, if it bends there and
             they are known; else None.
         frozen: the law along the leader's path and at the starts; None where it is not needed.
+        over_network: whether what is guaranteed covers late messages.
     """
 
     parts: Parts
@@ -36,6 +38,7 @@ class Case(NamedTuple):
     region: RegionCertificate | None = None
     slopes: Array | None = None
     frozen: FrozenLaws | None = None
+    over_network: bool = False
 
     @property
     def domain(self) -> Domain | None:
@@ -78,4 +81,5 @@ class Case(NamedTuple):
     @property
     def disturbed(self) -> str:
         """What acts that no promise covers, in words; empty without any."""
-        return " and ".join(text for text, acts in self.parts.world.differences.items() if acts)
+        acting = [text for text, acts in self.parts.world.differences.items() if acts]
+        return " and ".join(x for x in acting if not (self.over_network and x == LATE))

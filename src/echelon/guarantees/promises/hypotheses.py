@@ -17,6 +17,7 @@ from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array, States
 from echelon.core.words import Kind
+from echelon.guarantees.messages.network_lines import bias_line
 from echelon.guarantees.promises.case import Case
 from echelon.guarantees.promises.leaders import apart
 from echelon.guarantees.promises.modes import modes
@@ -34,6 +35,8 @@ def hypotheses(case: Case) -> Iterator[Statement]:
     yield _smooth(case)
     yield _matched(case)
     yield from modes(case)
+    bias = bias_line(case.parts, case.settings)
+    yield from () if bias is None else (bias,)
 
 
 def agent_lines(case: Case) -> Iterator[Statement]:

@@ -39,6 +39,8 @@ REQUIRED = (
     Hypothesis.CLAIMS,
 )
 """Hypotheses that every guarantee has a line on, beside those on agents and leaders."""
+_NOTED = (Hypothesis.CLAIMS, Hypothesis.MESSAGES, Hypothesis.OWN_STATE)
+"""What a sentence adds where it fails and leaves a guarantee."""
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLING)
 
 
@@ -225,8 +227,9 @@ class Promise(abc.ABC):
         text = self.guarantee() if self.promised else self._against()
         if self.promised and self.without:
             text += f" The guarantee ignores that {self.without}."
-        claims = self.hypotheses[Hypothesis.CLAIMS]
-        return f"{text} Note: {claims.explanation}." if claims.fails else text
+        noted = (self.hypotheses.get(name) for name in _NOTED)
+        notes = (f" Note: {x.explanation}." for x in noted if x and x.fails and not x.reason)
+        return text + "".join(notes)
 
     def _against(self) -> str:
         """Return all that stands against a guarantee, and what would help."""

@@ -9,7 +9,8 @@ that take turns each has its w, and while the leader does not reach everybody th
 at least does not grow.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,8 @@ import scipy.sparse.linalg as spla
 from echelon.agents.network.graph import Graph
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
+from echelon.guarantees.messages.late_agreement import LateRate
+from echelon.guarantees.messages.late_messages import LateMessages
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 from echelon.laws.stopping_point import StoppingPoint
 
@@ -42,21 +45,34 @@ def arrival_of(run: StoppingRun, position: Sequence[int]) -> float | None:
         run: under the law.
         position: which outputs are one.
     """
-    flat, graph, law, coupling = run.flat, run.parts.graph, run.law, run.coupling
+    graph, law = run.parts.graph, run.law
     by_parents = law.feedforward is Feedforward.PARENT
     alone = by_parents or graph.schedule is not None
     if not position or run.apart or alone and len(graph.followers) > _FEW:
         return None
+    moved = _all_together if graph.schedule is None else _in_turns
+    moved = _along_links if by_parents else moved
+    if run.network is None:
+        return _first_within(run, position, lambda _: moved)
+    rates = run.network.rates or (None,)
+    each = (partial(_late, run, run.network, rate) for rate in rates)
+    times = [t for late in each if (t := _first_within(run, position, lambda k: partial(late, k)))]
+    return min(times, default=None)
+
+
+def _first_within(
+    run: StoppingRun, position: Sequence[int], bounded: "Callable[[int], Callable[..., _Reach]]"
+) -> float | None:
+    """Return from when on all are within 1 cm by what bounds the stopping points of an output."""
+    flat, graph, law, coupling = run.flat, run.parts.graph, run.law, run.coupling
     loop, followers = law.ready, list(graph.followers)
     away = flat[followers] - flat[list(graph.nearest_leader())][followers]
     times = _CELL * np.arange(_MOST + 1)
     square = np.zeros((len(followers), _MOST))
-    moved = _all_together if graph.schedule is None else _in_turns
-    moved = _along_links if by_parents else moved
     for k in position:
         own = np.array(law.roots_for(loop.chains.degrees[k] - 1))
         stops = flat[:, :, k] @ loop.weights[:, k]
-        reach = moved(stops, graph, law, coupling, law.speed_of(k), times)
+        reach = bounded(k)(stops, graph, law, coupling, law.speed_of(k), times)
         driven = np.stack([_behind(own, m, times) for m in reach.bounds])[reach.whose]
         # Agents start in few ways in number; all at once would be (N, cells) anyway.
         square += (reach.weights[:, None] * driven + _left(own, away[:, :, k], times)) ** 2
@@ -138,6 +154,38 @@ def _turns(graph: Graph, horizon: float) -> Iterator[tuple[int, float, float]]:
             return
         begin = end
     yield -1, begin, 2.0 * horizon
+
+
+def _late(
+    run: StoppingRun,
+    network: LateMessages,
+    rate: LateRate | None,
+    output: int,
+    stops: Array,
+    graph: Graph,
+    law: StoppingPoint,
+    c: float,
+    speed: float,
+    times: Array,
+) -> _Reach:
+    """Return how far stopping points (N,) of an output are off over a network (T9).
+
+    Until everybody has a packet nobody is farther off than at the start and the leader's own way.
+    """
+    begin, followers, weights = network.ages.first_packet, list(graph.followers), network.weights
+    ways = np.ones(len(followers), int) if network.ways is None else network.ways
+    if begin is None:
+        return _Reach(np.full((1, len(times)), np.inf), 0 * ways, weights)
+    off = np.abs(stops[followers] - stops[list(graph.nearest_leader())][followers]).max()
+    off += begin * (run.path_speed(output, begin) + run.own_speed(output))
+    if rate is not None:
+        weights, c = rate.weights, rate.rate * float(rate.weights.max())
+    # Later by the largest age for each link of the way but the first.
+    links, whose = np.unique(ways, return_inverse=True)
+    clocks = np.maximum(times - begin - (links[:, None] - 1) * network.age, 0.0)
+    start, heaviest = float(off / weights.min()), float(weights.max())
+    bounds = np.stack([_falling(start, c, heaviest, speed, clock) for clock in clocks])
+    return _Reach(bounds, whose, weights)
 
 
 def _weights(graph: Graph, leaderward: bool) -> Array:

@@ -104,6 +104,5 @@ def separation_of(run: StoppingRun, tube: Tube | None, disturbed: bool) -> Separ
     apart = separations(hulls * scales) + np.diag(np.full(len(hulls), np.inf))
     i, j = sorted(np.unravel_index(apart.argmin(), apart.shape))
     speeds = np.array([run.law.speed_of(k) for k in run.law.places(model)])
-    ideal = not disturbed and run.parts.world.network is None
     rows = (int(i), int(j)), hulls[i] - hulls[j], scales, speeds, tuple(model.position)
-    return Separation(safety, float(apart[i, j]), *rows, run.settings.dt, ideal, tube)
+    return Separation(safety, float(apart[i, j]), *rows, run.settings.dt, not disturbed, tube)

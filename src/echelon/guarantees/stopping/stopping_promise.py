@@ -4,8 +4,12 @@ import dataclasses
 from types import MappingProxyType
 from typing import Any, cast, final
 
+import numpy as np
+
 from echelon.core.statement import Hypothesis, Statement, Topic, holds, unneeded
 from echelon.core.words import Kind
+from echelon.guarantees.messages.network_lines import messages_line
+from echelon.guarantees.messages.own_delay import OwnCase, own_delay_line
 from echelon.guarantees.promises.case import Case
 from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import agent_lines
@@ -23,7 +27,11 @@ from echelon.guarantees.stopping.stopping_run import (
 from echelon.guarantees.stopping.tube import Tube, tube_of
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared
+from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.settings import Settings
+
+_MODES = 12
+"""Of a large graph, which stand for all."""
 
 
 @final
@@ -50,10 +58,13 @@ class StoppingPromise(Promise):
         """Return what is guaranteed of prepared parts; `brief` leaves out arrival and motors."""
         parts, states = prepared.parts, prepared.problem.states
         run, leaders = stopping_run_of(parts, settings, states), leaders_of(parts, states)
-        case = Case(parts, settings, loop_of(parts), leaders)
+        case = Case(parts, settings, loop_of(parts), leaders)._replace(
+            over_network=run.network is not None
+        )
         (tube, tube_lines), drifts = tube_of(run, brief), leader_drift_line(run)
         lines = [*agent_lines(case), *condition_lines(run), *tube_lines]
-        lines += [drifts] if drifts is not None else []
+        more = drifts, messages_line(parts, settings, run.late), _own_line(run, prepared.problem)
+        lines += [line for line in more if line is not None]
         by_name = {cast(Hypothesis, x.statement): x for x in lines}
         against = any(line.fails and line.reason for line in by_name.values())
         tube = None if against else tube
@@ -131,3 +142,22 @@ class StoppingPromise(Promise):
         if self.tube is None or self.separation is None:
             return None if self.tube is None else self.tube.as_mapping()
         return self.tube.as_mapping() | {"separation": self.separation.as_mapping()}
+
+
+def _own_line(run: StoppingRun, problem: Problem) -> Statement | None:
+    """Return how late own states may be."""
+    parts, law, network = run.parts, run.law, run.network
+    if parts.graph.schedule is not None:
+        return None
+    heard = None
+    if network is None:
+        own = agreement_modes(parts.graph, law)
+    else:
+        own = network.sums
+        [L] = parts.graph.stretches(law.leaderward)
+        heard = L if network.ways is None else None
+    if len(own) > _MODES:
+        own = np.sort(own)[np.linspace(0, len(own) - 1, _MODES).round().astype(int)]
+    # A leader answers to its path as a follower with this factor would.
+    led = float(run.leader.strength(run.settings.dt)) / run.coupling
+    return own_delay_line(OwnCase(problem, parts.world, law, np.append(own, led), heard))

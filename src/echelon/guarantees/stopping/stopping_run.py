@@ -1,6 +1,7 @@
 """A run in flat coordinates, and the hypotheses of theorem T5 beside its tube."""
 
 from collections.abc import Iterator
+from fractions import Fraction
 from typing import NamedTuple
 
 import jax
@@ -12,12 +13,21 @@ from echelon.agents.models.chains import flat_output, flatten
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.core.compiled import cached_jit
+from echelon.core.enclosure.interval import point
 from echelon.core.linear import sampled_radius
+from echelon.core.rational import float_above
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind
+from echelon.guarantees.messages.late_messages import (
+    Following,
+    LateMessages,
+    Uncovered,
+    late_messages_of,
+)
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.flat_states import flat_states_of
+from echelon.guarantees.stopping.path_bounds import pieces_of
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
 from echelon.simulation.engine.law_drive import Laws
@@ -40,6 +50,7 @@ class StoppingRun(NamedTuple):
         states: (N, n) at the start.
         flat: (N, r, m) the same in flat coordinates, less the offsets.
         ahead: (r, m) of what the leader follows.
+        late: what is guaranteed over its network; None for the ideal one.
     """
 
     parts: Parts
@@ -47,6 +58,7 @@ class StoppingRun(NamedTuple):
     states: Array
     flat: Array
     ahead: Array
+    late: LateMessages | Uncovered | None = None
 
     @property
     def law(self) -> StoppingPoint:
@@ -74,6 +86,17 @@ class StoppingRun(NamedTuple):
         return min(modes)
 
     @property
+    def network(self) -> LateMessages | None:
+        """What is guaranteed over the network, if that is covered."""
+        return self.late if isinstance(self.late, LateMessages) else None
+
+    @property
+    def still(self) -> bool:
+        """Whether the leader is where it stays, from the start on."""
+        outputs = range(len(self.law.ready.chains.outputs))
+        return self.leader.reference is None and max(map(self.own_speed, outputs)) < _TOGETHER
+
+    @property
     def apart(self) -> bool:
         """Whether leaders start apart, so that their own agreement is in the errors."""
         return bool(np.ptp(self.flat[list(self.parts.graph.leaders)], axis=0).max() > _TOGETHER)
@@ -86,6 +109,8 @@ class StoppingRun(NamedTuple):
         one that switches for a while, that of the graph which stays.
         """
         schedule, c = self.parts.graph.schedule, self.coupling
+        if self.network is not None:
+            return self.network.rate
         if schedule is None:
             assert self.law.reach is not None
             return c * self.law.reach.slowest
@@ -108,8 +133,32 @@ class StoppingRun(NamedTuple):
         return Chain.of(self.law.roots_for(degree - 1))
 
     def speed(self, output: int) -> float:
-        """Return s of a follower against the leader: of each link on the way, told by parents."""
-        return self.links * self.law.speed_of(output)
+        """Return s of a follower against the leader: of each link on the way, told by parents.
+
+        Over a network an agent stands still against the path until its first packet comes.
+        """
+        s = self.links * self.law.speed_of(output)
+        if self.network is None:
+            return s
+        return max(s, self.path_speed(output) - self.own_speed(output))
+
+    def path_speed(self, output: int, until: float | None = None) -> float:
+        """Return what |zeta_r'| of the leader's path does not pass until a time (s), or at all.
+
+        Raises:
+            GainError: the path has no enclosure.
+        """
+        chains, weights = self.law.ready.chains, self.leader.ready.weights[:, output]
+        highest = max(chains.degrees)
+        pieces = pieces_of(
+            self.leader, self.parts.model, self.settings.horizon, chains.outputs, highest
+        )
+        factors = [Fraction(k) for k in weights.tolist()]
+        sums = (
+            sum((rows[order + 1][output].scale(k) for order, k in enumerate(factors)), point(0))
+            for rows in pieces.between(Fraction(0), None if until is None else Fraction(until))
+        )
+        return float_above(max(max(-each.lo, each.hi) for each in sums))
 
     @property
     def links(self) -> int:
@@ -120,8 +169,13 @@ class StoppingRun(NamedTuple):
     @property
     def longest_step(self) -> float:
         """The longest step (s) that keeps the largest stopping point from growing."""
+        return 1.0 / (self.coupling * self.heaviest)
+
+    @property
+    def heaviest(self) -> float:
+        """d_max, the largest sum of weights that a follower hears."""
         assert self.law.reach is not None
-        return 1.0 / (self.coupling * self.law.reach.heaviest)
+        return self.law.reach.heaviest if self.network is None else float(self.network.sums.max())
 
     def own_speed(self, output: int) -> float:
         """Return the speed against its path that a leader may have: what it starts off, or s_0."""
@@ -140,7 +194,13 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     assert isinstance(drive.leader, StoppingLeader)
     offsets = jnp.asarray(parts.formation.offsets)
     flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
-    return StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
+    run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
+    graph, leaderward = parts.graph, drive.follower.leaderward
+    speed = min(map(run.law.speed_of, range(len(run.law.ready.chains.outputs))))
+    avoiding = run.law.safety is not None
+    following = Following(graph, leaderward, run.coupling, speed, run.still, run.apart, avoiding)
+    times = settings.dt, settings.horizon, settings.steps
+    return run._replace(late=late_messages_of(parts.world.network, following, *times))
 
 
 @cached_jit
@@ -168,9 +228,12 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     yield unneeded(Hypothesis.SMOOTH, _PROOF, text)
     text = f"feedback turns all {n} states and the integrators before inputs into chains"
     yield unneeded(Hypothesis.DETECTABLE, _PROOF, text)
-    yield holds(Hypothesis.MATCHED_MOTION, _PROOF, run.law.information[1])
+    text = run.law.information[1]
+    if run.network is not None:
+        text = "everybody predicts zeta' by the leader's plan and the packet that it has of it"
+    yield holds(Hypothesis.MATCHED_MOTION, _PROOF, text)
     yield holds(Hypothesis.COUPLING, _PROOF, "any coupling suffices", c, f"c {c:.4g}, edge 0")
-    text = "c lambda_min"
+    text = "c lambda_min" if run.network is None else "the agreement over late messages"
     if run.parts.graph.schedule is not None:
         text = "the agreement over a period, or eventually"
     text += ", and the leaders' own coupling" * run.apart
@@ -219,9 +282,8 @@ def _offsets_line(run: StoppingRun) -> Statement:
 
 def _step_line(run: StoppingRun) -> Statement:
     """Return whether a held step keeps the largest stopping point from growing, c d_max dt <= 1."""
-    assert run.law.reach is not None
     name, dt, c = Hypothesis.SAMPLING, run.settings.dt, run.coupling
-    share = c * run.law.reach.heaviest * dt
+    share = c * run.heaviest * dt
     radius, share_text = _radius(run), f"c d_max dt = {share:.3g}"
     own = float(run.leader.strength(dt)) * dt
     if own > 1.0 + 1e-12:
@@ -233,8 +295,8 @@ def _step_line(run: StoppingRun) -> Statement:
         text = f"Euler's step of zeta does not grow; spectral radius {radius:.4g} a step"
         return holds(name, Kind.LINEARIZATION, text, share, share_text)
     text = f"the step `dt` = {dt:g} s is too long: c d_max dt = {share:.3g} is above 1"
-    remedy = f"lower `coupling` to {1.0 / (run.law.reach.heaviest * dt):.4g}, or shorten "
-    remedy += f"`simulation.dt` to {1.0 / (c * run.law.reach.heaviest):.3g} s"
+    remedy = f"lower `coupling` to {1.0 / (run.heaviest * dt):.4g}, or shorten "
+    remedy += f"`simulation.dt` to {1.0 / (c * run.heaviest):.3g} s"
     if share <= 1.0:
         text = f"the step `dt` = {dt:g} s is too long for this coupling and these roots: spectral "
         text, remedy = f"{text}radius {radius:.4g}", "lower `coupling` or `roots`, or shorten "
@@ -266,6 +328,9 @@ def _strengths(run: StoppingRun) -> Array:
     """Return eigenvalues of the followers' Laplacian that stand for all, (K,)."""
     graph, reach = run.parts.graph, run.law.reach
     assert reach is not None
+    if run.network is not None:
+        # What is heard is late, and an agent answers to its own deviation alone.
+        return run.network.sums
     if run.law.leaderward or graph.directed or graph.schedule is not None:
         return agreement_modes(graph, run.law)
     # By Gershgorin none is larger than 2 d_max, nor as large where somebody hears a leader.

@@ -10,6 +10,7 @@ import numpy as np
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.words import Feedforward, Kind, Theorem
+from echelon.guarantees.messages.late_messages import LateMessages
 from echelon.guarantees.stopping.arrival import arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
@@ -39,6 +40,7 @@ class Tube(NamedTuple):
         borders: what is claimed of each border, and of what it was computed; ready for JSON.
         motor_load: None where motors have no limits, may not suffice, or were left out.
         graphs: which graphs are meant, and this one, in words.
+        network: what T9 says; None for the ideal network.
     """
 
     rate: float
@@ -50,6 +52,7 @@ class Tube(NamedTuple):
     borders: tuple[dict[str, object], ...]
     motor_load: MotorLoad | None
     graphs: tuple[str, str] = _ANY
+    network: LateMessages | None = None
 
     @property
     def kind(self) -> Kind:
@@ -58,18 +61,26 @@ class Tube(NamedTuple):
 
     @property
     def theorem(self) -> Theorem:
-        """T5."""
-        return Theorem.T5
+        """T5, and over a network T9."""
+        return Theorem.T5 if self.network is None else Theorem.T9
 
     def sentence(self) -> str:
         """Return what is promised, in one sentence."""
         text = f"{self.kind.value}: errors converge to zero from {self.who}, for any number of "
-        text += f"agents and {self.graphs[0]}, if the model is exact and zeta' is received at all "
-        text += f"times (T5). On {self.graphs[1]} they decay at {self.rate:.3g} 1/s or faster "
-        text += "eventually"
+        text += f"agents and {self.graphs[0]}, if the model is exact and {self._received()}. "
+        text += f"On {self.graphs[1]} they decay at {self.rate:.3g} 1/s or faster eventually"
+        text += "" if self.network is None else self.network.faster()
         if self.arrival is not None:
             text += f"; from these starts all stay within 1 cm after {self.arrival:.3g} s"
+        text += "" if self.network is None else f". {self.network.sentence()}"
         return f"{text}." if self.motor_load is None else f"{text}. {self.motor_load.sentence()}"
+
+    def _received(self) -> str:
+        """Return what agents must receive, in words."""
+        if self.network is None:
+            return "zeta' is received at all times (T5)"
+        text = "every agent receives one packet of a leader that follows its plan; all messages "
+        return f"{text}after it may be late, lost or out of order (T9)"
 
     def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON."""
@@ -83,6 +94,7 @@ class Tube(NamedTuple):
             "within_1_cm_from": self.arrival,
             "borders": list(self.borders),
             "motors": None if self.motor_load is None else self.motor_load.as_mapping(),
+            **({} if self.network is None else {"network": self.network.as_mapping()}),
         }
 
 
@@ -127,6 +139,7 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
         tuple(border.data for border in borders),
         None,
         _graphs(run),
+        run.network,
     )
     if brief:
         return tube, lines
@@ -206,6 +219,9 @@ def _set_line(run: StoppingRun, border: Border) -> Statement:
         # What one link may have of a speed against the leader.
         least = border.fastest / run.links
         remedy = f"lower the `speed` of {border.outputs} below {least:.3g}"
+        if run.network is not None:
+            text += "; before their first packet agents stand still against the leader's path"
+            remedy += ", or choose a slower path"
     return fails(Hypothesis.SET, _PROOF, text, *number, remedy=remedy, reason=text)
 
 

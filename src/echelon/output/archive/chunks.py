@@ -14,12 +14,12 @@ from typing import Any, final
 import numpy as np
 
 from echelon.core.errors import OutputError
-from echelon.core.files import write_atomic
+from echelon.core.files import INPUTS, write_atomic
 from echelon.core.provenance import versions
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario.scenario import SCENARIO_FILE, Scenario
 from echelon.experiments.scenario.self_contained import self_contained
-from echelon.output.archive.folder import CHUNKS, INPUTS, write_errors
+from echelon.output.archive.folder import CHUNKS, write_errors
 from echelon.simulation.engine.record import Stretch
 from echelon.simulation.step.meter import Sums
 
@@ -61,7 +61,7 @@ class Chunks:
         Raises:
             OutputError: a file cannot be written.
         """
-        text, files = self_contained(scenario, INPUTS)
+        text, files = self_contained(scenario)
         with write_errors(self.folder):
             for name, source in files.items():
                 (self.folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,96 +1,162 @@
-"""A run's numbers for other programs: CSV, Parquet, NumPy, MATLAB."""
+"""A run's numbers for other programs: as a table, and as files of their formats."""
 
 import io
+import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from echelon.core.errors import MissingExtraError, OutputError, check_name
+from echelon.core.files import write_atomic
+from echelon.core.limits import excess_rows
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from echelon.core.types import JsonObject
+    from echelon.core.types import JsonObject, PathLike
     from echelon.experiments.results.recording import Recording
+    from echelon.simulation.engine.result import Result
 
 
-def content_of(kind: str) -> "Callable[[Recording], bytes]":
-    """Return the writer of a format.
+def table(run: "Result | Recording", every: int = 1) -> "pd.DataFrame":
+    """Return one row per time and agent, with a column for each state and input.
 
-    `csv` and `parquet` have one row per agent and time, `npz` and `mat` arrays.
+    The columns are `time` (s), `agent`, `leader` (whether it leads), the states and inputs by name
+    (an input that has the name of a state as `input_NAME`), and `formation_error`, the distance
+    from the goal. `attrs["units"]` has the unit of each column that has one.
+
+    Args:
+        run: a result.
+        every: takes every so-manieth stored frame.
+
+    Raises:
+        OutputError: the table would not fit in memory, with its size; or `every` is below 1.
+    """
+    import pandas as pd
+
+    from echelon.experiments.results.dataset import recording_of
+
+    if every < 1:
+        raise OutputError(f"`every` is {every}, and must be a whole number from 1 on.")
+    run = recording_of(run)
+    frames, agents = len(run.times[::every]), run.agents
+    excess = excess_rows(frames * agents, 4 + len(run.state_names) + len(run.input_names))
+    if excess is not None:
+        raise OutputError(f"the table is too large: {excess}; take fewer frames with `every`.")
+    states, inputs = run.states[::every], run.inputs[::every]
+    columns: JsonObject = {
+        "time": np.repeat(run.times[::every], agents),
+        "agent": np.tile(np.arange(agents), frames),
+        "leader": np.tile(np.isin(np.arange(agents), run.leaders), frames),
+        **{name: states[:, :, k].ravel() for k, name in enumerate(run.state_names)},
+    }
+    units = {"time": "s", **dict(zip(run.state_names, run.state_units, strict=True))}
+    for k, (name, unit) in enumerate(zip(run.input_names, run.input_units, strict=True)):
+        # A state and an input may share a name, such as a thrust that is both.
+        name = f"input_{name}" if name in columns else name
+        columns[name], units[name] = inputs[:, :, k].ravel(), unit
+    columns["formation_error"] = run.goal_distances(slice(None, None, every)).ravel()
+    units["formation_error"] = run.length_unit
+    frame = pd.DataFrame(columns)
+    frame.attrs["units"] = {name: unit for name, unit in units.items() if unit}
+    return frame
+
+
+def export(run: "Result", path: "PathLike", force: bool = False) -> Path:
+    """Write a run as a file for other programs, and return its path.
+
+    The ending chooses the format: `.csv`, `.parquet` and `.json` have the columns of `table`,
+    `.npz` and `.mat` (MATLAB) arrays (times, agents, states), `.nc` is the `run.nc` of a folder,
+    and `.html` the page that `echelon view` shows. Videos are written by `save_video`.
+
+    Args:
+        run: a result.
+        path: of the file.
+        force: whether to replace a file.
+
+    Raises:
+        OutputError: there is no such format, the file exists, or it cannot be written.
+        MissingExtraError: pyarrow, of Parquet, or the page's three.js is not installed.
+    """
+    from echelon.output.archive.folder import claim_file, write_errors
+
+    file = Path(path)
+    content = content_of(file.suffix.lower().removeprefix("."), f"`{file.name}` ends in")
+    claim_file(file, force)
+    with write_errors(file):
+        write_atomic(file, content(run))
+    return file
+
+
+def content_of(kind: str, what: str = "`--to` is") -> "Callable[[Result], bytes]":
+    """Return the writer of a format; `what` begins the message if there is none.
 
     Raises:
         OutputError: there is no such format.
     """
-    check_name("`--to` is", kind, _WRITERS, OutputError)
+    check_name(what, kind, _WRITERS, OutputError)
     return _WRITERS[kind]
 
 
-def table(run: "Recording") -> "pd.DataFrame":
-    """Return one row per agent and time: states and inputs by name, and the formation error."""
-    import pandas as pd
-
-    frames, agents = run.states.shape[:2]
-    leads = np.isin(np.arange(agents), run.leaders)
-    columns: JsonObject = {
-        "time": np.repeat(run.times, agents),
-        "agent": np.tile(np.arange(agents), frames),
-        "leader": np.tile(leads, frames),
-    }
-    for k, name in enumerate(run.state_names):
-        columns[name] = run.states[:, :, k].ravel()
-    for k, name in enumerate(run.input_names):
-        # A state and an input may share a name, such as a thrust that is both.
-        columns[name if name not in columns else f"input_{name}"] = run.inputs[:, :, k].ravel()
-    columns["formation_error"] = run.formation_errors.ravel()
-    return pd.DataFrame(columns)
-
-
-def _csv(run: "Recording") -> bytes:
+def _csv(run: "Result") -> bytes:
     return table(run).to_csv(index=False).encode()
 
 
-def _parquet(run: "Recording") -> bytes:
+def _parquet(run: "Result") -> bytes:
     content = io.BytesIO()
     try:
         table(run).to_parquet(content, index=False)
     except ImportError as error:
         raise MissingExtraError(
             "Parquet needs pyarrow, which is not installed; "
-            "`pip install 'echelon-formation[parquet]'`, or use `--to csv`."
+            "`pip install 'echelon-formation[parquet]'`, or use `csv`."
         ) from error
     return content.getvalue()
 
 
-def _arrays(run: "Recording") -> "JsonObject":
-    """Return the arrays of a run by name."""
-    arrays: JsonObject = {
-        "time": run.times,
-        "states": run.states,
-        "inputs": run.inputs,
-        "error": run.errors,
-        "formation_error": run.formation_errors,
-        "offsets": run.offsets,
-        "edges": run.edges,
-        "weights": run.weights,
-        "leaders": np.array(run.leaders),
-        "state_names": np.array(run.state_names),
-        "state_units": np.array(run.state_units),
-        "input_names": np.array(run.input_names),
-        "input_units": np.array(run.input_units),
+def _json(run: "Result") -> bytes:
+    columns = table(run)
+    # What is not finite has no number in JSON.
+    finite = {
+        name: [x if np.isfinite(x) else None for x in values.tolist()]
+        for name, values in columns.items()
     }
-    more = {"reference": run.reference, "lyapunov": run.lyapunov, "P": run.metric}
+    return json.dumps({"units": columns.attrs["units"], "columns": finite}).encode()
+
+
+def _arrays(run: "Result") -> "JsonObject":
+    """Return the arrays of a run by name."""
+    from echelon.experiments.results.dataset import recording_of
+
+    data = recording_of(run)
+    arrays: JsonObject = {
+        "time": data.times,
+        "states": data.states,
+        "inputs": data.inputs,
+        "error": data.errors,
+        "formation_error": data.formation_errors,
+        "offsets": data.offsets,
+        "edges": data.edges,
+        "weights": data.weights,
+        "leaders": np.array(data.leaders),
+        "state_names": np.array(data.state_names),
+        "state_units": np.array(data.state_units),
+        "input_names": np.array(data.input_names),
+        "input_units": np.array(data.input_units),
+    }
+    more = {"reference": data.reference, "lyapunov": data.lyapunov, "P": data.metric}
     return arrays | {name: value for name, value in more.items() if value is not None}
 
 
-def _npz(run: "Recording") -> bytes:
+def _npz(run: "Result") -> bytes:
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, **_arrays(run))
     return content.getvalue()
 
 
-def _mat(run: "Recording") -> bytes:
+def _mat(run: "Result") -> bytes:
     from scipy.io import savemat
 
     content = io.BytesIO()
@@ -103,9 +169,27 @@ def _mat(run: "Recording") -> bytes:
     return content.getvalue()
 
 
-_WRITERS: "dict[str, Callable[[Recording], bytes]]" = {
+def _netcdf(run: "Result") -> bytes:
+    from echelon.experiments.results.dataset import run_file
+
+    return run_file(run)
+
+
+def _page(run: "Result") -> bytes:
+    from echelon.experiments.results.dataset import recording_of
+    from echelon.output.viewer.page import check_page
+    from echelon.output.viewer.replay import replay_page
+
+    check_page()
+    return replay_page(recording_of(run)).encode()
+
+
+_WRITERS: "dict[str, Callable[[Result], bytes]]" = {
     "csv": _csv,
     "parquet": _parquet,
     "npz": _npz,
     "mat": _mat,
+    "nc": _netcdf,
+    "json": _json,
+    "html": _page,
 }

@@ -11,8 +11,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from echelon.core.errors import OutputError
+from echelon.core.files import INPUTS
 
-CHUNKS, INPUTS, RUNS, BATCHES = "chunks", "inputs", "runs", "batches"
+CHUNKS, RUNS, BATCHES = "chunks", "runs", "batches"
 DATA, GAIN, SUMMARY = "run.nc", "gain.json", "summary.json"
 _RUN = (SUMMARY, DATA, GAIN, "scenario.yaml", "report.txt", "figures", INPUTS, CHUNKS)
 _COMPARISON = ("comparison.json", "comparison.txt", RUNS, "figures")

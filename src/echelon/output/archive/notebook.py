@@ -1,10 +1,12 @@
-"""The HTML of a result in a notebook: outcome, a table of agents, and pictures."""
+"""The HTML of a result in a notebook: outcome, a table of agents, and pictures; or its replay."""
 
 import dataclasses
 import html
 from collections.abc import Iterator
 
+from echelon.core.errors import OutputError
 from echelon.experiments.results.foreseen import foreseen
+from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import metrics
 from echelon.experiments.results.recording import Recording
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS
@@ -13,6 +15,7 @@ from echelon.output.plots.figure_files import html_image
 from echelon.output.plots.run_figures import figures
 from echelon.output.reports.causes import causes, grows
 from echelon.output.reports.run_report import labelled
+from echelon.output.viewer.replay import replay_page
 from echelon.simulation.engine.result import Result
 
 _COLUMNS = ("start_error", "final_error", "saturated")
@@ -27,6 +30,19 @@ def result_page(result: Result) -> str:
     title = result.provenance.get("scenario") or type(result.model).__name__
     head = f"<b>{html.escape(title)}</b>: {html.escape(result.message)}"
     return f"<p>{head}</p>{_causes(result)}{_table(result)}{_pictures(result)}"
+
+
+def result_replay(result: Result) -> str:
+    """Return the page of a run without its guarantee.
+
+    Raises:
+        OutputError: no frame is stored, or the run is too large for a page.
+        MissingExtraError: the page's three.js is not built.
+    """
+    if not len(result.times):
+        raise OutputError("the run has no stored frame; a page needs at least one.")
+    V = lyapunov(result)
+    return replay_page(dataclasses.replace(_recorded(result), lyapunov=V and V.value))
 
 
 def _causes(result: Result) -> str:
@@ -66,9 +82,12 @@ def _cells(result: Result) -> Iterator[tuple[str, ...]]:
 
 def _recorded(result: Result) -> Recording:
     """Return the recording of a run without its promise, which takes seconds to compute."""
-    states = result.states
+    states, name = result.states, result.provenance.get("scenario") or type(result.model).__name__
+    run = foreseen(result.parts, result.settings, states[0], name)
+    ended = {"outcome": result.outcome.name.lower(), "message": result.message}
     return dataclasses.replace(
-        foreseen(result.parts, result.settings, states[0], ""),
+        run,
+        attributes=run.attributes | ended,
         times=result.times,
         states=states,
         inputs=result.inputs,

@@ -1,41 +1,15 @@
-"""Read a run's folder: its dataset, its partial results, or its gain."""
+"""The files of a run's folder that make claims."""
 
 from pathlib import Path
 from typing import NamedTuple
 
 from echelon.core.errors import OutputError
 from echelon.core.types import PathLike
-from echelon.experiments.results.recording import Recording, read_recording
 from echelon.experiments.scenario.scenario import SCENARIO_FILE
 from echelon.guarantees.verifier.strict_json import read_json
 from echelon.guarantees.verifier.verify import states_gain
 from echelon.output.archive.chunks import Chunks
-from echelon.output.archive.folder import DATA, GAIN, SUMMARY, check_exists
-
-
-def open_run(place: PathLike) -> Recording:
-    """Return the run in a folder, or in a netCDF file such as its `run.nc`.
-
-    Of an unfinished run it is the part that was computed.
-
-    Raises:
-        OutputError: there is none, it is damaged, or of another version.
-        ScenarioError: the scenario of an unfinished run cannot be read.
-    """
-    path = check_exists(Path(place))
-    if path.is_file():
-        return read_recording(path)
-    if (path / DATA).is_file():
-        return read_recording(path / DATA)
-    if path.is_dir() and Chunks(path).exist:
-        # Here, since building the scenario's parts loads JAX.
-        from echelon.experiments.results.dataset import recording_of
-        from echelon.output.archive.run_folder import load_run
-
-        return recording_of(load_run(path))
-    if (path / "comparison.json").is_file():
-        raise OutputError(f"`{path}` is a comparison; give one of its runs, `{path}/runs/NAME.nc`.")
-    raise OutputError(f"the folder `{path}` holds no run: it has no `{DATA}`.")
+from echelon.output.archive.folder import DATA, GAIN, SUMMARY
 
 
 class ClaimFiles(NamedTuple):

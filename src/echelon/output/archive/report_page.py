@@ -4,10 +4,12 @@ from html import escape
 from pathlib import Path
 
 from echelon import __version__
+from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.recording import Recording
 from echelon.experiments.scenario.scenario import SCENARIO_FILE
 from echelon.output.plots.figure_files import html_image
 from echelon.output.plots.run_figures import DEFAULT, figures
+from echelon.simulation.engine.result import Result
 
 _STYLE = """
 body { max-width: 62rem; margin: 2rem auto; padding: 0 1.2rem; color: #1c2128; background: #fff;
@@ -36,13 +38,14 @@ _CAPTIONS = {
 }
 
 
-def report_page(run: Recording, folder: Path | None) -> str:
+def report_page(run: Result | Recording, folder: Path | None) -> str:
     """Return the page, with the report and the scenario from the run's folder.
 
     Args:
         run: to report.
         folder: of the run; None of a dataset without one.
     """
+    run = recording_of(run)
     scenario = _text(folder, SCENARIO_FILE) or str(run.attributes.get("scenario_text", ""))
     text = _text(folder, "report.txt") or str(run.attributes["message"])
     facts = f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s; "

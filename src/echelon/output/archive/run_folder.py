@@ -3,18 +3,15 @@
 import json
 from pathlib import Path
 
-from echelon.core.errors import OutputError
 from echelon.core.files import write_atomic
 from echelon.core.types import PathLike
-from echelon.experiments.results.dataset import labelled, save_dataset, summary
+from echelon.experiments.results.dataset import labelled, run_file, summary
 from echelon.experiments.results.recording import recording
-from echelon.experiments.scenario.build import build, note_origin
-from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
+from echelon.experiments.scenario.scenario import SCENARIO_FILE
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.folder import DATA, GAIN, SUMMARY, claim_folder, write_errors
 from echelon.output.reports.run_report import report
 from echelon.simulation.engine.result import Result
-from echelon.simulation.engine.simulate import reassemble
 from echelon.synthesis.gains.gain_file import save_gain
 
 
@@ -38,30 +35,12 @@ def save_run(
     if "scenario_text" in result.provenance:
         with write_errors(place):
             write_atomic(place / SCENARIO_FILE, result.provenance["scenario_text"])
+            for each, content in result.files.items():
+                (place / each).parent.mkdir(parents=True, exist_ok=True)
+                write_atomic(place / each, content)
     write_findings(result, place, figures)
     Chunks(place).remove()
     return place
-
-
-def load_run(folder: PathLike) -> Result:
-    """Return what was computed of a run that was stopped before its horizon.
-
-    A complete run is in its `run.nc`, which `open_run` and xarray read.
-
-    Args:
-        folder: of the run, as `echelon run` created it.
-
-    Raises:
-        OutputError: the folder holds no unfinished run.
-        ScenarioError: its scenario cannot be read.
-    """
-    place = Path(folder)
-    if not Chunks(place).exist:
-        if (place / DATA).is_file():
-            raise OutputError(f"the run in `{place}` is complete; open its `{DATA}`.")
-        raise OutputError(f"`{place}` holds no unfinished run; give the folder of one.")
-    scenario = load_scenario(place / SCENARIO_FILE)
-    return note_origin(reassemble(*build(scenario), Chunks(place).read()), scenario)
 
 
 def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
@@ -73,7 +52,7 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
     with write_errors(folder):
         # The data first, so that a figure that fails loses nothing.
         data = labelled(result)
-        save_dataset(data, folder / DATA)
+        write_atomic(folder / DATA, run_file(result, data))
         # NaN is not JSON, and other parsers refuse it.
         content = json.dumps(summary(result), indent=2, allow_nan=False)
         write_atomic(folder / SUMMARY, content + "\n")

@@ -4,14 +4,14 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, final
 
-from echelon.core.files import write_atomic
+from echelon.core.files import INPUTS, write_atomic
 from echelon.experiments.results.labelled import labelled
 from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
 from echelon.experiments.sweeps.axes import read_axes
 from echelon.experiments.sweeps.plan import Sweep
 from echelon.experiments.sweeps.workers import SweepBatch
 from echelon.output.archive.chunks import Chunks
-from echelon.output.archive.folder import BATCHES, INPUTS, write_errors
+from echelon.output.archive.folder import BATCHES, write_errors
 
 if TYPE_CHECKING:
     import xarray as xr

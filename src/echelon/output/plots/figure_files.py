@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,8 +45,11 @@ def save(
     folder: Path,
     kinds: Sequence[str] = ("png", "pdf"),
     dpi: int = 150,
+    progress: Callable[[int, int], None] = lambda done, files: None,
 ) -> list[Path]:
     """Write each figure as PNG and PDF into a folder, and return the paths.
+
+    `progress` is called with how many files are written, and of how many.
 
     Raises:
         OSError: the folder or a file cannot be written.
@@ -65,4 +68,5 @@ def save(
                     path, lambda part: figure.savefig(part, format=kind, dpi=dpi, metadata=metadata)
                 )
             paths.append(path)
+            progress(len(paths), len(figures) * len(kinds))
     return paths

@@ -74,7 +74,7 @@ def figures(
         raise OutputError(f"`ax` takes one figure, and `what` has {len(names)} names.")
     if not len(run.times):
         return {}
-    data = recording_of(run) if isinstance(run, Result) else run
+    data = recording_of(run)
     with draw.style(page, ax):
         drawings = {name: make(data) for name, make in _MAKERS.items() if name in names}
     return {name: figure for name, figure in drawings.items() if figure is not None}

@@ -12,12 +12,14 @@ import numpy as np
 from echelon.core.errors import MissingExtraError, OutputError
 from echelon.core.files import make_atomic
 from echelon.core.types import Array
+from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import pen_of
 from echelon.output.plots.animation import MovingScene, moving_of
 from echelon.output.plots.camera import Camera, camera_for
 from echelon.output.plots.space import Space, clipped_places, space_of
+from echelon.simulation.engine.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,13 +31,14 @@ _RATE: Final = 25.0
 _PAPER, _GRID = "#f7f8fa", "#dde2e8"
 
 
-def save_video(run: Recording, file: Path, speed: float = 1.0) -> int:
+def save_video(run: Result | Recording, file: Path, speed: float = 1.0) -> int:
     """Write a run as MP4 or GIF, by ffmpeg, and return the number of pictures.
 
     Raises:
         OutputError: the run has no frames, or ffmpeg fails.
         MissingExtraError: there is no ffmpeg.
     """
+    run = recording_of(run)
     if len(run.times) < 2:
         raise OutputError("the run has fewer than two stored frames; a video needs at least two.")
     program, pictures = encoder(), times_of(run, speed)

@@ -1,6 +1,7 @@
 """The glossary of the documentation for `echelon explain`."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -15,8 +16,8 @@ _PLACES: Final = (
 _LINK: Final = re.compile(r"\[([^\]]*)\]\([^)]*\)")
 
 
-def glossary() -> dict[str, str]:
-    """Return every term with its definition.
+def glossary(more: Mapping[str, str]) -> dict[str, str]:
+    """Return every term with its definition, and `more` terms, those of scenarios.
 
     Raises:
         OutputError: the glossary is missing, as in a copy without `docs/`.
@@ -30,7 +31,7 @@ def glossary() -> dict[str, str]:
         name, _, text = block.split("\n\n")[0].partition("**: ")
         plain = _LINK.sub(r"\1", " ".join(text.split()))
         terms[name.strip("* ").replace("**", "")] = plain.replace("*", "")
-    return {**_numbers(), **terms}
+    return {**_numbers(), **more, **terms}
 
 
 def _numbers() -> dict[str, str]:
@@ -41,14 +42,16 @@ def _numbers() -> dict[str, str]:
     }
 
 
-def explain_term(term: str) -> dict[str, str]:
-    """Return the definitions of a term, or of all terms that contain it.
+def explain_term(term: str, more: Mapping[str, str]) -> dict[str, str]:
+    """Return the definitions of a term with those of its keys; else of all that contain it.
 
     Raises:
         OutputError: there is none.
     """
-    terms, key = glossary(), term.strip().lower()
-    exact = {name: text for name, text in terms.items() if name.lower() == key}
+    terms, key = glossary(more), term.strip().lower()
+    exact = {
+        name: text for name, text in terms.items() if key in (name.lower(), name.split(".")[-1])
+    }
     matches = exact or {k: text for k, text in terms.items() if key and key in k.lower()}
     if not matches:
         close = did_you_mean(key, [name.lower() for name in terms])

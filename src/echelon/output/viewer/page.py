@@ -56,8 +56,14 @@ def check_page() -> None:
 
 def _code() -> str:
     check_page()
-    parts = [_read(_BUNDLE), f"/* three.js:\n{_read(_LICENSE)}*/", *map(_read, _SCRIPTS)]
+    parts = [_read(_BUNDLE), f"/* three.js:\n{_read(_LICENSE)}*/", *map(_script, _SCRIPTS)]
     return "\n".join(parts)
+
+
+def _script(name: str) -> str:
+    """Return a script without indentation and comments, which every page would carry."""
+    lines = (line.strip() for line in _read(name).splitlines())
+    return "\n".join(line for line in lines if line and not line.startswith("//"))
 
 
 def _read(name: str) -> str:

@@ -2,59 +2,16 @@
 
 import abc
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from echelon.core.types import Array
+from echelon.simulation.engine.closest_pair import ClosestPair
 
 _FEW = 8
 """Agents up to which comparing all pairs is faster than a search for the nearest."""
-
-
-class ClosestPair(NamedTuple):
-    """Two agents when they were closest to each other.
-
-    Attributes:
-        distance: between them, m.
-        agents: their numbers, ascending.
-        time: of the stored frame, s.
-    """
-
-    distance: float
-    agents: tuple[int, int]
-    time: float
-
-    @classmethod
-    def of(cls, places: Float[Array, "N k"], time: float) -> "ClosestPair":
-        """Return the closest of two agents or more at places (m), at a time (s)."""
-        from scipy.spatial import KDTree
-
-        away, near = map(np.asarray, KDTree(places).query(places, k=2))
-        first = int(away[:, 1].argmin())
-        # Agents in one place come in any order.
-        other = next(int(agent) for agent in near[first] if agent != first)
-        distance = float(np.linalg.norm(places[first] - places[other]))
-        return cls(distance, (min(first, other), max(first, other)), time)
-
-    def touch(self, radius: float | None) -> bool:
-        """Return whether agents of a radius (m) touched; None has no size."""
-        return radius is not None and self.distance < 2.0 * radius
-
-    def sentence(self, radius: float | None) -> str:
-        """Return who was closest, how close and when, beside the size of agents of a radius (m)."""
-        one, other = self.agents
-        size = "" if radius is None else f"agents of radius {radius:.2g} m touch below"
-        if radius is not None and self.touch(radius):
-            return (
-                f"Warning: agents {one} and {other} came within {self.distance:.3g} m at "
-                f"{self.time:.4g} s; {size} {2.0 * radius:.3g} m, and the simulation lets them "
-                "pass through each other."
-            )
-        text = f"Smallest distance: {self.distance:.3g} m, agents {one} and {other} at "
-        text += f"{self.time:.4g} s"
-        return f"{text}; {size} {2.0 * radius:.3g} m." if radius is not None else f"{text}."
 
 
 _Some: TypeAlias = slice | Sequence[int] | Int[Array, " F"]
@@ -88,7 +45,7 @@ class _Frames(Protocol):
 
     def least_distances(self, frames: _Some = slice(None)) -> Float[Array, " F"] | None: ...
 
-    def approaches(self, last: int = 0) -> list[ClosestPair]: ...
+    def approaches(self) -> list[ClosestPair]: ...
 
 
 class FrameNumbers(abc.ABC):
@@ -151,18 +108,35 @@ class FrameNumbers(abc.ABC):
 
         None without a position, a second agent or a frame of finite numbers.
         """
-        pairs = self.approaches(1)
+        pairs = self.approaches()
         return pairs[-1] if pairs else None
 
-    def approaches(self: _Frames, last: int = 0) -> list[ClosestPair]:
-        """Return the pairs that were closer than any in a frame before, all or the last ones."""
-        least = self.least_distances() if self.states.shape[1] > 1 else None
-        if least is None:
+    def approaches(self: _Frames) -> list[ClosestPair]:
+        """Return the pairs that were closer than any in a frame before, in the order of time."""
+        if not self.position or self.states.shape[1] < 2 or not len(self.times):
             return []
-        least = np.where(np.isfinite(least), least, np.inf)
-        before = np.minimum.accumulate(np.concatenate([[np.inf], least[:-1]]))
-        frames, columns = np.flatnonzero(least < before)[-last:], list(self.position)
-        return [ClosestPair.of(self.states[k][:, columns], float(self.times[k])) for k in frames]
+        places, pairs = self.states[:, :, list(self.position)], list[ClosestPair]()
+        least, bound = np.inf, -np.inf
+        for k, motion in enumerate(_approach(places)):
+            # No pair is closer than the closest of an earlier frame less what two agents moved.
+            bound = bound - motion if np.isfinite(motion) else -np.inf
+            if bound > least or not np.isfinite(places[k]).all():
+                continue
+            pair = ClosestPair.of(places[k], float(self.times[k]))
+            bound = pair.distance
+            if bound < least:
+                least = bound
+                pairs.append(pair)
+        return pairs
+
+
+def _approach(places: Float[Array, "T N k"]) -> Float[Array, " T"]:
+    """Return by how much a distance between two agents can shrink up to each frame, at most."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        # What all agents do together changes no distance.
+        steps = np.diff(places - places.mean(axis=1, keepdims=True), axis=0, prepend=places[:1])
+        steps[0] = 0.0
+        return 2.0 * np.linalg.norm(steps, axis=2).max(axis=1)
 
 
 def _least(places: Float[Array, "T N k"]) -> Float[Array, " T"]:

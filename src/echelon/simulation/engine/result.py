@@ -12,7 +12,8 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.world import World
 from echelon.core.errors import Outcome
-from echelon.core.pages import notebook_page
+from echelon.core.lazy_field import LazyField
+from echelon.core.pages import CellPage, notebook_page
 from echelon.core.types import Array
 from echelon.simulation.engine.frame_numbers import FrameNumbers
 from echelon.simulation.engine.parts import Parts
@@ -33,31 +34,34 @@ class Result(FrameNumbers):
         states: (T, N, n).
         inputs: (T, N, m), physical, as delivered by the actuators from each frame on.
         reference: (T, n), the leader's reference state, or None where it follows nothing.
-        sums: over all steps, of which means are computed.
         outcome: how the run ended; `message` says it with time and agent.
         warnings: what is allowed but probably not meant, one sentence each.
-        parts: what ran, with its drive completed.
         settings: how it was computed.
-        wall_time: seconds of computing, compilation included.
+        wall_time: seconds of computing, compilation included; NaN where it is not stored.
+        sums: over all steps, of which means are computed.
+        parts: what ran, with its drive completed. Of a run from disk they are built when they are
+            first read, which executes the classes that its scenario names.
         work: of the solvers; None where laws gave the inputs.
         engine: what computed the steps, `jax` or `native`.
         provenance: scenario text, versions and the like, as text.
+        files: the files that the scenario text names, by the names that it gives them.
     """
 
     times: Array
     states: Array
     inputs: Array
     reference: Array | None
-    sums: Sums
     outcome: Outcome
     message: str
     warnings: tuple[str, ...]
-    parts: Parts
     settings: Settings
     wall_time: float
+    sums: LazyField[Sums] = LazyField()
+    parts: LazyField[Parts] = LazyField()
     work: SolverStats | None = None
     engine: str = "jax"
     provenance: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    files: Mapping[str, bytes] = dataclasses.field(default_factory=dict)
 
     @property
     def model(self) -> ControlAffine:
@@ -126,14 +130,30 @@ class Result(FrameNumbers):
         return self.length_unit or "state"
 
     def __repr__(self) -> str:
-        """Return the agents, the number of frames, and how the run ended."""
-        # Arrays would fill the screen.
-        who = f"{self.graph.agents} x {type(self.model).__name__}"
-        return f"Result({who}, {len(self.times)} frames, {self.message!r})"
+        """Return the scenario, the numbers of agents and frames, and how the run ended."""
+        # Neither arrays, which would fill the screen, nor parts, which may still have to be built.
+        frames, agents = self.states.shape[:2]
+        name = self.provenance.get("scenario", "")
+        who = f"{name!r}, {agents} agents" if name else f"{agents} agents"
+        return f"Result({who}, {frames} frames, {self.message!r})"
 
     def _repr_html_(self) -> str:
         """Return the run as a notebook displays it: a table with its picture."""
         return notebook_page("result", self)
+
+    def view(self, height: int = 560) -> CellPage:
+        """Return the replay of the run, which a notebook shows in a cell.
+
+        It states no guarantee, which takes seconds to compute; `echelon view` does.
+
+        Args:
+            height: pixels.
+
+        Raises:
+            OutputError: no frame is stored, or the run is too large for a page.
+            MissingExtraError: the page's three.js is not built.
+        """
+        return CellPage(notebook_page("replay", self), height)
 
     def with_provenance(self, **texts: str) -> "Result":
         """Return a copy with more provenance."""

@@ -248,8 +248,9 @@ class Chart {
   nameMarks(pen, w) {
     for (const mark of this.marks) {
       const y = this.y(this.log ? Math.log10(mark.value) : mark.value);
-      Object.assign(pen, { strokeStyle: themeColour("--panel"), fillStyle: themeColour("--cut"), lineWidth: 4, lineJoin: "round", textAlign: "right", textBaseline: mark.below ? "top" : "bottom" });
-      const at = [mark.name, w - MARGIN.right - 2, y + (mark.below ? 2 : -2)];
+      Object.assign(pen, { strokeStyle: themeColour("--panel"), fillStyle: themeColour("--cut"), lineWidth: 4, lineJoin: "round", textAlign: "right" });
+      const below = mark.below || y < MARGIN.top + 14, at = [mark.name, w - MARGIN.right - 2, y + (below ? 2 : -2)];
+      pen.textBaseline = below ? "top" : "bottom";
       pen.strokeText(...at);
       pen.fillText(...at);
     }

@@ -1,0 +1,68 @@
+"""All keys of a scenario file by their paths, and what a key that does not exist may mean."""
+
+from collections.abc import Iterator
+from typing import get_args
+
+from pydantic import BaseModel
+
+from echelon.core.errors import did_you_mean
+
+_COMMON_NAMES = {
+    "network": "radio wifi communication channel messages packets",
+    "network.delay": "delay latency lag",
+    "network.loss": "loss_rate packet_loss dropout drop dropped",
+    "disturbance": "wind gusts noise turbulence",
+    "sensing.noise": "measurement_noise sensor_noise",
+    "sensing": "sensors measurement estimation",
+    "actuator": "actuators motors motor",
+    "actuator.lag": "motor_lag time_constant",
+    "plant": "mismatch uncertainty truth",
+    "simulation.horizon": "duration time end t_end final_time",
+    "simulation.dt": "step timestep time_step",
+    "initial": "start starts initial_states x0",
+    "graph": "topology edges links",
+    "formation": "shape spacing",
+    "reference": "path trajectory waypoints",
+    "follower.law": "controller control law",
+    "follower.gain": "gains gain_method",
+}
+"""Keys by the names that others use for them."""
+
+
+def sections_in(annotation: object) -> Iterator[type[BaseModel]]:
+    """Yield the sections in the annotation of a key: its own, or those of its list."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from sections_in(inner)
+
+
+def key_paths(section: type[BaseModel], before: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the path of every key of a section, such as `network.delay`, with its description.
+
+    Changes of a live page are left out: no other command takes them.
+    """
+    for key, field in section.model_fields.items():
+        inner = next(sections_in(field.annotation), None)
+        text = field.description or (inner.__doc__ if inner is not None else "") or ""
+        yield before + key, " ".join(text.split())
+        if inner is not None and before + key != "live":
+            yield from key_paths(inner, f"{before}{key}.")
+
+
+def meant(key: object, allowed: list[str], scenario: type[BaseModel]) -> str:
+    """Return ` (did you mean ...?)` with what an unknown key may mean; empty if nothing is close.
+
+    Args:
+        key: that its section does not have.
+        allowed: the keys that the section has.
+        scenario: the class of the whole file.
+    """
+    paths = [path for path, _ in key_paths(scenario)]
+    common = [path for path, names in _COMMON_NAMES.items() if str(key) in names.split()]
+    same = [path for path in paths if path.rpartition(".")[2] == key]
+    places = [*common, *sorted(same, key=lambda path: path.count("."))]
+    if not places:
+        return did_you_mean(key, allowed)
+    first, *others = (f"`{path}`" for path in list(dict.fromkeys(places))[:3])
+    return f" (did you mean {' or '.join([', '.join([first, *others[:-1]]), *others[-1:]])}?)"

@@ -1,0 +1,181 @@
+"""The closed loop as a linear system: the leader's path in, the agents' errors out."""
+
+import dataclasses
+import io
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from echelon.agents.models.linearization import at_trim
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.references.guide import Guide
+from echelon.agents.world.world import World
+from echelon.core.errors import LawError, OutputError, SimulationError, check_kind
+from echelon.core.files import write_atomic
+from echelon.core.numerics import precision
+from echelon.core.types import Array, Input, PathLike, Scalar, State, States
+from echelon.laws.law import reference_of
+from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.step.loop import Loop, assemble, begin_forgetful
+from echelon.simulation.step.sequence import control
+from echelon.simulation.step.settings import Settings
+
+_MOST = 2000
+"""States of all agents; their matrix is dense."""
+_REST = 1e-9
+"""In the states' units per second; more than rounding leaves at a rest."""
+
+
+class StateSpace(NamedTuple):
+    """A linear system xdot = A x + B w, y = C x + D w; `state_space` says what x, w and y are."""
+
+    A: Float[Array, "Nn Nn"]
+    B: Float[Array, "Nn k"]
+    C: Float[Array, "Nn Nn"]
+    D: Float[Array, "Nn k"]
+
+
+class _Momentary(Guide):
+    """A leader's motion at one moment, by which the loop is differentiated."""
+
+    state: State
+    input: Input
+
+    def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
+        """Return its state (n,) and input (m,)."""
+        return self.state, self.input
+
+    def check(self) -> None:
+        """Do nothing: it is made from the trim."""
+
+    def fit(self, model: ControlAffine) -> None:
+        """Do nothing: it is made from the model's trim."""
+
+
+def state_space(parts: Parts, file: PathLike | None = None) -> StateSpace:
+    """Return the closed loop linearized at rest: all agents at their goals, the leader at its trim.
+
+    All quantities are deviations from that rest, in continuous time, in the model's units:
+
+    - x (N n): the states of agent 0, then of agent 1, and so on.
+    - w (n + m): the state and the input that the leaders' reference prescribes. Without a
+      reference B and D have no columns.
+    - y (N n): the error of each agent: of a follower, its state minus its nearest leader's and
+      minus the difference of their offsets; of a leader, its state minus the reference's.
+
+    Limits, wind, noise and the network are left out, and the agents are those of the model.
+
+    Args:
+        parts: agents with laws that have no memory, on a graph that does not switch.
+        file: `.mat` file to write: A, B, C, D and the names of x, w and y.
+
+    Raises:
+        LawError: a law has a memory, so that its loop has further states.
+        SimulationError: there is no linearization, the goals are no rest, or the agents have more
+            than 2,000 states.
+        OutputError: the file cannot be written.
+    """
+    check_kind("parts", parts, Parts)
+    _check(parts)
+    settings = Settings(horizon=1.0, dt=1e-3, limits=False)
+    ready = prepare(dataclasses.replace(parts, world=World()), settings)
+    drive = ready.parts.drive
+    assert isinstance(drive, Laws)
+    for place, law in (("leader", drive.leader), ("follower", drive.follower)):
+        if jax.tree.leaves(law.init()):
+            raise LawError(
+                f"the {place}'s law `{type(law).__name__}` has a memory, and `state_space` takes "
+                "laws without one, such as `consensus` and `tracking`."
+            )
+    loop = assemble(ready.problem, drive.leader, drive.follower)
+    with precision("float64"):
+        system = _linearized(loop, ready.parts)
+    if file is not None:
+        _write(system, parts, Path(file))
+    return system
+
+
+def _check(parts: Parts) -> None:
+    """Check what a linear system cannot have.
+
+    Raises:
+        SimulationError: the parts have it.
+    """
+    size = parts.graph.agents * len(parts.model.state_names)
+    fault = None
+    if not isinstance(parts.drive, Laws):
+        fault = f"the agents are driven by `{type(parts.drive).__name__}`, and not by laws"
+    elif parts.graph.schedule is not None:
+        fault = "the graph switches, and a linear system has one graph"
+    elif size > _MOST:
+        fault = f"the agents have {size} states, and at most {_MOST} are allowed"
+    elif at_trim(parts.model).bends.any() or at_trim(parts.model).gap is not None:
+        fault = f"`{type(parts.model).__name__}` is not smooth at its trim"
+    if fault:
+        raise SimulationError(f"the closed loop is no linear system: {fault}.")
+
+
+def _linearized(loop: Loop, parts: Parts) -> StateSpace:
+    model, count = parts.model, parts.graph.agents
+    x, u = (np.asarray(part, float) for part in model.trim)
+    n, led = len(x), reference_of(loop.leader) is not None
+    rest = jnp.asarray(x + loop.offsets)
+    motion = jnp.asarray(np.concatenate([x, u]) if led else np.zeros(0))
+    nearest = np.array(parts.graph.nearest_leader())
+
+    def velocity(states: States, w: jax.Array) -> States:
+        now = loop
+        if led:
+            moment = _Momentary(w[:n], w[n:])
+            now = eqx.tree_at(lambda loop: loop.leader.reference, loop, moment)
+        begun = jax.tree.map(jnp.asarray, begin_forgetful(now, states))
+        inputs = control(now, begun).inputs
+        return jax.vmap(model.velocity)(states, inputs)
+
+    def errors(states: States, w: jax.Array) -> States:
+        places = states - loop.offsets
+        lead = jnp.tile(w[:n] if led else jnp.asarray(x), (count, 1))
+        targets = jnp.where(np.isin(np.arange(count), loop.leaders)[:, None], lead, places[nearest])
+        return jax.vmap(model.difference)(places, targets)
+
+    drift = np.abs(np.asarray(jax.jit(velocity)(rest, motion)))
+    if not drift.max() <= _REST:
+        agent, k = np.unravel_index(int(np.argmax(drift)), drift.shape)
+        raise SimulationError(
+            f"the closed loop is not at rest at the goals: `{model.state_names[k]}` of agent "
+            f"{agent} moves there by {drift.max():.3g} per second."
+        )
+    (A, B), (C, D) = (
+        jax.jit(jax.jacfwd(function, (0, 1)))(rest, motion) for function in (velocity, errors)
+    )
+    size = count * n
+    shapes = ((A, size), (B, len(motion)), (C, size), (D, len(motion)))
+    return StateSpace(*(np.asarray(part).reshape(size, columns) for part, columns in shapes))
+
+
+def _write(system: StateSpace, parts: Parts, file: Path) -> None:
+    """Write the system with its names, as cell arrays."""
+    from scipy.io import savemat
+
+    model, agents = parts.model, range(parts.graph.agents)
+    states = [f"{name}_{k}" for k in agents for name in model.state_names]
+    path = [f"path_{name}" for name in (*model.state_names, *model.input_names)]
+    names = {
+        "states": states,
+        "inputs": path[: system.B.shape[1]],
+        "outputs": [f"error_{name}" for name in states],
+    }
+    content = io.BytesIO()
+    cells = {name: np.array(texts, dtype=object) for name, texts in names.items()}
+    savemat(content, {**system._asdict(), **cells}, oned_as="column")
+    try:
+        write_atomic(file, content.getvalue())
+    except OSError as error:
+        raise OutputError(f"`{file}` cannot be written: {error.strerror or error}.") from error

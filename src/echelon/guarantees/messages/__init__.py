@@ -1,0 +1,1 @@
+"""Theorem T9: what is guaranteed over a network that delays and loses messages."""

@@ -1,0 +1,105 @@
+"""Lines of a check on late messages: what covers them, and what messages of states cost."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+
+from echelon.core.numerics import precision
+from echelon.core.statement import Hypothesis, Statement, fails, holds
+from echelon.core.words import Kind, MessageContent, NeighbourChoice
+from echelon.guarantees.messages.late_messages import OFF_PLAN, LateMessages, Uncovered
+from echelon.guarantees.messages.message_ages import ages_of
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.settings import Settings
+
+_TIMES = 2001
+"""Of the leader's path, of which the mean speed is taken."""
+_MUCH = 0.01
+"""m of a bias that is pointed out."""
+_DIRECTED = "one-way edges (`graph.directed: true`) let messages of any age cost a delay alone"
+
+
+class Bias(NamedTuple):
+    """How far followers lag that receive states of a mean age (s) at a mean speed."""
+
+    age: float
+    speed: float
+    size: float
+    unit: str
+
+    def sentence(self) -> str:
+        """Return it in words."""
+        return (
+            f"messages contain states: at a mean age of {1e3 * self.age:.3g} ms and a mean speed "
+            f"of {self.speed:.3g} {self.unit}/s followers lag by {self.size:.3g} {self.unit}"
+        )
+
+
+def bias_of(parts: Parts, settings: Settings) -> Bias | None:
+    """Return by how much followers lag whose messages contain states; None where they do not.
+
+    Signals that are tau old, of a leader at a speed v, leave tau v L_g^-1 d, d the sums of weights
+    that followers hear.
+    """
+    world, graph, follower = parts.world, parts.graph, getattr(parts.drive, "follower", None)
+    network, leader = world.network, getattr(parts.drive, "leader", None)
+    position = list(parts.model.position_indices())
+    late = network is not None and network.messages is MessageContent.STATE
+    if not late or network is None or leader is None or follower is None or not position:
+        return None
+    if graph.schedule is not None:
+        return None
+    times = np.linspace(0.0, settings.horizon, _TIMES)
+    with precision("float64"):
+        path = leader.reference_states(parts.model, jnp.asarray(times))
+    if path is None:
+        return None
+    moved = np.linalg.norm(np.diff(np.asarray(path)[:, position], axis=0), axis=1).sum()
+    channel = network.prepared(settings.dt, settings.horizon, 0)
+    links = graph.exchange(follower.leaderward)
+    age = ages_of(channel, settings.dt, settings.steps, len(links.receivers), 1).mean
+    [L] = graph.stretches(follower.leaderward)
+    most = float(spla.splu(sp.csc_array(L)).solve(L.diagonal()).max())
+    if network.hears is NeighbourChoice.LEADERWARD:
+        most = float(graph.depths().max())
+    speed, [unit] = float(moved) / settings.horizon, {parts.model.state_units[position[0]]}
+    return Bias(age, speed, age * speed * most, unit or "1")
+
+
+def bias_line(parts: Parts, settings: Settings) -> Statement | None:
+    """Return a line on messages of states that make followers lag; None where they do not much."""
+    bias = bias_of(parts, settings)
+    if bias is None or bias.size < _MUCH:
+        return None
+    remedy = "set `messages: deviation`"
+    number = bias.size, f"{1e3 * bias.size:.3g} mm"
+    return fails(Hypothesis.MESSAGES, Kind.LINEARIZATION, bias.sentence(), *number, remedy=remedy)
+
+
+def messages_line(
+    parts: Parts, settings: Settings, late: LateMessages | Uncovered | None
+) -> Statement | None:
+    """Return whether T9 covers the network of a run; None for the ideal one."""
+    if late is None:
+        return None
+    name = Hypothesis.MESSAGES
+    if isinstance(late, Uncovered):
+        bias = bias_of(parts, settings)
+        text = late.text if bias is None else bias.sentence()
+        number = (None, "") if bias is None else (bias.size, f"{1e3 * bias.size:.3g} mm")
+        reason = text if late.lost else ""
+        return fails(name, Kind.PROOF, text, *number, remedy=late.remedy, reason=reason)
+    ages = late.ages
+    text = f"T9: no deviation in use is older than {1e3 * late.age:.3g} ms"
+    if ages.lost and ages.oldest < ages.forgotten:
+        text += f", in all but one run in a million, with up to {ages.lost} losses in a row"
+    elif ages.oldest == ages.forgotten:
+        text += ", when it is forgotten"
+    if late.off_plan is not None:
+        text += f"; behind a leader that leaves its plan at {OFF_PLAN:g}/s in an output, followers "
+        text += f"end within {late.off_plan:.3g} of it"
+    text += "" if late.ways is not None else f"; {_DIRECTED}"
+    return holds(name, Kind.PROOF, text, late.age, f"{1e3 * late.age:.3g} ms")

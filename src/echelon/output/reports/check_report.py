@@ -1,0 +1,105 @@
+"""The text of a check: the verdict on the scenario, what it rests on, and the paper's claims."""
+
+import enum
+import textwrap
+from collections.abc import Iterator, Sequence
+from typing import final
+
+from echelon.core.statement import Hypothesis, Statement, Topic
+from echelon.core.words import Verdict
+from echelon.experiments.studies.check import CheckResult
+
+WIDTH, HEIGHT = 80, 40
+"""Columns and lines of a terminal."""
+_PAPERS = {
+    *(Topic.AUTONOMOUS, Topic.GRAPH, Topic.GROUNDED, Topic.POSITIVE, Topic.SCHUR, Topic.EDGES),
+    *(Topic.MONOTONE, Topic.DRIFT_ALONG_Z, Topic.LMI_AS_PRINTED, Topic.FINITE),
+}
+_RESTS, _LOOP, _PRINTED = (
+    "what a guarantee rests on",
+    "leader, links and margins of this loop",
+    "the paper's printed claims; the guarantee does not need those that fail",
+)
+
+
+def grouped(lines: Sequence[Statement]) -> dict[str, list[Statement]]:
+    """Return the lines of a check under the titles of their groups."""
+    groups: dict[str, list[Statement]] = {_RESTS: [], _LOOP: [], _PRINTED: []}
+    for line in lines:
+        papers = _PRINTED if line.statement in _PAPERS else _LOOP
+        groups[_RESTS if isinstance(line.statement, Hypothesis) else papers].append(line)
+    return groups
+
+
+@final
+class _Detail(enum.IntEnum):
+    """What has room of the lines that hold, from most to least."""
+
+    ROWS = 0
+    NUMBERS = 1
+    NAMES = 2
+    COUNTS = 3
+
+
+def check_report(check: CheckResult) -> str:
+    """Return a check in at most 80 columns, and 40 lines unless more than that fails.
+
+    What fails stands with its remedy, and what holds with its number as far as there is room; of
+    what is not needed the names alone.
+    """
+    texts = ["\n".join(_text(check, detail)) for detail in _Detail]
+    return next((text for text in texts if text.count("\n") < HEIGHT), texts[-1])
+
+
+def _text(check: CheckResult, detail: _Detail) -> Iterator[str]:
+    yield from textwrap.wrap(check.promise.sentence(), WIDTH)
+    width = max(len(line.name) for line in check.lines)
+    for title, lines in grouped(check.lines).items():
+        yield from ("", f"{title}:")
+        brief = title == _PRINTED
+        yield from _group(lines, width, _Detail.NAMES if brief else detail, brief)
+    end = f"`--all` shows all {len(check.lines)} lines with reasons; "
+    yield from ("", end + "`echelon explain TERM` explains one.")
+
+
+def _group(lines: list[Statement], width: int, detail: _Detail, brief: bool) -> Iterator[str]:
+    """Yield the rows of a group, and the names of its other lines."""
+    rows = detail is _Detail.ROWS
+    shown = [x for x in lines if x.fails or (rows and _holds(x) and x.number_text)]
+    for line in shown:
+        yield from _row(line, width, brief)
+    for verdict in (Verdict.HOLDS, Verdict.NOT_NEEDED, Verdict.VACUOUS):
+        rest = [line for line in lines if line not in shown and line.verdict is verdict]
+        numbers = verdict is Verdict.HOLDS and detail is _Detail.NUMBERS
+        names = [
+            f"{x.name} ({x.number_text})" if numbers and x.number_text else x.name for x in rest
+        ]
+        if names:
+            text = f"{verdict}: {'; '.join(names)}"
+            yield from textwrap.wrap(text, WIDTH, initial_indent=" ", subsequent_indent="   ")
+
+
+def _listed(lines: list[Statement], detail: _Detail) -> Iterator[str]:
+    """Yield lines of one verdict by their names, or how many they are."""
+    verdict = lines[0].verdict
+    numbers = verdict is Verdict.HOLDS and detail is _Detail.NUMBERS
+    names = [f"{x.name} ({x.number_text})" if numbers and x.number_text else x.name for x in lines]
+    text = f"{len(lines)} lines" if detail is _Detail.COUNTS else "; ".join(names)
+    yield from _wrapped(f"{verdict}: {text}", " ", "   ")
+
+
+def _holds(line: Statement) -> bool:
+    return line.verdict is Verdict.HOLDS
+
+
+def _row(line: Statement, width: int, brief: bool) -> Iterator[str]:
+    """Yield a line with its verdict and number, and the remedy of what fails unless `brief`."""
+    head = f" {line.name:{width}}  {line.verdict!s:5}  "
+    text = line.number_text or (line.text if line.fails else "")
+    yield from _wrapped(text, head, " " * len(head)) or [head.rstrip()]
+    if line.fails and not brief:
+        yield from _wrapped(line.remedy, "   -> ", " " * 6)
+
+
+def _wrapped(text: str, first: str, later: str) -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent=first, subsequent_indent=later)

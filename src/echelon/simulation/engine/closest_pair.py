@@ -1,0 +1,50 @@
+"""The two agents of a run that came closest to each other, and what a report says of them."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+
+class ClosestPair(NamedTuple):
+    """Two agents when they were closest to each other.
+
+    Attributes:
+        distance: between them, m.
+        agents: their numbers, ascending.
+        time: of the stored frame, s.
+    """
+
+    distance: float
+    agents: tuple[int, int]
+    time: float
+
+    @classmethod
+    def of(cls, places: Float[np.ndarray, "N k"], time: float) -> "ClosestPair":
+        """Return the closest of two agents or more at places (m), at a time (s)."""
+        from scipy.spatial import KDTree
+
+        away, near = map(np.asarray, KDTree(places).query(places, k=2))
+        first = int(away[:, 1].argmin())
+        # Agents in one place come in any order.
+        other = next(int(agent) for agent in near[first] if agent != first)
+        distance = float(np.linalg.norm(places[first] - places[other]))
+        return cls(distance, (min(first, other), max(first, other)), time)
+
+    def touch(self, radius: float | None) -> bool:
+        """Return whether agents of a radius (m) touched; None has no size."""
+        return radius is not None and self.distance < 2.0 * radius
+
+    def sentence(self, radius: float | None) -> str:
+        """Return who was closest, how close and when, beside the size of agents of a radius (m)."""
+        one, other = self.agents
+        size = "" if radius is None else f"agents of radius {radius:.2g} m touch below"
+        if radius is not None and self.touch(radius):
+            return (
+                f"Warning: agents {one} and {other} came within {self.distance:.3g} m at "
+                f"{self.time:.4g} s; {size} {2.0 * radius:.3g} m, and the simulation lets them "
+                "pass through each other."
+            )
+        text = f"Smallest distance: {self.distance:.3g} m, agents {one} and {other} at "
+        text += f"{self.time:.4g} s"
+        return f"{text}; {size} {2.0 * radius:.3g} m." if radius is not None else f"{text}."

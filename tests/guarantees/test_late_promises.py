@@ -1,0 +1,247 @@
+"""Guarantees over networks (T9): what echelon says of its own runs, and what these do."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import echelon as ech
+from echelon.agents.world.sensing import Sensing
+from echelon.core.statement import Hypothesis
+from echelon.core.words import Theorem, Verdict
+from echelon.guarantees.promises.promise import promise
+
+CART = ech.models.DoubleIntegrator(2)
+CIRCLE = ech.references.Circle(radius=2.0, rate=0.7)
+TREE, ARROWS = [(0, 1), (1, 2), (1, 3)], [(0, 1), (1, 2), (1, 3), (2, 3)]
+RADIO = ech.Network(rate=50.0, delay=0.02, jitter=0.02, loss=0.3)
+DT = 0.01
+
+
+def parts_of(network=RADIO, edges=ARROWS, directed=True, model=CART, leaders=(0,), **options):
+    """Carts behind a circle over a network; options of the follower, the leader and the world."""
+    graph = ech.Graph(edges, directed=directed, leaders=leaders)
+    offsets = {k: [0.8 * k, 0.0] for k in range(graph.agents)}
+    leader = {"reference": CIRCLE} | options.pop("leader", {})
+    world = ech.World(network=network, **options.pop("world", {}))
+    start_error = options.pop("start_error", {})
+    laws = ech.Laws(ech.laws.StoppingLeader(**leader), ech.laws.StoppingPoint(**options))
+    formation = ech.Formation.from_offsets(model, graph, offsets)
+    return ech.Parts(
+        model, graph, formation, laws, {"position": 1.0}, start_error=start_error, world=world
+    )
+
+
+SETTINGS = ech.Settings(horizon=10.0, dt=DT)
+
+
+def said(parts, settings=SETTINGS):
+    return promise(parts, settings)
+
+
+def over(guarantee):
+    """What the JSON says of the network."""
+    return guarantee.as_mapping()["anywhere"]["network"]
+
+
+def stops(result, guarantee):
+    """Zeta~ of the followers in echelon's own run, (T, F, m), from positions and speeds."""
+    y = result.states - result.formation.offsets
+    root = guarantee.run.law.slowest_root
+    zeta = y[:, :, :2] + y[:, :, 2:] / root
+    return zeta[:, 1:] - zeta[:, :1]
+
+
+# ---- what runs do --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("network", "options"),
+    [
+        (RADIO, {}),
+        (RADIO, {"edges": TREE, "directed": False}),
+        (dataclasses.replace(RADIO, hears="leaderward"), {"edges": TREE, "directed": False}),
+    ],
+    ids=["one way", "both ways", "leaderward"],
+)
+@pytest.mark.slow
+def test_a_flight_over_a_radio_keeps_what_is_guaranteed(network, options):
+    parts, settings = parts_of(network, **options), SETTINGS._replace(horizon=16.0)
+    guarantee = said(parts, settings)
+    assert guarantee.promised and guarantee.theorem is Theorem.T9 and not guarantee.without
+    numbers, arrival = over(guarantee), guarantee.tube.arrival
+    result = ech.simulate(parts, settings)
+    away = np.abs(stops(result, guarantee))
+    # All have a packet in time, and from then on nobody's stopping point moves farther away.
+    first = int(np.ceil(numbers["packet_by"] / DT))
+    largest = np.maximum.accumulate(away[::-1].max(axis=1))[::-1]
+    assert (away[first:].max(axis=1) <= away[: first + 1].max(axis=(0, 1)) * 1.02).all()
+    errors = np.linalg.norm(result.errors, axis=-1) if result.errors.ndim == 3 else result.errors
+    late = result.times >= arrival
+    assert arrival < 15.0 and late.any() and errors[late].max() <= 0.01
+    # Eventually at the rate, to what a held step leaves: 1e-5 m here.
+    assert largest[-1].max() < 1e-3
+
+
+@pytest.mark.slow
+def test_whatever_is_lost_after_one_packet_errors_converge():
+    network = ech.Network(rate=50.0, loss=0.97, forget=0.1)
+    parts = parts_of(network, TREE, False)
+    guarantee = said(parts, SETTINGS._replace(horizon=60.0))
+    assert guarantee.promised and guarantee.rate > 0.0 and over(guarantee)["packet_by"] > 5.0
+    result = ech.simulate(parts, SETTINGS._replace(horizon=60.0, store_every=10))
+    assert np.abs(stops(result, guarantee)[-1]).max() < 1e-3
+
+
+# ---- what is covered -----------------------------------------------------------------------------
+
+
+def test_the_network_is_no_longer_ignored_but_what_else_is_there_is():
+    assert "ignores" not in said(parts_of()).sentence()
+    wind = {"disturbance": ech.Disturbance(constant={"velocity": 0.1})}
+    text = said(parts_of(world=wind)).sentence()
+    assert (
+        "ignores that wind or noise acts" in text and "late or lost" not in text.split("ignores")[1]
+    )
+
+
+@pytest.mark.parametrize(
+    ("network", "options", "words"),
+    [
+        (dataclasses.replace(RADIO, messages="state"), {}, "messages contain states"),
+        (dataclasses.replace(RADIO, prediction="none"), {}, "followers lag behind it"),
+        (dataclasses.replace(RADIO, loss=1.0), {}, "no message arrives"),
+        (dataclasses.replace(RADIO, hears="leaderward"), {"coupling": 101.0, "edges":
+         [(0, 1, 0.3), (1, 2, 0.3)]}, "weights count as 1"),
+    ],
+)  # fmt: skip
+def test_what_no_formation_survives_has_no_guarantee(network, options, words):
+    guarantee = said(parts_of(network, **options))
+    assert not guarantee.promised and guarantee.anywhere() is None
+    assert words in guarantee.sentence() and guarantee.hypotheses[Hypothesis.MESSAGES].fails
+
+
+def test_the_lag_behind_messages_of_states_is_that_of_a_run():
+    network = ech.Network(rate=50.0, delay=0.02, loss=0.2, messages="state")
+    parts = parts_of(network, [(0, 1), (1, 2)])
+    line = said(parts).hypotheses[Hypothesis.MESSAGES]
+    # 30 ms of 1.4 m/s on each of two links.
+    assert line.number == pytest.approx(0.084, rel=0.02)
+    result = ech.simulate(parts, SETTINGS)
+    assert ech.metrics(result).worst_steady == pytest.approx(line.number, rel=0.15)
+
+
+def test_a_leader_that_stays_needs_no_plan():
+    network = dataclasses.replace(RADIO, prediction="none")
+    assert said(parts_of(network, leader={"reference": None})).theorem is Theorem.T9
+
+
+def test_leaders_that_start_apart_are_not_covered():
+    starts = np.zeros((4, 4))
+    starts[0, 0] = 0.7
+    guarantee = said(parts_of(leaders=(0, 1)).replace(initial=starts))
+    assert "leaders start apart" in guarantee.sentence() and "late or lost" in guarantee.without
+
+
+def test_graphs_that_switch_are_not_covered():
+    graph = ech.Graph.switching([(0.0, [(0, 1), (1, 2)]), (1.0, [(0, 1), (0, 2)])], period=2.0)
+    parts = parts_of()
+    formation = ech.Formation.from_offsets(CART, graph, {1: [1.0, 0.0], 2: [2.0, 0.0]})
+    guarantee = said(parts.replace(graph=graph, formation=formation))
+    assert "switches" in guarantee.sentence() and "late or lost" in guarantee.without
+
+
+def test_the_ideal_network_has_no_line_of_it():
+    guarantee = said(parts_of(None))
+    assert guarantee.theorem is Theorem.T5 and Hypothesis.MESSAGES not in guarantee.hypotheses
+    assert "network" not in guarantee.as_mapping()["anywhere"]
+
+
+# ---- 4: the tube ---------------------------------------------------------------------------------
+
+
+def test_no_network_leaves_the_tube():
+    """A path whose speed upward is more than agreement may ask: before a packet it counts."""
+    unicycle = ech.models.Unicycle()
+    graph = ech.Graph([(0, 1)], directed=True)
+    laws = ech.Laws(ech.laws.StoppingLeader(reference=CIRCLE), ech.laws.StoppingPoint())
+    formation = ech.Formation.from_offsets(unicycle, graph, {1: [1.0, 0.0, 0.0]})
+    parts = ech.Parts(unicycle, graph, formation, laws)
+    assert said(parts).promised
+    radio = said(parts.replace(world=ech.World(network=RADIO)))
+    # Without a packet a unicycle stops, where its heading is not known.
+    assert not radio.promised and "before their first packet" in radio.sentence()
+
+
+# ---- 5: own states -------------------------------------------------------------------------------
+
+
+def delayed_radius(c, root, dt, delay):
+    """The spectral radius of carts with late states, y'' = root (zeta' - y'), zeta' = -c zeta."""
+    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    whole = scipy.linalg.expm(dt * np.block([[A, B], [np.zeros((1, 3))]]))
+    K = root * np.array([[c, c / root + 1.0]])
+    loop = np.zeros((2 + 2 * delay, 2 + 2 * delay))
+    loop[:2, :2], loop[:2, -2:] = whole[:2, :2], loop[:2, -2:] - whole[:2, 2:] @ K
+    loop[2:, :-2] += np.eye(2 * delay)
+    return np.abs(np.linalg.eigvals(loop)).max()
+
+
+def test_margins_of_own_states_are_those_of_the_delayed_loop():
+    world = {"sensing": Sensing(delay=0.01)}
+    guarantee = said(parts_of(world=world, observer=False, coupling=8.0))
+    line = guarantee.hypotheses[Hypothesis.OWN_STATE]
+    most, root = round(line.number / DT), guarantee.run.law.slowest_root
+    assert line.verdict is Verdict.HOLDS
+    # Followers 1 and 2 hear one other, follower 3 two.
+    radii = [[delayed_radius(8.0 * d, root, DT, k) for d in (1, 2)] for k in (most, most + 1)]
+    assert max(radii[0]) < 1.0 < max(radii[1])
+
+
+@pytest.mark.slow
+def test_beyond_the_margin_a_run_swings_and_is_warned_of():
+    for more in (-1, 2):
+        world = {"sensing": Sensing(delay=0.01)}
+        most = said(parts_of(world=world)).hypotheses[Hypothesis.OWN_STATE].number
+        late = {"sensing": Sensing(delay=most + more * DT)}
+        parts = parts_of(world=late, speed=np.inf)
+        guarantee = said(parts)
+        result = ech.simulate(parts, SETTINGS)
+        swung = np.abs(stops(result, guarantee)[-200:]).max()
+        assert (swung > 0.1) == (more > 0)
+        assert ("Note: own state" in guarantee.sentence()) == (more > 0)
+
+
+# ---- verification --------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_no_forged_number_of_a_network_is_verified(tmp_path):
+    from typer.testing import CliRunner
+
+    from echelon.apps.cli.app import app
+
+    run = CliRunner().invoke
+    found = run(app, ["check", "paper-radio", "--json"])
+    stored = json.loads(found.output)
+    file = tmp_path / "check.json"
+
+    def verdict(document, *options):
+        file.write_text(json.dumps(document))
+        return run(app, ["verify", str(file), *options]).exit_code
+
+    assert verdict(stored, "--scenario", "paper-radio") == 0
+    # Without its scenario nothing of a network can be computed again.
+    assert verdict(stored) == 5
+    numbers = stored["promise"]["anywhere"]["network"]
+    for key, value in numbers.items():
+        forged = json.loads(json.dumps(stored))
+        wrong = 1.001 * value if isinstance(value, float) else "T5"
+        forged["promise"]["anywhere"]["network"][key] = wrong
+        assert verdict(forged, "--scenario", "paper-radio") == 1, key
+
+
+def test_float32_settings_change_nothing_of_it():
+    assert over(said(parts_of(), SETTINGS._replace(precision="float32"))) == over(said(parts_of()))
