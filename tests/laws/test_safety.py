@@ -120,9 +120,11 @@ def held(period):
 
 
 def worst_flights(gain_step, flights=200, steps=40, seed=0):
-    """The least distance (flights,) of pairs that start at the limit and want towards each other."""
+    """The least distances of pairs that start at the limit and want to go towards each other."""
     draw, period = np.random.default_rng(seed), gain_step / SAFETY.gain
-    gaps, normals = apart_by(draw.normal(size=(flights, 4, 3)) + draw.normal(size=(flights, 1, 3)), KEPT)
+    gaps, normals = apart_by(
+        draw.normal(size=(flights, 4, 3)) + draw.normal(size=(flights, 1, 3)), KEPT
+    )
     gaps, least = gaps / SCALES, np.full(flights, np.inf)
     parts = [held(part * period) for part in (1 / 3, 2 / 3, 1.0)]
     leads = draw.random((flights, 1)) < 0.3
