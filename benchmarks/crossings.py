@@ -143,7 +143,7 @@ def _fly(loop: Loop, states: Array, offsets: Array, frames: int) -> tuple[jax.Ar
         (_, least), errors = jax.lax.scan(frame, start, None, length=frames)
         return jnp.sqrt(least), errors
 
-    return jax.vmap(one)(states, offsets)
+    return jax.vmap(one)(jnp.asarray(states), jnp.asarray(offsets))
 
 
 # ---- tables --------------------------------------------------------------------------------------
@@ -174,10 +174,11 @@ def cost(agents: int) -> tuple[float, float]:
     for how in (safety, None):
         parts = parts_of(antipodal(agents, 0), how, ech.World())
         settings = ech.Settings(horizon=5.0, dt=0.005, engine="jax", store_every=1000)
-        for _ in range(2):
-            began = time.process_time()
-            ech.simulate(parts, settings)
-            seconds = time.process_time() - began
+        # The first run compiles.
+        ech.simulate(parts, settings)
+        began = time.process_time()
+        ech.simulate(parts, settings)
+        seconds = time.process_time() - began
         times.append(1e6 * seconds / settings.steps / agents)
     return times[0], times[1]
 

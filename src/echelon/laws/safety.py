@@ -160,7 +160,7 @@ class Safety:
 class _Ascent(NamedTuple):
     """Corrections so far, the vector, the pull of each row, and the size of the last one."""
 
-    count: jax.Array
+    steps: jax.Array
     u: Float[jax.Array, " d"]
     pull: Float[jax.Array, " K"]
     last: jax.Array
@@ -182,10 +182,10 @@ def _projected(
         worst = jnp.argmax(jnp.abs(change))
         by = change[worst]
         pull = now.pull.at[worst].add(by)
-        return _Ascent(now.count + 1, now.u + by * normals[worst], pull, jnp.abs(by))
+        return _Ascent(now.steps + 1, now.u + by * normals[worst], pull, jnp.abs(by))
 
     def off(now: _Ascent) -> jax.Array:
-        return (now.count < _MOST_CORRECTIONS) & (now.last > _SOLVED)
+        return (now.steps < _MOST_CORRECTIONS) & (now.last > _SOLVED)
 
     start = _Ascent(jnp.zeros((), jnp.int32), u, 0.0 * low, jnp.full((), jnp.inf, u.dtype))
     return jax.lax.while_loop(off, corrected, start).u

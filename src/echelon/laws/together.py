@@ -90,6 +90,7 @@ def hulls_at(
     """Return the points in whose hulls the agents stay that begin at states."""
     followers, leaders = list(graph.followers), list(graph.leaders)
     led = _hulls(leader, model, jnp.asarray(states[leaders]))
+    assert led is not None, "followers follow leaders under the same law"
     first = np.empty((len(states), *led.shape[1:]))
     first[leaders] = led
     first[followers] = _hulls(law, model, jnp.asarray(states[followers]))

@@ -208,11 +208,11 @@ class Agent:
                     self._inbox.signals,
                     self._weights[row],
                     self._inbox.feedforward,
-                    self._hulls,
+                    self._hulls(),
                 )
             else:
                 mail, ages = self._mail(self._stamps)
-                rows = self._reader, time, own, mail, ages, self._weights[row], self._hulls
+                rows = self._reader, time, own, mail, ages, self._weights[row], self._hulls()
                 step = step_over_network(self._loop, self.leads, *rows)
         if step.finite:
             self._memory, self._begun = step.action.memory, True
@@ -222,17 +222,15 @@ class Agent:
             self.blind += 1
         return self._last
 
-    @property
     def _hulls(self) -> Near | None:
-        """The hulls of others as a follower keeps away from them, NaN for those not received."""
+        """Return the hulls of others for a follower, NaN for those that it did not receive."""
         if self._others is None or self.leads:
             return None
-        hulls = self._others.hulls.reshape(
-            len(self._others.time), -1, len(self._loop.model.position)
-        )
-        numbers = np.delete(np.arange(len(hulls) + 1), self.number)
-        known = ~np.isnan(hulls).any(axis=(1, 2))
-        return Near(jnp.asarray(hulls), np.isin(numbers, self._loop.leaders), known)
+        others, d = len(self._others.time), len(self._loop.model.position)
+        hulls = jnp.asarray(self._others.hulls.reshape(others, -1, d))
+        numbers = np.delete(np.arange(others + 1), self.number)
+        known = ~jnp.isnan(hulls).any(axis=(1, 2))
+        return Near(hulls, jnp.asarray(np.isin(numbers, self._loop.leaders)), known)
 
     def _with_hull(self, message: Message | None, hull: jax.Array | None) -> Message | None:
         if message is None or hull is None or self._others is None:

@@ -77,7 +77,9 @@ def less_expected(
     loop: Loop, t: jax.Array, hull: Float[jax.Array, "r d"], expected: Float[jax.Array, " s"]
 ) -> Float[jax.Array, "r d"]:
     """Return the points of a hull less those of a leader whose signal is expected somewhere."""
-    return hull - loop.leader.expected_hull(loop.model, t, expected)
+    there = loop.leader.expected_hull(loop.model, t, expected)
+    assert there is not None, "a law with `safety` follows a leader that can be expected"
+    return hull - there
 
 
 def _exchanged(
@@ -111,4 +113,5 @@ def all_hulls(loop: Loop, now: Moment) -> Float[jax.Array, "N r d"]:
 
 def _links(agents: int) -> tuple[Array, Array]:
     """Return receivers and senders of all pairs, by receiver."""
-    return np.nonzero(~np.eye(agents, dtype=bool))
+    receivers, senders = np.nonzero(~np.eye(agents, dtype=bool))
+    return receivers, senders
