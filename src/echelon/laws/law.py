@@ -17,12 +17,16 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.network.near import Near
 from echelon.agents.references.guide import Guide
 from echelon.core.errors import LawError
+from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, PyTree, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.laws.safety import Safety
 from echelon.synthesis.gains.gain import Gain
 
 Memory: TypeAlias = PyTree
+
+_CARRIED = 0.03
+"""s; longest step of the model by which the motion of a leader is carried on."""
 
 
 @final
@@ -266,6 +270,31 @@ class Law(eqx.Module):
             period: how long its inputs are held, s.
         """
         return None
+
+    def carried(
+        self,
+        model: ControlAffine,
+        signal: Float[jax.Array, " s"],
+        feedforward: Float[jax.Array, " k"],
+        u: Input,
+        time: Scalar,
+    ) -> Float[jax.Array, " s"]:
+        """Return the signal of a leader without a plan, a time (s) after its last message.
+
+        Unless replaced, a state moves on by the model under the same input, and a signal stays.
+
+        Args:
+            model: the agent.
+            signal: (s,) then; the state less the offset where the law has no signal.
+            feedforward: (k,) that the leader sent.
+            u: the input (m,) that its actuators delivered.
+            time: how long it moves on.
+        """
+        if type(self).signal is not Law.signal:
+            return signal
+        count = jnp.ceil(time / _CARRIED).astype(int)
+        piece = time / jnp.maximum(count, 1)
+        return jax.lax.fori_loop(0, count, lambda _, x: rk4(model.velocity, x, u, piece), signal)
 
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
         """Yield the rows of starts (K, n) that the law cannot take, and why in words."""

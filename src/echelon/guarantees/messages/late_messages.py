@@ -68,6 +68,7 @@ class LateMessages(NamedTuple):
         spread: max w, w = L_g^-1 1.
         coupling: c.
         speed: s of followers, the smallest of all outputs.
+        leaderward: whether neighbours with fewer hops alone are heard.
     """
 
     ages: MessageAges
@@ -79,6 +80,7 @@ class LateMessages(NamedTuple):
     spread: float
     coupling: float
     speed: float
+    leaderward: bool = False
 
     @property
     def age(self) -> float:
@@ -138,8 +140,10 @@ class LateMessages(NamedTuple):
         if ages.lost:
             text += f"In all but one run in a million no link loses more than {ages.lost} "
             text += "messages in a row, and "
-        text += f"all agents have a packet after {ages.first_packet:.3g} s"
+        text += "everybody has a packet"
+        text += " and knows its hops" * self.leaderward
         late = 0.0 if self.ways is None else float(self.ways.max() - 1) * self.age
+        text += f" after {ages.first_packet:.3g} s"
         return text + f"; messages then cost a delay of {late:.3g} s at most" * bool(late)
 
 
@@ -176,7 +180,7 @@ def late_messages_of(
         # Of any part of the neighbours nearer to the leader the mean is taken.
         ways = graph.depths()[list(graph.followers)]
         one = np.ones(1)
-        return LateMessages(ages, c, ways, ways.astype(float), (), one, float(hops), *law)
+        return LateMessages(ages, c, ways, ways.astype(float), (), one, float(hops), *law, True)
     [L] = graph.stretches(following.leaderward)
     ways, w = longest_ways(L), spla.splu(sp.csc_array(L)).solve(np.ones(len(graph.followers)))
     sums, spread = np.unique(L.diagonal()), float(w.max())

@@ -20,6 +20,7 @@ from echelon.agents.network.inbox import (
     Surroundings,
 )
 from echelon.agents.network.near import Near
+from echelon.agents.world.estimator import Estimate
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.numerics import precision
 from echelon.core.types import Array, State
@@ -32,6 +33,7 @@ from echelon.simulation.engine.own_step import (
     begin_alone,
     hull_of,
     is_finite,
+    measured_alone,
     signal_of,
     step_alone,
     step_over_network,
@@ -113,6 +115,9 @@ class Agent:
             self.neighbours, self._source_in(parts), *self._names, stamps=self._stamps
         )
         self._others = self._surroundings(graph.agents)
+        sensors = self._loop.sensors
+        self._estimator = None if sensors is None else sensors.estimator
+        self._estimate: Estimate | None = None
         self._memory: Memory | None = None
         self._begun, self._time, self.blind = False, -math.inf, 0
         self._last: tuple[Array, Message | None] = np.array(self._loop.model.trim[1], float), None
@@ -122,7 +127,7 @@ class Agent:
         channel = self._loop.channel
         if channel is None:
             return None
-        size = packet_size(channel, *map(len, self._names))
+        size = packet_size(channel, *self._sizes)
         own = self.number if self.leads else None
         deviation = channel.messages is MessageContent.DEVIATION
         return Stamps(len(self.neighbours), leaders, size, own, deviation)
@@ -138,6 +143,12 @@ class Agent:
         assert hull is not None
         names = tuple(f"{name}{k}" for k in range(len(hull)) for name in model.position)
         return Surroundings([k for k in range(agents) if k != self.number], names)
+
+    @property
+    def _sizes(self) -> tuple[int, int, int]:
+        """How many numbers a signal, a feed-forward and an input have."""
+        signal, forward = map(len, self._names)
+        return signal, forward, len(self._loop.model.input_names)
 
     def _source_in(self, parts: Parts) -> int | None:
         """Return whose feed-forward this agent uses; None for nobody's."""
@@ -166,7 +177,7 @@ class Agent:
             SimulationError: the state has another shape.
         """
         with precision("float64"):
-            own = self._own(self._state(x))
+            own = self._own(self._measured(self._state(x))[0])
             signal, hull = (
                 signal_of(self._loop, self._law, own),
                 hull_of(self._loop, self._law, own),
@@ -198,7 +209,8 @@ class Agent:
             self._stamps.clock = self._time
         row = 0 if self._schedule is None else self._schedule.row(t)
         with precision("float64"):
-            own, time = self._own(self._state(x)), jnp.asarray(self._time)
+            state, estimate = self._measured(self._state(x))
+            own, time = self._own(state), jnp.asarray(self._time)
             if self._stamps is None:
                 step = step_alone(
                     self._loop,
@@ -216,6 +228,8 @@ class Agent:
                 step = step_over_network(self._loop, self.leads, *rows)
         if step.finite:
             self._memory, self._begun = step.action.memory, True
+            if estimate is not None and self._estimator is not None:
+                self._estimate = self._estimator.act(estimate, step.action.input)
             message = self._with_hull(self._written(step), step.hull)
             self._last = np.asarray(step.action.input), message
         else:
@@ -244,7 +258,7 @@ class Agent:
     def _mail(self, stamps: Stamps) -> tuple[Mail, Ages]:
         """Return what the agent keeps of what it received, and its ages (s)."""
         assert self._loop.channel is not None
-        packet, size = stamps.packet, packet_size(self._loop.channel, *map(len, self._names))
+        packet, size = stamps.packet, packet_size(self._loop.channel, *self._sizes)
         leader = self.number if self.leads else NOBODY
         leader = leader if packet is None else packet.leader
         content = np.zeros(size) if packet is None else np.asarray(packet.content)
@@ -286,6 +300,14 @@ class Agent:
                 f"shape {(n,)} of numbers."
             )
         return jnp.asarray(state, float)
+
+    def _measured(self, y: State) -> tuple[State, Estimate | None]:
+        """Return the state that the agent assumes at a measurement (n,), and its estimate."""
+        if self._estimator is None:
+            return y, None
+        model, before = self._loop.model, self._estimate
+        before = self._estimator.begin(model, y) if before is None else before
+        return measured_alone(self._estimator, model, before, y, jnp.asarray(not self._begun))
 
     def _own(self, state: State) -> "OwnState":
         memory = self._memory if self._begun else begin_alone(self._loop, self._law, state)

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.near import Near
+from echelon.agents.world.estimator import Estimate, Estimator
 from echelon.core.compiled import cached_jit
 from echelon.core.types import PyTree, Scalar, State
 from echelon.laws.law import Law, LocalView, Memory
@@ -38,6 +40,14 @@ class OwnState(NamedTuple):
 def begin_alone(loop: Loop, law: Law, x: State) -> Memory:
     """Return the memory of an agent that begins at x."""
     return law.begin(loop.model, x)
+
+
+@cached_jit
+def measured_alone(
+    estimator: Estimator, model: ControlAffine, before: Estimate, y: State, first: jax.Array
+) -> tuple[State, Estimate]:
+    """Return the state that an agent assumes at a measurement (n,), and its estimate."""
+    return estimator.measure(model, before, y, first)
 
 
 @cached_jit
@@ -134,7 +144,7 @@ def step_over_network(
     action = act(loop, law, view, own.memory, leads)
     content = mail.packet.content
     if leads:
-        content = content_of(loop, t, *own, signal, action.message)[None]
+        content = content_of(loop, t, *own, signal, action.message, action.input)[None]
     step = jnp.zeros((), jnp.int32)
     assert loop.channel is not None
     letter, _ = write(

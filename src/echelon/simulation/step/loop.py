@@ -114,6 +114,7 @@ class WorldState(NamedTuple):
         motion: what the plants remember besides their states, as `MotionState`.
         measured: (d, N, n) the states of the last d steps, where agents measure theirs late.
         seen: messages about places, as `Sightings`, where agents keep away from each other.
+        estimates: of agents that estimate their states, as `Estimate`.
     """
 
     in_flight: PyTree = None
@@ -121,6 +122,7 @@ class WorldState(NamedTuple):
     motion: PyTree = None
     measured: PyTree = None
     seen: PyTree = None
+    estimates: PyTree = None
 
 
 class Moment(NamedTuple):

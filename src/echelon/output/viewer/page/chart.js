@@ -185,7 +185,7 @@ class Chart {
     for (const mark of this.marks) take(this.log ? Math.log10(mark.value) : mark.value);
     if (!(low <= high)) return this.log ? [-1, 0] : [0, 1];
     if (this.log) return high - low > 2 ? [low - 0.15, high + 0.25] : [Math.floor(low - 0.05), Math.ceil(high + 0.05)];
-    const margin = 0.06 * (high - low) || Math.max(1e-6, 0.1 * Math.abs(high));
+    const margin = 0.06 * (high - low) || 0.1 * Math.abs(high) || 1;
     return [low - margin, high + margin];
   }
 
