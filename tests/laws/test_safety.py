@@ -230,7 +230,7 @@ def test_native_code_is_refused_and_auto_says_why_it_is_not_used():
         (lambda: crossing(ech.Safety(radii=(0.1,) * 3, gain=60.0)), "one over the step, 50 1/s"),
         (lambda: crossing(ech.Safety(radii=(0.1,) * 3, reach=1.0)), "must be at least"),
         (lambda: crossing(ROUND, speed=np.inf), "must be at least inf m"),
-        (lambda: crossing(ROUND, size=0.15), "goal of agent 0 is too near to that of agent 1"),
+        (lambda: crossing(ROUND, size=0.15), "goal of agent 0 is too near to that of agent"),
         (lambda: crossing(ROUND, feedforward="parent"), "needs `feedforward: relay`"),
         (lambda: crossing(3.0), "must be a `Safety`"),
         (
