@@ -130,21 +130,20 @@ class LateMessages(NamedTuple):
             return ""
         return f", and at {self.quick:.3g} 1/s while no message in use is older than {age}"
 
-    def sentence(self) -> str:
-        """Return what is guaranteed beside rates and the arrival, in sentences."""
+    def sentence(self, arrival: float | None) -> str:
+        """Return what is guaranteed beside rates, in sentences; the arrival (s) where known."""
         ages, text = self.ages, "No stopping point moves farther from the leader's than the "
         text += "farthest one was"
         if ages.first_packet is None:
             return f"{text}. A link may lose all messages of a run"
-        more = "E"
-        if ages.lost:
-            more = f"In all but one run in a million no link loses more than {ages.lost} in a row, "
-            more += "and e"
-        text += f". {more}verybody has a packet"
-        text += " and knows its hops" * self.leaderward
+        few = f"In all but one run in a million no link loses more than {ages.lost} in a row, and e"
+        text += f". {few if ages.lost else 'E'}verybody has a packet"
+        text += " and knows its hops" * self.leaderward + f" after {ages.first_packet:.3g} s"
         late = 0.0 if self.ways is None else float(self.ways.max() - 1) * self.age
-        text += f" after {ages.first_packet:.3g} s"
-        return text + f"; messages then cost a delay of {late:.3g} s at most" * bool(late)
+        text += f"; messages then cost a delay of {late:.3g} s at most" * bool(late)
+        if arrival is not None:
+            text += f", and from these starts all stay within 1 cm after {arrival:.3g} s"
+        return text
 
 
 def late_messages_of(
