@@ -136,7 +136,7 @@ class LateMessages(NamedTuple):
         text += "farthest one was"
         if ages.first_packet is None:
             return f"{text}. A link may lose all messages of a run"
-        few = f"In all but one run in a million no link loses more than {ages.lost} in a row, and e"
+        few = f"In all but one run in a million no link loses more than {ages.lost} in a row, e"
         text += f". {few if ages.lost else 'E'}verybody has a packet"
         text += " and knows its hops" * self.leaderward + f" after {ages.first_packet:.3g} s"
         late = 0.0 if self.ways is None else float(self.ways.max() - 1) * self.age
