@@ -13,8 +13,7 @@ from browser import chromium, opened, until  # noqa: E402 - of the tests
 
 import echelon as ech  # noqa: E402
 from echelon.apps.live.server import live, serve_live  # noqa: E402
-from echelon.experiments.results.dataset import dataset  # noqa: E402
-from echelon.experiments.results.recording import recording  # noqa: E402
+from echelon.experiments.results.dataset import recording_of  # noqa: E402
 from echelon.output.viewer.replay import replay_page  # noqa: E402
 from echelon.output.viewer.serve import serving  # noqa: E402
 
@@ -23,7 +22,7 @@ SHORT = ("simulation.horizon=20", "simulation.store_every=4")
 
 def main() -> None:
     """Run the paper's scenario, and take both pictures."""
-    run = recording(dataset(ech.run(ech.load_scenario("paper", SHORT))))
+    run = recording_of(ech.run(ech.load_scenario("paper", SHORT)))
     file = HERE / "assets" / "replay.html"
     file.write_text(replay_page(run), "utf-8")
     with chromium() as browser:
@@ -36,6 +35,7 @@ def main() -> None:
         session.start()
         with serving(serve_live(session, html, 0)) as address, opened(browser, address) as page:
             until(lambda: page.evaluate("echelon.time") > 8.0, 90.0)
+            until(lambda: page.evaluate("echelon.promise.state") == "holds", 90.0)
             page.evaluate("echelon.ask('kick', 2)")
             page.wait_for_timeout(900)
             page.screenshot(path=HERE / "assets" / "live.png")

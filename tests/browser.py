@@ -70,7 +70,7 @@ def opened(browser, address, width=1280, height=720, **options):
     finally:
         context.close()
     home = address.split("?")[0].split("#")[0]
-    outside = [x for x in events.requests if not x.startswith((home, "blob:", "data:"))]
+    outside = [x for x in events.requests if not x.startswith((home, "blob:", "data:", "about:"))]
     assert events.errors == [] and outside == []
 
 

@@ -306,7 +306,8 @@ def test_every_dependency_is_imported_or_has_its_reason():
         for target in targets(module, node)
     }
     assert required - found == set(not_imported)
-    assert set(extras) == {*optional, "all", "dev"}
+    # What shows notebooks is a program of its own.
+    assert set(extras) == {*optional, "notebook", "all", "dev"}
 
 
 def test_every_advice_to_install_names_this_distribution():
@@ -326,6 +327,8 @@ def test_the_version_is_the_same_everywhere():
     version, citation = project()["version"], (ROOT / "CITATION.cff").read_text("utf-8")
     assert importlib.import_module("echelon").__version__ == version
     assert f"\nversion: {version}\n" in citation
+    # Every page of the documentation shows it.
+    assert f"site_name: echelon {version} #" in (ROOT / "mkdocs.yml").read_text("utf-8")
 
 
 def project() -> dict[str, Any]:

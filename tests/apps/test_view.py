@@ -401,12 +401,13 @@ def test_a_name_cannot_become_code(browser, run, tmp_path):
 
 def parts_of(run, cuts):
     """The stretches of a run between frames."""
-    names = ("times", "states", "inputs", "lyapunov")
+    names = ("times", "states", "inputs", "lyapunov", "reference")
     for a, b in itertools.pairwise(cuts):
         yield dataclasses.replace(run, **{name: getattr(run, name)[a:b] for name in names})
 
 
 def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_end(browser, run):
+    run = dataclasses.replace(run, reference=run.states[:, 0] + 0.1)
     growing = Growing(run)
     first, second, third = parts_of(run, (0, 90, 91, 301))
     with serving(serve_growing(growing, 0)) as address, opened(browser, address) as page:
@@ -428,10 +429,17 @@ def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_en
             for agent in (0, 3):
                 place = run.states[frame, agent, :3]
                 assert page.evaluate(f"echelon.position({agent})") == pytest.approx(place, abs=6e-5)
+            goal = run.reference[frame, :3]
+            assert page.evaluate("echelon.goal(0)") == pytest.approx(goal, abs=6e-5)
+            pair = dataclasses.replace(
+                run, times=run.times[: frame + 1], states=run.states[: frame + 1]
+            ).closest_pair()
+            told = f"{pair.distance:#.3g} m, agents {pair.agents[0]} and {pair.agents[1]}"
+            assert told in page.locator(".closest").inner_text()
         seek(page, 120)
         chart = page.locator(".chart").nth(1).inner_text().replace("\n", " ")
         assert f"V {run.lyapunov[120]:.3g}" in chart and "guaranteed slope, −1 1/s" in chart
-        with page.expect_navigation():
+        with page.expect_event("load"):
             growing.finish(run)
         # A time in between, so that the frame is rounded.
         shown = "Math.round(window.echelon?.frame) === 120 && !echelon.run.growing"
@@ -678,6 +686,25 @@ def test_a_page_that_is_served_is_drawn_too(browser, run):
 
     with serving(serve(Page, 0)) as address, opened(browser, address) as page:
         assert page.evaluate("echelon.last") == 300
+
+
+def test_a_notebook_shows_the_replay_in_a_cell_without_a_guarantee(browser, stored):
+    result, _ = stored
+    shown = result.view(height=400)
+    assert "a notebook shows it" in repr(shown)
+
+    class Notebook(Handler):
+        head = "<link rel='icon' href='data:,'><script>window.echelon = 1</script>"
+        page = (head + shown._repr_html_()).encode()
+
+    with serving(serve(Notebook, 0)) as address, opened(browser, address) as page:
+        cell = page.frames[1]
+        until(lambda: cell.evaluate("Boolean(window.echelon)"))
+        cell.evaluate("echelon.seek(echelon.last)")
+        place = result.states[-1, 1, :2]
+        assert cell.evaluate("echelon.position(1)")[:2] == pytest.approx(place, abs=1e-4)
+        assert not cell.locator(".promise").is_visible()
+        assert "Lyapunov function V" in cell.locator("#side").inner_text()
 
 
 def test_the_badge_says_which_rate_it_has_and_is_not_green_over_a_run_that_was_lost(run):

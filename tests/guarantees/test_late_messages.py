@@ -183,7 +183,8 @@ def test_the_rates_of_the_papers_tree():
     for age, about in ((0, 8.0), (20, 4.6), (50, 2.75), (100, 1.65), (300, 0.63), (500, 0.39)):
         best = scipy.optimize.brentq(short, 0.0, c, args=(age / 1000.0,))
         [late, *_] = late_rates(sp.csr_array(TREE), c, Fraction(age, 1000))
-        assert late.rate == pytest.approx(0.999 * best, rel=1e-6)
+        # The search ends within 1e-5 of the best one, below it.
+        assert (1.0 - 1e-5) * 0.999 * best <= late.rate <= 0.999 * best
         assert late.rate == pytest.approx(about, rel=0.02)
 
 

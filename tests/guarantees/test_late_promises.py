@@ -95,6 +95,61 @@ def test_whatever_is_lost_after_one_packet_errors_converge():
     assert np.abs(stops(result, guarantee)[-1]).max() < 1e-3
 
 
+def drawn_network(draw):
+    """A network of any kind, and a graph of carts in which the leader reaches all."""
+    n = int(draw.integers(3, 7))
+    directed = bool(draw.random() < 0.5)
+    edges = {(int(draw.integers(0, k)), k): draw.uniform(0.5, 2.0) for k in range(1, n)}
+    for i, j in draw.integers(1, n, (4, 2)).tolist():
+        if i != j and (j, i) not in edges:
+            edges[i, j] = draw.uniform(0.5, 2.0)
+    rate = float(draw.choice([100.0, 50.0, 20.0]))
+    delay, jitter = draw.choice([0.0, 0.02, 0.1]), draw.choice([0.0, 0.013, 0.06])
+    network = ech.Network(
+        rate=rate,
+        delay=float(delay),
+        jitter=float(jitter),
+        loss=float(draw.choice([0.0, 0.3, 0.7])),
+        bursts=ech.Bursts(float(draw.choice([0.0, 0.2])), 0.1),
+        forget=float(2.0 / rate + delay + jitter + draw.choice([0.001, 0.5])),
+        hears=str(draw.choice(["all", "all", "leaderward"])),
+    )
+    return network, [(i, j, w) for (i, j), w in edges.items()], directed
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("seed", range(40))
+def test_drawn_networks_keep_what_is_guaranteed(seed):
+    draw = np.random.default_rng(seed)
+    network, edges, directed = drawn_network(draw)
+    coupling = float(draw.uniform(2.0, 10.0)) if seed % 2 else None
+    parts = parts_of(network, edges, directed, coupling=coupling)
+    settings = SETTINGS._replace(horizon=20.0, seed=seed)
+    guarantee = said(parts, settings)
+    result = ech.simulate(parts, settings)
+    away = np.abs(stops(result, guarantee))
+    late = guarantee.run.network
+    if late is None:
+        # Weights that are too small for `leaderward`, or hop counts that may be forgotten.
+        assert (
+            network.hears.name == "LEADERWARD" and guarantee.hypotheses[Hypothesis.MESSAGES].fails
+        )
+        return
+    arrival = guarantee.tube.arrival
+    first = int(np.ceil(late.ages.first_packet / DT))
+    assert (away[first:].max() <= away[: first + 1].max() * 1.02).all()
+    if arrival is not None and arrival < 20.0:
+        errors = np.linalg.norm((result.errors)[result.times >= arrival][:, :, :2], axis=-1)
+        assert errors.max() <= 0.0101
+    # The slowest decay that is seen, from when it is small to 0.1 mm, is as fast as stated.
+    worst = np.maximum.accumulate(away.max(axis=(1, 2))[::-1])[::-1]
+    small, tiny = (int(np.argmax(worst < x)) for x in (0.03, 1e-3))
+    if 0 < small < tiny:
+        rate = np.log(worst[small] / worst[tiny]) / (DT * (tiny - small))
+        slack = 1.0 if late.ways is None else 0.4
+        assert rate >= slack * 0.9 * late.rate, (rate, late.rate)
+
+
 # ---- what is covered -----------------------------------------------------------------------------
 
 
@@ -157,6 +212,51 @@ def test_the_ideal_network_has_no_line_of_it():
     guarantee = said(parts_of(None))
     assert guarantee.theorem is Theorem.T5 and Hypothesis.MESSAGES not in guarantee.hypotheses
     assert "network" not in guarantee.as_mapping()["anywhere"]
+
+
+class Reversed(ech.laws.StoppingPoint):
+    """Its input has the wrong sign."""
+
+    def update(self, model, view, memory):
+        u, memory = super().update(model, view, memory)
+        return -u, memory
+
+
+class Elsewhere(ech.laws.StoppingLeader):
+    """It is expected where it is not."""
+
+    def expected(self, model, t, deviation, age, period):
+        there = super().expected(model, t, deviation, age, period)
+        return there._replace(signal=there.signal + 1.0)
+
+
+class ReversedConsensus(ech.laws.Consensus):
+    """Its input has the wrong sign."""
+
+    def update(self, model, view, memory):
+        u, memory = super().update(model, view, memory)
+        return -u, memory
+
+
+class Renamed(ech.laws.Consensus):
+    """A law with another name."""
+
+
+@pytest.mark.parametrize("network", [None, RADIO])
+def test_what_is_proved_of_a_law_is_not_of_its_subclasses(network):
+    parts = parts_of(network)
+    leader, follower = parts.drive.leader, parts.drive.follower
+    assert said(parts).promised
+    for laws in (
+        ech.Laws(leader, Reversed()),
+        ech.Laws(Elsewhere(reference=CIRCLE), follower),
+    ):
+        assert "its subclass" in said(parts.replace(drive=laws)).sentence()
+    gain = ech.synthesize(CART, parts.graph, ech.gains.Riccati())
+    rest = ech.laws.PathLQR(reference=CIRCLE)
+    for law, promised in ((Renamed(gain), True), (ReversedConsensus(gain), False)):
+        guarantee = said(parts.replace(drive=ech.Laws(rest, law), world=ech.World()))
+        assert guarantee.promised == promised
 
 
 # ---- 4: the tube ---------------------------------------------------------------------------------

@@ -68,6 +68,11 @@ ROUGH = {
     "by hand": by_hand(0.5),
     "another line": shifted(),
 }
+REASONS = {
+    "mod": "a path uses `ne` (of `//`, `%` or a comparison), and passes from one branch",
+    "interp": "a number that is not finite, as a table does that is read by `interp`",
+    "integer": "a path converts time to a whole number, which has no enclosure",
+}
 SMOOTH = {
     "sine": jnp.sin,
     "lemniscate": lambda t: jnp.cos(t) / (1.0 + jnp.sin(t) ** 2),
@@ -79,6 +84,7 @@ SMOOTH = {
     "abs off 0": lambda t: jnp.abs(2.0 + jnp.sin(t)) + jnp.abs(-2.0 - t),
     "one branch": lambda t: jnp.where(t < 100.0, t**2, 0.0) + jnp.where(t < -1.0, 0.0, t),
     "not reached": lambda t: jnp.clip(t, -1.0, 100.0) + jnp.floor(t / 99.0),
+    "of the first turn": lambda t: jnp.sin((t + 1.0) % 99.0) + (t + 1.0) // 99.0,
     "softplus": jax.nn.softplus,
     "sinc": lambda t: jnp.sinc(t + 0.1),
     "by hand": by_hand(1.0),
@@ -90,6 +96,7 @@ SMOOTH = {
 def test_a_path_that_jumps_or_bends_is_refused_with_its_reason(name):
     fault = path_fault(along(ROUGH[name]), chains_of(MODEL), 10.0)
     assert "is not known to have 2 bounded derivatives, since" in fault
+    assert REASONS.get(name, "") in fault
 
 
 @pytest.mark.parametrize("name", SMOOTH)

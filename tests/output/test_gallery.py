@@ -1,6 +1,8 @@
 """Pictures and notebooks of the documentation: their scripts produce them, and they stay small."""
 
+import base64
 import importlib.util
+import json
 import re
 import sys
 from pathlib import Path
@@ -59,9 +61,35 @@ def test_pictures_are_many_and_small():
 @pytest.mark.slow
 @pytest.mark.parametrize("book", ONE_BOOK, ids=lambda book: book.stem)
 def test_a_notebook_runs_and_shows_what_its_page_shows(book, monkeypatch):
-    found, pictures = script("render_notebooks", monkeypatch).render(book)
-    assert found == book.with_suffix(".md").read_text("utf-8")
+    text, pictures, notebook = script("render_notebooks", monkeypatch).render(book)
+    assert text == book.with_suffix(".md").read_text("utf-8")
     assert all((DOCS / "assets" / "notebooks" / name).is_file() for name in pictures)
+    # The stored outputs have today's words, and a picture where today has one.
+    stored, today = json.loads(book.read_text("utf-8")), json.loads(json.dumps(notebook))
+    assert without_pictures(stored) == without_pictures(today)
+
+
+def without_pictures(notebook):
+    """A notebook without the content of its pictures, whose bits differ between machines."""
+    for cell in notebook["cells"]:
+        for output in cell.get("outputs", ()):
+            if "image/png" in output.get("data", {}):
+                output["data"]["image/png"] = "a picture"
+    return notebook
+
+
+@pytest.mark.parametrize("book", BOOKS, ids=lambda book: book.stem)
+def test_a_notebook_is_shipped_with_its_outputs_and_the_pictures_of_its_page(book):
+    page, cells = book.with_suffix(".md").read_text("utf-8"), json.loads(book.read_text())["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    shown = [output for cell in code for output in cell["outputs"]]
+    words = [x.get("text") or x["data"].get("text/plain") for x in shown]
+    assert words and all("".join(text).rstrip() in page for text in words if text)
+    pictures = [x["data"]["image/png"] for x in shown if "image/png" in x.get("data", {})]
+    names = re.findall(r"\(\.\./assets/notebooks/(\S+)\)", page)
+    files = [DOCS / "assets" / "notebooks" / name for name in names]
+    assert pictures == [base64.b64encode(file.read_bytes()).decode() for file in files]
 
 
 def test_there_are_three_notebooks():

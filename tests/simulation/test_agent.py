@@ -42,9 +42,16 @@ def pair(request):
     return ech.Agent(parts, 1, dt=0.01), ech.Agent(parts, 2, dt=0.01)
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_agents_by_themselves_do_what_simulate_does(law):
-    parts = formation(law, position=1.0)
+# So little noise that the run's own measurements are the states.
+ESTIMATED = ech.World(sensing=ech.Sensing(noise={"position": 1e-18}, estimator="constant-gain"))
+
+
+@pytest.mark.parametrize(
+    ("law", "world"),
+    [("consensus", ech.World()), ("stopping-point", ech.World()), ("stopping-point", ESTIMATED)],
+)
+def test_agents_by_themselves_do_what_simulate_does(law, world):
+    parts = formation(law, position=1.0).replace(world=world)
     result = ech.simulate(parts, ech.Settings(horizon=0.2, dt=0.01, seed=3, engine="jax"))
     agents = [ech.Agent(parts, k, dt=0.01) for k in range(4)]
     for k, t in enumerate(result.times[:-1]):
@@ -214,6 +221,7 @@ def late_parts(law, **network):
         ),
         pytest.param("consensus", {"delay": 0.05}, marks=pytest.mark.study),
         ("consensus", {"delay": 0.03, "prediction": "none"}),
+        ("consensus", {"delay": 0.03, "prediction": "packet"}),
         ("stopping-point", {"delay": 0.03, "messages": "state"}),
     ],
 )

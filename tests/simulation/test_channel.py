@@ -265,3 +265,27 @@ def hops_of(loop, now):
 def test_a_network_that_cannot_work_is_refused_in_one_sentence(change, message):
     with pytest.raises(SimulationError, match=message):
         ech.simulate(parts(ech.Network(**{"rate": 50.0, **change})), chosen())
+
+
+def drifting(prediction, dt=0.01):
+    """Carts over a radio, whose leader drifts without a plan: their errors at the end, m."""
+    cart, graph = ech.models.DoubleIntegrator(dimension=1), ech.Graph.path(3)
+    line = ech.Formation.from_offsets(cart, graph, {1: [1.0], 2: [2.0]})
+    gain = ech.synthesize(cart, graph, ech.gains.Riccati())
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    radio = ech.Network(rate=25.0, delay=0.1, loss=0.3, prediction=prediction)
+    parts = ech.Parts(
+        *(cart, graph, line, drive, {"position": 0.3}),
+        start_error={"vx": 0.8},
+        world=ech.World(network=radio),
+    )
+    result = ech.simulate(parts, ech.Settings(horizon=12.0, dt=dt, engine="jax"))
+    return result.formation_errors[-1].max()
+
+
+def test_a_leader_without_a_plan_is_carried_on_by_the_model():
+    # It drifts at .8 m/s, and what is heard of it is some .15 s old.
+    assert drifting("packet") < 1e-3
+    assert drifting("none") > 0.05
+    with pytest.raises(EchelonError, match="has no plan; use `packet`"):
+        drifting("preview")

@@ -6,6 +6,8 @@ Nothing here needs JAX, so scenarios can be checked without it. Code compares me
 import enum
 from typing import Self
 
+from echelon.core.errors import SimulationError, check_name
+
 
 class Word(enum.Enum):
     """A word with a meaning: its name stands in tables and files, its value is the meaning."""
@@ -24,6 +26,16 @@ class Word(enum.Enum):
         if isinstance(name, cls):
             return name
         return {str(member): member for member in cls}[str(name)]
+
+    @classmethod
+    def checked(cls, name: object, what: str) -> Self:
+        """Return the member of a name, as `named`; `what` has the name, such as "`a` of the b".
+
+        Raises:
+            SimulationError: there is none.
+        """
+        check_name(f"{what} is", str(name), map(str, cls), SimulationError)
+        return cls.named(name)
 
 
 class Feedforward(Word):
@@ -60,7 +72,15 @@ class Prediction(Word):
     """How agents predict the leader from what it last sent."""
 
     PREVIEW = "by its plan, which they know"
+    PACKET = "by the motion that it was in when it sent it"
     NONE = "as it was when it sent it"
+
+
+class Estimation(Word):
+    """What agents make of what they measure of themselves."""
+
+    NONE = "they use it as it is"
+    CONSTANT_GAIN = "a prediction by the model, corrected by a constant gain"
 
 
 ENGINES = ("auto", "jax", "native")

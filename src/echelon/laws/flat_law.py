@@ -13,7 +13,7 @@ from echelon.agents.models.chains import Chains, chains_of, check_bounds, flatte
 from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ModelError, listing
-from echelon.core.types import Array, Input, State
+from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.flat_loop import FlatLoop, FlatMemory, Observer
 from echelon.laws.law import Law, LocalView
 
@@ -186,6 +186,17 @@ class FlatLaw(Law):
         return x * jax.lax.rsqrt(1.0 + (x * inverse) ** 2)
 
     # ---- what any agent does ----
+
+    def carried(
+        self,
+        model: ControlAffine,
+        signal: jax.Array,
+        feedforward: jax.Array,
+        u: Input,
+        time: Scalar,
+    ) -> jax.Array:
+        """Return zeta (m,) of a leader that moves on at the rate zeta' that it sent."""
+        return signal + time * feedforward[: len(signal)]
 
     def initial_memory(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x, with the derivatives of its reference."""

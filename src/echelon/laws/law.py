@@ -16,11 +16,15 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide
 from echelon.core.errors import LawError
+from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, PyTree, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.synthesis.gains.gain import Gain
 
 Memory: TypeAlias = PyTree
+
+_CARRIED = 0.03
+"""s; longest step of the model by which the motion of a leader is carried on."""
 
 
 @final
@@ -244,6 +248,31 @@ class Law(eqx.Module):
         """
         return None
 
+    def carried(
+        self,
+        model: ControlAffine,
+        signal: Float[jax.Array, " s"],
+        feedforward: Float[jax.Array, " k"],
+        u: Input,
+        time: Scalar,
+    ) -> Float[jax.Array, " s"]:
+        """Return the signal of a leader without a plan, a time (s) after its last message.
+
+        Unless replaced, a state moves on by the model under the same input, and a signal stays.
+
+        Args:
+            model: the agent.
+            signal: (s,) then; the state less the offset where the law has no signal.
+            feedforward: (k,) that the leader sent.
+            u: the input (m,) that its actuators delivered.
+            time: how long it moves on.
+        """
+        if type(self).signal is not Law.signal:
+            return signal
+        count = jnp.ceil(time / _CARRIED).astype(int)
+        piece = time / jnp.maximum(count, 1)
+        return jax.lax.fori_loop(0, count, lambda _, x: rk4(model.velocity, x, u, piece), signal)
+
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
         """Yield the rows of starts (K, n) that the law cannot take, and why in words."""
         yield from ()
@@ -260,6 +289,20 @@ class Law(eqx.Module):
     @abc.abstractmethod
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return one agent's physical input (m,), before actuator limits, and its next memory."""
+
+
+def declares(law: Law, name: str) -> bool:
+    """Tell whether a declaration of a law, such as `metric`, is of the law that runs.
+
+    A subclass that replaces a method inherits what its base declares about the replaced one.
+    """
+    kinds = type(law).__mro__
+    place = next(k for k, kind in enumerate(kinds) if name in vars(kind))
+    return not any(
+        not key.startswith("_") and key != "prover" and callable(getattr(kinds[place], key, None))
+        for kind in kinds[:place]
+        for key in vars(kind)
+    )
 
 
 def check_gain_fits(

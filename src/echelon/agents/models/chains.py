@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from echelon.agents.models.declarations import undeclared
+from echelon.agents.models.declarations import is_by_user, undeclared
 from echelon.agents.models.model import ControlAffine, FlatBound, Flattened
 from echelon.core.errors import ModelError, listing
 from echelon.core.memoize import memoize
@@ -245,8 +245,7 @@ def _check_size(model: ControlAffine, chains: Chains) -> None:
 
 def _check_map(model: ControlAffine, chains: Chains) -> None:
     """Check at samples that coordinates by a user's `flatten` are rates of each other."""
-    owner = next(kind for kind in type(model).__mro__ if "flatten" in vars(kind))
-    if "flatten" not in chains.declared or owner.__module__.startswith("echelon."):
+    if "flatten" not in chains.declared or not is_by_user(model, "flatten"):
         return
     n, m, draw = len(model.state_names), len(chains.outputs), np.random.default_rng(0)
     x = np.asarray(model.trim[0], float) + draw.uniform(-0.5, 0.5, (_SAMPLES, n))

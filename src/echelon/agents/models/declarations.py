@@ -47,6 +47,12 @@ def undeclared(model: ControlAffine, *names: str) -> tuple[str, ...]:
     return tuple(name for name in names if _is_about_another(model, name))
 
 
+def is_by_user(model: ControlAffine, name: str) -> bool:
+    """Tell whether a declaration stands in a class that is not echelon's, or on the instance."""
+    place = next(kind for kind in type(model).__mro__ if name in vars(kind))
+    return name in vars(model) or not place.__module__.startswith("echelon.")
+
+
 def _is_about_another(model: ControlAffine, name: str) -> bool:
     levels = list(_levels(model))
     place = next(k for k, level in enumerate(levels) if name in level)

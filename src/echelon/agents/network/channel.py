@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from echelon.core.draws import Draw, key_of, uniforms
-from echelon.core.errors import SimulationError, check_kind, did_you_mean, listing
+from echelon.core.errors import SimulationError, check_kind
 from echelon.core.types import Array, PyTree
-from echelon.core.words import MessageContent, NeighbourChoice, Prediction, Word
+from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 
 NEVER = -1
 """The stamp of a message that never came, and the arrival of one that never does."""
@@ -59,7 +59,8 @@ class Network:
         messages: `deviation`, the sender's deviation from where it expects the leader, which hardly
             changes while a message is under way; `state`, the signal itself.
         prediction: how agents predict the leader from what it last sent: `preview`, they know its
-            plan; `none`, as it was. Only for `deviation`.
+            plan; `packet`, they carry on its last motion by the model; `none`, as it was. Only for
+            `deviation`.
         forget: age, s, beyond which what a neighbour sent is not used.
         hears: `all` neighbours, or `leaderward`, those alone with fewer hops to the leader, as
             counted by the messages that arrive.
@@ -93,7 +94,8 @@ class Network:
             ("prediction", Prediction),
             ("hears", NeighbourChoice),
         ):
-            object.__setattr__(self, name, _named(name, word, getattr(self, name)))
+            member = word.checked(getattr(self, name), f"`{name}` of the network")
+            object.__setattr__(self, name, member)
         least = 2.0 / self.rate + self.delay + self.jitter
         if self.forget < least:
             raise SimulationError(
@@ -147,8 +149,7 @@ class Network:
         """What each agent receives, in words."""
         if self.messages is MessageContent.STATE:
             return "late: neighbours' signals, and the feed-forward of the leader"
-        leader = "the leader's plan, and its last deviation from it"
-        leader = leader if self.prediction is Prediction.PREVIEW else "the leader as it last was"
+        leader = _LEADERS[self.prediction]
         return f"late: neighbours' deviations from where they expect the leader; {leader}"
 
     def __str__(self) -> str:
@@ -165,6 +166,11 @@ class Network:
         return ", ".join(parts) + f"; {content}"
 
 
+_LEADERS: Mapping[Prediction, str] = {
+    Prediction.PREVIEW: "the leader's plan, and its last deviation from it",
+    Prediction.PACKET: "the leader's last state and input",
+    Prediction.NONE: "the leader as it last was",
+}
 _RANGES: Mapping[tuple[str, ...], tuple[str, Callable[[float], bool]]] = {
     ("rate", "forget", "bursts.length"): ("positive", lambda x: x > 0.0),
     ("delay", "jitter"): ("not negative", lambda x: x >= 0.0),
@@ -179,17 +185,6 @@ def _check_number(name: str, value: object, allowed: str, fits: Callable[[float]
         raise SimulationError(f"`{name}` of the network is {value!r}, and must be a number.")
     if not (math.isfinite(value) and fits(float(value))):
         raise SimulationError(f"`{name}` of the network is {value}, and must be {allowed}.")
-
-
-def _named(name: str, word: type[Word], value: object) -> Word:
-    try:
-        return word.named(value)
-    except KeyError:
-        names = list(map(str, word))
-        raise SimulationError(
-            f"`{name}` of the network is `{value}`, allowed are {listing(names)}"
-            f"{did_you_mean(str(value), names)}."
-        ) from None
 
 
 class Posts(NamedTuple):

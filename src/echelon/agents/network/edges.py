@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from echelon.core.errors import GraphError
 from echelon.core.limits import excess_agents, excess_edges
@@ -172,3 +173,32 @@ def name_agents(agents: np.ndarray) -> str:
     """Return a subject with its verb such as `agents 2, 3 have`, shortened when there are many."""
     numbers = ", ".join(str(agent) for agent in agents[:8]) + (", ..." if len(agents) > 8 else "")
     return f"agent {numbers} has" if len(agents) == 1 else f"agents {numbers} have"
+
+
+def edges_of_matrix(
+    matrix: ArrayLike, leaders: Iterable[int], directed: bool | None
+) -> tuple[list[list[float]], Iterable[int], int, bool]:
+    """Return edges, leaders, the number of agents and whether edges are directed, of an adjacency.
+
+    Raises:
+        GraphError: the matrix is not square, not finite, or not that of such a graph.
+    """
+    try:
+        weights = np.asarray(matrix, np.float64)
+    except (TypeError, ValueError):
+        weights = np.zeros(0)
+    if weights.ndim != 2 or len(weights) != len(weights.T):
+        raise GraphError(
+            f"the adjacency matrix has shape {np.shape(weights)}, and must be a square matrix of "
+            "numbers (agents, agents)."
+        )
+    symmetric = bool((weights == weights.T).all())
+    if directed is False and not symmetric:
+        raise GraphError(
+            "the adjacency matrix is not symmetric, and that of an undirected graph must be."
+        )
+    one_way = not symmetric if directed is None else directed
+    # Row i receives from column j, and a directed edge leads from the sender to the receiver.
+    receivers, senders = np.nonzero(weights if one_way else np.triu(weights))
+    edges = np.column_stack([senders, receivers, weights[receivers, senders]])
+    return edges.tolist(), leaders, len(weights), one_way

@@ -44,6 +44,12 @@ class Formation:
         """Tell whether two formations have the same offsets."""
         return isinstance(other, Formation) and np.array_equal(self.offsets, other.offsets)
 
+    def __repr__(self) -> str:
+        """Say the size and the largest offset."""
+        agents, states = self.offsets.shape
+        largest = np.abs(self.offsets).max(initial=0.0)
+        return f"Formation({agents} agents, {states} states, offsets up to {largest:.4g})"
+
     def __hash__(self) -> int:
         """Hash what `__eq__` compares."""
         # Where -0.0 is 0.0, which it equals.

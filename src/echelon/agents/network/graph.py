@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from echelon.agents.network.bound import Grounded
 from echelon.agents.network.edges import (
@@ -15,6 +16,7 @@ from echelon.agents.network.edges import (
     check_size,
     count_agents,
     count_grid,
+    edges_of_matrix,
     give_weights,
     links,
     split_weights,
@@ -149,8 +151,12 @@ class Graph(GraphMatrices):
         The edge attribute `weight` is read, and is 1 where it is missing.
 
         Raises:
-            GraphError: its nodes are not 0 .. N-1.
+            GraphError: it is no graph of networkx, or its nodes are not 0 .. N-1.
         """
+        if not (hasattr(graph, "nodes") and hasattr(graph, "is_directed")):
+            raise GraphError(
+                f"`graph` is a `{type(graph).__name__}`, and must be a graph of networkx."
+            )
         if set(graph.nodes) != set(range(len(graph))):
             raise GraphError(
                 "the nodes of the networkx graph must be the whole numbers from 0 on, without "
@@ -158,6 +164,23 @@ class Graph(GraphMatrices):
             )
         edges = [(i, j, data.get("weight", 1.0)) for i, j, data in graph.edges(data=True)]
         return cls(edges, leaders, len(graph), graph.is_directed())
+
+    @classmethod
+    def from_adjacency(
+        cls, matrix: ArrayLike, leaders: Iterable[int] = (0,), directed: bool | None = None
+    ) -> "Graph":
+        """Return the graph of an adjacency matrix.
+
+        Args:
+            matrix: (N, N), A_ij >= 0 is the weight with which i receives from j; 0 for no edge.
+            leaders: numbers of the leaders.
+            directed: whether edges carry information one way; by default if A is not symmetric.
+
+        Raises:
+            GraphError: the matrix is not square, a weight is negative or not finite, an agent has
+                an edge to itself, or an undirected graph is asked of a matrix without symmetry.
+        """
+        return cls(*edges_of_matrix(matrix, leaders, directed))
 
     def with_leaders(self, more: Iterable[int]) -> "Graph":
         """Return the same graph with more leaders."""

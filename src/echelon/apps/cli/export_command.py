@@ -22,12 +22,12 @@ def export(
     force: OverwriteOption = False,
 ) -> None:
     """Write a run's states, inputs and errors for pandas, NumPy, MATLAB or a spreadsheet."""
-    STATUS.begin(f"reading {run}")
     from echelon.output.archive.export import content_of
 
     content = content_of(to)
     file = Path(f"run.{to}") if out is None else out
     claim_file(file, force)
+    STATUS.begin(f"reading {run}")
     from echelon.output.archive.load_folder import load
 
     write_file(file, content(load(run)))

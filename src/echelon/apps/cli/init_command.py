@@ -1,5 +1,6 @@
 """`echelon init`: a starter folder with a scenario, a model, a law and a notebook."""
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -13,3 +14,5 @@ def init(folder: Annotated[Path, typer.Argument(help="A new folder, such as my-s
     files = create_starter(folder)
     print(f"- Written to {folder}: {', '.join(file.name for file in files)}.")
     print(f"- Next: cd {folder} && echelon run scenario.yaml")
+    if find_spec("jupyterlab") is None:
+        print("- The notebook needs JupyterLab: pip install 'echelon-formation[notebook]'")

@@ -41,13 +41,13 @@ def plot(
     from echelon.output.plots.run_figures import figures
     from echelon.output.plots.style import ONE_COLUMN, SCREEN, TWO_COLUMNS
 
-    recording = load(run)
+    result = load(run)
     folder = (run if run.is_dir() else run.parent) / "figures" if out is None else out
     pages = {"_one_column": ONE_COLUMN, "_two_columns": TWO_COLUMNS} if paper else {"": SCREEN}
     drawings = {
         f"{name}{suffix}": figure
         for suffix, page in pages.items()
-        for name, figure in figures(recording, names, page).items()
+        for name, figure in figures(result, names, page).items()
     }
     if not drawings:
         raise OutputError("the run has no data for these figures.")

@@ -40,7 +40,7 @@ def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: JsonObject) -> 
 
 def _path(swarm: LiveLoop, space: Space) -> list[list[float]]:
     """Return places along the reference as they are drawn; none without a reference."""
-    times = np.arange(0.0, _AHEAD, _APART)
+    times = swarm.first * swarm.settings.dt + np.arange(0.0, _AHEAD, _APART)
     states = swarm.reference_at(times)
     if states is None:
         return []

@@ -46,6 +46,10 @@ _HALVED = 2000
 """Pieces that are looked at beside those asked for."""
 
 
+class NoEnclosureError(GainError):
+    """A function has no enclosure, however short the time."""
+
+
 def enclose_derivatives(
     function: Callable[[jax.Array], jax.Array], times: Sequence[Fraction], order: int
 ) -> Iterator[list[list[Interval]]]:
@@ -108,9 +112,12 @@ def enclose_finely(
         count += 1
         try:
             [rows] = enclose_derivatives(function, (low, high), order)
-        except GainError:
+        except NoEnclosureError:
+            raise
+        except GainError as error:
             if high - low < _SHORT or count > len(times) + _HALVED:
-                raise
+                why, span = str(error).rstrip("."), f"{float(low):.6g} and {float(high):.6g} s"
+                raise GainError(f"{why}, between {span}.") from error
             spans += [((low + high) / 2, high), (low, (low + high) / 2)]
             continue
         yield EnclosedPiece(high, rows)
@@ -142,6 +149,11 @@ def _algebra(order: int) -> Algebra:
     """Return the algebra of series up to an order."""
 
     def lift(array: np.ndarray) -> np.ndarray:
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise NoEnclosureError(
+                "a path holds a number that is not finite, as a table does that is read by "
+                "`interp` or `searchsorted`."
+            )
         lifted = rules.lift(array)
         if lifted.dtype != object:
             return lifted
@@ -151,7 +163,7 @@ def _algebra(order: int) -> Algebra:
     def unknown(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
         if equation.primitive.name == "scan":
             return _scan(equation, operands, algebra)
-        raise GainError(
+        raise NoEnclosureError(
             f"a path uses `{equation.primitive.name}`, which has no enclosure over time."
         )
 
@@ -173,5 +185,5 @@ def _algebra(order: int) -> Algebra:
 
 def _convert(params: Params, x: np.ndarray) -> np.ndarray:
     if np.dtype(params["new_dtype"]).kind in "biu":
-        raise GainError("a path converts time to a whole number, which has no enclosure.")
+        raise NoEnclosureError("a path converts time to a whole number, which has no enclosure.")
     return x

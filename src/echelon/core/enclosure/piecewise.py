@@ -41,7 +41,12 @@ def _side(x: Series, name: str, edge: bool = True) -> bool:
 
 
 def _changes(name: str) -> GainError:
-    return GainError(f"a path uses `{name}`, and passes from one branch of it to another.")
+    what = f"`{name}`{_WRITTEN.get(name, '')}"
+    return GainError(f"a path uses {what}, and passes from one branch of it to another.")
+
+
+_WRITTEN = {"rem": " (of `%` or `mod`)", "ne": " (of `//`, `%` or a comparison)"}
+"""How somebody wrote a primitive, where its name does not say it."""
 
 
 def _compared(name: str, swap: bool, edge: bool) -> Rule:
@@ -57,8 +62,8 @@ def _compared(name: str, swap: bool, edge: bool) -> Rule:
 def _equal(name: str, equal: bool) -> Rule:
     def compare(order: int, a: Series | float, b: Series | float) -> bool:
         low, high = (lifted(a, order) - lifted(b, order)).parts[0]
-        if a is b:
-            # As JAX's own functions look for NaN.
+        # As JAX's own functions look for NaN, and compare signs.
+        if a is b or low == high == 0:
             return equal
         if low <= 0 <= high:
             raise _changes(name)

@@ -26,9 +26,13 @@ from echelon.experiments.results.recording import Recording, recording
 from echelon.experiments.results.run_groups import SUM, group_of
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
 from echelon.guarantees.promises.promise import promise
+from echelon.laws.law import gain_of
+from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
+from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.settings import Settings
+from echelon.synthesis.gains.gain import Gain
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -204,18 +208,24 @@ def statement(parts: Parts, settings: Settings, name: str) -> JsonObject:
         "dt_s": settings.dt,
         "seed": settings.seed,
         **parts.world.describe(parts.model),
-        "gain": None
-        if gain is None
-        else {
-            "method": gain.method,
-            "coupling": gain.coupling,
-            "P": gain.P.tolist(),
-            "R": gain.R.tolist(),
-        },
+        "gain": _gain_numbers(gain),
+        "leader_gain": _gain_numbers(leader_gain_of(parts.drive)),
         "promise": promise(parts, settings).as_mapping(),
         "lambda_min": spectrum.low,
         "lambda_max": spectrum.high,
     }
+
+
+def _gain_numbers(gain: Gain | None) -> JsonObject | None:
+    if gain is None:
+        return None
+    numbers = {"P": gain.P.tolist(), "R": gain.R.tolist()}
+    return {"method": gain.method, "coupling": gain.coupling, **numbers}
+
+
+def leader_gain_of(drive: Drive) -> Gain | None:
+    """Return the leaders' own gain; None without one."""
+    return gain_of(drive.leader) if isinstance(drive, Laws) else None
 
 
 _NUMBERS = tuple(x.key or name for name, x in shown_in(RUN_NUMBERS, Shown.SUMMARY).items())

@@ -27,7 +27,7 @@ from echelon.experiments.scenario.named_class import (
     named_class,
     offered,
 )
-from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.scenario import Scenario, ScenarioLike, as_scenario
 from echelon.experiments.scenario.self_contained import self_contained
 from echelon.experiments.scenario.user_code import as_scenario_error
 from echelon.experiments.scenario.values import marked_keys
@@ -60,18 +60,18 @@ class Experiment(NamedTuple):
     settings: Settings
 
 
-def build(scenario: Scenario, to_run: bool = False) -> Experiment:
+def build(scenario: ScenarioLike, to_run: bool = False) -> Experiment:
     """Return the parts and the settings of a scenario.
 
     Args:
-        scenario: a checked scenario.
+        scenario: a scenario, its name, its file, the folder of a run, or a mapping of its keys.
         to_run: also check that a run of it would fit in memory and has no `live` events, which
             `echelon run` cannot repeat.
 
     Raises:
         ScenarioError: one line for each part that cannot be built, with its place in the file.
     """
-    _check_scenario(scenario)
+    scenario = as_scenario(scenario)
     faults = FaultList(scenario)
     # Gains are computed here, and would have 7 digits under float32.
     with precision("float64"):
@@ -101,13 +101,6 @@ def _check_run(
     with faults.at("simulation"):
         check_memory(model, graph.agents, settings)
     faults.settle()
-
-
-def _check_scenario(scenario: object) -> None:
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError(
-            f"`scenario` is {scenario!r}, and must be a `Scenario`, as returned by `load_scenario`."
-        )
 
 
 def _parts(
@@ -161,7 +154,7 @@ def _parts(
 
 
 def run(
-    scenario: Scenario,
+    scenario: ScenarioLike,
     progress: Progress | None = None,
     built: Experiment | None = None,
     keep: Keep | None = None,
@@ -169,12 +162,17 @@ def run(
 ) -> Result:
     """Simulate a scenario, and record in the result what it was computed from.
 
-    `built` are its parts, built if None; `progress`, `keep` and `before` are those of `simulate`.
+    Args:
+        scenario: a scenario, its name, its file, the folder of a run, or a mapping of its keys.
+        progress: as in `simulate`.
+        built: its parts and settings, built if None.
+        keep: as in `simulate`.
+        before: as in `simulate`.
 
     Raises:
-        ScenarioError: a part cannot be built.
+        ScenarioError: there is no such scenario, it has faults, or a part cannot be built.
     """
-    _check_scenario(scenario)
+    scenario = as_scenario(scenario)
     parts = build(scenario) if built is None else built
     # Before the run, during which a file may change.
     origin = origin_of(scenario)
@@ -354,6 +352,4 @@ def _leader(
 
 def _settings(scenario: Scenario) -> Settings:
     numbers, window = scenario.simulation.model_dump(), scenario.report.steady_window
-    settings = Settings(**numbers, seed=scenario.seed, steady_window=window)
-    settings.check()
-    return settings
+    return Settings(**numbers, seed=scenario.seed, steady_window=window)

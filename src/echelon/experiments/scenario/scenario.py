@@ -6,7 +6,7 @@ All faults of a file are reported at once, a line each: `file:line: field: got .
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, final
+from typing import Annotated, Any, NoReturn, TypeAlias, final
 
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
@@ -23,6 +23,7 @@ from echelon.experiments.scenario.yaml import (
     KeyPath,
     apply_overrides,
     dump_yaml,
+    inline_yaml,
     is_or_are,
     joined,
     quoted,
@@ -82,6 +83,23 @@ class Scenario(BaseModel, **STRICT):
     def file(self) -> Path:
         """The file that it was read from; of a mapping, a file that does not exist."""
         return self._file
+
+    def with_(self, *changes: str, **values: Any) -> "Scenario":
+        """Return the scenario with changed keys, as `--set` changes them.
+
+        Args:
+            *changes: texts such as `simulation.horizon=10`.
+            **values: values by key, such as `seed=3`, or `simulation__horizon=10` with two
+                underscores for the dot.
+
+        Raises:
+            ScenarioError: the changed scenario has faults, as in `load_scenario`.
+        """
+        named = (
+            f"{key.replace('__', '.')}={inline_yaml(_plain(value))}"
+            for key, value in values.items()
+        )
+        return with_overrides(self, [*changes, *named])
 
     def place(self, *path: str | int) -> str:
         """Return the place of a key, as in `paper.yaml:4`; else its parent's."""
@@ -279,6 +297,27 @@ def scenario_from_mapping(data: Mapping[str, Any], folder: str | Path = ".") -> 
     """
     plain = _plain(data)
     return _scenario(Document(plain, {(): "mapping"}), dump_yaml(plain), Path(folder) / "mapping")
+
+
+ScenarioLike: TypeAlias = Scenario | str | Path | Mapping[str, Any]
+"""A scenario, its name, its file, the folder of a run, or a mapping with the keys of the file."""
+
+
+def as_scenario(source: ScenarioLike) -> Scenario:
+    """Return a scenario, loaded if it is given by its name, its file or its keys.
+
+    Raises:
+        ScenarioError: it is none of these, or has faults, as in `load_scenario`.
+    """
+    if isinstance(source, Scenario):
+        return source
+    if isinstance(source, Mapping):
+        return scenario_from_mapping(source)
+    if isinstance(source, str | Path):
+        return load_scenario(source)
+    raise ScenarioError(
+        f"the scenario is {source!r}, and must be a `Scenario`, a name, a file, or a mapping."
+    )
 
 
 def json_schema() -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from echelon.core.words import ENGINES, MessageContent, NeighbourChoice, Prediction
+from echelon.core.words import ENGINES, Estimation, MessageContent, NeighbourChoice, Prediction
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.values import (
     STRICT,
@@ -237,6 +237,9 @@ class SensingSpec(BaseModel, **STRICT):
     independent from step to step."""
     seed: Seed | None = None
     """Seed of the noise; default the scenario's."""
+    estimator: Annotated[str, OneOf(map(str, Estimation))] = "none"
+    """What agents make of their measurements: `none`, they use them as they are; `constant-gain`,
+    a prediction by the model, corrected by a constant gain."""
 
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -276,7 +279,8 @@ class NetworkSpec(BaseModel, **STRICT):
     `state`, its signal itself, with which followers lag behind a leader that moves."""
     prediction: Annotated[str, OneOf(map(str, Prediction))] = "preview"
     """How agents predict the leader from what it last sent: `preview`, by its plan, which they
-    know; `none`, as it was then. Only for the messages `deviation`."""
+    know; `packet`, carried on by the model from its last state and input; `none`, as it was then.
+    Only for the messages `deviation`."""
     forget: Annotated[Positive, Unit("s")] = 0.5
     """Age, s, beyond which a neighbour's deviation is not used."""
     hears: Annotated[str, OneOf(map(str, NeighbourChoice))] = "all"

@@ -13,7 +13,7 @@ from echelon.experiments.results.metrics import metrics
 from echelon.experiments.results.run_numbers import RunNumbers
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
-from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
 from echelon.guarantees.promises.promise import promise
 from echelon.laws.consensus import Consensus
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
@@ -127,7 +127,7 @@ def known_labels(requested: Sequence[str] | None) -> tuple[str, ...]:
 
 
 def compare(
-    scenario: Scenario,
+    scenario: ScenarioLike,
     built: Experiment | None = None,
     only: tuple[str, ...] = (*LABELS, OWN),
     progress: Callable[[str, float, int], None] = lambda label, done, methods: None,
@@ -136,7 +136,8 @@ def compare(
     """Run each method on a scenario from the same starts, under the same limits and wind.
 
     Args:
-        scenario: the agents, their graph, formation, starts, conditions and horizon.
+        scenario: the agents, their graph, formation, starts, conditions and horizon; a scenario,
+            its name, its file, or a mapping.
         built: its parts and settings; built if None.
         only: the labels of the methods; `own` for the scenario's drive.
         progress: called between chunks of steps and between runs, with the label of the method,
@@ -150,6 +151,7 @@ def compare(
     Raises:
         ScenarioError: a part cannot be built.
     """
+    scenario = as_scenario(scenario)
     parts, settings = build(scenario) if built is None else built
     scene = _with_starts(parts, settings)
     rows = list[ComparisonRow]()

@@ -19,7 +19,7 @@ from echelon.core.errors import EchelonError, GainError, check_name, listing
 from echelon.core.types import Array
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import build
-from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.scenario import Scenario, ScenarioLike, as_scenario
 from echelon.experiments.studies.design import with_gain
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.simulation.engine.gradient import Cost, Gradient, gradient
@@ -94,7 +94,7 @@ def _term(text: str) -> tuple[float, str]:
 
 
 def tune(
-    scenario: Scenario,
+    scenario: ScenarioLike,
     parameters: Sequence[str] = PARAMETERS[:2],
     cost: str = "formation",
     rounds: int = 30,
@@ -107,7 +107,7 @@ def tune(
     guarantee of the gain is computed anew, and a sweep shows its errors from other starts.
 
     Args:
-        scenario: its followers have a gain of the method `riccati`.
+        scenario: (or its name or file) its followers have a gain of the method `riccati`.
         parameters: of `PARAMETERS`.
         cost: a sum of `COSTS`, each with an optional factor.
         rounds: the largest number of iterations (L-BFGS-B), of one or a few trials each.
@@ -116,7 +116,7 @@ def tune(
     Raises:
         EchelonError: a part of the scenario cannot be built, or cannot be tuned.
     """
-    search = _Search(scenario, parameters, cost_named(cost), progress)
+    search = _Search(as_scenario(scenario), parameters, cost_named(cost), progress)
     bounds = [(x - np.log(_RANGE), x + np.log(_RANGE)) for x in search.start]
     lowest = search.lowest_coupling
     if lowest is not None:

@@ -14,12 +14,13 @@ import scipy.sparse.csgraph as csgraph
 import scipy.sparse.linalg as spla
 
 from echelon.core.enclosure.interval import ELEMENTARY, point
-from echelon.core.rational import bisect
 from echelon.core.types import Array
 
-_HALVINGS = 40
-_SHARES = (0.999, 0.9, 0.6)
-"""Of the best rate: the nearer to it, the larger the weights of some agents against others."""
+_NEAR, _HALVINGS = 1e-5, 60
+"""Relative distance to the best rate at which the search ends, and after how many steps at most."""
+_SHARES, _MANY = (0.999, 0.9, 0.6), 1000
+"""Of the best rate: the nearer to it, the larger the weights of some agents against others. Of so
+many followers one rate is enough."""
 
 
 class LateRate(NamedTuple):
@@ -50,8 +51,14 @@ def late_rates(L: sp.csr_array, c: float, age: Fraction) -> tuple[LateRate, ...]
         fits = np.isfinite(v).all() and (v > 0.0).all() and (K @ v > 0.0).all()
         return v / v.max() if fits else None
 
-    best = bisect(lambda r: weights(r) is not None, 0.0, c * float(L.diagonal().min()), _HALVINGS)
-    pairs = ((best * share, weights(best * share)) for share in _SHARES)
+    best, high = 0.0, c * float(L.diagonal().min())
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (best + high)
+        best, high = (best, middle) if weights(middle) is None else (middle, high)
+        if high - best <= _NEAR * best:
+            break
+    shares = _SHARES if len(ones) <= _MANY else _SHARES[:1]
+    pairs = ((best * share, weights(best * share)) for share in shares)
     drafts = (LateRate(rate, v) for rate, v in pairs if v is not None)
     return tuple(each for each in drafts if is_proved(each, L, c, age))
 

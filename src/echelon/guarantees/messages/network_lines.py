@@ -70,13 +70,25 @@ def bias_of(parts: Parts, settings: Settings) -> Bias | None:
 
 
 def bias_line(parts: Parts, settings: Settings) -> Statement | None:
-    """Return a line on messages of states that make followers lag; None where they do not much."""
+    """Return what late messages do under a law of states; None where no bound of it is known."""
     bias = bias_of(parts, settings)
     if bias is None or bias.size < _MUCH:
-        return None
+        return _swinging_line(parts)
     remedy = "set `messages: deviation`"
     number = bias.size, f"{1e3 * bias.size:.3g} mm"
     return fails(Hypothesis.MESSAGES, Kind.LINEARIZATION, bias.sentence(), *number, remedy=remedy)
+
+
+def _swinging_line(parts: Parts) -> Statement | None:
+    """Say that agents with motors that lag may swing if they hear each other late."""
+    actuator, graph = parts.world.actuator, parts.graph
+    lag = 0.0 if actuator is None else actuator.lag
+    if parts.world.network is None or not lag or graph.directed:
+        return None
+    text = "agents with motors that lag hear each other late and both ways, and may swing up"
+    remedy = "set `graph.directed: true`, or use the law `stopping-point`"
+    shown = f"lag {1e3 * lag:.3g} ms"
+    return fails(Hypothesis.MESSAGES, Kind.LINEARIZATION, text, lag, shown, remedy=remedy)
 
 
 def messages_line(

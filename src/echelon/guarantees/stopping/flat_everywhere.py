@@ -1,15 +1,18 @@
-"""Borders of the flat coordinates of models that do not state them: none for a linear map."""
+"""Borders of flat coordinates: as a model states them, or none for a linear map."""
 
 from collections.abc import Sequence
 from fractions import Fraction
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import numpy as np
 
 from echelon.agents.models.chains import Chains, derivatives_of
+from echelon.agents.models.declarations import is_by_user
 from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.core.memoize import memoize
+from echelon.core.words import Kind
+from echelon.guarantees.stopping.declared_borders import border_fault
 from echelon.simulation.scalars import (
     Node,
     ScalarGraph,
@@ -19,23 +22,45 @@ from echelon.simulation.scalars import (
     nodes,
 )
 
+_STATED = "flat_chains", "flat_bounds"
 _PARTIAL = {"exponent", "mantissa", "root_guess"}
 """Operations that are not defined for all numbers; quotients and roots are not for some."""
 _Form: TypeAlias = dict[int | None, Fraction]
 """A sum of multiples of nodes by their numbers, and of 1 under None."""
 
 
-def bounds_of(model: ControlAffine, chains: Chains) -> Sequence[FlatBound] | None:
-    """Return the borders of a model's flat coordinates; None where they are not known.
+class KnownBounds(NamedTuple):
+    """The borders of a model's flat coordinates, and how they are known.
 
-    A model declares them with its chains. Of one that does not, or whose motion is another than
-    that of which it inherits the declaration, they are none if its own equations, traced, are
-    defined everywhere and make flat coordinates an invertible linear map of all states and
-    integrators, above which the inputs act by an invertible constant matrix.
+    Attributes:
+        bounds: None where they are not known.
+        kind: of the argument: samples where somebody's class states them.
+        fault: why they are not known.
     """
-    if {"flat_chains", "flat_bounds"} <= {*chains.declared}:
-        return model.flat_bounds
-    return () if _is_everywhere(model, chains) else None
+
+    bounds: Sequence[FlatBound] | None
+    kind: Kind = Kind.PROOF
+    fault: str = ""
+
+
+def bounds_of(model: ControlAffine, chains: Chains) -> KnownBounds:
+    """Return the borders of a model's flat coordinates.
+
+    A model declares them with its chains; what a class that is not echelon's declares is compared
+    with its equations at samples. There are none if the equations, traced, are defined everywhere
+    and make flat coordinates an invertible linear map of all states and integrators, above which
+    the inputs act by an invertible constant matrix.
+    """
+    by_user = {name for name in chains.declared if is_by_user(model, name)}
+    mapped = Kind.SAMPLES if "flatten" in by_user else Kind.PROOF
+    if not {*_STATED} <= {*chains.declared}:
+        fault = f"`{type(model).__name__}` does not state where its flat coordinates end"
+        everywhere = _is_everywhere(model, chains)
+        return KnownBounds((), mapped) if everywhere else KnownBounds(None, fault=fault)
+    if by_user.isdisjoint(_STATED) or _is_everywhere(model, chains):
+        return KnownBounds(model.flat_bounds, mapped)
+    fault = border_fault(model, chains)
+    return KnownBounds(None if fault else model.flat_bounds, Kind.SAMPLES, fault)
 
 
 @memoize

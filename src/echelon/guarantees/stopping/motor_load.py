@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from echelon.agents.models.airframe import Airframe
-from echelon.agents.models.declarations import undeclared
+from echelon.agents.models.declarations import is_by_user, undeclared
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import is_limited
 from echelon.core.enclosure.interval import Interval
@@ -18,6 +18,7 @@ from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind
 from echelon.guarantees.stopping.chain_response import Chain
+from echelon.guarantees.stopping.declared_borders import airframe_fault
 from echelon.guarantees.stopping.motor_bounds import (
     MotorDemand,
     Motors,
@@ -142,8 +143,8 @@ class _MotorCase(NamedTuple):
 
 def motors_suffice_for(run: StoppingRun) -> bool:
     """Tell whether the motors are certified from the starts of a run."""
-    frame = _airframe(run.parts.model)
-    if frame is None or _beyond(run):
+    frame, _ = _airframe(run)
+    if frame is None:
         return False
     case = _MotorCase.of(run, frame)
     return _from(case)[0].within(Fraction(frame.motor_thrust))
@@ -151,9 +152,10 @@ def motors_suffice_for(run: StoppingRun) -> bool:
 
 def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
     """Return the load of the motors of a run's agents, if they suffice, and its line."""
-    frame, reason = _airframe(run.parts.model), _beyond(run)
-    if frame is None or reason:
-        return None, unneeded(Hypothesis.LIMITS, Kind.PROOF, reason or _UNKNOWN)
+    frame, reason = _airframe(run)
+    if frame is None:
+        return None, unneeded(Hypothesis.LIMITS, Kind.PROOF, reason)
+    kind = Kind.SAMPLES if is_by_user(run.parts.model, "airframe") else Kind.PROOF
     case = _MotorCase.of(run, frame)
     motors, starts = _from(case)
     most = Fraction(frame.motor_thrust)
@@ -164,7 +166,7 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
         remedy += "to the leader's velocity and attitude; `echelon design` finds some"
         # Without a reason: a promise of agents without limits is one too.
-        return None, fails(Hypothesis.LIMITS, Kind.PROOF, text, *number, remedy=remedy)
+        return None, fails(Hypothesis.LIMITS, kind, text, *number, remedy=remedy)
     ahead = _ahead(frame, run.ahead)
     load = MotorLoad(
         float_below(motors.least),
@@ -175,12 +177,16 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
         _data(case, run.law.roots_for(3), starts, ahead),
     )
     text = "the motors suffice from these starts at all times"
-    return load, holds(Hypothesis.LIMITS, Kind.PROOF, text, *number)
+    return load, holds(Hypothesis.LIMITS, kind, text, *number)
 
 
-def _airframe(model: ControlAffine) -> Airframe | None:
-    """Return the body under motors that a model declares of its own motion and limits."""
-    return None if undeclared(model, "airframe") else model.airframe
+def _airframe(run: StoppingRun) -> tuple[Airframe | None, str]:
+    """Return the body under motors that a model declares of its motion and limits, or why not."""
+    model, reason = run.parts.model, _beyond(run)
+    frame = None if undeclared(model, "airframe") else model.airframe
+    if frame is not None and not reason and is_by_user(model, "airframe"):
+        reason = airframe_fault(model, run.law.ready.chains, frame)
+    return (None, reason) if reason else (frame, _UNKNOWN)
 
 
 def _beyond(run: StoppingRun) -> str:

@@ -60,7 +60,8 @@ class StoppingPromise(Promise):
         )
         (tube, tube_lines), drifts = tube_of(run, brief), leader_drift_line(run)
         lines = [*agent_lines(case), *condition_lines(run), *tube_lines]
-        more = drifts, messages_line(parts, settings, run.late), _own_line(run, prepared.problem)
+        own = None if brief else _own_line(run, prepared.problem)
+        more = drifts, messages_line(parts, settings, run.late), own
         lines += [line for line in more if line is not None]
         by_name = {cast(Hypothesis, x.statement): x for x in lines}
         against = any(line.fails and line.reason for line in by_name.values())

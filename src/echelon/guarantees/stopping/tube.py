@@ -1,5 +1,6 @@
 """The tube of theorem T5: how far agents go, from which starts, and when they arrive."""
 
+import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -7,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.words import Feedforward, Kind, Theorem
@@ -41,6 +43,8 @@ class Tube(NamedTuple):
         motor_load: None where motors have no limits, may not suffice, or were left out.
         graphs: which graphs are meant, and this one, in words.
         network: what T9 says; None for the ideal network.
+        kind: of the argument: the chains' responses and the path are enclosed in rationals; what
+            somebody's class states of its flat coordinates or its motors was seen at samples.
     """
 
     rate: float
@@ -53,11 +57,7 @@ class Tube(NamedTuple):
     motor_load: MotorLoad | None
     graphs: tuple[str, str] = _ANY
     network: LateMessages | None = None
-
-    @property
-    def kind(self) -> Kind:
-        """Of the argument: the chains' responses and the path are enclosed in rationals."""
-        return _PROOF
+    kind: Kind = _PROOF
 
     @property
     def theorem(self) -> Theorem:
@@ -107,12 +107,13 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     longest = int(np.argmax(chains.degrees))
     fault = path_fault(run.leader.reference, chains, run.settings.horizon)
     if fault:
-        return _nothing(fault, "choose a smooth path, such as one of sines, or `waypoints`")
+        remedy = "choose a smooth path: sines of time need no remainder, and `waypoints` pass "
+        return _nothing(fault, f"{remedy}smoothly through the entries of a table")
     try:
         chain = run.chain(longest)
         gains = tuple(float(chain.gain(k)) for k in range(max(1, len(chain.powers) + 1)))
-        bounds = bounds_of(model, chains)
-        borders = None if bounds is None else [border_of(run, b) for b in bounds]
+        known = bounds_of(model, chains)
+        borders = None if known.bounds is None else [border_of(run, b) for b in known.bounds]
     except GainError as error:
         text = str(error).rstrip(".")
         remedy = "choose `roots` of a larger common unit" if "unit" in text else "use equal starts"
@@ -121,12 +122,11 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     number = gains[-1], ", ".join(f"{gain:.4g}" for gain in gains)
     inner = holds(Hypothesis.REGION, _PROOF, f"{text}size of the formation", *number)
     if borders is None:
-        name = f"`{type(model).__name__}`"
-        text = f"{name} does not state where its flat coordinates end"
-        return _nothing(text, "state `flat_chains` and `flat_bounds` in the model", inner)
+        remedy = "state `flat_chains` and `flat_bounds` in the model"
+        return _nothing(known.fault, remedy, inner)
     left = min((b.left for b in borders), default=Fraction(10**9))
     steepest = min((b.steepest for b in borders), default=math.inf)
-    lines = [inner, *_set_lines(run, borders)]
+    lines = [inner, *(_by(known.kind, model, line) for line in _set_lines(run, borders))]
     if any(line.fails for line in lines):
         return None, lines
     tube = Tube(
@@ -140,12 +140,24 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
         None,
         _graphs(run),
         run.network,
+        known.kind,
     )
     if brief:
         return tube, lines
     arrival = arrival_of(run, _positions(run))
     motor_load, line = motor_load_of(run)
-    return tube._replace(arrival=arrival, motor_load=motor_load), [*lines, line]
+    tube = tube._replace(arrival=arrival, motor_load=motor_load)
+    if motor_load is not None and line.kind is Kind.SAMPLES:
+        tube = tube._replace(kind=line.kind)
+    return tube, [*lines, line]
+
+
+def _by(kind: Kind, model: ControlAffine, line: Statement) -> Statement:
+    """Return a line that rests on what a model states of its flat coordinates."""
+    if kind is Kind.PROOF:
+        return line
+    text = f"{line.text}, if its borders are those that `{type(model).__name__}` states"
+    return dataclasses.replace(line, kind=kind, text=text)
 
 
 def _graphs(run: StoppingRun) -> tuple[str, str]:

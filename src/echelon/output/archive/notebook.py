@@ -1,10 +1,13 @@
-"""The HTML of a result in a notebook: outcome, a table of agents, and pictures."""
+"""The HTML of a result in a notebook: outcome, a table of agents, and pictures; or its replay."""
 
 import dataclasses
 import html
 from collections.abc import Iterator
 
+from echelon.core.errors import OutputError
+from echelon.experiments.results.dataset import STORED, recording_of
 from echelon.experiments.results.foreseen import foreseen
+from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import metrics
 from echelon.experiments.results.recording import Recording
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS
@@ -13,6 +16,7 @@ from echelon.output.plots.figure_files import html_image
 from echelon.output.plots.run_figures import figures
 from echelon.output.reports.causes import causes, grows
 from echelon.output.reports.run_report import labelled
+from echelon.output.viewer.replay import replay_page
 from echelon.simulation.engine.result import Result
 
 _COLUMNS = ("start_error", "final_error", "saturated")
@@ -24,9 +28,32 @@ def result_page(result: Result) -> str:
 
     Of many agents the table has the best, the median and the worst, like the report.
     """
-    title = result.provenance.get("scenario") or type(result.model).__name__
-    head = f"<b>{html.escape(title)}</b>: {html.escape(result.message)}"
-    return f"<p>{head}</p>{_causes(result)}{_table(result)}{_pictures(result)}"
+    head = f"<b>{html.escape(_name(result))}</b>: {html.escape(result.message)}"
+    numbers = "" if result in STORED else f"{_causes(result)}{_table(result)}"
+    return f"<p>{head}</p>{numbers}{_pictures(result)}"
+
+
+def _name(result: Result) -> str:
+    """Return the name of the scenario, or of the model."""
+    # The parts of a run from disk are not built, which executes code, only to display it.
+    if result in STORED:
+        return recording_of(result).name
+    return result.provenance.get("scenario") or type(result.model).__name__
+
+
+def result_replay(result: Result) -> str:
+    """Return the page of a run without its guarantee.
+
+    Raises:
+        OutputError: no frame is stored, or the run is too large for a page.
+        MissingExtraError: the page's three.js is not built.
+    """
+    if not len(result.times):
+        raise OutputError("the run has no stored frame; a page needs at least one.")
+    if result in STORED:
+        return replay_page(recording_of(result))
+    V = lyapunov(result)
+    return replay_page(dataclasses.replace(_recorded(result), lyapunov=V and V.value))
 
 
 def _causes(result: Result) -> str:
@@ -65,10 +92,15 @@ def _cells(result: Result) -> Iterator[tuple[str, ...]]:
 
 
 def _recorded(result: Result) -> Recording:
-    """Return the recording of a run without its promise, which takes seconds to compute."""
-    states = result.states
+    """Return the recording of a run, computed without its promise, which takes seconds."""
+    if result in STORED:
+        return recording_of(result)
+    states, name = result.states, _name(result)
+    run = foreseen(result.parts, result.settings, states[0], name)
+    ended = {"outcome": result.outcome.name.lower(), "message": result.message}
     return dataclasses.replace(
-        foreseen(result.parts, result.settings, states[0], ""),
+        run,
+        attributes=run.attributes | ended,
         times=result.times,
         states=states,
         inputs=result.inputs,

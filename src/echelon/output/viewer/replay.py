@@ -211,8 +211,13 @@ def _rate_in_words(promise: Mapping[str, Any]) -> str:
     )
 
 
-def _badge_of_run(run: Recording) -> dict[str, str]:
-    """Return the badge of a run, withdrawn if the guarantee does not cover the run."""
+def _badge_of_run(run: Recording) -> dict[str, str] | None:
+    """Return the badge of a run, withdrawn if the guarantee does not cover the run.
+
+    None where no guarantee was computed.
+    """
+    if not run.promise["sentence"]:
+        return None
     badge, outcome = promise_badge(run.promise), run.attributes.get("outcome")
     if badge["state"] != "holds" or outcome not in ("left_chart", "diverged"):
         return badge

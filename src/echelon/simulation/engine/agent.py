@@ -11,8 +11,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
+from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.inbox import Inbox, Message, NamedValues, Packet, Received, Stamps
+from echelon.agents.world.estimator import Estimate, Estimator
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.numerics import precision
@@ -100,6 +102,9 @@ class Agent:
         self._inbox = Inbox(
             self.neighbours, self._source_in(parts), *self._names, stamps=self._stamps
         )
+        sensors = self._loop.sensors
+        self._estimator = None if sensors is None else sensors.estimator
+        self._estimate: Estimate | None = None
         self._memory: Memory | None = None
         self._begun, self._time, self.blind = False, -math.inf, 0
         self._last: tuple[Array, Message | None] = np.array(self._loop.model.trim[1], float), None
@@ -109,10 +114,16 @@ class Agent:
         channel = self._loop.channel
         if channel is None:
             return None
-        size = packet_size(channel, *map(len, self._names))
+        size = packet_size(channel, *self._sizes)
         own = self.number if self.leads else None
         deviation = channel.messages is MessageContent.DEVIATION
         return Stamps(len(self.neighbours), leaders, size, own, deviation)
+
+    @property
+    def _sizes(self) -> tuple[int, int, int]:
+        """How many numbers a signal, a feed-forward and an input have."""
+        signal, forward = map(len, self._names)
+        return signal, forward, len(self._loop.model.input_names)
 
     def _source_in(self, parts: Parts) -> int | None:
         """Return whose feed-forward this agent uses; None for nobody's."""
@@ -136,7 +147,8 @@ class Agent:
             SimulationError: the state has another shape.
         """
         with precision("float64"):
-            signal = np.asarray(_signal(self._loop, self._law, self._own(self._state(x))))
+            own = self._own(self._measured(self._state(x))[0])
+            signal = np.asarray(_signal(self._loop, self._law, own))
         return self._message(signal) if np.isfinite(signal).all() else self._last[1]
 
     def step(self, t: float, x: ArrayLike) -> tuple[Array, Message | None]:
@@ -162,7 +174,8 @@ class Agent:
             self._stamps.clock = self._time
         row = 0 if self._schedule is None else self._schedule.row(t)
         with precision("float64"):
-            own, time = self._own(self._state(x)), jnp.asarray(self._time)
+            state, estimate = self._measured(self._state(x))
+            own, time = self._own(state), jnp.asarray(self._time)
             if self._stamps is None:
                 step = _step(
                     self._loop,
@@ -179,6 +192,8 @@ class Agent:
                 step = _late_step(self._loop, self.leads, *rows)
         if step.finite:
             self._memory, self._begun = step.action.memory, True
+            if estimate is not None and self._estimator is not None:
+                self._estimate = self._estimator.act(estimate, step.action.input)
             message = self._written(step)
             self._last = np.asarray(step.action.input), message
         else:
@@ -192,7 +207,7 @@ class Agent:
     def _mail(self, stamps: Stamps) -> tuple[Mail, Ages]:
         """Return what the agent keeps of what it received, and its ages (s)."""
         assert self._loop.channel is not None
-        packet, size = stamps.packet, packet_size(self._loop.channel, *map(len, self._names))
+        packet, size = stamps.packet, packet_size(self._loop.channel, *self._sizes)
         leader = self.number if self.leads else NOBODY
         leader = leader if packet is None else packet.leader
         content = np.zeros(size) if packet is None else np.asarray(packet.content)
@@ -235,6 +250,14 @@ class Agent:
             )
         return jnp.asarray(state, float)
 
+    def _measured(self, y: State) -> tuple[State, Estimate | None]:
+        """Return the state that the agent assumes at a measurement (n,), and its estimate."""
+        if self._estimator is None:
+            return y, None
+        model, before = self._loop.model, self._estimate
+        before = self._estimator.begin(model, y) if before is None else before
+        return _measure(self._estimator, model, before, y, jnp.asarray(not self._begun))
+
     def _own(self, state: State) -> "_OwnState":
         memory = self._memory if self._begun else _begin(self._loop, self._law, state)
         return _OwnState(state, jnp.asarray(self._loop.offsets[self.number]), memory)
@@ -274,6 +297,13 @@ class _OwnState(NamedTuple):
 @cached_jit
 def _begin(loop: Loop, law: Law, x: State) -> Memory:
     return law.begin(loop.model, x)
+
+
+@cached_jit
+def _measure(
+    estimator: Estimator, model: ControlAffine, before: Estimate, y: State, first: jax.Array
+) -> tuple[State, Estimate]:
+    return estimator.measure(model, before, y, first)
 
 
 @cached_jit
@@ -352,7 +382,7 @@ def _late_step(
     action = act(loop, law, view, own.memory, leads)
     content = mail.packet.content
     if leads:
-        content = content_of(loop, t, *own, signal, action.message)[None]
+        content = content_of(loop, t, *own, signal, action.message, action.input)[None]
     step = jnp.zeros((), jnp.int32)
     assert loop.channel is not None
     letter, _ = write(

@@ -111,7 +111,7 @@ class Laws(Drive):
         if network.messages is MessageContent.DEVIATION and preview and not self.leader.plans:
             raise SimulationError(
                 f"`prediction` of the network is `preview`, and a leader under the law "
-                f"`{type(self.leader).__name__}` has no plan; use `none`."
+                f"`{type(self.leader).__name__}` has no plan; use `packet`."
             )
         self.follower.check_late(graph, dt)
 

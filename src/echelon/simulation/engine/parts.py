@@ -37,6 +37,7 @@ class Parts:
 
     Raises:
         SimulationError: a part is not of the kind of its place.
+        ModelError: a spread or an error names no state and no group of states.
     """
 
     model: ControlAffine
@@ -48,11 +49,16 @@ class Parts:
     world: World = dataclasses.field(default_factory=World)
 
     def __post_init__(self) -> None:
-        """Check that each part is of the kind of its place."""
+        """Check that each part is of the kind of its place, and that names are states."""
         # The model is left out: `check_model` says more of what is wrong with one.
         kinds = {"graph": Graph, "formation": Formation, "drive": Drive, "world": World}
         for place, kind in kinds.items():
             check_kind(place, getattr(self, place), kind)
+        if isinstance(self.model, ControlAffine):
+            for named in (self.initial, self.start_error):
+                for name in named if isinstance(named, Mapping) else ():
+                    if isinstance(name, str):
+                        self.model.states_called(name)
 
     @property
     def information(self) -> Information:

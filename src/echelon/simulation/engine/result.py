@@ -13,7 +13,7 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.world.world import World
 from echelon.core.errors import Outcome
 from echelon.core.lazy_field import LazyField
-from echelon.core.pages import notebook_page
+from echelon.core.pages import CellPage, notebook_page
 from echelon.core.types import Array
 from echelon.simulation.engine.frame_numbers import FrameNumbers
 from echelon.simulation.engine.parts import Parts
@@ -140,6 +140,20 @@ class Result(FrameNumbers):
     def _repr_html_(self) -> str:
         """Return the run as a notebook displays it: a table with its picture."""
         return notebook_page("result", self)
+
+    def view(self, height: int = 560) -> CellPage:
+        """Return the replay of the run, which a notebook shows in a cell.
+
+        It states no guarantee, which takes seconds to compute; `echelon view` does.
+
+        Args:
+            height: pixels.
+
+        Raises:
+            OutputError: no frame is stored, or the run is too large for a page.
+            MissingExtraError: the page's three.js is not built.
+        """
+        return CellPage(notebook_page("replay", self), height)
 
     def with_provenance(self, **texts: str) -> "Result":
         """Return a copy with more provenance."""

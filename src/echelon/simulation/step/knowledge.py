@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from echelon.agents.network.channel import NEVER, Channel
 from echelon.agents.network.exchange import Difference, Exchange
-from echelon.core.types import Array, Scalar, State
+from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 from echelon.laws.law import Expected, LocalView, Memory
 from echelon.simulation.step.action import act
@@ -24,6 +24,10 @@ NOBODY = 2**30
 """The leader of an agent that has no packet, and more hops than any agent has."""
 HOP_LIFE = 10
 """Hop counts are used for this many times `forget`, so that losses do not change them."""
+
+_CARRIED_FULLY, _SLOWING = 0.4, 2.0
+"""s, for which a leader without a plan is taken to move on as it did, and the rate, 1/s, at which
+its motion slows down afterwards."""
 
 
 class Packets(NamedTuple):
@@ -112,11 +116,12 @@ def no_mail(readers: Readers, links: int, sent: Float[jax.Array, "N s"], packet:
     )
 
 
-def packet_size(channel: Channel, s: int, forward: int) -> int:
-    """Return how many numbers a packet has, for signals (s,) and a feed-forward (forward,)."""
+def packet_size(channel: Channel, s: int, forward: int, m: int) -> int:
+    """Return how many numbers a packet has, for signals (s,), a feed-forward and inputs (m,)."""
     if channel.messages is MessageContent.STATE:
         return forward
-    return s if channel.prediction is Prediction.PREVIEW else s + forward
+    more = {Prediction.PREVIEW: 0, Prediction.NONE: forward, Prediction.PACKET: forward + m}
+    return s + more[channel.prediction]
 
 
 def understand(
@@ -205,6 +210,7 @@ def content_of(
     memory: Memory,
     signal: Float[jax.Array, " s"],
     forward: Float[jax.Array, " k"],
+    u: Input,
 ) -> Float[jax.Array, " p"]:
     """Return what a leader says of itself, before its memory changes in this step."""
     channel = loop.channel
@@ -213,6 +219,8 @@ def content_of(
         return forward
     if channel.prediction is Prediction.NONE:
         return jnp.concatenate([signal, forward])
+    if channel.prediction is Prediction.PACKET:
+        return jnp.concatenate([signal, forward, u])
     deviation = loop.leader.deviation(loop.model, t, x, offset, memory)
     assert deviation is not None, "a channel with a preview has a leader with a plan"
     return deviation
@@ -234,10 +242,29 @@ def _leaders(
     elif channel.prediction is Prediction.NONE:
         signal, feedforward = jnp.split(packet.content, [sent.shape[1]], axis=1)
     else:
+        carries = channel.prediction is Prediction.PACKET
         rows = packet.content, jnp.where(ages < jnp.inf, ages, 0.0)
-        signal, feedforward = jax.vmap(lambda c, age: _expected(loop, t, c, age))(*rows)
+
+        def one(content: jax.Array, age: Scalar) -> tuple[jax.Array, jax.Array]:
+            if carries:
+                return _carried(loop, content, age, sent.shape[1])
+            return _expected(loop, t, content, age)
+
+        signal, feedforward = jax.vmap(one)(*rows)
     own = (packet.leader == readers.number)[:, None]
     return jnp.where(own | ~knows, sent, signal), jnp.where(knows, feedforward, 0.0)
+
+
+def _carried(
+    loop: Loop, content: Float[jax.Array, " p"], age: Scalar, s: int
+) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
+    """Return the signal and the feed-forward of a leader, from what it said an age (s) ago."""
+    m = len(loop.model.input_names)
+    signal, feedforward, u = content[:s], content[s:-m], content[-m:]
+    # Nobody knows where a leader is that was not heard for long: its motion slows down.
+    late = jnp.maximum(age - _CARRIED_FULLY, 0.0)
+    time = age - late + (1.0 - jnp.exp(-_SLOWING * late)) / _SLOWING
+    return loop.leader.carried(loop.model, signal, feedforward, u, time), feedforward
 
 
 def _expected(

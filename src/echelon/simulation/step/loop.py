@@ -113,12 +113,14 @@ class WorldState(NamedTuple):
         mail: what agents keep of those that they received, as `Mail`.
         motion: what the plants remember besides their states, as `MotionState`.
         measured: (d, N, n) the states of the last d steps, where agents measure theirs late.
+        estimates: of agents that estimate their states, as `Estimate`.
     """
 
     in_flight: PyTree = None
     mail: PyTree = None
     motion: PyTree = None
     measured: PyTree = None
+    estimates: PyTree = None
 
 
 class Moment(NamedTuple):

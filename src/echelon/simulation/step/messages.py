@@ -41,7 +41,9 @@ def begin_network(
     channel, readers = loop.channel, _all(loop)
     assert channel is not None
     links, s = len(loop.exchange.receivers), sent.shape[1]
-    mail = no_mail(readers, links, sent, packet_size(channel, s, forward))
+    mail = no_mail(
+        readers, links, sent, packet_size(channel, s, forward, len(loop.model.input_names))
+    )
     posts = channel.begin(Letters(sent, readers.number, mail.packet), links)
     return world._replace(in_flight=posts, mail=mail)
 
@@ -115,6 +117,7 @@ def send_messages(
     sent: Float[jax.Array, "N s"],
     difference: Difference,
     forward: Float[jax.Array, "L k"],
+    inputs: Float[jax.Array, "L m"],
 ) -> WorldState:
     """Return the world after a step in which agents may send.
 
@@ -127,12 +130,14 @@ def send_messages(
         sent: their signals.
         difference: of two signals.
         forward: of the leaders, from the inputs that they have just chosen.
+        inputs: of the leaders, as delivered.
     """
     channel, numbers = loop.channel, loop.leaders
     assert channel is not None
     t = now.step.astype(sent.dtype) * loop.motion.dt
     offsets = jnp.asarray(loop.offsets, sent.dtype)
-    rows = now.states[numbers], offsets[numbers], now.leader_memory, sent[numbers], forward
+    own = now.states[numbers], offsets[numbers], now.leader_memory
+    rows = *own, sent[numbers], forward, inputs
     content = jax.vmap(lambda *row: content_of(loop, t, *row))(*rows)
     content = jnp.zeros_like(mail.packet.content).at[numbers].set(content)
     letters, sends = write(

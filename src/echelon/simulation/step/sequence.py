@@ -38,6 +38,10 @@ def begin(loop: Loop, states: States) -> Moment:
         world = world._replace(motion=memory)
     if loop.sensors is not None:
         world = world._replace(measured=loop.sensors.begin(moment.states))
+        estimator = loop.sensors.estimator
+        if estimator is not None:
+            estimates = jax.vmap(lambda x: estimator.begin(loop.model, x))(moment.states)
+            world = world._replace(estimates=estimates)
     if loop.channel is not None:
         size = _feedforward_size(loop, moment)
         world = begin_network(loop, world, _sent(loop, moment)[0], size)
@@ -82,8 +86,11 @@ def control(loop: Loop, now: Moment) -> Control:
         followed = _act_all(loop, now, z, loop.follower, *rows)
     world = now.world
     if knowledge is not None and mail is not None:
-        world = send_messages(loop, exchange, now, mail, knowledge, sent, difference, led.message)
+        said = led.message, led.input
+        world = send_messages(loop, exchange, now, mail, knowledge, sent, difference, *said)
     u = jnp.concatenate([led.input, followed.input])[loop.order]
+    if loop.sensors is not None and loop.sensors.estimator is not None:
+        world = world._replace(estimates=jax.vmap(loop.sensors.estimator.act)(world.estimates, u))
     desired = jnp.concatenate([led.desired, followed.desired])[loop.order]
     limited, cut = limit_sides(u, desired)
     return Control(u, limited.any(axis=1), cut.astype(jnp.int8), led.memory, followed.memory, world)
@@ -94,7 +101,13 @@ def _measured(loop: Loop, now: Moment) -> Moment:
     if loop.sensors is None:
         return now
     states, last = loop.sensors.read(now.world.measured, now.states, now.step)
-    return now._replace(states=states, world=now.world._replace(measured=last))
+    world, estimator = now.world._replace(measured=last), loop.sensors.estimator
+    if estimator is not None:
+        states, estimates = jax.vmap(
+            lambda before, y: estimator.measure(loop.model, before, y, now.step == 0)
+        )(world.estimates, states)
+        world = world._replace(estimates=estimates)
+    return now._replace(states=states, world=world)
 
 
 def _lead(loop: Loop, now: Moment, z: Float[jax.Array, "N s"]) -> Action:

@@ -1,15 +1,33 @@
 """How a run is computed."""
 
+import functools
 import math
 import numbers
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.limits import MOST_STEPS, horizon_fault
 from echelon.core.numerics import INTEGRATORS, Precision
 from echelon.core.words import ENGINES
 
+_T = TypeVar("_T", bound="Settings")
 
+
+def _checked(cls: type[_T]) -> type[_T]:
+    """Return a class of tuples whose constructor checks the numbers; `_replace` does not."""
+    create = cls.__new__
+
+    @functools.wraps(create)
+    def new(own: type[_T], *arguments: Any, **named: Any) -> _T:
+        settings = create(own, *arguments, **named)
+        settings.check()
+        return settings
+
+    setattr(cls, "__new__", new)
+    return cls
+
+
+@_checked
 class Settings(NamedTuple):
     """How a run is computed.
 
@@ -28,6 +46,9 @@ class Settings(NamedTuple):
             steps them.
         steady_window: the last part of the run that counts as steady, s; a fifth when left out.
         substeps: steps of the integrator in each `dt`, over which the inputs are held.
+
+    Raises:
+        SimulationError: a number is out of range.
     """
 
     horizon: float

@@ -76,6 +76,24 @@ class Gain(eqx.Module):
         self.coupling, self.method, self.certificate = float(coupling), method, certificate
         self.inner = inner
 
+    def K(self, model: ControlAffine) -> Array:
+        """Return K (m, n) of the law linearized at the trim, u = u* - K z, in physical inputs.
+
+        K = S c R^-1 (g(x*) S)'P, z (n,) is the sum of a_ij (y_i - y_j) over neighbours; without the
+        inner loop, which is `inner`.
+
+        Raises:
+            GainError: the gain is not of the states and inputs of this model.
+        """
+        B = linearize(model).B
+        if self.P.shape[0] != B.shape[0] or self.R.shape[0] != B.shape[1]:
+            raise GainError(
+                f"the gain is of {self.P.shape[0]} states and {self.R.shape[0]} inputs, and "
+                f"`{type(model).__name__}` has {B.shape[0]} and {B.shape[1]}."
+            )
+        scale = np.asarray(model.input_scale, np.float64)
+        return self.coupling * scale @ self.R_inverse @ B.T @ self.P
+
     def inner_loop(self, model: ControlAffine, x: State, heading: Scalar | None = None) -> Input:
         """Return kappa(x) = -K (x - x*), the inner loop, for a heading; zero without one."""
         if self.inner is None:

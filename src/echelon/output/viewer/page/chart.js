@@ -185,7 +185,7 @@ class Chart {
     for (const mark of this.marks) take(this.log ? Math.log10(mark.value) : mark.value);
     if (!(low <= high)) return this.log ? [-1, 0] : [0, 1];
     if (this.log) return high - low > 2 ? [low - 0.15, high + 0.25] : [Math.floor(low - 0.05), Math.ceil(high + 0.05)];
-    const margin = 0.06 * (high - low) || Math.max(1e-6, 0.1 * Math.abs(high));
+    const margin = 0.06 * (high - low) || 0.1 * Math.abs(high) || 1;
     return [low - margin, high + margin];
   }
 
@@ -248,8 +248,9 @@ class Chart {
   nameMarks(pen, w) {
     for (const mark of this.marks) {
       const y = this.y(this.log ? Math.log10(mark.value) : mark.value);
-      Object.assign(pen, { strokeStyle: themeColour("--panel"), fillStyle: themeColour("--cut"), lineWidth: 4, lineJoin: "round", textAlign: "right", textBaseline: mark.below ? "top" : "bottom" });
-      const at = [mark.name, w - MARGIN.right - 2, y + (mark.below ? 2 : -2)];
+      Object.assign(pen, { strokeStyle: themeColour("--panel"), fillStyle: themeColour("--cut"), lineWidth: 4, lineJoin: "round", textAlign: "right" });
+      const below = mark.below || y < MARGIN.top + 14, at = [mark.name, w - MARGIN.right - 2, y + (below ? 2 : -2)];
+      pen.textBaseline = below ? "top" : "bottom";
       pen.strokeText(...at);
       pen.fillText(...at);
     }

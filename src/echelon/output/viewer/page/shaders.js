@@ -152,7 +152,7 @@ out float place;
 uniform float goals;
 void main() {
   place = along;
-  gl_Position = goals > 0.0 ? ribbon(first, second, corner, 0.7) : vec4(2.0, 2.0, 2.0, 1.0);
+  gl_Position = goals > 0.0 ? ribbon(first, second, corner, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
 }`,
   fragmentShader: `in float place; out vec4 colour; uniform vec3 goalColour;
 void main() { if (mod(place, 2.0) > 0.5) discard; colour = vec4(goalColour, 0.55); }`,

@@ -158,6 +158,7 @@ function ticks(low, high, step) {
 
 function format(value, step) {
   const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+  if (digits > 4 || step >= 1e5) return Math.abs(value) < step / 2 ? "0" : brief(value);
   return (Math.abs(value) < step / 2 ? 0 : value).toFixed(digits).replace("-", "\u2212");
 }
 
