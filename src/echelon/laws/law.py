@@ -314,6 +314,20 @@ class Law(eqx.Module):
         """Return one agent's physical input (m,), before actuator limits, and its next memory."""
 
 
+def declares(law: Law, name: str) -> bool:
+    """Tell whether a declaration of a law, such as `metric`, is of the law that runs.
+
+    A subclass that replaces a method inherits what its base declares about the replaced one.
+    """
+    kinds = type(law).__mro__
+    place = next(k for k, kind in enumerate(kinds) if name in vars(kind))
+    return not any(
+        not key.startswith("_") and key != "prover" and callable(getattr(kinds[place], key, None))
+        for kind in kinds[:place]
+        for key in vars(kind)
+    )
+
+
 def check_gain_fits(
     law: Law, model: ControlAffine, P_shape: tuple[int, ...], R_shape: tuple[int, ...]
 ) -> None:

@@ -69,10 +69,10 @@ class Tube(NamedTuple):
         text = f"{self.kind.value}: errors converge to zero from {self.who}, for any number of "
         text += f"agents and {self.graphs[0]}, if the model is exact and {self._received()}. "
         text += f"On {self.graphs[1]} they decay at {self.rate:.3g} 1/s or faster eventually"
-        text += "" if self.network is None else self.network.faster()
-        if self.arrival is not None:
+        if self.network is not None:
+            text += f"{self.network.faster()}. {self.network.sentence(self.arrival)}"
+        elif self.arrival is not None:
             text += f"; from these starts all stay within 1 cm after {self.arrival:.3g} s"
-        text += "" if self.network is None else f". {self.network.sentence()}"
         return f"{text}." if self.motor_load is None else f"{text}. {self.motor_load.sentence()}"
 
     def _received(self) -> str:
