@@ -12,8 +12,14 @@ from forgeries import at, forged, places, replaced
 import echelon as ech
 from echelon.experiments.results.dataset import OBSERVED, statement, summary
 from echelon.experiments.scenario.scenario import bundled_scenarios
-from echelon.experiments.studies.recomputation import compare_claims, compare_gain
+from echelon.experiments.studies.design import with_gain
+from echelon.experiments.studies.recomputation import (
+    compare_claims,
+    compare_gain,
+    with_leader_gain,
+)
 from echelon.guarantees.verifier.stored_values import compare_values
+from echelon.synthesis.gains import contraction
 from echelon.synthesis.gains.gain_file import save_gain
 
 SMALL = {
@@ -115,6 +121,55 @@ def forgeries_of(case, pick):
     count, missed = accepted(document, experiment, name, pick)
     assert missed == []
     return count
+
+
+SOLVED = SMALL | {
+    "reference": {"name": "circle", "radius": 1.0, "rate": 0.3},
+    "leader": {
+        "law": "tracking",
+        "gain": {
+            "method": "contraction",
+            "domain": {"position": 3.0, "velocity": 4.0},
+            "rate": 0.3,
+        },
+    },
+}
+
+
+def test_a_gain_of_the_leader_is_that_of_its_file_where_solvers_end_elsewhere(monkeypatch):
+    document = stated(ech.build(ech.scenario_from_mapping(SOLVED)), "small")
+    solve, noise = contraction.contraction, np.random.default_rng(0).normal(size=(4, 4)) * 3e-5
+
+    def another_machine(*arguments, **named):
+        metric = solve(*arguments, **named)
+        return metric._replace(P=metric.P * (1.0 + noise + noise.T))
+
+    monkeypatch.setattr(contraction, "contraction", another_machine)
+    experiment = ech.build(ech.scenario_from_mapping(SOLVED))
+    # By its own solution the other machine would call an honest file a forgery.
+    assert refused(compare_claims(document, experiment, "small"))
+
+    def verified(document):
+        own, findings = with_leader_gain(experiment, document["leader_gain"])
+        return refused([*findings, *compare_claims(document, own, "small")])
+
+    assert verified(document) == []
+    P = np.array(document["leader_gain"]["P"])
+    for false in ((P * 1.01).tolist(), (P * 1.0001).tolist(), (-P).tolist(), P[:2].tolist(), "P"):
+        forged_gain = document["leader_gain"] | {"P": false}
+        assert verified(document | {"leader_gain": forged_gain})
+    assert verified(document | {"leader_gain": None})
+
+
+def test_a_leader_that_reacts_does_so_by_the_gain_of_its_followers():
+    leader = {"law": "tracking", "reacts": True}
+    scenario = ech.scenario_from_mapping(SOLVED | {"leader": leader})
+    parts = ech.build(scenario).parts
+    gain = ech.synthesize(parts.model, parts.graph, ech.gains.Riccati(coupling=9.0))
+    drive = with_gain(parts, gain).drive
+    leader = drive.leader if isinstance(drive, ech.Laws) else None
+    assert isinstance(leader, ech.laws.Tracking) and leader.reaction is not None
+    assert (leader.reaction.P == gain.P).all() and leader.reaction.coupling == 9.0
 
 
 def test_all_that_a_check_prints_is_compared():

@@ -169,6 +169,7 @@ def test_no_code_is_executed_for_the_frames(own, here):
     other = ech.load(folder)
     assert set(ech.figures(other)) and len(ech.table(other)) == 3 * len(result.times)
     assert ech.dataset(other).identical(ech.dataset(result)) and repr(other) == repr(result)
+    assert "The run reached its horizon." in other._repr_html_()
     with pytest.raises(ech.errors.OutputError, match="or were changed"):
         other.parts
 

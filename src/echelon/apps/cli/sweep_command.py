@@ -34,6 +34,12 @@ def sweep(
     out: options.FolderOption = None,
     resume: options.ResumeOption = None,
     force: options.ForceOption = False,
+    keep_states: Annotated[
+        int | None,
+        typer.Option(
+            metavar="K", min=1, help="Store states and inputs of every K-th step of each run."
+        ),
+    ] = None,
     threads: Annotated[
         int | None, typer.Option(min=1, help="Threads of native code (default: one per processor).")
     ] = None,
@@ -44,7 +50,7 @@ def sweep(
     as_json: options.JsonOption = False,
 ) -> None:
     """Run a scenario for all combinations of values; write the numbers of all runs as a dataset."""
-    check_inputs("sweep", scenario, resume, over, set_, out, force)
+    check_inputs("sweep", scenario, resume, over, set_, out, force, keep_states)
     if cluster is not None:
         from echelon.experiments.sweeps.cluster import check_scheduler
 
@@ -52,18 +58,25 @@ def sweep(
     from echelon.output.archive.folder import BATCHES, writing
 
     if resume is None:
-        plan, batches, job = _new_sweep(str(scenario), over or [], set_ or [], out, force)
+        plan, batches, job = _new_sweep(
+            str(scenario), over or [], set_ or [], out, force, keep_states
+        )
     else:
         plan, batches, job = _unfinished_sweep(resume)
     with writing(job.folder, BATCHES), STOP.hold():
         with job.cleanup():
             results = _compute(plan, batches, threads, cluster, as_json)
-        _write(plan, job, results, figures, as_json)
+        _write(plan, job, batches, results, figures, as_json)
     raise typer.Exit(STOP.exit_code)
 
 
 def _new_sweep(
-    name: str, over: Sequence[str], changes: Sequence[str], out: Path | None, force: bool
+    name: str,
+    over: Sequence[str],
+    changes: Sequence[str],
+    out: Path | None,
+    force: bool,
+    keep_states: int | None,
 ) -> "tuple[Sweep, Batches, Job]":
     """Return a sweep and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
@@ -76,7 +89,7 @@ def _new_sweep(
     from echelon.output.archive.folder import BATCHES, claim_folder
     from echelon.output.archive.sweep_folder import Batches
 
-    plan = Sweep(scenario, axes)
+    plan = Sweep(scenario, axes, keep_states)
     batches = Batches(claim_folder(f"sweep-{scenario.name}", out, force, BATCHES))
     job = Job("sweep", batches.chunks)
     with job.cleanup():
@@ -108,7 +121,8 @@ def _compute(
 
     def store(batch: "SweepBatch") -> None:
         batches.write(batch)
-        results.append(batch)
+        # In the folder, since those of all batches would fill the memory.
+        results.append(batch._replace(frames=None))
 
     def progress(done: int, runs: int) -> None:
         STATUS.count(done, runs, "runs")
@@ -127,7 +141,12 @@ def _compute(
 
 
 def _write(
-    plan: "Sweep", job: Job, results: "Sequence[SweepBatch]", figures: bool, quiet: bool
+    plan: "Sweep",
+    job: Job,
+    batches: "Batches",
+    results: "Sequence[SweepBatch]",
+    figures: bool,
+    quiet: bool,
 ) -> None:
     """Write and print the results; the batches stay until all runs are in the dataset."""
     from echelon.experiments.sweeps.sweep_dataset import dataset_of
@@ -141,6 +160,7 @@ def _write(
     complete = sum(batch.runs for batch in results) == plan.count
     write_sweep(data, text, job.folder, figures and complete)
     if complete:
+        batches.write_frames(plan)
         job.chunks.remove()
     if quiet:
         print(json.dumps({"folder": str(job.folder), **sweep_mapping(data)}, indent=2))

@@ -17,6 +17,7 @@ from echelon.experiments.results.agent_metrics import (
     representatives,
     steady_error,
 )
+from echelon.experiments.results.avoidance import avoidance
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.labelled_parts import labelled_parts
 from echelon.experiments.results.lyapunov import lyapunov
@@ -26,9 +27,13 @@ from echelon.experiments.results.recording import Recording, recording
 from echelon.experiments.results.run_groups import SUM, group_of
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
 from echelon.guarantees.promises.promise import promise
+from echelon.laws.law import gain_of
+from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
+from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.settings import Settings
+from echelon.synthesis.gains.gain import Gain
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -46,7 +51,9 @@ def dataset(result: Result) -> "xr.Dataset":
     references'), `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`, `edge_agents`,
     `edge_weight`, `edge_heard` (whether each end of an edge receives from the other), of a
     switching graph `edge_weight_then` from each `stretch_start` on with its `graph_period`
-    (infinite without repetition), the gain's `P`, `R` and `coupling`, the poles of the checked
+    (infinite without repetition), of agents that keep apart `scaled_distance` and `active_rows` in
+    slices of the run from `slice_start` on with `touching_distance` and `kept_distance`,
+    the gain's `P`, `R` and `coupling`, the poles of the checked
     modes (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`, for directed graphs with the
     imaginary part `mode_eigenvalue_imaginary`), and the limits of the inputs u, `limit_low` <=
     `limit_matrix` u <= `limit_high`. Over a network that is late also `age` (of the oldest message
@@ -79,6 +86,7 @@ def _labelled(result: Result) -> Labelled:
         **_followed(result),
         **_poles(result),
         **_messages(result),
+        **_avoidance(result),
     }
     v = lyapunov(result)
     if v is not None:
@@ -120,6 +128,20 @@ def _messages(result: Result) -> Variables:
         "edge_age": (link, traffic.ages, seconds),
         "edge_lost": (link, traffic.losses),
         "forget": ((), network.forget, seconds),
+    }
+
+
+def _avoidance(result: Result) -> Variables:
+    """Return how agents kept apart; nothing where they do not."""
+    numbers, meters = avoidance(result), {"units": "m"}
+    if numbers is None:
+        return {}
+    return {
+        "slice_start": ("slice", numbers.times, {"units": "s"}),
+        "scaled_distance": ("slice", numbers.distance, meters),
+        "active_rows": ("slice", numbers.active),
+        "touching_distance": ((), numbers.touching, meters),
+        "kept_distance": ((), numbers.kept, meters),
     }
 
 
@@ -204,18 +226,24 @@ def statement(parts: Parts, settings: Settings, name: str) -> JsonObject:
         "dt_s": settings.dt,
         "seed": settings.seed,
         **parts.world.describe(parts.model),
-        "gain": None
-        if gain is None
-        else {
-            "method": gain.method,
-            "coupling": gain.coupling,
-            "P": gain.P.tolist(),
-            "R": gain.R.tolist(),
-        },
+        "gain": _gain_numbers(gain),
+        "leader_gain": _gain_numbers(leader_gain_of(parts.drive)),
         "promise": promise(parts, settings).as_mapping(),
         "lambda_min": spectrum.low,
         "lambda_max": spectrum.high,
     }
+
+
+def _gain_numbers(gain: Gain | None) -> JsonObject | None:
+    if gain is None:
+        return None
+    numbers = {"P": gain.P.tolist(), "R": gain.R.tolist()}
+    return {"method": gain.method, "coupling": gain.coupling, **numbers}
+
+
+def leader_gain_of(drive: Drive) -> Gain | None:
+    """Return the leaders' own gain; None without one."""
+    return gain_of(drive.leader) if isinstance(drive, Laws) else None
 
 
 _NUMBERS = tuple(x.key or name for name, x in shown_in(RUN_NUMBERS, Shown.SUMMARY).items())

@@ -57,15 +57,12 @@ class Labelled(NamedTuple):
         file = io.BytesIO()
         with h5netcdf.File(file, "w") as written:
             for name, part in self._split(group_of or (lambda *_: "")).items():
-                part._write(written.create_group(name) if name else written)
-            for name, value in self.attributes.items():
-                plain = value if isinstance(value, str) else _numeric(name, np.atleast_1d(value))
-                written.attrs[name] = plain
+                part.write(written.create_group(name) if name else written)
         return file.getvalue()
 
     def _split(self, group_of: "GroupOf") -> "dict[str, Labelled]":
         """Return the arrays of each group, the root first."""
-        groups, used = {"": Labelled({}, {}, {})}, dict[str, set[str]]()
+        groups, used = {"": Labelled({}, {}, self.attributes)}, dict[str, set[str]]()
         for name, part in self.variables.items():
             over = _whole(name, part)[0]
             group = group_of(name, over)
@@ -78,8 +75,8 @@ class Labelled(NamedTuple):
                 groups.setdefault(group, Labelled({}, {}, {})).coordinates[name] = part
         return groups
 
-    def _write(self, place: "h5netcdf.Group") -> None:
-        """Write all variables and coordinates into a group."""
+    def write(self, place: "h5netcdf.Group") -> None:
+        """Write all variables, coordinates and attributes into a group."""
         labels = set(self._labels())
         for name, part in {**self.variables, **self.coordinates}.items():
             dimensions, values, attributes = _whole(name, part)
@@ -89,6 +86,9 @@ class Labelled(NamedTuple):
         # Labels that no variable names are an attribute of the group.
         if labels:
             place.attrs["coordinates"] = " ".join(sorted(labels))
+        for name, value in self.attributes.items():
+            plain = value if isinstance(value, str) else _numeric(name, np.atleast_1d(value))
+            place.attrs[name] = plain
 
     def _labels(self, dimensions: tuple[str, ...] | None = None) -> list[str]:
         """Return the coordinates whose name is not that of their dimension, of these dimensions."""

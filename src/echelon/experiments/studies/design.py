@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
@@ -20,6 +21,7 @@ from echelon.experiments.scenario.yaml import Fault
 from echelon.experiments.studies.speedup import speedup
 from echelon.guarantees.promises.promise import LawDesign, Promise, promise, prover_of
 from echelon.laws.consensus import Consensus
+from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates import margins
@@ -244,9 +246,14 @@ def _missing_keys(method: str, missing: list[str], parts: Parts) -> str:
 
 
 def with_gain(parts: Parts, gain: Gain) -> Parts:
-    """Return the parts with another gain and the same feed-forward."""
+    """Return the parts with another gain and the same feed-forward.
+
+    A leader that reacts to its neighbours does so by this gain.
+    """
     drive = parts.drive
     law = Consensus(gain, drive.feedforward, drive.trimmed, drive.frame)
+    if isinstance(drive, Laws) and getattr(drive.leader, "reaction", None) is not None:
+        drive = Laws(eqx.tree_at(lambda leader: leader.reaction, drive.leader, gain), law)
     return parts.replace(drive=drive.with_follower(law))
 
 

@@ -9,11 +9,12 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 
 from echelon.core.errors import GainError
 from echelon.core.types import JsonObject
-from echelon.experiments.results.dataset import OBSERVED, statement
+from echelon.experiments.results.dataset import OBSERVED, leader_gain_of, statement
 from echelon.experiments.results.labelled_parts import labelled_parts
 from echelon.experiments.results.recording import recording_with_data
 from echelon.experiments.scenario.build import Experiment, build
@@ -29,7 +30,9 @@ from echelon.guarantees.verifier.strict_json import parse_json, read_json
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
+from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.gain_file import gain_as_mapping, load_gain
 
 _SOLVED = 1e-3
@@ -57,7 +60,10 @@ def recompute(
         with contextlib.suppress(GainError):
             experiment = with_gain_of(experiment, gain)
     if claims is not None:
-        yield from compare_claims(read_json(claims), experiment, scenario.name)
+        stored = read_json(claims)
+        experiment, findings = with_leader_gain(experiment, stored.get("leader_gain"))
+        yield from findings
+        yield from compare_claims(stored, experiment, scenario.name)
     if data is not None:
         yield from _compare_data(data, scenario, experiment)
 
@@ -104,6 +110,34 @@ def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Ite
         value = statement(*experiment, name)
         stored = {key: stored[key] for key in stored if key not in OBSERVED}
     yield from compare_values("", stored, _as_json(value))
+
+
+def with_leader_gain(experiment: Experiment, stored: object) -> tuple[Experiment, list[Finding]]:
+    """Return the parts with the gain that a summary states of the leaders, and what is compared.
+
+    It must be that of the scenario up to what differs between solvers.
+    """
+    drive = experiment.parts.drive
+    gain = leader_gain_of(drive)
+    if gain is None or not isinstance(stored, dict) or not {"P", "R"} <= stored.keys():
+        return experiment, []
+    numbers = {"P": gain.P.tolist(), "R": gain.R.tolist()}
+    theirs = {name: stored[name] for name in numbers}
+    findings = list(compare_values("leader_gain", theirs, numbers, _SOLVED))
+    with contextlib.suppress(GainError):
+        if not any(each.verdict == "refused" for each in findings):
+            P, R = (np.array(theirs[name], float) for name in numbers)
+            own = Gain(P, R, gain.coupling, gain.method, gain.certificate, gain.inner)
+            experiment = experiment._replace(parts=_led_by(experiment.parts, own))
+    return experiment, findings
+
+
+def _led_by(parts: Parts, gain: Gain) -> Parts:
+    """Return the parts with another gain of the leaders."""
+    drive = parts.drive
+    assert isinstance(drive, Laws)
+    leader = eqx.tree_at(lambda law: law.gain, drive.leader, gain)
+    return parts.replace(drive=Laws(leader, drive.follower))
 
 
 def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import NamedTuple, final
+from typing import TYPE_CHECKING, NamedTuple, final
 
 import numpy as np
 
@@ -10,6 +10,13 @@ from echelon.core.errors import ScenarioError
 from echelon.core.limits import excess_runs
 from echelon.experiments.scenario.scenario import Scenario, with_overrides
 from echelon.experiments.sweeps.axes import SEED, Axis
+
+if TYPE_CHECKING:
+    from echelon.experiments.scenario.build import Experiment
+    from echelon.experiments.sweeps.frames import FrameShape
+
+_SHAPING = ("model", "graph", "simulation")
+"""The sections on which agents, states and times of a run depend."""
 
 
 class SweepRun(NamedTuple):
@@ -36,14 +43,20 @@ class Sweep:
     Args:
         scenario: what does not vary.
         axes: the keys that vary, with their values.
+        every: store the states and inputs of every so-manieth step of each run; None stores none.
 
     Raises:
-        ScenarioError: there are too many runs, or a value makes a scenario with faults.
+        ScenarioError: there are too many runs, or a value makes a scenario with faults; or states
+            are stored, and a value changes the agents, states or times of a run.
     """
 
-    def __init__(self, scenario: Scenario, axes: tuple[Axis, ...]) -> None:
+    def __init__(
+        self, scenario: Scenario, axes: tuple[Axis, ...], every: int | None = None
+    ) -> None:
         """Check all values, each with the first ones of the other axes."""
-        self.scenario, self.axes = scenario, axes
+        self.scenario, self.axes, self.every = scenario, axes, every
+        if every is not None and every < 1:
+            raise ScenarioError(f"`keep_states` is {every}, and must be a whole number from 1 on.")
         self._check_size(0)
         for axis in axes:
             # A seed is a whole number from 0 on: if the ends of a range are, all are.
@@ -52,6 +65,11 @@ class Sweep:
             for k in {0, last} if ends else range(last + 1):
                 self._varied([a.override(k if a is axis else 0) for a in axes])
         self._check_size(self._columns())
+        self._check_frames()
+
+    def __getstate__(self) -> dict[str, object]:
+        """Return what a worker needs, which builds the parts by itself."""
+        return {name: value for name, value in vars(self).items() if name != "first_built"}
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -105,10 +123,36 @@ class Sweep:
         if excess is not None:
             raise ScenarioError(f"the sweep is too large: {excess}.")
 
-    def _columns(self) -> int:
-        """Return how many values are stored of a run."""
+    @cached_property
+    def first_built(self) -> "Experiment":
+        """The parts and settings of the first case."""
         from echelon.experiments.scenario.build import build
+
+        return build(self.case((0,) * len(self.axes)))
+
+    @cached_property
+    def frames(self) -> "FrameShape | None":
+        """The frames that are stored of each run; None if none are."""
+        from echelon.experiments.sweeps.frames import FrameShape
+
+        return None if self.every is None else FrameShape.of(self.first_built, self.every)
+
+    def _check_frames(self) -> None:
+        """Check that all values of the keys on which the shape of a run depends leave it."""
+        if self.frames is None or self.every is None:
+            return
+        from echelon.experiments.scenario.build import build
+
+        for place, axis in enumerate(self.axes):
+            if axis.key.partition(".")[0] not in _SHAPING:
+                continue
+            for k in range(1, len(axis.values)):
+                case = self.case(tuple(k if at == place else 0 for at in range(len(self.axes))))
+                self.frames.check(type(self.frames).of(build(case), self.every), axis.key)
+
+    def _columns(self) -> int:
+        """Return how many values are stored of a run, without its frames."""
         from echelon.experiments.sweeps.numbers import AGENT_COLUMNS, RUN_COLUMNS, WORDS
 
-        agents = build(self.case((0,) * len(self.axes))).parts.graph.agents
+        agents = self.first_built.parts.graph.agents
         return len(RUN_COLUMNS) + len(WORDS) + len(AGENT_COLUMNS) * agents

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from echelon.core.errors import ScenarioError
+from echelon.core.limits import excess_runs
 from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
 from echelon.experiments.sweeps.axes import axes_of
 from echelon.experiments.sweeps.plan import Sweep
@@ -19,7 +21,10 @@ Keep: TypeAlias = Callable[[SweepBatch], None]
 
 
 def sweep(
-    scenario: ScenarioLike, over: Mapping[str, Iterable[Any]], threads: int | None = None
+    scenario: ScenarioLike,
+    over: Mapping[str, Iterable[Any]],
+    threads: int | None = None,
+    keep_states: int | None = None,
 ) -> "xr.Dataset":
     """Run a scenario with all combinations of values of some of its keys.
 
@@ -29,15 +34,23 @@ def sweep(
             2]}`; a key's parts are joined by dots.
         threads: threads of native code; by default one for each processor. No number depends on
             them.
+        keep_states: store the states and inputs of every so-manieth step of each run, and of its
+            end; by default none.
 
     Returns:
         A dataset with a dimension for each key, and `agent`: outcomes, errors, settling times,
-        saturation, and the guarantee of each run.
+        saturation, and the guarantee of each run. With `keep_states` also `states` (key, .., time,
+        agent, state) and `inputs` (key, .., time, agent, input), NaN after the end of a run that
+        ended early.
 
     Raises:
-        ScenarioError: a key is unknown, a value is not allowed, or there are too many runs.
+        ScenarioError: a key is unknown, a value is not allowed, or there are too many runs or
+            stored states; or states are stored, and a value changes their number or times.
     """
-    plan = Sweep(as_scenario(scenario), axes_of(over))
+    plan = Sweep(as_scenario(scenario), axes_of(over), keep_states)
+    excess = None if plan.frames is None else excess_runs(plan.count, plan.frames.numbers)
+    if excess is not None:
+        raise ScenarioError(f"the sweep is too large: {excess}; `echelon sweep` stores on disk.")
     batches = list[SweepBatch]()
     compute(plan, batches.append, threads=threads)
     return dataset_of(plan, batches)

@@ -8,11 +8,12 @@ import numpy as np
 from echelon.core.errors import Outcome
 from echelon.core.provenance import versions
 from echelon.core.types import Array, JsonObject
-from echelon.experiments.results.labelled import Variables
+from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.quantity import ERROR, Quantity
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps.axes import Axis
+from echelon.experiments.sweeps.frames import FrameShape, labelled_frames
 from echelon.experiments.sweeps.numbers import (
     AGENT_COLUMNS,
     MISSING,
@@ -61,11 +62,32 @@ def dataset_of(plan: Sweep, batches: "Sequence[SweepBatch]") -> "xr.Dataset":
         dims = (*keys, "agent") if inner else keys
         variables[name] = (dims, _arranged(plan, whole), _attributes(name))
     _measure(variables)
-    coordinates = {axis.key: _values(axis) for axis in plan.axes} | {"agent": np.arange(agents)}
+    coordinates = axis_values(plan) | {"agent": np.arange(agents)}
+    frames = [batch.frames for batch in batches if batch.frames is not None]
+    if plan.frames is not None and frames and len(frames) == len(batches):
+        stored = _all_frames(plan, plan.frames, batches)
+        variables |= stored.variables
+        coordinates |= stored.coordinates
     attributes = {f"version_{name}": text for name, text in versions().items()}
     attributes |= {"scenario": plan.scenario.name, "scenario_text": plan.scenario.text}
     attributes["over"] = "\n".join(axis.text for axis in plan.axes)
     return xr.Dataset(variables, coordinates, attributes)
+
+
+def axis_values(plan: Sweep) -> Variables:
+    """Return the values of each key."""
+    return {axis.key: _values(axis) for axis in plan.axes}
+
+
+def _all_frames(plan: Sweep, shape: FrameShape, batches: "Sequence[SweepBatch]") -> Labelled:
+    """Return the frames of all batches in the order of the axes; NaN of runs in no batch."""
+    whole = dict[str, Array]()
+    for name, empty in shape.stored([]).items():
+        rows = np.full((plan.count, *empty.shape[1:]), np.nan)
+        for batch in batches:
+            rows[batch.first : batch.first + batch.runs] = (batch.frames or {})[name]
+        whole[name] = _arranged(plan, rows)
+    return labelled_frames(plan, axis_values(plan), whole)
 
 
 def _measure(variables: Variables) -> None:

@@ -7,6 +7,7 @@ from typing import NamedTuple, final
 from echelon.core.errors import EchelonError, Outcome
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import Experiment, build
+from echelon.experiments.sweeps.frames import StoredFrames
 from echelon.experiments.sweeps.numbers import Columns, columns_of, numbers_of, refused
 from echelon.experiments.sweeps.plan import Sweep, SweepRun
 from echelon.guarantees.promises.promise import Promise, promises
@@ -18,15 +19,21 @@ _AGENT_STEPS, _MOST, _LEAST = 20_000_000, 2_500, 16
 """Size of a batch: one or two seconds of native code, and at least one run for each vector lane."""
 _SLOWER = 20
 """Factor by which JAX is slower than native code."""
+_NUMBERS = 32 * 2**20
+"""Most numbers of the frames in a batch, where frames are stored."""
 _FRAMES = 20
 """Frames of a run checked for numbers that are not finite or exceed native code's range."""
 
 
 class SweepBatch(NamedTuple):
-    """Consecutive runs of a sweep: the number of the first one, and their columns of numbers."""
+    """Consecutive runs of a sweep: the number of the first one, their numbers and their frames.
+
+    `frames` is None if none are stored, or if they are in a file.
+    """
 
     first: int
     columns: Columns
+    frames: StoredFrames | None = None
 
     @property
     def runs(self) -> int:
@@ -46,12 +53,14 @@ class Workers:
     def __init__(self, plan: Sweep, threads: int | None = None) -> None:
         """Build the first case."""
         self.plan, self.runs = plan, Batch(threads)
-        first = build(plan.case((0,) * len(plan.axes)))
+        first = plan.first_built
         self._last: tuple[int, Experiment | str] = 0, first
         settings, graph = first.settings, first.parts.graph
         fast = settings.engine != "jax" and is_installed()
         most, least = (_AGENT_STEPS, _LEAST) if fast else (_AGENT_STEPS // _SLOWER, 1)
-        self.size = max(least, min(_MOST, most // (settings.steps * graph.agents)))
+        numbers = 1 if plan.frames is None else plan.frames.numbers
+        most = min(_MOST, most // (settings.steps * graph.agents), _NUMBERS // numbers)
+        self.size = max(least if plan.frames is None else 1, most)
 
     def batch(self, first: int, count: int, progress: StepCount) -> SweepBatch:
         """Return the numbers of some runs; `progress` is called several times a second.
@@ -62,7 +71,7 @@ class Workers:
         runs = [self._build(run) for run in self.plan.runs(first, count)]
         valid = [run for run in runs if not isinstance(run, str)]
         results, guarantees = self.runs.fly(valid, progress), _promises(valid)
-        rows = list[JsonObject]()
+        rows, flown = list[JsonObject](), list[Result | None]()
         for run in runs:
             result = run if isinstance(run, str) else next(results)
             guarantee = None if isinstance(run, str) else next(guarantees)
@@ -70,10 +79,13 @@ class Workers:
                 if result.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
                     raise KeyboardInterrupt
                 rows.append(numbers_of(result, guarantee))
+                flown.append(result)
             else:
+                flown.append(None)
                 rows.append(refused(str(guarantee if isinstance(result, Result) else result)))
             progress(0, 0)
-        return SweepBatch(first, columns_of(rows))
+        frames = None if self.plan.frames is None else self.plan.frames.stored(flown)
+        return SweepBatch(first, columns_of(rows), frames)
 
     def _build(self, run: SweepRun) -> Experiment | str:
         """Return the parts and settings of a run, or why they cannot be built."""
@@ -88,7 +100,8 @@ class Workers:
             return case
         settings = case.settings
         settings = settings if run.seed is None else settings._replace(seed=run.seed)
-        return Experiment(case.parts, settings._replace(store_every=-(-settings.steps // _FRAMES)))
+        every = self.plan.every or -(-settings.steps // _FRAMES)
+        return Experiment(case.parts, settings._replace(store_every=every))
 
 
 def _promises(experiments: Sequence[Experiment]) -> Iterator[Promise | EchelonError]:

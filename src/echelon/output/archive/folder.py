@@ -14,10 +14,10 @@ from echelon.core.errors import OutputError
 from echelon.core.files import INPUTS
 
 CHUNKS, RUNS, BATCHES = "chunks", "runs", "batches"
-DATA, GAIN, SUMMARY = "run.nc", "gain.json", "summary.json"
+DATA, GAIN, SUMMARY, FRAMES = "run.nc", "gain.json", "summary.json", "states.nc"
 _RUN = (SUMMARY, DATA, GAIN, "scenario.yaml", "report.txt", "figures", INPUTS, CHUNKS)
 _COMPARISON = ("comparison.json", "comparison.txt", RUNS, "figures")
-_SWEEP = ("sweep.nc", "scenario.yaml", "sweep.txt", "figures", INPUTS, BATCHES)
+_SWEEP = ("sweep.nc", FRAMES, "scenario.yaml", "sweep.txt", "figures", INPUTS, BATCHES)
 _MARKS = {SUMMARY: _RUN, CHUNKS: _RUN, "comparison.json": _COMPARISON}
 _MARKS |= {"sweep.nc": _SWEEP, BATCHES: _SWEEP}
 """The name that shows which command wrote a folder, and the files that `--force` then removes."""

@@ -5,6 +5,7 @@ import html
 from collections.abc import Iterator
 
 from echelon.core.errors import OutputError
+from echelon.experiments.results.dataset import STORED, recording_of
 from echelon.experiments.results.foreseen import foreseen
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import metrics
@@ -27,9 +28,17 @@ def result_page(result: Result) -> str:
 
     Of many agents the table has the best, the median and the worst, like the report.
     """
-    title = result.provenance.get("scenario") or type(result.model).__name__
-    head = f"<b>{html.escape(title)}</b>: {html.escape(result.message)}"
-    return f"<p>{head}</p>{_causes(result)}{_table(result)}{_pictures(result)}"
+    head = f"<b>{html.escape(_name(result))}</b>: {html.escape(result.message)}"
+    numbers = "" if result in STORED else f"{_causes(result)}{_table(result)}"
+    return f"<p>{head}</p>{numbers}{_pictures(result)}"
+
+
+def _name(result: Result) -> str:
+    """Return the name of the scenario, or of the model."""
+    # The parts of a run from disk are not built, which executes code, only to display it.
+    if result in STORED:
+        return recording_of(result).name
+    return result.provenance.get("scenario") or type(result.model).__name__
 
 
 def result_replay(result: Result) -> str:
@@ -41,6 +50,8 @@ def result_replay(result: Result) -> str:
     """
     if not len(result.times):
         raise OutputError("the run has no stored frame; a page needs at least one.")
+    if result in STORED:
+        return replay_page(recording_of(result))
     V = lyapunov(result)
     return replay_page(dataclasses.replace(_recorded(result), lyapunov=V and V.value))
 
@@ -81,8 +92,10 @@ def _cells(result: Result) -> Iterator[tuple[str, ...]]:
 
 
 def _recorded(result: Result) -> Recording:
-    """Return the recording of a run without its promise, which takes seconds to compute."""
-    states, name = result.states, result.provenance.get("scenario") or type(result.model).__name__
+    """Return the recording of a run, computed without its promise, which takes seconds."""
+    if result in STORED:
+        return recording_of(result)
+    states, name = result.states, _name(result)
     run = foreseen(result.parts, result.settings, states[0], name)
     ended = {"outcome": result.outcome.name.lower(), "message": result.message}
     return dataclasses.replace(

@@ -1,17 +1,22 @@
 """The folder of a sweep: batches while it is computed, then the dataset and figures."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, final
 
-from echelon.core.files import INPUTS, write_atomic
+from echelon.core.errors import OutputError
+from echelon.core.files import INPUTS, make_atomic, write_atomic
+from echelon.core.types import JsonObject
 from echelon.experiments.results.labelled import labelled
 from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
 from echelon.experiments.sweeps.axes import read_axes
+from echelon.experiments.sweeps.frames import write_frames
 from echelon.experiments.sweeps.plan import Sweep
+from echelon.experiments.sweeps.sweep_dataset import axis_values
 from echelon.experiments.sweeps.workers import SweepBatch
 from echelon.output.archive.chunks import Chunks
-from echelon.output.archive.folder import BATCHES, write_errors
+from echelon.output.archive.folder import BATCHES, FRAMES, write_errors
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -30,6 +35,7 @@ class Batches:
     def __init__(self, folder: Path) -> None:
         """Use a folder, which may not exist yet."""
         self.folder, self.chunks = folder, Chunks(folder, BATCHES)
+        self.frames = Chunks(folder, f"{BATCHES}/frames")
 
     def begin(self, plan: Sweep) -> None:
         """Write the scenario and the axes, before anything is computed.
@@ -37,8 +43,21 @@ class Batches:
         Raises:
             OutputError: a file cannot be written.
         """
-        over = json.dumps([axis.text for axis in plan.axes])
-        self.chunks.begin(plan.scenario, {_OVER: over + "\n"})
+        over = {"over": [axis.text for axis in plan.axes], "keep_states": plan.every}
+        self.chunks.begin(plan.scenario, {_OVER: json.dumps(over) + "\n"})
+        if plan.frames is not None:
+            with write_errors(self.folder):
+                self.frames.place.mkdir(exist_ok=True)
+            self._check_room(8 * plan.count * plan.frames.numbers)
+
+    def _check_room(self, size: int) -> None:
+        """Check that the disk has room for the frames, in batches and then in one file."""
+        free = shutil.disk_usage(self.folder).free
+        if 2 * size > free:
+            raise OutputError(
+                f"the states of all runs take {2 * size / 2**30:.3g} GiB, and {free / 2**30:.3g} "
+                f"GiB are free in `{self.folder}`; store fewer, with a larger `--keep-states`."
+            )
 
     def plan(self) -> Sweep:
         """Return the sweep that was begun here.
@@ -48,7 +67,10 @@ class Batches:
         """
         self.chunks.check()
         over = json.loads((self.folder / INPUTS / _OVER).read_text("utf-8"))
-        return Sweep(load_scenario(self.folder / SCENARIO_FILE), read_axes(over))
+        scenario = load_scenario(self.folder / SCENARIO_FILE)
+        # A list of axes, where an earlier version began it.
+        begun = {"over": over, "keep_states": None} if isinstance(over, list) else over
+        return Sweep(scenario, read_axes(begun["over"]), begun["keep_states"])
 
     def write(self, batch: SweepBatch) -> None:
         """Write a batch completely or not at all.
@@ -57,14 +79,39 @@ class Batches:
             OutputError: it cannot be written.
         """
         with write_errors(self.folder):
+            # Frames first: a batch whose numbers are stored is complete.
+            if batch.frames is not None:
+                self.frames.store(batch.first, batch.frames)
             self.chunks.store(batch.first, batch.columns)
 
     def read(self) -> list[SweepBatch]:
-        """Return the batches that are stored completely."""
+        """Return the batches that are stored completely, without their frames."""
         names = (file.stem for file in self.chunks.place.glob("*.npz"))
         firsts = sorted(int(name) for name in names if name.isdigit())
         stored = ((first, self.chunks.stored(first)) for first in firsts)
         return [SweepBatch(first, columns) for first, columns in stored if columns is not None]
+
+    def write_frames(self, plan: Sweep) -> None:
+        """Write the frames of all runs into one file, if the sweep stores them.
+
+        Raises:
+            OutputError: it cannot be written, or the frames of a batch are damaged.
+        """
+        if plan.frames is None:
+            return
+        stored = ((batch.first, self._frames(batch.first)) for batch in self.read())
+        with write_errors(self.folder):
+            make_atomic(
+                self.folder / FRAMES,
+                lambda part: write_frames(plan, axis_values(plan), stored, part),
+            )
+
+    def _frames(self, first: int) -> JsonObject:
+        frames = self.frames.stored(first)
+        if frames is None:
+            numbers = f"{self.chunks.place}/{first}.npz"
+            raise OutputError(f"`{numbers}` has lost its states; delete it, and resume the sweep.")
+        return frames
 
 
 def write_sweep(data: "xr.Dataset", text: str, folder: Path, figures: bool = True) -> None:
