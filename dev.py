@@ -185,6 +185,17 @@ def results(rest: list[str]) -> list[list[str]]:
     return [[python, f"benchmarks/{name}.py", *PAGES[name]] for name in rest or PAGES]
 
 
+def documentation(rest: list[str]) -> list[list[str]]:
+    """Get what pages load, draw the replay that they show, and return the command that builds them.
+
+    It is built as a module, so that Python finds docs/formulas.py.
+    """
+    python = str(program("python"))
+    step([python, "web/build.py", "docs"], "KaTeX could not be built; see the messages above.")
+    step([python, "docs/draw_replay.py"], "the replay could not be drawn; see the messages above.")
+    return [tool("zensical", "build", "--strict", "--clean", *rest)]
+
+
 VERBS = {
     "setup": lambda rest: [],
     "browser": browser,
@@ -196,7 +207,7 @@ VERBS = {
         [str(program("lint-imports"))],
     ],
     "types": lambda rest: [tool("pyright", *rest)],
-    "docs": lambda rest: [tool("zensical", "build", "--strict", "--clean", *rest)],
+    "docs": documentation,
     "sentences": lambda rest: [[str(program("python")), "tests/sentences.py", *rest]],
     "fuzz": lambda rest: [[str(program("python")), "benchmarks/fuzz.py", *rest]],
     "mutate": lambda rest: [[str(program("python")), "benchmarks/mutate.py", *rest]],

@@ -40,7 +40,7 @@ TESTS = {
     "synthesis/certificates/exact_proofs.py": ["exact"],
     "synthesis/certificates/jacobians.py": ["regional", "exact"],
     "synthesis/certificates/sampling.py": ["regional", "exact"],
-    "synthesis/gains": ["gains", "inner_loop", "regional", "paper", "sentences"],
+    "synthesis/gains": ["gains", "gain_rules", "inner_loop", "regional", "paper", "sentences"],
     "laws": ["laws", "feedforward", "inner_loop", "sentences", "paper", "attack"],
     "simulation/step": ["simulate", "feedforward", "disturbance", "metrics"],
     "simulation/engine": ["simulate", "feedforward", "disturbance", "metrics", "plans", "native"],

@@ -14,8 +14,7 @@ from typing import Any
 from PIL import Image
 
 import echelon as ech
-from echelon.experiments.results.dataset import dataset
-from echelon.experiments.results.recording import recording
+from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.studies.compare import compare
 from echelon.output.plots import figure_files
 from echelon.output.plots.comparison_figures import comparison_figures
@@ -87,7 +86,7 @@ def draw_run(scene: str, folder: Path, out: Path, quick: bool) -> None:
     short = ("simulation.horizon=0.1", "simulation.store_every=1", "report.steady_window=0.05")
     changes = (*told.get("set", ()), *(short if quick else ()))
     source = folder / scene if scene.endswith(".yaml") else scene
-    run = recording(dataset(ech.run(ech.load_scenario(source, changes))))
+    run = recording_of(ech.run(ech.load_scenario(source, changes)))
     drawn = ech.figures(run, tuple(told["figures"]))
     save({told["figures"][name]: figure for name, figure in drawn.items()}, out)
     if "video" in told:

@@ -285,7 +285,8 @@ def numbers(text):
 
 def test_the_reference_has_every_public_name_once():
     """Those of a family too; beyond them it may have what public functions return."""
-    named = re.findall(r"^::: (echelon\.\S+)$", page("api.md").read_text("utf-8"), re.MULTILINE)
+    texts = "\n".join(path.read_text("utf-8") for path in (DOCS / "api").glob("*.md"))
+    named = re.findall(r"^::: (echelon\.\S+)$", texts, re.MULTILINE)
     shown = [id(operator.attrgetter(name.removeprefix("echelon."))(ech)) for name in named]
     families = [getattr(ech, name) for name in ech.__all__ if is_module(getattr(ech, name))]
     public = {
@@ -295,6 +296,8 @@ def test_the_reference_has_every_public_name_once():
         if not is_module(getattr(family, name))
     }
     assert len(shown) == len(set(shown))
+    listed = re.findall(r"`(\w+)`", page("api.md").read_text("utf-8").partition("| page |")[2])
+    assert sorted(listed) == sorted(name.rpartition(".")[2] for name in named)
     assert [name for each, name in public.items() if each not in shown] == []
 
 

@@ -327,6 +327,8 @@ def test_the_version_is_the_same_everywhere():
     version, citation = project()["version"], (ROOT / "CITATION.cff").read_text("utf-8")
     assert importlib.import_module("echelon").__version__ == version
     assert f"\nversion: {version}\n" in citation
+    # Every page of the documentation shows it.
+    assert f"site_name: echelon {version} #" in (ROOT / "mkdocs.yml").read_text("utf-8")
 
 
 def project() -> dict[str, Any]:

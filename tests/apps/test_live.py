@@ -349,6 +349,8 @@ def test_the_promise_holds_stands_on_its_edge_or_is_lost_with_its_number(panel):
     strong = badge_of(panel, panel.start)
     assert strong["state"] == "holds" and strong["short"].startswith("guaranteed: ")
     edge = strong["edge"]
+    # Up to the end of the slider errors decay in held steps too.
+    assert strong["end"] is None
     near = badge_of(panel, panel.start._replace(coupling=1.05 * edge))
     assert near["state"] == "edge" and near["short"].endswith(", near its edge")
     parted = badge_of(panel, panel.start._replace(cut=frozenset({0, 3})))
@@ -405,6 +407,15 @@ def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_co
     assert str(panel.start.coupling) not in [each["short"] for each in told]
     monkeypatch.undo()
     assert badge_of(panel, fast)["short"] == short
+
+
+def test_the_slider_marks_from_where_on_errors_grow_in_held_steps(panel):
+    cheap = panel.start._replace(weight=0.02)
+    end, radii = promiser._end(panel, cheap, 0.5 * cheap.coupling), []
+    for c in (0.99 * end, 1.01 * end):
+        steps = [step_of(panel, cheap._replace(coupling=c), value) for value in eigenvalues(panel)]
+        radii.append(np.abs(np.linalg.eigvals(np.array(steps))).max())
+    assert radii[0] < 1.0 < radii[1]
 
 
 def eigenvalues(panel):

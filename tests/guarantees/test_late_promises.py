@@ -214,6 +214,51 @@ def test_the_ideal_network_has_no_line_of_it():
     assert "network" not in guarantee.as_mapping()["anywhere"]
 
 
+class Reversed(ech.laws.StoppingPoint):
+    """Its input has the wrong sign."""
+
+    def update(self, model, view, memory):
+        u, memory = super().update(model, view, memory)
+        return -u, memory
+
+
+class Elsewhere(ech.laws.StoppingLeader):
+    """It is expected where it is not."""
+
+    def expected(self, model, t, deviation, age, period):
+        there = super().expected(model, t, deviation, age, period)
+        return there._replace(signal=there.signal + 1.0)
+
+
+class ReversedConsensus(ech.laws.Consensus):
+    """Its input has the wrong sign."""
+
+    def update(self, model, view, memory):
+        u, memory = super().update(model, view, memory)
+        return -u, memory
+
+
+class Renamed(ech.laws.Consensus):
+    """A law with another name."""
+
+
+@pytest.mark.parametrize("network", [None, RADIO])
+def test_what_is_proved_of_a_law_is_not_of_its_subclasses(network):
+    parts = parts_of(network)
+    leader, follower = parts.drive.leader, parts.drive.follower
+    assert said(parts).promised
+    for laws in (
+        ech.Laws(leader, Reversed()),
+        ech.Laws(Elsewhere(reference=CIRCLE), follower),
+    ):
+        assert "its subclass" in said(parts.replace(drive=laws)).sentence()
+    gain = ech.synthesize(CART, parts.graph, ech.gains.Riccati())
+    rest = ech.laws.PathLQR(reference=CIRCLE)
+    for law, promised in ((Renamed(gain), True), (ReversedConsensus(gain), False)):
+        guarantee = said(parts.replace(drive=ech.Laws(rest, law), world=ech.World()))
+        assert guarantee.promised == promised
+
+
 # ---- 4: the tube ---------------------------------------------------------------------------------
 
 

@@ -8,9 +8,12 @@ from recordings import PROMISE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
+from echelon.experiments.results.avoidance import Avoidance
+from echelon.experiments.results.recording import MessageAges
 from echelon.output.plots.network import curves_of
+from echelon.output.plots.over_time import start_of
 from echelon.output.plots.run_figures import NAMES, figures
-from echelon.output.plots.style import ONE_COLUMN, TWO_COLUMNS
+from echelon.output.plots.style import ONE_COLUMN, TWO_COLUMNS, leader_pen, pen
 
 CERTIFIED = PROMISE | {
     "theorem": "T1",
@@ -25,7 +28,13 @@ WINDY = {"statement": "Assumption 3, exact states", "verdict": "fails"}
 def run():
     own = flown(seconds=4.0)
     rate = np.gradient(own.lyapunov, own.times)
-    return dataclasses.replace(own, tracking=tracked(own), lyapunov_rate=rate)
+    shape = len(own.times), len(own.edges), 2
+    late = MessageAges(
+        np.full(own.states.shape[:2], 0.02), np.ones(shape), np.ones(shape, int), 0.5
+    )
+    apart = Avoidance(own.times[::8], 0.3 + own.times[::8], np.sin(own.times[::8]) > 0.0, 0.25, 0.3)
+    more = {"tracking": tracked(own), "lyapunov_rate": rate, "messages": late, "avoidance": apart}
+    return dataclasses.replace(own, **more)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +48,8 @@ def lines_of(figure, place=0):
 
 def test_there_is_a_figure_of_each_name(run):
     made = figures(run, NAMES)
-    assert tuple(made) == NAMES
+    # In the ideal network no message has an age.
+    assert tuple(made) == tuple(name for name in NAMES if name != "ages")
     for name, figure in made.items():
         for ax in figure.axes:
             assert ax.get_ylabel() or name in ("inputs", "network"), name
@@ -48,11 +58,11 @@ def test_there_is_a_figure_of_each_name(run):
 def test_inputs_stand_in_percent_of_their_limits_which_are_drawn(run):
     figure = figures(run, ["inputs"])["inputs"]
     lines = lines_of(figure)
-    np.testing.assert_allclose(lines["follower 2"][:, 1], 100.0 * run.inputs[:151, 2].max(axis=1))
+    np.testing.assert_allclose(lines["follower 2"][:, 1], 100.0 * run.inputs[:, 2].max(axis=1))
     assert set(lines["limit"][:, 1]) == {100.0}
     low, high = figure.axes[0].get_ylim()
     assert low < 0.0 and high > 100.0
-    assert figure.axes[0].get_xlim() == (0.0, 3.0)
+    assert figure.axes[0].get_xlim() == (0.0, 4.0)
 
 
 def test_inputs_without_limits_have_their_names_and_units(run):
@@ -331,3 +341,98 @@ def test_other_figures_refuse_axes(run, what, sentence):
 
     with pytest.raises(OutputError, match=sentence):
         figures(run, what, ax=Figure().add_subplot())
+
+
+# ---- what an editor asks for ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def long():
+    """A minute, of which the errors settle within the first four seconds."""
+    own = flown(seconds=60.0, rate=10.0)
+    return dataclasses.replace(own, tracking=tracked(own), lyapunov_rate=-own.lyapunov)
+
+
+OVER_TIME = ("tracking", "formation", "inputs", "states", "distances", "lyapunov")
+
+
+def test_every_figure_over_time_has_its_start_enlarged_beside_the_whole(long):
+    for name, figure in figures(long, OVER_TIME).items():
+        times = [ax.get_xlim() for ax in figure.axes]
+        assert set(times) == {(0.0, 5.0), (0.0, 60.0)}, name
+        assert times[::2] == [(0.0, 5.0)] * (len(times) // 2), name
+        labels = {ax.get_xlabel() for ax in figure.axes} - {""}
+        assert labels == {"time (s), of 60 s", "time (s)"}, name
+        # The start has its own points: as many as frames of it are stored.
+        (line, *_) = (line for line in figure.axes[0].lines if len(line.get_xdata()) > 2)
+        assert len(line.get_xdata()) == 51, name
+
+
+def test_what_settles_late_or_is_short_has_no_enlarged_start(run, long):
+    assert len(figures(run, ["formation"])["formation"].axes) == 1
+    slow = with_errors(long, np.ones_like(long.states))
+    assert start_of(slow) == 3.0
+    assert len(figures(long, ["formation"], ONE_COLUMN)["formation"].axes) == 1
+
+
+def test_rounding_is_shaded_and_no_line_of_data(long):
+    shrink = np.exp(-2.0 * long.times)[:, None, None]
+    errors = np.zeros_like(long.states)
+    errors[:, 1:, :3] = shrink
+    states = errors + np.array([4.0] * 3 + [0.0] * 9)
+    noisy = dataclasses.replace(long, states=states, offsets=np.zeros_like(long.offsets))
+    ax = figures(noisy, ["formation"])["formation"].axes[-1]
+    (shade,) = [patch for patch in ax.patches if patch.get_label() == "rounding"]
+    floor = shade.get_y() + shade.get_height()
+    assert floor == pytest.approx(8 * np.finfo(float).eps * 5.0 * 3**0.5)
+    assert ax.get_ylim()[0] == pytest.approx(shade.get_y()) and ax.get_ylim()[0] > floor / 20.0
+    for line in ax.lines:
+        if line.get_label().startswith("follower"):
+            values = line.get_ydata()
+            assert np.nanmin(values) >= floor and np.isnan(values).sum() > 300
+    clean = figures(long, ["tracking", "distances"])
+    assert not any(ax.patches for figure in clean.values() for ax in figure.axes)
+
+
+@pytest.mark.parametrize("bounds", [True, False])
+def test_few_inputs_that_dwarf_the_rest_are_cut_off_and_the_figure_says_so(long, bounds):
+    inputs = long.inputs.copy()
+    inputs[1, 2] = 300.0
+    spiked = dataclasses.replace(long, inputs=inputs, bounds=long.bounds if bounds else None)
+    axes = figures(spiked, ["inputs"])["inputs"].axes
+    assert axes[1].get_ylim()[1] < (150.0 if bounds else 1.0)
+    title = axes[1].get_title(loc="right")
+    assert title.startswith("clipped: values from ") and title.endswith(
+        "3e+04" if bounds else "300"
+    )
+    plain = figures(long, ["inputs"])["inputs"]
+    assert not any(ax.get_title(loc="right") for ax in plain.axes)
+
+
+def test_the_closest_pair_is_marked_beside_the_size_of_agents(long):
+    sized = dataclasses.replace(long, radius=0.07)
+    lines = lines_of(figures(sized, ["distances"])["distances"], 3)
+    closest = sized.closest_pair()
+    text = "{:.3g} m: {} and {}".format(closest.distance, *closest.agents)
+    assert lines[text].tolist() == [[closest.time, closest.distance]]
+    assert set(lines["agents touch"][:, 1]) == {0.14}
+    assert "agents touch" not in lines_of(figures(long, ["distances"])["distances"], 3)
+
+
+def test_a_swarm_has_its_followers_in_the_legend_of_every_figure(flock):
+    made = figures(flock, ("states", "trajectories", "formation", "inputs"))
+    for name, figure in made.items():
+        legends = [ax.get_legend() for ax in figure.axes] + figure.legends
+        texts = [text.get_text() for each in filter(None, legends) for text in each.get_texts()]
+        assert {"57 followers", "5 to 95 %"} & {*texts}, name
+
+
+def test_lines_that_have_names_differ_in_grey_too():
+    from matplotlib.colors import to_rgb
+
+    looks = [pen(place, 10) for place in range(10)] + [leader_pen(0, 10)]
+    shades = [np.dot(to_rgb(look["color"]), (0.299, 0.587, 0.114)) for look in looks]
+    for i, one in enumerate(looks):
+        for j, other in enumerate(looks[:i]):
+            apart = abs(shades[i] - shades[j]) > 0.06
+            assert apart or one["linestyle"] != other["linestyle"], (i, j)

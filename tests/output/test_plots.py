@@ -269,12 +269,13 @@ def test_v_and_its_derivative_are_drawn_as_given(runs):
     result = runs("quadrotor")
     v = lyapunov(result)
     (above, below), lines = drawn(result, "lyapunov")
-    np.testing.assert_array_equal(lines["V"], np.column_stack([result.times, v.value]))
-    falls, rises = (lines.get(name) for name in ("V decreases", "V increases"))
-    np.testing.assert_array_equal(falls[:, 1], np.where(v.rate < 0.0, -v.rate, np.nan))
+    first = v.value[0]
+    np.testing.assert_allclose(lines["V"], np.column_stack([result.times, v.value / first]))
+    falls, rises = (lines.get(name) for name in ("dV/dt < 0", "dV/dt > 0"))
+    np.testing.assert_allclose(falls[:, 1], np.where(v.rate < 0.0, -v.rate / first, np.nan))
     assert (rises is None) == (v.rate <= 0.0).all()
     assert [ax.get_yscale() for ax in (above, below)] == ["log", "log"]
-    assert below.get_ylabel() == "|dV/dt| (1/s)"
+    assert [above.get_ylabel(), below.get_ylabel()] == ["V / V(0)", "|dV/dt| / V(0) (1/s)"]
 
 
 def with_v(result, value, rate):
@@ -287,8 +288,8 @@ def test_a_rising_v_is_told_apart(runs):
     count = len(result.times)
     rate = np.linspace(-1.0, 2.0, count)
     lines = labelled(figures(with_v(result, np.ones(count), rate))["lyapunov"])
-    np.testing.assert_array_equal(lines["V decreases"][:, 1], np.where(rate < 0.0, -rate, np.nan))
-    np.testing.assert_array_equal(lines["V increases"][:, 1], np.where(rate > 0.0, rate, np.nan))
+    np.testing.assert_array_equal(lines["dV/dt < 0"][:, 1], np.where(rate < 0.0, -rate, np.nan))
+    np.testing.assert_array_equal(lines["dV/dt > 0"][:, 1], np.where(rate > 0.0, rate, np.nan))
 
 
 def test_without_v_there_is_no_figure_of_it_and_without_motion_no_panel(runs):
@@ -303,7 +304,7 @@ def test_many_followers_have_no_names_and_their_worst_has(runs):
     made = all_figures(result)
     (ax,) = made["trajectories"].axes
     told = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert told == ["leader 0", "graph, every 0.1 s", "start", "end"]
+    assert told == ["leader 0", "24 followers", "graph, every 0.1 s", "start", "end"]
     lines = labelled(made["formation"])
     worst = next(name for name in lines if name.startswith("worst: follower "))
     told = {worst, "median follower", "largest at each time", "1 cm"}

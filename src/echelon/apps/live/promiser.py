@@ -7,6 +7,7 @@ from typing import NamedTuple, final
 from echelon.apps.live.knobs import Knobs
 from echelon.apps.live.panel import Panel
 from echelon.core.errors import EchelonError, GraphError
+from echelon.core.rational import bisect
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import build
 from echelon.guarantees.promises.closed_loop import LinearLoop
@@ -15,6 +16,7 @@ from echelon.output.reports.causes import beyond
 from echelon.output.viewer.replay import promise_badge
 from echelon.simulation.step.settings import Settings
 
+_HALVINGS = 12  # of the slider, for the place of a mark
 _NEAR = 1.1
 """Below this multiple of the smallest guaranteed coupling the badge warns of the edge."""
 
@@ -123,7 +125,7 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
         return {"state": "lost", "short": "no guarantee", "whole": cause, "causes": [cause]}
     badge: JsonObject = promise_badge(guarantee.as_mapping())
     badge["causes"] = [cause.sentence() for cause in guarantee.causes]
-    badge["edge"] = guarantee.edge
+    badge["edge"], badge["end"] = guarantee.edge, _end(panel, knobs, guarantee.edge)
     badge["rate"], certified = guarantee.rate, guarantee.certified
     badge["anywhere"] = certified is not None and certified.radius == float("inf")
     # Shown where the guarantee does not cover the state.
@@ -134,6 +136,22 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
         growth = _growth(panel.live.loop(knobs), panel.experiment.settings)
         badge["short"] = growth or badge["short"]
     return badge
+
+
+def _end(panel: Panel, knobs: Knobs, edge: float | None) -> float | None:
+    """Return a coupling above the edge at which errors begin to grow in held steps.
+
+    None without an edge, and where they grow nowhere or everywhere on the slider.
+    """
+    settings, highest = panel.experiment.settings, panel.ranges["coupling"].high
+
+    def decays(coupling: float) -> bool:
+        loop = panel.live.loop(knobs._replace(coupling=coupling))
+        return loop is not None and loop.radius(settings) < 1.0
+
+    if edge is None or not edge < highest or not decays(1.001 * edge) or decays(highest):
+        return None
+    return float(bisect(decays, 1.001 * edge, highest, _HALVINGS))
 
 
 def pending_badge(short: str = "guarantee \u2026") -> JsonObject:

@@ -48,6 +48,7 @@ class Scenario(BaseModel, **STRICT):
     reference: sections.ReferenceSpec | None = None
     leader: law_sections.LeaderSpec = Field(default_factory=law_sections.LeaderSpec)
     follower: law_sections.FollowerSpec = Field(default_factory=law_sections.FollowerSpec)
+    safety: sections.SafetySpec | None = None
     initial: sections.InitialSpec = Field(default_factory=sections.InitialSpec)
     disturbance: sections.DisturbanceSpec | None = None
     actuator: sections.ActuatorSpec | None = None

@@ -43,6 +43,7 @@ class Following(NamedTuple):
         speed: s of followers, the smallest of all outputs.
         still: whether the leader is where it stays from the start on.
         apart: whether leaders start apart.
+        avoiding: whether followers keep away from each other.
     """
 
     graph: Graph
@@ -51,6 +52,7 @@ class Following(NamedTuple):
     speed: float
     still: bool
     apart: bool
+    avoiding: bool = False
 
 
 class LateMessages(NamedTuple):
@@ -88,7 +90,7 @@ class LateMessages(NamedTuple):
     @property
     def quick(self) -> float | None:
         """The rate (1/s) while no message is older than those of all but a few runs; else None."""
-        faster = self.ways is None and self.ages.oldest < self.ages.forgotten and self.rates
+        faster = bool(self.rates) and self.rates[0].rate > self.rate
         return self.rates[0].rate if faster else None
 
     @property
@@ -123,26 +125,27 @@ class LateMessages(NamedTuple):
 
     def faster(self) -> str:
         """Return at what rate all but a few runs agree, as the end of a sentence."""
+        age = f"{1e3 * self.age:.3g} ms"
+        if self.ways is None and not self.ages.lost:
+            return f", with messages of at most {age}"
         if self.quick is None:
             return ""
-        age = f"{1e3 * self.age:.3g} ms"
         return f", and at {self.quick:.3g} 1/s while no message in use is older than {age}"
 
-    def sentence(self) -> str:
-        """Return what is guaranteed beside rates and the arrival, in sentences."""
+    def sentence(self, arrival: float | None) -> str:
+        """Return what is guaranteed beside rates, in sentences; the arrival (s) where known."""
         ages, text = self.ages, "No stopping point moves farther from the leader's than the "
         text += "farthest one was"
         if ages.first_packet is None:
             return f"{text}. A link may lose all messages of a run"
-        text += ". "
-        if ages.lost:
-            text += f"In all but one run in a million no link loses more than {ages.lost} "
-            text += "messages in a row, and "
-        text += "everybody has a packet"
-        text += " and knows its hops" * self.leaderward
+        few = f"In all but one run in a million no link loses more than {ages.lost} in a row, e"
+        text += f". {few if ages.lost else 'E'}verybody has a packet"
+        text += " and knows its hops" * self.leaderward + f" after {ages.first_packet:.3g} s"
         late = 0.0 if self.ways is None else float(self.ways.max() - 1) * self.age
-        text += f" after {ages.first_packet:.3g} s"
-        return text + f"; messages then cost a delay of {late:.3g} s at most" * bool(late)
+        text += f"; messages then cost a delay of {late:.3g} s at most" * bool(late)
+        if arrival is not None:
+            text += f", and from these starts all stay within 1 cm after {arrival:.3g} s"
+        return text
 
 
 def late_messages_of(
@@ -188,7 +191,7 @@ def late_messages_of(
     dt_exact = Fraction(dt)
     rates = late_rates(L, c, ages.oldest * dt_exact)
     slow = rates
-    if ages.oldest < ages.forgotten:
+    if ages.lost != 0 and ages.oldest < ages.forgotten:
         slow = late_rates(L, c, ages.forgotten * dt_exact)
     if not slow:
         return _UNPROVED
@@ -217,6 +220,9 @@ def _uncovered(network: Network, following: Following) -> Uncovered | None:
         return Uncovered(text, "set `prediction: preview`", True)
     if following.apart:
         return Uncovered("the leaders start apart", "start the leaders alike", False)
+    if following.avoiding:
+        text = "agents that keep apart do not always move as their messages ask"
+        return Uncovered(text, "remove `safety` to see what is guaranteed without it", False)
     if following.graph.schedule is not None:
         return Uncovered(
             "the graph switches, and late messages are covered for one graph only",

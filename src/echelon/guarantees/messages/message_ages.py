@@ -92,7 +92,8 @@ def losses_in_a_row(channel: Channel, links: int, messages: int) -> int | None:
         chance = (starts @ np.linalg.matrix_power(step, more)).sum(axis=1).max()
         return links * messages * float(chance) <= RARE
 
-    low, high = -1, messages - 1
+    # What can be lost is, now and then, however seldom.
+    low, high = -1 + bool(loss or channel.bursty), messages - 1
     if not fits(high):
         return None
     while high - low > 1:

@@ -108,10 +108,16 @@ def _decaying(case: Case) -> Statement:
     """Whether every mode of the network decays; `every` covers what lies between extremes."""
     name, loop = Hypothesis.DISAGREEMENT_DECAY, case.loop
     if not case.governed:
-        law = isinstance(case.parts.drive, Laws)
-        text = "the followers' law does not act on the disagreement"
-        text = text if law else f"no theorem covers `{type(case.parts.drive).__name__}`"
-        remedy = "use `consensus`" if law else "use laws that a theorem covers"
+        drive = case.parts.drive
+        text, remedy = (
+            f"no theorem covers `{type(drive).__name__}`",
+            "use laws that a theorem covers",
+        )
+        if isinstance(drive, Laws) and drive.metric(case.parts.model) is None:
+            text, remedy = "the followers' law does not act on the disagreement", "use `consensus`"
+        elif isinstance(drive, Laws):
+            text = f"`{type(drive.follower).__name__}` inherits `metric` of a law whose methods it "
+            text, remedy = f"{text}replaces", "declare `metric` in its own class"
         return fails(name, _LINEAR, text, remedy=remedy, reason=text)
     text = f"over {loop.certificate.modes} eigenvalues of the graph"
     if case.fed_by_parents:

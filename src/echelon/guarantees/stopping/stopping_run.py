@@ -197,7 +197,8 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
     graph, leaderward = parts.graph, drive.follower.leaderward
     speed = min(map(run.law.speed_of, range(len(run.law.ready.chains.outputs))))
-    following = Following(graph, leaderward, run.coupling, speed, run.still, run.apart)
+    avoiding = run.law.safety is not None
+    following = Following(graph, leaderward, run.coupling, speed, run.still, run.apart, avoiding)
     times = settings.dt, settings.horizon, settings.steps
     return run._replace(late=late_messages_of(parts.world.network, following, *times))
 
@@ -237,13 +238,31 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
         text = "the agreement over a period, or eventually"
     text += ", and the leaders' own coupling" * run.apart
     text = f"the slowest of the roots, {text}; far away the `speed` limits it"
-    yield holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, -run.rate, f"{-run.rate:.3g} 1/s")
+    text += ", and not while agents hold each other back" * (run.law.safety is not None)
+    changed = _changed(run)
+    yield (
+        changed
+        if changed is not None
+        else holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, -run.rate, f"{-run.rate:.3g} 1/s")
+    )
     text = "the law is linear in flat coordinates everywhere"
     yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)
     yield _step_line(run)
     if run.parts.graph.schedule is not None:
         yield _switching_line(run)
     yield unneeded(Hypothesis.CLAIMS, _PROOF, "there is no gain")
+
+
+def _changed(run: StoppingRun) -> Statement | None:
+    """Say that a law is a subclass, whose methods may be others than those that T5 is about."""
+    pairs = (run.law, StoppingPoint), (run.leader, StoppingLeader)
+    names = [f"`{type(law).__name__}`" for law, proved in pairs if type(law) is not proved]
+    if not names:
+        return None
+    text = f"T5 is about the bundled law, and nothing is known of its subclass {names[0]}"
+    remedy = "use the bundled law, or name a `prover` of your own"
+    name, kind = Hypothesis.DISAGREEMENT_DECAY, Kind.PROOF
+    return fails(name, kind, text, remedy=remedy, reason=text)
 
 
 def _switching_line(run: StoppingRun) -> Statement:

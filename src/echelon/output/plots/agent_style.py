@@ -22,7 +22,9 @@ def name_of(run: Recording, agent: int, short: bool = False) -> str | None:
         if not short or few or len(leaders) <= draw.NAMED:
             return f"leader {agent}"
         return f"{len(leaders)} leaders" if agent == leaders[0] else None
-    return f"follower {agent}" if few or not short else None
+    if few or not short:
+        return f"follower {agent}"
+    return f"{len(run.followers)} followers" if agent == run.followers[0] else None
 
 
 def pen_of(run: Recording, agent: int) -> dict[str, Any]:

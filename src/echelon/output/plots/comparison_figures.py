@@ -87,7 +87,8 @@ def _over_time(runs: _Runs, lines: dict[int, Array], text: str) -> "Figure":
     counts = _count_equal(runs, lines)
     # The time axis of the longest run, since others may have ended early.
     longest = max((run for _, _, run in runs), key=lambda run: run.times[-1])
-    figure, (ax,) = draw.panels(longest.times, longest.settings.horizon, 1, 3.4)
+    figure, [[ax]] = draw.sheet(3.4)
+    ax.set(xlim=(0.0, max(longest.times[-1], 1e-9)), xlabel="time (s)")
     curves = []
     for k, label, run in runs:
         if k not in counts:
@@ -131,5 +132,4 @@ def _approach(runs: _Runs) -> "Figure | None":
 
 
 def _pen(k: int) -> draw.Style:
-    dash = "-" if k < len(draw.COLOURS) else (0, (3, 1.2))
-    return {"color": draw.COLOURS[k % len(draw.COLOURS)], "linestyle": dash}
+    return draw.pen(k, draw.NAMED)

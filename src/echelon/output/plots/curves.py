@@ -1,5 +1,6 @@
 """Figures of a run over time: errors, V, inputs, states, distances."""
 
+import functools
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,13 @@ from echelon.output.plots.agent_style import (
     pen_of,
     reference_of,
 )
+from echelon.output.plots.over_time import (
+    above,
+    error_rounding,
+    over_time,
+    potential_rounding,
+    shade_rounding,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,8 +34,8 @@ if TYPE_CHECKING:
 
 _LINKS = 20_000  # links whose distances are computed, evenly spread over all
 _PANELS = 12  # that fit on a page
-_START = 3.0
-"""Seconds at the start in which inputs change quickly."""
+_DWARFS = 4.0
+"""Times the range of nearly all inputs from which on the others are cut off."""
 _DESIRED = {"color": "0.4", "linewidth": 0.9, "linestyle": (0, (1.0, 1.5)), "zorder": 1}
 _SLOPE = {"color": draw.EDGE, "linewidth": 1.0, "linestyle": (0, (5.0, 2.0)), "zorder": 2.2}
 
@@ -39,23 +47,26 @@ def tracking(run: Recording) -> "Figure | None":
     errors, names, units = run.tracking
     # Nobody can distinguish the lines of more leaders than have names.
     leaders = run.leaders if len(run.leaders) <= draw.NAMED else run.leaders[:1]
-    # Metres and radians share no axis; a dictionary keeps their order.
-    kinds = list(dict.fromkeys(units))
-    figure, panels = _panels(run, len(kinds), 1.7)
-    keep, cut = draw.thin(len(run.times), len(leaders)), False
-    for place, leader in enumerate(leaders):
-        look = draw.leader_pen(place, run.agents)
-        for k, name in enumerate(names):
-            error = errors[:, place, k, None]
-            values, over = draw.drop_runaways(error[keep], error[:1])
-            pen = {"color": draw.COLOURS[k % len(draw.COLOURS)], "linestyle": look["linestyle"]}
-            text = name.replace("_", " ") + (f", leader {leader}" if len(run.leaders) > 1 else "")
-            draw.plot(panels[kinds.index(units[k])], run.times[keep], values, label=text, **pen)
-            cut |= over
-    for ax, unit in zip(panels, kinds, strict=True):
+    cut = [False]
+
+    def show(ax: "Axes", frames: Array, unit: str) -> None:
+        outputs = [k for k in range(len(names)) if units[k] == unit]
+        for place, leader in enumerate(leaders):
+            for k in outputs:
+                error = errors[:, place, k, None]
+                values, over = draw.drop_runaways(error[frames], error[:1])
+                text = names[k].replace("_", " ")
+                text += f", leader {leader}" if len(run.leaders) > 1 else ""
+                pen = draw.pen(k + place * len(names), draw.NAMED)
+                draw.plot(ax, run.times[frames], values, label=text, **pen)
+                cut[0] |= over
         ax.set_ylabel(draw.label("tracking error", unit))
         ax.axhline(0.0, color="0.75", linewidth=0.6, zorder=1)
-    return draw.finish(figure, cut)
+
+    # Metres and radians share no axis; a dictionary keeps their order.
+    shows = [functools.partial(show, unit=unit) for unit in dict.fromkeys(units)]
+    figure, axes = over_time(run, shows, 1.7, len(leaders))
+    return draw.finish(figure, cut[0], [row[-1] for row in axes])
 
 
 # ---- convergence ------------------------------------------------------------------------------
@@ -67,28 +78,37 @@ def formation(run: Recording) -> "Figure":
     Of a large swarm it shows quantiles, the median and the worst follower.
     """
     followers, many = list(run.followers), run.agents > draw.NAMED
-    keep = draw.thin(len(run.times), len(followers))
-    errors, times = run.formation_errors[:, followers], run.times[keep]
-    figure, (ax,) = _panels(run, 1, 3.2)
-    if many:
-        _bands(ax, times, draw.above_zero(errors[keep]))
-        _worst(ax, run, times, errors, keep)
-    for agent, line in zip(() if many else followers, draw.above_zero(errors[keep]).T):
-        name = draw.say_zero(name_of(run, agent), line)
-        draw.plot(ax, times, line, label=name, **pen_of(run, agent))
-    _slope(ax, run, errors.max(axis=1, initial=0.0), 1.0)
-    bound = run.error_bound()
-    if bound is not None:
-        look = {"color": draw.EDGE, "linewidth": 1.0, "linestyle": (0, (1.0, 1.5)), "zorder": 2.2}
-        text = f"bound, by {run.promise['kind']} ({run.promise['theorem']})"
-        draw.plot(ax, times, bound[keep], label=text, **look)
-    if run.length_unit:
-        ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
-    ax.set_ylabel(draw.label("formation error", run.length_unit))
+    errors, floor, bound = (
+        run.formation_errors[:, followers],
+        error_rounding(run),
+        run.error_bound(),
+    )
     marks = [SETTLED] if run.length_unit else []
     # The end of the bound may lie far below all errors, so only its start sets the axis.
-    draw.logarithmic(ax, errors[keep], np.array(marks if bound is None else [*marks, bound[0]]))
-    return draw.finish(figure)
+    marks = np.array(marks if bound is None else [*marks, bound[0]])
+
+    def show(ax: "Axes", frames: Array) -> None:
+        times, values = run.times[frames], above(errors[frames], floor)
+        if many:
+            _bands(ax, times, values)
+            _worst(ax, run, times, errors, frames, floor)
+        for agent, line in zip(() if many else followers, values.T):
+            zero = draw.above_zero(errors[frames, followers.index(agent)])
+            name = draw.say_zero(name_of(run, agent), zero)
+            draw.plot(ax, times, line, label=name, **pen_of(run, agent))
+        _slope(ax, run, errors.max(axis=1, initial=0.0), 1.0)
+        if bound is not None:
+            text = f"bound, by {run.promise['kind']} ({run.promise['theorem']})"
+            look = _SLOPE | {"linestyle": (0, (1.0, 1.5))}
+            draw.plot(ax, times, bound[frames], label=text, **look)
+        if run.length_unit:
+            ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
+        ax.set_ylabel(draw.label("formation error", run.length_unit))
+        draw.logarithmic(ax, errors[frames], marks)
+        shade_rounding(ax, floor, errors[frames])
+
+    figure, ((*_, last),) = over_time(run, [show], 3.2, len(followers), alike=False)
+    return draw.finish(figure, legends=[last])
 
 
 def _bands(ax: "Axes", times: Array, values: Array, of: str = "follower") -> None:
@@ -104,7 +124,9 @@ def _bands(ax: "Axes", times: Array, values: Array, of: str = "follower") -> Non
     draw.plot(ax, times, ends[2], label=f"median {of}", color=draw.COLOURS[0])
 
 
-def _worst(ax: "Axes", run: Recording, times: Array, errors: Array, keep: Array) -> None:
+def _worst(
+    ax: "Axes", run: Recording, times: Array, errors: Array, keep: Array, floor: float
+) -> None:
     """Draw the follower with the largest steady error, and the largest error at each time.
 
     A run that ended before its steady window is evaluated as a whole.
@@ -115,8 +137,8 @@ def _worst(ax: "Axes", run: Recording, times: Array, errors: Array, keep: Array)
         place = int(np.argmax((errors[steady if steady.any() else ...] ** 2).sum(axis=0)))
     name = f"worst: follower {run.followers[place]}"
     pen = {"color": draw.COLOURS[1], "zorder": 3}
-    draw.plot(ax, times, draw.above_zero(errors[keep, place]), label=name, **pen)
-    largest = draw.above_zero(errors[keep].max(axis=1))
+    draw.plot(ax, times, above(errors[keep, place], floor), label=name, **pen)
+    largest = above(errors[keep].max(axis=1), floor)
     dash = {"linestyle": (0, (1.0, 1.2)), "linewidth": 0.9}
     draw.plot(ax, times, largest, label="largest at each time", **pen, **dash)
 
@@ -147,32 +169,38 @@ def _has_one_way_link(run: Recording) -> bool:
 
 
 def lyapunov(run: Recording) -> "Figure | None":
-    """Return V and its rate on logarithmic axes; None of a law without V."""
+    """Return V and its rate, by V at the start, on logarithmic axes; None of a law without V."""
     if run.lyapunov is None or run.lyapunov_rate is None:
         return None
-    keep = draw.thin(len(run.times))
-    times, value, rate = run.times[keep], run.lyapunov[keep], run.lyapunov_rate[keep]
-    value = draw.above_zero(value)
+    # By its first value V has no unit, which in itself depends on P.
+    first = float(run.lyapunov[0]) if run.lyapunov[0] > 0.0 else 1.0
+    value, rate, floor = run.lyapunov / first, run.lyapunov_rate / first, potential_rounding(run)
     # V is a square, and rates below the square of the floor are rounding of either sign.
-    moves = np.abs(rate) > draw.FLOOR**2
-    figure, panels = _panels(run, 2 if moves.any() else 1, 2.0)
-    draw.plot(panels[0], times, value, label=draw.say_zero("V", value), color=draw.LEADER)
-    _slope(panels[0], run, run.lyapunov, 2.0)
-    panels[0].set_ylabel("V")
-    draw.logarithmic(panels[0], value)
-    for ax in panels[1:]:
-        for name, speed, colour in zip(
-            ("decreases", "increases"), (-rate, rate), draw.COLOURS, strict=False
-        ):
-            shown = np.where(moves & (speed > 0.0), speed, np.nan)
+    moves = (np.abs(run.lyapunov_rate) > draw.FLOOR**2) & (run.lyapunov >= floor)
+
+    def show_value(ax: "Axes", frames: Array) -> None:
+        shown = above(value[frames], floor / first)
+        name = draw.say_zero("V", draw.above_zero(value[frames]))
+        draw.plot(ax, run.times[frames], shown, label=name, color=draw.LEADER)
+        _slope(ax, run, value, 2.0)
+        ax.set_ylabel("V / V(0)")
+        draw.logarithmic(ax, value[frames])
+        shade_rounding(ax, floor / first, value[frames])
+
+    def show_rate(ax: "Axes", frames: Array) -> None:
+        for k, (name, speed) in enumerate((("dV/dt < 0", -rate), ("dV/dt > 0", rate))):
+            shown = np.where(moves & (speed > 0.0), speed, np.nan)[frames]
             if not np.isnan(shown).all():
-                draw.plot(ax, times, shown, label=f"V {name}", color=colour, linewidth=0.8)
-        ax.set_ylabel("|dV/dt| (1/s)")
-        draw.logarithmic(ax, np.abs(rate[moves]))
-        if _increases_between(run):
-            text = f"at each frame; V increases in between, inputs held for dt = {run.dt:.3g} s"
-            ax.set_title(text, size=draw.page().letters - 1.0, loc="right")
-    return draw.finish(figure)
+                draw.plot(ax, run.times[frames], shown, label=name, **draw.pen(k, 2))
+        ax.set_ylabel("|dV/dt| / V(0) (1/s)")
+        draw.logarithmic(ax, np.abs(rate[frames][moves[frames]]))
+
+    shows = [show_value, show_rate] if moves.any() else [show_value]
+    figure, axes = over_time(run, shows, 2.0, alike=False)
+    if _increases_between(run) and len(axes) > 1:
+        text = f"at each frame; V increases in between, inputs held for dt = {run.dt:.3g} s"
+        axes[1][-1].set_title(text, size=draw.page().letters - 1.0, loc="right")
+    return draw.finish(figure, legends=[row[-1] for row in axes])
 
 
 def _increases_between(run: Recording) -> bool:
@@ -190,25 +218,41 @@ def _increases_between(run: Recording) -> bool:
 def inputs(run: Recording) -> "Figure | None":
     """Return the loads of actuators with their limits, at the start and over the whole run.
 
-    Without limits it is each input in its unit.
+    Without limits it is each input in its unit. An axis is clipped where few values dwarf the rest,
+    and its title says so.
     """
     loads = run.loads
     rows = _loads(loads) if loads is not None else _inputs(run)
-    parts = [run.times <= _START] if draw.page().narrow else [run.times <= _START, run.times >= 0]
-    parts = [part for part in parts if part.sum() > 1][: 1 if run.times[-1] <= 2 * _START else 2]
-    parts = parts or [run.times >= 0.0]
-    figure, axes = draw.grid(len(rows), len(parts), 1.5)
-    for (name, values), line in zip(rows.items(), axes, strict=True):
-        for part, ax in zip(parts, line, strict=True):
-            _agents_over(ax, run, run.times[part], values[part])
-            if loads is not None:
-                _limits(ax, values[part])
-            ax.set_xlim(run.times[part][0], max(run.times[part][-1], 1e-9))
-        line[0].set_ylabel(name)
-    for part, ax in zip(parts, axes[-1], strict=True):
-        end, whole = run.times[part][-1], run.times[-1]
-        ax.set_xlabel("time (s)" if end == whole else f"time (s), of {whole:.4g} s")
-    return draw.finish(figure, once=True, corner=axes[0][-1])
+
+    def show(ax: "Axes", frames: Array, name: str, values: Array) -> None:
+        _agents_over(ax, run, run.times[frames], values[frames])
+        if loads is not None:
+            _limits(ax, values)
+        _clip(ax, values, loads is not None)
+        ax.set_ylabel(name)
+
+    shows = [functools.partial(show, name=name, values=values) for name, values in rows.items()]
+    figure, axes = over_time(run, shows, 1.5, run.agents, narrow_start=True)
+    for row in axes:
+        for ax in row[:-1]:
+            ax.set_title("", loc="right")
+    return draw.finish(figure, legends=[axes[0][-1]], once=True)
+
+
+def _clip(ax: "Axes", values: Array, limited: bool) -> None:
+    """Clip an axis to what 98 % of the values need, where the others are beyond four times that."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return
+    (low, high), (least, most) = np.percentile(finite, [1.0, 99.0]), (finite.min(), finite.max())
+    if limited:
+        low, high = min(low, 0.0), max(high, 100.0)
+    size = max(float(high - low), 1e-12)
+    if most - least <= _DWARFS * size:
+        return
+    ax.set_ylim(low - 0.15 * size, high + 0.15 * size)
+    text = f"clipped: values from {least:.3g} to {most:.3g}"
+    ax.set_title(text, size=draw.page().letters - 1.0, loc="right")
 
 
 def _loads(loads: Array) -> dict[str, Array]:
@@ -230,7 +274,7 @@ def _inputs(run: Recording) -> dict[str, Array]:
 def _limits(ax: "Axes", values: Array) -> None:
     """Draw the limits 0 and 100 %, and shade the area beyond."""
     for value in (0.0, 100.0):
-        look = {"color": draw.COLOURS[1], "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 2}
+        look = {"color": draw.EDGE, "linewidth": 0.9, "linestyle": (0, (6, 2)), "zorder": 2}
         ax.axhline(value, label="limit" if value else None, **look)
     low, high = min(-8.0, float(np.nanmin(values))), max(108.0, float(np.nanmax(values)))
     ax.axhspan(low, 0.0, color="0.92", zorder=0)
@@ -241,15 +285,13 @@ def _limits(ax: "Axes", values: Array) -> None:
 def _agents_over(ax: "Axes", run: Recording, times: Array, values: Array) -> None:
     """Draw a number of each agent (T, N) as lines, or as quantiles of a large swarm."""
     if run.agents > draw.NAMED:
-        keep = draw.thin(len(times), run.agents)
-        _bands(ax, times[keep], values[keep][:, list(run.followers)])
+        _bands(ax, times, values[:, list(run.followers)])
         first = run.leaders[0]
         draw.plot(ax, times, values[:, first], label=f"leader {first}", **pen_of(run, first))
         return
-    keep = draw.thin(len(times), run.agents)
     for agent in leaders_first(run, range(run.agents)):
-        line, _ = draw.drop_runaways(values[keep, agent, None], values[:1, agent, None])
-        draw.plot(ax, times[keep], line, label=name_of(run, agent), **pen_of(run, agent))
+        line, _ = draw.drop_runaways(values[:, agent, None], values[:1, agent, None])
+        draw.plot(ax, times, line, label=name_of(run, agent), **pen_of(run, agent))
 
 
 # ---- states and distances ---------------------------------------------------------------------
@@ -263,72 +305,112 @@ def states(run: Recording) -> "Figure":
 def states_over_time(run: Recording, agents: Iterable[int]) -> "Figure":
     """Return a panel for each state, twelve at most, with a line for each agent."""
     agents = list(leaders_first(run, agents))
-    keep, cut = draw.thin(len(run.times), len(agents)), False
-    times, references = run.times[keep], [reference_of(run, agent) for agent in agents]
+    references = [reference_of(run, agent) for agent in agents]
     # With followers in the figure references would hide their lines.
     guides = references if set(agents) <= {*run.leaders} else []
-    count = min(len(run.state_names), _PANELS)
-    # On a narrow page columns of panels would have room for labels only.
-    columns = 1 if draw.page().narrow or count <= 4 else 2 if count <= 6 else 3
-    figure, panels = draw.panels(run.times, run.horizon, count, 1.4, columns)
-    for k, ax in enumerate(panels):
+    cut = [False]
+
+    def show(ax: "Axes", frames: Array, k: int) -> None:
         paths = run.states[:, agents, k, None]
         anchors = [references[0][:, k, None]] if references[0] is not None else []
         values, over = draw.drop_runaways(paths, paths[0], *anchors)
         for name, guide in zip(["reference", *[None] * len(guides)], guides):
             if guide is not None:
-                draw.plot(ax, times, guide[keep, k], label=name, **REFERENCE)
-        for agent, line in zip(agents, values[keep].swapaxes(0, 1), strict=True):
+                draw.plot(ax, run.times[frames], guide[frames, k], label=name, **REFERENCE)
+        for agent, line in zip(agents, values[frames].swapaxes(0, 1), strict=True):
             name = name_of(run, agent, short=True)
-            draw.plot(ax, times, line, label=name, **pen_of(run, agent))
+            draw.plot(ax, run.times[frames], line, label=name, **pen_of(run, agent))
         ax.set_ylabel(label(run, k))
-        cut |= over
-    return draw.finish(figure, cut, once=True, corner=panels[columns - 1])
+        cut[0] |= over
+
+    shows = [functools.partial(show, k=k) for k in range(min(len(run.state_names), _PANELS))]
+    figure, axes = over_time(run, shows, 1.4, len(agents))
+    return draw.finish(figure, cut[0], [axes[0][-1]], once=True)
 
 
 def distances(run: Recording) -> "Figure | None":
     """Return the distances of linked agents and their desired values, and the smallest distance.
 
-    None of agents without a position.
+    The closest pair is marked, and the distance at which agents of their size touch. None of agents
+    without a position.
     """
     if not run.position:
         return None
     places, columns = run.states[:, :, list(run.position)], list(run.position)
     links = slice(None, None, -(-len(run.edges) // _LINKS) or 1)
     i, j = run.edges[links].T
-    keep = draw.thin(len(run.times), max(1, len(i)))
     with np.errstate(over="ignore", invalid="ignore"):
-        apart = np.linalg.norm(places[keep][:, i] - places[keep][:, j], axis=2)
         desired = np.linalg.norm(run.offsets[i][:, columns] - run.offsets[j][:, columns], axis=1)
-    apart[~np.stack([run.linked(t)[links] for t in run.times[keep]])] = np.nan
-    figure, (linked, nearest) = _panels(run, 2, 1.9)
-    linked.set_ylabel(draw.label("linked agents", "m"))
-    _edges(linked, run, run.times[keep], apart, desired)
-    few = draw.thin(len(run.times), run.agents)
-    least = run.least_distances(few)
-    assert least is not None
-    draw.plot(nearest, run.times[few], least, color=draw.LEADER, label="any two")
-    nearest.set_ylabel(draw.label("smallest distance", "m"))
-    nearest.set_ylim(bottom=0.0)
-    return draw.finish(figure)
+
+    def show_links(ax: "Axes", frames: Array) -> None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            apart = np.linalg.norm(places[frames][:, i] - places[frames][:, j], axis=2)
+        apart[~np.stack([run.linked(t)[links] for t in run.times[frames]])] = np.nan
+        ax.set_ylabel(draw.label("linked agents", "m"))
+        _edges(ax, run, run.times[frames], apart, desired)
+
+    def show_nearest(ax: "Axes", frames: Array) -> None:
+        few = frames[draw.thin(len(frames), run.agents)]
+        least = run.least_distances(few)
+        assert least is not None
+        draw.plot(ax, run.times[few], least, color=draw.LEADER, label="any two")
+        _mark_closest(ax, run)
+        ax.set_ylabel(draw.label("smallest distance", "m"))
+        ax.set_ylim(bottom=0.0)
+
+    figure, axes = over_time(run, [show_links, show_nearest], 1.9, max(1, len(i)))
+    return draw.finish(figure, legends=[row[-1] for row in axes])
+
+
+def _mark_closest(ax: "Axes", run: Recording) -> None:
+    """Mark the closest pair, and twice the radius of an agent."""
+    closest = run.closest_pair()
+    if closest is not None:
+        text = "{}: {} and {}".format(f"{closest.distance:.3g} m", *closest.agents)
+        where = np.array([closest.time]), np.array([closest.distance])
+        draw.plot(ax, *where, label=text, **draw.dots("o", draw.COLOURS[1], 4.0))
+    if run.radius is not None:
+        look = {"color": draw.EDGE, "linewidth": 0.9, "linestyle": (0, (6, 2))}
+        ax.axhline(2.0 * run.radius, label="agents touch", **look)
 
 
 def ages(run: Recording) -> "Figure | None":
     """Return the age of the oldest message of each follower; None in the ideal network."""
-    if run.messages is None:
+    messages, followers = run.messages, list(run.followers)
+    if messages is None:
         return None
-    followers = list(run.followers)
-    keep = draw.thin(len(run.times), len(followers))
-    times, values = run.times[keep], run.messages.agents[keep][:, followers]
-    figure, (ax,) = _panels(run, 1, 2.6)
-    if run.agents > draw.NAMED:
-        _bands(ax, times, values)
-    for agent, line in zip(followers if run.agents <= draw.NAMED else (), values.T, strict=False):
-        draw.plot(ax, times, line, label=name_of(run, agent), **pen_of(run, agent))
-    look = {"color": "0.5", "linewidth": 0.8, "linestyle": ":", "zorder": 1}
-    ax.axhline(run.messages.forget, label="not used beyond", **look)
-    ax.set_ylabel(draw.label("age of the oldest message", "s"))
-    ax.set_ylim(bottom=0.0)
+
+    def show(ax: "Axes", frames: Array) -> None:
+        times, values = run.times[frames], messages.agents[frames][:, followers]
+        if run.agents > draw.NAMED:
+            _bands(ax, times, values)
+        few = followers if run.agents <= draw.NAMED else ()
+        for agent, line in zip(few, values.T, strict=False):
+            draw.plot(ax, times, line, label=name_of(run, agent), **pen_of(run, agent))
+        look = {"color": "0.5", "linewidth": 0.8, "linestyle": ":", "zorder": 1}
+        ax.axhline(messages.forget, label="not used beyond", **look)
+        ax.set_ylabel(draw.label("age of the oldest message", "s"))
+        ax.set_ylim(bottom=0.0)
+
+    figure, ((*_, last),) = over_time(run, [show], 2.6, len(followers))
+    return draw.finish(figure, legends=[last])
+
+
+def avoidance(run: Recording) -> "Figure | None":
+    """Return how near agents came that keep apart, and how many held each other back, over time."""
+    numbers = run.avoidance
+    if numbers is None:
+        return None
+    figure, (near, held) = _panels(run, 2, 1.9)
+    draw.plot(near, numbers.times, numbers.distance, color=draw.LEADER, label="any two agents")
+    look = {"color": "0.5", "linewidth": 0.8, "zorder": 1}
+    near.axhline(numbers.kept, label="kept by hulls", linestyle=":", **look)
+    near.axhline(numbers.touching, label="touching", linestyle="-", **look)
+    near.set_ylabel(draw.label("smallest scaled distance", "m"))
+    near.set_ylim(bottom=0.0)
+    held.step(numbers.times, numbers.active, where="post", color=draw.LEADER)
+    held.set_ylabel("active rows")
+    held.set_ylim(bottom=0.0)
     return draw.finish(figure)
 
 
@@ -347,7 +429,3 @@ def _edges(ax: "Axes", run: Recording, times: Array, apart: Array, desired: Arra
         ax.axhline(desired[place], **_DESIRED | {"color": look["color"]})
     # In the legend it has no colour of a link.
     ax.plot([], [], label="desired", **_DESIRED)
-
-
-def _panels(run: Recording, rows: int, height: float) -> "tuple[Figure, list[Axes]]":
-    return draw.panels(run.times, run.horizon, rows, height)

@@ -1,6 +1,6 @@
 """The style of figures, and their canvases, axes and lines; without pyplot and its state."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
@@ -26,7 +26,8 @@ NAMED = 10
 """With more agents than this, followers have one colour, and no name in the legend."""
 
 _TOP = 1e9  # of a logarithmic axis; above it the interesting part would be flat
-_HIGHEST = 9.0  # inches: a page of a journal, less a caption
+HIGHEST = 9.0
+"""Inches: a page of a journal, less a caption."""
 _POINTS = 2000  # of a line, more than the pixels that it covers
 _ALL_POINTS = 200_000  # of all lines of one figure
 
@@ -113,8 +114,8 @@ def crowding(agents: int) -> float:
     return min(1.0, NAMED / agents)
 
 
-# For leaders, who share a colour, and for followers beyond the palette.
-_DASHES = ("-", (0, (5.0, 1.5)), (0, (1.2, 1.2)), (0, (5.0, 1.5, 1.2, 1.5)))
+# In grey print colours of the palette are alike, so that neighbours in it differ in their dashes.
+_DASHES = ("-", (0, (5.0, 1.5)), (0, (1.2, 1.2)), (0, (5.0, 1.5, 1.2, 1.5)), (0, (9.0, 2.0)))
 
 
 def leader_pen(place: int, agents: int) -> Style:
@@ -130,7 +131,7 @@ def pen(place: int, agents: int) -> Style:
         look = {"linewidth": 1.1 * crowd**0.22, "alpha": crowd**0.35, "rasterized": agents > 100}
         return {"color": COLOURS[0]} | look
     again, hue = divmod(place, len(COLOURS))
-    return {"color": COLOURS[hue], "linestyle": _DASHES[again % len(_DASHES)]}
+    return {"color": COLOURS[hue], "linestyle": _DASHES[(hue + 3 * again) % len(_DASHES)]}
 
 
 def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> Style:
@@ -213,32 +214,6 @@ def sheet(
     return cast("Figure", ax.figure), [[ax]]
 
 
-def panels(
-    times: Array, horizon: float, count: int, height: float, columns: int = 1
-) -> "tuple[Figure, list[Axes]]":
-    """Return panels row by row with a common time axis, `height` inches each if they fit."""
-    rows = -(-count // columns)
-    # Smaller letters need less height.
-    height *= page().letters / 10.0 if page().narrow else 1.0
-    tall = float(np.clip(height * rows, 2.3 if page().narrow else 3.2, _HIGHEST))
-    figure, lines = sheet(tall, rows, columns, sharex=True)
-    axes = [ax for line in lines for ax in line]
-    # A margin for a single frame, whose dot the axis would cut in half.
-    axes[0].set_xlim((0.0, times[-1]) if len(times) > 1 else (-0.02 * horizon, horizon))
-    for ax in axes[count:]:
-        ax.remove()
-    for ax in axes[max(0, count - columns) : count]:
-        ax.set_xlabel("time (s)")
-        ax.tick_params(labelbottom=True)
-    return figure, axes[:count]
-
-
-def grid(rows: int, columns: int, height: float) -> "tuple[Figure, list[list[Axes]]]":
-    """Return panels with a common value axis per row and a common time axis per column."""
-    height *= page().letters / 10.0 if page().narrow else 1.0
-    return sheet(max(2.3, height * rows), rows, columns, sharex="col", sharey="row")
-
-
 def above_zero(values: Array) -> Array:
     """Return values with NaN where they are 0, which a logarithmic axis cannot show."""
     return np.where(values > 0.0, values, np.nan)
@@ -267,8 +242,15 @@ def logarithmic(ax: "Axes", *values: Array) -> None:
     ax.yaxis.set_minor_locator(NullLocator())
 
 
-def finish(figure: "Figure", cut: bool = False, once: bool = False, corner: Any = None) -> "Figure":
-    """Add legends (only the first if `once`, or one at `corner`) and a note on missing parts.
+def finish(
+    figure: "Figure",
+    cut: bool = False,
+    legends: "Sequence[Axes] | None" = None,
+    once: bool = False,
+) -> "Figure":
+    """Add legends beside all axes, or some, and a note on missing parts.
+
+    On a narrow page, where legends are above the axes, the only one (`once`) is on top.
 
     The layout is computed here, once for all file formats. In the caller's `ax` it is the caller's.
     """
@@ -276,10 +258,11 @@ def finish(figure: "Figure", cut: bool = False, once: bool = False, corner: Any 
         if ax.get_legend_handles_labels()[1]:
             ax.legend()
         return figure
-    first = figure.axes[:1] if corner is None or page().narrow else [corner]
-    for ax in first if once else figure.axes:
+    if once and page().narrow:
+        legends = figure.axes[:1]
+    for ax in figure.axes if legends is None else legends:
         if ax.get_legend_handles_labels()[1]:
-            _add_legend(figure, ax)
+            _add_legend(figure, ax, once)
     if cut:
         text = "The run diverged beyond these axes; the rest is not drawn."
         figure.suptitle(text, size=page().letters - 1.0, wrap=True)
@@ -315,10 +298,13 @@ def _label_power(ax: "Axes") -> None:
         ax.set_ylabel(f"{name} ({power} {unit}" if unit else f"{name} ({power})")
 
 
-def _add_legend(figure: "Figure", ax: "Axes") -> None:
+def _add_legend(figure: "Figure", ax: "Axes", once: bool) -> None:
     """Add a legend beside the axes, or above them on a narrow page."""
     narrow = page().narrow
-    if not narrow and ax.name == "3d":
+    if once and not narrow:
+        # Beside all rows, which would otherwise be as high as it.
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside right upper")
+    elif not narrow and ax.name == "3d":
         figure.legend(loc="upper right", bbox_to_anchor=(0.995, 0.97))
     elif not narrow:
         ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0)

@@ -88,7 +88,9 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
             graph,
             formation,
             Motion.of(model, parts.world, settings, graph.agents),
-            Meter.of(model, graph, formation, settings),
+            Meter.of(
+                model, graph, formation, settings, drive.safety and drive.safety.scales(model)
+            ),
             settings,
             initial_states(parts, settings.seed),
             channel,

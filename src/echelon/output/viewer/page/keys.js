@@ -26,8 +26,8 @@ function listenKeys(keys) {
     if (event.target.matches("select, input:not([type=range])") || event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.key === "?") return void help();
     const action = keys[event.key];
-    // A slider and a button have keys of their own.
-    if (!action || dialog.open || (event.target.matches("input, button") && !/^[a-z]$|Escape/.test(event.key))) return;
+    // A slider and a button have keys of their own; the button of a closed list may still have the focus.
+    if (!action || dialog.open || (event.target.matches("input, body button:not(dialog *)") && !/^[a-z]$|Escape/.test(event.key))) return;
     event.preventDefault();
     action[1](event.shiftKey);
   });

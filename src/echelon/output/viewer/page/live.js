@@ -47,8 +47,8 @@ class Live {
   // ---- pictures ----
 
   makeCharts() {
-    // V is a square of errors.
-    const { run } = this, line = (name, colour) => ({ name, colour, values: [], floor: name === "V" ? FLOOR ** 2 : FLOOR });
+    // V is a square of errors. In a stream, whose pictures are finite, NaN stands for what does not exist.
+    const { run } = this, line = (name, colour) => ({ name, colour, values: [], none: "\u2013 none", floor: name === "V" ? FLOOR ** 2 : FLOOR });
     const charts = [{ title: "formation error", unit: run.unit, log: true, lines: [line("worst", 1), line("median", 0), ...(run.referenced ? [line("leader", "leader")] : [])], marks: [{ value: 0.01, name: run.unit ? "1 cm" : "0.01" }] }];
     if (run.limited) charts.push({ title: run.loads ? "motors" : "inputs", unit: "% of limit", log: false, lines: [line("largest", 1), line("smallest", 0)], marks: [{ value: 100, name: "limit", below: true }, { value: 0, name: "limit" }] });
     if (run.lyapunov) charts.splice(1, 0, { title: "Lyapunov function V", unit: "", log: true, lines: [line("V", 0)], marks: [] });
@@ -130,7 +130,7 @@ class Live {
     this.promise = badge;
     this.causes = badge.causes ?? [];
     const coupling = this.controls.coupling;
-    if (coupling && badge.edge) coupling.mark(badge.edge);
+    if (coupling && badge.edge) coupling.mark(badge.edge, badge.end);
   }
 
   showNotes() {
@@ -259,7 +259,8 @@ class Slider {
     this.input = make("input", { type: "range", min: 0, max: 1000, step: 1, "aria-label": slider.text });
     this.output = make("output");
     this.edge = make("i", { class: "mark", hidden: "" });
-    this.element = make("label", { class: "knob" }, make("span", {}, slider.text), this.output, make("span", { class: "track" }, this.input, this.edge));
+    this.end = make("i", { class: "mark end", hidden: "" });
+    this.element = make("label", { class: "knob" }, make("span", {}, slider.text), this.output, make("span", { class: "track" }, this.input, this.edge, this.end));
     this.set(slider.value);
     let timer = null;
     this.input.addEventListener("input", () => {
@@ -294,10 +295,16 @@ class Slider {
     this.input.value = 1000 * this.partOf(value);
   }
 
-  mark(value) {
-    this.edge.hidden = false;
-    this.edge.title = `guaranteed above ${value.toPrecision(3)}`;
-    this.edge.style.left = `calc(8px + ${this.partOf(value)} * (100% - 16px))`;
+  // Marks from where on modes are guaranteed to decay, and from where on they grow in held steps.
+  mark(edge, end) {
+    const put = (element, value, words) => {
+      element.hidden = !value;
+      if (!value) return;
+      element.title = words;
+      element.style.left = `calc(8px + ${this.partOf(value)} * (100% - 16px))`;
+    };
+    put(this.edge, edge, `modes are guaranteed to decay above ${edge.toPrecision(3)}${end ? `, up to about ${end.toPrecision(3)}` : ""}`);
+    put(this.end, end, end && `errors grow in the steps of the loop from about ${end.toPrecision(3)} on`);
   }
 }
 

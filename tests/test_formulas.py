@@ -1,0 +1,93 @@
+"""Formulas of the documentation: plain text becomes the TeX that it means, and code stays code."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import markdown
+import pytest
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+
+
+def loaded():
+    """The extension, which is no part of the package."""
+    spec = importlib.util.spec_from_file_location("formulas", DOCS / "formulas.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+formulas = loaded()
+
+
+def squeezed(text):
+    return re.sub(r"\s+", "", text)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("xdot = f(x) + g(x) u", r"\dot{x} = f(x) + g(x) u"),
+        ("δ' (L_g ⊗ P) δ", r"\delta^{\prime} (L_{g} \otimes P) \delta"),
+        ("c >= 1/(2 λ_min)", r"c \ge 1/(2 \lambda_{\mathrm{min}})"),
+        ("1/2 z'z", r"\tfrac{1}{2} z^{\prime} z"),
+        ("|exp(A t) x|_P", r"| \operatorname{exp}(A t) x |_{P}"),
+        ("ζ~_i' = -σ(c z_i)", r"\tilde{\zeta}_{i}^{\prime} = -\sigma(c z_{i})"),
+        ("δ^ = D'δ", r"\hat{\delta} = D^{\prime} \delta"),
+        ("y^(r) = e^(-ρt)", r"y^{(r)} = e^{-\rho t}"),
+        ("x / sqrt(1 + (x/s)²)", r"x / \sqrt{1 + (x/s)^{2}}"),
+        ("f(x*) + g(x*) u* = 0", r"f(x^{*}) + g(x^{*}) u^{*} = 0"),
+        ("R^-1/2 1e-9", r"R^{-\tfrac{1}{2}} 10^{-9}"),
+    ],
+)
+def test_plain_text_becomes_what_it_means(text, expected):
+    assert squeezed(formulas.tex(text)) == squeezed(expected)
+
+
+@pytest.mark.parametrize(
+    "text", ["stopping-point", "Graph.spectrum", "max", "T2", "python x.py", "x = 'a'", "sqrt(x"]
+)
+def test_code_stays_code(text):
+    with pytest.raises(formulas.NotMath):
+        formulas.tex(text)
+
+
+PAGE = """# Page
+
+<!-- formulas -->
+
+### T1: a statement
+
+Let `c >= 0` for d_max and `relay`, so that
+
+    P A <= 0   for all A.
+
+Then `V' <= 0`. *Proof.* Clear.
+
+*Tests:* `test_a.py::test_b`.
+"""
+
+
+def rendered(text):
+    page = markdown.Markdown(extensions=[formulas.Formulas(), "tables"])
+    return page.convert(text)
+
+
+def test_a_marked_page_has_formulas_frames_and_folded_tests():
+    html = rendered(PAGE)
+    assert r'<div class="statement">' in html and html.count('class="formula"') == 4
+    assert "<code>relay</code>" in html and r"\(d_{\mathrm{max}}" in html
+    assert html.index("</div>\n<p><em>Proof.") < html.index("<details>")
+    assert "<summary>Tests</summary>" in html and "<code>test_a.py::test_b</code>" in html
+    # A page without the mark is as it was.
+    plain = PAGE.replace("<!-- formulas -->", "")
+    assert rendered(plain) == markdown.markdown(plain, extensions=["tables"])
+
+
+def test_braces_of_all_formulas_of_the_theory_page_match():
+    html = rendered((DOCS / "theory.md").read_text("utf-8"))
+    parts = re.findall(r'class="formula">\\[(\[](.*?)\\[)\]]</', html, re.DOTALL)
+    assert len(parts) > 300
+    for part in parts:
+        assert part.count("{") == part.count("}") and "class=" not in part, part
