@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_LABELLED = 8
+"""Up to so many values of a key are each marked on an axis."""
+
 
 def sweep_figures(data: "xr.Dataset") -> "dict[str, Figure]":
     """Return the figures of a sweep, by name.
@@ -109,6 +112,11 @@ def _region(data: "xr.Dataset", first: str, second: str) -> "Figure":
     mesh = ax.pcolormesh(x, y, rate.values, vmin=0.0, vmax=1.0, cmap="viridis", shading="nearest")
     _scale(ax, "x", x)
     _scale(ax, "y", y)
+    for axis, values in ((ax.xaxis, x), (ax.yaxis, y)):
+        if len(values) <= _LABELLED:
+            # Half a cell lies beyond the last value, such as shares above 1.
+            axis.set_ticks(values, [f"{value:g}" for value in values])
+            axis.set_ticks([], minor=True)
     ax.grid(False)
     ax.set_xlabel(first)
     ax.set_ylabel(second)
