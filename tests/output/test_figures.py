@@ -8,6 +8,8 @@ from recordings import PROMISE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
+from echelon.experiments.results.avoidance import Avoidance
+from echelon.experiments.results.recording import MessageAges
 from echelon.output.plots.network import curves_of
 from echelon.output.plots.over_time import start_of
 from echelon.output.plots.run_figures import NAMES, figures
@@ -26,7 +28,13 @@ WINDY = {"statement": "Assumption 3, exact states", "verdict": "fails"}
 def run():
     own = flown(seconds=4.0)
     rate = np.gradient(own.lyapunov, own.times)
-    return dataclasses.replace(own, tracking=tracked(own), lyapunov_rate=rate)
+    shape = len(own.times), len(own.edges), 2
+    late = MessageAges(
+        np.full(own.states.shape[:2], 0.02), np.ones(shape), np.ones(shape, int), 0.5
+    )
+    apart = Avoidance(own.times[::8], 0.3 + own.times[::8], np.sin(own.times[::8]) > 0.0, 0.25, 0.3)
+    more = {"tracking": tracked(own), "lyapunov_rate": rate, "messages": late, "avoidance": apart}
+    return dataclasses.replace(own, **more)
 
 
 @pytest.fixture(scope="module")

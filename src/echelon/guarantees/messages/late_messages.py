@@ -44,6 +44,7 @@ class Following(NamedTuple):
         speed: s of followers, the smallest of all outputs.
         still: whether the leader is where it stays from the start on.
         apart: whether leaders start apart.
+        avoiding: whether followers keep away from each other.
     """
 
     graph: Graph
@@ -52,6 +53,7 @@ class Following(NamedTuple):
     speed: float
     still: bool
     apart: bool
+    avoiding: bool = False
 
 
 class LateMessages(NamedTuple):
@@ -221,6 +223,9 @@ def _uncovered(network: Network, following: Following) -> Uncovered | None:
         return Uncovered(text, "set `prediction: preview`", True)
     if following.apart:
         return Uncovered("the leaders start apart", "start the leaders alike", False)
+    if following.avoiding:
+        text = "agents that keep apart do not always move as their messages ask"
+        return Uncovered(text, "remove `safety` to see what is guaranteed without it", False)
     if following.graph.schedule is not None:
         return Uncovered(
             "the graph switches, and late messages are covered for one graph only",

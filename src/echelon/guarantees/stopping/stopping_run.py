@@ -197,7 +197,8 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
     graph, leaderward = parts.graph, drive.follower.leaderward
     speed = min(map(run.law.speed_of, range(len(run.law.ready.chains.outputs))))
-    following = Following(graph, leaderward, run.coupling, speed, run.still, run.apart)
+    avoiding = run.law.safety is not None
+    following = Following(graph, leaderward, run.coupling, speed, run.still, run.apart, avoiding)
     times = settings.dt, settings.horizon, settings.steps
     return run._replace(late=late_messages_of(parts.world.network, following, *times))
 
@@ -237,6 +238,7 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
         text = "the agreement over a period, or eventually"
     text += ", and the leaders' own coupling" * run.apart
     text = f"the slowest of the roots, {text}; far away the `speed` limits it"
+    text += ", and not while agents hold each other back" * (run.law.safety is not None)
     changed = _changed(run)
     yield (
         changed

@@ -144,7 +144,8 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     )
     if brief:
         return tube, lines
-    arrival = arrival_of(run, _positions(run))
+    # Agents that hold each other back come later than they would alone.
+    arrival = None if run.law.safety is not None else arrival_of(run, _positions(run))
     motor_load, line = motor_load_of(run)
     tube = tube._replace(arrival=arrival, motor_load=motor_load)
     if motor_load is not None and line.kind is Kind.SAMPLES:
