@@ -118,6 +118,7 @@ _ALLOWED = {
     "greater_than": "is a number above {gt:g}",
     "greater_than_equal": "is a number of at least {ge:g}",
     "less_than": "is a number below {lt}",
+    "less_than_equal": "is a number of at most {le:g}",
     "too_short": "is a list of at least {min_length} number",
 }
 
