@@ -62,6 +62,7 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
         "saturated": np.zeros(agents),
         "tracking": None,
         "messages": None,
+        "avoidance": None,
         "modes": LoopPoles(np.array([[-1.0 + 2.0j, -1.0 - 2.0j]]), np.array([1.0])),
         "promise": PROMISE,
         "horizon": float(times[-1]),

@@ -62,6 +62,7 @@ from .guarantees.promises.promise import Promise as Promise
 from .guarantees.promises.promise import promise as promise
 from .guarantees.verifier.verify import verify as verify
 from .laws.law import Law as Law
+from .laws.safety import Safety as Safety
 from .output.archive.export import export as export
 from .output.archive.export import table as table
 from .output.archive.load_folder import (

@@ -146,6 +146,7 @@ def test_defaults():
         "disturbance": None,
         "actuator": None,
         "sensing": None,
+        "safety": None,
         "network": None,
         "simulation": {
             "horizon": 30.0,
@@ -276,9 +277,9 @@ def test_a_missing_key_is_told_at_its_parent(refused, key):
 def test_an_unknown_section_gets_a_guess(refused):
     assert refused(seed="sed: 0") == [
         "s.yaml:11: sed: got an unknown key, allowed are `name`, `model`, `plant`, `graph`,"
-        " `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`,"
-        " `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed` (did"
-        " you mean `seed`?)."
+        " `formation`, `reference`, `leader`, `follower`, `safety`, `initial`,"
+        " `disturbance`, `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed`"
+        " (did you mean `seed`?)."
     ]
 
 
@@ -385,8 +386,8 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, got):
         load_scenario(file)
     assert str(caught.value) == (
         f"{file}:1: got {got}, allowed is a mapping with the keys `name`, `model`, `plant`,"
-        " `graph`, `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`,"
-        " `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed`."
+        " `graph`, `formation`, `reference`, `leader`, `follower`, `safety`, `initial`,"
+        " `disturbance`, `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed`."
     )
 
 

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
@@ -263,7 +265,24 @@ def test_what_is_proved_of_a_law_is_not_of_its_subclasses(network):
 
 
 def test_no_network_leaves_the_tube():
-    """A path whose speed upward is more than agreement may ask: before a packet it counts."""
+    # The path is at 1.4 m/s, and agreement may ask .5 + .3: before a packet the path counts.
+    network = dataclasses.replace(RADIO, delay=0.3, loss=0.7, bursts=ech.Bursts(0.5, 0.3))
+    parts = parts_of(network, TREE, False, speed=0.5, leader={"reference": CIRCLE, "speed": 0.3})
+    parts = parts.replace(start_error={"position": 0.6})
+    guarantee, result = said(parts), ech.simulate(parts, SETTINGS)
+    run, root = guarantee.run, guarantee.run.law.slowest_root
+    zeta = result.states[:, 1:, :2] + result.states[:, 1:, 2:] / root
+    moved = np.diff(zeta, axis=0) / DT
+    path = np.asarray(jax.vmap(lambda t: run.leader.path(CART, t))(jnp.asarray(result.times[1:])))
+    rate = path[:, 1] + path[:, 2] / root
+    off = np.abs(moved - rate[:, None])
+    most = np.array([run.speed(k) + run.own_speed(k) for k in range(2)])
+    assert most.max() > 0.5 + 0.3 and (off <= most * 1.02).all()
+    # It is nearly reached before the first packet, and later it is agreement's alone.
+    assert (off.max(axis=(0, 1)) > 0.7 * most).any()
+
+
+def test_a_border_is_not_passed_before_the_first_packet():
     unicycle = ech.models.Unicycle()
     graph = ech.Graph([(0, 1)], directed=True)
     laws = ech.Laws(ech.laws.StoppingLeader(reference=CIRCLE), ech.laws.StoppingPoint())

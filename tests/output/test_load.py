@@ -3,6 +3,7 @@
 import dataclasses
 import gzip
 import json
+import pickle
 import shutil
 import warnings
 from pathlib import Path
@@ -17,6 +18,7 @@ from runs import OWN_PENDULUM
 import echelon as ech
 from echelon.experiments.results.dataset import recording_of, run_file
 from echelon.experiments.scenario.build import build
+from echelon.experiments.studies.recomputation import recompute
 from echelon.output.archive import export as exporting
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.report_page import report_page
@@ -122,6 +124,12 @@ def test_the_lyapunov_function_of_a_run_from_disk_is_computed_to_the_same_bits(t
     assert_same(result, other)
     for one, two in zip(ech.lyapunov(other), ech.lyapunov(result), strict=True):
         np.testing.assert_array_equal(one, two)
+
+
+def test_a_run_from_disk_can_be_pickled(run):
+    other = pickle.loads(pickle.dumps(ech.load(run[1])))
+    assert_same(run[0], other)
+    assert ech.report(other) == ech.report(run[0])
 
 
 def test_its_repr_is_one_line(run):
@@ -249,6 +257,9 @@ def test_a_file_of_format_3_is_read_but_for_its_sums(here):
     assert result.graph == now.graph and result.parts.formation == now.formation
     with pytest.raises(ech.errors.OutputError, match="has no sums over all steps"):
         ech.report(result)
+    data = here / "old" / "run.nc"
+    claims = list(recompute(integrators(), None, data=data))
+    assert len(claims) > 20 and {claim.verdict for claim in claims} == {"recomputed"}
 
 
 # ---- tables and other formats ------------------------------------------------------------------
@@ -312,6 +323,7 @@ BAD = {
     "sweep": "is a sweep, which holds numbers of many runs",
     "comparison": "is a comparison; give one of its runs",
     "two": "was written in format 2 by echelon",
+    "begun": "ended before any of it was stored",
 }
 
 
@@ -320,6 +332,7 @@ def test_what_is_no_run_is_refused_in_one_sentence(run, here, name):
     for each in BAD:
         (here / each).mkdir(exist_ok=each != "nothing")
     (here / "nothing").rmdir()
+    (here / "begun" / "chunks").mkdir()
     content = (run[1] / "run.nc").read_bytes()
     (here / "half" / "run.nc").write_bytes(content[: len(content) // 2])
     (here / "text" / "run.nc").write_text("times,states\n")

@@ -12,6 +12,7 @@ from echelon.core.errors import EchelonError
 CARTS = ech.models.DoubleIntegrator()
 CIRCLE = ech.references.Circle(radius=1.0, rate=0.6)
 TREE = ech.Graph([(0, 1, 0.7), (1, 2), (1, 3, 2.0)])
+APART = ech.Safety(radii=(0.085, 0.085, 0.085))
 X = np.array([0.3, -0.2, 0.1, 0.4])
 
 
@@ -25,6 +26,9 @@ LAWS = {
     ),
     "stopping-point": lambda: ech.Laws(
         ech.laws.StoppingLeader(reference=CIRCLE), ech.laws.StoppingPoint()
+    ),
+    "safety": lambda: ech.Laws(
+        ech.laws.StoppingLeader(reference=CIRCLE), ech.laws.StoppingPoint(safety=APART)
     ),
 }
 
@@ -53,6 +57,7 @@ ESTIMATED = ech.World(sensing=ech.Sensing(noise={"position": 1e-18}, estimator="
 def test_agents_by_themselves_do_what_simulate_does(law, world):
     parts = formation(law, position=1.0).replace(world=world)
     result = ech.simulate(parts, ech.Settings(horizon=0.2, dt=0.01, seed=3, engine="jax"))
+    assert result.sums.avoidance.any() == (law == "safety")
     agents = [ech.Agent(parts, k, dt=0.01) for k in range(4)]
     for k, t in enumerate(result.times[:-1]):
         x = result.states[k]
@@ -115,8 +120,10 @@ def test_a_bad_message_is_rejected_with_a_reason_and_changes_nothing(pair):
 
 
 def formation_of(agent):
-    law = "consensus" if "vx" in agent.hello(X).signal.names else "stopping-point"
-    return formation(law)
+    hello = agent.hello(X)
+    if hello.hull is not None:
+        return formation("safety")
+    return formation("consensus" if "vx" in hello.signal.names else "stopping-point")
 
 
 def test_an_agent_that_hears_nobody_acts_and_goes_on_with_what_it_last_heard(pair):
@@ -195,8 +202,9 @@ LATE_TREE = ech.Graph([(0, 1), (1, 2), (1, 3)])
 def late_parts(law, **network):
     offsets = {1: (1.0, 0.0), 2: (1.0, 0.8), 3: (1.0, -0.8)}
     reference = ech.references.Circle(rate=0.5)
-    if law == "stopping-point":
-        drive = ech.Laws(ech.laws.StoppingLeader(reference=reference), ech.laws.StoppingPoint())
+    if law != "consensus":
+        follower = ech.laws.StoppingPoint(safety=APART if law == "safety" else None)
+        drive = ech.Laws(ech.laws.StoppingLeader(reference=reference), follower)
     else:
         gain = ech.synthesize(POINTS, LATE_TREE, ech.gains.Riccati())
         drive = ech.Laws(ech.laws.Tracking(reference), ech.laws.Consensus(gain))
@@ -223,6 +231,7 @@ def late_parts(law, **network):
         ("consensus", {"delay": 0.03, "prediction": "none"}),
         ("consensus", {"delay": 0.03, "prediction": "packet"}),
         ("stopping-point", {"delay": 0.03, "messages": "state"}),
+        ("safety", {"delay": 0.05}),
     ],
 )
 def test_agents_over_a_plain_queue_fly_as_simulated(law, network):
@@ -230,6 +239,7 @@ def test_agents_over_a_plain_queue_fly_as_simulated(law, network):
     parts, dt, steps = late_parts(law, **network), 0.01, 150
     settings = ech.Settings(horizon=steps * dt, dt=dt, engine="jax", integrator="euler")
     simulated = ech.simulate(parts, settings)
+    assert simulated.sums.avoidance.any() == (law == "safety")
     agents = [ech.Agent(parts, k, dt) for k in range(4)]
     x, queue = simulated.states[0].copy(), []
     delay = max(1, round(network["delay"] / dt))
@@ -237,7 +247,7 @@ def test_agents_over_a_plain_queue_fly_as_simulated(law, network):
         np.testing.assert_allclose(x, simulated.states[k], atol=1e-9)
         for due, message in queue:
             if due == k:
-                broadcast([a for a in agents if message.sender in a.neighbours], message)
+                broadcast(agents, message)
         inputs, messages = zip(*(a.step(k * dt, x[a.number]) for a in agents), strict=True)
         if k % 4 == 0:
             queue += [(k + delay, message) for message in messages if message is not None]

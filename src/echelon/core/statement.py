@@ -28,6 +28,7 @@ class Hypothesis(Word):
     REGION = "region of the gain"
     SET = "certified set"
     STARTS = "starts in the certified set"
+    SEPARATION = "distance between agents"
     LIMITS = "motors, from these starts"
     CLAIMS = "claims of the gain"
 

@@ -116,6 +116,7 @@ class Theorem(Word):
     A5 = "the drift does not expand P while all agents stay in"
     T5 = "stopping points agree from anywhere, and each agent stays in its tube"
     T9 = "the same over a network that delays and loses messages"
+    T10 = "agents never touch, and each stays in its tube"
 
     def __str__(self) -> str:
         """Return the theorem's name as the theory page has it."""

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from echelon.agents.models.chains import Chains, chains_of, check_bounds, flatten, switch_on
 from echelon.agents.models.model import ControlAffine, FlatBound
@@ -16,6 +17,8 @@ from echelon.core.errors import LawError, ModelError, listing
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.flat_loop import FlatLoop, FlatMemory, Observer
 from echelon.laws.law import Law, LocalView
+from echelon.laws.nearest_point import MOST_POINTS
+from echelon.laws.safety import hull_points
 
 Speed: TypeAlias = float | tuple[float, ...]
 
@@ -200,17 +203,59 @@ class FlatLaw(Law):
 
     def initial_memory(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x, with the derivatives of its reference."""
-        return self.ready.initial_memory(model, x, switch_on(model, self.ready.chains, x, ahead))
+        e = switch_on(model, self.ready.chains, x, ahead)
+        return self._counting(self.ready.initial_memory(model, x, e))
 
     def init(self) -> FlatMemory:
         """Return a memory of zeros."""
-        return self.ready.zero_memory()
+        return self._counting(self.ready.zero_memory())
+
+    def _counting(self, memory: FlatMemory) -> FlatMemory:
+        """Return a memory that counts the rows that act, if there are any."""
+        return memory if self.safety is None else memory._replace(active=0.0 * memory.half)
 
     def signal(
         self, model: ControlAffine, x: State, offset: State, memory: FlatMemory
     ) -> jax.Array:
         """Return zeta less the offset, (m,)."""
         return self.ready.place(model, x, offset, memory)
+
+    def hull(self, model: ControlAffine, x: State, memory: FlatMemory) -> Float[jax.Array, "r d"]:
+        """Return the points in whose hull the position stays, the last one of zeta."""
+        return self.hull_of(model, self.ready.flat_values(model, x, memory))
+
+    def active(self, memory: FlatMemory) -> jax.Array | None:
+        """Return how many others changed the rates of agents, (K,)."""
+        return memory.active
+
+    def hull_of(
+        self, model: ControlAffine, values: Float[jax.Array, "r m"]
+    ) -> Float[jax.Array, "r d"]:
+        """Return the same of flat coordinates."""
+        places = self.places(model)
+        degree = self.ready.chains.degrees[places[0]]
+        return hull_points(values[:degree, np.array(places)], self.roots_for(degree - 1))
+
+    def places(self, model: ControlAffine) -> list[int]:
+        """Return which flat outputs are the position.
+
+        Raises:
+            LawError: a coordinate is none, or their chains are too long or not of one length.
+        """
+        name, chains = f"`{type(model).__name__}`", self.ready.chains
+        if not {*model.position} <= {*chains.outputs}:
+            raise LawError(
+                f"`safety` needs the position of {name} among its flat outputs, "
+                f"{listing(chains.outputs)}."
+            )
+        places = [chains.outputs.index(x) for x in model.position]
+        degrees = [chains.degrees[k] for k in places]
+        if len({*degrees}) > 1 or degrees[0] > MOST_POINTS:
+            raise LawError(
+                "`safety` needs chains of one length for the coordinates of the position, at most "
+                f"{MOST_POINTS}, and {name} has {listing(map(str, degrees))}."
+            )
+        return places
 
     def message(self, model: ControlAffine, x: State, v: Input, memory: FlatMemory) -> jax.Array:
         """Return zeta', (m,)."""

@@ -82,6 +82,7 @@ class FlatMemory(NamedTuple):
             step, and the acceleration that the model lacks.
         half: half of the step before, s; 0 at first.
         scale: of the observer: the thrust relative to the model's; None where it is not estimated.
+        active: how many others changed the rate in the step before; None where none may.
     """
 
     chain: jax.Array
@@ -91,6 +92,7 @@ class FlatMemory(NamedTuple):
     push: jax.Array
     half: jax.Array
     scale: jax.Array | None = None
+    active: jax.Array | None = None
 
 
 @final
@@ -149,13 +151,13 @@ class FlatLoop(eqx.Module):
         """Return zeta less the offset, (m,): where the agent would come to rest."""
         outputs = self.chains.outputs
         shift = flat_output(model, outputs, offset) - flat_output(model, outputs, 0.0 * offset)
-        return self.stop(self._flat_values(model, x, memory)) - shift
+        return self.stop(self.flat_values(model, x, memory)) - shift
 
     def stop(self, values: jax.Array) -> jax.Array:
         """Return zeta (m,) of flat coordinates (r, m)."""
         return (jnp.asarray(self.weights, values.dtype) * values).sum(axis=0)
 
-    def _flat_values(self, model: ControlAffine, x: State, memory: FlatMemory) -> jax.Array:
+    def flat_values(self, model: ControlAffine, x: State, memory: FlatMemory) -> jax.Array:
         """Return the flat coordinates (r, m), corrected by the observer."""
         values = flatten(model, self.chains, x, memory.chain).values
         if not self.observer:
@@ -181,7 +183,7 @@ class FlatLoop(eqx.Module):
         """Return the physical input that makes zeta move at a rate (m,), and the next memory."""
         flat, values = (
             flatten(model, self.chains, x, memory.chain),
-            self._flat_values(model, x, memory),
+            self.flat_values(model, x, memory),
         )
         degrees = np.array(self.chains.degrees)
         lower = np.arange(len(values))[:, None] < degrees - 1
@@ -231,7 +233,9 @@ class FlatLoop(eqx.Module):
         first, second = self.observer.gains
         base = speed - error + half * pull + period * (memory.push + first * error)
         push = memory.push + period * second * error
-        after = FlatMemory(chain, memory.rate, v, base, push, half + 0.0 * error[0], memory.scale)
+        after = memory._replace(
+            chain=chain, delivered=v, base=base, push=push, half=half + 0.0 * error[0]
+        )
         return after if self.thrust is None else self._ascribe(model, x, pull, period, after)
 
     # ---- the observer ----

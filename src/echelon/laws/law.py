@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Iterator
-from typing import ClassVar, NamedTuple, TypeAlias, final
+from typing import ClassVar, NamedTuple, TypeAlias, cast, final
 
 import equinox as eqx
 import jax
@@ -14,11 +14,13 @@ from jaxtyping import Float
 from echelon.agents.models.heading_symmetry import heading_index, rest_heading
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
+from echelon.agents.network.near import Near
 from echelon.agents.references.guide import Guide
 from echelon.core.errors import LawError
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, PyTree, Scalar, State
 from echelon.core.words import Feedforward
+from echelon.laws.safety import Safety
 from echelon.synthesis.gains.gain import Gain
 
 Memory: TypeAlias = PyTree
@@ -40,6 +42,7 @@ class LocalView(eqx.Module):
         feedforward: what the agent's leader or parent sent, or zeros (m,): a normalized input (m,)
             unless the law's `message` says otherwise.
         period: how long the input will be held, s; 0 where it is not known.
+        near: the others, where the law keeps away from them; None elsewhere.
 
     Raises:
         LawError: it is made of numbers while JAX computes in float32.
@@ -51,6 +54,7 @@ class LocalView(eqx.Module):
     disagreement: Float[jax.Array, " s"]
     feedforward: Float[jax.Array, " k"]
     period: Scalar | float = 0.0
+    near: Near | None = None
 
     def __check_init__(self) -> None:
         """Refuse to lose digits silently."""
@@ -86,11 +90,14 @@ class Law(eqx.Module):
         leaderward: whether followers use messages of neighbours nearer to a leader alone.
         prover: the `Promise` of followers under the law, as `module:class`.
         turning: whether followers receive the heading that their leader follows.
+        safety: how followers keep away from each other; None where they do not.
     """
 
     feedforward = Feedforward.NONE
     leaderward = False
     turning = False
+    # Without an annotation, which would make it a field of every law.
+    safety = cast("Safety | None", None)
     prover: ClassVar[str] = "echelon.guarantees.promises.metric_promise:MetricPromise"
 
     @property
@@ -206,6 +213,22 @@ class Law(eqx.Module):
         beyond that loop.
         """
         return v
+
+    def hull(
+        self, model: ControlAffine, x: State, memory: Memory
+    ) -> Float[jax.Array, "r d"] | None:
+        """Return points in whose hull the agent's position stays, for others' safety, or None."""
+        return None
+
+    def expected_hull(
+        self, model: ControlAffine, t: Scalar, signal: Float[jax.Array, " s"]
+    ) -> Float[jax.Array, "r d"] | None:
+        """Return `hull` of a leader that is expected at a signal at a time (s), or None."""
+        return None
+
+    def active(self, memory: Memory) -> jax.Array | None:
+        """Return how many others changed what agents with memories (K, ..) do, or None."""
+        return None
 
     def check_late(self, graph: Graph, period: float) -> None:
         """Check that a follower's law works with late messages, with inputs held for a period (s).

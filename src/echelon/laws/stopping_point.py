@@ -5,8 +5,8 @@ from anywhere, over any graph in which the leader reaches everybody, and an agen
 on its own start and on a speed alone.
 """
 
+import dataclasses
 import functools
-import math
 from typing import final
 
 import equinox as eqx
@@ -19,7 +19,7 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.references.flatness import first_state, followed_states
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
-from echelon.core.errors import LawError, listing
+from echelon.core.errors import LawError, check_kind, listing
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
@@ -35,12 +35,11 @@ from echelon.laws.flat_law import (
 )
 from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Expected, Law, LocalView
+from echelon.laws.safety import Safety
+from echelon.laws.saturated_decay import saturated_decay
 
 _INSTANT = 1e-9
 """s; a shorter period is none."""
-_LINEAR = 1e-8
-"""Of c |x| / s; below it sigma is linear to rounding."""
-_LN2 = math.log(2.0)
 _SEEN = 60.0
 """s of the leader's path, for default speeds; guarantees use the whole run."""
 
@@ -108,6 +107,7 @@ class StoppingPoint(FlatLaw):
             that each hears.
         hears: `all` neighbours, or `leaderward` those alone that are nearer to the leader; with
             `parent` it is that one.
+        safety: keeps away from all others, whatever the graph; None for not.
         reach: of the graph; computed by `prepared`.
         ahead: (r, m) the beginning of the leader's path; set by `following`.
     """
@@ -119,6 +119,7 @@ class StoppingPoint(FlatLaw):
     hears: NeighbourChoice = eqx.field(
         default=NeighbourChoice.ALL, static=True, converter=NeighbourChoice.named
     )
+    safety: Safety | None = eqx.field(default=None, static=True)
     reach: GraphDemand | None = None
     ahead: Array | None = None
 
@@ -130,6 +131,10 @@ class StoppingPoint(FlatLaw):
                 f"`feedforward` is `{self.feedforward}`, and the law `stopping-point` is sent "
                 f"zeta' by {listing(map(str, allowed))}: without it a leader that moves is lost."
             )
+        if self.safety is not None:
+            check_kind("safety", self.safety, Safety, LawError)
+            if self.feedforward is Feedforward.PARENT:
+                raise LawError("`safety` needs `feedforward: relay`, one zeta' for all agents.")
 
     @property
     def leaderward(self) -> bool:
@@ -141,7 +146,9 @@ class StoppingPoint(FlatLaw):
         """Neighbours' stopping points, and the rate of the leader or the parent."""
         parent = self.feedforward is Feedforward.PARENT
         whose = "its parent's" if parent else "the leader's, forwarded to everybody"
-        return ("neighbours' stopping points zeta", f"zeta' of the same step, {whose}")
+        words = "neighbours' stopping points zeta", f"zeta' of the same step, {whose}"
+        near = "positions and their derivatives of all within reach"
+        return words if self.safety is None else (*words, near)
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "StoppingPoint":
         """Find the model's chains, and the graph's properties for the coupling."""
@@ -156,12 +163,16 @@ class StoppingPoint(FlatLaw):
         waits = self.speed is None and waits_for_path(model)
         reach = GraphDemand.of(graph, self.leaderward, links, waits)
         speed = self.speeds_within(model, loop.chains, SPEED, _share(links), links)
-        return eqx.tree_at(
+        law = eqx.tree_at(
             lambda law: (law.loop, law.reach, law.ahead, law.speed),
             self,
             (loop, reach, np.zeros_like(loop.weights), speed),
             is_leaf=lambda part: part is None,
         )
+        if self.safety is None:
+            return law
+        law.places(model)
+        return dataclasses.replace(law, safety=self.safety.prepared(model))
 
     def following(self, leader: Law, model: ControlAffine) -> "StoppingPoint":
         """Take over the beginning of the leader's path, which sets the level thrust."""
@@ -218,6 +229,15 @@ class StoppingPoint(FlatLaw):
     ) -> tuple[Input, FlatMemory]:
         """Return the input of one agent."""
         pull = self.bounded(self.strength(view.period) * view.disagreement)
+        if self.safety is None or view.near is None:
+            return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period)
+        places = np.array(self.places(model))
+        speeds = jnp.broadcast_to(jnp.asarray(self.speed, view.x.dtype), pull.shape)[places]
+        scales = jnp.asarray(self.safety.scales(model), view.x.dtype)
+        rate, active = self.safety.filtered(-pull[places], view.near, scales, speeds)
+        # Where no row acts it is the same to the bit.
+        pull = pull.at[places].set(-rate)
+        memory = memory._replace(active=active)
         return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period)
 
 
@@ -352,34 +372,10 @@ class StoppingLeader(FlatLaw):
         there = self.ready.stop(self.path(model, t)[:-1])
         return Expected(there + away, self._rate(model, t, away, period))
 
-
-def saturated_decay(
-    start: jax.Array, coupling: Scalar | float, inverse: jax.Array, age: Scalar
-) -> jax.Array:
-    """Return x after a time (s) of x' = -sigma(c x), sigma(x) = x / sqrt(1 + (x/s)^2), entrywise.
-
-    With v = c |x| / s the function F(v) = sqrt(1 + v^2) - arsinh(1/v) falls by c per second.
-
-    Args:
-        start: x at the beginning.
-        coupling: c, 1/s.
-        inverse: 1/s of each entry, 0 where sigma is linear.
-        age: the time, s.
-    """
-    v = coupling * jnp.abs(start) * inverse
-    linear = v < _LINEAR
-    v = jnp.where(linear, 1.0, v)
-    target = _fallen(v) - coupling * age
-    # F is above ln v and above v - 1 or so; from there Newton's method in ln v has all digits soon.
-    guess = jnp.where(target >= 1.0, jnp.log(jnp.maximum(target, 1.0)), target - 1.0 + _LN2)
-    for _ in range(4):
-        now = jnp.exp(guess)
-        guess = guess - (_fallen(now) - target) / jnp.sqrt(1.0 + now**2)
-    return start * jnp.where(linear, jnp.exp(-coupling * age), jnp.exp(guess) / v)
-
-
-def _fallen(v: jax.Array) -> jax.Array:
-    return jnp.sqrt(1.0 + v**2) - jnp.arcsinh(1.0 / v)
+    def expected_hull(self, model: ControlAffine, t: Scalar, signal: jax.Array) -> jax.Array:
+        """Return the hull of the path, moved so that it ends at the signal."""
+        hull = self.hull_of(model, self.path(model, t)[:-1])
+        return hull - hull[-1:] + signal[None, np.array(self.places(model))]
 
 
 @memoize

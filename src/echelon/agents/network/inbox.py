@@ -61,6 +61,8 @@ class Message(NamedTuple):
         time: when it was sent, s; None in the ideal network.
         hops: to a leader, as counted by messages.
         packet: the newest of a leader; None before it has one.
+        hull: where agents keep apart, the points in whose hull the sender's position stays; over a
+            network that is late, less those of the leader as expected.
     """
 
     sender: int
@@ -69,6 +71,7 @@ class Message(NamedTuple):
     time: float | None = None
     hops: int = 0
     packet: Packet | None = None
+    hull: NamedValues | None = None
 
 
 @final
@@ -113,8 +116,8 @@ class Inbox:
         if message.sender not in heard:
             return Received.NOT_HEARD
         # Both before either is stored, so that a message is taken as a whole.
-        values = _read(message.signal)
-        forward = {} if message.feedforward is None else _read(message.feedforward)
+        values = read_values(message.signal)
+        forward = {} if message.feedforward is None else read_values(message.feedforward)
         if isinstance(values, Received) or isinstance(forward, Received):
             return next(part for part in (values, forward) if isinstance(part, Received))
         if not {*self._names} & {*values}:
@@ -128,6 +131,49 @@ class Inbox:
         if message.sender == self._source and forward:
             self.feedforward[:] = [forward.get(name, np.nan) for name in self._forward_names]
         return Received.TAKEN
+
+
+@final
+class Surroundings:
+    """The last good hull of every other agent, whatever the graph.
+
+    Args:
+        senders: the others.
+        names: of the numbers of a hull.
+
+    Attributes:
+        names: likewise.
+        hulls: (K, h), NaN for what was not received.
+        time: (K,) when they were sent, s; -inf for none, and in the ideal network.
+    """
+
+    hulls: Float[Array, "K h"]
+    time: Float[Array, " K"]
+
+    def __init__(self, senders: Sequence[int], names: tuple[str, ...]) -> None:
+        """Receive nothing yet."""
+        self._places, self.names = {who: k for k, who in enumerate(senders)}, names
+        self.hulls = np.full((len(senders), len(names)), np.nan)
+        self.time = np.full(len(senders), -np.inf)
+
+    def take(self, message: object, clock: float | None) -> bool:
+        """Store the hull of a message, and tell whether it could be used.
+
+        `clock` is the receiver's time, s; None in the ideal network, where the last one is used.
+        """
+        if not isinstance(message, Message) or not isinstance(message.sender, numbers.Integral):
+            return False
+        place = self._places.get(int(message.sender))
+        values = {} if message.hull is None else read_values(message.hull)
+        if place is None or isinstance(values, Received) or {*values} != {*self.names}:
+            return False
+        if clock is not None:
+            sent = message.time
+            if not _is_time(sent) or not self.time[place] < sent <= clock + _AHEAD:  # pyright: ignore
+                return False
+            self.time[place] = sent
+        self.hulls[place] = [values[name] for name in self.names]
+        return True
 
 
 @final
@@ -187,7 +233,7 @@ class Stamps:
         # Nobody hands the leadership over yet, and a packet of a later epoch would win for ever.
         if not whole or packet.leader not in self._leaders or packet.epoch != 0:
             return Received.NO_MESSAGE
-        values = _read((tuple(map(str, range(self._size))), packet.content))
+        values = read_values((tuple(map(str, range(self._size))), packet.content))
         return values if isinstance(values, Received) else None
 
     def _wins(self, packet: Packet) -> bool:
@@ -211,7 +257,7 @@ def _is_time(value: object) -> bool:
     return isinstance(value, numbers.Real) and bool(-LARGEST < value < LARGEST)  # pyright: ignore
 
 
-def _read(part: object) -> dict[str, float] | Received:
+def read_values(part: object) -> dict[str, float] | Received:
     """Return the named values of a part of a message, or what is wrong with it."""
     if not isinstance(part, tuple) or len(part) != 2 or not isinstance(part[0], list | tuple):
         return Received.NO_MESSAGE

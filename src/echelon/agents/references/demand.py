@@ -43,6 +43,8 @@ class ReferenceDemand(NamedTuple):
         return self.defect <= _FEASIBLE
 
 
+_AT_REST = 1e-9
+"""Of a rate; a path that is no faster rests, and the rest is rounding."""
 _FEASIBLE = 0.05
 """Knots a tenth of the fastest period apart leave 0.02; a path of another model leaves 1."""
 _SAMPLES = 1000
@@ -84,7 +86,7 @@ def reference_demand(
         float(ratios[k]),
         float(times[k]),
         inputs[k],
-        float(away[j, i]) / max(fastest, np.finfo(float).tiny),
+        float(away[j, i]) / max(fastest, _AT_REST),
         (int(i), float(np.abs(rate - velocities)[j, i]), float(times[j])),
     )
 

@@ -17,6 +17,7 @@ from echelon.experiments.results.agent_metrics import (
     representatives,
     steady_error,
 )
+from echelon.experiments.results.avoidance import avoidance
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.labelled_parts import labelled_parts
 from echelon.experiments.results.lyapunov import lyapunov
@@ -50,7 +51,9 @@ def dataset(result: Result) -> "xr.Dataset":
     references'), `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`, `edge_agents`,
     `edge_weight`, `edge_heard` (whether each end of an edge receives from the other), of a
     switching graph `edge_weight_then` from each `stretch_start` on with its `graph_period`
-    (infinite without repetition), the gain's `P`, `R` and `coupling`, the poles of the checked
+    (infinite without repetition), of agents that keep apart `scaled_distance` and `active_rows` in
+    slices of the run from `slice_start` on with `touching_distance` and `kept_distance`,
+    the gain's `P`, `R` and `coupling`, the poles of the checked
     modes (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`, for directed graphs with the
     imaginary part `mode_eigenvalue_imaginary`), and the limits of the inputs u, `limit_low` <=
     `limit_matrix` u <= `limit_high`. Over a network that is late also `age` (of the oldest message
@@ -83,6 +86,7 @@ def _labelled(result: Result) -> Labelled:
         **_followed(result),
         **_poles(result),
         **_messages(result),
+        **_avoidance(result),
     }
     v = lyapunov(result)
     if v is not None:
@@ -124,6 +128,20 @@ def _messages(result: Result) -> Variables:
         "edge_age": (link, traffic.ages, seconds),
         "edge_lost": (link, traffic.losses),
         "forget": ((), network.forget, seconds),
+    }
+
+
+def _avoidance(result: Result) -> Variables:
+    """Return how agents kept apart; nothing where they do not."""
+    numbers, meters = avoidance(result), {"units": "m"}
+    if numbers is None:
+        return {}
+    return {
+        "slice_start": ("slice", numbers.times, {"units": "s"}),
+        "scaled_distance": ("slice", numbers.distance, meters),
+        "active_rows": ("slice", numbers.active),
+        "touching_distance": ((), numbers.touching, meters),
+        "kept_distance": ((), numbers.kept, meters),
     }
 
 

@@ -18,6 +18,7 @@ from echelon.core.errors import OutputError
 from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
 from echelon.core.words import Verdict
+from echelon.experiments.results.avoidance import Avoidance
 from echelon.experiments.results.labelled import Labelled, read_labelled
 from echelon.simulation.engine.frame_numbers import FrameNumbers
 
@@ -99,6 +100,7 @@ class Recording(FrameNumbers):
         tracking: of the leaders; None without a reference.
         modes: None where the laws have no linearization.
         messages: over a network; None in the ideal one.
+        avoidance: how agents kept apart; None where they do not.
         promise: as `Promise.as_mapping` returns it.
         horizon, dt: s.
         attributes: provenance and settings, as stored.
@@ -131,6 +133,7 @@ class Recording(FrameNumbers):
     tracking: TrackingErrors | None
     modes: LoopPoles | None
     messages: MessageAges | None
+    avoidance: Avoidance | None
     promise: JsonObject
     horizon: float
     dt: float
@@ -258,6 +261,7 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         tracking=_tracking(arrays),
         modes=_modes(arrays),
         messages=_messages(arrays),
+        avoidance=_avoidance(arrays),
         promise=json.loads(attributes["promise"]),
         horizon=float(attributes["horizon"]),
         dt=float(attributes["dt"]),
@@ -310,6 +314,14 @@ def _modes(values: Mapping[str, np.ndarray]) -> LoopPoles | None:
         return None
     poles = values["pole_real"] + 1j * values["pole_imaginary"]
     return LoopPoles(poles, values["mode_eigenvalue"])
+
+
+def _avoidance(values: Mapping[str, np.ndarray]) -> Avoidance | None:
+    if "scaled_distance" not in values:
+        return None
+    names = "slice_start", "scaled_distance", "active_rows"
+    limits = (float(values[name]) for name in ("touching_distance", "kept_distance"))
+    return Avoidance(*(values[name] for name in names), *limits)
 
 
 def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
 from echelon.experiments.results.agent_metrics import FollowerMetrics, Metrics
+from echelon.experiments.results.avoidance import Avoidance, avoidance
 from echelon.experiments.results.quantity import ERROR, Quantity, Shown, quantities
 
 if TYPE_CHECKING:
@@ -77,6 +78,11 @@ class RunNumbers:
     def of_network(self, name: str) -> float | None:
         """Return a number of the messages; None in the ideal network."""
         return None if self.result.traffic is None else getattr(self.result.traffic, name)
+
+    @functools.cached_property
+    def avoidance(self) -> Avoidance | None:
+        """How agents kept apart; None where they do not."""
+        return avoidance(self.result)
 
     @functools.cached_property
     def first_and_last(self) -> Float[np.ndarray, "2 F"]:
@@ -244,6 +250,19 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         "messages that arrived after a newer one of the same sender",
         of=lambda run: run.of_network("late"),
         shown=_OF_NETWORK,
+    ),
+    "scaled_distance": Quantity(
+        "smallest scaled distance between two agents that keep apart, over all steps",
+        "m",
+        column="scaled\ndistance",
+        of=lambda run: None if run.avoidance is None else run.avoidance.least,
+        shown=Shown.SWEEP | Shown.SUMMARY,
+    ),
+    "held_back_until": Quantity(
+        "time until which agents that keep apart held each other back",
+        "s",
+        of=lambda run: None if run.avoidance is None else run.avoidance.last,
+        shown=Shown.SWEEP | Shown.SUMMARY,
     ),
     "promise_rate": Quantity(
         "rate at which errors are guaranteed to decay",

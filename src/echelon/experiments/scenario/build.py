@@ -41,6 +41,7 @@ from echelon.experiments.scenario.world_parts import (
 )
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
+from echelon.laws.safety import Safety
 from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
@@ -284,13 +285,27 @@ def _follower(
     spec = scenario.follower
     part = law_class(scenario, registry.FOLLOWER_LAWS, spec.law)
     _check_keys(scenario, faults, "follower", part)
-    offers = law_arguments(spec)
+    offers = law_arguments(spec) | _safety(scenario, faults, part)
     if "gain" in accepted(part.cls):
         with faults.at("follower", "gain"):
             offers["gain"] = _gain(model, graph, spec.gain, scenario)
         if "gain" not in offers:
             return None
     return _law(part, offers, model, graph)
+
+
+def _safety(scenario: Scenario, faults: FaultList, part: NamedClass) -> dict[str, Safety]:
+    """Return how followers keep apart; nothing where they do not."""
+    if scenario.safety is None:
+        return {}
+    with faults.at("safety"):
+        if "safety" not in accepted(part.cls):
+            raise ScenarioError(
+                f"got `safety`, but the law `{part.name}` moves agents by their states, for which "
+                "there is no proof; use `stopping-point`."
+            )
+        return {"safety": Safety(**scenario.safety.model_dump())}
+    return {}
 
 
 def _check_keys(scenario: Scenario, faults: FaultList, role: str, part: NamedClass) -> None:

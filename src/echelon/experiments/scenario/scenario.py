@@ -49,6 +49,7 @@ class Scenario(BaseModel, **STRICT):
     reference: sections.ReferenceSpec | None = None
     leader: law_sections.LeaderSpec = Field(default_factory=law_sections.LeaderSpec)
     follower: law_sections.FollowerSpec = Field(default_factory=law_sections.FollowerSpec)
+    safety: sections.SafetySpec | None = None
     initial: sections.InitialSpec = Field(default_factory=sections.InitialSpec)
     disturbance: sections.DisturbanceSpec | None = None
     actuator: sections.ActuatorSpec | None = None
@@ -118,6 +119,7 @@ _ALLOWED = {
     "greater_than": "is a number above {gt:g}",
     "greater_than_equal": "is a number of at least {ge:g}",
     "less_than": "is a number below {lt}",
+    "less_than_equal": "is a number of at most {le:g}",
     "too_short": "is a list of at least {min_length} number",
 }
 

@@ -291,6 +291,27 @@ class NetworkSpec(BaseModel, **STRICT):
 
 
 @final
+class SafetySpec(BaseModel, **STRICT):
+    """Collision avoidance of the followers under the law `stopping-point`, with a proof.
+
+    Upright ellipsoids about the agents are kept apart. Distances are scaled: heights are divided by
+    the ellipsoid's height over its width.
+    """
+
+    radii: Annotated[Numbers | None, Unit("m")] = None
+    """Radii of the ellipsoid along x, y and z, m, the first two equal; default the model's radius,
+    and three times as much upward."""
+    gain: Annotated[Positive, Unit("1/s")] = 4.0
+    """Rate at which agents may use up their distance, 1/s; at most 1 / `simulation.dt`."""
+    swirl: Annotated[NotNegative, Unit("m/s")] = 0.5
+    """Speed with which an agent that is held back turns to its right, m/s."""
+    margin: Annotated[NotNegative, Unit("m")] = 0.05
+    """Added to the distance that is kept, m: for late messages, lag, noise and wind."""
+    reach: Annotated[Positive, Unit("m")] = 3.0
+    """Scaled distance up to which other agents are regarded, m, whatever the graph."""
+
+
+@final
 class SimulationSpec(BaseModel, **STRICT):
     """How the run is computed."""
 

@@ -15,6 +15,7 @@ from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 from echelon.guarantees.messages.late_agreement import LateRate, late_rates, longest_ways
 from echelon.guarantees.messages.message_ages import MessageAges, ages_of
 
+_DIRECTED = "With `graph.directed: true` messages of any age would cost a delay alone"
 OFF_PLAN = 0.01
 """Of a leader's speed against its plan, in units of an output per second, for an example."""
 
@@ -43,6 +44,7 @@ class Following(NamedTuple):
         speed: s of followers, the smallest of all outputs.
         still: whether the leader is where it stays from the start on.
         apart: whether leaders start apart.
+        avoiding: whether followers keep away from each other.
     """
 
     graph: Graph
@@ -51,6 +53,7 @@ class Following(NamedTuple):
     speed: float
     still: bool
     apart: bool
+    avoiding: bool = False
 
 
 class LateMessages(NamedTuple):
@@ -130,21 +133,22 @@ class LateMessages(NamedTuple):
             return ""
         return f", and at {self.quick:.3g} 1/s while no message in use is older than {age}"
 
-    def sentence(self) -> str:
-        """Return what is guaranteed beside rates and the arrival, in sentences."""
+    def sentence(self, arrival: float | None) -> str:
+        """Return what is guaranteed beside rates, in sentences; the arrival (s) where known."""
         ages, text = self.ages, "No stopping point moves farther from the leader's than the "
         text += "farthest one was"
         if ages.first_packet is None:
             return f"{text}. A link may lose all messages of a run"
-        more = "E"
-        if ages.lost:
-            more = f"In all but one run in a million no link loses more than {ages.lost} in a row, "
-            more += "and e"
-        text += f". {more}verybody has a packet"
-        text += " and knows its hops" * self.leaderward
+        few = f"In all but one run in a million no link loses more than {ages.lost} in a row, e"
+        text += f". {few if ages.lost else 'E'}verybody has a packet"
+        text += " and knows its hops" * self.leaderward + f" after {ages.first_packet:.3g} s"
         late = 0.0 if self.ways is None else float(self.ways.max() - 1) * self.age
-        text += f" after {ages.first_packet:.3g} s"
-        return text + f"; messages then cost a delay of {late:.3g} s at most" * bool(late)
+        text += f"; messages then cost a delay of {late:.3g} s at most" * bool(late)
+        if arrival is not None:
+            text += f", and from these starts all stay within 1 cm after {arrival:.3g} s"
+        # Without ages agreement is at least as fast as c / max w.
+        slow = self.ways is None and 2.0 * self.rate < self.coupling / self.spread
+        return f"{text}. {_DIRECTED}" if slow else text
 
 
 def late_messages_of(
@@ -219,6 +223,9 @@ def _uncovered(network: Network, following: Following) -> Uncovered | None:
         return Uncovered(text, "set `prediction: preview`", True)
     if following.apart:
         return Uncovered("the leaders start apart", "start the leaders alike", False)
+    if following.avoiding:
+        text = "agents that keep apart do not always move as their messages ask"
+        return Uncovered(text, "remove `safety` to see what is guaranteed without it", False)
     if following.graph.schedule is not None:
         return Uncovered(
             "the graph switches, and late messages are covered for one graph only",

@@ -17,6 +17,7 @@ from echelon.guarantees.promises.leaders import leaders_of
 from echelon.guarantees.promises.promise import AgreementModes, Promise
 from echelon.guarantees.stopping.leader_drift import leader_drift_line
 from echelon.guarantees.stopping.motor_design import MotorDesign, design_with_motors
+from echelon.guarantees.stopping.separation import Separation, separation_of
 from echelon.guarantees.stopping.stopping_run import (
     StoppingRun,
     agreement_modes,
@@ -43,12 +44,14 @@ class StoppingPromise(Promise):
         tube: what is guaranteed; None for nothing.
         coupling: c.
         hold: the longest step (s) that keeps the largest stopping point from growing.
+        separation: what is guaranteed of distances; None where agents do not keep apart.
     """
 
     run: StoppingRun
     tube: Tube | None
     coupling: float
     hold: float
+    separation: Separation | None
 
     @classmethod
     def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "StoppingPromise":
@@ -65,6 +68,10 @@ class StoppingPromise(Promise):
         lines += [line for line in more if line is not None]
         by_name = {cast(Hypothesis, x.statement): x for x in lines}
         against = any(line.fails and line.reason for line in by_name.values())
+        tube = None if against else tube
+        separation = separation_of(run, tube, bool(case.disturbed))
+        if separation is not None:
+            by_name[Hypothesis.SEPARATION] = separation.line
         return cls(
             loop=case.loop,
             hypotheses=MappingProxyType(by_name),
@@ -75,7 +82,8 @@ class StoppingPromise(Promise):
             # In float64, which a law computes in only here.
             coupling=run.coupling,
             hold=run.longest_step,
-            tube=None if against else tube,
+            tube=tube,
+            separation=separation,
         )
 
     @classmethod
@@ -84,14 +92,15 @@ class StoppingPromise(Promise):
         return design_with_motors(parts, settings)
 
     @property
-    def ground(self) -> Tube | None:
-        """What T5 says; None where nothing is guaranteed."""
-        return self.tube
+    def ground(self) -> Tube | Separation | None:
+        """What T5 or T10 says; None where nothing is guaranteed."""
+        return self.separation or self.tube
 
     @property
     def rate(self) -> float | None:
-        """At what rate errors shrink in the end, 1/s; None where nothing is guaranteed."""
-        return None if self.tube is None else self.tube.rate
+        """At what rate errors shrink in the end, 1/s; None where that is not guaranteed."""
+        # Agents that hold each other back may do so for ever.
+        return None if self.tube is None or self.separation is not None else self.tube.rate
 
     @property
     def slowest(self) -> float | None:
@@ -103,9 +112,9 @@ class StoppingPromise(Promise):
         return self.hold
 
     def guarantee(self) -> str:
-        """Return what T5 guarantees."""
-        assert self.tube is not None
-        return self.tube.sentence()
+        """Return what T5 or T10 guarantees."""
+        assert self.ground is not None
+        return self.ground.sentence()
 
     def why_covered(self) -> str:
         """Return why a run is covered in which no limit acted."""
@@ -131,7 +140,9 @@ class StoppingPromise(Promise):
 
     def anywhere(self) -> dict[str, Any] | None:
         """Return the tube ready for JSON; None where nothing is guaranteed."""
-        return None if self.tube is None else self.tube.as_mapping()
+        if self.tube is None or self.separation is None:
+            return None if self.tube is None else self.tube.as_mapping()
+        return self.tube.as_mapping() | {"separation": self.separation.as_mapping()}
 
 
 def _own_line(run: StoppingRun, problem: Problem) -> Statement | None:

@@ -197,7 +197,8 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
     graph, leaderward = parts.graph, drive.follower.leaderward
     speed = min(map(run.law.speed_of, range(len(run.law.ready.chains.outputs))))
-    following = Following(graph, leaderward, run.coupling, speed, run.still, run.apart)
+    avoiding = run.law.safety is not None
+    following = Following(graph, leaderward, run.coupling, speed, run.still, run.apart, avoiding)
     times = settings.dt, settings.horizon, settings.steps
     return run._replace(late=late_messages_of(parts.world.network, following, *times))
 
@@ -237,6 +238,7 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
         text = "the agreement over a period, or eventually"
     text += ", and the leaders' own coupling" * run.apart
     text = f"the slowest of the roots, {text}; far away the `speed` limits it"
+    text += ", and not while agents hold each other back" * (run.law.safety is not None)
     changed = _changed(run)
     yield (
         changed
@@ -343,14 +345,15 @@ def _strengths(run: StoppingRun) -> Array:
     """Return eigenvalues of the followers' Laplacian that stand for all, (K,)."""
     graph, reach = run.parts.graph, run.law.reach
     assert reach is not None
-    if run.network is not None:
-        # What is heard is late, and an agent answers to its own deviation alone.
-        return run.network.sums
+    # Over a network what is heard is late, and an agent answers to its own deviation.
+    alone = np.array([]) if run.network is None else run.network.sums
+    if run.network is not None and run.network.ways is not None:
+        return alone
     if run.law.leaderward or graph.directed or graph.schedule is not None:
-        return agreement_modes(graph, run.law)
+        return np.append(alone, agreement_modes(graph, run.law))
     # By Gershgorin none is larger than 2 d_max, nor as large where somebody hears a leader.
-    alone = max(run.law.ready.chains.degrees) == 1
-    return np.array([reach.slowest, 2.0 * reach.heaviest * (_BELOW if alone else 1.0)])
+    below = _BELOW if max(run.law.ready.chains.degrees) == 1 else 1.0
+    return np.append(alone, [reach.slowest, 2.0 * reach.heaviest * below])
 
 
 def agreement_modes(graph: Graph, law: StoppingPoint) -> Array:

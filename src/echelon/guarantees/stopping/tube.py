@@ -69,10 +69,10 @@ class Tube(NamedTuple):
         text = f"{self.kind.value}: errors converge to zero from {self.who}, for any number of "
         text += f"agents and {self.graphs[0]}, if the model is exact and {self._received()}. "
         text += f"On {self.graphs[1]} they decay at {self.rate:.3g} 1/s or faster eventually"
-        text += "" if self.network is None else self.network.faster()
-        if self.arrival is not None:
+        if self.network is not None:
+            text += f"{self.network.faster()}. {self.network.sentence(self.arrival)}"
+        elif self.arrival is not None:
             text += f"; from these starts all stay within 1 cm after {self.arrival:.3g} s"
-        text += "" if self.network is None else f". {self.network.sentence()}"
         return f"{text}." if self.motor_load is None else f"{text}. {self.motor_load.sentence()}"
 
     def _received(self) -> str:
@@ -144,7 +144,8 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     )
     if brief:
         return tube, lines
-    arrival = arrival_of(run, _positions(run))
+    # Agents that hold each other back come later than they would alone.
+    arrival = None if run.law.safety is not None else arrival_of(run, _positions(run))
     motor_load, line = motor_load_of(run)
     tube = tube._replace(arrival=arrival, motor_load=motor_load)
     if motor_load is not None and line.kind is Kind.SAMPLES:

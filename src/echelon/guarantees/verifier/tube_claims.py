@@ -14,6 +14,7 @@ import numpy as np
 from echelon.core.types import Array, JsonObject
 from echelon.guarantees.verifier.findings import Finding, compare, decide
 from echelon.guarantees.verifier.motor_claims import motor_findings
+from echelon.guarantees.verifier.separation_claims import separation_findings
 
 FORMAT = "echelon tube 1"
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
@@ -41,6 +42,8 @@ def tube_findings(tube: JsonObject) -> Iterator[Finding]:
         yield from _check_margin(border, roots, name)
     if tube.get("motors") is not None:
         yield from motor_findings(tube["motors"])
+    if tube.get("separation") is not None:
+        yield from separation_findings(tube["separation"])
 
 
 def _check_margin(border: JsonObject, roots: Sequence[Fraction], name: str) -> Iterator[Finding]:

@@ -33,6 +33,7 @@ _CAPTIONS = {
     "formation": "Distances of the followers from their goals, with the guaranteed rate.",
     "inputs": "Actuator loads and their limits.",
     "lyapunov": "Lyapunov function V and its derivative.",
+    "avoidance": "Smallest scaled distance of agents that keep apart, and those held back.",
     "ages": "Age of the oldest message of each follower.",
 }
 

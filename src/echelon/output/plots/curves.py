@@ -300,6 +300,35 @@ def ages(run: Recording) -> "Figure | None":
     return draw.finish(figure, legends=[last])
 
 
+def avoidance(run: Recording) -> "Figure | None":
+    """Return how near agents came that keep apart, and how many held each other back, over time."""
+    numbers = run.avoidance
+    if numbers is None:
+        return None
+
+    def slices(frames: Array) -> tuple[Array, Array]:
+        within = numbers.times <= run.times[frames[-1]]
+        return within, numbers.times[within]
+
+    def show_near(ax: "Axes", frames: Array) -> None:
+        within, times = slices(frames)
+        draw.plot(ax, times, numbers.distance[within], color=draw.LEADER, label="any two agents")
+        look = {"color": "0.5", "linewidth": 0.8, "zorder": 1}
+        ax.axhline(numbers.kept, label="kept by hulls", linestyle=":", **look)
+        ax.axhline(numbers.touching, label="touching", linestyle="-", **look)
+        ax.set_ylabel(draw.label("smallest scaled distance", "m"))
+        ax.set_ylim(bottom=0.0)
+
+    def show_held(ax: "Axes", frames: Array) -> None:
+        within, times = slices(frames)
+        ax.step(times, numbers.active[within], where="post", color=draw.LEADER)
+        ax.set_ylabel("active rows")
+        ax.set_ylim(bottom=0.0)
+
+    figure, axes = over_time(run, [show_near, show_held], 1.9)
+    return draw.finish(figure, legends=[row[-1] for row in axes])
+
+
 def _edges(ax: "Axes", run: Recording, times: Array, apart: Array, desired: Array) -> None:
     """Draw the distance of each edge, or quantiles of the errors of many."""
     if len(run.edges) > draw.NAMED:

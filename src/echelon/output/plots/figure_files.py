@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 NAMES = (
     *("leader_3d", "trajectories", "top_view", "tracking", "formation", "inputs"),
-    *("states", "distances", "lyapunov", "modes", "network", "ages"),
+    *("states", "distances", "lyapunov", "modes", "network", "ages", "avoidance"),
 )
 """All figures of a run."""
 

@@ -21,19 +21,17 @@ _MAKERS: "dict[str, Callable[[Recording], Figure | None]]" = dict(
         NAMES,
         (
             *(trajectories.leader, trajectories.trajectories, trajectories.top_view),
-            *(
-                curves.tracking,
-                curves.formation,
-                input_figure.inputs,
-                curves.states,
-                curves.distances,
-            ),
-            *(curves.lyapunov, network.modes, network.network, curves.ages),
+            *(curves.tracking, curves.formation, input_figure.inputs),
+            *(curves.states, curves.distances, curves.lyapunov),
+            *(network.modes, network.network, curves.ages, curves.avoidance),
         ),
         strict=True,
     )
 )
-DEFAULT = ("leader_3d", "trajectories", "tracking", "formation", "inputs", "lyapunov", "ages")
+DEFAULT = (
+    *("leader_3d", "trajectories", "tracking", "formation", "inputs", "lyapunov"),
+    *("ages", "avoidance"),
+)
 """Figures that a run writes into its folder."""
 
 
@@ -56,6 +54,7 @@ def figures(
     - `modes`: the closed-loop poles
     - `network`: the communication graph
     - `ages`: of the oldest message of each follower, over a network
+    - `avoidance`: how near agents came that keep apart, and how many held each other back
 
     A run without a stored frame has no figures. Parts of a diverging run a million times beyond its
     start and reference are not drawn, and the figure says so.

@@ -97,7 +97,7 @@ def _success(data: "xr.Dataset", keys: list[str]) -> "Figure":
         bars = np.abs(np.stack([rate - low, high - rate]))
         look = {"marker": "o", "markersize": 3, "linestyle": ":", "elinewidth": 0.9, "capsize": 2}
         ax.errorbar(values, rate, bars, color=draw.COLOURS[0], linewidth=0.7, **look)
-        _scale(ax, "x", values)
+        _name_values(ax, "x", values)
         ax.set_xlabel(_label(data, key))
         ax.set_ylim(-0.03, 1.03)
     axes[0].set_ylabel("share of runs that settle")
@@ -112,11 +112,8 @@ def _region(data: "xr.Dataset", first: str, second: str) -> "Figure":
     ends = []
     for which, key in (("x", first), ("y", second)):
         values = rate[key].values
-        _scale(ax, which, values)
+        _name_values(ax, which, values)
         ends.append(_cell_ends(values))
-        ticks = values if len(values) <= _TICKS else values[:: -(-len(values) // _TICKS)]
-        getattr(ax, f"set_{which}ticks")(ticks, [f"{value:g}" for value in ticks])
-        getattr(ax, f"set_{which}ticks")([], minor=True)
         getattr(ax, f"set_{which}label")(_label(data, key))
     x, y = ends
     mesh = ax.pcolormesh(x, y, rate.values, vmin=0.0, vmax=1.0, cmap="viridis")
@@ -159,6 +156,14 @@ def _scale(ax: "Axes", which: str, values: Array) -> None:
     """Choose a logarithmic axis where values need one."""
     if _is_geometric(values):
         getattr(ax, f"set_{which}scale")("log")
+
+
+def _name_values(ax: "Axes", which: str, values: Array) -> None:
+    """Put ticks of an axis at values, or at some of many."""
+    _scale(ax, which, values)
+    ticks = values if len(values) <= _TICKS else values[:: -(-len(values) // _TICKS)]
+    getattr(ax, f"set_{which}ticks")(ticks, [f"{value:g}" for value in ticks])
+    getattr(ax, f"set_{which}ticks")([], minor=True)
 
 
 def _cell_ends(values: Array) -> Array:

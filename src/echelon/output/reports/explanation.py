@@ -8,6 +8,7 @@ from echelon.agents.network.hearing import who_hears_whom
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
 from echelon.experiments.results.agent_metrics import Metrics
+from echelon.experiments.results.avoidance import avoidance
 from echelon.experiments.results.lyapunov import Lyapunov, lyapunov
 from echelon.guarantees.promises.covering import coverage
 from echelon.guarantees.promises.promise import Promise, promise
@@ -58,6 +59,8 @@ def _closest(result: Result, numbers: Metrics) -> Iterator[str]:
     """Yield which agents came closest to each other, and whether vehicles would have touched."""
     if numbers.closest is not None and result.outcome is not Outcome.DIVERGED:
         yield numbers.closest.sentence(result.radius)
+    kept = avoidance(result)
+    yield from () if kept is None else (kept.sentence(),)
 
 
 def _world(result: Result) -> Iterator[str]:

@@ -3,39 +3,51 @@
 import math
 import numbers
 from collections.abc import Sequence
-from typing import NamedTuple, final
+from typing import final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
 
-from echelon.agents.models.model import ControlAffine
-from echelon.agents.network.exchange import Exchange
-from echelon.agents.network.inbox import Inbox, Message, NamedValues, Packet, Received, Stamps
-from echelon.agents.world.estimator import Estimate, Estimator
-from echelon.core.compiled import cached_jit
+from echelon.agents.network.inbox import (
+    Inbox,
+    Message,
+    NamedValues,
+    Packet,
+    Received,
+    Stamps,
+    Surroundings,
+)
+from echelon.agents.network.near import Near
+from echelon.agents.world.estimator import Estimate
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.numerics import precision
-from echelon.core.types import Array, PyTree, Scalar, State
+from echelon.core.types import Array, State
 from echelon.core.words import Feedforward, MessageContent
-from echelon.laws.law import Law, LocalView, Memory
+from echelon.laws.law import Law, Memory
 from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.own_step import (
+    OwnState,
+    Step,
+    begin_alone,
+    hull_of,
+    is_finite,
+    measured_alone,
+    signal_of,
+    step_alone,
+    step_over_network,
+)
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.action import Action, act, feedforward_of
+from echelon.simulation.step.action import feedforward_of
 from echelon.simulation.step.knowledge import (
     NOBODY,
     Ages,
-    Letters,
     Mail,
     Packets,
     Readers,
-    content_of,
     packet_size,
-    understand,
-    write,
 )
 from echelon.simulation.step.loop import Loop, assemble
 from echelon.simulation.step.settings import Settings
@@ -81,8 +93,8 @@ class Agent:
                 f"agent {agent!r} is not in this graph, whose agents are 0 to "
                 f"{parts.graph.agents - 1}."
             )
-        network = parts.world.network
-        horizon = dt if network is None else dt * math.ceil(1.0 + network.delay / dt)
+        late = [part.delay for part in (parts.world.network, parts.world.sensing) if part]
+        horizon = dt * math.ceil(1.0 + max([0.0, *late]) / dt)
         prepared = prepare(parts, Settings(horizon=horizon, dt=dt, limits=limits))
         drive = prepared.parts.drive
         assert isinstance(drive, Laws)
@@ -102,6 +114,7 @@ class Agent:
         self._inbox = Inbox(
             self.neighbours, self._source_in(parts), *self._names, stamps=self._stamps
         )
+        self._others = self._surroundings(graph.agents)
         sensors = self._loop.sensors
         self._estimator = None if sensors is None else sensors.estimator
         self._estimate: Estimate | None = None
@@ -118,6 +131,18 @@ class Agent:
         own = self.number if self.leads else None
         deviation = channel.messages is MessageContent.DEVIATION
         return Stamps(len(self.neighbours), leaders, size, own, deviation)
+
+    def _surroundings(self, agents: int) -> Surroundings | None:
+        """Return where the hulls of others are stored; None where agents do not keep apart."""
+        safety, model = self._loop.follower.safety, self._loop.model
+        if safety is None:
+            return None
+        with precision("float64"):
+            x = jnp.zeros(len(model.state_names))
+            hull = jax.eval_shape(lambda: self._law.hull(model, x, self._law.begin(model, x)))
+        assert hull is not None
+        names = tuple(f"{name}{k}" for k in range(len(hull)) for name in model.position)
+        return Surroundings([k for k in range(agents) if k != self.number], names)
 
     @property
     def _sizes(self) -> tuple[int, int, int]:
@@ -136,7 +161,12 @@ class Agent:
 
     def receive(self, message: object) -> Received:
         """Take a message of another agent, or return why it is not used. It never raises."""
-        return self._inbox.receive(message)
+        received = self._inbox.receive(message)
+        if self._others is None or received not in (Received.TAKEN, Received.NOT_HEARD):
+            return received
+        # Of others than neighbours the place alone is used.
+        clock = None if self._stamps is None else self._stamps.clock
+        return Received.TAKEN if self._others.take(message, clock) else received
 
     def hello(self, x: ArrayLike) -> Message | None:
         """Return the message of the agent at a state (n,), before it acts.
@@ -148,8 +178,13 @@ class Agent:
         """
         with precision("float64"):
             own = self._own(self._measured(self._state(x))[0])
-            signal = np.asarray(_signal(self._loop, self._law, own))
-        return self._message(signal) if np.isfinite(signal).all() else self._last[1]
+            signal, hull = (
+                signal_of(self._loop, self._law, own),
+                hull_of(self._loop, self._law, own),
+            )
+        message = self._message(np.asarray(signal))
+        finite = bool(is_finite((signal, hull)))
+        return self._with_hull(message, hull) if finite else self._last[1]
 
     def step(self, t: float, x: ArrayLike) -> tuple[Array, Message | None]:
         """Return the physical input (m,) that is delivered from t (s) on, and the whole message.
@@ -177,7 +212,7 @@ class Agent:
             state, estimate = self._measured(self._state(x))
             own, time = self._own(state), jnp.asarray(self._time)
             if self._stamps is None:
-                step = _step(
+                step = step_alone(
                     self._loop,
                     self.leads,
                     time,
@@ -185,20 +220,36 @@ class Agent:
                     self._inbox.signals,
                     self._weights[row],
                     self._inbox.feedforward,
+                    self._hulls(),
                 )
             else:
                 mail, ages = self._mail(self._stamps)
-                rows = self._reader, time, own, mail, ages, self._weights[row]
-                step = _late_step(self._loop, self.leads, *rows)
+                rows = self._reader, time, own, mail, ages, self._weights[row], self._hulls()
+                step = step_over_network(self._loop, self.leads, *rows)
         if step.finite:
             self._memory, self._begun = step.action.memory, True
             if estimate is not None and self._estimator is not None:
                 self._estimate = self._estimator.act(estimate, step.action.input)
-            message = self._written(step)
+            message = self._with_hull(self._written(step), step.hull)
             self._last = np.asarray(step.action.input), message
         else:
             self.blind += 1
         return self._last
+
+    def _hulls(self) -> Near | None:
+        """Return the hulls of others for a follower, NaN for those that it did not receive."""
+        if self._others is None or self.leads:
+            return None
+        others, d = len(self._others.time), len(self._loop.model.position)
+        hulls = jnp.asarray(self._others.hulls.reshape(others, -1, d))
+        numbers = np.delete(np.arange(others + 1), self.number)
+        known = ~jnp.isnan(hulls).any(axis=(1, 2))
+        return Near(hulls, jnp.asarray(np.isin(numbers, self._loop.leaders)), known)
+
+    def _with_hull(self, message: Message | None, hull: jax.Array | None) -> Message | None:
+        if message is None or hull is None or self._others is None:
+            return message
+        return message._replace(hull=NamedValues(self._others.names, np.asarray(hull).ravel()))
 
     @property
     def _reader(self) -> Readers:
@@ -223,7 +274,7 @@ class Agent:
         link = jnp.asarray(np.maximum(0.0, self._time - stamps.time))
         return mail, Ages(link, jnp.array([since]))
 
-    def _written(self, step: "_Step") -> Message | None:
+    def _written(self, step: "Step") -> Message | None:
         """Return the message of a step; None of an agent that has heard of no leader."""
         if self._stamps is None or step.letter is None:
             return self._message(step.signal, step.action.message)
@@ -256,11 +307,11 @@ class Agent:
             return y, None
         model, before = self._loop.model, self._estimate
         before = self._estimator.begin(model, y) if before is None else before
-        return _measure(self._estimator, model, before, y, jnp.asarray(not self._begun))
+        return measured_alone(self._estimator, model, before, y, jnp.asarray(not self._begun))
 
-    def _own(self, state: State) -> "_OwnState":
-        memory = self._memory if self._begun else _begin(self._loop, self._law, state)
-        return _OwnState(state, jnp.asarray(self._loop.offsets[self.number]), memory)
+    def _own(self, state: State) -> "OwnState":
+        memory = self._memory if self._begun else begin_alone(self._loop, self._law, state)
+        return OwnState(state, jnp.asarray(self._loop.offsets[self.number]), memory)
 
 
 def _names(loop: Loop, law: Law) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -269,9 +320,9 @@ def _names(loop: Loop, law: Law) -> tuple[tuple[str, ...], tuple[str, ...]]:
     x, v = jnp.zeros(len(model.state_names)), jnp.zeros(len(model.input_names))
 
     def sizes() -> tuple[jax.Array, jax.Array]:
-        own = _OwnState(x, x, law.begin(model, x))
+        own = OwnState(x, x, law.begin(model, x))
         forward = feedforward_of(follower, model, x, v, own.memory)
-        return _signal(loop, law, own), forward
+        return signal_of(loop, law, own), forward
 
     signal, forward = jax.eval_shape(sizes)
     heading = ("heading",) * follower.turning
@@ -284,108 +335,3 @@ def _names(loop: Loop, law: Law) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def _fitting(names: tuple[str, ...], size: int) -> tuple[str, ...]:
     """Return names of as many values; numbers where a law of a user's own says no names."""
     return names if len(names) == size else tuple(map(str, range(size)))
-
-
-class _OwnState(NamedTuple):
-    """What an agent knows without messages: its state (n,), its offset (n,) and its memory."""
-
-    x: State
-    offset: State
-    memory: Memory
-
-
-@cached_jit
-def _begin(loop: Loop, law: Law, x: State) -> Memory:
-    return law.begin(loop.model, x)
-
-
-@cached_jit
-def _measure(
-    estimator: Estimator, model: ControlAffine, before: Estimate, y: State, first: jax.Array
-) -> tuple[State, Estimate]:
-    return estimator.measure(model, before, y, first)
-
-
-@cached_jit
-def _signal(loop: Loop, law: Law, own: _OwnState) -> Float[jax.Array, " s"]:
-    """Return what the agent sends to its neighbours."""
-    signal = law.signal(loop.model, *own)
-    return own.x - own.offset if signal is None else signal
-
-
-class _Step(NamedTuple):
-    """The signal (s,) of an agent, what it does, and whether both and its state are finite.
-
-    `letter` is what it sends over a network that is late, as a row of one.
-    """
-
-    signal: jax.Array
-    action: Action
-    finite: jax.Array
-    letter: Letters | None = None
-
-
-@cached_jit
-def _step(
-    loop: Loop,
-    leads: bool,
-    t: Scalar,
-    own: _OwnState,
-    received: Float[jax.Array, "K s"],
-    weights: Float[jax.Array, " K"],
-    forward: Float[jax.Array, " k"],
-) -> _Step:
-    """Return what the agent does with what it received, NaN for what it did not."""
-    law, model = loop.leader if leads else loop.follower, loop.model
-    signal = _signal(loop, law, own)
-    states = law.signal(model, *own) is None
-    difference = model.difference if states else jnp.subtract
-    # The own value has no difference: a neighbour that is not heard does not act.
-    theirs = jnp.where(jnp.isnan(received), signal, received)
-    gaps = jax.vmap(lambda value: difference(signal, value))(theirs)
-    alone = jnp.zeros_like(forward)
-    if loop.follower.turning and not leads:
-        alone = alone.at[-1].set(law.heading(model, t, own.x))
-    forward = jnp.where(jnp.isnan(forward), alone, forward)
-    forward = jnp.zeros(len(model.input_names)) if leads else forward
-    view = LocalView(t, own.x, own.offset, weights @ gaps, forward, loop.motion.dt)
-    action = act(loop, law, view, own.memory, leads)
-    return _Step(signal, action, _finite((own.x, signal, action)))
-
-
-def _finite(tree: PyTree) -> jax.Array:
-    leaves = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
-    return jnp.all(jnp.array([jnp.isfinite(leaf).all() for leaf in leaves]))
-
-
-@cached_jit
-def _late_step(
-    loop: Loop,
-    leads: bool,
-    reader: Readers,
-    t: Scalar,
-    own: _OwnState,
-    mail: Mail,
-    ages: Ages,
-    weights: Float[jax.Array, " K"],
-) -> _Step:
-    """Return what the agent does and sends over a network that is late."""
-    law, model = loop.leader if leads else loop.follower, loop.model
-    signal, nobody = _signal(loop, law, own), np.zeros(len(weights), np.int32)
-    states = law.signal(model, *own) is None
-    difference = jax.vmap(model.difference if states else jnp.subtract)
-    rows = loop, Exchange(nobody, nobody, weights), reader, t, mail, ages, signal[None], difference
-    knowledge = understand(*rows)
-    forward = jnp.zeros(len(model.input_names)) if leads else knowledge.feedforward[0]
-    z = knowledge.disagreement[0]
-    view = LocalView(t, own.x, own.offset, z, forward, loop.motion.dt)
-    action = act(loop, law, view, own.memory, leads)
-    content = mail.packet.content
-    if leads:
-        content = content_of(loop, t, *own, signal, action.message, action.input)[None]
-    step = jnp.zeros((), jnp.int32)
-    assert loop.channel is not None
-    letter, _ = write(
-        loop.channel, reader, step, mail, knowledge, signal[None], difference, content
-    )
-    return _Step(signal, action, _finite((own.x, signal, action, letter)), letter)

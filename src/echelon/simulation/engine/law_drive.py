@@ -17,8 +17,11 @@ from echelon.core.errors import (
 )
 from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
+from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import leader_warnings, prepare_law
+from echelon.laws.safety import Safety
+from echelon.laws.together import check_numbers, hulls_at, separations, too_near
 from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.native import is_installed
 from echelon.simulation.native.stepper import NativeStepper
@@ -76,6 +79,11 @@ class Laws(Drive):
         return getattr(self.leader, "reaction", None) is not None
 
     @property
+    def safety(self) -> Safety | None:
+        """How the followers' law keeps them away from each other."""
+        return self.follower.safety
+
+    @property
     def trimmed(self) -> bool:
         """Whether the followers' law applies the trim input."""
         return getattr(self.follower, "trim", True)
@@ -108,7 +116,13 @@ class Laws(Drive):
                 "nothing in the same step; use `relay`, which is predicted."
             )
         preview = network.prediction is Prediction.PREVIEW
-        if network.messages is MessageContent.DEVIATION and preview and not self.leader.plans:
+        deviations = network.messages is MessageContent.DEVIATION
+        if self.safety is not None and not (deviations and preview):
+            raise SimulationError(
+                "`safety` over a network needs the messages `deviation` and the prediction "
+                f"`preview`, and got `{network.messages}` and `{network.prediction}`."
+            )
+        if deviations and preview and not self.leader.plans:
             raise SimulationError(
                 f"`prediction` of the network is `preview`, and a leader under the law "
                 f"`{type(self.leader).__name__}` has no plan; use `packet`."
@@ -121,6 +135,9 @@ class Laws(Drive):
         Raises:
             LawError: one is refused.
         """
+        if isinstance(self.follower, FlatLaw) and self.safety is not None:
+            rows = problem.graph, problem.formation.offsets, problem.settings.dt
+            check_numbers(self.follower, problem.model, *rows)
         refused = self.refusals(problem.model, problem.graph, problem.states[None])
         for _, agent, text in refused:
             raise LawError(f"agent {agent} starts where its law has no meaning: {text}.")
@@ -133,6 +150,13 @@ class Laws(Drive):
             starts = states[:, list(agents)].reshape(-1, states.shape[2])
             for place, text in law.refusals(model, starts):
                 yield place // len(agents), agents[place % len(agents)], text
+        if isinstance(self.follower, FlatLaw) and self.safety is not None:
+            for place, start in enumerate(states):
+                hulls = hulls_at(self.follower, model, self.leader, graph, start)
+                apart = separations(hulls * self.safety.scales(model))
+                near = too_near(self.safety, apart)
+                if near is not None:
+                    yield place, near.agent, f"it is too near to {near.text}"
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws, and about references that leaders cannot follow."""

@@ -70,6 +70,8 @@ class BlockRows(NamedTuple):
             raise Unsupported("a network that is not ideal")
         if loop.sensors is not None:
             raise Unsupported("agents that measure their states late or with noise")
+        if loop.follower.safety is not None:
+            raise Unsupported("agents that keep away from each other")
         if not loop.motion.ideal:
             raise Unsupported(
                 "substeps, actuators that lag, correlated wind, air, or agents that differ"

@@ -390,9 +390,9 @@ class NativeStepper(Stepper):
             unsettled=of(rows.unsettled)[:, 0],
             inside=np.minimum(of(rows.inside), ALWAYS),
             chatter=of(rows.chatter)[:, 0],
+            **dict.fromkeys(("separation", "avoidance"), np.zeros((len(agent_sums), 0))),
         )
-        sums = Sums(*(np.asarray(part, np.float64) for part in sums))
-        return sums.split(len(self.loops))
+        return Sums(*(np.asarray(part, np.float64) for part in sums)).split(len(self.loops))
 
 
 def _total_and_window(sums: Array) -> Array:

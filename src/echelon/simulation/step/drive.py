@@ -22,6 +22,7 @@ from echelon.core.errors import SimulationError
 from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.core.words import Feedforward, Frame
 from echelon.laws.law import Law
+from echelon.laws.safety import Safety
 from echelon.simulation.step.meter import Meter, Sums
 from echelon.simulation.step.motion import Motion
 from echelon.simulation.step.settings import Settings
@@ -203,6 +204,11 @@ class Drive(eqx.Module):
     def reacts(self) -> bool:
         """Whether the leaders react to their neighbours."""
         return False
+
+    @property
+    def safety(self) -> Safety | None:
+        """How followers keep away from each other; None where they do not."""
+        return None
 
     @property
     def trimmed(self) -> bool:

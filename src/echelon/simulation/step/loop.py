@@ -113,6 +113,7 @@ class WorldState(NamedTuple):
         mail: what agents keep of those that they received, as `Mail`.
         motion: what the plants remember besides their states, as `MotionState`.
         measured: (d, N, n) the states of the last d steps, where agents measure theirs late.
+        seen: messages about places, as `Sightings`, where agents keep away from each other.
         estimates: of agents that estimate their states, as `Estimate`.
     """
 
@@ -120,6 +121,7 @@ class WorldState(NamedTuple):
     mail: PyTree = None
     motion: PyTree = None
     measured: PyTree = None
+    seen: PyTree = None
     estimates: PyTree = None
 
 

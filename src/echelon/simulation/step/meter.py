@@ -27,6 +27,8 @@ _Numbers = TypeVar("_Numbers", jax.Array, Array)
 ALWAYS = 2**31 - 1
 """The first step at which a state was outside of its chart, if it never was."""
 
+SLICES = 200
+"""Of a run at most, for each of which distances are stored where agents keep apart."""
 SETTLED = 0.01
 """A follower has settled when its error stays below this: 1 cm for a position."""
 
@@ -49,6 +51,9 @@ class Sums(NamedTuple):
         inside: (N, k) the first step at which each of the k states that the model's chart bounds
             was not inside; `ALWAYS` if there is none.
         chatter: (N,) number of steps in which an input went from one limit to the opposite one.
+        separation: (N, B) where agents keep apart, the least scaled distance to another agent, m,
+            in each of B slices of the run; infinite before.
+        avoidance: (N, B) how many others changed the agent's rate, summed over the steps of each.
     """
 
     steps: Total
@@ -61,10 +66,13 @@ class Sums(NamedTuple):
     unsettled: Total
     inside: Total
     chatter: Total
+    separation: Total
+    avoidance: Total
 
     def plus(self, more: "Sums") -> "Sums":
         """Return the sums of two stretches of a run."""
         total = Sums(*(a + b for a, b in zip(self, more, strict=True)))
+        total = total._replace(separation=self.separation.clip(None, more.separation))
         # The maximum, and below the minimum; written so that NumPy on the host and JAX within a
         # chunk both have it.
         last = self.unsettled + (more.unsettled - self.unsettled).clip(0)
@@ -136,14 +144,23 @@ class Meter(eqx.Module):
     first_steady: Array
     charted: Array
     chart: Array
+    per_slice: Array
+    scales: Array
     # Static, since they decide shapes.
     measured: tuple[int, ...] = eqx.field(static=True)
+    slices: int = eqx.field(static=True, default=0)
 
     @classmethod
     def of(
-        cls, model: ControlAffine, graph: Graph, formation: Formation, settings: Settings
+        cls,
+        model: ControlAffine,
+        graph: Graph,
+        formation: Formation,
+        settings: Settings,
+        scales: Array | None = None,
     ) -> "Meter":
-        """Return the meter of a run."""
+        """Return the meter of a run, in which agents that keep apart have `scales` (d,)."""
+        per_slice = steps_per_slice(settings)
         measured = measured_states(model)
         i, j = graph.edges.T
         goals = formation.offsets[:, list(measured)]
@@ -160,7 +177,10 @@ class Meter(eqx.Module):
             first_steady=np.asarray(settings.first_steady, np.int32),
             charted=np.array([model.state_names.index(name) for name in model.chart], int),
             chart=np.array([*model.chart.values()], float).reshape(-1, 2),
+            per_slice=np.asarray(per_slice, np.int32),
+            scales=np.zeros(0) if scales is None else scales,
             measured=measured,
+            slices=0 if scales is None else -(-settings.steps // per_slice),
         )
 
     def zero_sums(self, xp: ModuleType = jnp) -> Sums:
@@ -179,6 +199,8 @@ class Meter(eqx.Module):
             unsettled=xp.full(agents, -1, np.int32),
             inside=xp.full((agents, len(self.charted)), ALWAYS, np.int32),
             chatter=xp.zeros(agents, np.int32),
+            separation=xp.full((agents, self.slices), jnp.inf, dtype),
+            avoidance=xp.zeros((agents, self.slices), dtype),
         )
 
     def read(
@@ -220,7 +242,22 @@ class Meter(eqx.Module):
             unsettled=rows.unsettled.astype(jnp.int32),
             inside=rows.inside.astype(jnp.int32),
             chatter=chatter.astype(jnp.int32),
+            separation=jnp.full((len(states), self.slices), jnp.inf, states.dtype),
+            avoidance=jnp.zeros((len(states), self.slices), states.dtype),
         )
+
+    def of_slice(
+        self, step: jax.Array, states: States, active: Float[jax.Array, " N"]
+    ) -> dict[str, jax.Array]:
+        """Return the terms `separation` and `avoidance` of a step, where agents keep apart."""
+        nothing, at = self.zero_sums(), step // jnp.asarray(self.per_slice)
+        places = states[:, np.array(self.measured)] * jnp.asarray(self.scales[None], states.dtype)
+        squares = ((places[:, None] - places[None]) ** 2).sum(axis=2)
+        others = jnp.where(jnp.eye(len(states), dtype=bool), jnp.inf, squares)
+        return {
+            "separation": nothing.separation.at[:, at].set(jnp.sqrt(others.min(axis=1))),
+            "avoidance": nothing.avoidance.at[:, at].set(active),
+        }
 
     def of_agent(
         self, step: jax.Array, steady: jax.Array, x: State, offset: State, leader: State, u: Input
@@ -308,6 +345,11 @@ def outside(bounded: _Numbers, low: _Numbers, high: _Numbers) -> _Numbers:
 def reference_at(reference: Array | None, k: jax.Array, states: States) -> jax.Array | None:
     """Return row k of a reference (S, n) in the precision of the states; None without one."""
     return None if reference is None else jnp.asarray(reference, states.dtype)[k]
+
+
+def steps_per_slice(settings: Settings) -> int:
+    """Return of how many steps each slice of a run is, for which distances are stored."""
+    return -(-settings.steps // SLICES)
 
 
 def measured_states(model: ControlAffine) -> tuple[int, ...]:

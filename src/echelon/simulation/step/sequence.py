@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from echelon.agents.network.exchange import Difference
+from echelon.agents.network.near import Near
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.laws.law import Law, LocalView, Memory
@@ -16,6 +17,7 @@ from echelon.simulation.step.loop import Loop, Moment, WorldState, exchange_at
 from echelon.simulation.step.messages import begin_network, read_messages, send_messages
 from echelon.simulation.step.meter import Sums, reference_at
 from echelon.simulation.step.motion import MotionState
+from echelon.simulation.step.nearby import begin_sightings, look_around
 
 
 @cached_jit
@@ -45,6 +47,7 @@ def begin(loop: Loop, states: States) -> Moment:
     if loop.channel is not None:
         size = _feedforward_size(loop, moment)
         world = begin_network(loop, world, _sent(loop, moment)[0], size)
+        world = world._replace(seen=begin_sightings(loop, moment))
     return moment._replace(world=world)
 
 
@@ -76,6 +79,7 @@ def control(loop: Loop, now: Moment) -> Control:
     else:
         knowledge, mail = read_messages(loop, exchange, now, sent, difference)
         z = knowledge.disagreement
+    near, seen = look_around(loop, now, knowledge, mail)
     led = _lead(loop, now, z)
     if loop.levels is not None:
         followed = _by_depth(loop, now, led, z)
@@ -83,11 +87,12 @@ def control(loop: Loop, now: Moment) -> Control:
         broadcast = led.message[loop.sender]
         forward = broadcast if knowledge is None else knowledge.feedforward[loop.followers]
         rows = loop.followers, forward, now.follower_memory
-        followed = _act_all(loop, now, z, loop.follower, *rows)
+        followed = _act_all(loop, now, z, loop.follower, *rows, near=near)
     world = now.world
     if knowledge is not None and mail is not None:
         said = led.message, led.input
         world = send_messages(loop, exchange, now, mail, knowledge, sent, difference, *said)
+        world = world._replace(seen=seen)
     u = jnp.concatenate([led.input, followed.input])[loop.order]
     if loop.sensors is not None and loop.sensors.estimator is not None:
         world = world._replace(estimates=jax.vmap(loop.sensors.estimator.act)(world.estimates, u))
@@ -127,21 +132,28 @@ def _act_all(
     forward: Float[jax.Array, "K k"],
     memory: Memory,
     leads: bool = False,
+    near: Near | None = None,
 ) -> Action:
-    """Return what some agents do, with what they are sent (K, k) and remember."""
+    """Return what some agents do, with what they are sent (K, k), remember and know of others."""
     x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
     # From the step number, since a sum of many dt would gather rounding.
     t = now.step.astype(x.dtype) * loop.motion.dt
 
     # One time for all; of everything else, an agent sees its own row and no other.
     def one(
-        x: State, offset: State, z: jax.Array, forward: jax.Array, memory: Memory, row: PyTree
+        x: State,
+        offset: State,
+        z: jax.Array,
+        forward: jax.Array,
+        memory: Memory,
+        row: PyTree,
+        near: Near | None,
     ) -> Action:
-        view = LocalView(t, x, offset, z, forward, loop.motion.dt)
+        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near)
         return act(loop.with_motion(row), law, view, memory, leads)
 
-    rows = jax.tree.map(lambda leaf: leaf[agents], loop.motion.rows)
-    return jax.vmap(one)(x[agents], offsets[agents], z[agents], forward, memory, rows)
+    rows, near = jax.tree.map(lambda leaf: leaf[agents], (loop.motion.rows, near))
+    return jax.vmap(one)(x[agents], offsets[agents], z[agents], forward, memory, rows, near)
 
 
 def _by_depth(loop: Loop, now: Moment, led: Action, z: Float[jax.Array, "N s"]) -> Action:
@@ -228,7 +240,12 @@ def measured_step(
     followed = reference_at(reference, now.step - first, now.states)
     chatter = (acted.cut * now.cut < 0).any(axis=1)
     moment = now.step, now.states, acted.inputs
-    return _move(loop, now, acted), loop.meter.read(*moment, acted.limited, chatter, followed)
+    read = loop.meter.read(*moment, acted.limited, chatter, followed)
+    active = loop.follower.active(acted.follower_memory)
+    if active is not None:
+        every = jnp.zeros(len(now.states), active.dtype).at[loop.followers].set(active)
+        read = read._replace(**loop.meter.of_slice(now.step, now.states, every))
+    return _move(loop, now, acted), read
 
 
 Frames: TypeAlias = tuple[Float[jax.Array, "T N n"], Float[jax.Array, "T N m"]]

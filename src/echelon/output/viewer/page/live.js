@@ -47,8 +47,8 @@ class Live {
   // ---- pictures ----
 
   makeCharts() {
-    // V is a square of errors.
-    const { run } = this, line = (name, colour) => ({ name, colour, values: [], floor: name === "V" ? FLOOR ** 2 : FLOOR });
+    // V is a square of errors. In a stream, whose pictures are finite, NaN stands for what does not exist.
+    const { run } = this, line = (name, colour) => ({ name, colour, values: [], none: "\u2013 none", floor: name === "V" ? FLOOR ** 2 : FLOOR });
     const charts = [{ title: "formation error", unit: run.unit, log: true, lines: [line("worst", 1), line("median", 0), ...(run.referenced ? [line("leader", "leader")] : [])], marks: [{ value: 0.01, name: run.unit ? "1 cm" : "0.01" }] }];
     if (run.limited) charts.push({ title: run.loads ? "motors" : "inputs", unit: "% of limit", log: false, lines: [line("largest", 1), line("smallest", 0)], marks: [{ value: 100, name: "limit", below: true }, { value: 0, name: "limit" }] });
     if (run.lyapunov) charts.splice(1, 0, { title: "Lyapunov function V", unit: "", log: true, lines: [line("V", 0)], marks: [] });

@@ -1,0 +1,108 @@
+"""What the hull filter guarantees: agents never touch, from these starts (T10)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from echelon.core.statement import Hypothesis, Statement, fails, holds
+from echelon.core.types import Array
+from echelon.core.words import Kind, Theorem
+from echelon.guarantees.stopping.stopping_run import StoppingRun
+from echelon.guarantees.stopping.tube import Tube
+from echelon.laws.safety import AXES, Safety
+from echelon.laws.together import hulls_at, separations
+
+_EXACT = "the model is exact and all is known at the same instant"
+
+
+class Separation(NamedTuple):
+    """What is guaranteed of the distances between the agents of a run.
+
+    Attributes:
+        safety: its numbers.
+        least: the smallest distance of two hulls at the start, scaled, m.
+        pair: whose it is.
+        gap: (r, d) the points of the first one's hull less those of the other, m.
+        scales: (d,) of the coordinates.
+        speeds: (d,) of the followers in them.
+        axes: their names.
+        step: for which inputs are held, s.
+        ideal: whether the run is one that the theorem covers.
+        tube: of the agents' other states.
+    """
+
+    safety: Safety
+    least: float
+    pair: tuple[int, int]
+    gap: Float[Array, "r d"]
+    scales: Float[Array, " d"]
+    speeds: Float[Array, " d"]
+    axes: tuple[str, ...]
+    step: float
+    ideal: bool
+    tube: Tube
+
+    @property
+    def kind(self) -> Kind:
+        """Of the argument."""
+        return Kind.PROOF
+
+    @property
+    def theorem(self) -> Theorem:
+        """T10."""
+        return Theorem.T10
+
+    @property
+    def line(self) -> Statement:
+        """The line of a check."""
+        name, number = Hypothesis.SEPARATION, (self.least, f"{self.least:.3g} m at the start")
+        if self.ideal:
+            text = f"{self.safety.distance:.3g} m are kept, scaled, while {_EXACT} (T10)"
+            return holds(name, Kind.PROOF, text, *number)
+        text = f"observed, not proved: T10 rests on it that {_EXACT}"
+        remedy = "allow for the rest by `safety.margin`"
+        return fails(name, Kind.PROOF, text, *number, remedy=remedy)
+
+    def sentence(self) -> str:
+        """Return what is guaranteed."""
+        radii = " x ".join(f"{self.safety.radii[AXES.index(x)]:.4g}" for x in self.axes)  # pyright: ignore
+        text = f"{self.kind.value}: ellipsoids about the agents with radii of {radii} m never "
+        text += f"overlap from these starts, for any number of agents and any graph, if {_EXACT} "
+        text += "(T10), and each agent stays in its tube (T5). Convergence is not guaranteed while "
+        text += "agents hold each other back; without that, errors decay at "
+        text += f"{self.tube.rate:.3g} 1/s or faster eventually."
+        if not self.ideal:
+            text += " In this world distances are observed, not proved."
+        motors = self.tube.motor_load
+        return text if motors is None else f"{text} {motors.sentence()}"
+
+    def as_mapping(self) -> dict[str, object]:
+        """Return it ready for JSON."""
+        numbers = {name: getattr(self.safety, name) for name in ("gain", "margin", "reach")}
+        return {
+            "radii": list(self.safety.radii or ()),
+            **numbers,
+            "distance": self.safety.distance,
+            "least": self.least,
+            "pair": list(self.pair),
+            "gap": self.gap.tolist(),
+            "axes": list(self.axes),
+            "speeds": self.speeds.tolist(),
+            "step": self.step,
+            "ideal": self.ideal,
+        }
+
+
+def separation_of(run: StoppingRun, tube: Tube | None, disturbed: bool) -> Separation | None:
+    """Return what is guaranteed of distances; None without `safety`, or without a tube."""
+    safety, model = run.law.safety, run.parts.model
+    if safety is None or tube is None:
+        return None
+    scales = safety.scales(model)
+    hulls = hulls_at(run.law, model, run.leader, run.parts.graph, run.states)
+    apart = separations(hulls * scales) + np.diag(np.full(len(hulls), np.inf))
+    i, j = sorted(np.unravel_index(apart.argmin(), apart.shape))
+    speeds = np.array([run.law.speed_of(k) for k in run.law.places(model)])
+    rows = (int(i), int(j)), hulls[i] - hulls[j], scales, speeds, tuple(model.position)
+    return Separation(safety, float(apart[i, j]), *rows, run.settings.dt, not disturbed, tube)
