@@ -13,7 +13,8 @@ from echelon.experiments.results.quantity import ERROR, Quantity
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps.axes import Axis
-from echelon.experiments.sweeps.frames import FrameShape, labelled_frames
+from echelon.experiments.sweeps.frame_shape import FrameShape
+from echelon.experiments.sweeps.frames import labelled_frames
 from echelon.experiments.sweeps.numbers import (
     AGENT_COLUMNS,
     MISSING,
