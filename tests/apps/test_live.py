@@ -157,6 +157,8 @@ def test_another_law_takes_over_where_the_agents_are_and_is_the_loop_of_a_run(se
     assert session.swarm is not swarm and session.knobs == session.panel.start._replace(size=2.0)
     np.testing.assert_array_equal(session.swarm.now.states, places)
     assert session.swarm.steps == swarm.steps and "coupling" not in session.panel.ranges
+    assert first_look(session.panel, session.knobs)["state"] == "pending"
+    assert badge_of(session.panel, session.knobs)["end"] is None
     session.ask({"name": "reset"})
     session.settle()
     parts, settings = build(session.panel.scenario_at(session.knobs))
