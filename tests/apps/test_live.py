@@ -11,6 +11,7 @@ import urllib.request
 import numpy as np
 import pytest
 from browser import chromium, opened, until
+from recordings import recorded
 
 import echelon as ech
 from echelon.apps.live import promiser
@@ -23,7 +24,6 @@ from echelon.apps.live.server import live, serve_live
 from echelon.apps.live.session import Session
 from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import SimulationError
-from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import scenario_from_mapping
@@ -157,6 +157,8 @@ def test_another_law_takes_over_where_the_agents_are_and_is_the_loop_of_a_run(se
     assert session.swarm is not swarm and session.knobs == session.panel.start._replace(size=2.0)
     np.testing.assert_array_equal(session.swarm.now.states, places)
     assert session.swarm.steps == swarm.steps and "coupling" not in session.panel.ranges
+    assert first_look(session.panel, session.knobs)["state"] == "pending"
+    assert badge_of(session.panel, session.knobs)["end"] is None
     session.ask({"name": "reset"})
     session.settle()
     parts, settings = build(session.panel.scenario_at(session.knobs))
@@ -193,7 +195,10 @@ def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
 
 def test_a_loop_goes_on_from_the_last_state_of_a_run(swarm):
     whole = ech.run(scenario(simulation=GIVEN["simulation"] | {"horizon": 0.8}))
-    session, _ = live(scenario(), recording_of(ech.run(scenario())))
+    names = whole.model.state_names
+    parts = (whole.states[:11], whole.inputs[:11], whole.times[:11], whole.offsets)
+    first = recorded(*parts, names=names, position=(0, 1))
+    session, _ = live(scenario(), first)
     assert session.swarm.advance(still=True).time == pytest.approx(0.4)
     shown = [session.swarm.advance() for _ in range(10)]
     np.testing.assert_allclose([each.states for each in shown], whole.states[11:], atol=1e-11)
@@ -206,9 +211,9 @@ def test_a_loop_goes_on_from_the_last_state_of_a_run(swarm):
     assert session.swarm.steps == 40
     assert session.ask({"name": "save"})["fault"].startswith("A scenario begins at 0 s")
     session.promiser.end()
-    other = dataclasses.replace(recording_of(whole), states=whole.states[:, :3])
+    other = dataclasses.replace(first, states=whole.states[:11, :3])
     with pytest.raises(SimulationError, match="the run has 3 agents, and its scenario 4 agents of"):
-        live(scenario(), other)
+        served._continue(swarm, other)
 
 
 def test_who_was_closest_is_kept_until_a_reset(session, swarm):

@@ -319,6 +319,28 @@ def test_margins_of_own_states_are_those_of_the_delayed_loop():
     assert max(radii[0]) < 1.0 < max(radii[1])
 
 
+def test_within_the_margin_late_messages_of_any_age_are_borne_both_ways():
+    world, c = {"sensing": Sensing(delay=0.01)}, 4.0
+    guarantee = said(parts_of(RADIO, TREE, False, world=world, observer=False, coupling=c))
+    line, root = guarantee.hypotheses[Hypothesis.OWN_STATE], guarantee.run.law.slowest_root
+    delay, draw = round(line.number / DT), np.random.default_rng(0)
+    assert line.verdict is Verdict.HOLDS and delay >= 2
+    heard = np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    d, steps, oldest = np.array([3.0, 1.0, 1.0]), 4000, 40
+    begin = oldest + delay
+    y, v, zeta = (np.zeros((begin + steps + 1, 3)) for _ in range(3))
+    y[: begin + 1] = zeta[:begin] = draw.normal(size=3)
+    for k in range(begin, begin + steps):
+        late = k - delay
+        zeta[k] = y[late] + v[late] / root
+        ages = draw.integers(0, oldest + 1, (3, 3))
+        z = d * zeta[k] - (heard * zeta[k - ages, np.arange(3)[None]]).sum(axis=1)
+        push = root * (-c * z - v[late])
+        y[k + 1] = y[k] + DT * v[k] + 0.5 * DT**2 * push
+        v[k + 1] = v[k] + DT * push
+    assert np.abs(y[-1]).max() < 1e-3 * np.abs(y[0]).max()
+
+
 @pytest.mark.slow
 def test_beyond_the_margin_a_run_swings_and_is_warned_of():
     for more in (-1, 2):

@@ -143,13 +143,15 @@ def _end(panel: Panel, knobs: Knobs, edge: float | None) -> float | None:
 
     None without an edge, and where they grow nowhere or everywhere on the slider.
     """
+    if edge is None or "coupling" not in panel.ranges:
+        return None
     settings, highest = panel.experiment.settings, panel.ranges["coupling"].high
 
     def decays(coupling: float) -> bool:
         loop = panel.live.loop(knobs._replace(coupling=coupling))
         return loop is not None and loop.radius(settings) < 1.0
 
-    if edge is None or not edge < highest or not decays(1.001 * edge) or decays(highest):
+    if not edge < highest or not decays(1.001 * edge) or decays(highest):
         return None
     return float(bisect(decays, 1.001 * edge, highest, _HALVINGS))
 

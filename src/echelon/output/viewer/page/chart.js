@@ -46,8 +46,9 @@ class TimeWindow {
     this.range = length >= last - first && this.latest === Infinity ? null : [start, start + length];
   }
 
-  // Stretches time by a factor about a time that stays, then moves it by seconds.
+  // Stretches time by a factor about a time that stays, then moves it by seconds. A stream keeps its newest time.
   change(factor, at, shift = 0) {
+    if (this.latest < Infinity && !shift && this.whole && this.span[1] >= this.whole[1]) at = this.span[1];
     this.set(this.span.map((t) => at + factor * (t - at) + shift));
     this.draw();
   }
