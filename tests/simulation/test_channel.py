@@ -289,3 +289,13 @@ def test_a_leader_without_a_plan_is_carried_on_by_the_model():
     assert drifting("none") > 0.05
     with pytest.raises(EchelonError, match="has no plan; use `packet`"):
         drifting("preview")
+
+
+def test_states_are_not_predicted_by_a_plan_of_stopping_points():
+    parts, settings = ech.build(ech.load_scenario("paper-global", ["simulation.horizon=0.05"]))
+    followers = ech.build(ech.load_scenario("paper"))[0].drive.follower
+    mixed = parts.replace(drive=ech.Laws(parts.drive.leader, followers))
+    radio = ech.Network(prediction="packet")
+    with pytest.raises(SimulationError, match="`Consensus` do not send what the plan .* `packet`"):
+        ech.simulate(mixed.replace(world=ech.World(network=ech.Network())), settings)
+    assert ech.simulate(mixed.replace(world=ech.World(network=radio)), settings).outcome.reached
