@@ -174,7 +174,9 @@ def errors_of(result):
 
 def test_a_run_continues_with_the_messages_that_are_under_way():
     network = ech.Network(rate=50.0, delay=0.03, loss=0.3, messages="state")
-    run = parts(network), chosen(horizon=200 * DT)
+    sensing = ech.Sensing(delay=0.02, noise={"x": 0.1}, estimator="constant-gain")
+    world = ech.World(network=network, sensing=sensing)
+    run = parts(network).replace(world=world), chosen(horizon=200 * DT)
     whole, stretches = ech.simulate(*run), []
 
     def enough(so_far):
