@@ -107,8 +107,8 @@ class Polynomials(PolynomialPath):
                 return cls(spans, powers)
             count += 1 + count // 4
         raise ReferenceError(
-            f"{_MANY} pieces do not follow `{type(path).__name__}` to {_CLOSE:g} m for {horizon:g} s; "
-            "make it shorter or smoother."
+            f"{_MANY} pieces do not follow `{type(path).__name__}` to {_CLOSE:g} m for "
+            f"{horizon:g} s; make it shorter or smoother."
         )
 
     def moved(self, offset: Sequence[float]) -> "Polynomials":
