@@ -120,7 +120,8 @@ class CompiledFunction(Generic[_R]):
         return self._jitted(renewed)
 
     def _jitted(self, function: Callable[..., _R]) -> Callable[..., _R]:
-        return eqx.filter_jit(function, compiler_options=self._options)
+        named: dict[str, Any] = {"compiler_options": self._options}
+        return eqx.filter_jit(function, **named)
 
     def _load_or_compile(self, call: _CallArguments, key: bytes) -> _Compiled | None:
         """Return what is stored for a call, or compile and store it; None if JAX compiles it."""
