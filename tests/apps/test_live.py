@@ -28,6 +28,7 @@ from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import scenario_from_mapping
 from echelon.experiments.scenario.yaml import dump_yaml, read_yaml
+from echelon.output.viewer.replay import link_shades
 from echelon.output.viewer.serve import serving
 from echelon.simulation.native import kernel_cache
 from echelon.simulation.step import sequence
@@ -104,6 +105,42 @@ def test_a_law_that_remembers_and_signals_is_live_too():
     np.testing.assert_allclose(shown[4], wanted[4], atol=1e-9)
     np.testing.assert_allclose(shown[9], wanted[8], atol=1e-9)
     assert found.start.coupling == pytest.approx(ech.run(own).drive.follower.strength(0.005))
+
+
+IMPERFECT = {
+    "network": {"rate": 25.0, "delay": 0.01, "loss": 0.2, "forget": 0.3},
+    "disturbance": {"rms": {"velocity": 0.3}, "time": 0.5},
+    "actuator": {"lag": 0.05},
+    "sensing": {"noise": {"position": 0.01}},
+}
+
+
+def test_radio_gusts_lag_and_noise_are_knobs():
+    own = scenario(**IMPERFECT)
+    panel = Panel(own, build(own))
+    swarm = LiveLoop(*panel.experiment, panel.live)
+    assert {"delay", "loss", "outages", "gusts", "lag", "noise"} <= {*panel.ranges}
+    knobs = panel.start._replace(
+        **{"delay": 0.06, "loss": 0.5, "outages": 0.2, "gusts": 2.0, "lag": 0.1, "noise": 3.0}
+    )
+    for each in (panel.start, knobs):
+        parts, settings = build(panel.scenario_at(each))
+        run = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
+        swarm.apply(each)
+        np.testing.assert_allclose(flown(swarm), run.states[1:], atol=1e-11)
+    # A link is as fresh as its oldest message, but for what arrives at the frame itself.
+    traffic, heard = run.traffic, run.parts.receives
+    fresh = link_shades(traffic.ages[-1], np.zeros(heard.shape), 0.3, heard)
+    shades = swarm.advance(still=True).shades
+    assert shades.shape == (4,) and (shades <= fresh + 1e-9).all() and shades.max() > 0.0
+
+
+def test_an_agent_that_is_lost_has_no_links(panel, session):
+    session.apply(session.ask({"name": "lose", "value": 1}))
+    edges = panel.live.parts.graph.edges
+    assert session.knobs.cut == frozenset(np.flatnonzero((edges == 1).any(axis=1)).tolist())
+    with pytest.raises(SimulationError, match="`lose` got `99`, and must be the number"):
+        session.ask({"name": "lose", "value": 99})
 
 
 KNOBS = {
@@ -394,6 +431,8 @@ def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_co
     began, ended, told = threading.Event(), threading.Event(), []
 
     def slow(_, knobs):
+        if knobs.coupling == 1.0:
+            raise ZeroDivisionError
         if knobs != fast:
             began.set()
             ended.wait(10.0)
@@ -407,6 +446,11 @@ def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_co
     until(lambda: told[-1]["short"] == short)
     assert told[-1]["state"] == "lost"
     ended.set()
+    until(lambda: told[-1]["short"] == str(fast.coupling))
+    # An error of echelon's own is said, and the next guarantee is computed.
+    answers.ask(panel, fast._replace(coupling=1.0))
+    until(lambda: told[-1]["short"] == "guarantee not computed")
+    answers.ask(panel, fast)
     until(lambda: told[-1]["short"] == str(fast.coupling))
     answers.end()
     assert str(panel.start.coupling) not in [each["short"] for each in told]

@@ -112,16 +112,22 @@ def test_every_function_gives_the_same_for_a_run_from_disk(run):
         pd.testing.assert_frame_equal(ech.table(other), ech.table(result))
         promises = (ech.promise(x.parts, x.settings).as_mapping() for x in (other, result))
         assert next(promises) == next(promises)
-        assert report_page(other, None) == report_page(result, None)
-        assert charts_of(recording_of(other)).descriptions == (
-            charts_of(recording_of(result)).descriptions
-        )
+    runs = (ech.load(folder), result)
+    pages, charts = map(report_page, runs, (None, None)), map(charts_of, map(recording_of, runs))
+    assert next(pages) == next(pages)
+    assert next(charts).descriptions == next(charts).descriptions
 
 
 def test_the_lyapunov_function_of_a_run_from_disk_is_computed_to_the_same_bits(tmp_path):
     result = ech.run(ech.load_scenario("planar-quadrotor", ["simulation.horizon=0.1"]))
-    other = ech.load(ech.save_run(result, tmp_path / "p", figures=False))
+    folder = ech.save_run(result, tmp_path / "p", figures=False)
+    other = ech.load(folder)
     assert_same(result, other)
+    assert_no_group_multiplies(folder / "run.nc")
+    inputs = xr.open_dataset(folder / "run.nc", group="inputs", engine="h5netcdf").inputs
+    np.testing.assert_array_equal(inputs.sel(agent=2).values, result.inputs[:, 2])
+    assert inputs.dims == ("time", "agent", "input")
+    assert inputs.input_unit.values.tolist() == list(result.model.input_units)
     for one, two in zip(ech.lyapunov(other), ech.lyapunov(result), strict=True):
         np.testing.assert_array_equal(one, two)
 
@@ -135,6 +141,7 @@ def test_a_run_from_disk_can_be_pickled(run):
 def test_its_repr_is_one_line(run):
     text = repr(ech.load(run[1]))
     assert text == "Result('integrators', 4 agents, 6 frames, 'The run reached its horizon.')"
+    assert repr(recording_of(ech.load(run[1]))) == "Recording('integrators', 4 agents, 6 frames)"
 
 
 def test_the_names_of_before_lead_to_the_same_with_a_warning(run):
@@ -182,6 +189,15 @@ def test_no_code_is_executed_for_the_frames(own, here):
         other.parts
 
 
+def test_a_run_from_disk_is_verified_as_its_folder_is(own):
+    folder = ech.save_run(ech.run(own), "o", figures=False)
+    assert ech.verify(folder).verdict == "incomplete"
+    assert ech.verify(folder, scenario=folder).holds and ech.verify(ech.load(folder)).holds
+    with h5netcdf.File(folder / "run.nc", "r+") as data:
+        data.attrs["promise"] = data.attrs["promise"].replace("linearization", "vertices")
+    assert ech.verify(ech.load(folder)).verdict == "refused"
+
+
 # ---- unfinished runs ---------------------------------------------------------------------------
 
 
@@ -218,16 +234,6 @@ def test_a_run_that_has_just_begun_has_no_frame(tmp_path):
 def test_no_group_has_more_dimensions_than_one_of_its_variables(tmp_path, changes):
     ech.save_dataset(ech.run(integrators(*changes)), tmp_path / "run.nc")
     assert_no_group_multiplies(tmp_path / "run.nc")
-
-
-def test_a_run_with_a_gain_and_a_reference_has_no_such_group_either(tmp_path):
-    result = ech.run(ech.load_scenario("paper", ["simulation.horizon=0.02"]))
-    ech.save_dataset(result, tmp_path / "run.nc")
-    assert_no_group_multiplies(tmp_path / "run.nc")
-    inputs = xr.open_dataset(tmp_path / "run.nc", group="inputs", engine="h5netcdf").inputs
-    np.testing.assert_array_equal(inputs.sel(agent=2).values, result.inputs[:, 2])
-    assert inputs.dims == ("time", "agent", "input")
-    assert inputs.input_unit.values.tolist() == list(result.model.input_units)
 
 
 def assert_no_group_multiplies(file):
@@ -310,6 +316,8 @@ def alone(file):
 def test_an_unknown_ending_is_refused(run, tmp_path):
     with pytest.raises(ech.errors.OutputError, match="`run.xls` ends in `xls`, allowed are `csv`"):
         ech.export(run[0], tmp_path / "run.xls")
+    with pytest.raises(ech.errors.OutputError, match="`run` has no ending"):
+        ech.export(run[0], tmp_path / "run")
 
 
 # ---- what is no run ----------------------------------------------------------------------------
