@@ -57,8 +57,8 @@ class Safety:
 
     def __post_init__(self) -> None:
         """Check every number."""
-        radii = () if self.radii is None else tuple(self.radii)
         if self.radii is not None:
+            radii = tuple(np.atleast_1d(np.asarray(self.radii, object)).tolist())
             object.__setattr__(self, "radii", radii)
             if len(radii) != 3 or not all(map(_positive, radii)) or radii[0] != radii[1]:
                 raise LawError(
