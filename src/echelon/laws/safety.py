@@ -24,7 +24,7 @@ from echelon.laws.nearest_point import nearest_point
 AXES = ("x", "y", "z")
 _DOWNWASH = 3.0
 """Height over width of the ellipsoid about a model with a radius: rotors blow downward."""
-_MOST_CORRECTIONS, _SOLVED = 200, 1e-12
+_MOST_CORRECTIONS, _SOLVED = 60, 1e-9
 """Corrections of a rate by single rows, and the size (m/s) of one that ends them."""
 
 
