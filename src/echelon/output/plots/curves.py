@@ -396,24 +396,6 @@ def ages(run: Recording) -> "Figure | None":
     return draw.finish(figure, legends=[last])
 
 
-def avoidance(run: Recording) -> "Figure | None":
-    """Return how near agents came that keep apart, and how many held each other back, over time."""
-    numbers = run.avoidance
-    if numbers is None:
-        return None
-    figure, (near, held) = _panels(run, 2, 1.9)
-    draw.plot(near, numbers.times, numbers.distance, color=draw.LEADER, label="any two agents")
-    look = {"color": "0.5", "linewidth": 0.8, "zorder": 1}
-    near.axhline(numbers.kept, label="kept by hulls", linestyle=":", **look)
-    near.axhline(numbers.touching, label="touching", linestyle="-", **look)
-    near.set_ylabel(draw.label("smallest scaled distance", "m"))
-    near.set_ylim(bottom=0.0)
-    held.step(numbers.times, numbers.active, where="post", color=draw.LEADER)
-    held.set_ylabel("active rows")
-    held.set_ylim(bottom=0.0)
-    return draw.finish(figure)
-
-
 def _edges(ax: "Axes", run: Recording, times: Array, apart: Array, desired: Array) -> None:
     """Draw the distance of each edge, or quantiles of the errors of many."""
     if len(run.edges) > draw.NAMED:
