@@ -186,13 +186,18 @@ def results(rest: list[str]) -> list[list[str]]:
 
 
 def documentation(rest: list[str]) -> list[list[str]]:
-    """Get what pages load, draw the replay that they show, and return the command that builds them.
+    """Get what pages load and draw the replay that they show; return the command that builds them.
 
     It is built as a module, so that Python finds docs/formulas.py.
     """
-    python = str(program("python"))
-    step([python, "web/build.py", "docs"], "KaTeX could not be built; see the messages above.")
-    step([python, "docs/draw_replay.py"], "the replay could not be drawn; see the messages above.")
+    echelon, folder, page = str(program("echelon")), str(BUILD / "replay"), "docs/assets/paper.html"
+    short = ["--set", "simulation.horizon=20", "--set", "simulation.store_every=4"]
+    for command in (
+        [str(program("python")), "web/build.py", "docs"],
+        [echelon, "-q", "run", "paper", *short, "--no-figures", "--out", folder, "--force"],
+        [echelon, "-q", "view", folder, "--html", page, "--force"],
+    ):
+        step(command, "the documentation could not be built; see the messages above.")
     return [tool("zensical", "build", "--strict", "--clean", *rest)]
 
 

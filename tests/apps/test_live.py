@@ -11,6 +11,7 @@ import urllib.request
 import numpy as np
 import pytest
 from browser import chromium, opened, until
+from recordings import recorded
 
 import echelon as ech
 from echelon.apps.live import promiser
@@ -23,11 +24,11 @@ from echelon.apps.live.server import live, serve_live
 from echelon.apps.live.session import Session
 from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import SimulationError
-from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import scenario_from_mapping
 from echelon.experiments.scenario.yaml import dump_yaml, read_yaml
+from echelon.output.viewer.replay import link_shades
 from echelon.output.viewer.serve import serving
 from echelon.simulation.native import kernel_cache
 from echelon.simulation.step import sequence
@@ -106,6 +107,42 @@ def test_a_law_that_remembers_and_signals_is_live_too():
     assert found.start.coupling == pytest.approx(ech.run(own).drive.follower.strength(0.005))
 
 
+IMPERFECT = {
+    "network": {"rate": 25.0, "delay": 0.01, "loss": 0.2, "forget": 0.3},
+    "disturbance": {"rms": {"velocity": 0.3}, "time": 0.5},
+    "actuator": {"lag": 0.05},
+    "sensing": {"noise": {"position": 0.01}},
+}
+
+
+def test_radio_gusts_lag_and_noise_are_knobs():
+    own = scenario(**IMPERFECT)
+    panel = Panel(own, build(own))
+    swarm = LiveLoop(*panel.experiment, panel.live)
+    assert {"delay", "loss", "outages", "gusts", "lag", "noise"} <= {*panel.ranges}
+    knobs = panel.start._replace(
+        **{"delay": 0.06, "loss": 0.5, "outages": 0.2, "gusts": 2.0, "lag": 0.1, "noise": 3.0}
+    )
+    for each in (panel.start, knobs):
+        parts, settings = build(panel.scenario_at(each))
+        run = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
+        swarm.apply(each)
+        np.testing.assert_allclose(flown(swarm), run.states[1:], atol=1e-11)
+    # A link is as fresh as its oldest message, but for what arrives at the frame itself.
+    traffic, heard = run.traffic, run.parts.receives
+    fresh = link_shades(traffic.ages[-1], np.zeros(heard.shape), 0.3, heard)
+    shades = swarm.advance(still=True).shades
+    assert shades.shape == (4,) and (shades <= fresh + 1e-9).all() and shades.max() > 0.0
+
+
+def test_an_agent_that_is_lost_has_no_links(panel, session):
+    session.apply(session.ask({"name": "lose", "value": 1}))
+    edges = panel.live.parts.graph.edges
+    assert session.knobs.cut == frozenset(np.flatnonzero((edges == 1).any(axis=1)).tolist())
+    with pytest.raises(SimulationError, match="`lose` got `99`, and must be the number"):
+        session.ask({"name": "lose", "value": 99})
+
+
 KNOBS = {
     "coupling": {"coupling": 3.0},
     "weight": {"weight": 4.0},
@@ -157,6 +194,8 @@ def test_another_law_takes_over_where_the_agents_are_and_is_the_loop_of_a_run(se
     assert session.swarm is not swarm and session.knobs == session.panel.start._replace(size=2.0)
     np.testing.assert_array_equal(session.swarm.now.states, places)
     assert session.swarm.steps == swarm.steps and "coupling" not in session.panel.ranges
+    assert first_look(session.panel, session.knobs)["state"] == "pending"
+    assert badge_of(session.panel, session.knobs)["end"] is None
     session.ask({"name": "reset"})
     session.settle()
     parts, settings = build(session.panel.scenario_at(session.knobs))
@@ -193,7 +232,10 @@ def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
 
 def test_a_loop_goes_on_from_the_last_state_of_a_run(swarm):
     whole = ech.run(scenario(simulation=GIVEN["simulation"] | {"horizon": 0.8}))
-    session, _ = live(scenario(), recording_of(ech.run(scenario())))
+    names = whole.model.state_names
+    parts = (whole.states[:11], whole.inputs[:11], whole.times[:11], whole.offsets)
+    first = recorded(*parts, names=names, position=(0, 1))
+    session, _ = live(scenario(), first)
     assert session.swarm.advance(still=True).time == pytest.approx(0.4)
     shown = [session.swarm.advance() for _ in range(10)]
     np.testing.assert_allclose([each.states for each in shown], whole.states[11:], atol=1e-11)
@@ -206,9 +248,9 @@ def test_a_loop_goes_on_from_the_last_state_of_a_run(swarm):
     assert session.swarm.steps == 40
     assert session.ask({"name": "save"})["fault"].startswith("A scenario begins at 0 s")
     session.promiser.end()
-    other = dataclasses.replace(recording_of(whole), states=whole.states[:, :3])
+    other = dataclasses.replace(first, states=whole.states[:11, :3])
     with pytest.raises(SimulationError, match="the run has 3 agents, and its scenario 4 agents of"):
-        live(scenario(), other)
+        served._continue(swarm, other)
 
 
 def test_who_was_closest_is_kept_until_a_reset(session, swarm):
@@ -389,6 +431,8 @@ def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_co
     began, ended, told = threading.Event(), threading.Event(), []
 
     def slow(_, knobs):
+        if knobs.coupling == 1.0:
+            raise ZeroDivisionError
         if knobs != fast:
             began.set()
             ended.wait(10.0)
@@ -402,6 +446,11 @@ def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_co
     until(lambda: told[-1]["short"] == short)
     assert told[-1]["state"] == "lost"
     ended.set()
+    until(lambda: told[-1]["short"] == str(fast.coupling))
+    # An error of echelon's own is said, and the next guarantee is computed.
+    answers.ask(panel, fast._replace(coupling=1.0))
+    until(lambda: told[-1]["short"] == "guarantee not computed")
+    answers.ask(panel, fast)
     until(lambda: told[-1]["short"] == str(fast.coupling))
     answers.end()
     assert str(panel.start.coupling) not in [each["short"] for each in told]

@@ -329,6 +329,18 @@ def test_losses_in_a_row_are_those_of_many_links(numbers, monkeypatch):
     assert shares[lost - 1] >= 0.8 / 2000
 
 
+def test_the_mean_age_is_that_of_many_links():
+    net, draw, links = channel(loss=0.2, bursts=Bursts(0.3, 0.2)), np.random.default_rng(4), 50_000
+    out, lost = draw.random(links) < float(net.share), np.zeros(links)
+    for _ in range(200):
+        gone = out | (draw.random(links) < float(net.loss))
+        lost = np.where(gone, lost + 1, 0)
+        out = draw.random(links) < np.where(out, 1.0 - float(net.ends), float(net.begins))
+    # A step of delay, half a period of four steps, and what was lost.
+    seen = 0.005 * (1 + 1.5 + 4 * lost.mean())
+    assert ages_of(net, 0.005, 12000, 6, 2).mean == pytest.approx(seen, rel=0.02)
+
+
 def test_without_losses_ages_are_those_of_the_clock():
     ages = ages_of(channel(delay=0.02, jitter=0.012), 0.005, 12000, 6, 2)
     # 4 steps of delay, 2 of jitter, 4 between two messages.

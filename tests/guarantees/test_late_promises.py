@@ -3,6 +3,8 @@
 import dataclasses
 import json
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
@@ -262,8 +264,26 @@ def test_what_is_proved_of_a_law_is_not_of_its_subclasses(network):
 # ---- 4: the tube ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_no_network_leaves_the_tube():
-    """A path whose speed upward is more than agreement may ask: before a packet it counts."""
+    # The path is at 1.4 m/s, and agreement may ask .5 + .3: before a packet the path counts.
+    network = dataclasses.replace(RADIO, delay=0.3, loss=0.7, bursts=ech.Bursts(0.5, 0.3))
+    parts = parts_of(network, TREE, False, speed=0.5, leader={"reference": CIRCLE, "speed": 0.3})
+    parts = parts.replace(start_error={"position": 0.6})
+    guarantee, result = said(parts), ech.simulate(parts, SETTINGS)
+    run, root = guarantee.run, guarantee.run.law.slowest_root
+    zeta = result.states[:, 1:, :2] + result.states[:, 1:, 2:] / root
+    moved = np.diff(zeta, axis=0) / DT
+    path = np.asarray(jax.vmap(lambda t: run.leader.path(CART, t))(jnp.asarray(result.times[1:])))
+    rate = path[:, 1] + path[:, 2] / root
+    off = np.abs(moved - rate[:, None])
+    most = np.array([run.speed(k) + run.own_speed(k) for k in range(2)])
+    assert most.max() > 0.5 + 0.3 and (off <= most * 1.02).all()
+    # It is nearly reached before the first packet, and later it is agreement's alone.
+    assert (off.max(axis=(0, 1)) > 0.7 * most).any()
+
+
+def test_a_border_is_not_passed_before_the_first_packet():
     unicycle = ech.models.Unicycle()
     graph = ech.Graph([(0, 1)], directed=True)
     laws = ech.Laws(ech.laws.StoppingLeader(reference=CIRCLE), ech.laws.StoppingPoint())
@@ -298,6 +318,28 @@ def test_margins_of_own_states_are_those_of_the_delayed_loop():
     # Followers 1 and 2 hear one other, follower 3 two.
     radii = [[delayed_radius(8.0 * d, root, DT, k) for d in (1, 2)] for k in (most, most + 1)]
     assert max(radii[0]) < 1.0 < max(radii[1])
+
+
+def test_within_the_margin_late_messages_of_any_age_are_borne_both_ways():
+    world, c = {"sensing": Sensing(delay=0.01)}, 4.0
+    guarantee = said(parts_of(RADIO, TREE, False, world=world, observer=False, coupling=c))
+    line, root = guarantee.hypotheses[Hypothesis.OWN_STATE], guarantee.run.law.slowest_root
+    delay, draw = round(line.number / DT), np.random.default_rng(0)
+    assert line.verdict is Verdict.HOLDS and delay >= 2
+    heard = np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    d, steps, oldest = np.array([3.0, 1.0, 1.0]), 4000, 40
+    begin = oldest + delay
+    y, v, zeta = (np.zeros((begin + steps + 1, 3)) for _ in range(3))
+    y[: begin + 1] = zeta[:begin] = draw.normal(size=3)
+    for k in range(begin, begin + steps):
+        late = k - delay
+        zeta[k] = y[late] + v[late] / root
+        ages = draw.integers(0, oldest + 1, (3, 3))
+        z = d * zeta[k] - (heard * zeta[k - ages, np.arange(3)[None]]).sum(axis=1)
+        push = root * (-c * z - v[late])
+        y[k + 1] = y[k] + DT * v[k] + 0.5 * DT**2 * push
+        v[k + 1] = v[k] + DT * push
+    assert np.abs(y[-1]).max() < 1e-3 * np.abs(y[0]).max()
 
 
 @pytest.mark.slow

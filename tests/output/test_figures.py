@@ -48,8 +48,7 @@ def lines_of(figure, place=0):
 
 def test_there_is_a_figure_of_each_name(run):
     made = figures(run, NAMES)
-    # In the ideal network no message has an age.
-    assert tuple(made) == tuple(name for name in NAMES if name != "ages")
+    assert tuple(made) == NAMES
     for name, figure in made.items():
         for ax in figure.axes:
             assert ax.get_ylabel() or name in ("inputs", "network"), name
@@ -359,13 +358,13 @@ OVER_TIME = ("tracking", "formation", "inputs", "states", "distances", "lyapunov
 def test_every_figure_over_time_has_its_start_enlarged_beside_the_whole(long):
     for name, figure in figures(long, OVER_TIME).items():
         times = [ax.get_xlim() for ax in figure.axes]
-        assert set(times) == {(0.0, 5.0), (0.0, 60.0)}, name
-        assert times[::2] == [(0.0, 5.0)] * (len(times) // 2), name
+        assert set(times) == {(0.0, 4.0), (0.0, 60.0)}, name
+        assert times[::2] == [(0.0, 4.0)] * (len(times) // 2), name
         labels = {ax.get_xlabel() for ax in figure.axes} - {""}
         assert labels == {"time (s), of 60 s", "time (s)"}, name
         # The start has its own points: as many as frames of it are stored.
         (line, *_) = (line for line in figure.axes[0].lines if len(line.get_xdata()) > 2)
-        assert len(line.get_xdata()) == 51, name
+        assert len(line.get_xdata()) == 41, name
 
 
 def test_what_settles_late_or_is_short_has_no_enlarged_start(run, long):

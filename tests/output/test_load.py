@@ -3,6 +3,7 @@
 import dataclasses
 import gzip
 import json
+import pickle
 import shutil
 import warnings
 from pathlib import Path
@@ -17,6 +18,7 @@ from runs import OWN_PENDULUM
 import echelon as ech
 from echelon.experiments.results.dataset import recording_of, run_file
 from echelon.experiments.scenario.build import build
+from echelon.experiments.studies.recomputation import recompute
 from echelon.output.archive import export as exporting
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.report_page import report_page
@@ -110,23 +112,36 @@ def test_every_function_gives_the_same_for_a_run_from_disk(run):
         pd.testing.assert_frame_equal(ech.table(other), ech.table(result))
         promises = (ech.promise(x.parts, x.settings).as_mapping() for x in (other, result))
         assert next(promises) == next(promises)
-        assert report_page(other, None) == report_page(result, None)
-        assert charts_of(recording_of(other)).descriptions == (
-            charts_of(recording_of(result)).descriptions
-        )
+    runs = (ech.load(folder), result)
+    pages, charts = map(report_page, runs, (None, None)), map(charts_of, map(recording_of, runs))
+    assert next(pages) == next(pages)
+    assert next(charts).descriptions == next(charts).descriptions
 
 
 def test_the_lyapunov_function_of_a_run_from_disk_is_computed_to_the_same_bits(tmp_path):
     result = ech.run(ech.load_scenario("planar-quadrotor", ["simulation.horizon=0.1"]))
-    other = ech.load(ech.save_run(result, tmp_path / "p", figures=False))
+    folder = ech.save_run(result, tmp_path / "p", figures=False)
+    other = ech.load(folder)
     assert_same(result, other)
+    assert_no_group_multiplies(folder / "run.nc")
+    inputs = xr.open_dataset(folder / "run.nc", group="inputs", engine="h5netcdf").inputs
+    np.testing.assert_array_equal(inputs.sel(agent=2).values, result.inputs[:, 2])
+    assert inputs.dims == ("time", "agent", "input")
+    assert inputs.input_unit.values.tolist() == list(result.model.input_units)
     for one, two in zip(ech.lyapunov(other), ech.lyapunov(result), strict=True):
         np.testing.assert_array_equal(one, two)
+
+
+def test_a_run_from_disk_can_be_pickled(run):
+    other = pickle.loads(pickle.dumps(ech.load(run[1])))
+    assert_same(run[0], other)
+    assert ech.report(other) == ech.report(run[0])
 
 
 def test_its_repr_is_one_line(run):
     text = repr(ech.load(run[1]))
     assert text == "Result('integrators', 4 agents, 6 frames, 'The run reached its horizon.')"
+    assert repr(recording_of(ech.load(run[1]))) == "Recording('integrators', 4 agents, 6 frames)"
 
 
 def test_the_names_of_before_lead_to_the_same_with_a_warning(run):
@@ -174,6 +189,15 @@ def test_no_code_is_executed_for_the_frames(own, here):
         other.parts
 
 
+def test_a_run_from_disk_is_verified_as_its_folder_is(own):
+    folder = ech.save_run(ech.run(own), "o", figures=False)
+    assert ech.verify(folder).verdict == "incomplete"
+    assert ech.verify(folder, scenario=folder).holds and ech.verify(ech.load(folder)).holds
+    with h5netcdf.File(folder / "run.nc", "r+") as data:
+        data.attrs["promise"] = data.attrs["promise"].replace("linearization", "vertices")
+    assert ech.verify(ech.load(folder)).verdict == "refused"
+
+
 # ---- unfinished runs ---------------------------------------------------------------------------
 
 
@@ -212,16 +236,6 @@ def test_no_group_has_more_dimensions_than_one_of_its_variables(tmp_path, change
     assert_no_group_multiplies(tmp_path / "run.nc")
 
 
-def test_a_run_with_a_gain_and_a_reference_has_no_such_group_either(tmp_path):
-    result = ech.run(ech.load_scenario("paper", ["simulation.horizon=0.02"]))
-    ech.save_dataset(result, tmp_path / "run.nc")
-    assert_no_group_multiplies(tmp_path / "run.nc")
-    inputs = xr.open_dataset(tmp_path / "run.nc", group="inputs", engine="h5netcdf").inputs
-    np.testing.assert_array_equal(inputs.sel(agent=2).values, result.inputs[:, 2])
-    assert inputs.dims == ("time", "agent", "input")
-    assert inputs.input_unit.values.tolist() == list(result.model.input_units)
-
-
 def assert_no_group_multiplies(file):
     with h5netcdf.File(file, "r") as stored:
         groups = [stored, *stored.groups.values(), *stored["sums"].groups.values()]
@@ -249,6 +263,9 @@ def test_a_file_of_format_3_is_read_but_for_its_sums(here):
     assert result.graph == now.graph and result.parts.formation == now.formation
     with pytest.raises(ech.errors.OutputError, match="has no sums over all steps"):
         ech.report(result)
+    data = here / "old" / "run.nc"
+    claims = list(recompute(integrators(), None, data=data))
+    assert len(claims) > 20 and {claim.verdict for claim in claims} == {"recomputed"}
 
 
 # ---- tables and other formats ------------------------------------------------------------------
@@ -299,6 +316,8 @@ def alone(file):
 def test_an_unknown_ending_is_refused(run, tmp_path):
     with pytest.raises(ech.errors.OutputError, match="`run.xls` ends in `xls`, allowed are `csv`"):
         ech.export(run[0], tmp_path / "run.xls")
+    with pytest.raises(ech.errors.OutputError, match="`run` has no ending"):
+        ech.export(run[0], tmp_path / "run")
 
 
 # ---- what is no run ----------------------------------------------------------------------------
@@ -312,6 +331,7 @@ BAD = {
     "sweep": "is a sweep, which holds numbers of many runs",
     "comparison": "is a comparison; give one of its runs",
     "two": "was written in format 2 by echelon",
+    "begun": "ended before any of it was stored",
 }
 
 
@@ -320,6 +340,7 @@ def test_what_is_no_run_is_refused_in_one_sentence(run, here, name):
     for each in BAD:
         (here / each).mkdir(exist_ok=each != "nothing")
     (here / "nothing").rmdir()
+    (here / "begun" / "chunks").mkdir()
     content = (run[1] / "run.nc").read_bytes()
     (here / "half" / "run.nc").write_bytes(content[: len(content) // 2])
     (here / "text" / "run.nc").write_text("times,states\n")

@@ -58,6 +58,14 @@ def test_stopping_points_agree_over_bad_networks(case, seed):
     assert result.outcome.reached and worst(result, 4.0) < bound
 
 
+@pytest.mark.study
+@pytest.mark.parametrize("seed", range(8))
+def test_formations_stand_with_everything_at_once(seed):
+    """Gusts, unlike masses, lag, noise and a radio: the root mean square of the worst follower."""
+    parts, settings = ech.build(ech.load_scenario("paper-everything", [f"seed={seed}"]))
+    assert ech.metrics(ech.simulate(parts, settings)).worst_steady < 0.06
+
+
 @pytest.mark.slow
 def test_states_agree_over_a_radio_too():
     result = flown("paper", LATE, ONE_WAY)

@@ -98,7 +98,7 @@ def test_formations_stand_actuators_that_are_not_ideal(world, bound):
 
 def test_late_states_are_those_of_some_steps_ago_and_noise_has_its_size():
     with jax.enable_x64(True):
-        sensors = Sensing(delay=0.02, noise={"x": 0.5}, seed=3).prepared(POINT, 0.01, 0)
+        sensors = Sensing(delay=0.02, noise={"x": 0.5}, seed=3).prepared(POINT, 0.01, 9.0, 0)
         states = jnp.asarray(np.random.default_rng(0).normal(size=(9, 400, 2 * N)))
         last, seen = sensors.begin(states[0]), []
         for k in range(9):
@@ -159,6 +159,7 @@ def test_air_drags_an_agent_along():
         (lambda: ech.World(actuator=Actuator(lag=-1.0)), "`lag` .* -1.0"),
         (lambda: ech.World(sensing=Sensing(noise={"yaw": 1.0})), "`yaw` is no state or group"),
         (lambda: ech.World(sensing=Sensing(delay=-1.0)), "`delay` of the sensing is -1.0"),
+        (lambda: ech.World(sensing=Sensing(delay=1e9)), "must be at most the horizon, 0.1 s"),
         (
             lambda: ech.World(plants={9: ech.models.SingleIntegrator(dimension=3)}),
             "plant for agent 9, and the agents are 0 to",
@@ -177,6 +178,28 @@ def test_a_world_that_cannot_be_is_refused_in_one_sentence(world, message):
     with pytest.raises(EchelonError, match=message):
         parts = dataclasses.replace(parts, world=world())
         ech.simulate(parts, settings._replace(horizon=0.1, steady_window=0.1))
+
+
+def test_a_least_thrust_above_the_largest_is_refused():
+    drone = ech.models.Quadrotor.crazyflie()
+    with pytest.raises(SimulationError, match="below the largest thrust .* `Quadrotor`, 0.159"):
+        Actuator(minimum=5.0).prepared(drone)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("network={loss: 1.5}", "is a number of at most 1."),
+        ("actuator={levels: 1}", "--set actuator={levels: 1}: `levels`"),
+        ("sensing={estimator: constant-gain}", "constant-gain}: `estimator` .* states are exact"),
+        ("sensing={noise: {foo: 1}}", "sensing.noise: `foo` is no state"),
+        ("disturbance={air: [1, 0], drag: 0.1}", "drag: 0.1}: got `drag`"),
+    ],
+)
+def test_a_fault_of_the_world_is_one_sentence_with_its_place(override, words):
+    with pytest.raises(EchelonError, match=words) as caught:
+        ech.build(ech.load_scenario("paper-global", [override]))
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_the_printed_update_has_no_time_for_a_lag():

@@ -4,8 +4,8 @@ import contextlib
 import functools
 import os
 import threading
-from collections.abc import Callable, Sequence
-from typing import Final, Generic, NamedTuple, TypeVar, final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, Generic, NamedTuple, TypeVar, final
 
 import equinox as eqx
 import jax
@@ -80,10 +80,13 @@ class CompiledFunction(Generic[_R]):
     are of echelon's own classes.
     """
 
-    def __init__(self, function: Callable[..., _R]) -> None:
-        """Wrap a module-level function."""
+    def __init__(
+        self, function: Callable[..., _R], options: Mapping[str, Any] | None = None
+    ) -> None:
+        """Wrap a module-level function; `options` are XLA's."""
         functools.update_wrapper(self, function)
-        self._function, self._plain = function, eqx.filter_jit(function)
+        self._function, self._options = function, options
+        self._plain = self._jitted(function)
         self._foreign = BoundedCache[Callable[..., _R]](_MOST)
         self._programs = BoundedCache[_Compiled | None](_MOST)
         self._last: tuple[_CallArguments, bytes | None] | None = None
@@ -115,7 +118,11 @@ class CompiledFunction(Generic[_R]):
     def _renewed(self) -> Callable[..., _R]:
         """Return the function compiled as another one to JAX."""
         function = self._function
-        return eqx.filter_jit(functools.wraps(function)(lambda *a, **named: function(*a, **named)))
+        renewed = functools.wraps(function)(lambda *a, **named: function(*a, **named))
+        return self._jitted(renewed)
+
+    def _jitted(self, function: Callable[..., _R]) -> Callable[..., _R]:
+        return eqx.filter_jit(function, compiler_options=self._options)
 
     def _load_or_compile(self, call: _CallArguments, key: bytes) -> _Compiled | None:
         """Return what is stored for a call, or compile and store it; None if JAX compiles it."""
@@ -128,7 +135,7 @@ class CompiledFunction(Generic[_R]):
             # An unreadable entry is compiled again.
             with contextlib.suppress(Exception):
                 return None if stored == _OTHER else _load(stored, len(call.arrays))
-        compiled, packed = _compile(self._function, call), _OTHER
+        compiled, packed = _compile(self._function, call, self._options), _OTHER
         # A program that cannot be serialized is left to JAX from the next process on.
         with contextlib.suppress(Exception):
             packed = _OTHER if compiled is None else _packed(compiled)
@@ -139,6 +146,14 @@ class CompiledFunction(Generic[_R]):
 def cached_jit(function: Callable[..., _R]) -> Callable[..., _R]:
     """Return a function compiled by JAX; its arrays may be of JAX or NumPy."""
     return CompiledFunction(function)
+
+
+def compiled_for_one_call(function: Callable[..., _R]) -> Callable[..., _R]:
+    """Return the same for a function whose programs run once, which takes less than compiling them.
+
+    They are compiled without LLVM's optimizer, in little more than half of the time.
+    """
+    return CompiledFunction(function, {"xla_backend_optimization_level": 0})
 
 
 def _call_of(arguments: PyTree) -> _CallArguments | None:
@@ -175,7 +190,9 @@ def _form(array: jax.Array) -> tuple[tuple[int, ...], str, bool]:
 # ---- compiled code -------------------------------------------------------------------------------
 
 
-def _compile(function: Callable[..., PyTree], call: _CallArguments) -> _Compiled | None:
+def _compile(
+    function: Callable[..., PyTree], call: _CallArguments, options: Mapping[str, Any] | None
+) -> _Compiled | None:
     """Return a function compiled for a call; None if it calls foreign code such as LAPACK."""
     trees = list[PyTree]()
 
@@ -191,7 +208,7 @@ def _compile(function: Callable[..., PyTree], call: _CallArguments) -> _Compiled
     # A program that JAX loads from its own disk cache cannot be serialized again. A unique name
     # prevents such a load.
     flat.__name__ = f"{function.__name__}_{os.urandom(8).hex()}"
-    lowered = jax.jit(flat, keep_unused=True).lower(*call.arrays)
+    lowered = jax.jit(flat, keep_unused=True, compiler_options=options).lower(*call.arrays)
     if "custom_call" in lowered.as_text():
         return None
     # The option is shared by all threads.

@@ -87,7 +87,7 @@ class Linear(ControlAffine):
         """
         sampled = cls(A, B, C, names)
         if not (np.isfinite(step) and step > 0.0):
-            raise ModelError(f"the step of `Linear.discrete` is {step}, and must be positive.")
+            raise ModelError(f"the step of a discrete-time model is {step} s, and must be above 0.")
         return cls(*_continuous(sampled.A, sampled.B, float(step)), C, names)
 
     @classmethod
@@ -105,11 +105,10 @@ class Linear(ControlAffine):
                 f"`D` of `{file}` is not zero, and the output of an agent depends on its state "
                 "only; leave `D` out, or add the input's filter to the states."
             )
-        step = float(np.max(found.get("Ts", np.zeros(1)), initial=0.0))
-        matrices = found["A"], found["B"]
-        if step > 0.0:
-            return cls.discrete(*matrices, step, found.get("C"), names)
-        return cls(*matrices, found.get("C"), names)
+        matrices, C, Ts = (found["A"], found["B"]), found.get("C"), found.get("Ts", np.zeros(1))
+        if Ts.size != 1 or not Ts.any():
+            return cls(*matrices, C, names)
+        return cls.discrete(*matrices, Ts.item(), C, names)
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -170,10 +169,12 @@ def _continuous(A: Array, B: Array, step: float) -> tuple[Array, Array]:
 
 def _matrix(name: str, value: Sequence[Sequence[float]] | Array) -> Array:
     try:
-        matrix = np.array(value, dtype=np.float64)
+        # Not `array`, which drops imaginary parts.
+        matrix = np.asarray(value).astype(np.float64, casting="same_kind")
     except (TypeError, ValueError):
+        got = " ".join(str(value).split())[:60]
         raise ModelError(
-            f"`{name}` of `Linear` is {value}, and must be a list of rows of numbers."
+            f"`{name}` of `Linear` is {got}, and must be a list of rows of real numbers."
         ) from None
     if matrix.ndim != 2 or not np.isfinite(matrix).all():
         raise ModelError(

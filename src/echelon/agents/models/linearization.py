@@ -9,7 +9,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.secants import Gap, Sides, sides, stencil, units_at
-from echelon.core.compiled import cached_jit
+from echelon.core.compiled import compiled_for_one_call
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.trace import call_once_traced
@@ -79,7 +79,7 @@ def _units(model: ControlAffine) -> Array:
     return np.sqrt(1.0 / np.where(diagonal > 0.0, diagonal, 1.0))
 
 
-@cached_jit
+@compiled_for_one_call
 def _evaluate(model: ControlAffine, x: State, u: Input, points: States) -> list[jax.Array]:
     functions = [
         functools.partial(call_once_traced, function)

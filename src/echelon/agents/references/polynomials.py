@@ -5,13 +5,13 @@ from collections.abc import Iterator, Sequence
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.references.path_file import read_columns
 from echelon.agents.references.polynomial_path import PolynomialPath
 from echelon.agents.references.reference import COORDINATES, Reference, numbers_of
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import ReferenceError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, PathLike
@@ -25,6 +25,7 @@ _CLOSE, _MANY = 1e-4, 4096
 """Largest distance of written pieces from their path, m or rad, and their largest number."""
 _LONG = 4.0
 """Duration of the first pieces that are tried, s; then there are more."""
+_BLOCK = 512
 _BETWEEN = np.linspace(0.0, 1.0, 9)[1:-1]
 
 
@@ -99,8 +100,7 @@ class Polynomials(PolynomialPath):
         count = math.ceil(horizon / _LONG)
         while count <= _MANY:
             times = np.linspace(0.0, horizon, count + 1)
-            with precision("float64"):
-                rows = np.asarray(_sampled(path, times))
+            rows = _sampled(path, times)
             spans = np.diff(times)
             powers = _between(spans, np.stack([rows[:-1], rows[1:]], axis=1))
             if _distance(path, times[:-1], spans, powers) <= _CLOSE:
@@ -204,16 +204,24 @@ def _of_polynomials(path: PolynomialPath) -> Polynomials:
     return Polynomials(spans, pieces)
 
 
-def _sampled(path: Reference, times: Array) -> jax.Array:
-    """Return value and three derivatives (T, 4, 4) of a path."""
-    return jax.vmap(lambda t: path.derivatives(t, _ORDERS - 1, COORDINATES))(jnp.asarray(times))
+def _sampled(path: Reference, times: Float[Array, " T"]) -> Float[Array, "T 4 4"]:
+    """Return value and three derivatives [order, coordinate] of a path."""
+    # In blocks of one size, since each other one would be compiled anew.
+    padded = np.pad(times, (0, -len(times) % _BLOCK), mode="edge").reshape(-1, _BLOCK)
+    with precision("float64"):
+        rows = [np.asarray(_derivatives(path, block)) for block in padded]
+    return np.concatenate(rows)[: len(times)]
+
+
+@cached_jit
+def _derivatives(path: Reference, times: jax.Array) -> jax.Array:
+    return jax.vmap(lambda t: path.derivatives(t, _ORDERS - 1, COORDINATES))(times)
 
 
 def _distance(path: Reference, begins: Array, spans: Array, powers: Float[Array, "P 4 8"]) -> float:
     """Return the largest distance of pieces from their path, at points between their ends."""
     times = begins[:, None] + spans[:, None] * _BETWEEN
-    with precision("float64"):
-        exact = np.asarray(jax.vmap(path)(jnp.asarray(times.ravel())))
+    exact = _sampled(path, times.ravel())[:, 0]
     since = (spans[:, None] * _BETWEEN)[..., None] ** np.arange(8)
     pieces = np.einsum("psk,pck->psc", since, powers)
     return float(np.abs(pieces.reshape(exact.shape) - exact).max())

@@ -70,6 +70,11 @@ class Actuator:
                 "`input_limits` are not as many as its inputs, with finite bounds."
             )
         low, high = np.asarray(limits.low, float), np.asarray(limits.high, float)
+        if self.minimum is not None and (self.minimum >= high).any():
+            raise SimulationError(
+                f"`minimum` of the actuator is {self.minimum:g}, and must be below the largest "
+                f"thrust of a motor of `{type(plant).__name__}`, {high.min():g}."
+            )
         step = (high - low) / (self.levels - 1) if self.levels else None
         least = low if self.minimum is None else np.maximum(low, self.minimum)
         return MotorArrays(lag, mixing, np.linalg.inv(mixing), low, least, step)

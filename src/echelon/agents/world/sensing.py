@@ -59,12 +59,22 @@ class Sensing:
                 "a `noise` or a `delay`, or leave it out."
             )
 
-    def prepared(self, model: ControlAffine, dt: float, seed: int) -> "Sensors | None":
-        """Return the sensing as arrays for a control step (s) and a run's seed; None if exact.
+    def prepared(
+        self, model: ControlAffine, dt: float, horizon: float, seed: int
+    ) -> "Sensors | None":
+        """Return the sensing as arrays for a control step and a horizon (s) and a run's seed.
+
+        None if it is exact.
 
         Raises:
             ModelError: a name is no state or group of the model.
+            SimulationError: no state is measured within the horizon.
         """
+        if self.delay > horizon:
+            raise SimulationError(
+                f"`delay` of the sensing is {self.delay:g} s, and must be at most the horizon, "
+                f"{horizon:g} s, within which otherwise agents know only their starts."
+            )
         std, late = model.per_state(self.noise), round(self.delay / dt)
         if not late and not std.any():
             return None

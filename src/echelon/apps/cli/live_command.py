@@ -22,11 +22,11 @@ def live(
     browser: BrowserOption = True,
 ) -> None:
     """Run a scenario in real time in the browser, with controls that show what is guaranteed."""
-    from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
+    from echelon.experiments.scenario.scenario import load_scenario
+    from echelon.output.archive.folder import when_written
     from echelon.output.viewer.page import check_page
 
-    folder = Path(scenario) if Path(scenario).is_dir() else None
-    loaded = load_scenario(scenario if folder is None else folder / SCENARIO_FILE, set_ or [])
+    loaded = load_scenario(scenario, set_ or [])
     check_page()
     STATUS.begin(f"preparing {loaded.name} for the browser, which takes up to a minute")
     from echelon.apps.cli.view_command import keep_serving
@@ -35,7 +35,9 @@ def live(
     from echelon.experiments.results.dataset import recording_of
     from echelon.output.archive.load_folder import load
 
-    run = None if folder is None else recording_of(load(folder))
+    # A bundled scenario wins over a folder of its name, and a folder may hold no run yet.
+    folder = Path(scenario) if loaded.folder == Path(scenario) else None
+    run = recording_of(load(folder)) if folder is not None and when_written(folder) else None
     session, html = make_ready(loaded, run, STATUS.counter("parts"))
     server = serve_live(session, html, port)
     session.start()

@@ -35,6 +35,7 @@ def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: JsonObject) -> 
         "path": _path(swarm, space),
         "unit": run.length_unit,
         "limited": run.loads is not None,
+        "messages": swarm.parts.world.network is not None,
     }
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.models.linearization import linearize
+from echelon.agents.network.channel import Network
 from echelon.agents.network.graph import Graph
 from echelon.apps.live.choices import shapes_of
 from echelon.core.numerics import precision
@@ -32,6 +33,12 @@ class Knobs(NamedTuple):
         size: factor on the size of the formation.
         turn: of the formation, degrees.
         wind: added to the rate of the first velocity, or of the first position.
+        delay: of messages, s.
+        loss: share of messages lost.
+        outages: share of the time that a link is out.
+        gusts: factor on the random wind.
+        lag: of the actuators, s; None without one.
+        noise: factor on the noise of measurements.
         cut: indices of the cut edges.
         method: of the gain; None for the scenario's own.
         shape: of the formation; None for the scenario's own.
@@ -43,6 +50,12 @@ class Knobs(NamedTuple):
     size: float = 1.0
     turn: float = 0.0
     wind: float = 0.0
+    delay: float = 0.0
+    loss: float = 0.0
+    outages: float = 0.0
+    gusts: float = 1.0
+    lag: float | None = None
+    noise: float = 1.0
     cut: frozenset[int] = frozenset()
     method: str | None = None
     shape: str | None = None
@@ -61,7 +74,7 @@ class LiveParts:
         """Begin with the scenario's own parts."""
         self.scenario, self.parts = scenario, experiment.parts
         model = self.parts.model
-        self.start = Knobs(_coupling(experiment))
+        self.start = _start(experiment)
         self.axes = list(model.position_indices())
         self.shapes = shapes_of(self.parts)
         # The state that the wind acts on; None of agents without a position.
@@ -135,6 +148,22 @@ class LiveParts:
             wind[self.wind_state] += knobs.wind
         return wind
 
+    @property
+    def longest_delay(self) -> float | None:
+        """The delay (s) beyond which messages are forgotten when they arrive."""
+        network = self.parts.world.network
+        if network is None:
+            return None
+        return round(network.forget - 2.0 / network.rate - network.jitter, 9)
+
+    def network(self, knobs: Knobs) -> Network | None:
+        """Return the network with the delay, the losses and the outages of the knobs."""
+        network = self.parts.world.network
+        if network is None:
+            return None
+        bursts = dataclasses.replace(network.bursts, share=knobs.outages)
+        return dataclasses.replace(network, delay=knobs.delay, loss=knobs.loss, bursts=bursts)
+
     def edges(self, knobs: Knobs, weights: Float[Array, " e"]) -> list[list[Any]]:
         """Return the edges with a weight that are not cut, as a scenario lists them."""
         edges = self.parts.graph.edges
@@ -173,6 +202,17 @@ class LiveParts:
         graph = self.graph(knobs) if knobs.cut else parts.graph
         with precision("float64"):
             return loop_of(parts.replace(drive=Laws(parts.drive.leader, law), graph=graph))
+
+
+def _start(experiment: Experiment) -> Knobs:
+    """Return the positions at which the knobs have no effect."""
+    world, knobs = experiment.parts.world, Knobs(_coupling(experiment))
+    if world.actuator is not None and world.actuator.lag:
+        knobs = knobs._replace(lag=world.actuator.lag)
+    if world.network is None:
+        return knobs
+    network = world.network
+    return knobs._replace(delay=network.delay, loss=network.loss, outages=network.bursts.share)
 
 
 def _coupling(experiment: Experiment) -> float | None:

@@ -1,12 +1,13 @@
 """The controls of the live page, each with its range, label, unit and scenario keys."""
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, final
+from collections.abc import Iterable, Sequence
+from typing import Any, final
 
 import numpy as np
 
 from echelon.apps.live.choices import AS_GIVEN
 from echelon.apps.live.knobs import Knobs, LiveParts
+from echelon.apps.live.sliders import SLIDERS
 from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario import registry
@@ -14,115 +15,11 @@ from echelon.experiments.scenario.build import Experiment
 from echelon.experiments.scenario.override import rename_files
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.experiments.scenario.yaml import dump_yaml
-from echelon.synthesis.gains.fixed import FixedGain
 from echelon.synthesis.gains.inner_loop import InnerLoop
 from echelon.synthesis.gains.riccati import Riccati
 
 _METHODS = (Riccati.name, InnerLoop.name)
 """Gain methods that take less than a picture's time, and need no parameters."""
-
-
-class Range(NamedTuple):
-    """The values of a slider, whose scale may be logarithmic."""
-
-    low: float
-    high: float
-    logarithmic: bool = False
-
-
-class Slider(NamedTuple):
-    """A control of one number.
-
-    Attributes:
-        label: on the page.
-        unit: of the number; of the wind that of its state's rate.
-        range: None if the parts have no such number.
-        write: writes the scenario keys that have the effect of the knobs.
-    """
-
-    label: str
-    unit: str
-    range: Callable[[LiveParts], Range | None]
-    write: Callable[[LiveParts, Knobs, JsonObject], None]
-
-
-def _coupling_range(live: LiveParts) -> Range | None:
-    c = live.start.coupling
-    return None if c is None else Range(0.02 * c, 8.0 * c, True)
-
-
-def _write_coupling(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
-    # On another graph a method would choose another coupling, so it is written there too.
-    if knobs.coupling is None or (not knobs.cut and knobs.coupling == live.start.coupling):
-        return
-    follower, gain = data.setdefault("follower", {}), live.parts.drive.gain
-    if gain is None:
-        follower["coupling"] = knobs.coupling
-        return
-    section = follower.setdefault("gain", {})
-    if "file" in section:
-        section = {"method": FixedGain.name, "P": gain.P.tolist(), "R": gain.R.tolist()}
-    follower["gain"] = section | {"coupling": knobs.coupling}
-
-
-def _weight_range(live: LiveParts) -> Range | None:
-    gain, section = live.parts.drive.gain, (live.data().get("follower") or {}).get("gain") or {}
-    computed = gain is not None and gain.method == Riccati.name and "file" not in section
-    return Range(0.02, 50.0, True) if computed else None
-
-
-def _write_weight(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
-    gain = live.unweighted_gain(knobs)
-    if knobs.weight != 1.0 and gain is not None:
-        section = data.setdefault("follower", {}).setdefault("gain", {})
-        section |= {"method": Riccati.name, "R": (knobs.weight * gain.R).tolist()}
-
-
-def _feedforward_range(live: LiveParts) -> Range | None:
-    return Range(0.0, 1.0) if str(live.parts.drive.feedforward.name) != "NONE" else None
-
-
-def _write_feedforward(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
-    if not knobs.feedforward:
-        data.setdefault("follower", {})["feedforward"] = "none"
-
-
-def _size_range(live: LiveParts) -> Range | None:
-    apart = bool(live.axes) and live.parts.formation.offsets[:, live.axes].any()
-    return Range(0.3, 3.0, True) if live.shapes or apart else None
-
-
-def _turn_range(live: LiveParts) -> Range | None:
-    in_plane = len(live.axes) > 1 and _size_range(live) is not None
-    return Range(-180.0, 180.0) if in_plane else None
-
-
-def _write_formation(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
-    if (knobs.size, knobs.turn, knobs.shape) != (1.0, 0.0, None):
-        offsets = live.offsets(knobs)
-        agents = np.flatnonzero(offsets.any(axis=1))
-        data["formation"] = {"offsets": {i: offsets[i, live.axes].tolist() for i in agents}}
-
-
-def _wind_range(live: LiveParts) -> Range | None:
-    return None if live.wind_state is None else Range(-3.0, 3.0)
-
-
-def _write_wind(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
-    if knobs.wind and live.wind_state is not None:
-        name = live.parts.model.state_names[live.wind_state]
-        constant = data.setdefault("disturbance", {}).setdefault("constant", {})
-        constant[name] = constant.get(name, 0.0) + knobs.wind
-
-
-SLIDERS = {
-    "coupling": Slider("coupling c", "", _coupling_range, _write_coupling),
-    "weight": Slider("input weight R", "\u00d7", _weight_range, _write_weight),
-    "feedforward": Slider("feed-forward", "", _feedforward_range, _write_feedforward),
-    "size": Slider("formation size", "\u00d7", _size_range, _write_formation),
-    "turn": Slider("formation turn", "\u00b0", _turn_range, _write_formation),
-    "wind": Slider("wind", "{rate}", _wind_range, _write_wind),
-}
 
 
 @final
@@ -190,6 +87,8 @@ class Panel:
         if name in ("cut", "restore"):
             edge = {self.edge(value)}
             return knobs._replace(cut=knobs.cut | edge if name == "cut" else knobs.cut - edge)
+        if name == "lose":
+            return knobs._replace(cut=knobs.cut | self._links(value))
         if name in self.options:
             return self._choose(knobs, name, value)
         if name not in self.ranges:
@@ -219,6 +118,13 @@ class Panel:
         gain = None if choice is None else self.live.unweighted_gain(changed)
         coupling = self.start.coupling if gain is None else round(gain.coupling, 9)
         return changed._replace(weight=1.0, coupling=coupling)
+
+    def _links(self, agent: Any) -> frozenset[int]:
+        """Return the indices of the edges of an agent."""
+        graph = self.live.parts.graph
+        if type(agent) is not int or not 0 <= agent < graph.agents:
+            raise SimulationError(f"`lose` got `{agent}`, and must be the number of an agent.")
+        return frozenset(np.flatnonzero((graph.edges == agent).any(axis=1)).tolist())
 
     def edge(self, pair: Any) -> int:
         """Return the index of the edge between two agents.

@@ -172,6 +172,7 @@ class Session:
             goals[:, list(space.axes)],
             space.sign * picture.states[:, list(space.angles)],
             np.clip(loads, 0.0, 1.0),
+            picture.shades,
         ]
         numbers = np.concatenate([part.ravel() for part in parts]).astype("<f4")
         return struct.pack("<I4xd", _PICTURE, picture.time) + numbers.tobytes()

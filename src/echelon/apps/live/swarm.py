@@ -1,6 +1,7 @@
 """The live closed loop: steps for each picture, and knobs that change it without compiling."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple, final
 
@@ -11,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.channel import NEVER, Channel
 from echelon.agents.network.hearing import edges_of
 from echelon.agents.world.disturbance import Disturbance
 from echelon.apps.live.knobs import Knobs, LiveParts
@@ -21,6 +23,7 @@ from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, PyTree
 from echelon.experiments.results.lyapunov import fixed_metric, potential
 from echelon.laws.law import Law
+from echelon.output.viewer.replay import link_shades
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
@@ -41,8 +44,8 @@ class Picture(NamedTuple):
     """The swarm at a time (s): states (N, n), inputs (N, m), errors (N,), offsets (N, n).
 
     `reference` (n,) is that of the leaders, None if they follow nothing; `lyapunov` is V, NaN if
-    it does not exist; `beyond` (N,) marks the agents whose states or inputs
-    are not finite, or are too large for the stepper.
+    it does not exist; `beyond` (N,) marks the agents whose states or inputs are not finite, or are
+    too large for the stepper; `shades` (E,) are those of the links over a network.
     """
 
     time: float
@@ -53,6 +56,7 @@ class Picture(NamedTuple):
     reference: Array | None
     lyapunov: float
     beyond: Array
+    shades: Array = np.zeros(0)
 
 
 @final
@@ -87,12 +91,18 @@ class LiveLoop:
         # The share of the feed-forward is a number of the loop, so that a knob can change it.
         self.loop: Loop = dataclasses.replace(loop, follower=law, share=np.asarray(1.0))
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
+        if loop.channel is not None:
+            self.loop = dataclasses.replace(self.loop, channel=self._roomy(loop.channel))
+        assert loop.motion.wind is not None
+        self.rms = loop.motion.wind.rms
+        self.std = None if loop.sensors is None else loop.sensors.std
         self.potentials: dict[Hashable, Callable[[Array], Array]] = {}
         self.states, self.first = problem.states, 0
         self.measured = list(problem.meter.measured)
         self.nearest = np.array(parts.graph.nearest_leader())
         self.weights = np.asarray(loop.exchange.weights, np.float64)
-        self.edge = edges_of(parts.graph, loop.exchange)[0]
+        self.place = edges_of(parts.graph, loop.exchange)
+        self.edge = self.place[0]
         self.count = max(1, round(PICTURE / settings.dt))
         self.offsets = panel.offsets(panel.start)
         self.potential = self._potential(panel.start)
@@ -167,7 +177,29 @@ class LiveLoop:
             self.loop,
             (self.offsets, weights, self.panel.wind(knobs)),
         )
-        self.loop = eqx.tree_at(self._adjustable, loop, self._numbers(knobs))
+        self.loop = self._in_world(eqx.tree_at(self._adjustable, loop, self._numbers(knobs)), knobs)
+
+    def _roomy(self, channel: Channel) -> Channel:
+        """Return a channel with memory for the longest delay, and the code of outages."""
+        most = self.panel.longest_delay or 0.0
+        steps = math.ceil(most / self.settings.dt) + int(channel.jitter) + 1
+        return dataclasses.replace(channel, slots=steps // int(channel.every) + 2, bursty=True)
+
+    def _in_world(self, loop: Loop, knobs: Knobs) -> Loop:
+        """Return the loop with the network, the gusts, the lag and the noise of the knobs."""
+        network, motors, settings = self.panel.network(knobs), loop.motion.motors, self.settings
+        if network is not None:
+            channel = network.prepared(settings.dt, math.inf, settings.seed)
+            loop = dataclasses.replace(loop, channel=self._roomy(channel))
+        if self.rms is not None:
+            rms = knobs.gusts * self.rms
+            loop = eqx.tree_at(lambda loop: loop.motion.wind.rms, loop, rms)
+        if motors is not None and motors.lag is not None:
+            lag = np.asarray(knobs.lag)
+            loop = eqx.tree_at(lambda loop: loop.motion.motors.lag, loop, lag)
+        if self.std is not None:
+            loop = eqx.tree_at(lambda loop: loop.sensors.std, loop, knobs.noise * self.std)
+        return loop
 
     def _numbers(self, knobs: Knobs) -> tuple[PyTree, ...]:
         """Return the values of the adjustable numbers at these positions of the knobs."""
@@ -224,7 +256,24 @@ class LiveLoop:
         V = float(self.potential(y[None])[0]) if valid.all() and self.potential else np.nan
         desired = None if reference is None else reference[counts[0]]
         beyond = np.logical_not(valid)
-        return Picture(time, states, inputs, errors, self.offsets, desired, V, beyond)
+        shades = self._shades(int(counts[0]))
+        return Picture(time, states, inputs, errors, self.offsets, desired, V, beyond, shades)
+
+    def _shades(self, steps: int) -> Float[Array, " E"]:
+        """Return how each link is drawn after some steps; nothing in the ideal network."""
+        channel, network = self.loop.channel, self.parts.world.network
+        if channel is None or network is None:
+            return np.zeros(0)
+        posts, now, every = self.now.world.in_flight, self.steps, int(channel.every)
+        stamps, arrival = np.asarray(self.now.world.mail.stamp), np.asarray(posts.arrival)
+        sent = np.arange(-(-(now - steps) // every), -(-now // every))[-channel.slots :]
+        gone = (arrival[sent % channel.slots] == NEVER).sum(axis=0)
+        edges = len(self.parts.graph.edges)
+        ages, lost = np.full((edges, 2), np.nan), np.zeros((edges, 2))
+        age = np.where(stamps == NEVER, np.inf, (now - stamps) * self.settings.dt)
+        ages[self.place], lost[self.place] = age, gone
+        lost[~self.parts.receives] = 0
+        return link_shades(ages, lost, network.forget, self.parts.receives)
 
     def goals(self, picture: Picture) -> Float[Array, "N n"]:
         """Return the goals: of leaders relative to the reference, NaN if they follow nothing."""

@@ -140,6 +140,10 @@ class Recording(FrameNumbers):
     attributes: JsonObject
     radius: float | None = None
 
+    def __repr__(self) -> str:
+        """Return the name and the sizes."""
+        return f"Recording({self.name!r}, {self.agents} agents, {len(self.times)} frames)"
+
     @property
     def agents(self) -> int:
         """The number of agents."""

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from echelon.core.errors import Outcome, OutputError
@@ -22,7 +23,7 @@ _SETTINGS = tuple(name for name in Settings._fields if name != "limits")
 
 def read_result(
     file: Path,
-    parts: Callable[[Result], Parts],
+    parts: Callable[[JsonObject, Settings], Parts],
     summary: JsonObject,
     files: Mapping[str, bytes],
 ) -> Result:
@@ -30,7 +31,7 @@ def read_result(
 
     Args:
         file: the run's `run.nc`.
-        parts: returns the parts of the run.
+        parts: returns the parts of a run with these attributes and settings.
         summary: of the run, with its computing time; empty where there is none.
         files: that the scenario text names, by name.
 
@@ -50,14 +51,15 @@ def read_result(
 def _result(
     file: Path,
     data: Labelled,
-    parts: Callable[[Result], Parts],
+    parts: Callable[[JsonObject, Settings], Parts],
     summary: JsonObject,
     files: Mapping[str, bytes],
 ) -> Result:
     attributes, arrays = data.attributes, data.arrays()
     sums = {name: arrays[SUM + name] for name in Sums._fields if SUM + name in arrays}
     solver = attributes.get("solver")
-    result = Result(
+    settings = _settings(attributes)
+    return Result(
         times=arrays["time"],
         states=arrays["states"],
         inputs=arrays["inputs"],
@@ -65,16 +67,15 @@ def _result(
         outcome=Outcome[attributes["outcome"].upper()],
         message=attributes["message"],
         warnings=tuple(attributes["warnings"].splitlines()),
-        settings=_settings(attributes),
+        settings=settings,
         wall_time=float(summary.get("wall_time_s", float("nan"))),
-        sums=Later(lambda: _sums(file, sums)),
-        parts=Later(lambda: parts(result)),
+        sums=Later(partial(_sums, file, sums)),
+        parts=Later(partial(parts, attributes, settings)),
         work=None if solver is None else SolverStats(**json.loads(solver)),
         engine=attributes.get("computed_by") or summary.get("engine", "jax"),
         provenance={name: attributes[name] for name in _provenance(attributes)},
         files=files,
     )
-    return result
 
 
 def _sums(file: Path, sums: Mapping[str, object]) -> Sums:

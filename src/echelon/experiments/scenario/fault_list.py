@@ -27,7 +27,9 @@ class FaultList:
         except MissingExtraError:
             raise
         except EchelonError as error:
-            self.faults.append(Fault(self.scenario.place(*path), joined(path), str(error)))
+            # Of a part that is checked key by key, and then whole, each fault once.
+            if str(error) not in {fault.message for fault in self.faults}:
+                self.faults.append(Fault(self.scenario.place(*path), joined(path), str(error)))
 
     def part(self, make: Callable[[], _Part], *path: str | int) -> _Part:
         """Return a part; in place of one with a fault None, until `settle` raises the fault."""

@@ -37,15 +37,17 @@ def sections_in(annotation: object) -> Iterator[type[BaseModel]]:
         yield from sections_in(inner)
 
 
-def key_paths(section: type[BaseModel], before: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the path of every key of a section, such as `network.delay`, with its description.
+def key_paths(section: type[BaseModel], before: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield the path of every key of a section, such as `network.delay`, its description and unit.
 
     Changes of a live page are left out: no other command takes them.
     """
     for key, field in section.model_fields.items():
         inner = next(sections_in(field.annotation), None)
         text = field.description or (inner.__doc__ if inner is not None else "") or ""
-        yield before + key, " ".join(text.split())
+        extra = field.json_schema_extra
+        unit = str(extra.get("unit", "")) if isinstance(extra, dict) else ""
+        yield before + key, " ".join(text.split()), unit
         if inner is not None and before + key != "live":
             yield from key_paths(inner, f"{before}{key}.")
 
@@ -58,7 +60,7 @@ def meant(key: object, allowed: list[str], scenario: type[BaseModel]) -> str:
         allowed: the keys that the section has.
         scenario: the class of the whole file.
     """
-    paths = [path for path, _ in key_paths(scenario)]
+    paths = [path for path, _, _ in key_paths(scenario)]
     common = [path for path, names in _COMMON_NAMES.items() if str(key) in names.split()]
     same = [path for path in paths if path.rpartition(".")[2] == key]
     places = [*common, *sorted(same, key=lambda path: path.count("."))]

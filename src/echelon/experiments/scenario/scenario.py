@@ -4,6 +4,7 @@ All faults of a file are reported at once, a line each: `file:line: field: got .
 """
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeAlias, final
@@ -118,6 +119,7 @@ _ALLOWED = {
     "greater_than": "is a number above {gt:g}",
     "greater_than_equal": "is a number of at least {ge:g}",
     "less_than": "is a number below {lt}",
+    "less_than_equal": "is a number of at most {le:g}",
     "too_short": "is a list of at least {min_length} number",
 }
 
@@ -327,6 +329,15 @@ def json_schema() -> dict[str, Any]:
     return draft | Scenario.model_json_schema()
 
 
+def key_label(path: str) -> tuple[str, str]:
+    """Return a key in a few words, and its unit; the last parts of its path if it has no text."""
+    for place, text, unit in key_paths(Scenario):
+        words = re.split(r"[;,.:]", text)[0].strip()
+        if place == path and words:
+            return words[0].lower() + words[1:], "" if unit == "1" else unit
+    return " ".join(path.split(".")[-2:]).replace("_", " "), ""
+
+
 def key_meanings() -> dict[str, str]:
     """Return what every key of the file means, by its path, such as `network.delay`."""
-    return dict(key_paths(Scenario))
+    return {place: text for place, text, _ in key_paths(Scenario)}

@@ -373,6 +373,20 @@ class LiveSpec(BaseModel, **STRICT):
     """Rotation of the formation about its first leader, degrees."""
     wind: Annotated[float | None, Unit("the states', per s")] = None
     """Wind on the first velocity, or on the first position, added to `disturbance`."""
+    delay: Annotated[NotNegative | None, Unit("s")] = None
+    """Delay of the messages of `network`, s."""
+    loss: Annotated[Share | None, Unit("1")] = None
+    """Share of these messages that is lost."""
+    outages: Annotated[Share | None, Unit("1")] = None
+    """Share of the time that each link of `network` is out."""
+    gusts: Annotated[NotNegative | None, Unit("1")] = None
+    """Size of the random wind, relative to that of `disturbance`."""
+    lag: Annotated[Positive | None, Unit("s")] = None
+    """Lag of the actuators, s, where `actuator` has one."""
+    noise: Annotated[NotNegative | None, Unit("1")] = None
+    """Size of the noise, relative to that of `sensing`."""
+    lose: int | None = None
+    """The number of an agent that falls silent: all its edges are removed."""
     cut: Annotated[Annotated[tuple[int, int], Field(strict=False)] | None, Unit("agents")] = None
     """The two agents of an edge that is removed."""
     restore: Annotated[Annotated[tuple[int, int], Field(strict=False)] | None, Unit("agents")] = (

@@ -48,8 +48,12 @@ def disturbance_of(
         with faults.at("disturbance", key):
             # Each alone, so that its fault is reported at its own line.
             Disturbance(**{key: getattr(spec, key)}).prepared(model, scenario.simulation.dt, 0)
-    numbers: dict[str, Any] = spec.model_dump() | {"air": spec.air or ()}
-    return faults.part(lambda: Disturbance(**numbers), "disturbance")
+    disturbance = None
+    with faults.at("disturbance"):
+        numbers: dict[str, Any] = spec.model_dump() | {"air": spec.air or ()}
+        disturbance = Disturbance(**numbers)
+        disturbance.prepared(model, scenario.simulation.dt, 0)
+    return disturbance
 
 
 def actuator_of(scenario: Scenario, faults: FaultList, model: ControlAffine) -> Actuator | None:
@@ -57,8 +61,9 @@ def actuator_of(scenario: Scenario, faults: FaultList, model: ControlAffine) -> 
     spec = scenario.actuator
     if spec is None:
         return None
-    actuator = Actuator(**spec.model_dump())
+    actuator = None
     with faults.at("actuator"):
+        actuator = Actuator(**spec.model_dump())
         actuator.prepared(model)
     return actuator
 
@@ -68,9 +73,12 @@ def sensing_of(scenario: Scenario, faults: FaultList, model: ControlAffine) -> S
     spec = scenario.sensing
     if spec is None:
         return None
-    sensing = Sensing(**spec.model_dump())
+    sensing, simulation = None, scenario.simulation
     with faults.at("sensing", "noise"):
-        sensing.prepared(model, scenario.simulation.dt, 0)
+        model.per_state(spec.noise)
+    with faults.at("sensing"):
+        sensing = Sensing(**spec.model_dump())
+        sensing.prepared(model, simulation.dt, simulation.horizon, 0)
     return sensing
 
 

@@ -1,85 +1,21 @@
 """Stored states and inputs of the runs of a sweep: every K-th step of each run."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
-from echelon.core.errors import ScenarioError
-from echelon.core.types import Array, JsonObject
+from echelon.core.types import JsonObject
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.labelled_parts import labelled_parts
-from echelon.experiments.scenario.build import Experiment
-from echelon.simulation.engine.grid import ChunkGrid
-from echelon.simulation.engine.result import Result
+from echelon.experiments.sweeps.frame_shape import NAMES, StoredFrames
+from echelon.experiments.sweeps.plan import Sweep
 
-if TYPE_CHECKING:
-    from echelon.experiments.sweeps.plan import Sweep
-
-StoredFrames: TypeAlias = Mapping[str, Array]
-"""`states` (runs, T, N, n) and `inputs` (runs, T, N, m); NaN where a run has none."""
-NAMES = ("states", "inputs")
 _CHUNK = 500_000
 """Numbers of a run that are read together from its file, 4 MB."""
 
 
-class FrameShape(NamedTuple):
-    """What the runs of a sweep that stores states have in common.
-
-    Attributes:
-        times: (T,) s.
-        states, inputs: names.
-        agents: their number N.
-    """
-
-    times: tuple[float, ...]
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    agents: int
-
-    @classmethod
-    def of(cls, experiment: Experiment, every: int) -> "FrameShape":
-        """Return the shape of a run that stores every so-manieth step."""
-        parts, settings = experiment
-        grid = ChunkGrid(settings._replace(store_every=every), 1)
-        steps = np.arange(settings.steps + 1)
-        times = settings.dt * steps[grid.stored(steps)]
-        model = parts.model
-        return cls(tuple(times), model.state_names, model.input_names, parts.graph.agents)
-
-    @property
-    def numbers(self) -> int:
-        """How many numbers are stored of each run."""
-        return len(self.times) * self.agents * (len(self.states) + len(self.inputs))
-
-    def check(self, other: "FrameShape", key: str) -> None:
-        """Check that a value of a key leaves the shape as it is.
-
-        Raises:
-            ScenarioError: it does not.
-        """
-        if self != other:
-            raise ScenarioError(
-                f"--over {key}: its values change the agents, states or times of a run, and runs "
-                "whose states are stored must have them in common; leave `--keep-states` out."
-            )
-
-    def stored(self, results: Sequence[Result | None]) -> StoredFrames:
-        """Return the frames of some runs; None of those that could not be built."""
-        sizes = (len(self.states), len(self.inputs))
-        frames = {
-            name: np.full((len(results), len(self.times), self.agents, size), np.nan)
-            for name, size in zip(NAMES, sizes, strict=True)
-        }
-        for k, result in enumerate(results):
-            if result is not None:
-                for name, whole in frames.items():
-                    whole[k, : len(result.times)] = getattr(result, name)
-        return frames
-
-
-def labelled_frames(plan: "Sweep", axes: Variables, values: StoredFrames) -> Labelled:
+def labelled_frames(plan: Sweep, axes: Variables, values: StoredFrames) -> Labelled:
     """Return arrays of all runs, with a dimension for each key, as a dataset.
 
     Args:
@@ -101,7 +37,7 @@ def labelled_frames(plan: "Sweep", axes: Variables, values: StoredFrames) -> Lab
 
 
 def write_frames(
-    plan: "Sweep", axes: Variables, batches: Iterable[tuple[int, StoredFrames]], file: Path
+    plan: Sweep, axes: Variables, batches: Iterable[tuple[int, StoredFrames]], file: Path
 ) -> None:
     """Write the frames of a sweep run by run, each a chunk of its own, which few of fit in memory.
 

@@ -13,7 +13,7 @@ from echelon.experiments.sweeps.axes import SEED, Axis
 
 if TYPE_CHECKING:
     from echelon.experiments.scenario.build import Experiment
-    from echelon.experiments.sweeps.frames import FrameShape
+    from echelon.experiments.sweeps.frame_shape import FrameShape
 
 _SHAPING = ("model", "graph", "simulation")
 """The sections on which agents, states and times of a run depend."""
@@ -133,7 +133,7 @@ class Sweep:
     @cached_property
     def frames(self) -> "FrameShape | None":
         """The frames that are stored of each run; None if none are."""
-        from echelon.experiments.sweeps.frames import FrameShape
+        from echelon.experiments.sweeps.frame_shape import FrameShape
 
         return None if self.every is None else FrameShape.of(self.first_built, self.every)
 

@@ -11,9 +11,11 @@ from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.quantity import ERROR, Quantity
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS
+from echelon.experiments.scenario.scenario import key_label
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps.axes import Axis
-from echelon.experiments.sweeps.frames import FrameShape, labelled_frames
+from echelon.experiments.sweeps.frame_shape import FrameShape
+from echelon.experiments.sweeps.frames import labelled_frames
 from echelon.experiments.sweeps.numbers import (
     AGENT_COLUMNS,
     MISSING,
@@ -76,7 +78,13 @@ def dataset_of(plan: Sweep, batches: "Sequence[SweepBatch]") -> "xr.Dataset":
 
 def axis_values(plan: Sweep) -> Variables:
     """Return the values of each key."""
-    return {axis.key: _values(axis) for axis in plan.axes}
+    return {axis.key: (axis.key, _values(axis), _key_attributes(axis.key)) for axis in plan.axes}
+
+
+def _key_attributes(key: str) -> JsonObject:
+    """Return what a key is, in words, with its unit."""
+    words, unit = key_label(key)
+    return {"long_name": words} | ({"units": unit} if unit else {})
 
 
 def _all_frames(plan: Sweep, shape: FrameShape, batches: "Sequence[SweepBatch]") -> Labelled:

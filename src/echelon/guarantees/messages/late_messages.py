@@ -15,6 +15,7 @@ from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 from echelon.guarantees.messages.late_agreement import LateRate, late_rates, longest_ways
 from echelon.guarantees.messages.message_ages import MessageAges, ages_of
 
+_DIRECTED = "With `graph.directed: true` messages of any age would cost a delay alone"
 OFF_PLAN = 0.01
 """Of a leader's speed against its plan, in units of an output per second, for an example."""
 
@@ -67,7 +68,7 @@ class LateMessages(NamedTuple):
         sums: (K,) d_i, the sums of weights that followers hear.
         spread: max w, w = L_g^-1 1.
         coupling: c.
-        speed: s of followers, the smallest of all outputs.
+        speed: s of followers, the smallest of all outputs; 0 without one leader that has a plan.
         leaderward: whether neighbours with fewer hops alone are heard.
     """
 
@@ -145,7 +146,9 @@ class LateMessages(NamedTuple):
         text += f"; messages then cost a delay of {late:.3g} s at most" * bool(late)
         if arrival is not None:
             text += f", and from these starts all stay within 1 cm after {arrival:.3g} s"
-        return text
+        # Without ages agreement is at least as fast as c / max w.
+        slow = self.ways is None and 2.0 * self.rate < self.coupling / self.spread
+        return f"{text}. {_DIRECTED}" if slow else text
 
 
 def late_messages_of(
@@ -166,7 +169,9 @@ def late_messages_of(
     if obstacle is not None:
         return obstacle
     graph, c = following.graph, following.coupling
-    law = c, following.speed
+    # Of several leaders each may leave its plan, and without a plan its rate misleads too.
+    planned = network.prediction is Prediction.PREVIEW and len(graph.leaders) == 1
+    law = c, following.speed if planned else 0.0
     channel, links = network.prepared(dt, horizon, 0), graph.exchange(following.leaderward)
     hops = int(graph.depths().max())
     ages = ages_of(channel, dt, steps, len(links.receivers), hops)

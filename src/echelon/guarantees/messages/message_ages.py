@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from echelon.agents.network.channel import Channel
+from echelon.core.types import Array
 from echelon.simulation.step.knowledge import HOP_LIFE
 
 RARE = 1e-6
@@ -48,9 +49,14 @@ class MessageAges(NamedTuple):
         return None if self.arrived is None else self.hops * self.arrived * self.dt
 
     @property
+    def hop_life(self) -> int:
+        """The age, in steps, to which hop counts are used."""
+        return HOP_LIFE * (self.forgotten - 1)
+
+    @property
     def hops_last(self) -> bool:
         """Whether a link delivers before the hop counts that it delivered are forgotten."""
-        return self.arrived is not None and self.arrived <= HOP_LIFE * (self.forgotten - 1)
+        return self.arrived is not None and self.arrived <= self.hop_life
 
 
 def ages_of(channel: Channel, dt: float, steps: int, links: int, hops: int) -> MessageAges:
@@ -58,9 +64,11 @@ def ages_of(channel: Channel, dt: float, steps: int, links: int, hops: int) -> M
     every, delay, jitter = (int(x) for x in (channel.every, channel.delay, channel.jitter))
     lost = losses_in_a_row(channel, links, -(-steps // every))
     arrived = None if lost is None else delay + jitter + every * (lost + 1)
-    share = 1.0 - (1.0 - float(channel.loss)) * (1.0 - float(channel.share))
-    again = every * share / (1.0 - share) if share < 1.0 else float(steps)
-    mean = dt * (delay + 0.5 * jitter + 0.5 * (every - 1) + again)
+    starts, step = _outages(channel)
+    # One for each number of messages that are lost in a row at the end.
+    rest = np.eye(2) - step
+    again = float((starts[0] @ np.linalg.inv(rest)).sum()) if channel.loss < 1.0 else steps / every
+    mean = dt * (delay + 0.5 * jitter + 0.5 * (every - 1) + every * again)
     return MessageAges(lost, arrived, int(channel.forget) + 1, hops, dt, mean)
 
 
@@ -76,6 +84,24 @@ def losses_in_a_row(channel: Channel, links: int, messages: int) -> int | None:
         links: how many.
         messages: on each of them.
     """
+    starts, step = _outages(channel)
+
+    def fits(more: int) -> bool:
+        chance = (starts @ np.linalg.matrix_power(step, more)).sum(axis=1).max()
+        return links * messages * float(chance) <= RARE
+
+    # What can be lost is, now and then, however seldom.
+    low, high = -1 + bool(channel.loss > 0.0 or channel.bursty), messages - 1
+    if not fits(high):
+        return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if fits(middle) else (middle, high)
+    return high
+
+
+def _outages(channel: Channel) -> tuple[Array, Array]:
+    """Return pi'D (2, 2), a row for each of two moments, and P D (2, 2) of the same."""
     loss, share, begins, ends = (
         float(x) for x in (channel.loss, channel.share, channel.begins, channel.ends)
     )
@@ -86,17 +112,4 @@ def losses_in_a_row(channel: Channel, links: int, messages: int) -> int | None:
     step = np.array([[1.0 - begins, begins], [1.0 - stays, stays]]) @ np.diag([loss, 1.0])
     # The share of links that are out ends between its first two values, or at the first.
     later = (1.0 - share) * begins + share * stays
-    starts = np.array([[1.0 - out, out] for out in (share, later)]) * [loss, 1.0]
-
-    def fits(more: int) -> bool:
-        chance = (starts @ np.linalg.matrix_power(step, more)).sum(axis=1).max()
-        return links * messages * float(chance) <= RARE
-
-    # What can be lost is, now and then, however seldom.
-    low, high = -1 + bool(loss or channel.bursty), messages - 1
-    if not fits(high):
-        return None
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if fits(middle) else (middle, high)
-    return high
+    return np.array([[1.0 - out, out] for out in (share, later)]) * [loss, 1.0], step

@@ -19,7 +19,6 @@ _TIMES = 2001
 """Of the leader's path, of which the mean speed is taken."""
 _MUCH = 0.01
 """m of a bias that is pointed out."""
-_DIRECTED = "one-way edges (`graph.directed: true`) let messages of any age cost a delay alone"
 
 
 class Bias(NamedTuple):
@@ -113,5 +112,4 @@ def messages_line(
     if late.off_plan is not None:
         text += f"; behind a leader that leaves its plan at {OFF_PLAN:g}/s in an output, followers "
         text += f"end within {late.off_plan:.3g} of it"
-    text += "" if late.ways is not None else f"; {_DIRECTED}"
     return holds(name, Kind.PROOF, text, late.age, f"{1e3 * late.age:.3g} ms")

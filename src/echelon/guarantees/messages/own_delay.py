@@ -20,7 +20,7 @@ from echelon.agents.world.world import World
 from echelon.core.compiled import cached_jit
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
-from echelon.core.words import Kind
+from echelon.core.words import Estimation, Kind
 from echelon.laws.law import LocalView
 from echelon.laws.stopping_point import StoppingPoint
 from echelon.simulation.step.action import act
@@ -34,8 +34,8 @@ _STEADY = 3
 """Steps until a memory at rest repeats."""
 _EDGE = 1.0 - 1e-9
 """Of a spectral radius: what rounding leaves of 1."""
-_DECAYED = 1e-6
-"""Of a response, beyond which it is not summed."""
+_DECAYED, _LONGEST = 1e-6, 50_000
+"""Of a response, beyond which it is not summed, and after how many steps nothing is known of it."""
 
 
 class LateStep(NamedTuple):
@@ -81,14 +81,16 @@ class LateStep(NamedTuple):
         n, size, m = self.states, len(self.A), self.E.shape[1]
         x, total = np.zeros((size + n * delay, m)), np.zeros((m, m))
         x[:size] = -own * self.E
-        first = largest = 0.0
-        while largest >= _DECAYED * first or not first:
+        first = 0.0
+        for _ in range(_LONGEST):
             late = x[:n] if not delay else x[-n:]
             o = np.abs(self.G @ x[:size] + self.F @ late)
             largest = float(np.abs(x).max())
             first = max(first, largest)
             total, x = total + o, whole @ x
-        return float(total.sum(axis=1).max())
+            if largest < _DECAYED * first:
+                return float(total.sum(axis=1).max())
+        return np.inf
 
 
 class OwnCase(NamedTuple):
@@ -120,7 +122,9 @@ def own_delay_line(case: OwnCase) -> Statement | None:
     name, kind = Hypothesis.OWN_STATE, Kind.LINEARIZATION
     step = late_step(case.problem, case.law, lag)
     text = f"own state {1e3 * delay * dt:.3g} ms late, " * bool(delay)
-    text += f"lag {1e3 * lag:.3g} ms, " * bool(lag) + f"inputs held for {1e3 * dt:.3g} ms: "
+    estimated = world.sensing is not None and world.sensing.estimator is not Estimation.NONE
+    text += f"lag {1e3 * lag:.3g} ms, " * bool(lag) + "without the estimator, " * estimated
+    text += f"inputs held for {1e3 * dt:.3g} ms: "
     if step is None:
         return unneeded(name, kind, f"{text}the model has no linearization at its trim")
     most = longest_delay(case, step)
@@ -137,7 +141,7 @@ def own_delay_line(case: OwnCase) -> Statement | None:
 
 
 def longest_delay(case: OwnCase, step: LateStep) -> int:
-    """Return with which delay, in steps, and all shorter ones the loop decays; -1 for none."""
+    """Return up to which delay, in steps, the loop decays; -1 for none."""
     last, size = -1, len(step.A)
     most = min(round(_MOST / case.problem.settings.dt), (_LARGEST - size) // step.states)
     while last < most:

@@ -11,7 +11,7 @@ import numpy as np
 from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import at_limits, is_limited, trim_shortfall
-from echelon.core.compiled import cached_jit
+from echelon.core.compiled import compiled_for_one_call
 from echelon.core.errors import listing
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
@@ -70,7 +70,7 @@ def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = 
         return np.asarray(_drifts(model, law, goals), np.float64)
 
 
-@cached_jit
+@compiled_for_one_call
 def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> jax.Array:
     if law is None:
         return jax.vmap(model.normalized_drift)(states)

@@ -12,7 +12,7 @@ from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.chains import Chains, derivatives_of, flatten
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.quadrotor import Quadrotor
-from echelon.core.compiled import cached_jit
+from echelon.core.compiled import compiled_for_one_call
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
@@ -58,7 +58,7 @@ def _segments(model: ControlAffine, chains: Chains) -> tuple[Array, Array]:
     return points[..., :n], points[..., n:]
 
 
-@cached_jit
+@compiled_for_one_call
 def _on_segments(
     model: ControlAffine, chains: Chains, x: jax.Array, e: jax.Array
 ) -> tuple[jax.Array, Bool[jax.Array, "K L"], Float[jax.Array, "K L"]]:
@@ -119,7 +119,7 @@ def airframe_fault(model: ControlAffine, chains: Chains, frame: Airframe) -> str
     return f"{name} is not of its motion: at a sample a motor's thrust is {off:.3g} N off"
 
 
-@cached_jit
+@compiled_for_one_call
 def _inverted(
     model: ControlAffine, chains: Chains, x: jax.Array, e: jax.Array, tops: jax.Array
 ) -> tuple[Float[jax.Array, "K m"], Float[jax.Array, "K r m"]]:
@@ -134,6 +134,6 @@ def _inverted(
     return jax.vmap(one)(x, e, tops)
 
 
-@cached_jit
+@compiled_for_one_call
 def _inputs_along(body: Quadrotor, paths: jax.Array) -> jax.Array:
     return jax.vmap(lambda path: body.flat(path)[1])(paths)

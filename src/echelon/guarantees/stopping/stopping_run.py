@@ -345,14 +345,15 @@ def _strengths(run: StoppingRun) -> Array:
     """Return eigenvalues of the followers' Laplacian that stand for all, (K,)."""
     graph, reach = run.parts.graph, run.law.reach
     assert reach is not None
-    if run.network is not None:
-        # What is heard is late, and an agent answers to its own deviation alone.
-        return run.network.sums
+    # Over a network what is heard is late, and an agent answers to its own deviation.
+    alone = np.array([]) if run.network is None else run.network.sums
+    if run.network is not None and run.network.ways is not None:
+        return alone
     if run.law.leaderward or graph.directed or graph.schedule is not None:
-        return agreement_modes(graph, run.law)
+        return np.append(alone, agreement_modes(graph, run.law))
     # By Gershgorin none is larger than 2 d_max, nor as large where somebody hears a leader.
-    alone = max(run.law.ready.chains.degrees) == 1
-    return np.array([reach.slowest, 2.0 * reach.heaviest * (_BELOW if alone else 1.0)])
+    below = _BELOW if max(run.law.ready.chains.degrees) == 1 else 1.0
+    return np.append(alone, [reach.slowest, 2.0 * reach.heaviest * below])
 
 
 def agreement_modes(graph: Graph, law: StoppingPoint) -> Array:

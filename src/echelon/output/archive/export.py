@@ -83,6 +83,8 @@ def export(run: "Result", path: "PathLike", force: bool = False) -> Path:
     from echelon.output.archive.folder import claim_file, write_errors
 
     file = Path(path)
+    if not file.suffix:
+        raise OutputError(f"`{file.name}` has no ending, such as `.csv`, to choose the format.")
     content = content_of(file.suffix.lower().removeprefix("."), f"`{file.name}` ends in")
     claim_file(file, force)
     with write_errors(file):

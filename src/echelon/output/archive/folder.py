@@ -97,13 +97,13 @@ def newest_run() -> Path:
         OutputError: there is none.
     """
     folders = [path for path in Path(RUNS).glob("*") if path.is_dir()]
-    ages = {path: _written(path) for path in folders}
+    ages = {path: when_written(path) for path in folders}
     if not any(ages.values()):
         raise OutputError(f"there is no run in `{RUNS}/`; give the folder of a run.")
     return max(ages, key=lambda path: ages[path])
 
 
-def _written(folder: Path) -> float:
+def when_written(folder: Path) -> float:
     """Return when the dataset or the parts of a run were last written; 0 of another folder."""
     marks = [path for path in (folder / DATA, folder / CHUNKS) if path.exists()]
     return max((path.stat().st_mtime for path in marks), default=0.0)

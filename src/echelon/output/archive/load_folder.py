@@ -3,12 +3,13 @@
 import dataclasses
 import json
 import warnings
+from functools import partial
 from pathlib import Path
 
 from echelon.core.errors import OutputError
 from echelon.core.files import INPUTS
 from echelon.core.types import JsonObject, PathLike
-from echelon.experiments.results.dataset import digest_of, labelled
+from echelon.experiments.results.dataset import digest_of
 from echelon.experiments.results.stored_result import read_result
 from echelon.experiments.scenario.build import build, origin_of
 from echelon.experiments.scenario.scenario import (
@@ -25,6 +26,7 @@ from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.record import Stretch
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import reassemble
+from echelon.simulation.step.settings import Settings
 
 
 def load(place: PathLike, parts: Parts | None = None) -> Result:
@@ -51,8 +53,9 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
     chunks = Chunks(path)
     if chunks.exist:
         stretches = chunks.read()
+        done = stretches[-1].done if stretches else 0
         # A run that was stopped, continued and killed is longer in its chunks.
-        if stored is None or (stretches and stretches[-1].times[-1] > stored.times[-1]):
+        if stored is None or done > _steps(stored):
             return _unfinished(path, stretches)
     if stored is None:
         raise OutputError(_no_run(path))
@@ -67,8 +70,19 @@ def _no_run(path: Path) -> str:
     return f"the folder `{path}` holds no run: it has no `{DATA}`."
 
 
+def _steps(result: Result) -> int:
+    """Return how many steps a run took."""
+    try:
+        return int(result.sums.steps[0])
+    except OutputError:
+        # In format 3 the last frame says it.
+        return round(float(result.times.max(initial=0.0)) / result.settings.dt)
+
+
 def _unfinished(folder: Path, stretches: list[Stretch]) -> Result:
     """Return a run from the chunks in its folder."""
+    if not (folder / SCENARIO_FILE).is_file():
+        raise OutputError(f"the run in `{folder}` ended before any of it was stored.")
     scenario = load_scenario(folder / SCENARIO_FILE)
     result = reassemble(*build(scenario), stretches)
     return dataclasses.replace(result, **origin_of(scenario))
@@ -79,12 +93,17 @@ def _stored(file: Path, parts: Parts | None) -> Result:
     folder = file.parent if file.name == DATA else None
     names = [] if folder is None else sorted((folder / INPUTS).rglob("*"))
     files = {x.relative_to(file.parent).as_posix(): x.read_bytes() for x in names if x.is_file()}
+    summary = {} if folder is None else _mapping(folder / SUMMARY)
+    # No closures, so that a result can be pickled.
+    return read_result(file, partial(_built, file, parts, digest_of(files)), summary, files)
 
-    def built(result: Result) -> Parts:
-        own = build(_scenario(result, file)).parts if parts is None else parts
-        return prepare(own, result.settings).parts
 
-    return read_result(file, built, {} if folder is None else _mapping(folder / SUMMARY), files)
+def _built(
+    file: Path, parts: Parts | None, digest: str, attributes: JsonObject, settings: Settings
+) -> Parts:
+    """Return the parts of a run, built from its scenario unless they are given."""
+    own = build(_scenario(file, digest, attributes)).parts if parts is None else parts
+    return prepare(own, settings).parts
 
 
 def _mapping(file: Path) -> JsonObject:
@@ -96,9 +115,9 @@ def _mapping(file: Path) -> JsonObject:
     return content if isinstance(content, dict) else {}
 
 
-def _scenario(result: Result, file: Path) -> Scenario:
-    """Return the scenario of a run in a file."""
-    text = result.provenance.get("scenario_text")
+def _scenario(file: Path, digest: str, attributes: JsonObject) -> Scenario:
+    """Return the scenario of a run in a file; `digest` is that of the inputs beside it."""
+    text = attributes.get("scenario_text")
     if text is None:
         raise OutputError(
             f"the run in `{file}` was made from parts in Python, which no file contains; give "
@@ -107,11 +126,10 @@ def _scenario(result: Result, file: Path) -> Scenario:
     scenario = scenario_from_text(text, file.with_name(SCENARIO_FILE))
     if not names_files(scenario):
         return scenario
-    stored = labelled(result).attributes
-    if "inputs" not in stored:
+    if "inputs" not in attributes:
         # The text in format 3 names files where they were; the scenario of the folder, its copies.
         return load_scenario(file.with_name(SCENARIO_FILE))
-    if stored["inputs"] != digest_of(result.files):
+    if attributes["inputs"] != digest:
         raise OutputError(
             f"the files that the run in `{file}` was computed from are not in its folder, or were "
             f"changed; `echelon run` computes it again from its `{SCENARIO_FILE}`."

@@ -1,4 +1,4 @@
-"""Figures of a run over time: errors, V, inputs, states, distances."""
+"""Figures of a run over time: errors, V, states, distances."""
 
 import functools
 from collections.abc import Iterable
@@ -22,6 +22,7 @@ from echelon.output.plots.agent_style import (
 )
 from echelon.output.plots.over_time import (
     above,
+    bands,
     error_rounding,
     over_time,
     potential_rounding,
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
 
 _LINKS = 20_000  # links whose distances are computed, evenly spread over all
 _PANELS = 12  # that fit on a page
-_DWARFS = 4.0
-"""Times the range of nearly all inputs from which on the others are cut off."""
 _DESIRED = {"color": "0.4", "linewidth": 0.9, "linestyle": (0, (1.0, 1.5)), "zorder": 1}
 _SLOPE = {"color": draw.EDGE, "linewidth": 1.0, "linestyle": (0, (5.0, 2.0)), "zorder": 2.2}
 
@@ -90,7 +89,7 @@ def formation(run: Recording) -> "Figure":
     def show(ax: "Axes", frames: Array) -> None:
         times, values = run.times[frames], above(errors[frames], floor)
         if many:
-            _bands(ax, times, values)
+            bands(ax, times, values)
             _worst(ax, run, times, errors, frames, floor)
         for agent, line in zip(() if many else followers, values.T):
             zero = draw.above_zero(errors[frames, followers.index(agent)])
@@ -109,19 +108,6 @@ def formation(run: Recording) -> "Figure":
 
     figure, ((*_, last),) = over_time(run, [show], 3.2, len(followers), alike=False)
     return draw.finish(figure, legends=[last])
-
-
-def _bands(ax: "Axes", times: Array, values: Array, of: str = "follower") -> None:
-    """Draw quantiles of values (T, N) and the median."""
-    with np.errstate(invalid="ignore"):
-        # At times at which all values are 0 there is nothing to draw, and no warning.
-        some = np.isfinite(values).any(axis=1)
-        ends = np.full((5, len(times)), np.nan)
-        ends[:, some] = np.nanpercentile(values[some], [5, 25, 50, 75, 95], axis=1)
-    look = {"color": draw.COLOURS[0], "linewidth": 0.0, "zorder": 1.5}
-    ax.fill_between(times, ends[0], ends[4], alpha=0.18, label="5 to 95 %", **look)
-    ax.fill_between(times, ends[1], ends[3], alpha=0.35, label="25 to 75 %", **look)
-    draw.plot(ax, times, ends[2], label=f"median {of}", color=draw.COLOURS[0])
 
 
 def _worst(
@@ -210,88 +196,6 @@ def _increases_between(run: Recording) -> bool:
     return bool(
         (rises(run.lyapunov[:-1], run.lyapunov[1:]) & decreasing[:-1] & decreasing[1:]).any()
     )
-
-
-# ---- inputs -----------------------------------------------------------------------------------
-
-
-def inputs(run: Recording) -> "Figure | None":
-    """Return the loads of actuators with their limits, at the start and over the whole run.
-
-    Without limits it is each input in its unit. An axis is clipped where few values dwarf the rest,
-    and its title says so.
-    """
-    loads = run.loads
-    rows = _loads(loads) if loads is not None else _inputs(run)
-
-    def show(ax: "Axes", frames: Array, name: str, values: Array) -> None:
-        _agents_over(ax, run, run.times[frames], values[frames])
-        if loads is not None:
-            _limits(ax, values)
-        _clip(ax, values, loads is not None)
-        ax.set_ylabel(name)
-
-    shows = [functools.partial(show, name=name, values=values) for name, values in rows.items()]
-    figure, axes = over_time(run, shows, 1.5, run.agents, narrow_start=True)
-    for row in axes:
-        for ax in row[:-1]:
-            ax.set_title("", loc="right")
-    return draw.finish(figure, legends=[axes[0][-1]], once=True)
-
-
-def _clip(ax: "Axes", values: Array, limited: bool) -> None:
-    """Clip an axis to what 98 % of the values need, where the others are beyond four times that."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return
-    (low, high), (least, most) = np.percentile(finite, [1.0, 99.0]), (finite.min(), finite.max())
-    if limited:
-        low, high = min(low, 0.0), max(high, 100.0)
-    size = max(float(high - low), 1e-12)
-    if most - least <= _DWARFS * size:
-        return
-    ax.set_ylim(low - 0.15 * size, high + 0.15 * size)
-    text = f"clipped: values from {least:.3g} to {most:.3g}"
-    ax.set_title(text, size=draw.page().letters - 1.0, loc="right")
-
-
-def _loads(loads: Array) -> dict[str, Array]:
-    """Return loads (T, N, k) in % of their limits: the only one, or the largest and smallest."""
-    percent = 100.0 * loads
-    if percent.shape[2] == 1:
-        return {"input\n(% of limit)": percent[:, :, 0]}
-    return {
-        "largest\n(% of limit)": percent.max(axis=2),
-        "smallest\n(% of limit)": percent.min(axis=2),
-    }
-
-
-def _inputs(run: Recording) -> dict[str, Array]:
-    pairs = list(zip(run.input_names, run.input_units, strict=True))[:_PANELS]
-    return {draw.label(*pair): run.inputs[:, :, k] for k, pair in enumerate(pairs)}
-
-
-def _limits(ax: "Axes", values: Array) -> None:
-    """Draw the limits 0 and 100 %, and shade the area beyond."""
-    for value in (0.0, 100.0):
-        look = {"color": draw.EDGE, "linewidth": 0.9, "linestyle": (0, (6, 2)), "zorder": 2}
-        ax.axhline(value, label="limit" if value else None, **look)
-    low, high = min(-8.0, float(np.nanmin(values))), max(108.0, float(np.nanmax(values)))
-    ax.axhspan(low, 0.0, color="0.92", zorder=0)
-    ax.axhspan(100.0, high, color="0.92", zorder=0)
-    ax.set_ylim(low, high)
-
-
-def _agents_over(ax: "Axes", run: Recording, times: Array, values: Array) -> None:
-    """Draw a number of each agent (T, N) as lines, or as quantiles of a large swarm."""
-    if run.agents > draw.NAMED:
-        _bands(ax, times, values[:, list(run.followers)])
-        first = run.leaders[0]
-        draw.plot(ax, times, values[:, first], label=f"leader {first}", **pen_of(run, first))
-        return
-    for agent in leaders_first(run, range(run.agents)):
-        line, _ = draw.drop_runaways(values[:, agent, None], values[:1, agent, None])
-        draw.plot(ax, times, line, label=name_of(run, agent), **pen_of(run, agent))
 
 
 # ---- states and distances ---------------------------------------------------------------------
@@ -383,7 +287,7 @@ def ages(run: Recording) -> "Figure | None":
     def show(ax: "Axes", frames: Array) -> None:
         times, values = run.times[frames], messages.agents[frames][:, followers]
         if run.agents > draw.NAMED:
-            _bands(ax, times, values)
+            bands(ax, times, values)
         few = followers if run.agents <= draw.NAMED else ()
         for agent, line in zip(few, values.T, strict=False):
             draw.plot(ax, times, line, label=name_of(run, agent), **pen_of(run, agent))
@@ -396,13 +300,44 @@ def ages(run: Recording) -> "Figure | None":
     return draw.finish(figure, legends=[last])
 
 
+def avoidance(run: Recording) -> "Figure | None":
+    """Return how near agents came that keep apart, and how many held each other back, over time."""
+    numbers = run.avoidance
+    if numbers is None:
+        return None
+
+    def slices(frames: Array) -> tuple[Array, Array]:
+        within = numbers.times <= run.times[frames[-1]]
+        return within, numbers.times[within]
+
+    def show_near(ax: "Axes", frames: Array) -> None:
+        within, times = slices(frames)
+        draw.plot(ax, times, numbers.distance[within], color=draw.LEADER, label="any two agents")
+        look = {"color": "0.5", "linewidth": 0.8, "zorder": 1}
+        ax.axhline(numbers.kept, label="kept by hulls", linestyle=":", **look)
+        ax.axhline(numbers.touching, label="touching", linestyle="-", **look)
+        ax.set_ylabel(draw.label("smallest scaled distance", "m"))
+        ax.set_ylim(bottom=0.0)
+
+    def show_held(ax: "Axes", frames: Array) -> None:
+        within, times = slices(frames)
+        ax.step(times, numbers.active[within], where="post", color=draw.LEADER)
+        ax.set_ylabel("active rows")
+        ax.set_ylim(bottom=0.0)
+
+    figure, axes = over_time(run, [show_near, show_held], 1.9)
+    return draw.finish(figure, legends=[row[-1] for row in axes])
+
+
 def _edges(ax: "Axes", run: Recording, times: Array, apart: Array, desired: Array) -> None:
     """Draw the distance of each edge, or quantiles of the errors of many."""
     if len(run.edges) > draw.NAMED:
         errors = np.abs(apart - desired)
-        _bands(ax, times, draw.above_zero(errors), "link")
+        floor = error_rounding(run)
+        bands(ax, times, above(errors, floor), "link")
         ax.set_ylabel("distance error (m)")
         draw.logarithmic(ax, errors)
+        shade_rounding(ax, floor, errors)
         return
     for place, (i, j) in enumerate(run.edges):
         look = draw.pen(place, len(run.edges))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _SETTLES = 0.05
 """Share of their largest value that errors have where the start of a run ends."""
-_SPANS = (1.0, 2.0, 3.0, 5.0, 10.0)
+_SPANS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 _USUAL = 3.0
 """Seconds of a start whose errors do not settle."""
 _ULPS = 8.0
@@ -142,3 +142,16 @@ def shade_rounding(ax: "Axes", floor: float, *values: Array) -> bool:
 def above(values: Array, floor: float) -> Array:
     """Return values with NaN where they are rounding, which is shaded instead."""
     return np.where(values >= floor, draw.above_zero(values), np.nan)
+
+
+def bands(ax: "Axes", times: Array, values: Array, of: str = "follower") -> None:
+    """Draw quantiles of values (T, N) and the median."""
+    with np.errstate(invalid="ignore"):
+        # At times at which all values are 0 there is nothing to draw, and no warning.
+        some = np.isfinite(values).any(axis=1)
+        ends = np.full((5, len(times)), np.nan)
+        ends[:, some] = np.nanpercentile(values[some], [5, 25, 50, 75, 95], axis=1)
+    look = {"color": draw.COLOURS[0], "linewidth": 0.0, "zorder": 1.5}
+    ax.fill_between(times, ends[0], ends[4], alpha=0.18, label="5 to 95 %", **look)
+    ax.fill_between(times, ends[1], ends[3], alpha=0.35, label="25 to 75 %", **look)
+    draw.plot(ax, times, ends[2], label=f"median {of}", color=draw.COLOURS[0])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from echelon.core.errors import OutputError
 from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.recording import Recording
-from echelon.output.plots import curves, network, separation_curves, trajectories
+from echelon.output.plots import curves, input_figure, network, trajectories
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import NAMES, check_names, save
 from echelon.simulation.engine.result import Result
@@ -21,14 +21,9 @@ _MAKERS: "dict[str, Callable[[Recording], Figure | None]]" = dict(
         NAMES,
         (
             *(trajectories.leader, trajectories.trajectories, trajectories.top_view),
-            *(curves.tracking, curves.formation, curves.inputs, curves.states, curves.distances),
-            *(
-                curves.lyapunov,
-                network.modes,
-                network.network,
-                curves.ages,
-                separation_curves.avoidance,
-            ),
+            *(curves.tracking, curves.formation, input_figure.inputs),
+            *(curves.states, curves.distances, curves.lyapunov),
+            *(network.modes, network.network, curves.ages, curves.avoidance),
         ),
         strict=True,
     )

@@ -263,6 +263,9 @@ def finish(
     for ax in figure.axes if legends is None else legends:
         if ax.get_legend_handles_labels()[1]:
             _add_legend(figure, ax, once)
+    for each in (*figure.legends, *(ax.get_legend() for ax in figure.axes)):
+        if each is not None:
+            _widen_swarm(each)
     if cut:
         text = "The run diverged beyond these axes; the rest is not drawn."
         figure.suptitle(text, size=page().letters - 1.0, wrap=True)
@@ -313,6 +316,13 @@ def _add_legend(figure: "Figure", ax: "Axes", once: bool) -> None:
     else:
         look = {"handlelength": 1.4, "columnspacing": 1.0, "handletextpad": 0.5}
         ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=_columns(ax), **look)
+
+
+def _widen_swarm(legend: Any) -> None:
+    """Show the many lines of a swarm as a band."""
+    for line, text in zip(legend.get_lines(), legend.get_texts(), strict=False):
+        if text.get_text().endswith(" followers"):
+            line.set(linewidth=6.0, alpha=0.35)
 
 
 def _columns(ax: "Axes") -> int:

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+_TICKS, _COUNTED = 9, 100
+"""Most values named at an axis of a map, and most cells with their counts."""
+
+
 def sweep_figures(data: "xr.Dataset") -> "dict[str, Figure]":
     """Return the figures of a sweep, by name.
 
@@ -93,8 +97,8 @@ def _success(data: "xr.Dataset", keys: list[str]) -> "Figure":
         bars = np.abs(np.stack([rate - low, high - rate]))
         look = {"marker": "o", "markersize": 3, "linestyle": ":", "elinewidth": 0.9, "capsize": 2}
         ax.errorbar(values, rate, bars, color=draw.COLOURS[0], linewidth=0.7, **look)
-        _scale(ax, "x", values)
-        ax.set_xlabel(key)
+        _name_values(ax, "x", values)
+        ax.set_xlabel(_label(data, key))
         ax.set_ylim(-0.03, 1.03)
     axes[0].set_ylabel("share of runs that settle")
     return draw.finish(figure)
@@ -105,18 +109,67 @@ def _region(data: "xr.Dataset", first: str, second: str) -> "Figure":
     settled, runs = (part.sortby([first, second]) for part in _share(data, [first, second]))
     rate = (settled / runs.clip(min=1)).transpose(second, first)
     figure, (ax,) = _canvas(1)
-    x, y = rate[first].values, rate[second].values
-    mesh = ax.pcolormesh(x, y, rate.values, vmin=0.0, vmax=1.0, cmap="viridis", shading="nearest")
-    _scale(ax, "x", x)
-    _scale(ax, "y", y)
+    ends = []
+    for which, key in (("x", first), ("y", second)):
+        values = rate[key].values
+        _name_values(ax, which, values)
+        ends.append(_cell_ends(values))
+        getattr(ax, f"set_{which}label")(_label(data, key))
+    x, y = ends
+    mesh = ax.pcolormesh(x, y, rate.values, vmin=0.0, vmax=1.0, cmap="viridis")
     ax.grid(False)
-    ax.set_xlabel(first)
-    ax.set_ylabel(second)
+    if rate.size <= _COUNTED:
+        _count(ax, settled.transpose(second, first), runs.transpose(second, first))
     figure.colorbar(mesh, ax=ax, label="share of runs that settle")
     return draw.finish(figure)
 
 
+def _count(ax: "Axes", settled: "xr.DataArray", runs: "xr.DataArray") -> None:
+    """Write into each cell how many of its runs settle."""
+    second, first = map(str, settled.dims)
+    for (row, column), count in np.ndenumerate(settled.values):
+        total = int(runs.values[row, column])
+        # The upper end of the colours is bright.
+        colour = "black" if count > 0.6 * total else "white"
+        place = float(settled[first].values[column]), float(settled[second].values[row])
+        look: draw.Style = {"color": colour, "size": draw.page().letters - 3.0}
+        ax.text(*place, f"{int(count)}/{total}", ha="center", va="center", **look)
+
+
+def _label(data: "xr.Dataset", key: str) -> str:
+    """Return the label of a key: its meaning and unit, or itself."""
+    attributes = data[key].attrs
+    return draw.label(str(attributes.get("long_name", key)), str(attributes.get("units", "")))
+
+
+def _is_geometric(values: Array) -> bool:
+    """Return whether values belong on a logarithmic axis: over decades, or by equal factors."""
+    values = np.unique(values)
+    if values[0] <= 0.0 or len(values) < 2:
+        return False
+    factors = values[1:] / values[:-1]
+    equal = len(values) > 2 and factors.min() > 1.2 and factors.max() < 1.3 * factors.min()
+    return bool(values[-1] >= 30.0 * values[0] or equal)
+
+
 def _scale(ax: "Axes", which: str, values: Array) -> None:
-    """Choose a logarithmic axis for values over more than a decade."""
-    if values.min() > 0.0 and values.max() >= 30.0 * values.min():
+    """Choose a logarithmic axis where values need one."""
+    if _is_geometric(values):
         getattr(ax, f"set_{which}scale")("log")
+
+
+def _name_values(ax: "Axes", which: str, values: Array) -> None:
+    """Put ticks of an axis at values, or at some of many."""
+    _scale(ax, which, values)
+    ticks = values if len(values) <= _TICKS else values[:: -(-len(values) // _TICKS)]
+    getattr(ax, f"set_{which}ticks")(ticks, [f"{value:g}" for value in ticks])
+    getattr(ax, f"set_{which}ticks")([], minor=True)
+
+
+def _cell_ends(values: Array) -> Array:
+    """Return the ends of cells around ascending values, half way between them on their axis."""
+    places = np.log(values) if _is_geometric(values) else values.astype(float)
+    between = 0.5 * (places[1:] + places[:-1])
+    first, last = 1.5 * places[0] - 0.5 * places[1], 1.5 * places[-1] - 0.5 * places[-2]
+    ends = np.concatenate([[first], between, [last]])
+    return np.exp(ends) if _is_geometric(values) else ends

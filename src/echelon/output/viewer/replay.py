@@ -7,7 +7,7 @@ import numpy as np
 
 from echelon.core.errors import OutputError
 from echelon.core.types import Array, JsonObject
-from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.recording import MessageAges, Recording
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
 from echelon.output.plots.style import raised
 from echelon.output.viewer.charts import charts_of
@@ -54,6 +54,8 @@ def replay_data(run: Recording) -> bytes:
     loads, many = motor_loads(run, space), run.agents > FLOCK
     if loads is not None:
         groups["motors"] = Group(_flat(loads[frames]), BYTE if many else COARSE, (0.0, 1.0))
+    if run.messages is not None:
+        groups["shades"] = Group(_shades(run, run.messages, frames), BYTE, (0.0, 2.0))
     _check_size(run, groups, len(frames))
     description = {
         **header(run, space),
@@ -65,6 +67,27 @@ def replay_data(run: Recording) -> bytes:
         "chartTimes": charts.times,
     }
     return pack(description, {**groups, "series": charts.group})
+
+
+def _shades(run: Recording, messages: MessageAges, frames: Array) -> Array:
+    """Return how each link is drawn at some frames, (F, E)."""
+    lost = np.diff(messages.lost.cumsum(axis=0)[frames], axis=0, prepend=0)
+    return link_shades(messages.edges[frames], lost, messages.forget, run.heard)
+
+
+def link_shades(ages: Array, lost: Array, forget: float, heard: Array) -> Array:
+    """Return 1 for a link with a new message, down to 0 as it ages, and 2 where one was lost.
+
+    Args:
+        ages: (..., E, 2) of the newest message at each end of the links, s; NaN for none.
+        lost: (..., E, 2) how many were lost since the last picture.
+        forget: age beyond which messages are not used, s.
+        heard: (E, 2) which ends receive.
+    """
+    old = np.where(np.isfinite(ages), ages, np.inf)
+    oldest = np.where(heard, old, 0.0).max(axis=-1)
+    fresh = np.clip(1.0 - oldest / forget, 0.0, 1.0)
+    return np.where((lost > 0).any(axis=-1), 2.0, fresh)
 
 
 def frames_of(run: Recording) -> Array:

@@ -93,8 +93,8 @@ class Agent:
                 f"agent {agent!r} is not in this graph, whose agents are 0 to "
                 f"{parts.graph.agents - 1}."
             )
-        network = parts.world.network
-        horizon = dt if network is None else dt * math.ceil(1.0 + network.delay / dt)
+        late = [part.delay for part in (parts.world.network, parts.world.sensing) if part]
+        horizon = dt * math.ceil(1.0 + max([0.0, *late]) / dt)
         prepared = prepare(parts, Settings(horizon=horizon, dt=dt, limits=limits))
         drive = prepared.parts.drive
         assert isinstance(drive, Laws)

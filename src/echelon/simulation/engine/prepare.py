@@ -106,7 +106,7 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
 def sensors_of(parts: Parts, settings: Settings) -> Sensors | None:
     """Return the sensors of a run; None for exact ones."""
     sensing = parts.world.sensing
-    return sensing and sensing.prepared(parts.model, settings.dt, settings.seed)
+    return sensing and sensing.prepared(parts.model, settings.dt, settings.horizon, settings.seed)
 
 
 def channel_of(parts: Parts, settings: Settings) -> Channel | None:

@@ -45,6 +45,11 @@ class Result(FrameNumbers):
         engine: what computed the steps, `jax` or `native`.
         provenance: scenario text, versions and the like, as text.
         files: the files that the scenario text names, by the names that it gives them.
+
+    Raises:
+        OutputError: when `parts` of a run from disk are first read, its scenario is missing or was
+            changed; when `sums` are, the file is of an earlier format without them.
+        ScenarioError: when `parts` are first read, its scenario cannot be built.
     """
 
     times: Array

@@ -46,8 +46,9 @@ class TimeWindow {
     this.range = length >= last - first && this.latest === Infinity ? null : [start, start + length];
   }
 
-  // Stretches time by a factor about a time that stays, then moves it by seconds.
+  // Stretches time by a factor about a time that stays, then moves it by seconds. A stream keeps its newest time.
   change(factor, at, shift = 0) {
+    if (this.latest < Infinity && !shift && this.whole && this.span[1] >= this.whole[1]) at = this.span[1];
     this.set(this.span.map((t) => at + factor * (t - at) + shift));
     this.draw();
   }
@@ -282,12 +283,13 @@ class Chart {
     const k = Math.max(0, Math.min(this.times.length - 1, upper(this.times, time) - 1));
     // Values far below the axis are rounding errors.
     const most = Math.max(...this.limits.map(Math.abs));
-    const words = (value, floor) => {
+    const words = (value, { floor, none }) => {
+      if (none && Number.isNaN(value)) return none;
       if (this.log) return value === -Infinity ? `< ${brief(floor)}` : brief(10 ** value);
       return brief(Math.abs(value) < 1e-9 * most ? 0 : value);
     };
     this.lines.forEach((line, place) => {
-      if (this.readouts[place] && !line.mute && this.times.length) this.readouts[place].textContent = words(line.values[k], line.floor);
+      if (this.readouts[place] && !line.mute && this.times.length) this.readouts[place].textContent = words(line.values[k], line);
     });
   }
 }

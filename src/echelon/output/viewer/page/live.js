@@ -47,8 +47,8 @@ class Live {
   // ---- pictures ----
 
   makeCharts() {
-    // V is a square of errors.
-    const { run } = this, line = (name, colour) => ({ name, colour, values: [], floor: name === "V" ? FLOOR ** 2 : FLOOR });
+    // V is a square of errors. In a stream, whose pictures are finite, NaN stands for what does not exist.
+    const { run } = this, line = (name, colour) => ({ name, colour, values: [], none: "\u2013 none", floor: name === "V" ? FLOOR ** 2 : FLOOR });
     const charts = [{ title: "formation error", unit: run.unit, log: true, lines: [line("worst", 1), line("median", 0), ...(run.referenced ? [line("leader", "leader")] : [])], marks: [{ value: 0.01, name: run.unit ? "1 cm" : "0.01" }] }];
     if (run.limited) charts.push({ title: run.loads ? "motors" : "inputs", unit: "% of limit", log: false, lines: [line("largest", 1), line("smallest", 0)], marks: [{ value: 100, name: "limit", below: true }, { value: 0, name: "limit" }] });
     if (run.lyapunov) charts.splice(1, 0, { title: "Lyapunov function V", unit: "", log: true, lines: [line("V", 0)], marks: [] });
@@ -72,6 +72,7 @@ class Live {
       if (turns === 3) moment.setAngles(i, numbers[at], numbers[at + 1], numbers[at + 2]);
       else if (turns) moment.setAngles(i, 0, 0, numbers[at]);
     for (let i = 0; i < agents; i++, at += loads) for (let k = 0; k < loads; k++) moment.motors[4 * i + k] = numbers[at + k];
+    if (run.messages) moment.shades = numbers.subarray(at, at + run.edges.length);
     if (this.pictures++ && time < moment.time) this.view.trail.clear();
     this.view.trail.push(moment.position, time);
     moment.time = time;
@@ -194,6 +195,7 @@ class Live {
     };
     this.panel.append(make("div", { class: "buttons" },
       button("kick", "push the selected agent, else the first follower (k)", () => this.kick()),
+      button("lose", "cut all links of the selected agent, else of the first follower", () => this.lose()),
       button("reset", "restart with the present controls", () => this.ask("reset")),
       button("save as scenario", "download a scenario file that repeats this session", () => this.save())));
     this.panel.append(make("p", { class: "hint" }, "click a link to cut or restore it, or an agent to select it"));
@@ -232,6 +234,10 @@ class Live {
       r: ["restart with the present controls", () => this.ask("reset")],
       ...this.views.keys,
     });
+  }
+
+  lose() {
+    this.ask("lose", this.view.selected >= 0 ? this.view.selected : this.firstFollower);
   }
 
   kick() {

@@ -109,6 +109,7 @@ class Replay {
     if (this.motors)
       for (let c = 0, wide = this.motors.low.length / this.agents; c < this.motors.low.length; c++)
         now.motors[4 * Math.floor(c / wide) + (c % wide)] = valueOf(this.motors, c, k, part);
+    if (this.shades) now.shades = this.shades.low.map((_, edge) => valueOf(this.shades, edge, k, 0));
     now.setGoals(this);
     return now;
   }

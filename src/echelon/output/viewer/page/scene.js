@@ -131,9 +131,17 @@ class View {
   markLink(edge) {
     const present = !this.row || this.row[edge] === "1", part = this.links.geometry.getAttribute("alive");
     this.alive[edge] = present && !this.cut[edge];
+    const shade = this.shades ? 0.6 + 0.4 * this.shades[edge] : 1;
     for (const at of [edge, this.heads.get(edge)])
-      if (at !== undefined) part.array.fill(this.cut[edge] ? 0 : present ? 1 : -1, 4 * at, 4 * at + 4);
+      if (at !== undefined) part.array.fill(this.cut[edge] ? 0 : present ? shade : -1, 4 * at, 4 * at + 4);
     part.needsUpdate = true;
+  }
+
+  // Links fade as their messages age, and flash where one was lost.
+  fadeLinks(shades) {
+    if (!shades) return;
+    this.shades = shades;
+    this.run.edges.forEach((_, edge) => this.markLink(edge));
   }
 
   // Shows the links of a switching graph at a time.
@@ -312,6 +320,7 @@ class View {
       agent.needsUpdate = true;
     }
     this.switchLinks(moment.time);
+    this.fadeLinks(moment.shades);
     this.shared.now.value = moment.time;
     this.trail.window(this.trailMesh.geometry, moment.time);
     this.moment = moment;

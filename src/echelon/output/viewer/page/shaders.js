@@ -111,7 +111,8 @@ vec4 head(vec3 first, vec3 second, vec2 corner, float body) {
 }`;
 
 // kind of a link: 0 bidirectional, 1 from the first to the second, 2 inactive; 3 an arrow head,
-// 4 to the goal of an agent, 5 down to the floor. alive: 1 present, 0 cut, -1 absent.
+// 4 to the goal of an agent, 5 down to the floor. alive: from 0.6 for an old message to 1 for a new one, 1.4 for a lost
+// one, 0 cut, -1 absent.
 const LINK = {
   vertexShader: `${FETCH}${RIBBON}${HEAD}
 in vec2 ends, corner;
@@ -125,6 +126,10 @@ void main() {
   float wide = kind > 0.5 && kind < 1.5 ? mix(1.1, 2.6 - 2.2 * corner.x, tapered) : 1.1;
   bool cut = alive < 0.5;
   shade = vec4(cut ? cutColour : linkColour, links * (cut ? 0.55 : kind > 1.5 && kind < 2.5 ? 0.4 : 0.9));
+  if (kind < 3.5 && alive > 0.5) {
+    if (alive > 1.2) shade.rgb = cutColour;
+    else shade.a *= clamp(2.5 * alive - 1.5, 0.12, 1.0);
+  }
   if (alive < -0.5 || (cut && kind > 2.5 && kind < 3.5)) shade.a = 0.0;
   along = cut ? corner.x : -1.0;
   if (kind > 3.5) {
