@@ -60,7 +60,6 @@ from .experiments.studies.state_space import state_space as state_space
 from .experiments.studies.tune import tune as tune
 from .guarantees.promises.promise import Promise as Promise
 from .guarantees.promises.promise import promise as promise
-from .guarantees.verifier.verify import verify as verify
 from .laws.law import Law as Law
 from .laws.safety import Safety as Safety
 from .output.archive.export import export as export
@@ -75,6 +74,7 @@ from .output.archive.load_folder import (
     open_run as open_run,
 )
 from .output.archive.run_folder import save_run as save_run
+from .output.archive.verify_folder import verify as verify
 from .output.plots.run_figures import figures as figures
 from .output.plots.run_figures import save_figures as save_figures
 from .output.plots.video import save_video as save_video

@@ -22,6 +22,7 @@ from echelon.experiments.scenario.registry import families
 from echelon.experiments.scenario.scenario import key_meanings
 from echelon.output.archive.export import table
 from echelon.output.plots import animation, video
+from echelon.output.plots import style as draw
 from echelon.output.plots.camera import camera_for
 from echelon.output.plots.space import space_of
 from echelon.output.reports.glossary import explain_term, glossary
@@ -136,15 +137,42 @@ def test_the_report_is_one_page_with_promise_figures_and_how_to_cite(echelon, he
 @pytest.mark.parametrize("kind", ["mp4", "gif"])
 def test_a_video_has_its_pictures_in_its_size(echelon, here, file, kind):
     code, told, _ = echelon("video", file, f"run.{kind}", "--speed", "2.5")
-    assert code == 0 and told.startswith(f"- Written to run.{kind}: 11 pictures, ")
+    count = 11 if kind == "mp4" else 6
+    assert code == 0 and told.startswith(f"- Written to run.{kind}: {count} pictures, ")
     said = subprocess.run(
         [video.encoder(), "-i", f"run.{kind}", "-f", "null", "-"], capture_output=True, text=True
     ).stderr
     assert ("960x540" if kind == "mp4" else "640x360") in said
 
 
+def test_a_video_has_the_size_rate_and_part_that_are_asked_for(echelon, here, file):
+    options = ("--size", "400x300", "--fps", "10", "--from", "0.2", "--to", "0.6")
+    code, told, _ = echelon("video", file, "run.mp4", *options)
+    assert code == 0 and told.startswith("- Written to run.mp4: 5 pictures, ")
+    said = subprocess.run(
+        [video.encoder(), "-i", "run.mp4", "-f", "null", "-"], capture_output=True, text=True
+    ).stderr
+    assert "400x300" in said and "10 fps" in said
+
+
+def test_a_gif_of_twenty_seconds_is_small(here):
+    kept = flown(seconds=20.0, rate=12.5)
+    assert video.save_video(kept, here / "run.gif") == 251
+    assert (here / "run.gif").stat().st_size < 3e6
+
+
+def test_a_picture_names_the_closest_pair_and_warns_of_those_that_touch(run):
+    for radius, warns in ((None, False), (1e3, True)):
+        sized = dataclasses.replace(run, radius=radius)
+        film = video._Film(sized, (960, 540), run.times[[0, -1]])
+        (text,) = [t for t in film.ax.texts if t.get_text().startswith("smallest distance ")]
+        closest = run.closest_pair()
+        assert "{} and {} at".format(*closest.agents) in text.get_text()
+        assert (text.get_color() == draw.COLOURS[1]) == warns
+
+
 def test_a_moving_agent_moves_in_the_pictures(run):
-    film = video._Film(run)
+    film = video._Film(run, (960, 540), run.times[[0, -1]])
     first, last = film.pictures(np.array([0.0, 1.0]))
     one, two = (np.frombuffer(each, np.uint8).reshape(540, 960, 4) for each in (first, last))
     assert (one[:, :600] != two[:, :600]).any()
@@ -184,6 +212,16 @@ def test_without_ffmpeg_a_sentence_says_how_to_get_it(monkeypatch):
     [
         (("run.avi",), "`run.avi` ends in `.avi`, and must end in .mp4 or .gif."),
         (("run.mp4", "--speed", "0"), "`--speed` is 0, and must be from 0.01 to 100."),
+        (("run.mp4", "--fps", "0"), "`--fps` is 0, and must be from 1 to 60."),
+        (
+            ("run.mp4", "--size", "401x300"),
+            "`--size` is `401x300`, and must be even numbers of pixels as in `960x540`, 320 to "
+            "3840 across and a third to 1.5 of that high.",
+        ),
+        (
+            ("run.mp4", "--from", "3"),
+            "nothing lies between 3 and 1 s; the run is stored from 0 to 1 s.",
+        ),
         (("none/run.mp4",), "`none` is not a folder; create it first to write `none/run.mp4`."),
     ],
 )

@@ -431,6 +431,8 @@ def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_co
     began, ended, told = threading.Event(), threading.Event(), []
 
     def slow(_, knobs):
+        if knobs.coupling == 1.0:
+            raise ZeroDivisionError
         if knobs != fast:
             began.set()
             ended.wait(10.0)
@@ -444,6 +446,11 @@ def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_co
     until(lambda: told[-1]["short"] == short)
     assert told[-1]["state"] == "lost"
     ended.set()
+    until(lambda: told[-1]["short"] == str(fast.coupling))
+    # An error of echelon's own is said, and the next guarantee is computed.
+    answers.ask(panel, fast._replace(coupling=1.0))
+    until(lambda: told[-1]["short"] == "guarantee not computed")
+    answers.ask(panel, fast)
     until(lambda: told[-1]["short"] == str(fast.coupling))
     answers.end()
     assert str(panel.start.coupling) not in [each["short"] for each in told]

@@ -95,6 +95,7 @@ def test_no_forged_field_of_a_summary_agrees_with_its_scenario(change):
 
 
 CASES = {name: () for name in bundled_scenarios()}
+CASES |= {"paper-radio, both ways": ("graph.directed=false",)}
 CASES |= {"paper-global, motors": MOTORS, "van-der-pol, proved": PROVED}
 
 

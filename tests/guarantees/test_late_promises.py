@@ -264,6 +264,7 @@ def test_what_is_proved_of_a_law_is_not_of_its_subclasses(network):
 # ---- 4: the tube ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_no_network_leaves_the_tube():
     # The path is at 1.4 m/s, and agreement may ask .5 + .3: before a packet the path counts.
     network = dataclasses.replace(RADIO, delay=0.3, loss=0.7, bursts=ech.Bursts(0.5, 0.3))

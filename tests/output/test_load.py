@@ -189,6 +189,15 @@ def test_no_code_is_executed_for_the_frames(own, here):
         other.parts
 
 
+def test_a_run_from_disk_is_verified_as_its_folder_is(own):
+    folder = ech.save_run(ech.run(own), "o", figures=False)
+    assert ech.verify(folder).verdict == "incomplete"
+    assert ech.verify(folder, scenario=folder).holds and ech.verify(ech.load(folder)).holds
+    with h5netcdf.File(folder / "run.nc", "r+") as data:
+        data.attrs["promise"] = data.attrs["promise"].replace("linearization", "vertices")
+    assert ech.verify(ech.load(folder)).verdict == "refused"
+
+
 # ---- unfinished runs ---------------------------------------------------------------------------
 
 

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, Generic, NamedTuple, TypeVar, final
 
 import equinox as eqx
@@ -80,9 +80,7 @@ class CompiledFunction(Generic[_R]):
     are of echelon's own classes.
     """
 
-    def __init__(
-        self, function: Callable[..., _R], options: Mapping[str, Any] | None = None
-    ) -> None:
+    def __init__(self, function: Callable[..., _R], options: dict[str, Any] | None = None) -> None:
         """Wrap a module-level function; `options` are XLA's."""
         functools.update_wrapper(self, function)
         self._function, self._options = function, options
@@ -122,7 +120,8 @@ class CompiledFunction(Generic[_R]):
         return self._jitted(renewed)
 
     def _jitted(self, function: Callable[..., _R]) -> Callable[..., _R]:
-        return eqx.filter_jit(function, compiler_options=self._options)
+        named: dict[str, Any] = {"compiler_options": self._options}
+        return eqx.filter_jit(function, **named)
 
     def _load_or_compile(self, call: _CallArguments, key: bytes) -> _Compiled | None:
         """Return what is stored for a call, or compile and store it; None if JAX compiles it."""
@@ -191,7 +190,7 @@ def _form(array: jax.Array) -> tuple[tuple[int, ...], str, bool]:
 
 
 def _compile(
-    function: Callable[..., PyTree], call: _CallArguments, options: Mapping[str, Any] | None
+    function: Callable[..., PyTree], call: _CallArguments, options: dict[str, Any] | None
 ) -> _Compiled | None:
     """Return a function compiled for a call; None if it calls foreign code such as LAPACK."""
     trees = list[PyTree]()

@@ -95,7 +95,7 @@ def _head(place: str, cells: list[str], names: Sequence[str], optional: Sequence
         which = f"lacks {listing(missing)}" if missing else f"has {listing(dict.fromkeys(surplus))}"
         raise ReferenceError(
             f"the first line of the path at {place} {which}, and must name each of the columns "
-            f"{listing(names)} once."
+            f"{listing(names)} once, separated by commas."
         )
     return head
 

@@ -93,7 +93,7 @@ class Polynomials(PolynomialPath):
             horizon: its length, s.
 
         Raises:
-            ReferenceError: the path is not smooth enough for 4096 pieces.
+            ReferenceError: the path is too long or not smooth enough for 4096 pieces.
         """
         if isinstance(path, PolynomialPath):
             return _of_polynomials(path)
@@ -107,8 +107,8 @@ class Polynomials(PolynomialPath):
                 return cls(spans, powers)
             count += 1 + count // 4
         raise ReferenceError(
-            f"the path `{type(path).__name__}` is more than {_CLOSE:g} m from {_MANY} polynomials; "
-            "it must be smooth."
+            f"{_MANY} pieces do not follow `{type(path).__name__}` to {_CLOSE:g} m for "
+            f"{horizon:g} s; make it shorter or smoother."
         )
 
     def moved(self, offset: Sequence[float]) -> "Polynomials":

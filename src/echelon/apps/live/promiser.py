@@ -1,8 +1,9 @@
 """The guarantee of a live loop, computed in threads while the loop runs."""
 
 import threading
+import traceback
 from collections.abc import Callable
-from typing import NamedTuple, final
+from typing import Final, NamedTuple, final
 
 from echelon.apps.live.knobs import Knobs
 from echelon.apps.live.panel import Panel
@@ -62,6 +63,16 @@ class _Newest:
             self.work(request)
 
 
+FAILED: Final[JsonObject] = {
+    "state": "lost",
+    "short": "guarantee not computed",
+    "whole": "The guarantee could not be computed because of an internal error of echelon, which "
+    "the terminal shows.",
+    "causes": [],
+}
+"""The badge after an error that should not happen."""
+
+
 class _Request(NamedTuple):
     """A position of the knobs, by the number of its change."""
 
@@ -101,17 +112,26 @@ class Promiser:
             worker.end()
 
     def _look(self, request: _Request) -> None:
-        badge = first_look(request.panel, request.knobs)
+        badge = _badge(first_look, request)
         with self.lock:
             if self.complete < request.number == self.number:
                 self.answer(badge)
 
     def _judge(self, request: _Request) -> None:
-        badge = badge_of(request.panel, request.knobs)
+        badge = _badge(badge_of, request)
         with self.lock:
             if request.number == self.number:
                 self.complete = request.number
                 self.answer(badge)
+
+
+def _badge(compute: Callable[[Panel, Knobs], JsonObject], request: _Request) -> JsonObject:
+    try:
+        return compute(request.panel, request.knobs)
+    except Exception:
+        # A thread that ends would leave the page waiting for ever.
+        traceback.print_exc()
+        return FAILED
 
 
 def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:

@@ -68,7 +68,7 @@ class LateMessages(NamedTuple):
         sums: (K,) d_i, the sums of weights that followers hear.
         spread: max w, w = L_g^-1 1.
         coupling: c.
-        speed: s of followers, the smallest of all outputs.
+        speed: s of followers, the smallest of all outputs; 0 without one leader that has a plan.
         leaderward: whether neighbours with fewer hops alone are heard.
     """
 
@@ -169,7 +169,9 @@ def late_messages_of(
     if obstacle is not None:
         return obstacle
     graph, c = following.graph, following.coupling
-    law = c, following.speed
+    # Of several leaders each may leave its plan, and without a plan its rate misleads too.
+    planned = network.prediction is Prediction.PREVIEW and len(graph.leaders) == 1
+    law = c, following.speed if planned else 0.0
     channel, links = network.prepared(dt, horizon, 0), graph.exchange(following.leaderward)
     hops = int(graph.depths().max())
     ages = ages_of(channel, dt, steps, len(links.receivers), hops)

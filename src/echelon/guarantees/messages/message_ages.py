@@ -49,9 +49,14 @@ class MessageAges(NamedTuple):
         return None if self.arrived is None else self.hops * self.arrived * self.dt
 
     @property
+    def hop_life(self) -> int:
+        """The age, in steps, to which hop counts are used."""
+        return HOP_LIFE * (self.forgotten - 1)
+
+    @property
     def hops_last(self) -> bool:
         """Whether a link delivers before the hop counts that it delivered are forgotten."""
-        return self.arrived is not None and self.arrived <= HOP_LIFE * (self.forgotten - 1)
+        return self.arrived is not None and self.arrived <= self.hop_life
 
 
 def ages_of(channel: Channel, dt: float, steps: int, links: int, hops: int) -> MessageAges:

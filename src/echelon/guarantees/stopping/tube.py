@@ -80,7 +80,11 @@ class Tube(NamedTuple):
         if self.network is None:
             return "zeta' is received at all times (T5)"
         text = "every agent receives one packet of a leader that follows its plan; all messages "
-        return f"{text}after it may be late, lost or out of order (T9)"
+        text += "after it may be late, lost or out of order"
+        if self.network.leaderward:
+            ages = self.network.ages
+            text += f" while no link is silent for {ages.hop_life * ages.dt:.3g} s"
+        return f"{text} (T9)"
 
     def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON."""

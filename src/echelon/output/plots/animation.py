@@ -180,7 +180,7 @@ class _Dots(MovingScene):
         """Move dots to places (K, 3), with a radius that is a part of a body's width."""
         middle = self.camera.project(places)[0]
         beside = self.camera.project(places + part * self.size * self.camera.axes[0])[0]
-        points = 72.0 / self.ax.figure.dpi
+        points = 0.72  # of a hundredth of an inch
         dots.set_offsets(middle)
         # The size of a marker is the area of the square around it, in points.
         dots.set_sizes((2.0 * points * (beside - middle)[:, 0]) ** 2)

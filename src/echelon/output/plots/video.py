@@ -3,7 +3,7 @@
 import contextlib
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final, final
 
@@ -18,41 +18,82 @@ from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import pen_of
 from echelon.output.plots.animation import MovingScene, moving_of
 from echelon.output.plots.camera import Camera, camera_for
+from echelon.output.plots.over_time import above, error_rounding, shade_rounding
 from echelon.output.plots.space import Space, clipped_places, space_of
 from echelon.simulation.engine.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_SIZE: Final = (960, 540)
+_WIDTH: Final = 960.0
+"""Units of the picture across, whatever its pixels: letters and lines are sized in them."""
 _SCENE: Final = 620
-"""Width of the scene in pixels; the rest is for curves."""
-_RATE: Final = 25.0
+"""Width of the scene in these units; the rest is for curves."""
 _PAPER, _GRID = "#f7f8fa", "#dde2e8"
+_SIZES: Final = {".mp4": (960, 540), ".gif": (640, 360)}
+_UNITS: Final = 100.0
+"""Units per inch."""
+_RATES: Final = {".mp4": 25.0, ".gif": 12.5}
+"""Pixels, and pictures a second; fewer of a GIF, whose pictures are stored nearly one by one."""
+_COLOURS: Final = 96
 
 
-def save_video(run: Result | Recording, file: Path, speed: float = 1.0) -> int:
+def save_video(
+    run: Result | Recording,
+    file: Path,
+    speed: float = 1.0,
+    *,
+    size: tuple[int, int] | None = None,
+    rate: float | None = None,
+    begin: float | None = None,
+    end: float | None = None,
+    progress: Callable[[int, int], None] = lambda done, pictures: None,
+) -> int:
     """Write a run as MP4 or GIF, by ffmpeg, and return the number of pictures.
 
+    Args:
+        run: a result, or a recording of one.
+        file: that ends in `.mp4` or `.gif`.
+        speed: of the playback; 2 plays twice as fast.
+        size: width and height in pixels, even numbers; by default 960 x 540, of a GIF 640 x 360.
+        rate: pictures a second; by default 25, of a GIF 12.5.
+        begin: of the part that is shown, s; by default of the run.
+        end: of that part, s; by default of the run.
+        progress: called with how many pictures are drawn, and of how many.
+
     Raises:
-        OutputError: the run has no frames, or ffmpeg fails.
+        OutputError: the run has no frames between these times, or ffmpeg fails.
         MissingExtraError: there is no ffmpeg.
     """
-    run = recording_of(run)
+    run, kind = recording_of(run), file.suffix.lower()
+    rate = _RATES[kind] if rate is None else rate
     if len(run.times) < 2:
         raise OutputError("the run has fewer than two stored frames; a video needs at least two.")
-    program, pictures = encoder(), times_of(run, speed)
+    program, pictures = encoder(), times_of(run, speed, rate, begin, end)
     with draw.style():
-        film = _Film(run)
-        make_atomic(file, lambda part: _encode(program, film, pictures, part, file.suffix.lower()))
+        film = _Film(run, _SIZES[kind] if size is None else size, pictures[[0, -1]])
+        film.progress = progress
+        make_atomic(file, lambda part: _encode(program, film, pictures, part, kind, rate))
     return len(pictures)
 
 
-def times_of(run: Recording, speed: float) -> Array:
-    """Return the times (s) of pictures, 25 a second of the video."""
-    last = float(run.times[-1] - run.times[0])
-    count = max(2, round(_RATE * last / speed) + 1)
-    return run.times[0] + np.linspace(0.0, last, count)
+def times_of(
+    run: Recording, speed: float, rate: float, begin: float | None = None, end: float | None = None
+) -> Array:
+    """Return the times (s) of pictures, `rate` a second of the video.
+
+    Raises:
+        OutputError: the run has nothing between the times.
+    """
+    first, last = float(run.times[0]), float(run.times[-1])
+    start, stop = max(first, begin or first), last if end is None else min(last, end)
+    if not start < stop:
+        raise OutputError(
+            f"nothing lies between {start:g} and {stop:g} s; the run is stored from {first:g} to "
+            f"{last:g} s."
+        )
+    count = max(2, round(rate * (stop - start) / speed) + 1)
+    return start + np.linspace(0.0, stop - start, count)
 
 
 def encoder() -> str:
@@ -75,19 +116,20 @@ def encoder() -> str:
         ) from error
 
 
-def _encode(program: str, film: "_Film", times: Array, part: Path, kind: str) -> None:
-    size, rate = f"{_SIZE[0]}x{_SIZE[1]}", f"{_RATE:g}"
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgba", "-s", size, "-r", rate, "-i", "-"]
-    small = "fps=12.5,scale=640:-1:flags=lanczos,split[a][b];[a]palettegen=max_colors=96[p];"
+def _encode(program: str, film: "_Film", times: Array, part: Path, kind: str, rate: float) -> None:
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgba", "-s", "{}x{}".format(*film.size)]
+    # One palette for all pictures, and of each picture the rectangle that changed.
+    palette = f"split[a][b];[a]palettegen=max_colors={_COLOURS}:stats_mode=full[p];"
     options = {
         # A third of the time of the default preset, and a tenth more bytes.
         ".mp4": ["-c:v", "libx264", "-preset", "veryfast", "-pix_fmt", "yuv420p", "-crf", "20"]
         + ["-f", "mp4", "-movflags", "+faststart"],
-        ".gif": ["-filter_complex", f"{small}[b][p]paletteuse=dither=none", "-f", "gif"],
+        ".gif": ["-filter_complex", f"{palette}[b][p]paletteuse=dither=none:diff_mode=rectangle"]
+        + ["-f", "gif"],
     }[kind]
-    command = [program, "-loglevel", "error", "-y", *raw, *options, str(part)]
+    command = [program, "-loglevel", "error", "-y", *raw, "-r", f"{rate:g}", "-i", "-"]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, **pipes) as process:
+    with subprocess.Popen([*command, *options, str(part)], **pipes) as process:
         assert process.stdin is not None and process.stderr is not None
         _feed(process.stdin, film, times)
         message = process.stderr.read().decode(errors="replace").strip()
@@ -99,28 +141,34 @@ def _encode(program: str, film: "_Film", times: Array, part: Path, kind: str) ->
 def _feed(pipe: IO[bytes], film: "_Film", times: Array) -> None:
     # If ffmpeg ends early, its message says why.
     with contextlib.suppress(BrokenPipeError), pipe:
-        for picture in film.pictures(times):
+        for done, picture in enumerate(film.pictures(times), start=1):
             pipe.write(picture)
+            film.progress(done, len(times))
 
 
 @final
 class _Film:
     """The figure of a video, its background and its moving parts."""
 
-    def __init__(self, run: Recording) -> None:
+    progress: Callable[[int, int], None] = staticmethod(lambda done, pictures: None)
+
+    def __init__(self, run: Recording, size: tuple[int, int], ends: Array) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         self.run, self.space = run, space_of(run)
         self.places = scene_places(run, self.space)
-        self.camera = camera_for(self.space, _SCENE, _SIZE[1], 0)
-        self.figure = Figure((_SIZE[0] / 100, _SIZE[1] / 100), dpi=100, facecolor=_PAPER)
+        self.size, tall = size, _WIDTH * size[1] / size[0]
+        self.camera = camera_for(self.space, _SCENE, round(tall), 0)
+        inches = _WIDTH / _UNITS, tall / _UNITS
+        self.figure = Figure(inches, dpi=size[0] / inches[0], facecolor=_PAPER)
         self.canvas: FigureCanvasAgg = FigureCanvasAgg(self.figure)
         self.ax = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        self.ax.set(xlim=(0, _SIZE[0]), ylim=(0, _SIZE[1]))
+        self.ax.set(xlim=(0, _WIDTH), ylim=(0, tall))
         self.ax.axis("off")
         draw_floor(self.ax, self.camera, self.space)
-        self.cursors = _curves(self.figure, run)
+        _name_closest(self.ax, run)
+        self.cursors = _curves(self.figure, run, ends)
         self.moving: MovingScene = moving_of(self.ax, run, self.space, self.camera)
 
     def pictures(self, times: Array) -> Iterator[bytes]:
@@ -194,19 +242,32 @@ def draw_floor(ax: "Axes", camera: Camera, space: Space) -> None:
     ax.text(14, 14, words.replace("_", " "), color="0.45", size=8)
 
 
+def _name_closest(ax: "Axes", run: Recording) -> None:
+    """Write which agents came closest to each other, in a warning colour if they touched."""
+    closest = run.closest_pair()
+    if closest is not None:
+        text = "smallest distance {:.3g} m: {} and {} at {:.4g} s".format(
+            closest.distance, *closest.agents, closest.time
+        )
+        colour = draw.COLOURS[1] if closest.touch(run.radius) else "0.45"
+        ax.text(14, 32, text, color=colour, size=9)
+
+
 def _nice(value: float) -> float:
     """Return the smallest of 1, 2 and 5 times a power of ten that is not below a value."""
     power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
     return float(next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= value * 0.999))
 
 
-def _curves(figure: Any, run: Recording) -> list[Any]:
+def _curves(figure: Any, run: Recording, ends: Array) -> list[Any]:
     """Draw the formation error and the inputs, and return their cursors."""
-    left = (_SCENE + 62) / _SIZE[0]
+    left = (_SCENE + 62) / _WIDTH
     errors = figure.add_axes((left, 0.58, 0.985 - left, 0.34), facecolor="none")
     inputs = figure.add_axes((left, 0.1, 0.985 - left, 0.34), facecolor="none")
-    keep, followers = draw.thin(len(run.times)), list(run.followers)
-    values = draw.above_zero(run.goal_distances(keep)[:, followers])
+    within = np.flatnonzero((run.times >= ends[0]) & (run.times <= ends[1]))
+    keep, followers = within[draw.thin(len(within))], list(run.followers)
+    floor, errors_now = error_rounding(run), run.goal_distances(keep)[:, followers]
+    values = above(errors_now, floor)
     if run.agents > draw.NAMED:
         lines = {"worst": values.max(axis=1), "median": np.median(values, axis=1)}
         for name, colour in (("worst", 1), ("median", 0)):
@@ -215,7 +276,8 @@ def _curves(figure: Any, run: Recording) -> list[Any]:
     else:
         for agent, line in zip(followers, values.T, strict=True):
             errors.plot(run.times[keep], line, **pen_of(run, agent))
-    draw.logarithmic(errors, values)
+    draw.logarithmic(errors, errors_now)
+    shade_rounding(errors, floor, errors_now)
     errors.set_title(draw.label("formation error", run.length_unit), size=9, loc="left")
     loads = run.loads
     sizes = (
@@ -228,7 +290,7 @@ def _curves(figure: Any, run: Recording) -> list[Any]:
     inputs.set_xlabel("time (s)", size=9)
     for ax in (errors, inputs):
         ax.tick_params(labelsize=8)
-        ax.set_xlim(run.times[0], run.times[-1])
+        ax.set_xlim(*ends)
     return [
         ax.axvline(run.times[0], color=draw.COLOURS[0], linewidth=1.4) for ax in (errors, inputs)
     ]

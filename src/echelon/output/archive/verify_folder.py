@@ -1,0 +1,115 @@
+"""Checks all that a run states of its gain and its guarantee."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from echelon.agents.models.model import ControlAffine
+from echelon.core.types import PathLike
+from echelon.experiments.scenario.build import build
+from echelon.experiments.scenario.scenario import (
+    Scenario,
+    ScenarioLike,
+    as_scenario,
+    load_scenario,
+)
+from echelon.experiments.scenario.self_contained import files_of, names_code, without_folders
+from echelon.experiments.studies.recomputation import recompute
+from echelon.guarantees.verifier import verify as verifier
+from echelon.guarantees.verifier.findings import Finding
+from echelon.guarantees.verifier.verify import PROMISE, Verification, judge
+from echelon.output.archive.open_folder import ClaimFiles, claim_files
+from echelon.output.archive.run_folder import save_run
+from echelon.simulation.engine.result import Result
+
+_SETTLED = {"graph spectrum": "graph.spectrum", "method": "method"}
+"""What independent code leaves open of large and switching graphs and own methods, and what the
+scenario settles it by."""
+
+
+def verify(
+    run: "Result | PathLike",
+    model: ControlAffine | None = None,
+    scenario: ScenarioLike | None = None,
+) -> Verification:
+    """Check a gain by independent code, and compute a run's guarantee again from its scenario.
+
+    Args:
+        run: a gain file, the output of `check --json`, the folder of a run, or a result, whose
+            guarantee is that of its file if it is from disk.
+        model: the agents' model of a gain file, if it is not bundled. Without it, claims about its
+            equations are not checked and the verdict is `incomplete`.
+        scenario: of a folder whose scenario names classes of your own, which are executed; a
+            result's own is executed.
+
+    Raises:
+        GainError: a file is neither, or a part is missing or unknown.
+        OutputError: a folder has no claims.
+        ScenarioError: the scenario has faults, or a part of it cannot be built.
+    """
+    if isinstance(run, Result):
+        with TemporaryDirectory() as place:
+            folder = save_run(run, Path(place) / "run", figures=False)
+            own = folder if "scenario_text" in run.provenance else None
+            return verify(folder, model, own)
+    if Path(run).is_file() and scenario is None:
+        return verifier.verify(run, model)
+    trusted = None if scenario is None else as_scenario(scenario)
+    return check_files(claim_files(run), trusted)[0]
+
+
+def check_files(
+    files: ClaimFiles, trusted: Scenario | None, begin: Callable[[], None] = lambda: None
+) -> tuple[Verification, str]:
+    """Return what holds of files with claims, and what is against their scenario, if anything.
+
+    Args:
+        files: of a run, or a gain file.
+        trusted: the scenario whose code may be executed.
+        begin: called before the guarantee is computed again, which may take a minute.
+    """
+    source, obstacle = _source(files, trusted)
+    findings, note = _independent(files, trusted)
+    computed = list[Finding]()
+    # A gain file by itself is no run.
+    if source is not None and (files.claims is not None or files.data is not None):
+        begin()
+        computed = list(recompute(source, files.claims, files.gain, files.data))
+    return judge([*_still_open(findings, computed, obstacle), *computed], note), obstacle
+
+
+def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | None, str]:
+    """Return the scenario from which claims are computed again; or None, and what is against it."""
+    if files.scenario is None:
+        return trusted, "" if trusted is not None else "no scenario is beside the file"
+    own = load_scenario(files.scenario)
+    if trusted is not None:
+        same = without_folders(own.data) == without_folders(trusted.data)
+        return (trusted, "") if same else (None, "the scenario is not that of the run")
+    if names_code(own):
+        return None, "the scenario names code, which is not executed unless you name it"
+    folder = files.scenario.parent.resolve()
+    if not all(each.resolve().is_relative_to(folder) for each in files_of(own)):
+        return None, "the scenario names a file outside of its folder"
+    return own, ""
+
+
+def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[Finding], str]:
+    """Return what independent code finds in each file, and its notes."""
+    model = None if trusted is None else build(trusted).parts.model
+    checked = [each for each in (files.gain, files.claims) if each is not None]
+    results = [verifier.verify(each, model) for each in checked]
+    return [x for each in results for x in each.findings], "".join(x.note for x in results)
+
+
+def _still_open(
+    findings: list[Finding], computed: list[Finding], obstacle: str
+) -> Iterator[Finding]:
+    """Yield what independent code found, without what it left open and the scenario has settled."""
+    agree = {each.claim.partition(": ")[2] for each in computed if each.verdict == "recomputed"}
+    for each in findings:
+        if each.claim.startswith(PROMISE):
+            if not computed:
+                yield each._replace(text=obstacle or each.text)
+        elif not (each.open and _SETTLED.get(each.claim) in agree):
+            yield each
