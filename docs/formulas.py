@@ -65,7 +65,8 @@ _NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?(?:e-?\d+)?")
 _HALF = re.compile(r"(\d+)/(\d+)(?![\w.(])")
 _INDEX = re.compile(r"_(\{[^}]*\}|[A-Za-z0-9]+|[α-ωΑ-Ω]+)")
 _SYMBOL = re.compile(
-    r"(?<![\w./'-])(?:[A-Za-zα-ωΑ-Ω][~^]?_(?:[a-z0-9]{1,2}|min|max|FL)'*|[α-ωΓΔΘΛΞΦΨΩ][~^]?'*)(?!\w)"
+    r"(?<![\w./'-])(?:[A-Za-zα-ωΑ-Ω][~^]?_(?:[a-z0-9]{1,2}|min|max|FL|[α-ω])'*"
+    r"|[α-ωΓΔΘΛΞΦΨΩ][~^]?'*|[A-Z]\^-1|[xu]\*)(?!\w)"
 )
 """A letter with an index, or a Greek one, in the text."""
 _POWER = re.compile(r"-?(?:\d+(?:/\d+)?|[A-Za-zα-ω])")
@@ -379,12 +380,17 @@ def _frame_statements(root: etree.Element) -> None:
             framed.append(etree.Element("div", {"class": "statement"}))
             framed[-1].append(element)
             previous, expected = framed[-1], False
-        elif element.tag == "ol" and previous.get("class") == "statement":
+        elif previous.get("class") == "statement" and _continues(element):
             previous.append(element)
         else:
             framed.append(element)
             previous = element
     root[:] = framed
+
+
+def _continues(element: etree.Element) -> bool:
+    """Tell whether an element belongs to the statement before it."""
+    return element.tag == "ol" or element.get("class") == "formula"
 
 
 def _frame_until_proofs(root: etree.Element) -> None:
