@@ -196,7 +196,9 @@ def test_a_run_folder_contains_the_file_of_its_path(tmp_path, echelon):
 @pytest.mark.slow
 def test_verify_computes_the_guarantee_from_the_path_in_the_folder(tmp_path, echelon):
     write_points(tmp_path)
-    file = written(tmp_path, simulation={"horizon": 2.0, "dt": 0.01})
+    # The guarantee of a linear agent does not depend on its leader's path.
+    planar = {"name": "planar-quadrotor"}
+    file = written(tmp_path, model=planar, simulation={"horizon": 2.0, "dt": 0.01})
     assert echelon("run", file, "--out", tmp_path / "run", "--no-figures")[0] == 0
     assert echelon("verify", tmp_path / "run")[0] == 0
     path = tmp_path / "run" / "inputs" / "path.csv"
