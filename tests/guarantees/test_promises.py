@@ -475,8 +475,9 @@ def test_the_data_of_a_run_hold_the_whole_promise():
     result = ech.simulate(parts, settings(horizon=0.1))
     told, data = ech.summary(result)["promise"], ech.dataset(result)
     assert told == ech.promise(parts, settings(horizon=0.1)).as_mapping()
-    # Lines of laws that turn, of graphs that switch and of motors are there only where these are.
+    # These lines are there only for laws that turn, graphs that switch, motors, networks, ...
     apart = {Hypothesis.HEADING_FRAME, Hypothesis.SWITCHING, Hypothesis.LIMITS}
+    apart |= {Hypothesis.MESSAGES, Hypothesis.OWN_STATE, Hypothesis.SEPARATION}
     always = {h.value for h in Hypothesis if h not in apart}
     assert {each["statement"] for each in told["hypotheses"]} == always
     for each in told["hypotheses"]:

@@ -24,7 +24,7 @@ from echelon.laws.nearest_point import nearest_point
 AXES = ("x", "y", "z")
 _DOWNWASH = 3.0
 """Height over width of the ellipsoid about a model with a radius: rotors blow downward."""
-_MOST_CORRECTIONS, _SOLVED = 200, 1e-12
+_MOST_CORRECTIONS, _SOLVED = 60, 1e-9
 """Corrections of a rate by single rows, and the size (m/s) of one that ends them."""
 
 
@@ -57,8 +57,8 @@ class Safety:
 
     def __post_init__(self) -> None:
         """Check every number."""
-        radii = () if self.radii is None else tuple(self.radii)
         if self.radii is not None:
+            radii = tuple(np.atleast_1d(np.asarray(self.radii, object)).tolist())
             object.__setattr__(self, "radii", radii)
             if len(radii) != 3 or not all(map(_positive, radii)) or radii[0] != radii[1]:
                 raise LawError(
@@ -126,7 +126,6 @@ class Safety:
         Returns:
             The rate (d,), and how many rows act on it.
         """
-        # Of who is not known nothing is a number.
         corners = jnp.where(near.known[:, None, None], near.gaps, 0.0) * scales[None, None]
         nearest = nearest_point(corners)
         far = jnp.sqrt((nearest * nearest).sum(axis=1))
@@ -138,7 +137,7 @@ class Safety:
         short = jnp.where(used, low - normals @ (rate * scales), 0.0)
         u = rate * scales + self._aside(normals, short)
         u = _shrunk(_projected(u, normals, low, used), normals, low, used) / scales
-        # What is shrunk towards 0 still meets all rows that 0 meets.
+        # Less of it still meets all rows that 0 meets.
         u = u * (speeds / jnp.maximum(jnp.abs(u), speeds)).min()
         active = (short > 0.0).sum()
         return jnp.where(active > 0, u, rate), active.astype(rate.dtype)

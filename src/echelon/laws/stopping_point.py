@@ -171,8 +171,9 @@ class StoppingPoint(FlatLaw):
         )
         if self.safety is None:
             return law
+        law = dataclasses.replace(law, safety=self.safety.prepared(model))
         law.places(model)
-        return dataclasses.replace(law, safety=self.safety.prepared(model))
+        return law
 
     def following(self, leader: Law, model: ControlAffine) -> "StoppingPoint":
         """Take over the beginning of the leader's path, which sets the level thrust."""

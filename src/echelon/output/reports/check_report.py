@@ -44,8 +44,8 @@ class _Detail(enum.IntEnum):
 def check_report(check: CheckResult) -> str:
     """Return a check in at most 80 columns, and 40 lines unless more than that fails.
 
-    What fails stands with its remedy, and what holds with its number as far as there is room; of
-    what is not needed the names alone.
+    What fails stands with its remedy, and what holds with its number as far as there is room, else
+    by its name, or as a count; of what is not needed the names alone.
     """
     texts = ["\n".join(_text(check, detail)) for detail in _Detail]
     return next((text for text in texts if text.count("\n") < HEIGHT), texts[-1])
@@ -57,7 +57,8 @@ def _text(check: CheckResult, detail: _Detail) -> Iterator[str]:
     for title, lines in grouped(check.lines).items():
         yield from ("", f"{title}:")
         brief = title == _PRINTED
-        yield from _group(lines, width, _Detail.NAMES if brief else detail, brief)
+        least = max(detail, _Detail.NAMES) if brief else detail
+        yield from _group(lines, width, least, brief)
     end = f"`--all` shows all {len(check.lines)} lines with reasons; "
     yield from ("", end + "`echelon explain TERM` explains one.")
 
@@ -67,16 +68,11 @@ def _group(lines: list[Statement], width: int, detail: _Detail, brief: bool) -> 
     rows = detail is _Detail.ROWS
     shown = [x for x in lines if x.fails or (rows and _holds(x) and x.number_text)]
     for line in shown:
-        yield from _row(line, width, brief)
+        yield from _row(line, width, detail is _Detail.COUNTS, brief)
     for verdict in (Verdict.HOLDS, Verdict.NOT_NEEDED, Verdict.VACUOUS):
         rest = [line for line in lines if line not in shown and line.verdict is verdict]
-        numbers = verdict is Verdict.HOLDS and detail is _Detail.NUMBERS
-        names = [
-            f"{x.name} ({x.number_text})" if numbers and x.number_text else x.name for x in rest
-        ]
-        if names:
-            text = f"{verdict}: {'; '.join(names)}"
-            yield from textwrap.wrap(text, WIDTH, initial_indent=" ", subsequent_indent="   ")
+        if rest:
+            yield from _listed(rest, detail)
 
 
 def _listed(lines: list[Statement], detail: _Detail) -> Iterator[str]:
@@ -92,10 +88,14 @@ def _holds(line: Statement) -> bool:
     return line.verdict is Verdict.HOLDS
 
 
-def _row(line: Statement, width: int, brief: bool) -> Iterator[str]:
-    """Yield a line with its verdict and number, and the remedy of what fails unless `brief`."""
+def _row(line: Statement, width: int, short: bool, brief: bool) -> Iterator[str]:
+    """Yield a line with its verdict and number, and the remedy of what fails unless `brief`.
+
+    With `short` a text in place of the number has one row.
+    """
     head = f" {line.name:{width}}  {line.verdict!s:5}  "
     text = line.number_text or (line.text if line.fails else "")
+    text = textwrap.shorten(text, WIDTH - len(head), placeholder=" ...") if short else text
     yield from _wrapped(text, head, " " * len(head)) or [head.rstrip()]
     if line.fails and not brief:
         yield from _wrapped(line.remedy, "   -> ", " " * 6)

@@ -80,6 +80,8 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
     """
     if parts.world.network is not None:
         raise SimulationError("got a network, but derivatives are of messages that are never late.")
+    if parts.drive.safety is not None:
+        raise SimulationError("got `safety`, but derivatives are of agents that do not keep apart.")
     with precision("float64"):
         prepared = _take(parts, settings, tuple(wrt))
         result = choose_engine(

@@ -1,0 +1,86 @@
+"""What is guaranteed of agents that keep apart (T10), and what is not."""
+
+import copy
+import json
+
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon.core.statement import Hypothesis
+from echelon.core.words import Theorem
+from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.verifier.verify import verify
+
+MODEL = ech.models.DoubleIntegrator()
+SETTINGS = ech.Settings(horizon=1.0, dt=0.02)
+
+
+def guaranteed(safety=ech.Safety(radii=(0.1, 0.1, 0.3)), settings=SETTINGS, **world):
+    graph = ech.Graph.ring(4)
+    offsets = {1: (1.0, 0.0), 2: (1.0, 1.0), 3: (0.0, 1.0)}
+    starts = {1: (0.9, 0.8, 0.5, -0.5), 2: (0.4, 0.1, 0.0, 0.0), 3: (0.0, 1.0, 0.0, 0.0)}
+    drive = ech.Laws(ech.laws.StoppingLeader(), ech.laws.StoppingPoint(safety=safety))
+    formation = ech.Formation.from_offsets(MODEL, graph, offsets)
+    parts = ech.Parts(MODEL, graph, formation, drive, initial=starts, world=ech.World(**world))
+    return parts, promise(parts, settings)
+
+
+def test_distances_are_guaranteed_and_convergence_is_not():
+    _, value = guaranteed()
+    assert value.theorem is Theorem.T10 and value.promised and value.rate is None
+    text = value.sentence()
+    assert "radii of 0.1 x 0.1 m never overlap" in text and "Convergence is not guaranteed" in text
+    assert "converge to zero" not in text and "observed" not in text
+    line = value.hypotheses[Hypothesis.SEPARATION]
+    assert not line.fails
+    # Agents 0 and 2 rest at the start, so that their hulls are single points.
+    np.testing.assert_allclose(line.number, np.hypot(0.4, 0.1), rtol=1e-12)
+    _, without = guaranteed(None)
+    assert without.theorem is Theorem.T5 and Hypothesis.SEPARATION not in without.hypotheses
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        {"network": ech.Network(rate=25.0)},
+        {"disturbance": ech.Disturbance(constant={"velocity": 0.1})},
+        {"sensing": ech.Sensing(noise={"position": 0.01})},
+        {"plant": ech.models.DoubleIntegrator(drag=0.1)},
+    ],
+    ids=["network", "wind", "noise", "plant"],
+)
+def test_in_a_world_that_is_not_ideal_distances_are_observed(world):
+    _, value = guaranteed(**world)
+    assert value.hypotheses[Hypothesis.SEPARATION].fails
+    assert "In this world distances are observed, not proved." in value.sentence()
+    assert "converge to zero" not in value.sentence()
+
+
+def stored(value):
+    return json.loads(json.dumps({"promise": value.as_mapping()}))
+
+
+FORGERIES = {
+    "least": lambda claim: claim.update(least=1.2 * claim["least"]),
+    "gap": lambda claim: claim.update(gap=(0.3 * np.array(claim["gap"])).tolist()),
+    "radii": lambda claim: claim.update(radii=[0.3, 0.3, 0.9]),
+    "distance": lambda claim: claim.update(distance=0.1),
+    "gain": lambda claim: claim.update(gain=60.0),
+    "step": lambda claim: claim.update(step=0.3),
+    "reach": lambda claim: claim.update(reach=1.0),
+    "speeds": lambda claim: claim.update(speeds=[9.0, 9.0]),
+}
+
+
+def test_claims_of_distances_are_checked_by_code_of_its_own(tmp_path):
+    _, value = guaranteed()
+    document = stored(value)
+    file = tmp_path / "summary.json"
+    file.write_text(json.dumps(document))
+    assert verify(file).verdict == "incomplete"
+    for name, forge in FORGERIES.items():
+        forged = copy.deepcopy(document)
+        forge(forged["promise"]["anywhere"]["separation"])
+        file.write_text(json.dumps(forged))
+        assert verify(file).verdict == "refused", name
