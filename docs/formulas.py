@@ -57,7 +57,7 @@ _FUNCTIONS = {
 }
 _FUNCTIONS |= {"arg", "Re", "Im", "sign"}
 _WORDS = {"roll", "pitch", "yaw", "edge", "hover", "noise", "wind", "mean", "edges", "followers"}
-_WORDS |= {"free", "model"}
+_WORDS |= {"free", "model", "reach"}
 _ASCII = {"lambda": r"\lambda ", "rho": r"\rho ", "alpha": r"\alpha "}
 _DIFFERENTIALS = {"dx", "dt", "df", "dg", "dz", "dm", "dy", "ds"}
 _WORD = re.compile(r"[A-Za-z]{2,}")
@@ -65,7 +65,8 @@ _NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?(?:e-?\d+)?")
 _HALF = re.compile(r"(\d+)/(\d+)(?![\w.(])")
 _INDEX = re.compile(r"_(\{[^}]*\}|[A-Za-z0-9]+|[α-ωΑ-Ω]+)")
 _SYMBOL = re.compile(
-    r"(?<![\w./'-])(?:[A-Za-zα-ωΑ-Ω][~^]?_(?:[a-z0-9]{1,2}|min|max|FL)'*|[α-ωΓΔΘΛΞΦΨΩ][~^]?'*)(?!\w)"
+    r"(?<![\w./'-])(?:[A-Za-zα-ωΑ-Ω][~^]?_(?:[a-z0-9]{1,2}|min|max|FL|[α-ω])'*"
+    r"|[α-ωΓΔΘΛΞΦΨΩ][~^]?'*|[A-Z]\^-1|[xu]\*)(?!\w)"
 )
 """A letter with an index, or a Greek one, in the text."""
 _POWER = re.compile(r"-?(?:\d+(?:/\d+)?|[A-Za-zα-ω])")
@@ -175,8 +176,10 @@ class _Scanner:
             return self.after("I", word[1:])
         if word not in _WORDS and not self.words:
             raise NotMath(self.text)
-        space = " " if self.text[self.at : self.at + 1] == " " else ""
-        return self.after(rf"\text{{{word}{space}}}")
+        # TeX drops spaces between symbols; a word before this one ends in its own.
+        before, after = self.text[: self.at - len(word)], self.text[self.at : self.at + 1]
+        first = " " if before.endswith(" ") and not re.search(r"[A-Za-z]{2},? $", before) else ""
+        return self.after(rf"\text{{{first}{word}{' ' if after == ' ' else ''}}}")
 
     def after(self, base: str, index: str = "") -> str:
         """Return a symbol with its accents, index, primes and power."""
@@ -191,6 +194,9 @@ class _Scanner:
                 power, step = power + {"²": "2", "³": "3"}[rest[0]], 1
             elif rest[0] == "*" and re.match(r"\*(?=[^\w(]|$|\()", rest):
                 power, step = power + "*", 1
+            elif rest.startswith("_("):
+                self.at += 1
+                index, step = index + self.inside(), 0
             elif found := _INDEX.match(rest):
                 index, step = index + _index(found[1]), found.end()
             elif rest[0] == "^" and re.match(r"\^(?=['\s),|]|$)", rest):
@@ -379,12 +385,17 @@ def _frame_statements(root: etree.Element) -> None:
             framed.append(etree.Element("div", {"class": "statement"}))
             framed[-1].append(element)
             previous, expected = framed[-1], False
-        elif element.tag == "ol" and previous.get("class") == "statement":
+        elif previous.get("class") == "statement" and _continues(element):
             previous.append(element)
         else:
             framed.append(element)
             previous = element
     root[:] = framed
+
+
+def _continues(element: etree.Element) -> bool:
+    """Tell whether an element belongs to the statement before it."""
+    return element.tag == "ol" or element.get("class") == "formula"
 
 
 def _frame_until_proofs(root: etree.Element) -> None:

@@ -38,6 +38,11 @@ def main() -> None:
             until(lambda: page.evaluate("echelon.promise.state") == "holds", 90.0)
             page.evaluate("echelon.ask('kick', 2)")
             page.wait_for_timeout(900)
+            # A slow machine is drawn coarsely until it rests.
+            page.evaluate("echelon.ask('pause', true)")
+            page.wait_for_timeout(900)
+            page.set_viewport_size({"width": 1281, "height": 720})
+            page.wait_for_timeout(400)
             page.screenshot(path=HERE / "assets" / "live.png")
         session.end()
 

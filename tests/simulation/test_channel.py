@@ -174,7 +174,9 @@ def errors_of(result):
 
 def test_a_run_continues_with_the_messages_that_are_under_way():
     network = ech.Network(rate=50.0, delay=0.03, loss=0.3, messages="state")
-    run = parts(network), chosen(horizon=200 * DT)
+    sensing = ech.Sensing(delay=0.02, noise={"x": 0.1}, estimator="constant-gain")
+    world = ech.World(network=network, sensing=sensing)
+    run = parts(network).replace(world=world), chosen(horizon=200 * DT)
     whole, stretches = ech.simulate(*run), []
 
     def enough(so_far):
@@ -289,3 +291,13 @@ def test_a_leader_without_a_plan_is_carried_on_by_the_model():
     assert drifting("none") > 0.05
     with pytest.raises(EchelonError, match="has no plan; use `packet`"):
         drifting("preview")
+
+
+def test_states_are_not_predicted_by_a_plan_of_stopping_points():
+    parts, settings = ech.build(ech.load_scenario("paper-global", ["simulation.horizon=0.05"]))
+    followers = ech.build(ech.load_scenario("paper"))[0].drive.follower
+    mixed = parts.replace(drive=ech.Laws(parts.drive.leader, followers))
+    radio = ech.Network(prediction="packet")
+    with pytest.raises(SimulationError, match="`Consensus` do not send what the plan .* `packet`"):
+        ech.simulate(mixed.replace(world=ech.World(network=ech.Network())), settings)
+    assert ech.simulate(mixed.replace(world=ech.World(network=radio)), settings).outcome.reached

@@ -77,3 +77,88 @@ def test_messages_that_contain_raw_signals_lag_behind_the_leader():
     """The reason for deviations: what is late of a place is the way since then."""
     raw = flown("paper-global", ech.Network(delay=0.02, messages="state"), ONE_WAY)
     assert worst(raw, 4.0) > 0.05
+
+
+# ---- a flight of one's own -----------------------------------------------------------------------
+
+ROOT, COUPLING, LEAD, SPEED, LEAD_SPEED, DT = 2.0, 4.0, 3.0, 0.6, 0.9, 0.01
+
+
+def saturated(x, speed):
+    return x / np.sqrt(1.0 + (x / speed) ** 2)
+
+
+def path(t):
+    """Where the leader would come to rest on its circle, and how fast that moves."""
+    c, s = np.cos(0.5 * t), np.sin(0.5 * t)
+    place, rate, bend = np.array([c, s]), 0.5 * np.array([-s, c]), -0.25 * np.array([c, s])
+    return place + rate / ROOT, rate + bend / ROOT
+
+
+def decayed(away, age):
+    """The leader's deviation an age later, by many small steps of Runge-Kutta."""
+    h = age / 10
+
+    def slope(x):
+        return -saturated(LEAD * x, LEAD_SPEED)
+
+    for _ in range(10):
+        a = slope(away)
+        b = slope(away + h / 2 * a)
+        c = slope(away + h / 2 * b)
+        away = away + h / 6 * (a + 2 * b + 2 * c + slope(away + h * c))
+    return away
+
+
+def own_flight(x, offsets, stamps, every, forget):
+    """Positions (T, 3, 2) of carts in a row, by plain loops, from the stamps of their messages."""
+    p, v = x[:, :2].copy(), x[:, 2:].copy()
+    posted, packets, flown = {}, [None] * 3, [p.copy()]
+    for k in range(len(stamps)):
+        rest, rate = path(k * DT)
+        stops = p + v / ROOT - offsets
+        deviations, u = [np.zeros(2)] * 3, np.zeros((3, 2))
+        packets[0] = k, stops[0] - rest
+        u[0] = ROOT * (rate - saturated(LEAD * packets[0][1], LEAD_SPEED) - v[0])
+        for i in (1, 2):
+            desired, heard = np.zeros(2), stamps[k][i - 1]
+            if heard >= 0 and (packets[i] is None or posted[heard][i - 1][1][0] > packets[i][0]):
+                packets[i] = posted[heard][i - 1][1]
+            if packets[i] is not None:
+                away = decayed(packets[i][1], (k - packets[i][0]) * DT)
+                deviations[i] = stops[i] - rest - away
+                held = posted[heard][i - 1][0] if k - heard <= forget else 0.0
+                z = deviations[i] - held
+                desired = rate - saturated(LEAD * away, LEAD_SPEED)
+                desired = desired - saturated(COUPLING * z, SPEED)
+            u[i] = ROOT * (desired - v[i])
+        if k % every == 0:
+            posted[k] = list(zip(deviations, packets, strict=True))
+        p, v = p + DT * v + DT**2 / 2 * u, v + DT * u
+        flown.append(p.copy())
+    return np.array(flown)
+
+
+def test_a_lossy_flight_is_that_of_plain_loops():
+    """Shares with the library only which messages arrive when."""
+    cart, graph = ech.models.DoubleIntegrator(), ech.Graph.path(3, directed=True)
+    line = ech.Formation.from_offsets(cart, graph, {1: [1.0, 0.0], 2: [2.0, 0.5]})
+    circle = ech.references.Circle(radius=1.0, rate=0.5)
+    shared = {"roots": (ROOT,), "observer": False}
+    leader = ech.laws.StoppingLeader(reference=circle, coupling=LEAD, speed=LEAD_SPEED, **shared)
+    follower = ech.laws.StoppingPoint(coupling=COUPLING, speed=SPEED, **shared)
+    radio = ech.Network(rate=20.0, delay=0.03, jitter=0.06, loss=0.6, forget=0.4)
+    parts = ech.Parts(
+        *(cart, graph, line, ech.Laws(leader, follower), {"position": 1.0}),
+        start_error={"x": 0.8, "y": -0.5},
+        world=ech.World(network=radio),
+    )
+    result = ech.simulate(parts, ech.Settings(horizon=8.0, dt=DT, engine="jax", seed=2))
+    ages = result.traffic.ages[:-1, :, 1]
+    steps = np.arange(len(ages))[:, None]
+    stamps = np.where(np.isnan(ages), -1, steps - np.rint(np.nan_to_num(ages) / DT)).astype(int)
+    offsets = line.offsets[:, :2]
+    flown = own_flight(result.states[0], offsets, stamps.tolist(), 5, 40)
+    # Losses matter: somebody is forgotten, and the flight is not the ideal one.
+    assert (ages > 0.4).any() and result.traffic.lost > 100
+    np.testing.assert_allclose(flown, result.states[:, :, :2], atol=1e-7)

@@ -279,7 +279,7 @@ class Law(eqx.Module):
         u: Input,
         time: Scalar,
     ) -> Float[jax.Array, " s"]:
-        """Return the signal of a leader without a plan, a time (s) after its last message.
+        """Return the signal of a leader a time (s) after its last message, by a follower's law.
 
         Unless replaced, a state moves on by the model under the same input, and a signal stays.
 

@@ -64,14 +64,9 @@ def over_time(
         narrow_start: whether a narrow page has the start.
         alike: whether the start has the value axis of the whole.
     """
-    whole, start = np.arange(len(run.times)), np.flatnonzero(run.times <= start_of(run))
-    narrow, long = draw.page().narrow, run.times[-1] > 2.0 * start_of(run) and len(start) > 2
-    parts = [start, whole] if long and not narrow and draw.target() is None else [whole]
-    if long and narrow and narrow_start:
-        parts = [start]
+    parts, narrow = _parts(run, narrow_start), draw.page().narrow
     height *= draw.page().letters / 10.0 if narrow else 1.0
-    least = 2.3 if narrow else 3.2
-    size = float(np.clip(height * len(shows), least, draw.HIGHEST))
+    size = float(np.clip(height * len(shows), 2.3 if narrow else 3.2, draw.HIGHEST))
     share = "row" if alike else False
     figure, axes = draw.sheet(size, len(shows), len(parts), sharex="col", sharey=share)
     for show, row in zip(shows, axes, strict=True):
@@ -81,6 +76,16 @@ def over_time(
     for part, ax in zip(parts, axes[-1], strict=True):
         _label_time(ax, run, part)
     return figure, axes
+
+
+def _parts(run: Recording, narrow_start: bool) -> list[Int[np.ndarray, " F"]]:
+    """Return the frames of each column."""
+    whole, start = np.arange(len(run.times)), np.flatnonzero(run.times <= start_of(run))
+    if run.times[-1] <= 2.0 * start_of(run) or len(start) < 3 or draw.target() is not None:
+        return [whole]
+    if draw.page().narrow:
+        return [start] if narrow_start else [whole]
+    return [start, whole]
 
 
 def _label_time(ax: "Axes", run: Recording, part: Int[np.ndarray, " F"]) -> None:

@@ -264,7 +264,7 @@ def _carried(
     # Nobody knows where a leader is that was not heard for long: its motion slows down.
     late = jnp.maximum(age - _CARRIED_FULLY, 0.0)
     time = age - late + (1.0 - jnp.exp(-_SLOWING * late)) / _SLOWING
-    return loop.leader.carried(loop.model, signal, feedforward, u, time), feedforward
+    return loop.follower.carried(loop.model, signal, feedforward, u, time), feedforward
 
 
 def _expected(
