@@ -123,10 +123,8 @@ def own_delay_line(case: OwnCase) -> Statement | None:
         return None
     name, kind = Hypothesis.OWN_STATE, Kind.LINEARIZATION
     if case.heard is not None and len(case.own) > _MANY:
-        text = (
-            f"no margin is known where agents hear each other with more than {_MANY - 1} sums of "
-        )
-        return unneeded(name, kind, f"{text}weights")
+        text = "no margin is known of agents that hear each other with many sums of weights"
+        return unneeded(name, kind, text)
     step = late_step(case.problem, case.law, lag)
     text = f"own state {1e3 * delay * dt:.3g} ms late, " * bool(delay)
     estimated = world.sensing is not None and world.sensing.estimator is not Estimation.NONE
@@ -140,7 +138,8 @@ def own_delay_line(case: OwnCase) -> Statement | None:
     if most >= delay:
         text += f"the linearized loop decays with own states up to {shown} late"
         return holds(name, kind, text, *number)
-    text += "the linearized loop is not known to decay"
+    decays = "does not decay" if case.heard is None else "is not known to decay"
+    text += f"the linearized loop {decays}"
     if most >= 0:
         text += f", but with own states {'that are current' if not most else f'up to {shown} late'}"
     remedy = "lower `coupling` or `roots`"
