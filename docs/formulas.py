@@ -57,7 +57,7 @@ _FUNCTIONS = {
 }
 _FUNCTIONS |= {"arg", "Re", "Im", "sign"}
 _WORDS = {"roll", "pitch", "yaw", "edge", "hover", "noise", "wind", "mean", "edges", "followers"}
-_WORDS |= {"free", "model"}
+_WORDS |= {"free", "model", "reach"}
 _ASCII = {"lambda": r"\lambda ", "rho": r"\rho ", "alpha": r"\alpha "}
 _DIFFERENTIALS = {"dx", "dt", "df", "dg", "dz", "dm", "dy", "ds"}
 _WORD = re.compile(r"[A-Za-z]{2,}")
@@ -176,8 +176,10 @@ class _Scanner:
             return self.after("I", word[1:])
         if word not in _WORDS and not self.words:
             raise NotMath(self.text)
-        space = " " if self.text[self.at : self.at + 1] == " " else ""
-        return self.after(rf"\text{{{word}{space}}}")
+        # TeX drops spaces between symbols; a word before this one ends in its own.
+        before, after = self.text[: self.at - len(word)], self.text[self.at : self.at + 1]
+        first = " " if before.endswith(" ") and not re.search(r"[A-Za-z]{2},? $", before) else ""
+        return self.after(rf"\text{{{first}{word}{' ' if after == ' ' else ''}}}")
 
     def after(self, base: str, index: str = "") -> str:
         """Return a symbol with its accents, index, primes and power."""
@@ -192,6 +194,9 @@ class _Scanner:
                 power, step = power + {"²": "2", "³": "3"}[rest[0]], 1
             elif rest[0] == "*" and re.match(r"\*(?=[^\w(]|$|\()", rest):
                 power, step = power + "*", 1
+            elif rest.startswith("_("):
+                self.at += 1
+                index, step = index + self.inside(), 0
             elif found := _INDEX.match(rest):
                 index, step = index + _index(found[1]), found.end()
             elif rest[0] == "^" and re.match(r"\^(?=['\s),|]|$)", rest):

@@ -193,6 +193,20 @@ def test_a_run_folder_contains_the_file_of_its_path(tmp_path, echelon):
     assert (at(again, [0.7, 3.0]) == before).all()
 
 
+@pytest.mark.slow
+def test_verify_computes_the_guarantee_from_the_path_in_the_folder(tmp_path, echelon):
+    write_points(tmp_path)
+    # The guarantee of a linear agent does not depend on its leader's path.
+    planar = {"name": "planar-quadrotor"}
+    file = written(tmp_path, model=planar, simulation={"horizon": 2.0, "dt": 0.01})
+    assert echelon("run", file, "--out", tmp_path / "run", "--no-figures")[0] == 0
+    assert echelon("verify", tmp_path / "run")[0] == 0
+    path = tmp_path / "run" / "inputs" / "path.csv"
+    path.write_text(path.read_text("utf-8").replace("-0.5", "-0.9"), "utf-8")
+    code, said, _ = echelon("verify", tmp_path / "run")
+    assert code == 1 and "Refused" in said
+
+
 def test_the_command_writes_the_leaders_path_and_a_followers_goal(tmp_path, echelon):
     write_points(tmp_path)
     file, out = written(tmp_path), tmp_path / "leader.csv"

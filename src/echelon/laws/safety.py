@@ -126,7 +126,6 @@ class Safety:
         Returns:
             The rate (d,), and how many rows act on it.
         """
-        # Of who is not known nothing is a number.
         corners = jnp.where(near.known[:, None, None], near.gaps, 0.0) * scales[None, None]
         nearest = nearest_point(corners)
         far = jnp.sqrt((nearest * nearest).sum(axis=1))
@@ -138,7 +137,7 @@ class Safety:
         short = jnp.where(used, low - normals @ (rate * scales), 0.0)
         u = rate * scales + self._aside(normals, short)
         u = _shrunk(_projected(u, normals, low, used), normals, low, used) / scales
-        # What is shrunk towards 0 still meets all rows that 0 meets.
+        # Less of it still meets all rows that 0 meets.
         u = u * (speeds / jnp.maximum(jnp.abs(u), speeds)).min()
         active = (short > 0.0).sum()
         return jnp.where(active > 0, u, rate), active.astype(rate.dtype)

@@ -34,8 +34,7 @@ def check_numbers(
     Raises:
         LawError: it cannot; the text says what is in the way.
     """
-    safety = law.safety
-    assert safety is not None
+    assert law.safety is not None
     if len(graph.leaders) > 1:
         raise LawError(
             f"`safety` needs one leader, relative to which all move, and got {len(graph.leaders)}."
@@ -45,12 +44,18 @@ def check_numbers(
             f"`safety` compares all pairs of agents, of which {_MOST_AGENTS} are allowed, and got "
             f"{graph.agents}."
         )
-    share = safety.gain * period
-    if share > 1.0 + _ROUNDING:
+    if law.safety.gain * period > 1.0 + _ROUNDING:
         raise LawError(
-            f"`gain` of `safety` is {safety.gain:g} 1/s, and must be at most one over the step, "
-            f"{1.0 / period:g} 1/s."
+            f"`gain` of `safety` is {law.safety.gain:g} 1/s, and must be at most one over the "
+            f"step, {1.0 / period:g} 1/s."
         )
+    _check_space(law.safety, law, model, offsets)
+
+
+def _check_space(
+    safety: Safety, law: FlatLaw, model: ControlAffine, offsets: Float[Array, "N n"]
+) -> None:
+    """Check that agents regard each other in time, and have goals that are apart."""
     scales = safety.scales(model)
     least = safety.needed_reach(np.array([law.speed_of(k) for k in law.places(model)]), scales)
     if safety.reach < least:

@@ -1,5 +1,7 @@
 """Matrices of a linear system in a MATLAB file."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from echelon.core.errors import ModelError, listing
@@ -14,19 +16,7 @@ def read_matrices(file: PathLike) -> dict[str, Array]:
     Raises:
         ModelError: the file cannot be read, or lacks A or B.
     """
-    # Imported here: few models are in files, and SciPy's readers load slowly.
-    from scipy.io import loadmat
-
-    try:
-        content = loadmat(str(file), appendmat=False)
-    except NotImplementedError:
-        raise ModelError(
-            f"`{file}` is a MATLAB file of version 7.3; save it with `save(..., '-v7')`."
-        ) from None
-    except OSError as error:
-        raise ModelError(f"`{file}` cannot be read: {error.strerror or error}.") from None
-    except Exception as error:  # SciPy raises whatever a damaged file causes
-        raise ModelError(f"`{file}` is not a MATLAB file that can be read: {error}.") from None
+    content = _content(file)
     names = [name for name in content if not name.startswith("__")]
     missing = [name for name in ("A", "B") if name not in names]
     if missing:
@@ -36,6 +26,23 @@ def read_matrices(file: PathLike) -> dict[str, Array]:
             "`save('plant.mat', 'A', 'B', 'C', 'D')`."
         )
     return {name: _dense(content[name]) for name in _NAMES if name in names}
+
+
+def _content(file: PathLike) -> Mapping[str, object]:
+    """Return all that a MATLAB file holds, by name."""
+    # Imported here: few models are in files, and SciPy's readers load slowly.
+    from scipy.io import loadmat
+
+    try:
+        return loadmat(str(file), appendmat=False)
+    except NotImplementedError:
+        raise ModelError(
+            f"`{file}` is a MATLAB file of version 7.3; save it with `save(..., '-v7')`."
+        ) from None
+    except OSError as error:
+        raise ModelError(f"`{file}` cannot be read: {error.strerror or error}.") from None
+    except Exception as error:  # SciPy raises whatever a damaged file causes
+        raise ModelError(f"`{file}` is not a MATLAB file that can be read: {error}.") from None
 
 
 def _dense(value: object) -> Array:

@@ -12,7 +12,7 @@ from echelon.agents.references.path_file import read_columns
 from echelon.agents.references.polynomial_path import PolynomialPath
 from echelon.agents.references.reference import COORDINATES, Reference, numbers_of
 from echelon.core.compiled import cached_jit
-from echelon.core.errors import ReferenceError
+from echelon.core.errors import ReferenceError, check_kind
 from echelon.core.numerics import precision
 from echelon.core.types import Array, PathLike
 
@@ -95,6 +95,7 @@ class Polynomials(PolynomialPath):
         Raises:
             ReferenceError: the path is too long or not smooth enough for 4096 pieces.
         """
+        check_kind("path", path, Reference, ReferenceError)
         if isinstance(path, PolynomialPath):
             return _of_polynomials(path)
         count = math.ceil(horizon / _LONG)

@@ -1,13 +1,16 @@
 """`echelon check`: what is guaranteed of a scenario, and the paper's claims about it."""
 
 import json
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from echelon.apps.cli import tables
 from echelon.apps.cli.options import JsonOption, ScenarioArgument, SetOption
 from echelon.apps.cli.status import STATUS
+
+if TYPE_CHECKING:
+    from echelon.experiments.studies.check import CheckResult
 
 
 def check(
@@ -26,13 +29,19 @@ def check(
     # Not above: an error in the file is reported without the wait for JAX.
     from echelon.experiments.scenario.build import build
     from echelon.experiments.studies.check import check as examine
+
+    checked = examine(*build(loaded))
+    if as_json:
+        print(json.dumps(checked.as_mapping(), indent=2))
+    else:
+        _print(checked, every)
+    raise typer.Exit(0 if checked.promised else 1)
+
+
+def _print(result: "CheckResult", every: bool) -> None:
     from echelon.output.reports.check_report import check_report, grouped
 
-    assumptions = examine(*build(loaded))
-    if as_json:
-        print(json.dumps(assumptions.as_mapping(), indent=2))
-    elif every:
-        tables.print_statements(grouped(assumptions.lines), assumptions.promise.sentence())
+    if every:
+        tables.print_statements(grouped(result.lines), result.promise.sentence())
     else:
-        print(check_report(assumptions))
-    raise typer.Exit(0 if assumptions.promised else 1)
+        print(check_report(result))

@@ -59,7 +59,7 @@ def sweep(
 
     if resume is None:
         plan, batches, job = _new_sweep(
-            str(scenario), over or [], set_ or [], out, force, keep_states
+            str(scenario), over or [], set_ or [], out, force, keep_states, as_json
         )
     else:
         plan, batches, job = _unfinished_sweep(resume)
@@ -77,6 +77,7 @@ def _new_sweep(
     out: Path | None,
     force: bool,
     keep_states: int | None,
+    quiet: bool,
 ) -> "tuple[Sweep, Batches, Job]":
     """Return a sweep and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
@@ -84,7 +85,7 @@ def _new_sweep(
 
     axes = read_axes(over)
     scenario = load_scenario(name, changes)
-    STATUS.begin(f"preparing {scenario.name}", log=False)
+    STATUS.begin(f"preparing {scenario.name}", not quiet)
     from echelon.experiments.sweeps.plan import Sweep
     from echelon.output.archive.folder import BATCHES, claim_folder
     from echelon.output.archive.sweep_folder import Batches

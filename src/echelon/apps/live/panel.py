@@ -96,6 +96,10 @@ class Panel:
                 f"there is no control `{name}`{did_you_mean(name, self.ranges)}; this scenario has "
                 f"{listing(self.ranges)}."
             )
+        return self._moved(knobs, name, value)
+
+    def _moved(self, knobs: Knobs, name: str, value: Any) -> Knobs:
+        """Return the knobs with another number for one of them, clamped to its range."""
         if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
             raise SimulationError(f"`{name}` got `{value}`, and must be a number.")
         gain = self.live.unweighted_gain(knobs)

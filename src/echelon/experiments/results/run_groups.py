@@ -18,6 +18,7 @@ _GROUPS = {
     "input_weight": {"input", "input_column"},
     "limits": {"limit", "input"},
     "modes": {"mode", "pole"},
+    "avoidance": {"slice"},
 }
 
 

@@ -15,11 +15,11 @@ from jaxtyping import Float
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
 from echelon.experiments.results.agent_metrics import FollowerMetrics, Metrics
-from echelon.experiments.results.avoidance import Avoidance, avoidance
 from echelon.experiments.results.quantity import ERROR, Quantity, Shown, quantities
 
 if TYPE_CHECKING:
     from echelon.core.types import JsonObject
+    from echelon.experiments.results.avoidance import Avoidance
     from echelon.guarantees.promises.promise import Promise
     from echelon.simulation.engine.result import Result
 
@@ -80,8 +80,11 @@ class RunNumbers:
         return None if self.result.traffic is None else getattr(self.result.traffic, name)
 
     @functools.cached_property
-    def avoidance(self) -> Avoidance | None:
+    def avoidance(self) -> "Avoidance | None":
         """How agents kept apart; None where they do not."""
+        # Not above: `echelon explain` needs the table below at once, and not what computes it.
+        from echelon.experiments.results.avoidance import avoidance
+
         return avoidance(self.result)
 
     @functools.cached_property

@@ -89,7 +89,7 @@ def formation(run: Recording) -> "Figure":
     def show(ax: "Axes", frames: Array) -> None:
         times, values = run.times[frames], above(errors[frames], floor)
         if many:
-            bands(ax, times, values)
+            bands(ax, times, errors[frames], floor=floor)
             _worst(ax, run, times, errors, frames, floor)
         for agent, line in zip(() if many else followers, values.T):
             zero = draw.above_zero(errors[frames, followers.index(agent)])
@@ -337,7 +337,7 @@ def _edges(ax: "Axes", run: Recording, times: Array, apart: Array, desired: Arra
     if len(run.edges) > draw.NAMED:
         errors = np.abs(apart - desired)
         floor = error_rounding(run)
-        bands(ax, times, above(errors, floor), "link")
+        bands(ax, times, errors, "link", floor)
         ax.set_ylabel("distance error (m)")
         draw.logarithmic(ax, errors)
         shade_rounding(ax, floor, errors)

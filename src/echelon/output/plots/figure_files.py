@@ -63,10 +63,9 @@ def save(
     for name, figure in figures.items():
         for kind in kinds:
             path, metadata = folder / f"{name}.{kind}", dates.get(kind)
+            look: dict[str, Any] = {"format": kind, "dpi": dpi, "metadata": metadata}
             with style():
-                make_atomic(
-                    path, lambda part: figure.savefig(part, format=kind, dpi=dpi, metadata=metadata)
-                )
+                make_atomic(path, lambda part: figure.savefig(part, **look))
             paths.append(path)
             progress(len(paths), len(figures) * len(kinds))
     return paths

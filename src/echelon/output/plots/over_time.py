@@ -64,14 +64,9 @@ def over_time(
         narrow_start: whether a narrow page has the start.
         alike: whether the start has the value axis of the whole.
     """
-    whole, start = np.arange(len(run.times)), np.flatnonzero(run.times <= start_of(run))
-    narrow, long = draw.page().narrow, run.times[-1] > 2.0 * start_of(run) and len(start) > 2
-    parts = [start, whole] if long and not narrow and draw.target() is None else [whole]
-    if long and narrow and narrow_start:
-        parts = [start]
+    parts, narrow = _parts(run, narrow_start), draw.page().narrow
     height *= draw.page().letters / 10.0 if narrow else 1.0
-    least = 2.3 if narrow else 3.2
-    size = float(np.clip(height * len(shows), least, draw.HIGHEST))
+    size = float(np.clip(height * len(shows), 2.3 if narrow else 3.2, draw.HIGHEST))
     share = "row" if alike else False
     figure, axes = draw.sheet(size, len(shows), len(parts), sharex="col", sharey=share)
     for show, row in zip(shows, axes, strict=True):
@@ -81,6 +76,16 @@ def over_time(
     for part, ax in zip(parts, axes[-1], strict=True):
         _label_time(ax, run, part)
     return figure, axes
+
+
+def _parts(run: Recording, narrow_start: bool) -> list[Int[np.ndarray, " F"]]:
+    """Return the frames of each column."""
+    whole, start = np.arange(len(run.times)), np.flatnonzero(run.times <= start_of(run))
+    if run.times[-1] <= 2.0 * start_of(run) or len(start) < 3 or draw.target() is not None:
+        return [whole]
+    if draw.page().narrow:
+        return [start] if narrow_start else [whole]
+    return [start, whole]
 
 
 def _label_time(ax: "Axes", run: Recording, part: Int[np.ndarray, " F"]) -> None:
@@ -144,13 +149,18 @@ def above(values: Array, floor: float) -> Array:
     return np.where(values >= floor, draw.above_zero(values), np.nan)
 
 
-def bands(ax: "Axes", times: Array, values: Array, of: str = "follower") -> None:
-    """Draw quantiles of values (T, N) and the median."""
+def bands(
+    ax: "Axes", times: Array, values: Array, of: str = "follower", floor: float | None = None
+) -> None:
+    """Draw quantiles of values (T, N) and the median, cut off where they are rounding."""
     with np.errstate(invalid="ignore"):
         # At times at which all values are 0 there is nothing to draw, and no warning.
         some = np.isfinite(values).any(axis=1)
         ends = np.full((5, len(times)), np.nan)
         ends[:, some] = np.nanpercentile(values[some], [5, 25, 50, 75, 95], axis=1)
+    if floor is not None:
+        # Of all values: without those below it the quantiles of the others would be higher.
+        ends[:2], ends[2:] = np.maximum(ends[:2], floor), above(ends[2:], floor)
     look = {"color": draw.COLOURS[0], "linewidth": 0.0, "zorder": 1.5}
     ax.fill_between(times, ends[0], ends[4], alpha=0.18, label="5 to 95 %", **look)
     ax.fill_between(times, ends[1], ends[3], alpha=0.35, label="25 to 75 %", **look)

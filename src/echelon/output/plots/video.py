@@ -260,37 +260,44 @@ def _nice(value: float) -> float:
 
 
 def _curves(figure: Any, run: Recording, ends: Array) -> list[Any]:
-    """Draw the formation error and the inputs, and return their cursors."""
+    """Draw the formation error and the inputs between two times, and return their cursors."""
     left = (_SCENE + 62) / _WIDTH
     errors = figure.add_axes((left, 0.58, 0.985 - left, 0.34), facecolor="none")
     inputs = figure.add_axes((left, 0.1, 0.985 - left, 0.34), facecolor="none")
     within = np.flatnonzero((run.times >= ends[0]) & (run.times <= ends[1]))
-    keep, followers = within[draw.thin(len(within))], list(run.followers)
-    floor, errors_now = error_rounding(run), run.goal_distances(keep)[:, followers]
-    values = above(errors_now, floor)
-    if run.agents > draw.NAMED:
-        lines = {"worst": values.max(axis=1), "median": np.median(values, axis=1)}
-        for name, colour in (("worst", 1), ("median", 0)):
-            errors.plot(run.times[keep], lines[name], color=draw.COLOURS[colour], label=name)
-        errors.legend(loc="upper right", fontsize=8)
-    else:
-        for agent, line in zip(followers, values.T, strict=True):
-            errors.plot(run.times[keep], line, **pen_of(run, agent))
-    draw.logarithmic(errors, errors_now)
-    shade_rounding(errors, floor, errors_now)
-    errors.set_title(draw.label("formation error", run.length_unit), size=9, loc="left")
-    loads = run.loads
-    sizes = (
-        np.abs(run.inputs).max(axis=1)[keep] if loads is None else 100.0 * loads.max(axis=2)[keep]
-    )
-    inputs.plot(run.times[keep], sizes if loads is None else sizes.max(axis=1), color=draw.LEADER)
-    inputs.set_title(
-        "largest input" if loads is None else "largest input, % of limit", size=9, loc="left"
-    )
-    inputs.set_xlabel("time (s)", size=9)
+    keep = within[draw.thin(len(within))]
+    _draw_errors(errors, run, keep)
+    _draw_inputs(inputs, run, keep)
     for ax in (errors, inputs):
         ax.tick_params(labelsize=8)
         ax.set_xlim(*ends)
-    return [
-        ax.axvline(run.times[0], color=draw.COLOURS[0], linewidth=1.4) for ax in (errors, inputs)
-    ]
+    return [ax.axvline(ends[0], color=draw.COLOURS[0], linewidth=1.4) for ax in (errors, inputs)]
+
+
+def _draw_errors(ax: "Axes", run: Recording, keep: Array) -> None:
+    """Draw the formation errors, or the worst and the median of a large swarm."""
+    followers, floor = list(run.followers), error_rounding(run)
+    errors = run.goal_distances(keep)[:, followers]
+    if run.agents > draw.NAMED:
+        lines = {"worst": errors.max(axis=1), "median": np.median(errors, axis=1)}
+        for name, colour in (("worst", 1), ("median", 0)):
+            line = above(lines[name], floor)
+            ax.plot(run.times[keep], line, color=draw.COLOURS[colour], label=name)
+        ax.legend(loc="upper right", fontsize=8)
+    else:
+        for agent, line in zip(followers, above(errors, floor).T, strict=True):
+            ax.plot(run.times[keep], line, **pen_of(run, agent))
+    draw.logarithmic(ax, errors)
+    shade_rounding(ax, floor, errors)
+    ax.set_title(draw.label("formation error", run.length_unit), size=9, loc="left")
+
+
+def _draw_inputs(ax: "Axes", run: Recording, keep: Array) -> None:
+    """Draw the largest load, or each input's largest value without limits."""
+    loads, title = run.loads, "largest input"
+    sizes = np.abs(run.inputs).max(axis=1)[keep]
+    if loads is not None:
+        sizes, title = 100.0 * loads.max(axis=(1, 2))[keep], "largest input, % of limit"
+    ax.plot(run.times[keep], sizes, color=draw.LEADER)
+    ax.set_title(title, size=9, loc="left")
+    ax.set_xlabel("time (s)", size=9)
