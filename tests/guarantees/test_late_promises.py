@@ -353,7 +353,7 @@ def test_beyond_the_margin_a_run_swings_and_is_warned_of():
         result = ech.simulate(parts, SETTINGS)
         swung = np.abs(stops(result, guarantee)[-200:]).max()
         assert (swung > 0.1) == (more > 0)
-        assert ("Note: own state" in guarantee.sentence()) == (more > 0)
+        assert ("the linearized loop does not decay" in guarantee.sentence()) == (more > 0)
 
 
 # ---- verification --------------------------------------------------------------------------------
