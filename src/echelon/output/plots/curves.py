@@ -294,8 +294,11 @@ def ages(run: Recording) -> "Figure | None":
         look = {"color": "0.5", "linewidth": 0.8, "linestyle": ":", "zorder": 1}
         ax.axhline(messages.forget, label="not used beyond", **look)
         ax.set_ylabel(draw.label("age of the oldest message", "s"))
-        ax.set_ylim(bottom=0.0)
+        ax.set_ylim(0.0, 1.05 * top)
 
+    known = np.nan_to_num(messages.agents[:, followers])
+    # Of the whole run: the panels of its start and of all of it have one axis.
+    top = max(messages.forget, float(known.max(initial=0.0)))
     figure, ((*_, last),) = over_time(run, [show], 2.6, len(followers))
     return draw.finish(figure, legends=[last])
 
