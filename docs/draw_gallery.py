@@ -42,6 +42,13 @@ RUNS: dict[str, dict[str, Any]] = {
         "video": ("flock", 4.0),
     },
     "oscillators.yaml": {"figures": {"trajectories": "phase"}, "video": ("oscillators", 2.5)},
+    "carts.yaml": {
+        "set": (
+            "network={rate: 20, delay: 0.05, jitter: 0.05, bursts: {share: 0.2, length: 0.3}}",
+            "simulation={horizon: 8, dt: 0.01}",
+        ),
+        "figures": {"ages": "ages"},
+    },
     "ring.yaml": {"figures": {"formation": "van_der_pol", "lyapunov": "lyapunov"}},
     "blimps.yaml": {
         "set": ("simulation.horizon=30",),

@@ -19,7 +19,14 @@ from echelon.experiments.results.dataset import recording_of
 from echelon.output.plots.space import space_of
 from echelon.output.viewer.growing import Growing, serve_growing
 from echelon.output.viewer.pack import Group, pack
-from echelon.output.viewer.replay import frames_of, header, promise_badge, replay_data, replay_page
+from echelon.output.viewer.replay import (
+    frames_of,
+    header,
+    link_shades,
+    promise_badge,
+    replay_data,
+    replay_page,
+)
 from echelon.output.viewer.serve import Handler, serve, serving
 
 
@@ -718,3 +725,13 @@ def test_the_badge_says_which_rate_it_has_and_is_not_green_over_a_run_that_was_l
         ended = dict(run.attributes) | {"outcome": outcome, "message": "It ended so."}
         drawn = dataclasses.replace(run, promise=promise, attributes=ended)
         assert header(drawn, space_of(run))["promise"]["state"] == state
+
+
+def test_links_fade_with_age_and_flash_for_a_lost_message():
+    heard = np.array([[False, True], [True, True], [False, False]])
+    ages = np.array([[np.nan, 0.1], [0.3, 0.2], [np.nan, np.nan]])
+    lost = np.zeros((3, 2), int)
+    assert link_shades(ages, lost, 0.4, heard) == pytest.approx([0.75, 0.25, 1.0])
+    # The older of two, none yet, and nobody who hears.
+    ages[1, 0], lost[0, 1] = np.nan, 2
+    assert link_shades(ages, lost, 0.4, heard).tolist() == [2.0, 0.0, 1.0]

@@ -56,6 +56,10 @@ CASES = {
     "a sum of nothing": (lambda x: jnp.sum(x[2:])[None], ["0"]),
     "whole numbers": (lambda x: x[jnp.argsort(jnp.array([3, 1]))], ["2/7", "1/3"]),
     "a matrix of whole numbers": (lambda x: jnp.array([[1, 2], [0, -3]]) @ x, ["19/21", "-6/7"]),
+    "a number outside": (
+        lambda x: x.at[jnp.array([9, 1])].get(mode="fill", fill_value=0.0),
+        ["0", "2/7"],
+    ),
     "a cumulative sum": (lambda x: jnp.cumsum(x), ["1/3", "13/21"]),
 }
 

@@ -156,7 +156,7 @@ MASS, ARM = Quadrotor().airframe.mass, Quadrotor().airframe.arm
         (body(arm=0.9 * ARM), "is not of its motion"),
         (body(gravity=9.0), "is not of its motion"),
         (body(motor_thrust=1.0), "has motors of 0 to 1 N, `input_limits` have others"),
-        (Dragged(), "is not of its motion"),
+        pytest.param(Dragged(), "is not of its motion", marks=pytest.mark.slow),
     ],
 )
 def test_an_airframe_has_the_motors_that_the_equations_ask_for(model, fault):

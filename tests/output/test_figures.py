@@ -179,6 +179,17 @@ def test_a_flock_is_bands_a_median_and_its_worst_by_name(flock):
     assert f"worst: follower {worst}" in lines
 
 
+def test_quantiles_of_a_flock_count_those_whose_errors_are_rounding(flock):
+    errors = np.zeros_like(flock.errors)
+    # Two thirds of the followers are at rounding from half of the run on.
+    errors[:, list(flock.followers), 0] = 1.0
+    exact = list(flock.followers)[::3] + list(flock.followers)[1::3]
+    errors[np.ix_(flock.times >= 1.0, exact, [0])] = 1e-18
+    lines = lines_of(figures(with_errors(flock, errors), ["formation"])["formation"])
+    median = lines["median follower"][:, 1]
+    assert (median[flock.times < 1.0] == 1.0).all() and np.isnan(median[flock.times >= 1.0]).all()
+
+
 def test_the_worst_of_a_flock_is_that_of_the_steady_window_as_in_the_table(flock):
     errors = np.zeros_like(flock.errors)
     errors[:, 7, 0] = np.where(flock.times < 0.8 * flock.horizon - 1e-9, 9.0, 0.1)

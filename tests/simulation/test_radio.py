@@ -58,6 +58,30 @@ def test_stopping_points_agree_over_bad_networks(case, seed):
     assert result.outcome.reached and worst(result, 4.0) < bound
 
 
+MASS = [f"{k}: {{scale: {{mass: {mass}}}}}" for k, mass in enumerate((0.9, 1.2, 0.8, 1.1))]
+MASSES = f"plant={{agents: {{{', '.join(MASS)}}}}}"
+SCALE = [f"{role}.observer={{push: 8, scale: 2}}" for role in ("leader", "follower")]
+HELD = ["simulation.dt=0.01", "simulation.substeps=2", "simulation.store_every=5"]
+WORLDS = {
+    "lag 30 ms": (["actuator={lag: 0.03}"], 1e-5),
+    "lag 50 ms": (["actuator={lag: 0.05}"], 1e-5),
+    "lag 30 ms, held at 100 Hz": (["actuator={lag: 0.03}", *HELD], 1e-5),
+    "lag 30 ms, messages 300 ms late": (["actuator={lag: 0.03}", "network={delay: 0.3}"], 2e-3),
+    "motors of 8 bits": (["actuator={levels: 256}"], 5e-3),
+    "unlike masses": ([MASSES, *SCALE], 1e-3),
+}
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("case", WORLDS)
+@pytest.mark.parametrize("seed", range(8))
+def test_formations_stand_plants_that_are_not_ideal(case, seed):
+    overrides, bound = WORLDS[case]
+    window = ["simulation.horizon=15", "report.steady_window=4", f"seed={seed}"]
+    parts, settings = ech.build(ech.load_scenario("paper-global", [ONE_WAY, *window, *overrides]))
+    assert ech.metrics(ech.simulate(parts, settings)).worst_steady < bound
+
+
 @pytest.mark.study
 @pytest.mark.parametrize("seed", range(8))
 def test_formations_stand_with_everything_at_once(seed):

@@ -136,7 +136,7 @@ def apply(equation: JaxprEqn, operands: list[np.ndarray], algebra: Algebra) -> l
     if name in PLACED | ADDED and (_is_open(equation, operands) or has_function(equation)):
         return algebra.unknown(equation, operands)
     if name in PLACED:
-        return _place(equation, operands, algebra.outside)
+        return _place(equation, operands, algebra)
     if name in ADDED:
         return [_add(equation, operands, algebra.constant)]
     # JAX lets it multiply whole numbers and others, where they are indices everywhere else.
@@ -233,14 +233,20 @@ _COMPUTED = BoundedCache[list[np.ndarray]](256, lambda of: sum(a.nbytes for a in
 
 
 def _place(
-    equation: JaxprEqn, operands: Sequence[np.ndarray], outside: Callable[[], Entry]
+    equation: JaxprEqn, operands: Sequence[np.ndarray], algebra: Algebra
 ) -> list[np.ndarray]:
     """Return the results of a primitive that copies entries: JAX moves their places about."""
     pool, places = _label_entries(operands)
+    value = equation.params.get("fill_value")
+    fill = math.nan if value is None else float(value)
+    if value is not None:
+        # What `gather` reads from outside: a number, which would be taken for a place.
+        equation = equation.replace(params={**equation.params, "fill_value": -1.0})
 
     def entry(place: float) -> Entry:
-        # `gather` fills what it reads from outside with NaN, which no comparison holds for.
-        return pool[int(place)] if 0.0 <= place < len(pool) else outside()
+        if 0.0 <= place < len(pool):
+            return pool[int(place)]
+        return algebra.outside() if math.isnan(fill) else algebra.constant(fill)
 
     return [map_entries(entry, r) for r in compute(equation, places)]
 

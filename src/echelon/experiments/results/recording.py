@@ -323,9 +323,10 @@ def _modes(values: Mapping[str, np.ndarray]) -> LoopPoles | None:
 def _avoidance(values: Mapping[str, np.ndarray]) -> Avoidance | None:
     if "scaled_distance" not in values:
         return None
-    names = "slice_start", "scaled_distance", "active_rows"
     limits = (float(values[name]) for name in ("touching_distance", "kept_distance"))
-    return Avoidance(*(values[name] for name in names), *limits)
+    return Avoidance(
+        values["slice_start"], values["scaled_distance"], values["active_rows"], *limits
+    )
 
 
 def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:

@@ -15,7 +15,10 @@ from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 from echelon.guarantees.messages.late_agreement import LateRate, late_rates, longest_ways
 from echelon.guarantees.messages.message_ages import MessageAges, ages_of
 
-_DIRECTED = "With `graph.directed: true` messages of any age would cost a delay alone"
+_ONE_WAY = (
+    "With one-way edges, or `follower.hears: leaderward`, messages of any age would cost a delay "
+    "alone"
+)
 OFF_PLAN = 0.01
 """Of a leader's speed against its plan, in units of an output per second, for an example."""
 
@@ -148,7 +151,7 @@ class LateMessages(NamedTuple):
             text += f", and from these starts all stay within 1 cm after {arrival:.3g} s"
         # Without ages agreement is at least as fast as c / max w.
         slow = self.ways is None and 2.0 * self.rate < self.coupling / self.spread
-        return f"{text}. {_DIRECTED}" if slow else text
+        return f"{text}. {_ONE_WAY}" if slow else text
 
 
 def late_messages_of(

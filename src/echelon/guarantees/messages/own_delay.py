@@ -30,6 +30,8 @@ from echelon.simulation.step.motion import Motion
 
 _MOST, _LARGEST = 1.0, 1000
 """Delays that are looked at, s, and matrices for them."""
+_MANY = 13
+"""Different factors of agents that hear each other, the leader's among them."""
 _STEADY = 3
 """Steps until a memory at rest repeats."""
 _EDGE = 1.0 - 1e-9
@@ -120,6 +122,9 @@ def own_delay_line(case: OwnCase) -> Statement | None:
     if not lag and not delay:
         return None
     name, kind = Hypothesis.OWN_STATE, Kind.LINEARIZATION
+    if case.heard is not None and len(case.own) > _MANY:
+        text = "no margin is known of agents that hear each other with many sums of weights"
+        return unneeded(name, kind, text)
     step = late_step(case.problem, case.law, lag)
     text = f"own state {1e3 * delay * dt:.3g} ms late, " * bool(delay)
     estimated = world.sensing is not None and world.sensing.estimator is not Estimation.NONE
@@ -133,8 +138,10 @@ def own_delay_line(case: OwnCase) -> Statement | None:
     if most >= delay:
         text += f"the linearized loop decays with own states up to {shown} late"
         return holds(name, kind, text, *number)
-    text += "the linearized loop is not known to decay"
-    text += f", but with own states up to {shown} late" * (most >= 0)
+    decays = "does not decay" if case.heard is None else "is not known to decay"
+    text += f"the linearized loop {decays}"
+    if most >= 0:
+        text += f", but with own states {'that are current' if not most else f'up to {shown} late'}"
     remedy = "lower `coupling` or `roots`"
     remedy += "" if case.heard is None else ", or set `graph.directed: true`"
     return fails(name, kind, text, *number, remedy=remedy)

@@ -157,9 +157,7 @@ def _own_line(run: StoppingRun, problem: Problem) -> Statement | None:
         own = network.sums
         [L] = parts.graph.stretches(law.leaderward)
         heard = L if network.ways is None else None
-    if heard is not None and len(own) > _MODES:
-        return None
-    if len(own) > _MODES:
+    if heard is None and len(own) > _MODES:
         own = np.sort(own)[np.linspace(0, len(own) - 1, _MODES).round().astype(int)]
     # A leader answers to its path as a follower with this factor would.
     led = float(run.leader.strength(run.settings.dt)) / run.coupling

@@ -89,7 +89,7 @@ def formation(run: Recording) -> "Figure":
     def show(ax: "Axes", frames: Array) -> None:
         times, values = run.times[frames], above(errors[frames], floor)
         if many:
-            bands(ax, times, values)
+            bands(ax, times, errors[frames], floor=floor)
             _worst(ax, run, times, errors, frames, floor)
         for agent, line in zip(() if many else followers, values.T):
             zero = draw.above_zero(errors[frames, followers.index(agent)])
@@ -294,8 +294,11 @@ def ages(run: Recording) -> "Figure | None":
         look = {"color": "0.5", "linewidth": 0.8, "linestyle": ":", "zorder": 1}
         ax.axhline(messages.forget, label="not used beyond", **look)
         ax.set_ylabel(draw.label("age of the oldest message", "s"))
-        ax.set_ylim(bottom=0.0)
+        ax.set_ylim(0.0, 1.05 * top)
 
+    known = np.nan_to_num(messages.agents[:, followers])
+    # Of the whole run: the panels of its start and of all of it have one axis.
+    top = max(messages.forget, float(known.max(initial=0.0)))
     figure, ((*_, last),) = over_time(run, [show], 2.6, len(followers))
     return draw.finish(figure, legends=[last])
 
@@ -334,7 +337,7 @@ def _edges(ax: "Axes", run: Recording, times: Array, apart: Array, desired: Arra
     if len(run.edges) > draw.NAMED:
         errors = np.abs(apart - desired)
         floor = error_rounding(run)
-        bands(ax, times, above(errors, floor), "link")
+        bands(ax, times, errors, "link", floor)
         ax.set_ylabel("distance error (m)")
         draw.logarithmic(ax, errors)
         shade_rounding(ax, floor, errors)

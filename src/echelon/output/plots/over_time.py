@@ -149,13 +149,18 @@ def above(values: Array, floor: float) -> Array:
     return np.where(values >= floor, draw.above_zero(values), np.nan)
 
 
-def bands(ax: "Axes", times: Array, values: Array, of: str = "follower") -> None:
-    """Draw quantiles of values (T, N) and the median."""
+def bands(
+    ax: "Axes", times: Array, values: Array, of: str = "follower", floor: float | None = None
+) -> None:
+    """Draw quantiles of values (T, N) and the median, cut off where they are rounding."""
     with np.errstate(invalid="ignore"):
         # At times at which all values are 0 there is nothing to draw, and no warning.
         some = np.isfinite(values).any(axis=1)
         ends = np.full((5, len(times)), np.nan)
         ends[:, some] = np.nanpercentile(values[some], [5, 25, 50, 75, 95], axis=1)
+    if floor is not None:
+        # Of all values: without those below it the quantiles of the others would be higher.
+        ends[:2], ends[2:] = np.maximum(ends[:2], floor), above(ends[2:], floor)
     look = {"color": draw.COLOURS[0], "linewidth": 0.0, "zorder": 1.5}
     ax.fill_between(times, ends[0], ends[4], alpha=0.18, label="5 to 95 %", **look)
     ax.fill_between(times, ends[1], ends[3], alpha=0.35, label="25 to 75 %", **look)

@@ -278,14 +278,14 @@ def _draw_errors(ax: "Axes", run: Recording, keep: Array) -> None:
     """Draw the formation errors, or the worst and the median of a large swarm."""
     followers, floor = list(run.followers), error_rounding(run)
     errors = run.goal_distances(keep)[:, followers]
-    values = above(errors, floor)
     if run.agents > draw.NAMED:
-        lines = {"worst": values.max(axis=1), "median": np.median(values, axis=1)}
+        lines = {"worst": errors.max(axis=1), "median": np.median(errors, axis=1)}
         for name, colour in (("worst", 1), ("median", 0)):
-            ax.plot(run.times[keep], lines[name], color=draw.COLOURS[colour], label=name)
+            line = above(lines[name], floor)
+            ax.plot(run.times[keep], line, color=draw.COLOURS[colour], label=name)
         ax.legend(loc="upper right", fontsize=8)
     else:
-        for agent, line in zip(followers, values.T, strict=True):
+        for agent, line in zip(followers, above(errors, floor).T, strict=True):
             ax.plot(run.times[keep], line, **pen_of(run, agent))
     draw.logarithmic(ax, errors)
     shade_rounding(ax, floor, errors)
