@@ -180,6 +180,12 @@ def test_what_no_formation_survives_has_no_guarantee(network, options, words):
     assert words in guarantee.sentence() and guarantee.hypotheses[Hypothesis.MESSAGES].fails
 
 
+def test_in_a_run_too_short_for_a_first_packet_nobody_is_said_to_arrive():
+    with np.errstate(all="raise"):
+        guarantee = said(parts_of(), ech.Settings(horizon=0.1, dt=DT))
+    assert guarantee.tube.arrival is None and guarantee.tube.network.ages.first_packet is None
+
+
 def test_the_lag_behind_messages_of_states_is_that_of_a_run():
     network = ech.Network(rate=50.0, delay=0.02, loss=0.2, messages="state")
     parts = parts_of(network, [(0, 1), (1, 2)])

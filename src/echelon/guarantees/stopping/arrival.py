@@ -54,6 +54,8 @@ def arrival_of(run: StoppingRun, position: Sequence[int]) -> float | None:
     moved = _along_links if by_parents else moved
     if run.network is None:
         return _first_within(run, position, lambda _: moved)
+    if run.network.ages.first_packet is None:
+        return None
     rates = run.network.rates or (None,)
     each = (partial(_late, run, run.network, rate) for rate in rates)
     times = [t for late in each if (t := _first_within(run, position, lambda k: partial(late, k)))]
@@ -76,7 +78,8 @@ def _first_within(
         driven = np.stack([_behind(own, m, times) for m in reach.bounds])[reach.whose]
         # Agents start in few ways in number; all at once would be (N, cells) anyway.
         square += (reach.weights[:, None] * driven + _left(own, away[:, :, k], times)) ** 2
-    outside = np.flatnonzero((np.sqrt(square) + _SLACK >= _WITHIN).any(axis=0))
+    # Not within is outside, and so is what is no number.
+    outside = np.flatnonzero(~(np.sqrt(square) + _SLACK < _WITHIN).all(axis=0))
     if not len(outside):
         return 0.0
     last = int(outside[-1]) + 1
@@ -174,8 +177,7 @@ def _late(
     """
     begin, followers, weights = network.ages.first_packet, list(graph.followers), network.weights
     ways = np.ones(len(followers), int) if network.ways is None else network.ways
-    if begin is None:
-        return _Reach(np.full((1, len(times)), np.inf), 0 * ways, weights)
+    assert begin is not None  # or there is no such bound
     off = np.abs(stops[followers] - stops[list(graph.nearest_leader())][followers]).max()
     off += begin * (run.path_speed(output, begin) + run.own_speed(output))
     if rate is not None:

@@ -73,7 +73,7 @@ class Separation(NamedTuple):
         text += "agents hold each other back; without that, errors decay at "
         text += f"{self.tube.rate:.3g} 1/s or faster eventually."
         if not self.ideal:
-            text += " In this world distances are observed, not proved."
+            text = f"In this world distances are observed, not proved. In the ideal one: {text}"
         motors = self.tube.motor_load
         return text if motors is None else f"{text} {motors.sentence()}"
 
