@@ -10,8 +10,9 @@ delay. It prints the formation error of the worst follower over the last 4 s in 
 import argparse
 import heapq
 import itertools
+from typing import Any
 
-import mujoco
+import mujoco  # type: ignore[import-not-found]
 import numpy as np
 
 import echelon as ech
@@ -23,7 +24,7 @@ MOTOR = '<general site="s{k}" gear="{gear}"/>'
 GEARS = ("0 0 1 0 0 0", "0 0 0 1 0 0", "0 0 0 0 1 0", "0 0 0 0 0 1")
 
 
-def bodies(model, agents, step):
+def bodies(model: ech.models.Quadrotor, agents: int, step: float) -> Any:
     """Return MuJoCo's model of free bodies that are steered by thrust and torques."""
     inertia = " ".join(map(repr, model.inertia))
     world = "".join(BODY.format(k=k, mass=model.mass, inertia=inertia) for k in range(agents))
@@ -35,7 +36,7 @@ def bodies(model, agents, step):
     )
 
 
-def place(data, k, x):
+def place(data: Any, k: int, x: np.ndarray) -> None:
     """Put body k at a state of the quadrotor."""
     half, quaternion = 0.5 * np.asarray(x[6:9]), np.array([1.0, 0.0, 0.0, 0.0])
     for axis in (2, 1, 0):  # yaw, then pitch, then roll about the body's axes
@@ -48,7 +49,7 @@ def place(data, k, x):
     data.qvel[6 * k : 6 * k + 6] = [*x[3:6], *x[9:]]
 
 
-def state(data, k):
+def state(data: Any, k: int) -> np.ndarray:
     """Return the quadrotor's state of body k."""
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, data.qpos[7 * k + 3 : 7 * k + 7])
@@ -58,7 +59,7 @@ def state(data, k):
     return np.array([*data.qpos[7 * k : 7 * k + 3], *v[:3], *angles, *v[3:]])
 
 
-def fly(parts, settings, starts):
+def fly(parts: ech.Parts, settings: ech.Settings, starts: np.ndarray) -> np.ndarray:
     """Return positions (T, N, 3) of a flight from states (N, 12)."""
     agents = [ech.Agent(parts, k, settings.dt) for k in range(len(starts))]
     plant = bodies(parts.model, len(agents), settings.dt / 5)
@@ -84,7 +85,7 @@ def fly(parts, settings, starts):
     return np.array(positions)
 
 
-def main():
+def main() -> None:
     """Fly both and print the errors."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("scenario", nargs="?", default="paper-radio")
