@@ -115,7 +115,8 @@ FAULTS = {
     "few": (GOOD + "2,0,0\n", ":4` has 3 numbers, and must have 5."),
     "times": (GOOD + "1,0,0,1,0\n", "`t` of the path at `{}:4` is 1 s, and must be more"),
     "empty": ("", "`{}:1` lacks `t`, `x`, `y`, `z`"),
-    "one": ("t,x,y,z\n0,0,0,1\n", "has 1 lines of numbers, and must have from 2"),
+    "semicolons": ("t;x;y;z\n0;0;0;1\n", "once (`yaw` may be left out), separated by commas."),
+    "one": ("t,x,y,z\n0,0,0,1\n", "must have from 2 to 100000 lines of numbers, and has 1."),
     "binary": ("t,x\0", "path"),
 }
 
@@ -133,7 +134,7 @@ def test_a_wrong_line_is_named(tmp_path, fault):
 def test_a_file_of_a_million_lines_and_none_at_all_are_refused_soon(tmp_path):
     file = tmp_path / "long.csv"
     file.write_text("t,x,y,z\n" + "".join(f"{k},0,0,1\n" for k in range(100_001)), "utf-8")
-    with pytest.raises(ech.errors.ReferenceError, match="has more than 100000 lines"):
+    with pytest.raises(ech.errors.ReferenceError, match="and has more than 100000."):
         Waypoints.read(file)
     with pytest.raises(ech.errors.ReferenceError, match=r"none.csv` cannot be read: No such file"):
         Waypoints.read(tmp_path / "none.csv")
