@@ -232,6 +232,15 @@ def test_the_command_writes_the_leaders_path_and_a_followers_goal(tmp_path, eche
     assert at(parts.drive.leader.reference, [1.3]) == pytest.approx(at(own, [1.3]), abs=1e-9)
 
 
+def test_a_misspelt_key_beside_a_file_is_named_with_the_right_one(tmp_path):
+    write_points(tmp_path)
+    scenario = ech.load_scenario(
+        written(tmp_path, reference={"name": "waypoints", "file": "path.csv", "degres": 1})
+    )
+    with pytest.raises(ech.EchelonError, match="did you mean `degrees`"):
+        ech.build(scenario)
+
+
 def test_the_time_at_which_a_path_exceeds_a_limit_is_named():
     fast = Waypoints([0.0, 1.0, 2.0], [[0.0, 0.0, 1.0], [0.0, 0.0, 4.0], [0.0, 0.0, 1.0]])
     quadrotor, times = ech.models.Quadrotor.crazyflie(), np.linspace(0.0, 3.0, 3001)
