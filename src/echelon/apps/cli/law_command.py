@@ -7,6 +7,7 @@ import typer
 
 from echelon.apps.cli import options
 from echelon.apps.cli.status import STATUS
+from echelon.output.archive.folder import check_empty
 
 
 def law(
@@ -23,12 +24,11 @@ def law(
     loaded = load_scenario(scenario, set_ or [])
     STATUS.begin(f"writing the law of agent {agent} of {loaded.name}")
     folder = Path(f"law-{agent}") if out is None else out
+    check_empty(folder)
     from echelon.experiments.scenario.build import build
     from echelon.experiments.scenario.self_contained import content_of_files
-    from echelon.output.archive.law_folder import claim_law, law_files, save_law
+    from echelon.output.archive.law_folder import law_files, save_law
 
-    claim_law(folder)
     files = law_files(*build(loaded), agent, content_of_files(loaded))
     save_law(files, folder)
-    sizes = ", ".join(f"{name} {len(text) / 1000:.1f} kB" for name, text in files.items())
-    print(f"- Written to {folder}: {sizes}.")
+    print(f"- Written to {folder}: {', '.join(files)}.")

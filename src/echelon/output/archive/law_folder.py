@@ -27,16 +27,6 @@ _EXCLUDES = (
 )
 
 
-def claim_law(folder: Path) -> None:
-    """Check that a law can be written into a folder.
-
-    Raises:
-        OutputError: it is not empty, or no folder.
-    """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError(f"`{folder}` exists and is not empty; choose another folder.")
-
-
 def law_files(parts: Parts, settings: Settings, agent: int, formation: str) -> dict[str, str]:
     """Return the files of one agent's law by name.
 
@@ -47,22 +37,25 @@ def law_files(parts: Parts, settings: Settings, agent: int, formation: str) -> d
         formation: a text that is equal for all agents of the formation alone.
 
     Raises:
-        OutputError: the law has no code in C, with the reason.
+        OutputError: the law has no scalar operations; with the file and line of a user's code.
         EchelonError: there is no such agent, or the parts do not fit each other.
     """
     own = Agent(parts, agent, settings.dt, settings.limits).own_law
     try:
         functions = law_functions(own)
     except Unsupported as error:
-        raise OutputError(f"the law of agent {agent} cannot be exported: it has {error}.") from None
+        raise OutputError(
+            f"the law of agent {agent} cannot be exported: there is no code for {error}."
+        ) from None
     mark = hashlib.sha256(f"{__version__}\n{settings.dt!r}\n{formation}".encode()).hexdigest()
-    about = f"The law of agent {agent}, by echelon {__version__}; formation {mark[:16]}."
+    about = f"The law of agent {agent}, by echelon {__version__}; see law.json."
+    constants = {"AGENT": agent, "DT": settings.dt, "FORMATION": mark}
     sizes = {name.upper(): size for f in functions for name, size in f.inputs.items() if size}
     sizes |= {name.upper(): len(part) for name, part in functions[-1].outputs.items()}
     texts = {
-        "law.py": python_text(functions, about),
+        "law.py": python_text(functions, about, constants),
         "law.c": c_text(functions, about),
-        "law.h": header_text(functions, about, {"DT": settings.dt, **sizes}),
+        "law.h": header_text(functions, about, constants | sizes),
     }
     described = {
         "agent": agent,

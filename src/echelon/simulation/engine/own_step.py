@@ -28,7 +28,6 @@ from echelon.simulation.step.knowledge import (
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.nearby import less_expected
 
-
 Signal: TypeAlias = Float[jax.Array, " s"]
 """What an agent sends to its neighbours."""
 

@@ -1,5 +1,6 @@
 """The law of one agent in C99: no memory is allocated, and of the library only `sqrt` is called."""
 
+import json
 from collections.abc import Mapping, Sequence
 
 from echelon.simulation.onboard.law_functions import LawFunction
@@ -32,7 +33,8 @@ static double law_abs(double a)
     "law_copysign": """
 static double law_copysign(double a, double b)
 {
-    return law_number((law_bits(a) & 0x7FFFFFFFFFFFFFFFULL) | (law_bits(b) & 0x8000000000000000ULL));
+    const uint64_t size = law_bits(a) & 0x7FFFFFFFFFFFFFFFULL;
+    return law_number(size | (law_bits(b) & 0x8000000000000000ULL));
 }
 """,
     "law_rint": """
@@ -138,7 +140,7 @@ def c_text(functions: Sequence[LawFunction], about: str) -> str:
 
 
 def header_text(
-    functions: Sequence[LawFunction], about: str, constants: Mapping[str, float]
+    functions: Sequence[LawFunction], about: str, constants: Mapping[str, float | str]
 ) -> str:
     """Return the declarations of the functions, and constants by name."""
     return "\n".join(
@@ -148,7 +150,7 @@ def header_text(
             "#ifndef LAW_H",
             "#define LAW_H",
             "",
-            *(f"#define LAW_{name} {value!r}" for name, value in constants.items()),
+            *(f"#define LAW_{name} {json.dumps(value)}" for name, value in constants.items()),
             "",
             *(f"/* {f.about[0].upper()}{f.about[1:]}. */\n{_head(f)};\n" for f in functions),
             "#endif",

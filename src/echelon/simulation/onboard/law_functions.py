@@ -112,7 +112,8 @@ def law_functions(own: OwnLaw) -> tuple[LawFunction, ...]:
         difference,
         _function(
             "tick",
-            "a step: what the agent does and sends",
+            "a step at t (s), with z, the sum of weights times `difference`, and the feed-forward "
+            "that was received, NaN if none was",
             tick,
             ("u", "memory", "signal", "message"),
             {**sizes, "feed_forward": k, "memory": memory},

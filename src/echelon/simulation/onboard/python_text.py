@@ -1,6 +1,7 @@
 """The law of one agent in plain Python: floats, lists and `math`."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 
 from echelon.simulation.onboard.law_functions import LawFunction
 from echelon.simulation.onboard.statements import Syntax, statements
@@ -75,8 +76,8 @@ def law_single(a):
         return a
     half, exponent = math.frexp(a)
     digits = min(24, exponent + 149)
-    a = math.ldexp(round(math.ldexp(half, digits)), exponent - digits)
-    return a if abs(a) < 2.0**128 else math.copysign(math.inf, a)
+    size = math.ldexp(round(math.ldexp(abs(half), digits)), exponent - digits)
+    return math.copysign(size if size < 2.0**128 else math.inf, a)
 """,
 }
 
@@ -97,11 +98,14 @@ _PYTHON = Syntax.of(
 )
 
 
-def python_text(functions: Sequence[LawFunction], about: str) -> str:
-    """Return the functions as a module; `about` is its docstring."""
+def python_text(
+    functions: Sequence[LawFunction], about: str, constants: Mapping[str, float | str]
+) -> str:
+    """Return the functions as a module with constants by name; `about` is its docstring."""
     body = "\n\n".join(map(_function_text, functions))
     helpers = _PYTHON.used_helpers(body).replace("\n\n\n", "\n\n")
-    return f'"""{about}"""\n\nimport math\n{helpers}\n\n{body}'
+    named = "\n".join(f"{name} = {json.dumps(value)}" for name, value in constants.items())
+    return f'"""{about}"""\n\nimport math\n\n{named}\n{helpers}\n\n{body}'
 
 
 def _function_text(function: LawFunction) -> str:
