@@ -229,8 +229,7 @@ def test_a_law_by_itself_steps_as_the_agent_does(agent, tmp_path):
         for way, run in runs.items():
             before = memory[way]
             gaps = [run["difference"](x.tolist(), before, s.tolist()) for s in signals]
-            z = (own.weights[0] @ np.array(gaps).reshape(len(signals), -1)).tolist()
-            z = z or [0.0] * functions[-1].inputs["z"]
+            z = (own.weights[0] @ np.array(gaps)).tolist()
             inputs = time, x.tolist(), z, forward.tolist(), before
             *results, valid = run["tick"](*inputs)
             memory[way] = results[1]

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 
 from echelon.simulation.onboard.law_functions import LawFunction
-from echelon.simulation.onboard.statements import Syntax, statements
+from echelon.simulation.onboard.statements import COMMON, Syntax, statements
 
 # The same instructions on the bits of numbers as those of `codegen.vector_ir`.
 _HELPERS = {
@@ -116,8 +116,9 @@ static double law_single(double a)
 """,
 }
 
-_C = Syntax.of(
+_C = Syntax(
     {
+        **COMMON,
         "sqrt": "sqrt({0})",
         "and": "{0} && {1}",
         "or": "{0} || {1}",

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 
 from echelon.simulation.onboard.law_functions import LawFunction
-from echelon.simulation.onboard.statements import Syntax, statements
+from echelon.simulation.onboard.statements import COMMON, Syntax, statements
 
 # Python raises errors where C returns infinity or NaN.
 _HELPERS = {
@@ -81,8 +81,9 @@ def law_single(a):
 """,
 }
 
-_PYTHON = Syntax.of(
+_PYTHON = Syntax(
     {
+        **COMMON,
         **dict.fromkeys(("div", "exact_div"), "law_divide({0}, {1})"),
         "abs": "abs({0})",
         "copysign": "math.copysign({0}, {1})",

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from echelon.simulation.onboard.law_functions import LawFunction
 from echelon.simulation.scalars import Node, needed
 
-_COMMON = {
+COMMON = {
     "add": "{0} + {1}",
     **dict.fromkeys(("sub", "unfused_sub"), "{0} - {1}"),
     "mul": "{0} * {1}",
@@ -29,6 +29,7 @@ _COMMON = {
     "single": "law_single({0})",
     **{name: f"law_{name}({{0}}, {{1}})" for name in ("min", "max", "copysign")},
 }
+"""The text of each operation where languages agree, with the places of its operands."""
 
 
 class Syntax(NamedTuple):
@@ -47,11 +48,6 @@ class Syntax(NamedTuple):
     special: tuple[str, str, str, str]
     helpers: Mapping[str, str]
 
-    @classmethod
-    def of(cls, operations: Mapping[str, str], *rest: object) -> "Syntax":
-        """Return the syntax of a language with some operations of its own."""
-        return cls({**_COMMON, **operations}, *rest)  # type: ignore[arg-type]
-
     def literal(self, value: float | bool) -> str:
         """Return a plain number, to the bit."""
         infinite, nan, true, false = self.special
@@ -64,7 +60,7 @@ class Syntax(NamedTuple):
     def used_helpers(self, text: str) -> str:
         """Return the functions that a text calls, directly or not."""
         used = ""
-        for name, helper in reversed(self.helpers.items()):
+        for name, helper in reversed([*self.helpers.items()]):
             if f"{name}(" in text + used:
                 used = f"{helper}\n{used}"
         return used
