@@ -140,7 +140,7 @@ def test_a_model_of_ones_own_must_be_given_and_is_never_imported(tmp_path):
     assert not found.holds and verdicts["equations of the model"] == "not checked"
     assert (
         found.sentence
-        == "Incomplete: 14 claims hold as stored, and could not be checked: equations of the model."
+        == "Incomplete: 14 claims hold as stored; not checked: equations of the model."
     )
     assert ech.verify(file, model).sentence.startswith("Verified:")
     assert not ech.verify(file, ech.models.Pendulum()).holds
