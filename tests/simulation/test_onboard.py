@@ -278,11 +278,11 @@ CARTS = ech.models.DoubleIntegrator()
 PAIR = ech.Graph.path(3)
 
 
-def carts(**more):
-    places = ech.Formation.from_offsets(CARTS, PAIR, {1: (1.0, 0.0), 2: (1.0, 0.8)})
+def carts(graph=PAIR, **more):
+    places = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.0), 2: (1.0, 0.8)})
     circle = ech.references.Circle(radius=1.0, rate=0.6)
     laws = ech.Laws(ech.laws.StoppingLeader(reference=circle), ech.laws.StoppingPoint(**more))
-    return ech.Parts(CARTS, PAIR, places, laws)
+    return ech.Parts(CARTS, graph, places, laws)
 
 
 APART = ech.Safety(radii=(0.085, 0.085, 0.085))
@@ -292,6 +292,9 @@ REFUSED = {
     ),
     "agents that measure their states late or with noise": lambda: carts().replace(
         world=ech.World(sensing=ech.Sensing(delay=0.01))
+    ),
+    "a graph that switches": lambda: carts(
+        graph=ech.Graph.switching([(0.0, [(0, 1), (1, 2)]), (1.0, [(0, 1), (0, 2)])])
     ),
     "agents that keep away from each other": lambda: carts(safety=APART),
 }
