@@ -43,6 +43,7 @@ JOURNEYS = [
     slow("learning"),
     slow("crazyflie"),
     slow("matlab"),
+    slow("onboard"),
 ]
 
 FENCE = re.compile(

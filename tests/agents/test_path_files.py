@@ -115,7 +115,8 @@ FAULTS = {
     "few": (GOOD + "2,0,0\n", ":4` has 3 numbers, and must have 5."),
     "times": (GOOD + "1,0,0,1,0\n", "`t` of the path at `{}:4` is 1 s, and must be more"),
     "empty": ("", "`{}:1` lacks `t`, `x`, `y`, `z`"),
-    "one": ("t,x,y,z\n0,0,0,1\n", "has 1 lines of numbers, and must have from 2"),
+    "semicolons": ("t;x;y;z\n0;0;0;1\n", "once (`yaw` may be left out), separated by commas."),
+    "one": ("t,x,y,z\n0,0,0,1\n", "must have from 2 to 100000 lines of numbers, and has 1."),
     "binary": ("t,x\0", "path"),
 }
 
@@ -133,7 +134,7 @@ def test_a_wrong_line_is_named(tmp_path, fault):
 def test_a_file_of_a_million_lines_and_none_at_all_are_refused_soon(tmp_path):
     file = tmp_path / "long.csv"
     file.write_text("t,x,y,z\n" + "".join(f"{k},0,0,1\n" for k in range(100_001)), "utf-8")
-    with pytest.raises(ech.errors.ReferenceError, match="has more than 100000 lines"):
+    with pytest.raises(ech.errors.ReferenceError, match="and has more than 100000."):
         Waypoints.read(file)
     with pytest.raises(ech.errors.ReferenceError, match=r"none.csv` cannot be read: No such file"):
         Waypoints.read(tmp_path / "none.csv")
@@ -229,6 +230,15 @@ def test_the_command_writes_the_leaders_path_and_a_followers_goal(tmp_path, eche
     written_pieces = {"reference": {"name": "polynomials", "file": "leader.csv"}}
     parts, _ = ech.build(ech.load_scenario(written(tmp_path, **written_pieces)))
     assert at(parts.drive.leader.reference, [1.3]) == pytest.approx(at(own, [1.3]), abs=1e-9)
+
+
+def test_a_misspelt_key_beside_a_file_is_named_with_the_right_one(tmp_path):
+    write_points(tmp_path)
+    scenario = ech.load_scenario(
+        written(tmp_path, reference={"name": "waypoints", "file": "path.csv", "degres": 1})
+    )
+    with pytest.raises(ech.EchelonError, match="did you mean `degrees`"):
+        ech.build(scenario)
 
 
 def test_the_time_at_which_a_path_exceeds_a_limit_is_named():

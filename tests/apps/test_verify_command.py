@@ -131,6 +131,7 @@ FORGED = {
     "a gain in a promise": ("gain", in_json("gain.json", hide), 2),
     "a gain of another run": ("gain", link, 1),
     "no gain": ("gain", lambda folder: (folder / "gain.json").unlink(), 2),
+    "no data": ("gain", lambda folder: (folder / "run.nc").unlink(), 5),
     "no summary": ("gain", lambda folder: (folder / "summary.json").write_text("{}"), 2),
     "a gain doubled in all files": (
         "gain",
@@ -210,6 +211,7 @@ def test_no_forged_folder_is_verified(runs, echelon, here, what):
     forge(here / "run")
     found, out, err = echelon("verify", "run")
     assert found == code, out + err
+    assert ("Incomplete: " in out) is (code == 5)
     assert ("Verified" in out) is (code == 0) and ("Refused: " in out) is (code == 1)
     assert err.count("\n") == (code == 2)
 

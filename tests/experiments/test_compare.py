@@ -92,6 +92,9 @@ def test_what_is_said_of_those_that_settle_is_said_to_be_of_them():
     assert "Of those that settle, a takes the least computing time, b 4 times as much." in text
     text = " ".join(verdict(Comparison("mine", rows[1:], 5.0, 1.0, ())))
     assert "Of those" not in text and "a has the smallest effort (5; next b, 6)." in text
+    # One that settles is the best of nothing.
+    text = " ".join(verdict(Comparison("mine", rows[:2], 5.0, 1.0, ())))
+    assert "a settles (2 s)." in text and "Of those" not in text and "effort" not in text
 
 
 def test_a_number_of_the_table_is_in_every_table_that_it_names(planar, monkeypatch):

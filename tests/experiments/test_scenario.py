@@ -96,6 +96,7 @@ def test_defaults():
             "name": "pendulum",
             "python": None,
             "parameters": None,
+            "file": None,
             "allow_unphysical": False,
         },
         "plant": None,

@@ -199,6 +199,9 @@ def test_a_path_on_the_command_line_is_relative_to_the_working_folder(folder, mo
     scenario = ech.load_scenario("integrators", [own_law])
     assert scenario.follower.law.python == f"{folder}/mine.py:Pull"
     assert type(ech.build(scenario).parts.drive.follower).__name__ == "Pull"
+    # Without a class it is no path, and stays as it was written.
+    with pytest.raises(ech.EchelonError, match='got `"?mine.py"?`, allowed is a file and a class'):
+        ech.load_scenario("paper", ["model.python=mine.py"])
 
 
 def test_a_gain_file_or_a_method_of_ones_own_takes_the_place_of_a_method(folder, monkeypatch):

@@ -307,9 +307,12 @@ def test_plot_draws_png_pdf_and_svg_from_the_file_and_loses_no_other(echelon, he
     from echelon.experiments.results.recording import FORMAT
 
     (here / "run.nc").write_bytes(as_file(swinging(("x", "y", "z"), (0, 1, 2), n=3), FORMAT))
-    code, told, _ = echelon("plot", "run.nc", "--what", "formation,network", "--dpi", "60")
+    code, told, _ = echelon("plot", "run.nc", "--what", "formation,network,ages", "--dpi", "60")
     assert code == 0
-    assert told == ("- Written to figures: formation, network, each as PNG, PDF, SVG.\n")
+    assert told == (
+        "- Written to figures: formation, network, each as PNG, PDF, SVG.\n"
+        "- The run has no data for `ages`.\n"
+    )
     made = sorted(path.name for path in (here / "figures").iterdir())
     assert made == sorted(
         f"{n}.{k}" for n in ("formation", "network") for k in ("png", "pdf", "svg")

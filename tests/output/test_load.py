@@ -288,8 +288,9 @@ def test_a_table_that_does_not_fit_is_refused_with_its_size(run, monkeypatch):
     )
     with pytest.raises(ech.errors.OutputError, match=r"3298534883328 rows of 10 columns need 2.4"):
         ech.table(huge)
-    with pytest.raises(ech.errors.OutputError, match="`every` is 0"):
-        ech.table(run[0], every=0)
+    for every in (0, 2.5):
+        with pytest.raises(ech.errors.OutputError, match=f"`every` is {every}, and must be"):
+            ech.table(run[0], every=every)
 
 
 @pytest.mark.parametrize("kind", exporting._WRITERS)
@@ -321,6 +322,15 @@ def test_an_unknown_ending_is_refused(run, tmp_path):
 
 
 # ---- what is no run ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "function", [ech.metrics, ech.report, ech.summary, ech.dataset, ech.figures, ech.table]
+)
+def test_the_name_of_a_folder_is_no_result(function):
+    with pytest.raises(ech.EchelonError, match="`result` is a `str`, and must be a `Result`"):
+        function("folder")
+
 
 BAD = {
     "nothing": "does not exist",

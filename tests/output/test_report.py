@@ -145,6 +145,10 @@ def test_a_horizon_shorter_than_the_slowest_mode_is_told():
     [(text, remedy)] = found.items()
     assert "the slowest mode takes" in text and "the horizon is 2 s" in text
     assert "`simulation.horizon`" in remedy and "`echelon design`" in remedy
+    # The angles of pendulums have no metres.
+    starts = "initial.spread={angle: 0.1}", "leader.start_error={angle: 0.1}"
+    [text] = told("model={name: pendulum}", *starts, scenario="van-der-pol")
+    assert "s from 1 to 0.01, and the horizon is 2 s" in text
 
 
 @pytest.mark.study

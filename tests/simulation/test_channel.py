@@ -261,7 +261,7 @@ def hops_of(loop, now):
         ({"bursts": ech.Bursts(share=1.0)}, r"`bursts.share` .* at least 0 and below 1"),
         ({"forget": 0.02}, r"`forget` .* 0.02 s, .* at least two periods"),
         ({"messages": "stat"}, r"`messages` .* `stat`, allowed are .* .did you mean"),
-        ({"prediction": "preview"}, r"`prediction` .* `Agreement` has no plan; use `none`"),
+        ({"prediction": "preview"}, r"`prediction` .* `Agreement` has no plan; use `packet`"),
     ],
 )
 def test_a_network_that_cannot_work_is_refused_in_one_sentence(change, message):

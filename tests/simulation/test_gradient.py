@@ -309,6 +309,13 @@ def test_what_is_no_variable_is_refused_in_words(wrt, told):
         gradient(integrators(1.0), ech.Settings(0.2, 0.1), squares, wrt)
 
 
+@pytest.mark.parametrize("engine", ["jax", "native"])
+def test_a_cost_of_many_numbers_is_refused_in_words(engine):
+    settings = ech.Settings(0.2, 0.1, engine=engine)
+    with pytest.raises(ech.EchelonError, match=r"has shape \(2, 1\), and must be one number"):
+        gradient(integrators(1.0), settings, lambda sums: sums.effort[:, None], ("P",))
+
+
 def test_without_a_gain_there_is_no_p():
     parts = integrators(1.0)
     rest = ech.laws.TrimInput()

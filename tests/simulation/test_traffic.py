@@ -40,7 +40,9 @@ NETWORKS = {
 }
 
 
-@pytest.mark.parametrize(("name", "directed"), zip(NETWORKS, (False, False, True), strict=True))
+@pytest.mark.parametrize(
+    ("name", "directed"), list(zip(NETWORKS, (False, False, True), strict=True))
+)
 def test_ages_are_those_of_the_messages_that_the_run_itself_used(name, directed):
     prepared, found = followed(NETWORKS[name], directed=directed)
     drive = prepared.parts.drive

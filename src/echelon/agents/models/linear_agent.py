@@ -178,7 +178,7 @@ def _matrix(name: str, value: Sequence[Sequence[float]] | Array) -> Array:
         ) from None
     if matrix.ndim != 2 or not np.isfinite(matrix).all():
         raise ModelError(
-            f"`{name}` of `Linear` must be a matrix of finite numbers, "
-            f"and has shape {matrix.shape}."
+            f"`{name}` of `Linear` must be a matrix of finite numbers, and "
+            + ("has NaN or infinite ones." if matrix.ndim == 2 else f"has shape {matrix.shape}.")
         )
     return matrix

@@ -72,8 +72,8 @@ def _columns(
     if not 2 - ("t" not in names) <= len(numbers) <= _MOST:
         count = f"more than {_MOST}" if len(numbers) > _MOST else str(len(numbers))
         raise ReferenceError(
-            f"the path `{file}` has {count} lines of numbers, and must have from "
-            f"{2 - ('t' not in names)} to {_MOST}."
+            f"the path `{file}` must have from {2 - ('t' not in names)} to {_MOST} lines of "
+            f"numbers, and has {count}."
         )
     table = np.array(numbers)
     absent = np.zeros(len(table))
@@ -93,9 +93,10 @@ def _head(place: str, cells: list[str], names: Sequence[str], optional: Sequence
     surplus = [name for name in head if name not in names or head.count(name) > 1]
     if missing or surplus:
         which = f"lacks {listing(missing)}" if missing else f"has {listing(dict.fromkeys(surplus))}"
+        free = f" ({listing(optional)} may be left out)" if optional else ""
         raise ReferenceError(
             f"the first line of the path at {place} {which}, and must name each of the columns "
-            f"{listing(names)} once, separated by commas."
+            f"{listing(names)} once{free}, separated by commas."
         )
     return head
 

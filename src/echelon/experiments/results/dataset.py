@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from echelon.core.errors import check_kind
 from echelon.core.files import write_atomic
 from echelon.core.types import Array, JsonObject, PathLike
 from echelon.experiments.results.agent_metrics import (
@@ -70,6 +71,7 @@ STORED: "WeakKeyDictionary[Result, Labelled]" = WeakKeyDictionary()
 
 def labelled(result: Result) -> Labelled:
     """Return the labelled arrays of `dataset`: as they are stored, of a run from disk."""
+    check_kind("result", result, Result)
     stored = STORED.get(result)
     return _labelled(result) if stored is None else stored
 

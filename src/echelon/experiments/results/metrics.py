@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
-from echelon.core.errors import Outcome
+from echelon.core.errors import Outcome, check_kind
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.experiments.results.agent_metrics import (
@@ -21,6 +21,7 @@ from echelon.simulation.step.meter import SETTLED, output_error
 
 def metrics(result: Result) -> Metrics:
     """Return the numbers of a run; means are over all its steps, whatever frames were stored."""
+    check_kind("result", result, Result)
     exists = result.outcome is not Outcome.DIVERGED and bool(result.sums.steps[0] > 0)
     with np.errstate(over="ignore", invalid="ignore"):
         return Metrics(

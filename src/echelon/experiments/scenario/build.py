@@ -12,7 +12,7 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
 from echelon.agents.world.world import World
-from echelon.core.errors import ModelError, ScenarioError, listing
+from echelon.core.errors import ModelError, ScenarioError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
@@ -258,7 +258,10 @@ def _read(part: NamedClass, file: Path, **offers: object) -> Any:
         raise ScenarioError(f"`{part.name}` does not read files; leave `file` out.")
     surplus = [name for name in part.arguments if name not in accepted(read)]
     if surplus:
-        raise ScenarioError(f"got `file` and {listing(surplus)}, allowed is the file or the keys.")
+        raise ScenarioError(
+            f"got `file` and {listing(surplus)}, allowed is the file or the keys"
+            f"{did_you_mean(surplus[0], accepted(read))}."
+        )
     return read(file, **offered(read, offers), **part.arguments)
 
 

@@ -55,7 +55,7 @@ def named_files(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str, st
             yield from named_files(item, (*path, key))
     elif isinstance(value, str) and path and path[-1] == "file":
         yield path, value, ""
-    elif isinstance(value, str) and path and path[-1] == "python":
+    elif isinstance(value, str) and path and path[-1] == "python" and ":" in value:
         file, colon, name = value.rpartition(":")
         yield path, file, colon + name
 

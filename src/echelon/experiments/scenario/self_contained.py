@@ -1,6 +1,7 @@
 """A scenario together with all files that it names, so that its folder repeats the run."""
 
 import copy
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,13 @@ def without_folders(data: Any) -> Any:
 def files_of(scenario: Scenario) -> list[Path]:
     """Return the file of a scenario and all files that it names."""
     return [scenario.file, *self_contained(scenario, "")[1].values()]
+
+
+def content_of_files(scenario: Scenario) -> str:
+    """Return a text that is equal for equal values and equal files that they name."""
+    text, files = self_contained(scenario)
+    digests = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files.values()]
+    return "\n".join([text, *digests])
 
 
 def _free(name: str, source: Path, taken: dict[str, Path]) -> str:

@@ -131,7 +131,7 @@ def judge(findings: Sequence[Finding], note: str = "") -> Verification:
         return Verification(tuple(findings), "refused", text, note)
     if open_ or not findings:
         names = "; ".join(open_) or "anything"
-        text = f"Incomplete: {text}, and could not be checked: {names}.{note}"
+        text = f"Incomplete: {text}; not checked: {names}.{note}"
         return Verification(tuple(findings), "incomplete", text, note)
     return Verification(tuple(findings), "verified", f"Verified: {text}.{note}", note)
 

@@ -32,13 +32,14 @@ def table(run: "Result | Recording", every: int = 1) -> "pd.DataFrame":
         every: takes every so-manieth stored frame.
 
     Raises:
-        OutputError: the table would not fit in memory, with its size; or `every` is below 1.
+        OutputError: the table would not fit in memory, with its size; or `every` is no whole
+            number from 1 on.
     """
     import pandas as pd
 
     from echelon.experiments.results.dataset import recording_of
 
-    if every < 1:
+    if not isinstance(every, int | np.integer) or every < 1:
         raise OutputError(f"`every` is {every}, and must be a whole number from 1 on.")
     run = recording_of(run)
     frames, agents = len(run.times[::every]), run.agents

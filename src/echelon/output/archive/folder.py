@@ -42,6 +42,16 @@ def claim_folder(name: str, out: Path | None, force: bool, by: str = CHUNKS) -> 
         return folder
 
 
+def check_empty(folder: Path) -> None:
+    """Check that a folder is new or empty.
+
+    Raises:
+        OutputError: it holds something, or is a file.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(f"`{folder}` exists and is not empty; choose another name.")
+
+
 def claim_folders(names: Sequence[str], out: Path | None, force: bool) -> list[Path]:
     """Return a folder for the comparison of each named scenario: `out` itself where there is one.
 

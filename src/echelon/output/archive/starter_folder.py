@@ -6,7 +6,7 @@ from string import Template
 
 from echelon.core.errors import OutputError
 from echelon.core.files import write_atomic
-from echelon.output.archive.folder import write_errors
+from echelon.output.archive.folder import check_empty, write_errors
 
 _START = Path(__file__).resolve().parent / "start"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
@@ -24,8 +24,7 @@ def create_starter(folder: Path) -> list[Path]:
         raise OutputError(
             f"`{name}` cannot name a scenario; use letters, digits, `.`, `-` and `_` only."
         )
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError(f"`{folder}` exists and is not empty; choose another name.")
+    check_empty(folder)
     files = []
     with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -16,8 +16,9 @@ from echelon.experiments.scenario.scenario import (
 from echelon.experiments.scenario.self_contained import files_of, names_code, without_folders
 from echelon.experiments.studies.recomputation import recompute
 from echelon.guarantees.verifier import verify as verifier
-from echelon.guarantees.verifier.findings import Finding
+from echelon.guarantees.verifier.findings import Finding, unchecked
 from echelon.guarantees.verifier.verify import PROMISE, Verification, judge
+from echelon.output.archive.folder import DATA, SUMMARY
 from echelon.output.archive.open_folder import ClaimFiles, claim_files
 from echelon.output.archive.run_folder import save_run
 from echelon.simulation.engine.result import Result
@@ -75,7 +76,10 @@ def check_files(
     if source is not None and (files.claims is not None or files.data is not None):
         begin()
         computed = list(recompute(source, files.claims, files.gain, files.data))
-    return judge([*_still_open(findings, computed, obstacle), *computed], note), obstacle
+    still_open = [*_still_open(findings, computed, obstacle)]
+    if files.claims is not None and files.claims.name == SUMMARY and files.data is None:
+        still_open.append(unchecked(DATA, "", "it is missing"))
+    return judge([*still_open, *computed], note), obstacle
 
 
 def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | None, str]:

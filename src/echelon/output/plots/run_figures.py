@@ -73,9 +73,9 @@ def figures(
     names = check_names(what)
     if ax is not None and len(names) != 1:
         raise OutputError(f"`ax` takes one figure, and `what` has {len(names)} names.")
-    if not len(run.times):
-        return {}
     data = recording_of(run)
+    if not len(data.times):
+        return {}
     with draw.style(page, ax):
         drawings = {name: make(data) for name, make in _MAKERS.items() if name in names}
     return {name: figure for name, figure in drawings.items() if figure is not None}

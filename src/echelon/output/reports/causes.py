@@ -62,9 +62,10 @@ def _slow(result: Result, guarantee: Promise) -> Iterator[Cause]:
     by_mode = guarantee.slowest is not None
     rate = -guarantee.slowest if guarantee.slowest is not None else guarantee.rate
     if guarantee.promised and rate and result.settings.horizon * rate < _SETTLES:
+        span = "1 m to 1 cm" if result.length_unit else "1 to 0.01"
         yield Cause(
             f"{'the slowest mode' if by_mode else 'the guaranteed rate'} takes "
-            f"{_SETTLES / rate:.3g} s from 1 m to 1 cm, and the horizon is "
+            f"{_SETTLES / rate:.3g} s from {span}, and the horizon is "
             f"{result.settings.horizon:g} s",
             "lengthen `simulation.horizon`, or let `echelon design` find a faster gain",
         )

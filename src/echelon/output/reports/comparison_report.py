@@ -183,16 +183,19 @@ def verdict(comparison: Comparison) -> tuple[str, ...]:
     runs = [row for row in comparison.rows if row.flight is not None]
     settled = [row for row in runs if row.number("worst_settling_time") is not None]
     some = 0 < len(settled) < len(runs)
+    # Among others that do not settle, one alone is compared with nothing.
+    ranked = [] if some and len(settled) == 1 else settled
+    some = some and bool(ranked)
     return tuple(
         sentence
         for sentence in (
             _unsettled(runs, settled),
-            _among_settled(some, _closest(settled or runs)),
-            _best(settled, "settles first", "worst_settling_time"),
+            _among_settled(some, _closest(ranked or runs)),
+            _best(settled, "settles first" if ranked else "settles", "worst_settling_time"),
             _best(runs, "has the smallest error over the whole run", "worst_rmse"),
             _leader(runs),
-            _among_settled(some, _best(settled, "has the smallest effort", "effort")),
-            _among_settled(some, _cheapest(settled)),
+            _among_settled(some, _best(ranked, "has the smallest effort", "effort")),
+            _among_settled(some, _cheapest(ranked)),
         )
         if sentence
     )

@@ -49,10 +49,13 @@ def explain_term(term: str, more: Mapping[str, str]) -> dict[str, str]:
         OutputError: there is none.
     """
     terms, key = glossary(more), term.strip().lower()
-    exact = {
-        name: text for name, text in terms.items() if key in (name.lower(), name.split(".")[-1])
+    # A key alone is not all that its last name may mean, as `margin` of `safety` is not.
+    exact = key in map(str.lower, terms)
+    matches = {
+        name: text
+        for name, text in terms.items()
+        if (key in (name.lower(), name.split(".")[-1]) if exact else key and key in name.lower())
     }
-    matches = exact or {k: text for k, text in terms.items() if key and key in k.lower()}
     if not matches:
         close = did_you_mean(key, [name.lower() for name in terms])
         raise OutputError(

@@ -28,6 +28,7 @@ from echelon.core.words import Feedforward, MessageContent
 from echelon.laws.law import Law, Memory
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.own_step import (
+    OwnLaw,
     OwnState,
     Step,
     begin_alone,
@@ -111,9 +112,8 @@ class Agent:
         with precision("float64"):
             self._names = _names(self._loop, self._law)
         self._stamps = self._stamps_of(graph.leaders)
-        self._inbox = Inbox(
-            self.neighbours, self._source_in(parts), *self._names, stamps=self._stamps
-        )
+        self._source = self._source_in(parts)
+        self._inbox = Inbox(self.neighbours, self._source, *self._names, stamps=self._stamps)
         self._others = self._surroundings(graph.agents)
         sensors = self._loop.sensors
         self._estimator = None if sensors is None else sensors.estimator
@@ -143,6 +143,12 @@ class Agent:
         assert hull is not None
         names = tuple(f"{name}{k}" for k in range(len(hull)) for name in model.position)
         return Surroundings([k for k in range(agents) if k != self.number], names)
+
+    @property
+    def own_law(self) -> OwnLaw:
+        """Its law, and whom it hears."""
+        offset, heard = self._loop.offsets[self.number], (self.neighbours, self._weights)
+        return OwnLaw(self._loop, self.leads, offset, *heard, *self._names, self._source)
 
     @property
     def _sizes(self) -> tuple[int, int, int]:

@@ -24,7 +24,9 @@ class ClosestPair(NamedTuple):
         """Return the closest of two agents or more at places (m), at a time (s)."""
         from scipy.spatial import KDTree
 
-        away, near = map(np.asarray, KDTree(places).query(places, k=2))
+        # Of places whose squares are beyond floats a tree knows no distances.
+        scaled = np.ldexp(places, -max(0, int(np.frexp(np.abs(places).max())[1])))
+        away, near = map(np.asarray, KDTree(scaled).query(scaled, k=2))
         first = int(away[:, 1].argmin())
         # Agents in one place come in any order.
         other = next(int(agent) for agent in near[first] if agent != first)

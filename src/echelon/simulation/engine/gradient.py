@@ -75,7 +75,8 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
 
     Raises:
         EchelonError: a part is malformed or does not fit the others; the agents are not driven by
-            laws, or these have no gain; messages are late; a variable is unknown;
+            laws, or these have no gain; messages are late; a variable is unknown; the cost is not
+            one number;
             `settings.engine` is `native`, and native code is unavailable.
     """
     if parts.world.network is not None:
@@ -283,8 +284,18 @@ def _cost_slopes(cost: Cost, sums: Sums) -> tuple[jax.Array, Sums]:
     """Return a cost of sums, and its derivatives by those that are differentiable."""
     names = ("errors", "tracking", "outputs", "effort", "spacing")
     smooth = {name: getattr(sums, name) for name in names}
-    value, slopes = jax.value_and_grad(lambda part: cost(sums._replace(**part)))(smooth)
+    value, slopes = jax.value_and_grad(lambda part: _number(cost, sums._replace(**part)))(smooth)
     return value, sums._replace(**slopes)
+
+
+def _number(cost: Cost, sums: Sums) -> jax.Array:
+    """Return the cost of sums, which must be one number."""
+    value = cost(sums)
+    if (shape := jnp.shape(value)) != ():
+        raise SimulationError(
+            f"the cost of a run has shape {shape}, and must be one number, such as a sum of it."
+        )
+    return value
 
 
 # ---- by JAX --------------------------------------------------------------------------------------
@@ -339,7 +350,7 @@ def _differentiate(
         start = jnp.asarray(values.get("initial", states))
         changed = _with_offsets(_with_gain(loop, values), values)
         sums = _sums(changed, start, reference, steps)
-        return cost(sums), sums
+        return _number(cost, sums), sums
 
     return jax.value_and_grad(whole, has_aux=True)(jax.tree.map(jnp.asarray, values))
 

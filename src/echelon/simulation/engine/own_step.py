@@ -1,6 +1,7 @@
 """A step of one agent by itself, from its state, its memory and what it received."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.near import Near
 from echelon.agents.world.estimator import Estimate, Estimator
 from echelon.core.compiled import cached_jit
-from echelon.core.types import PyTree, Scalar, State
+from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act
 from echelon.simulation.step.knowledge import (
@@ -26,6 +27,9 @@ from echelon.simulation.step.knowledge import (
 )
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.nearby import less_expected
+
+Signal: TypeAlias = Float[jax.Array, " s"]
+"""What an agent sends to its neighbours."""
 
 
 class OwnState(NamedTuple):
@@ -51,7 +55,7 @@ def measured_alone(
 
 
 @cached_jit
-def signal_of(loop: Loop, law: Law, own: OwnState) -> Float[jax.Array, " s"]:
+def signal_of(loop: Loop, law: Law, own: OwnState) -> Signal:
     """Return what the agent sends to its neighbours."""
     signal = law.signal(loop.model, *own)
     return own.x - own.offset if signal is None else signal
@@ -66,6 +70,34 @@ def hull_of(loop: Loop, law: Law, own: OwnState) -> Float[jax.Array, "r d"] | No
 def _gaps(near: Near | None, hull: Float[jax.Array, "r d"] | None) -> Near | None:
     """Return what an agent knows of others, from their hulls and its own."""
     return None if near is None or hull is None else near._replace(gaps=hull[None] - near.gaps)
+
+
+class OwnLaw(NamedTuple):
+    """The law of one agent, and whom it hears.
+
+    Attributes:
+        loop: of its formation.
+        leads: whether it is a leader.
+        offset: of its goal (n,).
+        neighbours: the numbers of those that it hears.
+        weights: of their signals (rows, K); a graph that switches has several rows.
+        signal_names, forward_names: of what it sends.
+        source: whose feed-forward it uses; None for nobody's.
+    """
+
+    loop: Loop
+    leads: bool
+    offset: Array
+    neighbours: tuple[int, ...]
+    weights: Array
+    signal_names: tuple[str, ...]
+    forward_names: tuple[str, ...]
+    source: int | None
+
+    @property
+    def law(self) -> Law:
+        """The leaders' law or the others'."""
+        return self.loop.leader if self.leads else self.loop.follower
 
 
 class Step(NamedTuple):
@@ -93,20 +125,41 @@ def step_alone(
     near: Near | None,
 ) -> Step:
     """Return what the agent does with what it received, NaN for what it did not."""
-    law, model = loop.leader if leads else loop.follower, loop.model
+    gaps = jax.vmap(lambda value: gap_of(loop, leads, own, value))(received)
+    return step_with(loop, leads, t, own, weights @ gaps, forward, near)
+
+
+def gap_of(loop: Loop, leads: bool, own: OwnState, received: Signal) -> Float[jax.Array, " k"]:
+    """Return the difference of an agent's signal from another's; 0 where that one is NaN."""
+    law = loop.leader if leads else loop.follower
     signal = signal_of(loop, law, own)
-    states = law.signal(model, *own) is None
-    difference = model.difference if states else jnp.subtract
     # The own value has no difference: a neighbour that is not heard does not act.
-    theirs = jnp.where(jnp.isnan(received), signal, received)
-    gaps = jax.vmap(lambda value: difference(signal, value))(theirs)
+    return _difference(loop, law, own)(signal, jnp.where(jnp.isnan(received), signal, received))
+
+
+def _difference(loop: Loop, law: Law, own: OwnState) -> Callable[..., jax.Array]:
+    """Return the difference of two signals: the model's, where they are states."""
+    return loop.model.difference if law.signal(loop.model, *own) is None else jnp.subtract
+
+
+def step_with(
+    loop: Loop,
+    leads: bool,
+    t: Scalar,
+    own: OwnState,
+    z: Float[jax.Array, " s"],
+    forward: Float[jax.Array, " k"],
+    near: Near | None,
+) -> Step:
+    """Return what the agent does with a disagreement; a feed-forward is NaN if not received."""
+    law, model = loop.leader if leads else loop.follower, loop.model
+    signal, hull = signal_of(loop, law, own), hull_of(loop, law, own)
     alone = jnp.zeros_like(forward)
     if loop.follower.turning and not leads:
         alone = alone.at[-1].set(law.heading(model, t, own.x))
     forward = jnp.where(jnp.isnan(forward), alone, forward)
     forward = jnp.zeros(len(model.input_names)) if leads else forward
-    hull = hull_of(loop, law, own)
-    rows = weights @ gaps, forward, loop.motion.dt, _gaps(near, hull)
+    rows = z, forward, loop.motion.dt, _gaps(near, hull)
     action = act(loop, law, LocalView(t, own.x, own.offset, *rows), own.memory, leads)
     return Step(signal, action, is_finite((own.x, signal, action, hull)), hull=hull)
 
@@ -132,8 +185,7 @@ def step_over_network(
     """Return what the agent does and sends over a network that is late."""
     law, model = loop.leader if leads else loop.follower, loop.model
     signal, nobody = signal_of(loop, law, own), np.zeros(len(weights), np.int32)
-    states = law.signal(model, *own) is None
-    difference = jax.vmap(model.difference if states else jnp.subtract)
+    difference = jax.vmap(_difference(loop, law, own))
     rows = loop, Exchange(nobody, nobody, weights), reader, t, mail, ages, signal[None], difference
     knowledge = understand(*rows)
     forward = jnp.zeros(len(model.input_names)) if leads else knowledge.feedforward[0]

@@ -66,12 +66,7 @@ class BlockRows(NamedTuple):
         Raises:
             Unsupported: the memory of a law is not made of numbers, or messages take time.
         """
-        if loop.channel is not None:
-            raise Unsupported("a network that is not ideal")
-        if loop.sensors is not None:
-            raise Unsupported("agents that measure their states late or with noise")
-        if loop.follower.safety is not None:
-            raise Unsupported("agents that keep away from each other")
+        check_information(loop)
         if not loop.motion.ideal:
             raise Unsupported(
                 "substeps, actuators that lag, correlated wind, air, or agents that differ"
@@ -93,6 +88,20 @@ class BlockRows(NamedTuple):
         ]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q, 1]
         return cls(*row_ranges(sizes))
+
+
+def check_information(loop: Loop) -> None:
+    """Check that agents know exact states, current messages, and nothing else.
+
+    Raises:
+        Unsupported: they do not.
+    """
+    if loop.channel is not None:
+        raise Unsupported("a network that is not ideal")
+    if loop.sensors is not None:
+        raise Unsupported("agents that measure their states late or with noise")
+    if loop.follower.safety is not None:
+        raise Unsupported("agents that keep away from each other")
 
 
 def memory_size(law: Law) -> int:

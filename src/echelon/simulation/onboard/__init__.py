@@ -1,0 +1,1 @@
+"""The law of one agent as source code, for programs without echelon."""

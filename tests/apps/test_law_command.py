@@ -1,0 +1,82 @@
+"""`echelon law` writes a law that runs without echelon, or says why it does not."""
+
+import hashlib
+import json
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon.output.archive.law_folder import law_files
+
+ALONE = """
+import law
+memory = law.begin({x})
+u, memory, signal, message, valid = law.tick(0.0, {x}, [0.0] * {n}, [0.0] * {k}, memory)
+assert valid and law.AGENT == 1 and law.DT == 0.01
+print(u)
+"""
+
+
+def test_the_files_state_whom_an_agent_hears_and_run_without_echelon(tmp_path, echelon):
+    out = tmp_path / "law"
+    command = ("law", "integrators", "--set", "simulation.dt=0.01", "--agent", 1)
+    code, said, errors = echelon(*command, "--out", out)
+    assert code == 0 and not errors and "law.py" in said
+    assert sorted(file.name for file in out.iterdir()) == ["law.c", "law.h", "law.json", "law.py"]
+    stated = json.loads((out / "law.json").read_text("utf-8"))
+    parts, settings = ech.build(ech.load_scenario("integrators", ["simulation.dt=0.01"]))
+    agent = ech.Agent(parts, 1, 0.01)
+    assert stated["hears"] == list(agent.neighbours) and len(stated["weights"]) == len(
+        agent.neighbours
+    )
+    assert stated["guaranteed"] == ech.promise(parts, settings).sentence()
+    for name, digest in stated["sha256"].items():
+        assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
+    x = [0.5] * len(stated["states"])
+    text = ALONE.format(x=x, n=len(stated["signal"]), k=len(stated["message"]))
+    # -S: no packages, of which echelon is one.
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", text], cwd=out, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert np.isfinite(json.loads(done.stdout)).all()
+    # Agents of one formation have one mark, and those of another have another.
+    marks = [
+        json.loads(law_files(parts, settings, k, text)["law.json"])["formation"]
+        for k, text in ((0, "a"), (1, "a"), (1, "b"))
+    ]
+    assert marks[0] == marks[1] != marks[2]
+
+
+def test_what_cannot_be_exported_is_refused_in_one_sentence(tmp_path, echelon):
+    code, _, errors = echelon("law", "integrators", "--agent", 99, "--out", tmp_path / "law")
+    assert code == 2 and "agent 99 is not in this graph" in errors and errors.count("\n") == 1
+    assert not (tmp_path / "law").exists()
+    code, _, errors = echelon("law", "paper-radio", "--agent", 1, "--out", tmp_path / "law")
+    assert code == 2 and errors == (
+        "echelon: the law of agent 1 cannot be exported: there is no code for a network that is "
+        "not ideal.\n"
+    )
+    (tmp_path / "mine").write_text("")
+    code, _, errors = echelon("law", "integrators", "--agent", 1, "--out", tmp_path)
+    assert code == 2 and "is not empty" in errors
+
+
+class Bends(ech.laws.Law):
+    """Uses what has no scalar operations."""
+
+    def update(self, model, view, memory):
+        return jax.scipy.special.erfinv(view.disagreement)[:1] * 0.0, memory
+
+
+def test_a_law_without_scalar_operations_is_refused_with_its_line():
+    model, graph = ech.models.Pendulum(), ech.Graph.path(2)
+    drive = ech.Laws(ech.laws.TrimInput(), Bends())
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((2, 2))), drive)
+    line = r"there is no code for `erf_inv` in .*test_law_command\.py, line \d+\.$"
+    with pytest.raises(ech.errors.OutputError, match=line):
+        law_files(parts, ech.Settings(horizon=1.0, dt=0.01), 1, "")

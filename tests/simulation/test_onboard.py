@@ -1,0 +1,306 @@
+"""Exported laws, in Python and in C, compute what `Agent` computes."""
+
+import ctypes
+import math
+import re
+import shutil
+import subprocess
+
+import jax
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon.simulation.onboard.c_text import c_text, header_text
+from echelon.simulation.onboard.law_functions import LawFunction, law_functions
+from echelon.simulation.onboard.python_text import python_text
+from echelon.simulation.scalars import ScalarGraph, Unsupported
+from echelon.simulation.scalars.scalar_graph import OPERATIONS
+
+COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wdouble-promotion", "-Werror")
+
+
+# ---- three ways to run the text ------------------------------------------------------------------
+
+
+def as_python(functions, folder):
+    scope = {}
+    exec(python_text(functions, "A law.", {}), scope)
+    return {f.name: scope[f.name] for f in functions}
+
+
+def as_read_c(functions, folder):
+    """Evaluate the assignments of the C text one by one, with NumPy's functions as helpers."""
+    text, scope = c_text(functions, "A law."), dict(NUMPY_TWINS)
+    for _, name, arguments, body in re.findall(
+        r"^(void|int) law_(\w+)\(([^)]*)\)\n\{\n(.*?)^\}", text, re.M | re.S
+    ):
+        names = [argument.split()[-1].lstrip("*") for argument in arguments.split(", ")]
+        lines = [f"def {name}({', '.join(names)}):", *map(read, body.splitlines())]
+        exec("\n".join(lines), scope)
+    return {f.name: with_outputs(f, scope[f.name], list) for f in functions}
+
+
+def read(line):
+    """Return a line of C as one of Python."""
+    line = re.sub(r"^(    )?const (double|int) ", r"    ", line.rstrip(";"))
+    line = re.sub(r"\(void\)\w+", "pass", line)
+    line = re.sub(r"if \((.*)\)$", r"if \1:", line)
+    line = re.sub(r" = (\S+) \? (.+) : (.+)$", r" = \2 if \1 else \3", line)
+    line = re.sub(r" = (\S+) / (\S+)$", r" = divide(\1, \2)", line)
+    line = line.replace("&&", "and").replace("||", "or")
+    line = re.sub(r"!(?!=)", "not ", line)
+    return line.replace("(double)INFINITY", "inf").replace("(double)NAN", "nan")
+
+
+def frexp(a):
+    half, exponent = np.frexp(abs(a))
+    return (2.0 * half, exponent - 1) if half < math.sqrt(0.5) else (half, exponent)
+
+
+NUMPY_TWINS = {
+    "inf": math.inf,
+    "nan": math.nan,
+    "divide": lambda a, b: float(np.divide(a, b)),
+    "sqrt": lambda a: float(np.sqrt(a)),
+    "law_abs": abs,
+    "law_bit": lambda a, place: (int(np.float64(a).view(np.uint64)) >> place) % 2 == 1,
+    "law_exponent": lambda a: float(frexp(a)[1]),
+    "law_mantissa": lambda a: float(frexp(a)[0]),
+    "law_single": lambda a: float(np.float32(a)),
+    "law_pow2": lambda a: float(np.ldexp(1.0, int(a))),
+    "law_root_guess": lambda a: float(
+        (np.uint64(0x5FE6EB50C7B537A9) - (np.float64(a).view(np.uint64) >> np.uint64(1))).view(
+            np.float64
+        )
+    ),
+    **{
+        f"law_{name}": lambda *a, of=of: float(of(*a))
+        for name, of in {
+            "floor": np.floor,
+            "ceil": np.ceil,
+            "rint": np.rint,
+            "min": np.minimum,
+            "max": np.maximum,
+            "copysign": np.copysign,
+        }.items()
+    },
+}
+
+
+def as_compiled_c(functions, folder):
+    (folder / "law.c").write_text(c_text(functions, "A law."))
+    (folder / "law.h").write_text(header_text(functions, "A law.", {}))
+    options = [*FLAGS, "-ffp-contract=off", "-O2", "-shared", "-fPIC", "-o", "law.so", "law.c"]
+    subprocess.run([COMPILER, *options, "-lm"], cwd=folder, check=True)
+    library = ctypes.CDLL(str(folder / "law.so"))
+    result = {}
+    for f in functions:
+        function = getattr(library, f"law_{f.name}")
+        both = {**f.inputs, **{name: len(part) for name, part in f.outputs.items()}}
+        pointer = np.ctypeslib.ndpointer(np.float64)
+        function.argtypes = [ctypes.c_double if n is None else pointer for n in both.values()]
+        result[f.name] = with_outputs(f, function, np.array)
+    return result
+
+
+def with_outputs(function, call, array):
+    """Return a function with outputs as arguments as one that returns them."""
+
+    def run(*inputs):
+        both = {
+            name: value if size is None else array(value)
+            for (name, size), value in zip(function.inputs.items(), inputs, strict=True)
+        }
+        for name, part in function.outputs.items():
+            both.setdefault(name, array([math.nan] * len(part)))
+        with np.errstate(all="ignore"):
+            valid = call(*both.values())
+        results = [list(map(float, both[name])) for name in function.outputs]
+        if function.valid is None:
+            [results] = results
+            return results
+        return *results, bool(valid)
+
+    return run
+
+
+WAYS = [as_python, as_read_c, *([as_compiled_c] if COMPILER else [])]
+
+
+# ---- each operation ------------------------------------------------------------------------------
+
+SPECIAL = [0.0, -0.0, 0.5, -0.5, 1.5, 2.5, -2.5, 0.3, -7.7, 1e300, -1e300, 2.0**52 + 1.0]
+SPECIAL += [math.inf, -math.inf, math.nan]
+WHOLE = [-500.0, -1.0, 0.0, 1.0, 7.0, 512.0]
+SHIFTED = [1.5 * 2.0**52 + k for k in range(-5, 6)]
+POSITIVE = [1e-300, 0.3, 0.5, math.sqrt(0.5), 0.999, 1.0, 2.0, 1.414, 1.4143, 3e200]
+DOMAINS = {"pow2": WHOLE, "bit0": SHIFTED, "bit1": SHIFTED}
+DOMAINS |= dict.fromkeys(("exponent", "mantissa", "root_guess"), POSITIVE)
+DOMAINS["single"] = [x for x in SPECIAL if not abs(x) > 1e39 or math.isinf(x)]
+LOGICAL = {"and": 2, "or": 2, "xor": 2, "not": 1, "unlikely": 1}
+ARITY = {"copysign": 2, "min": 2, "max": 2, "fma": 3, "fms": 3, "fnma": 3, "select": 3}
+UNARY = {"neg", "abs", "sqrt", "floor", "ceil", "rint", *DOMAINS}
+
+
+def operations(values):
+    """Return one function that applies each operation to a, b and c."""
+    graph = ScalarGraph()
+    a, b, c = (graph.leaf("x", k) for k in range(3))
+    truths = [graph.make("lt", 0.0, x) for x in (a, b, c)]
+    results = {}
+    for op in values:
+        if op == "select":
+            results[op] = graph.make(op, truths[0], b, c)
+            continue
+        operands = truths if op in LOGICAL else (a, b, c)
+        arity = LOGICAL.get(op, 1 if op in UNARY else ARITY.get(op, 2))
+        node = graph.make(op, *operands[:arity])
+        results[op] = graph.make("select", node, 1.0, 0.0) if node.truth else node
+    return LawFunction("each", "all of them", {"x": 3}, {op: [n] for op, n in results.items()})
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_each_operation_is_the_graphs_own_to_the_bit(way, tmp_path):
+    plain = [op for op in OPERATIONS if op not in DOMAINS]
+    for domain, ops in [(SPECIAL, plain), *((d, [op]) for op, d in DOMAINS.items())]:
+        folder = tmp_path / ops[0]
+        folder.mkdir()
+        function = operations(ops)._replace(
+            outputs={"y": sum(operations(ops).outputs.values(), [])}
+        )
+        each = way([function], folder)["each"]
+        for a in domain:
+            for b, c in [(b, c) for b in SPECIAL for c in (0.25, -0.0, math.nan)]:
+                expected = [expectation(op, a, b, c) for op in ops]
+                for op, got, value in zip(ops, each([a, b, c]), expected, strict=True):
+                    check = np.testing.assert_array_equal
+                    if op == "root_guess":
+                        np.testing.assert_allclose(got, value, rtol=0.035)
+                        continue
+                    check(got, value, err_msg=f"{op} {a} {b} {c}")
+                    if value == 0.0 and op not in ("min", "max"):
+                        assert math.copysign(1.0, got) == math.copysign(1.0, value), (op, a, b, c)
+                if domain is not SPECIAL:
+                    break
+
+
+def expectation(op, *values):
+    with np.errstate(all="ignore"):
+        if op in ("exponent", "mantissa"):
+            return float(frexp(values[0])[op == "exponent"])
+        if op == "select":
+            values = values[0] > 0.0, *values[1:]
+        elif op in LOGICAL:
+            values = [x > 0.0 for x in values]
+        arity = LOGICAL.get(op, 1 if op in UNARY else ARITY.get(op, 2))
+        numbers = [x if isinstance(x, bool) else np.float64(x) for x in values[:arity]]
+        return float(OPERATIONS[op](*numbers))
+
+
+# ---- against `Agent` -----------------------------------------------------------------------------
+
+OBSERVED = ["leader.observer={push: 16, scale: 2}", "follower.observer={push: 16, scale: 2}"]
+AGENTS = {"consensus": ("paper", [], 2), "stopping-point": ("paper-far", OBSERVED, 2)}
+AGENTS["its-leader"] = ("paper-far", OBSERVED, 0)
+
+
+@pytest.fixture(scope="module", params=AGENTS)
+def agent(request):
+    name, changes, number = AGENTS[request.param]
+    parts, settings = ech.build(ech.load_scenario(name, changes))
+    return ech.Agent(parts, number, settings.dt, settings.limits)
+
+
+def test_a_law_by_itself_steps_as_the_agent_does(agent, tmp_path):
+    functions, own = law_functions(agent.own_law), agent.own_law
+    runs = {way: way(functions, tmp_path) for way in WAYS}
+    trim, draws = np.array(own.loop.model.trim[0]), np.random.default_rng(0)
+    memory = {way: run["begin"](trim.tolist()) for way, run in runs.items()}
+    for k in range(300):
+        x = trim + 0.1 * draws.normal(size=len(trim)) * (k > 0)
+        signals, forward = receive(agent, draws)
+        time = k * own.loop.motion.dt
+        u, message = agent.step(time, x)
+        leaves = [np.ravel(leaf) for leaf in jax.tree.leaves(agent._memory)]
+        flat = np.concatenate([np.zeros(0), *leaves])
+        expected = u, flat, message.signal.values, message.feedforward.values
+        for way, run in runs.items():
+            before = memory[way]
+            gaps = [run["difference"](x.tolist(), before, s.tolist()) for s in signals]
+            z = (own.weights[0] @ np.array(gaps)).tolist()
+            inputs = time, x.tolist(), z, forward.tolist(), before
+            *results, valid = run["tick"](*inputs)
+            memory[way] = results[1]
+            assert valid and run["hello"](x.tolist(), before) == results[2]
+            for got, value in zip(results, expected, strict=True):
+                size = max(1.0, np.abs(value).max(initial=0.0))
+                np.testing.assert_allclose(got, value, rtol=0, atol=1e-14 * size)
+    # Python and C agree to the bit.
+    assert all(numbers == memory[as_python] for numbers in memory.values())
+
+
+def receive(agent, draws):
+    """Send an agent random signals, and a feed-forward, and return both."""
+    own = agent.own_law
+    names, forward_names = own.signal_names, own.forward_names
+    signals = [0.3 * draws.normal(size=len(names)) for _ in own.neighbours]
+    forward = 0.1 * draws.normal(size=len(forward_names))
+    sent = ech.Message(own.source, (names, np.zeros(len(names))), (forward_names, forward))
+    if own.source is not None:
+        assert str(agent.receive(sent)) == "taken"
+    for sender, signal in zip(own.neighbours, signals, strict=True):
+        feed = (forward_names, forward) if sender == own.source else None
+        assert str(agent.receive(ech.Message(sender, (names, signal), feed))) == "taken"
+    return signals, forward
+
+
+def test_what_is_not_finite_is_not_valid(agent, tmp_path):
+    own, functions = agent.own_law, law_functions(agent.own_law)
+    trim = list(map(float, own.loop.model.trim[0]))
+    sizes = {f.name: f.inputs for f in functions}["tick"]
+    for way in WAYS:
+        run = way(functions, tmp_path)
+        memory = run["begin"](trim)
+        zeros = {name: [0.0] * size for name, size in sizes.items() if size is not None}
+        rest = zeros | {"x": trim, "memory": memory}
+        assert run["tick"](0.0, *rest.values())[-1]
+        for bad in (math.nan, math.inf, -math.inf):
+            wrong = rest | {"x": [*trim[:2], bad, *trim[3:]]}
+            assert not run["tick"](0.0, *wrong.values())[-1], (way, bad)
+
+
+# ---- what has no code ----------------------------------------------------------------------------
+
+
+CARTS = ech.models.DoubleIntegrator()
+PAIR = ech.Graph.path(3)
+
+
+def carts(graph=PAIR, **more):
+    places = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.0), 2: (1.0, 0.8)})
+    circle = ech.references.Circle(radius=1.0, rate=0.6)
+    laws = ech.Laws(ech.laws.StoppingLeader(reference=circle), ech.laws.StoppingPoint(**more))
+    return ech.Parts(CARTS, graph, places, laws)
+
+
+APART = ech.Safety(radii=(0.085, 0.085, 0.085))
+REFUSED = {
+    "a network that is not ideal": lambda: carts().replace(
+        world=ech.World(network=ech.Network(rate=50.0, delay=0.02))
+    ),
+    "agents that measure their states late or with noise": lambda: carts().replace(
+        world=ech.World(sensing=ech.Sensing(delay=0.01))
+    ),
+    "a graph that switches": lambda: carts(
+        graph=ech.Graph.switching([(0.0, [(0, 1), (1, 2)]), (1.0, [(0, 1), (0, 2)])])
+    ),
+    "agents that keep away from each other": lambda: carts(safety=APART),
+}
+
+
+@pytest.mark.parametrize("reason", REFUSED)
+def test_what_a_law_file_does_not_know_is_refused(reason):
+    with pytest.raises(Unsupported, match=re.escape(reason)):
+        law_functions(ech.Agent(REFUSED[reason](), 1, 0.01).own_law)
