@@ -32,6 +32,9 @@ def test_distances_are_guaranteed_and_convergence_is_not():
     text = value.sentence()
     assert "radii of 0.1 x 0.1 m never overlap" in text and "Convergence is not guaranteed" in text
     assert "converge to zero" not in text and "observed" not in text
+    # The proof is of continuous time and of agents whose actuators deliver what the law asks.
+    assert "time is continuous, no input is at a limit" in text and "held for" in text
+    assert value.hypotheses[Hypothesis.SEPARATION].kind is value.tube.kind
     line = value.hypotheses[Hypothesis.SEPARATION]
     assert not line.fails
     # Agents 0 and 2 rest at the start, so that their hulls are single points.

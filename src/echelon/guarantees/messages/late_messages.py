@@ -138,8 +138,8 @@ class LateMessages(NamedTuple):
 
     def sentence(self, arrival: float | None) -> str:
         """Return what is guaranteed beside rates, in sentences; the arrival (s) where known."""
-        ages, text = self.ages, "No stopping point moves farther from the leader's than the "
-        text += "farthest one was"
+        ages, text = self.ages, "Once everybody has a packet no stopping point moves farther from "
+        text += "the leader's than the farthest one was"
         if ages.first_packet is None:
             return f"{text}. A link may lose all messages of a run"
         few = f"In all but one run in a million no link loses more than {ages.lost} in a row, e"

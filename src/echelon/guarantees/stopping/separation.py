@@ -13,7 +13,10 @@ from echelon.guarantees.stopping.tube import Tube
 from echelon.laws.safety import AXES, Safety
 from echelon.laws.together import hulls_at, separations
 
-_EXACT = "the model is exact and all is known at the same instant"
+_EXACT = (
+    "the model is exact, time is continuous, no input is at a limit and all is known at the same "
+    "instant"
+)
 
 
 class Separation(NamedTuple):
@@ -45,8 +48,8 @@ class Separation(NamedTuple):
 
     @property
     def kind(self) -> Kind:
-        """Of the argument."""
-        return Kind.PROOF
+        """Of the argument, which rests on the tube's flat coordinates."""
+        return self.tube.kind
 
     @property
     def theorem(self) -> Theorem:
@@ -59,17 +62,19 @@ class Separation(NamedTuple):
         name, number = Hypothesis.SEPARATION, (self.least, f"{self.least:.3g} m at the start")
         if self.ideal:
             text = f"{self.safety.distance:.3g} m are kept, scaled, while {_EXACT} (T10)"
-            return holds(name, Kind.PROOF, text, *number)
+            return holds(name, self.kind, text, *number)
         text = f"observed, not proved: T10 rests on it that {_EXACT}"
         remedy = "allow for the rest by `safety.margin`"
-        return fails(name, Kind.PROOF, text, *number, remedy=remedy)
+        return fails(name, self.kind, text, *number, remedy=remedy)
 
     def sentence(self) -> str:
         """Return what is guaranteed."""
         radii = " x ".join(f"{self.safety.radii[AXES.index(x)]:.4g}" for x in self.axes)  # pyright: ignore
         text = f"{self.kind.value}: ellipsoids about the agents with radii of {radii} m never "
         text += f"overlap from these starts, for any number of agents and any graph, if {_EXACT} "
-        text += "(T10), and each agent stays in its tube (T5). Convergence is not guaranteed while "
+        text += "(T10), and each agent stays in its tube (T5). The inputs are held "
+        text += f"for {self.step:.3g} s, which `safety.margin` has to allow for. "
+        text += "Convergence is not guaranteed while "
         text += "agents hold each other back; without that, errors decay at "
         text += f"{self.tube.rate:.3g} 1/s or faster eventually."
         if not self.ideal:
