@@ -1,4 +1,4 @@
-"""Crazyflies that are none, at the other end of cflib's UDP: CRTP packets, and vehicles behind them.
+"""Crazyflies that are none, at the other end of cflib's UDP: CRTP packets, and vehicles behind.
 
     python fake_crazyflie.py '{"port": 19850, "starts": [[0, 0, 1]], "file": "flown.npz"}'
 
@@ -152,7 +152,9 @@ class Crazyflie:
         for block, (period, last, entries) in self.blocks.items():
             if period and now >= last + period:
                 self.blocks[block][1] = max(last + period, now - period)
-                body = b"".join(struct.pack("<" + FORMATS[kind & 15], values[k]) for kind, k in entries)
+                body = b"".join(
+                    struct.pack("<" + FORMATS[kind & 15], values[k]) for kind, k in entries
+                )
                 stamp = int(1e3 * now) & 0xFFFFFF
                 due.append(bytes([0x5E, block]) + struct.pack("<I", stamp)[:3] + body)
         return due
@@ -170,7 +172,9 @@ def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=No
     print("ready", flush=True)
     while True:
         now = time.monotonic()
-        ends, _, _ = select.select([*sockets, sys.stdin], [], [], max(0.0, begun + steps * dt - now))
+        ends, _, _ = select.select(
+            [*sockets, sys.stdin], [], [], max(0.0, begun + steps * dt - now)
+        )
         if sys.stdin in ends:
             break
         now = time.monotonic()

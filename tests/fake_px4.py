@@ -79,7 +79,12 @@ class Px4:
         self.logged = max(self.logged + self.period, now - self.period)
         turn = Rotation.from_matrix(WORLD @ Rotation.from_quat(np.roll(q, -1)).as_matrix() @ BODY)
         # As PX4 has it: the velocity in the body's frame.
-        numbers = *(WORLD @ p), np.roll(turn.as_quat(), 1), *turn.inv().apply(WORLD @ v), *(BODY @ w)
+        numbers = (
+            *(WORLD @ p),
+            np.roll(turn.as_quat(), 1),
+            *turn.inv().apply(WORLD @ v),
+            *(BODY @ w),
+        )
         self.wire.mav.odometry_send(int(1e6 * now), 1, 12, *numbers, [0.0] * 21, [0.0] * 21)
 
 

@@ -641,7 +641,7 @@ def test_a_named_quadrotor_takes_changes():
 
 
 def test_the_firmware_s_gains_are_those_of_its_set():
-    """Mellinger's attitude controller by hand: gains in units of 65535, error of twice the angle."""
+    """Mellinger's attitude controller by hand: gains of 65535ths, an error of twice the angle."""
     model = CrazyflieAttitude.named("firmware")
     motor = 0.12 / 65535
     tilt = 2 * 0.0325 * motor / 16.613656e-6  # rad/s^2 a unit; half of it goes to each motor

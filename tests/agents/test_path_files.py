@@ -217,7 +217,9 @@ def test_all_paths_are_written_with_the_file_of_crazyswarm2_that_lists_them(tmp_
     assert code == 0 and f"Written to {out}: 2 paths of 3 pieces, 4 s." in said
     robots = YAML(typ="safe").load(out / "crazyflies.yaml")["robots"]
     begins = [at(Polynomials.read(out / f"{name}.csv"), [0.0])[0, 0] for name in robots]
-    assert [*robots] == ["agent0", "agent1"] and begins[1] - begins[0] == pytest.approx([1, 0.5, 0, 0])
+    assert [*robots] == ["agent0", "agent1"] and begins[1] - begins[0] == pytest.approx(
+        [1, 0.5, 0, 0]
+    )
     for robot, begin in zip(robots.values(), begins, strict=True):
         assert robot["initial_position"] == pytest.approx([*begin[:2], 0.0], abs=1e-4)
     assert len({robot["uri"] for robot in robots.values()}) == 2

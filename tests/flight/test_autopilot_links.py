@@ -3,6 +3,7 @@
 import math
 import struct
 import sys
+import time
 from types import ModuleType, SimpleNamespace
 
 import pytest
@@ -155,7 +156,9 @@ def test_the_newest_state_is_read_once(crazyflie):
     assert reading.x == pytest.approx([0.0, 0.0, 1.2, 0.0, -0.3, 0.0, 0.0, 0.0, 0.0])
     assert reading.battery == pytest.approx(0.5) and link.read(0.0) is None
     crazyflie.connection_lost[0]("", "Too many packets lost\nin the air.")
-    with pytest.raises(FlightError, match="the link to the Crazyflie failed: Too many packets lost"):
+    with pytest.raises(
+        FlightError, match="the link to the Crazyflie failed: Too many packets lost"
+    ):
         link.read(1.0)
 
 
@@ -168,14 +171,22 @@ def test_accelerations_go_as_full_states_from_the_measured_place(crazyflie):
     assert crazyflie.fake.acceleration == pytest.approx([0.1, 0.2, -0.3], abs=1e-3)
 
 
-def test_a_descent_is_level_and_ends_with_the_motors_off(crazyflie):
-    link = CflibLink("", facts(), crazyflie)
+def test_a_descent_is_level_and_ends_with_the_motors_off_at_the_ground_or_in_time(
+    crazyflie, monkeypatch
+):
+    link, blind = (CflibLink("", facts(), crazyflie) for _ in range(2))
     link.send([0.1, 0.2, -0.3, 0.25])
     link.level_descend()
     assert crazyflie.fake.command == pytest.approx([0.0, 0.0, 0.0, 0.93 * 0.3], abs=4e-6)
-    crazyflie.arrive(z=20)
+    for call in crazyflie.configs[0].data_received_cb:
+        call(0, dict.fromkeys(crazyflie.configs[0].variables, 0), None)
     link.level_descend()
     assert crazyflie.fake.command == [0.0] * 4
+    now = time.monotonic()
+    for later, thrust in ((0.0, 0.93 * 0.3), (4.9, 0.93 * 0.3), (5.1, 0.0), (9.0, 0.0)):
+        monkeypatch.setattr(time, "monotonic", lambda later=later: now + later)
+        blind.level_descend()
+        assert crazyflie.fake.command[3] == pytest.approx(thrust, abs=4e-6)
 
 
 REFUSED = {

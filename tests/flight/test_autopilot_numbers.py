@@ -19,7 +19,6 @@ from echelon.flight.links.crazyflie_units import (
     state_of_log,
     unpack_quaternion,
 )
-from echelon.flight.links.descent import Descent
 
 rng = np.random.default_rng(5)
 ANGLES = rng.uniform([-1.2, -1.2, -3.0], [1.2, 1.2, 3.0], (20, 3))
@@ -111,14 +110,6 @@ def test_full_states_keep_place_and_speed_and_ask_for_an_acceleration():
     assert q == pytest.approx([0.0, 0.0, math.sin(0.5), math.cos(0.5)]) and rates == [0.0] * 3
     # Thousandths of what is given, in the two bytes that the firmware reads as mrad/s.
     assert struct.pack("<h", int(1.5 * 1000)) == struct.pack("<h", 1500)
-
-
-def test_a_descent_weighs_less_than_the_vehicle_and_ends_at_the_ground_or_in_time():
-    sinks = Descent(0.3, 0.01)
-    assert sinks.thrust(1.0) == sinks.thrust(None) == pytest.approx(0.93 * 0.3)
-    assert sinks.thrust(0.04) is None and sinks.thrust(1.0) is None
-    blind = Descent(0.3, 0.01)
-    assert [blind.thrust(None) is None for _ in range(502)][498:] == [False, False, True, True]
 
 
 # ---- PX4 ----

@@ -109,7 +109,7 @@ def fly(parts, links):
 
 
 def errors(file, begin):
-    """The largest distances (m) from the goals beside the leader, and of the leader from its path."""
+    """The largest distances (m) from the goals beside the leader, and of it from its path."""
     flown = np.load(file)
     t = flown["times"] - begin
     within = (t > SETTLED) & (t < SECONDS - 0.1)
@@ -118,6 +118,15 @@ def errors(file, begin):
     apart = [places[:, k] - places[:, 0] - np.array(OFFSETS[k]) for k in OFFSETS]
     beside = max(np.linalg.norm(gap, axis=1).max() for gap in apart)
     return beside, np.linalg.norm(places[:, 0] - wanted, axis=1).max()
+
+
+def say(capsys, name, beside, leader, late):
+    beside, leader, late = 1e3 * beside, 1e3 * leader, 1e3 * np.quantile(late, 0.99)
+    with capsys.disabled():
+        print(
+            f"\n{name}: followers {beside:.1f} mm beside the leader, leader {leader:.1f} mm beside"
+        )
+        print(f"its path; one step in 100 was {late:.1f} ms late")
 
 
 def starts():
@@ -149,9 +158,7 @@ def test_a_swarm_of_cflib_flies_a_formation(tmp_path, name, capsys):
             links = [CflibLink("", facts(model, k), each[k]) for k in range(4)]
             begin, late = fly(parts, links)
     beside, leader = errors(file, begin)
-    with capsys.disabled():
-        print(f"\n{name}: followers {1e3 * beside:.1f} mm beside the leader, leader "
-              f"{1e3 * leader:.1f} mm; steps late p99 {1e3 * np.quantile(late, 0.99):.1f} ms")  # fmt: skip
+    say(capsys, name, beside, leader, late)
     assert beside <= 0.015 and leader <= 0.05
 
 
@@ -159,13 +166,14 @@ def test_a_stand_in_for_px4_flies_a_formation(tmp_path, capsys):
     extra("pymavlink.mavutil", "px4")
     model = CrazyflieAttitude()
     file, parts = str(tmp_path / "flown.npz"), formation(model)
-    with served("fake_px4.py", port=14540, starts=starts(), file=file), contextlib.ExitStack() as end:
+    with (
+        served("fake_px4.py", port=14540, starts=starts(), file=file),
+        contextlib.ExitStack() as end,
+    ):
         links = [Px4Link(f"udpin:127.0.0.1:{14540 + k}", facts(model, k)) for k in range(4)]
         for link in links:
             end.callback(link.close)
         begin, late = fly(parts, links)
     beside, leader = errors(file, begin)
-    with capsys.disabled():
-        print(f"\nPX4: followers {1e3 * beside:.1f} mm beside the leader, leader {1e3 * leader:.1f} "
-              f"mm; steps late p99 {1e3 * np.quantile(late, 0.99):.1f} ms")  # fmt: skip
+    say(capsys, "PX4", beside, leader, late)
     assert beside <= 0.010 and leader <= 0.05

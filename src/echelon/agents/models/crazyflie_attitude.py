@@ -16,11 +16,17 @@ from echelon.core.types import Input, InputMap, State
 def _identified(mass: float, gain: float, stiffness: float, damping: float, command: float,
                 yaw: float, motor: float = 0.12) -> dict[str, float]:  # fmt: skip
     attitude = {"stiffness": stiffness, "rate_damping": damping, "command_gain": command}
-    return {"mass": mass, "thrust_gain": gain, **attitude, "yaw_damping": yaw, "motor_thrust": motor}
+    return {
+        "mass": mass,
+        "thrust_gain": gain,
+        **attitude,
+        "yaw_damping": yaw,
+        "motor_thrust": motor,
+    }
 
 
-# Linearized by hand, with inertia and motors of `crazyflie-2.1+` (`quadrotor.py`). One unit of the
-# controller's output is a torque of 2 arm F / 65535 about x and y, and of 4 F c / 65535 about z; its
+# Linearized by hand, with inertia and motors of `crazyflie-2.1+` (`quadrotor.py`): a unit of the
+# controller's output is a torque of 2 arm F / 65535 about x and y, and 4 F c / 65535 about z, its
 # error of the attitude is twice the angle; kR = 70000, kw = 20000, kd_omega = 200, kw_z = 12000.
 _FIRMWARE = _identified(0.029, 1.0, 412.3, 58.9, 412.3, 21.0)
 ATTITUDE_PARAMETERS: dict[str, dict[str, float]] = {

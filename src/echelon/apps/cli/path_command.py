@@ -79,7 +79,7 @@ def path(
 
 
 def _files(target: Path, every: bool, paths: "list[Polynomials]") -> dict[Path, str]:
-    """Return the path's file, or those of all agents with the file of Crazyswarm2 that lists them."""
+    """Return the file of a path, or those of all agents and the one that lists them."""
     texts = [path.text() for path in paths]
     if not every:
         return {target: texts[0]}

@@ -17,7 +17,12 @@ def quaternion_of(roll: float, pitch: float, yaw: float) -> Numbers:
     (a, b, c), (d, e, f) = (
         [turn(0.5 * angle) for angle in (roll, pitch, yaw)] for turn in (math.cos, math.sin)
     )
-    return a * b * c + d * e * f, d * b * c - a * e * f, a * e * c + d * b * f, a * b * f - d * e * c
+    return (
+        a * b * c + d * e * f,
+        d * b * c - a * e * f,
+        a * e * c + d * b * f,
+        a * b * f - d * e * c,
+    )
 
 
 def angles_of(quaternion: Sequence[float]) -> Numbers:

@@ -18,7 +18,6 @@ from echelon.flight.links.crazyflie_units import (
     manual_setpoint,
     state_of_log,
 )
-from echelon.flight.links.descent import Descent
 from echelon.flight.links.link import Link, Reading
 
 _FULL_THRUST: Final = 0.48
@@ -27,6 +26,8 @@ _PATIENCE: Final = 20.0
 """s until a Crazyflie has told its variables and parameters."""
 _VOLTS: Final = (3.0, 4.1)
 """Of an empty and of a full battery, in flight."""
+_SINKING, _GROUND, _LONGEST = 0.93, 0.05, 5.0
+"""A descent: the share of the weight (0.7 m/s^2), its end above z = 0 (m), or at the latest (s)."""
 
 
 class _Route(NamedTuple):
@@ -44,11 +45,12 @@ class _Route(NamedTuple):
 
 
 # Mellinger's controller takes rates for a request to hover, and the PID reads no acceleration.
+_LAST = ("yaw_rate_command", "thrust")
 _ROUTES: Final = {
-    ("roll_command", "pitch_command", "yaw_rate_command", "thrust"): _Route(2),
-    ("roll_rate_command", "pitch_rate_command", "yaw_rate_command", "thrust"): _Route(1, rates=True),
+    ("roll_command", "pitch_command", *_LAST): _Route(2),
+    ("roll_rate_command", "pitch_rate_command", *_LAST): _Route(1, rates=True),
     ("ax", "ay", "az"): _Route(2, full_state=True),
-}  # fmt: skip
+}
 
 
 @final
@@ -73,8 +75,8 @@ class CflibLink(Link):
         self._states = check_states(facts["states"])
         uri, _, thrust = address.partition("#")
         self._full_thrust = _newtons(thrust) if thrust else _FULL_THRUST
-        weight = facts["trim"].get("thrust", 0.5 * self._full_thrust)
-        self._descent = Descent(weight, facts["dt"])
+        self._weight = facts["trim"].get("thrust", 0.5 * self._full_thrust)
+        self._end, self._down = math.inf, False
         self._arrival = threading.Condition()
         self._newest: Reading | None = None
         self._known: dict[str, float] = {}
@@ -96,23 +98,22 @@ class CflibLink(Link):
 
     def send(self, u: Sequence[float]) -> None:
         """Send an input."""
-        commander = self._crazyflie.commander
-        if self._route.full_state:
-            # Before the first state there is nothing to accelerate from.
-            if self._known:
-                commander.send_full_state_setpoint(*full_state_setpoint(self._known, u))
-        else:
-            numbers = manual_setpoint(u, self._full_thrust)
-            commander.send_setpoint_manual(*numbers, self._route.rates)
+        if not self._route.full_state:
+            self._manual(u, self._route.rates)
+        # Before the first state there is nothing to accelerate from.
+        elif self._known:
+            setpoint = full_state_setpoint(self._known, u)
+            self._crazyflie.commander.send_full_state_setpoint(*setpoint)
 
     def level_descend(self) -> None:
         """Let the vehicle sink level, then switch its motors off."""
-        thrust = self._descent.thrust(self._known.get("z"))
-        if thrust is None:
+        now, low = time.monotonic(), self._known.get("z", math.inf) < _GROUND
+        self._end = min(self._end, now + _LONGEST)
+        self._down |= low or now > self._end
+        if self._down:
             self._crazyflie.commander.send_stop_setpoint()
-            return
-        level = manual_setpoint((0.0, 0.0, 0.0, thrust), self._full_thrust)
-        self._crazyflie.commander.send_setpoint_manual(*level, False)
+        else:
+            self._manual((0.0, 0.0, 0.0, _SINKING * self._weight), rates=False)
 
     def close(self) -> None:
         """Let go of the link."""
@@ -122,9 +123,13 @@ class CflibLink(Link):
             if link is not None:
                 link.close()
 
+    def _manual(self, u: Sequence[float], rates: bool) -> None:
+        numbers = manual_setpoint(u, self._full_thrust)
+        self._crazyflie.commander.send_setpoint_manual(*numbers, rates)
+
     def _prepare(self) -> None:
         """Choose the controller, start the log and unlock the thrust."""
-        from cflib.crazyflie.log import LogConfig
+        from cflib.crazyflie.log import LogConfig  # pyright: ignore[reportMissingImports]
 
         self._crazyflie.param.set_value("stabilizer.controller", self._route.controller)
         log = LogConfig("echelon", period_in_ms=10)
@@ -179,8 +184,8 @@ def _newtons(text: str) -> float:
 def _connected(uri: str) -> Any:
     """Return the open Crazyflie at an address of cflib."""
     try:
-        import cflib.crtp
-        from cflib.crazyflie import Crazyflie
+        import cflib.crtp  # pyright: ignore[reportMissingImports]
+        from cflib.crazyflie import Crazyflie  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MissingExtraError(
             "a Crazyflie needs cflib, which is not installed; "

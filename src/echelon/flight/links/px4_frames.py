@@ -1,4 +1,7 @@
-"""From east, north, up and forward, left, up to PX4's north, east, down and forward, right, down."""
+"""From echelon's frames (east, north, up; forward, left, up) to PX4's and back.
+
+PX4's are north, east, down and forward, right, down.
+"""
 
 import math
 from collections.abc import Sequence

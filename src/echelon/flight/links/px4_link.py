@@ -144,7 +144,7 @@ def _connected(address: str) -> Any:
     # Otherwise pymavlink speaks version 1, which has no `ODOMETRY`.
     os.environ["MAVLINK20"] = "1"
     try:
-        from pymavlink import mavutil
+        from pymavlink import mavutil  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MissingExtraError(
             "PX4 needs pymavlink, which is not installed; `pip install 'echelon-formation[px4]'`."

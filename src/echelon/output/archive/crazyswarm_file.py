@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-_HEAD = """# For Crazyswarm2, by echelon. Edit the addresses: `agent3` is echelon's agent 3. Before the start
-# each vehicle stands below the first point of agent3.csv, which is its `initial_position`.
+_HEAD = """# For Crazyswarm2, by echelon. Edit the addresses. Before the start each vehicle
+# stands at its `initial_position`, below the first point of its CSV file.
 robots:
 """
 _TAIL = """robot_types:
