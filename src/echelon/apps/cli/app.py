@@ -27,6 +27,7 @@ from echelon.apps.cli.init_command import init
 from echelon.apps.cli.law_command import law
 from echelon.apps.cli.list_command import list_, schema
 from echelon.apps.cli.live_command import live
+from echelon.apps.cli.options import EchelonCommand
 from echelon.apps.cli.path_command import path
 from echelon.apps.cli.plot_command import plot
 from echelon.apps.cli.report_command import report
@@ -142,4 +143,4 @@ _COMMANDS: tuple[Callable[..., None], ...] = (
     *(check, design, tune, compare, verify, list_, explain, doctor, schema),
 )
 for _command in _COMMANDS:
-    app.command(_command.__name__.rstrip("_"))(_guarded(_command))
+    app.command(_command.__name__.rstrip("_"), cls=EchelonCommand)(_guarded(_command))
