@@ -84,7 +84,9 @@ def _spreads(parts: Parts) -> Iterator[str]:
         return
     spread = model.per_state({k: v for k, v in initial.items() if isinstance(k, str)})  # type: ignore[misc]
     trim = np.asarray(model.trim[0], float)
-    large = [k for k in np.flatnonzero(spread > _HALF_TURN) if _wraps(model, trim, k, spread[k])]
+    large = [
+        k for k in np.flatnonzero(spread > _HALF_TURN).tolist() if _wraps(model, trim, k, spread[k])
+    ]
     if large:
         names, sizes = (model.state_names[k] for k in large), {f"{spread[k]:g}" for k in large}
         yield (
