@@ -62,8 +62,8 @@ def test_what_cannot_be_exported_is_refused_in_one_sentence(tmp_path, echelon):
     assert not (tmp_path / "law").exists()
     code, _, errors = echelon("export", "crossing", "--agent", 1, "--out", tmp_path / "law")
     assert code == 2 and errors == (
-        "echelon: the law of agent 1 cannot be exported: there is no code for agents that keep away "
-        "from each other.\n"
+        "echelon: the law of agent 1 cannot be exported: there is no code for agents that keep "
+        "away from each other.\n"
     )
     (tmp_path / "mine").write_text("")
     code, _, errors = echelon("export", "integrators", "--agent", 1, "--out", tmp_path)

@@ -57,7 +57,10 @@ class Plain:
         state, leaderward = facts["messages"] == "state", facts["uses"] == "leaderward"
         memory = law["begin"](x) if self.memory is None else self.memory
         signal = law["signal"](x, memory)
-        away_from = lambda other: law["difference"](x, memory, other)
+
+        def away_from(other):
+            return law["difference"](x, memory, other)
+
         ready = self.own.leads or self.packet is not None
         leader, forward, valid = signal, [0.0] * len(self.own.forward_names), True
         if self.packet is not None:

@@ -314,7 +314,7 @@ class Law(eqx.Module):
 
 
 def carried_pieces(time: Scalar) -> tuple[jax.Array, jax.Array]:
-    """Return in how many steps of the model a leader is carried on for a time, and their length (s).
+    """Return in how many steps of the model a leader is carried on, and their length (s).
 
     The time is in s.
     """

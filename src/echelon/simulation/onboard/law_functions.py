@@ -31,7 +31,7 @@ from echelon.simulation.native.agent_step import (
     single,
     unflatten,
 )
-from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, needed, nodes
+from echelon.simulation.scalars import Node, ScalarGraph, lower, needed, nodes
 from echelon.simulation.step.knowledge import (
     carried_time,
     content_of,
