@@ -41,6 +41,7 @@ class Promised:
 
 class Found:
     """A check with as many lines as there are, each made by a function."""
+
     warnings = ()
 
     def __init__(self, make):
