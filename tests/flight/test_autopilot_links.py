@@ -137,9 +137,10 @@ def crazyflie(monkeypatch):
 
 def test_attitudes_reach_the_crazyflie_with_the_signs_of_echelon(crazyflie):
     link = CflibLink("", facts(), crazyflie)
-    assert crazyflie.armed == [True] and crazyflie.fake.parameters["stabilizer.controller"] == 2
-    assert not crazyflie.fake.locked and link.watchdog
+    assert crazyflie.armed == [] and crazyflie.fake.locked and link.watchdog
     link.send([0.1, 0.2, -0.3, 0.25])
+    assert crazyflie.armed == [True] and crazyflie.fake.parameters["stabilizer.controller"] == 2
+    assert not crazyflie.fake.locked
     assert crazyflie.fake.command == pytest.approx([0.1, 0.2, -0.3, 0.25], abs=4e-6)
     strong = CflibLink("radio://0/80/2M#0.72", facts(), crazyflie)
     crazyflie.fake.full = 0.72

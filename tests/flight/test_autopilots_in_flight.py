@@ -80,7 +80,7 @@ class Flown:
     def hello(self):
         if (reading := self.link.read(0.0)) is not None:
             self.x = reading.x
-        return self.law["hello"](self.x, self.memory)
+        return self.law["signal"](self.x, self.memory)
 
     def act(self, t, signals, forward):
         """Take a step; returns what the agent feeds forward."""
