@@ -265,6 +265,8 @@ def test_who_was_closest_is_kept_until_a_reset(session, swarm):
     assert session.closest.distance == pytest.approx(apart.min(), rel=1e-12)
     assert session.closest.agents == pairs[pair]
     assert session.closest.time == pytest.approx(0.04 * (frame + 1))
+    near, active = np.frombuffer(session.picture[16:], "<f4")[8:10]
+    assert near == pytest.approx(apart[-1].min(), rel=1e-6) and active == 0.0
     session.ask({"name": "reset"})
     session.settle()
     assert session.closest.time == 0.0

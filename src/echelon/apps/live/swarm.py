@@ -166,6 +166,12 @@ class LiveLoop:
         """The number of steps so far."""
         return int(self.now.step)
 
+    @property
+    def active(self) -> float:
+        """How many others changed the rates of agents that keep apart, in the last step."""
+        active = self.loop.follower.active(self.now.follower_memory)
+        return 0.0 if active is None else float(np.sum(np.asarray(active)))
+
     def apply(self, knobs: Knobs) -> None:
         """Change the loop to these positions of the knobs."""
         self.potential = self._potential(knobs)
