@@ -16,6 +16,7 @@ from runs import made_up
 import echelon as ech
 from echelon.apps.cli.explain_command import _names_and_keys
 from echelon.core.errors import MissingExtraError, OutputError
+from echelon.experiments.results.avoidance import Ellipsoid
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.recording import FORMAT, read_recording
 from echelon.experiments.scenario.registry import families
@@ -183,14 +184,24 @@ def test_a_video_of_agents_that_keep_apart_has_their_distance_its_limits_and_row
     run = separated(flown(seconds=2.5, rate=20.0))
     film = video._Film(run, (960, 540), run.times[[0, -1]])
     titles = [ax.get_title(loc="left") for ax in film.figure.axes]
-    assert "smallest scaled distance (m); active rows, 6 at most" in titles
-    near = film.figure.axes[titles.index("smallest scaled distance (m); active rows, 6 at most")]
+    near = film.figure.axes[titles.index("smallest scaled distance (m), active rows")]
+    assert {"kept", "touching"} == {text.get_text() for text in near.texts}
     line, *limits = [each.get_xydata() for each in near.get_lines()]
     steps = np.floor(run.times + 1e-9)
     np.testing.assert_allclose(line[:, 1], 0.3 + 0.1 * steps)
     assert [float(each[0, 1]) for each in limits[:2]] == [0.3, 0.25]
     (text,) = [t for t in film.ax.texts if t.get_text().startswith("smallest scaled distance ")]
-    assert text.get_color() != draw.COLOURS[1]
+    assert text.get_color() == draw.COLOURS[1]
+    [*film.pictures(np.array([0.4, 2.0]))]
+    assert len(film.moving.shells.get_paths()) == 4
+
+
+def test_an_ellipsoid_tells_who_is_too_near():
+    sizes = Ellipsoid(0.125, 0.375, 0.3)
+    places = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.7], [0.28, 0.0, 0.7], [5.0, 0.0, 0.0]])
+    # Scaled: .233 m overlapping, .28 m below the limit, .364 m, and far away.
+    assert sizes.too_near(places, ("x", "y", "z")).tolist() == [2.0, 2.0, 1.0, 0.0]
+    assert sizes.too_near(places[:, ::2], ("x", "z")).tolist() == [2.0, 2.0, 1.0, 0.0]
 
 
 def test_a_moving_agent_moves_in_the_pictures(run):

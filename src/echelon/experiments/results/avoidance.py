@@ -11,6 +11,10 @@ from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import steps_per_slice
 
 
+ROUNDING = 1e-4
+"""Below its limit by this a distance still counts as kept, m: pages round places."""
+
+
 class Ellipsoid(NamedTuple):
     """An upright ellipsoid about each agent, in which distances between agents are scaled.
 
@@ -29,9 +33,19 @@ class Ellipsoid(NamedTuple):
         """The scaled distance at which two touch, m."""
         return 2.0 * self.radius
 
-    def scales(self, coordinates: Sequence[str]) -> Array:
-        """Return the factors (d,) of a position's coordinates in scaled distances."""
-        return np.array([self.radius / self.height if x == "z" else 1.0 for x in coordinates])
+    def radii(self, coordinates: Sequence[str]) -> Float[Array, " d"]:
+        """Return the radii along a position's coordinates, m."""
+        return np.array([self.height if x == "z" else self.radius for x in coordinates])
+
+    def too_near(
+        self, places: Float[Array, "N d"], coordinates: Sequence[str]
+    ) -> Float[Array, " N"]:
+        """Return 2 for agents whose ellipsoid overlaps another, 1 below the limit, else 0."""
+        scaled = places * self.radius / self.radii(coordinates)
+        apart = np.linalg.norm(scaled[:, None] - scaled, axis=2)
+        np.fill_diagonal(apart, np.inf)
+        least = apart.min(axis=1)
+        return (least < self.limit - ROUNDING) * 1.0 + (least < self.touching)
 
 
 class Avoidance(NamedTuple):

@@ -177,8 +177,8 @@ class Recording(FrameNumbers):
     @property
     def scales(self) -> Float[np.ndarray, " d"]:
         """The factors of the position's coordinates in distances between agents."""
-        names = [self.state_names[k] for k in self.position]
-        return np.ones(len(names)) if self.ellipsoid is None else self.ellipsoid.scales(names)
+        names, sizes = [self.state_names[k] for k in self.position], self.ellipsoid
+        return np.ones(len(names)) if sizes is None else sizes.radius / sizes.radii(names)
 
     def near(self, frames: Int[np.ndarray, " F"]) -> Avoidance | None:
         """Return how near agents came: over all steps if they keep apart, else in frames.

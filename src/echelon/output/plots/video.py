@@ -270,7 +270,7 @@ def _curves(figure: Any, run: Recording, ends: Array) -> list[Any]:
     shows = [_draw_errors, *[draw_near] * (run.avoidance is not None), _draw_inputs]
     left, tall, axes = (_SCENE + 62) / _WIDTH, 0.96 / len(shows), list["Axes"]()
     for place, show in enumerate(shows):
-        box = (left, 0.94 - tall * (place + 1) + 0.12, 0.985 - left, tall - 0.14)
+        box = (left, 0.95 - tall * (place + 1) + 0.11, 0.985 - left, tall - 0.13)
         axes.append(figure.add_axes(box, facecolor="none"))
         show(axes[-1], run, keep)
         axes[-1].tick_params(labelsize=8)
@@ -314,10 +314,14 @@ def draw_near(ax: "Axes", run: Recording, keep: Array) -> None:
         return
     distance, active = (near.over(run.times[keep], each) for each in (near.distance, near.active))
     ax.plot(run.times[keep], distance, color=draw.LEADER)
-    for value, dash in ((near.ellipsoid.limit, ":"), (near.ellipsoid.touching, "-")):
-        ax.axhline(value, color=draw.COLOURS[1], linewidth=0.9, linestyle=dash)
+    for value, name, side in (
+        (near.ellipsoid.limit, "kept", "bottom"),
+        (near.ellipsoid.touching, "touching", "top"),
+    ):
+        ax.axhline(value, color=draw.COLOURS[1], linewidth=0.9)
+        where = {"transform": ax.get_yaxis_transform(), "ha": "right", "va": side, "size": 7}
+        ax.text(1.0, value, name, color=draw.COLOURS[1], **where)
     ax.set_ylim(0.0, 1.05 * max(np.nanmax(distance), near.ellipsoid.limit))
     rows = active * 0.25 * ax.get_ylim()[1] / max(1.0, active.max())
     ax.fill_between(run.times[keep], rows, step="post", color=draw.COLOURS[1], alpha=0.3)
-    text = f"smallest scaled distance (m); active rows, {active.max():.3g} at most"
-    ax.set_title(text, size=9, loc="left")
+    ax.set_title("smallest scaled distance (m), active rows", size=9, loc="left")

@@ -147,10 +147,11 @@ def distance_chart(run: Recording, lines: list[JsonObject]) -> JsonObject:
     sizes, marks = run.ellipsoid, list[JsonObject]()
     if sizes is not None:
         marks = [{"value": sizes.touching, "name": "touching", "below": True}]
-    if sizes is None or run.avoidance is None:
-        return _chart("smallest distance", run.length_unit, False, lines, marks)
-    marks.insert(0, {"value": sizes.limit, "name": "kept"})
-    return _chart("smallest scaled distance", run.length_unit, False, lines, marks)
+    title = "smallest distance"
+    if sizes is not None and run.avoidance is not None:
+        title = "smallest scaled distance"
+        marks.append({"value": sizes.limit, "name": "kept"})
+    return _chart(title, run.length_unit, False, lines, marks) | {"zero": True}
 
 
 def _inputs(run: Recording, sheet: _Sheet) -> JsonObject:

@@ -181,7 +181,7 @@ def ellipsoid_of(run: Recording, space: Space) -> JsonObject | None:
     if sizes is None or not run.position:
         return None
     return {
-        "radii": [sizes.height if name == "z" else sizes.radius for name in space.names],
+        "radii": sizes.radii(space.names).tolist(),
         "touching": sizes.touching,
         "limit": sizes.limit,
         "kept": run.avoidance is not None,
@@ -229,11 +229,21 @@ def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
     """Return the badge of a promise: its state `holds` or `lost`, a short and a whole text."""
     if not promise["promised"]:
         return {"state": "lost", "short": "no guarantee", "whole": promise["sentence"]}
+    apart = (promise.get("anywhere") or {}).get("separation")
+    if apart is not None:
+        return _badge_of_distances(apart["ideal"], promise)
     rate, kind = promise["rate"], promise["kind"]
     source = promise["theorem"] or kind
     short = f"guaranteed: {f'{rate:.3g} 1/s' if rate else 'V does not rise'}, {source}"
     whole = f"{promise['sentence']} {_rate_in_words(promise)}".rstrip()
     return {"state": "holds", "short": short, "whole": whole}
+
+
+def _badge_of_distances(ideal: bool, promise: Mapping[str, Any]) -> dict[str, str]:
+    """Return the badge of agents that keep apart, in the world of the theorem or in another."""
+    short = f"guaranteed: agents stay apart, {promise['theorem']}"
+    short = short if ideal else "distances observed, not proved"
+    return {"state": "holds" if ideal else "edge", "short": short, "whole": promise["sentence"]}
 
 
 def _rate_in_words(promise: Mapping[str, Any]) -> str:

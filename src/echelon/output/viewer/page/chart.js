@@ -184,10 +184,11 @@ class Chart {
     const [start, end] = this.shown();
     for (const line of this.lines) if (!line.bound && !line.strip) for (let k = start; k < end; k++) take(line.values[k]);
     for (const mark of this.marks) take(this.log ? Math.log10(mark.value) : mark.value);
+    if (this.zero) take(0);
     if (!(low <= high)) return this.log ? [-1, 0] : [0, 1];
     if (this.log) return high - low > 2 ? [low - 0.15, high + 0.25] : [Math.floor(low - 0.05), Math.ceil(high + 0.05)];
     const margin = 0.06 * (high - low) || 0.1 * Math.abs(high) || 1;
-    return [low - margin, high + margin];
+    return [this.zero ? 0 : low - margin, high + margin];
   }
 
   draw() {

@@ -71,8 +71,8 @@ class ViewControls {
     Object.assign(this, { views, show, target: null, box: make("div", { class: "toggles" }) });
     for (const name of ["links", "goals", "trails"]) this.toggle(name, (on) => views.forEach((view) => (view.shared[name].value = on ? opacities(view.run)[name] : 0)));
     if (views.some((view) => view.labels.all.length)) this.toggle("names", (on) => views.forEach((view) => (view.labels.visible = on)));
-    const sized = views.filter((view) => view.sized);
-    if (sized.length) this.toggle("ellipsoids", (on) => sized.forEach((view) => (view.shared.ellipsoids.value = on ? 1 : 0)), sized[0].run.ellipsoid.kept);
+    const sized = views.flatMap((view) => view.ellipsoids ?? []);
+    if (sized.length) this.toggle("ellipsoids", (on) => sized.forEach((each) => (each.shown.value = on ? 1 : 0)), sized[0].shown.value > 0);
     this.makeFollow();
     const home = make("button", { title: "show all (h)" }, "show all");
     home.addEventListener("click", () => this.home());

@@ -48,43 +48,11 @@ class View {
       links: value(opacities(this.run).links),
       tapered: value(this.run.agents > 200 ? 1 : 0),
       goals: value(1),
-      radii: value(this.sizes()),
-      ellipsoids: value(this.run.ellipsoid?.kept ? 1 : 0),
       trails: value(opacities(this.run).trails),
       now: value(0),
       window: value(1),
     };
     for (const name of ["shadow", "goalColour", "linkColour", "cutColour", "plain"]) this.shared[name] = value([0, 0, 0]);
-  }
-
-  // Whether agents have ellipsoids, which are not drawn of a flock.
-  get sized() {
-    const { agents, ellipsoid, space } = this.run;
-    return Boolean(ellipsoid) && agents <= 200 && ["space", "plane"].includes(space.kind);
-  }
-
-  sizes() {
-    const radii = this.run.ellipsoid?.radii ?? [];
-    return [0, 1, 2].map((k) => radii[k] ?? 0.01);
-  }
-
-  // The mark of an agent, without that of selection.
-  mark(agent) {
-    return this.state[4 * this.texel(agent, 0) + 3] & ~1;
-  }
-
-  // Of each agent 2 if another is nearer than hulls keep, 4 if their ellipsoids overlap, else 0.
-  tooNear(p) {
-    const { agents, ellipsoid } = this.run, marks = new Uint8Array(agents);
-    if (!this.sized) return marks;
-    const { radii, touching, limit } = ellipsoid, scale = [0, 1, 2].map((k) => (k < radii.length ? touching / 2 / radii[k] : 0));
-    for (let i = 0; i < agents; i++)
-      for (let j = 0; j < i; j++) {
-        const far = Math.hypot(...scale.map((s, k) => s * (p[3 * i + k] - p[3 * j + k])));
-        const mark = far < touching ? 4 : far < limit - 1e-4 ? 2 : 0;
-        for (const agent of [i, j]) marks[agent] = Math.max(marks[agent], mark);
-      }
-    return marks;
   }
 
   material(code, more = {}) {
@@ -106,7 +74,7 @@ class View {
     this.halo = this.add(halo(this.flat), this.material(VEHICLE), 3);
     this.makeLinks(lines);
     this.makeTrails(lines);
-    if (this.sized) this.add(ellipsoids(run.agents), this.material(ELLIPSOID, lines), 4);
+    if (run.ellipsoid && run.agents <= 200 && ["space", "plane"].includes(run.space.kind)) this.ellipsoids = new Ellipsoids(this, lines);
     if (run.referenced) this.path = new Path(this, lines);
   }
 
@@ -334,12 +302,12 @@ class View {
   }
 
   show(moment) {
-    const { state, run } = this, { position: p, turn: q, motors: m, goal: g } = moment, near = this.tooNear(p);
+    const { state, run } = this, { position: p, turn: q, motors: m, goal: g } = moment, near = this.ellipsoids?.marks(p);
     for (let i = 0; i < run.agents; i++) {
       let at = 4 * this.texel(i, 0);
       const exists = Number.isFinite(p[3 * i] + p[3 * i + 1] + p[3 * i + 2]);
       for (let k = 0; k < 3; k++) state[at + k] = exists ? p[3 * i + k] : 0;
-      state[at + 3] = !exists ? -1 : near[i] + (i === this.selected ? 1 : 0);
+      state[at + 3] = !exists ? -1 : (near?.[i] ?? 0) + (i === this.selected ? 1 : 0);
       for (let k = 0; k < 4; k++) (state[at + 4 + k] = q[4 * i + k]), (state[at + 8 + k] = m[4 * i + k]);
       at += 16;
       state[at] = g[3 * i], state[at + 1] = g[3 * i + 1], state[at + 2] = g[3 * i + 2];
