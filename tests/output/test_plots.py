@@ -372,7 +372,8 @@ def test_a_leader_at_rest_has_no_path_to_draw(runs):
 
 
 def test_a_run_of_no_frame_has_no_figures(runs, tmp_path):
-    empty = cut(runs("quadrotor"), np.zeros((0,)), None)
+    run = runs("quadrotor")
+    empty = cut(run, run.states[:0], None)
     assert figures(empty) == {}
     assert save_figures(empty, tmp_path) == []
 

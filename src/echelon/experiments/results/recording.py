@@ -17,7 +17,7 @@ from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
 from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
-from echelon.core.words import Verdict
+from echelon.core.words import Verdict, amount
 from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
 from echelon.experiments.results.labelled import Labelled, read_labelled
 from echelon.simulation.engine.frame_numbers import FrameNumbers
@@ -142,7 +142,8 @@ class Recording(FrameNumbers):
 
     def __repr__(self) -> str:
         """Return the name and the sizes."""
-        return f"Recording({self.name!r}, {self.agents} agents, {len(self.times)} frames)"
+        frames = amount(len(self.times), "frame")
+        return f"Recording({self.name!r}, {self.agents} agents, {frames})"
 
     @property
     def agents(self) -> int:
@@ -348,10 +349,13 @@ def _modes(values: Mapping[str, np.ndarray]) -> LoopPoles | None:
 def _avoidance(values: Mapping[str, np.ndarray]) -> Avoidance | None:
     if "ellipsoid_radius" not in values:
         return None
-    sizes = ("ellipsoid_radius", "ellipsoid_height", "kept_distance")
-    names = ("slice_start", "scaled_distance", "active_rows")
-    slices = (values.get(name, np.zeros(0)) for name in names)
-    return Avoidance(*slices, Ellipsoid(*(float(values[name]) for name in sizes)))
+    radius, height, limit = (
+        float(values[name]) for name in ("ellipsoid_radius", "ellipsoid_height", "kept_distance")
+    )
+    times, distance, active = (
+        values.get(name, np.zeros(0)) for name in ("slice_start", "scaled_distance", "active_rows")
+    )
+    return Avoidance(times, distance, active, Ellipsoid(radius, height, limit))
 
 
 def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:

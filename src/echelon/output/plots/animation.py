@@ -18,9 +18,8 @@ _FEW = 60
 """Agents that are drawn as vehicles; more are drawn as dots, all of a kind by one artist."""
 _SOLID = ("space", "plane")
 """Kinds of pictures in which agents have a size."""
-_NEAR = np.array([[0.0, 0.0, 0.0, 1.0], [0.85, 0.56, 0.0, 1.0], [0.78, 0.2, 0.17, 1.0]])
+_NEAR: Any = np.array([[0.0, 0.0, 0.0, 1.0], [0.85, 0.56, 0.0, 1.0], [0.78, 0.2, 0.17, 1.0]])
 """Colours of ellipsoids: none of their own, below the limit, overlapping."""
-_ALPHA = np.array([0.0, 0.0, 0.0, 1.0])
 _LINK, _GOAL, _SHADOW = "#4f5b68", "#d99000", "#d3d9e0"
 
 
@@ -147,15 +146,17 @@ class _Vehicles(MovingScene):
         sizes, names = self.run.ellipsoid, self.space.names
         if self.run.avoidance is None or sizes is None or self.space.kind not in _SOLID:
             return
-        near = sizes.too_near(now[:, : len(names)], names)
+        near: Any = sizes.too_near(now[:, : len(names)], names)
         squares = np.resize(sizes.radii(names), 3) ** 2
         # Where an ellipsoid with these semi-axes is touched by planes through a direction w.
         w = self.ring[:, :1] * self.camera.axes[0] + self.ring[:, 1:2] * self.camera.axes[1]
         outline = squares * w / np.sqrt((squares * w * w).sum(axis=1, keepdims=True))
         self.shells.set_verts(list(self.camera.project(now[:, None] + outline)[0]))
-        colours = np.where(near[:, None] > 0.0, _NEAR[near.astype(int)], self.colours)
-        self.shells.set_edgecolor(colours * (1.0, 1.0, 1.0, 0.7))
-        self.shells.set_facecolor(colours * np.where(near > 0.0, 0.35, 0.1)[:, None] ** _ALPHA)
+        edges = np.where(near[:, None] > 0.0, _NEAR[near.astype(int)], self.colours)
+        faces: Any = edges.copy()
+        faces[:, 3] = np.where(near > 0.0, 0.35, 0.1)
+        self.shells.set_edgecolor(edges)
+        self.shells.set_facecolor(faces)
 
     def _quadrotors(self, now: Array, angles: Array, order: Array) -> None:
         project, size, turns = self.camera.project, self.size, rotations(angles)
