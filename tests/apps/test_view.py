@@ -327,7 +327,7 @@ def test_the_smallest_distance_so_far_has_its_pair_its_time_and_the_size_of_vehi
 
 def marks(page):
     """Of each agent 2 below the kept distance, 4 where ellipsoids overlap, else 0."""
-    return page.evaluate("[0, 1, 2, 3].map((i) => echelon.player.view.ellipsoids.marks(echelon.run.moment.position)[i])")
+    return page.evaluate("[...echelon.player.view.ellipsoids.marks(echelon.run.moment.position)]")
 
 
 def test_ellipsoids_are_marked_below_the_limit_and_the_chart_has_distance_and_rows(

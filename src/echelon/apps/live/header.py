@@ -10,6 +10,7 @@ from echelon.experiments.results.recording import Recording
 from echelon.output.plots.space import Space, space_of
 from echelon.output.viewer.charts import distance_chart
 from echelon.output.viewer.replay import header, motor_loads
+
 _AHEAD, _APART = 60.0, 0.1
 """Seconds of the reference that are drawn, and seconds between two places of it."""
 

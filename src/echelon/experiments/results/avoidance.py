@@ -10,7 +10,6 @@ from echelon.core.types import Array
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import steps_per_slice
 
-
 ROUNDING = 1e-4
 """Below its limit by this a distance still counts as kept, m: pages round places."""
 
@@ -74,9 +73,7 @@ class Avoidance(NamedTuple):
         held = np.flatnonzero(self.active)
         return float(self.times[held[-1]]) if len(held) else None
 
-    def over(
-        self, times: Float[Array, " T"], values: Float[Array, " B"]
-    ) -> Float[Array, " T"]:
+    def over(self, times: Float[Array, " T"], values: Float[Array, " B"]) -> Float[Array, " T"]:
         """Return values of slices at times (s)."""
         return values[np.searchsorted(self.times, times, side="right") - 1]
 

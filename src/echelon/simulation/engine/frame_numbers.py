@@ -107,9 +107,7 @@ class FrameNumbers(abc.ABC):
         least[finite] = _least(places[finite])
         return least
 
-    def closest_pair(
-        self: _Frames, scales: Float[Array, " d"] | float = 1.0
-    ) -> ClosestPair | None:
+    def closest_pair(self: _Frames, scales: Float[Array, " d"] | float = 1.0) -> ClosestPair | None:
         """Return which agents were closest to each other in the stored frames, and when.
 
         None without a position, a second agent or a frame of finite numbers.
@@ -117,9 +115,7 @@ class FrameNumbers(abc.ABC):
         pairs = self.approaches(scales)
         return pairs[-1] if pairs else None
 
-    def approaches(
-        self: _Frames, scales: Float[Array, " d"] | float = 1.0
-    ) -> list[ClosestPair]:
+    def approaches(self: _Frames, scales: Float[Array, " d"] | float = 1.0) -> list[ClosestPair]:
         """Return the pairs that were closer than any in a frame before, in the order of time."""
         if not self.position or self.states.shape[1] < 2 or not len(self.times):
             return []
