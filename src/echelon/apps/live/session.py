@@ -19,6 +19,7 @@ from echelon.apps.live.promiser import Promiser
 from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.core.types import Array, JsonObject
+from echelon.core.words import amount
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.viewer.replay import heard_by
 from echelon.simulation.engine.closest_pair import ClosestPair
@@ -85,8 +86,8 @@ class Session:
         for agent, jump in kicks.items():
             if not 0 <= agent < agents or len(jump) != n:
                 raise SimulationError(
-                    f"`kick` got agent {agent} with {len(jump)} numbers, and must be of "
-                    f"agents 0 to {agents - 1} with {n}."
+                    f"`kick` got agent {agent} with {amount(len(jump), 'number')}, and "
+                    f"must be of agents 0 to {agents - 1} with {n}."
                 )
 
     # ---- the loop -------------------------------------------------------------------------------

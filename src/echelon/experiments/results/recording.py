@@ -17,7 +17,7 @@ from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
 from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
-from echelon.core.words import Verdict
+from echelon.core.words import Verdict, amount
 from echelon.experiments.results.avoidance import Avoidance
 from echelon.experiments.results.labelled import Labelled, read_labelled
 from echelon.simulation.engine.frame_numbers import FrameNumbers
@@ -142,7 +142,8 @@ class Recording(FrameNumbers):
 
     def __repr__(self) -> str:
         """Return the name and the sizes."""
-        return f"Recording({self.name!r}, {self.agents} agents, {len(self.times)} frames)"
+        frames = amount(len(self.times), "frame")
+        return f"Recording({self.name!r}, {self.agents} agents, {frames})"
 
     @property
     def agents(self) -> int:

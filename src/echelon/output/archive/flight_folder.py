@@ -15,9 +15,10 @@ from echelon.core.errors import FlightError, OutputError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import MessageContent
+from echelon.guarantees.promises.promise import promise
 from echelon.core.files import write_atomic
 from echelon.output.archive.folder import write_errors
-from echelon.output.archive.law_folder import law_files
+from echelon.output.archive.law_folder import python_law
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
@@ -50,9 +51,9 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     network = _network(parts)
     agents = parts.graph.agents
     flown = parts.replace(world=dataclasses.replace(parts.world, sensing=None))
-    files = dict[str, str | bytes]()
+    files, guaranteed = dict[str, str | bytes](), promise(parts, settings).sentence()
     for k in range(agents):
-        law = law_files(flown, settings, k, formation)
+        law = python_law(flown, settings, k, formation, guaranteed)
         files |= {f"law-{k}/{name}": text for name, text in law.items()}
     facts = json.loads(files["law-0/law.json"])
     vehicles = _vehicles(parts, settings)

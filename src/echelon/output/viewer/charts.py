@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.metrics import SETTLED
+from echelon.experiments.results.quantity import settling_bound
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
 from echelon.output.plots.style import FLOOR
@@ -84,7 +85,7 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
         name = "leaders" if len(run.leaders) > 1 else "leader"
         lines.append(sheet.line(name, away, "leader", True))
     lines += _slope(run, errors[0].max(), 1.0)
-    marks = [{"value": SETTLED, "name": "1 cm" if run.length_unit else "0.01"}]
+    marks = [{"value": SETTLED, "name": settling_bound(run.length_unit)}]
     return _chart("formation error", run.length_unit, True, lines, marks)
 
 
