@@ -80,7 +80,9 @@ def _bridge(mission: Mission, options: argparse.Namespace) -> int:
     return 0
 
 
-def _ways(mission: Mission, number: int, options: argparse.Namespace) -> tuple[Address, list[Address]]:
+def _ways(
+    mission: Mission, number: int, options: argparse.Namespace
+) -> tuple[Address, list[Address]]:
     """Return where a process listens, and where it sends to: on this machine unless told."""
     ports = ports_of(mission.agents, options.port)
     own = ports[min(number, mission.agents)]

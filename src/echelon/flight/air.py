@@ -55,9 +55,7 @@ class Air:
         FlightError: the address is in use, or is not this machine's.
     """
 
-    def __init__(
-        self, listen: Address, to: Sequence[Address], interface: str = LOOPBACK
-    ) -> None:
+    def __init__(self, listen: Address, to: Sequence[Address], interface: str = LOOPBACK) -> None:
         """Open the socket."""
         self._to = [each for each in to if each != listen or _is_group(listen)]
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

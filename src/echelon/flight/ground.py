@@ -5,6 +5,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Final, final
 
 from echelon.flight.air import Air
@@ -121,7 +122,7 @@ def page_of(ground: Ground) -> type[Handler]:
     """Return the handler of the page of a ground station."""
 
     class Page(Handler):
-        page = _PAGE.encode()
+        page = Path(__file__).with_name("ground.html").read_bytes()
 
         def do_GET(self) -> None:
             """Send the page, or what it shows."""
@@ -141,55 +142,3 @@ def page_of(ground: Ground) -> type[Handler]:
             self.send(b"\n", "text/plain", 404 if action is None else 200)
 
     return Page
-
-
-_PAGE: Final = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Ground station</title>
-<meta name="viewport" content="width=device-width">
-<style>
-body{font:16px/1.5 system-ui,sans-serif;margin:2em;max-width:70em}
-table{border-collapse:collapse;width:100%}
-th,td{text-align:left;padding:.3em .8em .3em 0;border-bottom:1px solid #ccc;vertical-align:top}
-button{font:inherit;padding:.5em 1.5em;margin-right:1em}
-#stop{background:#b00020;color:#fff;border:0;font-weight:bold}
-.bad{color:#b00020;font-weight:bold}
-</style>
-<h1>Ground station</h1>
-<p><button id="stop">Stop: all level and descend</button><button id="start">Start the plan</button>
-<span id="note" role="status"></span></p>
-<table><thead><tr><th>Agent<th>State<th>Plan, s<th>Place, m<th>Oldest letter, s<th>Tick, ms
-<th>Battery<th>Dropped datagrams</tr></thead><tbody></tbody></table>
-<script>
-const say = text => document.getElementById("note").textContent = text;
-const post = path => fetch(path, {method: "POST"}).catch(() => say("The ground station has ended."));
-for (const name of ["start", "stop"])
-  document.getElementById(name).onclick = () => post("/" + name);
-const cell = (row, text, bad) => {
-  const td = row.insertCell();
-  td.textContent = text ?? "";
-  if (bad) td.className = "bad";
-};
-async function show() {
-  let state;
-  try { state = await (await fetch("/state")).json(); }
-  catch { return say("The ground station has ended."); }
-  const body = document.querySelector("tbody");
-  body.replaceChildren();
-  for (const a of state.agents) {
-    const row = body.insertRow(), silent = a.mode === "silent";
-    cell(row, a.agent);
-    cell(row, a.mode + (silent ? ` for ${a.silent} s` : "") + (a.why ? `: ${a.why}` : ""),
-      silent || a.why);
-    cell(row, a.time);
-    cell(row, a.place?.map(x => x ?? "?").join(", "));
-    cell(row, a.heard);
-    cell(row, a.tick);
-    cell(row, a.battery == null ? "" : Math.round(100 * a.battery) + " %");
-    cell(row, a.dropped?.join("; "));
-  }
-  document.getElementById("start").disabled = state.started || state.stopped;
-  const said = state.stopped ? "Stop was said." : state.started ? "The plan has started." : "";
-  say([said, ...state.dropped].join(" "));
-}
-show();
-setInterval(show, 500);
-</script></html>"""

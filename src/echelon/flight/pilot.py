@@ -139,7 +139,5 @@ class Pilot:
         return Letter(self._number, t, hops, tuple(value), packet)
 
 
-def _weighted(
-    terms: Sequence[tuple[float, list[float]]], nothing: list[float]
-) -> list[float]:
+def _weighted(terms: Sequence[tuple[float, list[float]]], nothing: list[float]) -> list[float]:
     return [sum(w * gap[k] for w, gap in terms) for k in range(len(nothing))]

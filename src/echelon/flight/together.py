@@ -184,11 +184,13 @@ class Errors:
     def back(self, number: int, since: float, within: float = 0.01) -> float:
         """Return how long (s) after a time the error of an agent is last beyond a distance (m)."""
         pairs = zip(self.times, self.rows, strict=True)
-        return max((t - since for t, row in pairs if t >= since and row[number] > within), default=0.0)
+        return max(
+            (t - since for t, row in pairs if t >= since and row[number] > within), default=0.0
+        )
 
 
 def read_errors(mission: Mission, begins: float, speed: float) -> Errors:
-    """Return the errors in positions.csv of a flight that began at a time of the monotonic clock."""
+    """Return the errors in positions.csv, of a plan that began at a monotonic time (s)."""
     facts = mission.facts
     offsets, d = facts["offsets"], len(facts["position"])
     leader = facts["leader"]

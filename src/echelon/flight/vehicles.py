@@ -11,7 +11,6 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final, TextIO, TypeAlias, final
 
 from echelon.flight.links.udp import DESCEND, HEAD, INPUT
@@ -92,7 +91,10 @@ class Vehicle:
         """Stay on the ground, where the motors are off."""
         height = self._facts["height"]
         if self.descends and height is not None and self.x[height] <= 0.0:
-            self.x = [value if k in self._facts["place"] else rest for k, (value, rest) in enumerate(zip(self.x, self._facts["rest"], strict=True))]
+            self.x = [
+                value if k in self._facts["place"] else rest
+                for k, (value, rest) in enumerate(zip(self.x, self._facts["rest"], strict=True))
+            ]
             self.x[height], self.u, self.descends = 0.0, None, False
 
 

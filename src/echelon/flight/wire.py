@@ -210,9 +210,7 @@ class Wire:
         packet = letter.packet or Packet(0, 0.0, (0.0,) * self._sizes[1])
         head = packet.epoch, letter.hops, letter.packet is not None
         rest = packet.leader, packet.time, *packet.content
-        return self._sign(
-            Kind.LETTER, letter.time, self._letter.pack(*head, *letter.value, *rest)
-        )
+        return self._sign(Kind.LETTER, letter.time, self._letter.pack(*head, *letter.value, *rest))
 
     def start(self, wall: float, at: float) -> bytes:
         """Return the command that the plan starts at a time, both in s since 1970."""
@@ -290,7 +288,9 @@ class Wire:
         self._newest[sender, Kind(kind)] = boot, count
         return Opened(Kind(kind), sender, boot, stamp, body)
 
-    def _body(self, kind: Kind, sender: int, stamp: float, text: bytes) -> Drop | Letter | Report | float | None:
+    def _body(
+        self, kind: Kind, sender: int, stamp: float, text: bytes
+    ) -> Drop | Letter | Report | float | None:
         if not math.isfinite(stamp):
             return Drop.NOT_FINITE
         if kind is Kind.STOP:

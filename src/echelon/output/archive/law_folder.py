@@ -70,9 +70,7 @@ def python_law(
     return {**files, "law.json": _facts(own, functions, constants, guaranteed, files)}
 
 
-def _traced(
-    parts: Parts, settings: Settings, agent: int
-) -> tuple[OwnLaw, dict[str, LawFunction]]:
+def _traced(parts: Parts, settings: Settings, agent: int) -> tuple[OwnLaw, dict[str, LawFunction]]:
     own = Agent(parts, agent, settings.dt, settings.limits).own_law
     try:
         return own, law_functions(own)
@@ -82,9 +80,7 @@ def _traced(
         ) from None
 
 
-def _head(
-    settings: Settings, agent: int, formation: str
-) -> tuple[str, dict[str, float | str]]:
+def _head(settings: Settings, agent: int, formation: str) -> tuple[str, dict[str, float | str]]:
     """Return the comment at the head of each file, and the constants."""
     mark = hashlib.sha256(f"{__version__}\n{settings.dt!r}\n{formation}".encode()).hexdigest()
     about = f"The law of agent {agent}, by echelon {__version__}; see law.json."

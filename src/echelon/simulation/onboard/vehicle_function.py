@@ -40,5 +40,7 @@ def motions_of(motion: Motion, agents: int, substeps: int) -> list[Motion]:
     """Return the motion of each agent in a part of a step."""
     rows = [motion] * agents
     if motion.rows is not None:
-        rows = [motion.of_row(jax.tree.map(lambda a, k=k: a[k], motion.rows)) for k in range(agents)]
+        rows = [
+            motion.of_row(jax.tree.map(lambda a, k=k: a[k], motion.rows)) for k in range(agents)
+        ]
     return [dataclasses.replace(each, dt=motion.dt / substeps) for each in rows]
