@@ -13,44 +13,46 @@ from echelon.apps.cli.status import STATUS
 from echelon.core.errors import FlightError
 from echelon.output.archive.folder import check_empty
 
+_SCENARIO = "The name of a bundled scenario, a YAML file, or a folder that `--out` wrote."
+_Number = Annotated[int | None, typer.Option(help="Fly this agent.")]
+_All = Annotated[bool, typer.Option("--all", help="Fly all agents, with simulated vehicles.")]
+_Ground = Annotated[bool, typer.Option("--ground", help="Serve the ground station's page.")]
+_Dry = Annotated[
+    bool, typer.Option("--dry-run", help="Check everything, and send nothing to others.")
+]
+_Link = Annotated[str, typer.Option(help="Link to the vehicle: udp, cflib://... or px4://...")]
+_Key = Annotated[Path | None, typer.Option(help="The key file of the formation.")]
+_Listen = Annotated[
+    str | None, typer.Option(help="ADDRESS:PORT to hear others at, as a multicast group.")
+]
+_Interface = Annotated[
+    str | None, typer.Option(help="Own address on the network of a multicast group.")
+]
+_Seconds = Annotated[
+    float | None, typer.Option(help="Length of the flight, s (default: the horizon).")
+]
+_Speed = Annotated[
+    float | None, typer.Option(help="Below 1, simulated vehicles are slower than real ones.")
+]
+_Out = Annotated[
+    Path | None, typer.Option("--out", help="Prepare the flight in this folder, and end.")
+]
+
 
 def fly(
-    scenario: Annotated[
-        str,
-        typer.Argument(
-            help="The name of a bundled scenario, a YAML file, or a folder that `--out` wrote."
-        ),
-    ],
-    agent: Annotated[int | None, typer.Option(help="Fly this agent.")] = None,
-    every: Annotated[
-        bool, typer.Option("--all", help="Fly all agents, with simulated vehicles.")
-    ] = False,
-    ground: Annotated[
-        bool, typer.Option("--ground", help="Serve the ground station's page.")
-    ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Check everything, and send nothing to others.")
-    ] = False,
-    link: Annotated[
-        str, typer.Option(help="Link to the vehicle: udp, cflib://... or px4://...")
-    ] = "udp",
-    key: Annotated[Path | None, typer.Option(help="The key file of the formation.")] = None,
-    listen: Annotated[
-        str | None, typer.Option(help="ADDRESS:PORT to hear others at, as a multicast group.")
-    ] = None,
-    interface: Annotated[
-        str | None, typer.Option(help="Own address on the network of a multicast group.")
-    ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(help="Length of the flight, s (default: the horizon).")
-    ] = None,
-    speed: Annotated[
-        float | None, typer.Option(help="Below 1, simulated vehicles are slower than real ones.")
-    ] = None,
+    scenario: Annotated[str, typer.Argument(help=_SCENARIO)],
+    agent: _Number = None,
+    every: _All = False,
+    ground: _Ground = False,
+    dry_run: _Dry = False,
+    link: _Link = "udp",
+    key: _Key = None,
+    listen: _Listen = None,
+    interface: _Interface = None,
+    seconds: _Seconds = None,
+    speed: _Speed = None,
     set_: options.SetOption = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Prepare the flight in this folder, and end.")
-    ] = None,
+    out: _Out = None,
 ) -> None:
     """Fly a scenario: a process for each agent, which needs neither JAX nor NumPy."""
     if out is None and agent is None and not every and not ground:
