@@ -132,6 +132,7 @@ def _description(own: OwnLaw, functions: Mapping[str, LawFunction]) -> JsonObjec
         "feed_forward_from": own.source,
         "states": dict(zip(model.state_names, model.state_units, strict=True)),
         "inputs": dict(zip(model.input_names, model.input_units, strict=True)),
+        "trim": dict(zip(model.input_names, model.trim[1], strict=True)),
         "signal": list(own.signal_names),
         "message": list(own.forward_names),
         "memory": len(functions["begin"].outputs["memory"]),
