@@ -23,6 +23,7 @@ from echelon.apps.cli.design_command import design
 from echelon.apps.cli.doctor_command import doctor
 from echelon.apps.cli.explain_command import explain
 from echelon.apps.cli.export_command import export
+from echelon.apps.cli.fly_command import fly
 from echelon.apps.cli.init_command import init
 from echelon.apps.cli.list_command import list_, schema
 from echelon.apps.cli.live_command import live
@@ -138,7 +139,7 @@ def _guarded(command: Callable[..., None]) -> Callable[..., None]:
 
 # Listed here instead of decorated in their files, so that the order is that of `--help`.
 _COMMANDS: tuple[Callable[..., None], ...] = (
-    *(init, run, sweep, view, live, plot, video, report, export, path),
+    *(init, run, sweep, view, live, fly, plot, video, report, export, path),
     *(check, design, tune, compare, verify, list_, explain, doctor, schema),
 )
 for _command in _COMMANDS:
