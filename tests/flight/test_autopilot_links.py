@@ -116,9 +116,18 @@ class Stub:
     def __init__(self):
         self.fake, self.configs, self.armed = Crazyflie(), [], []
         self.commander, self.connection_lost = Commander(self.fake), Callbacks()
-        self.param = SimpleNamespace(set_value=self.fake.parameters.__setitem__)
+        self.confirm = Callbacks()
+        self.param = SimpleNamespace(
+            set_value=self.set_value,
+            add_update_callback=lambda group, name, cb: self.confirm.append(cb),
+        )
         self.log = SimpleNamespace(add_config=self.configs.append)
         self.supervisor = SimpleNamespace(send_arming_request=self.armed.append)
+
+    def set_value(self, name, value):
+        self.fake.parameters[name] = value
+        for call in self.confirm:
+            call(name, str(value))
 
     def arrive(self, **values):
         names = self.configs[0].variables
@@ -146,6 +155,13 @@ def test_attitudes_reach_the_crazyflie_with_the_signs_of_echelon(crazyflie):
     crazyflie.fake.full = 0.72
     strong.send([0.0, 0.0, 0.0, 0.5])
     assert crazyflie.fake.command[3] == pytest.approx(0.5, abs=6e-6)
+
+
+def test_a_crazyflie_that_keeps_another_controller_is_refused(crazyflie, monkeypatch):
+    monkeypatch.setattr("echelon.flight.links.cflib_link._PATIENCE", 0.01)
+    crazyflie.param.set_value = lambda *_: None
+    with pytest.raises(FlightError, match="does not confirm its parameter `stabilizer.controller`"):
+        CflibLink("", facts(), crazyflie)
 
 
 def test_the_newest_state_is_read_once(crazyflie):

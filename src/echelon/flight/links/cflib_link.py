@@ -133,7 +133,7 @@ class CflibLink(Link):
         """Choose the controller, and start the log."""
         from cflib.crazyflie.log import LogConfig  # pyright: ignore[reportMissingImports]
 
-        self._crazyflie.param.set_value("stabilizer.controller", self._route.controller)
+        self._choose(self._route.controller)
         log = LogConfig("echelon", period_in_ms=10)
         for name, kind in LOG.items():
             log.add_variable(f"stateEstimateZ.{name}", kind)
@@ -144,6 +144,21 @@ class CflibLink(Link):
             raise FlightError(f"the Crazyflie has no log of its state: {error}.") from None
         log.data_received_cb.add_callback(self._receive)
         log.start()
+
+    def _choose(self, controller: int) -> None:
+        """Set the firmware's controller, and wait until it is set: inputs are for that one."""
+        chosen, parameters = threading.Event(), self._crazyflie.param
+
+        def confirm(_: str, value: str) -> None:
+            if value == str(controller):
+                chosen.set()
+
+        parameters.add_update_callback(group="stabilizer", name="controller", cb=confirm)
+        parameters.set_value("stabilizer.controller", controller)
+        if not chosen.wait(_PATIENCE):
+            raise FlightError(
+                "the Crazyflie does not confirm its parameter `stabilizer.controller`."
+            )
 
     def _unlock(self) -> None:
         """Arm, and unlock the thrust; not before the first input, since a dry run sends none."""
