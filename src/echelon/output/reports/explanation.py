@@ -9,6 +9,7 @@ from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
 from echelon.experiments.results.agent_metrics import Metrics
 from echelon.experiments.results.avoidance import avoidance
+from echelon.experiments.results.event_outcomes import event_outcomes
 from echelon.experiments.results.lyapunov import Lyapunov, lyapunov
 from echelon.guarantees.promises.covering import coverage
 from echelon.guarantees.promises.promise import Promise, promise
@@ -22,6 +23,7 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
     return (
         *_outcome(result, numbers),
         *_closest(result, numbers),
+        *(outcome.sentence() for outcome in event_outcomes(result)),
         *(cause.sentence() for cause in causes(result, numbers, guarantee)),
         *_world(result),
         *_guarantee(result, guarantee),
@@ -41,17 +43,19 @@ def _outcome(result: Result, numbers: Metrics) -> Iterator[str]:
             f"{last:.4g}{unit} at {result.times[-1]:g} s."
         )
         return
-    times = [follower.settling_time for follower in numbers.followers]
+    here = np.ones(result.graph.agents, bool) if result.presence is None else result.presence[-1]
+    there = " that are there" * (not here.all())
+    times = [follower.settling_time for follower in numbers.followers if here[follower.agent]]
     settled = [time for time in times if time is not None]
     if len(settled) == len(times):
         yield (
-            f"All {len(times)} followers stay within 0.01{unit} of their goals "
+            f"All {len(times)} followers{there} stay within 0.01{unit} of their goals "
             f"from {max(settled):.3g} s on."
         )
     else:
         yield (
-            f"{len(times) - len(settled)} of {len(times)} followers have not settled to 0.01{unit} "
-            f"by {result.times[-1]:g} s."
+            f"{len(times) - len(settled)} of {len(times)} followers{there} have not settled to "
+            f"0.01{unit} by {result.times[-1]:g} s."
         )
 
 
