@@ -292,8 +292,7 @@ class Law(eqx.Module):
         """
         if type(self).signal is not Law.signal:
             return signal
-        count = jnp.ceil(time / _CARRIED).astype(int)
-        piece = time / jnp.maximum(count, 1)
+        count, piece = carried_pieces(time)
         return jax.lax.fori_loop(0, count, lambda _, x: rk4(model.velocity, x, u, piece), signal)
 
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
@@ -312,6 +311,15 @@ class Law(eqx.Module):
     @abc.abstractmethod
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return one agent's physical input (m,), before actuator limits, and its next memory."""
+
+
+def carried_pieces(time: Scalar) -> tuple[jax.Array, jax.Array]:
+    """Return in how many steps of the model a leader is carried on, and their length (s).
+
+    The time is in s.
+    """
+    count = jnp.ceil(time / _CARRIED).astype(int)
+    return count, time / jnp.maximum(count, 1)
 
 
 def declares(law: Law, name: str) -> bool:

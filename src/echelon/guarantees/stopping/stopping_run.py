@@ -222,11 +222,11 @@ def _flat(
 
 def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     """Yield the conditions of T5 beside the tube."""
-    n, c = len(run.parts.model.state_names), run.coupling
+    c = run.coupling
     yield _offsets_line(run)
     text = "in flat coordinates every agent is linear, with or without a trim"
     yield unneeded(Hypothesis.SMOOTH, _PROOF, text)
-    text = f"feedback turns all {n} states and the integrators before inputs into chains"
+    text = "feedback turns all states and the integrators before inputs into chains"
     yield unneeded(Hypothesis.DETECTABLE, _PROOF, text)
     text = run.law.information[1]
     if run.network is not None:
