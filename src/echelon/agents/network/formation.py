@@ -12,6 +12,7 @@ from echelon.core.compiled import cached_jit
 from echelon.core.errors import FormationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, States
+from echelon.core.words import amount
 
 # For an analytic model one random state would do, almost surely; kinks need more.
 _SAMPLES = 32
@@ -48,7 +49,7 @@ class Formation:
         """Say the size and the largest offset."""
         agents, states = self.offsets.shape
         largest = np.abs(self.offsets).max(initial=0.0)
-        return f"Formation({agents} agents, {states} states, offsets up to {largest:.4g})"
+        return f"Formation({agents} agents, {amount(states, 'state')}, offsets up to {largest:.4g})"
 
     def __hash__(self) -> int:
         """Hash what `__eq__` compares."""
@@ -264,7 +265,7 @@ def _whole_state(model: ControlAffine, agent: int, offset: Iterable[float]) -> n
         return full
     lengths = f"{len(axes)} (position) or {n} (all states)" if axes else f"{n} (all states)"
     raise FormationError(
-        f"the offset of agent {agent} has {values.size} numbers, and must have {lengths}."
+        f"the offset of agent {agent} has {amount(values.size, 'number')}, and must have {lengths}."
     )
 
 

@@ -27,6 +27,7 @@ def labelled_parts(parts: Parts, settings: Settings) -> Labelled:
         "nearest_leader": ("agent", np.array(graph.nearest_leader())),
         **_edges(parts),
         **_gain(parts),
+        **_ellipsoid(parts),
         **_limits(model, settings),
     }
     coordinates = {
@@ -95,6 +96,19 @@ def _gain(parts: Parts) -> Variables:
         "P": (("state", "state_column"), gain.P),
         "R": (("input", "input_column"), gain.R),
         "coupling": ((), gain.coupling),
+    }
+
+
+def _ellipsoid(parts: Parts) -> Variables:
+    """Return the ellipsoid about agents that keep apart; nothing where they do not."""
+    safety, meters = parts.drive.safety, {"units": "m"}
+    # What is not prepared may have no size yet.
+    if safety is None or not (safety.radii or safety.of_model):
+        return {}
+    return {
+        "ellipsoid_radius": ((), safety.size[0], meters),
+        "ellipsoid_height": ((), safety.size[2], meters),
+        "kept_distance": ((), safety.distance, meters),
     }
 
 

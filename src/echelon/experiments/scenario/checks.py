@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 from echelon.core.errors import did_you_mean, listing
 from echelon.core.limits import horizon_fault
+from echelon.core.words import amount
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
 from echelon.experiments.scenario.sections import FormationSpec, GraphSpec
@@ -230,7 +231,8 @@ def _weights(data: Part) -> Iterator[Finding]:
     if isinstance(edges, list) and isinstance(weights, list):
         if len(edges) != len(weights):
             message = (
-                f"got {len(weights)} weights for {len(edges)} edges, allowed is one for each edge"
+                f"got {amount(len(weights), 'weight')} for {amount(len(edges), 'edge')}, allowed "
+                "is one for each edge"
             )
             yield ("graph", "weights"), f"{message}."
         for index, edge in enumerate(edges):

@@ -150,8 +150,18 @@ def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
         )
     got = context.get("got", error["input"])
     allowed = _ALLOWED[kind].format(**context) if kind in _ALLOWED else error["msg"]
-    close = did_you_mean(got, context.get("names", "").split())
+    close = did_you_mean(got, context.get("names", "").split()) or _like_key(path)
     return path, f"got {quoted(got)}, allowed {allowed}{close}."
+
+
+def _like_key(path: KeyPath) -> str:
+    """Return what a key that its section does not name, but its class may take, may mean."""
+    try:
+        keys = _keys(path[:-1])
+        hint = "" if path[-1] in keys else did_you_mean(path[-1], keys)
+    except (StopIteration, LookupError):  # the value is within a key
+        return ""
+    return hint.replace("mean ", "mean the key ")
 
 
 def _with_defaults(data: Mapping[Any, Any]) -> dict[Any, Any]:

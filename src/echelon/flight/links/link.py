@@ -37,9 +37,9 @@ class Reading(NamedTuple):
 class Link(abc.ABC):
     """The vehicle of one agent. All methods are called by one thread.
 
-    Args of every class: `address`, the text after `scheme://` ("" if there is none), and `facts`,
-    the content of law.json: `agent`, `dt`, and `states` and `inputs` with their units in order.
-    It raises a `FlightError`, one sentence, if it cannot serve such a law or reach the vehicle.
+    Args:
+        address: the text after `scheme://`; "" if there is none.
+        facts: the content of law.json: `agent`, `dt`, `states` and `inputs` with their units.
 
     Attributes:
         inputs: the names of the law's inputs that it can send, in order, such as
@@ -49,6 +49,14 @@ class Link(abc.ABC):
 
     inputs: ClassVar[tuple[str, ...] | None] = None
     watchdog: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def __init__(self, address: str, facts: Mapping[str, Any]) -> None:
+        """Reach the vehicle.
+
+        Raises:
+            FlightError: it cannot be reached, or the link cannot serve such a law.
+        """
 
     @abc.abstractmethod
     def read(self, wait: float) -> Reading | None:

@@ -46,17 +46,9 @@ def law_files(
         OutputError: the law has no scalar operations; with the file and line of a user's code.
         EchelonError: there is no such agent, or the parts do not fit each other.
     """
-    own = Agent(parts, agent, settings.dt, settings.limits).own_law
-    try:
-        double, single = law_functions(own), law_functions(own, 32)
-    except Unsupported as error:
-        raise OutputError(
-            f"the law of agent {agent} cannot be exported: there is no code for {error}."
-        ) from None
-    mark = hashlib.sha256(f"{__version__}\n{settings.dt!r}\n{formation}".encode()).hexdigest()
-    about = f"The law of agent {agent}, by echelon {__version__}; see law.json."
-    constants = {"AGENT": agent, "DT": settings.dt, "FORMATION": mark}
-    functions = double.values()
+    own, double = _traced(parts, settings, agent)
+    single, functions = law_functions(own, 32), double.values()
+    about, constants = _head(settings, agent, formation)
     files: dict[str, str | bytes] = {
         "law.py": python_text(functions, about, constants),
         "law.c": c_text(functions, single.values(), about),
@@ -64,18 +56,58 @@ def law_files(
     }
     image = object_file(single.values())
     files |= {} if image is None else {"law.o": image}
+    guaranteed = promise(parts, settings).sentence()
+    return {**files, "law.json": _facts(own, double, constants, guaranteed, files)}
+
+
+def python_law(
+    parts: Parts, settings: Settings, agent: int, formation: str, guaranteed: str
+) -> dict[str, str | bytes]:
+    """Return law.py and law.json of one agent, as `law_files`, with the sentence of `promise`."""
+    own, functions = _traced(parts, settings, agent)
+    about, constants = _head(settings, agent, formation)
+    files: dict[str, str | bytes] = {"law.py": python_text(functions.values(), about, constants)}
+    return {**files, "law.json": _facts(own, functions, constants, guaranteed, files)}
+
+
+def _traced(parts: Parts, settings: Settings, agent: int) -> tuple[OwnLaw, dict[str, LawFunction]]:
+    own = Agent(parts, agent, settings.dt, settings.limits).own_law
+    try:
+        return own, law_functions(own)
+    except Unsupported as error:
+        raise OutputError(
+            f"the law of agent {agent} cannot be exported: there is no code for {error}."
+        ) from None
+
+
+def _head(settings: Settings, agent: int, formation: str) -> tuple[str, dict[str, float | str]]:
+    """Return the comment at the head of each file, and the constants."""
+    mark = hashlib.sha256(f"{__version__}\n{settings.dt!r}\n{formation}".encode()).hexdigest()
+    about = f"The law of agent {agent}, by echelon {__version__}; see law.json."
+    return about, {"AGENT": agent, "DT": settings.dt, "FORMATION": mark}
+
+
+def _facts(
+    own: OwnLaw,
+    functions: Mapping[str, LawFunction],
+    constants: Mapping[str, float | str],
+    guaranteed: str,
+    files: Mapping[str, str | bytes],
+) -> str:
+    """Return law.json."""
+    dt = float(constants["DT"])
     described = {
-        "agent": agent,
-        "formation": mark,
-        **_description(own, double),
-        "dt": settings.dt,
-        "network": network_facts(own, settings.dt, double),
-        "guaranteed": promise(parts, settings).sentence(),
+        "agent": constants["AGENT"],
+        "formation": constants["FORMATION"],
+        **_description(own, functions),
+        "dt": dt,
+        "network": network_facts(own, dt, functions),
+        "guaranteed": guaranteed,
         "excluded": [*_EXCLUDES, _CURRENT if own.loop.channel is None else _LATE],
         "echelon": __version__,
         "sha256": {name: _digest(content) for name, content in files.items()},
     }
-    return {**files, "law.json": json.dumps(described, indent=2) + "\n"}
+    return json.dumps(described, indent=2) + "\n"
 
 
 def _digest(content: str | bytes) -> str:
@@ -100,6 +132,7 @@ def _description(own: OwnLaw, functions: Mapping[str, LawFunction]) -> JsonObjec
         "feed_forward_from": own.source,
         "states": dict(zip(model.state_names, model.state_units, strict=True)),
         "inputs": dict(zip(model.input_names, model.input_units, strict=True)),
+        "trim": dict(zip(model.input_names, model.trim[1], strict=True)),
         "signal": list(own.signal_names),
         "message": list(own.forward_names),
         "memory": len(functions["begin"].outputs["memory"]),

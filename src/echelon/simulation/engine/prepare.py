@@ -8,14 +8,15 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Channel
-from echelon.agents.network.formation import Formation
 from echelon.agents.world.sensing import Sensors
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.identity import digest
 from echelon.core.limits import excess_frames
 from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
+from echelon.core.words import amount
 from echelon.simulation.engine.initial import initial_states
+from echelon.simulation.engine.part_warnings import part_warnings
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.meter import Meter
@@ -98,7 +99,7 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         )
         parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)
-    warnings += formation_warnings(model, formation)
+    warnings += (*part_warnings(parts, problem.states, settings.horizon),)
     # Model and drive may say the same; a dictionary keeps the first, and the order.
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
 
@@ -146,23 +147,5 @@ def _check_offsets(model: ControlAffine, parts: Parts) -> None:
     if parts.formation.offsets.shape != shape:
         raise SimulationError(
             f"the formation has offsets {parts.formation.offsets.shape}, and {shape[0]} agents "
-            f"with {shape[1]} states need {shape}."
+            f"with {amount(shape[1], 'state')} need {shape}."
         )
-
-
-def formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str, ...]:
-    """Return warnings of offsets that break a symmetry of the model, and of equal goals."""
-    broken = formation.broken_symmetries(model)
-    sentences = [
-        f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, "
-        "so the agents settle off their goals."
-        # One warning is enough: the other offsets mostly break the same symmetry.
-        for agent, reason in list(broken.items())[:1]
-    ]
-    pairs = formation.coincident() if model.position else ()
-    sentences += [
-        f"agents {i} and {j} have the same goal, and would collide there." for i, j in pairs[:3]
-    ]
-    if len(pairs) > 3:
-        sentences.append(f"{len(pairs) - 3} more pairs of agents have the same goal.")
-    return tuple(sentences)
