@@ -45,8 +45,9 @@ def begin_network(
     channel, readers = loop.channel, first_readers(loop)
     assert channel is not None
     links, s = len(loop.exchange.receivers), sent.shape[1]
-    size = packet_size(channel, s, forward, len(loop.model.input_names))
-    mail = no_mail(readers, links, sent, size, loop.succession is not None)
+    heirs = loop.succession is not None
+    size = packet_size(channel, s, forward, len(loop.model.input_names), heirs)
+    mail = no_mail(readers, links, sent, size, heirs)
     posts = channel.begin(Letters(sent, readers.number, mail.packet), links)
     return world._replace(in_flight=posts, mail=mail)
 
