@@ -141,7 +141,11 @@ def packet_size(channel: Channel, s: int, forward: int, m: int, heirs: bool = Fa
     """
     if channel.messages is MessageContent.STATE:
         return forward
-    more = {Prediction.PREVIEW: 0, Prediction.NONE: forward, Prediction.PACKET: forward + m + heirs * forward}
+    more = {
+        Prediction.PREVIEW: 0,
+        Prediction.NONE: forward,
+        Prediction.PACKET: forward + m + heirs * forward,
+    }
     return s + more[channel.prediction]
 
 
