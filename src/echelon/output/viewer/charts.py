@@ -81,17 +81,19 @@ def _frames(run: Recording) -> Array:
 
 def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
     errors, followers = run.formation_errors, list(run.followers)
+    here = np.ones_like(errors, bool) if run.presence is None else run.presence
+    none = {} if run.presence is None else {"none": "\u2013 absent"}
     if 0 < len(followers) <= NAMED:
         lines = [
-            sheet.line(str(agent), errors[:, agent], place, True)
+            sheet.line(str(agent), np.where(here, errors, np.nan)[:, agent], place, True) | none
             for place, agent in enumerate(followers)
         ]
     else:
-        rows = errors[:, followers] if followers else errors
-        lines = [
-            sheet.line("worst", rows.max(axis=1), 1, True),
-            sheet.line("median", np.median(rows, axis=1), 0, True),
-        ]
+        some = followers or slice(None)
+        rows = np.where(here, errors, np.nan)[:, some]
+        worst = np.where(here, errors, 0.0)[:, some].max(axis=1)
+        median = np.median(rows, axis=1) if here.all() else np.nanmedian(rows, axis=1)
+        lines = [sheet.line("worst", worst, 1, True), sheet.line("median", median, 0, True)]
     if run.reference is not None:
         away = _off_reference(run, run.reference)
         name = "leaders" if len(run.leaders) > 1 else "leader"
