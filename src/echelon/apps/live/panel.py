@@ -162,7 +162,8 @@ class Panel:
 
     def _graph(self, knobs: Knobs) -> JsonObject:
         """Return the graph without the cut edges as a scenario states it."""
-        graph, schedule = self.live.parts.graph, self.live.parts.graph.schedule
+        graph = self.live.parts.graph.before
+        schedule = graph.schedule
         section: JsonObject = {"leaders": list(graph.leaders), "agents": graph.agents}
         section |= {"directed": True} if graph.directed else {}
         weights = [graph.weights] if schedule is None else schedule.weights

@@ -26,7 +26,7 @@ from echelon.output.viewer.replay import heard_by
 from echelon.simulation.engine.closest_pair import ClosestPair
 
 if TYPE_CHECKING:
-    from echelon.experiments.scenario.sections import LiveSpec
+    from echelon.experiments.scenario.event_sections import LiveSpec
 
 _PICTURE, _MESSAGE = 0, 1
 _EMPTY = struct.pack("<I", _MESSAGE) + b"{}"

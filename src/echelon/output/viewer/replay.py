@@ -199,7 +199,7 @@ def _schedule(run: Recording) -> JsonObject | None:
     """Return the schedule of edges, each graph as a text of 1 and 0."""
     if run.schedule is None:
         return None
-    starts, weights, period = run.schedule
+    starts, weights, period = run.schedule[:3]
     rows = ["".join("1" if weight else "0" for weight in row) for row in weights]
     return {"starts": starts.tolist(), "rows": rows, "period": period}
 

@@ -111,6 +111,10 @@ def check_distances(loop: Loop) -> None:
     """
     if loop.follower.safety is not None:
         raise Unsupported("agents that keep away from each other")
+    if loop.presence is not None:
+        raise Unsupported("agents that are lost or join")
+    if loop.succession is not None:
+        raise Unsupported("heirs of a leader")
 
 
 def memory_size(law: Law) -> int:

@@ -38,11 +38,13 @@ class Packets(NamedTuple):
         leader: its number.
         stamp: the step at which it said so; `NEVER` for no packet.
         content: a row of numbers, which depends on the prediction.
+        epoch: how often the lead was taken over; None without heirs.
     """
 
     leader: Int[jax.Array, " N"]
     stamp: Int[jax.Array, " N"]
     content: Float[jax.Array, "N p"]
+    epoch: Int[jax.Array, " N"] | None = None
 
 
 class Letters(NamedTuple):
@@ -102,19 +104,33 @@ class Knowledge(NamedTuple):
 # ---- one agent, or many --------------------------------------------------------------------------
 
 
-def no_mail(readers: Readers, links: int, sent: Float[jax.Array, "N s"], packet: int) -> Mail:
+def no_mail(
+    readers: Readers, links: int, sent: Float[jax.Array, "N s"], packet: int, heirs: bool = False
+) -> Mail:
     """Return the mail before the first message, for signals as sent and packets (packet,)."""
-    agents = len(readers.number)
     return Mail(
         jnp.full(links, NEVER, jnp.int32),
         jnp.zeros((links, sent.shape[1]), sent.dtype),
         jnp.full(links, NOBODY, jnp.int32),
-        Packets(
-            jnp.where(readers.leads, readers.number, NOBODY).astype(jnp.int32),
-            jnp.full(agents, NEVER, jnp.int32),
-            jnp.zeros((agents, packet), sent.dtype),
-        ),
+        no_packets(readers, jnp.zeros((len(readers.number), packet), sent.dtype), heirs),
     )
+
+
+def no_packets(readers: Readers, content: Float[jax.Array, "N p"], heirs: bool) -> Packets:
+    """Return the packets before the first one, with epochs where there are heirs."""
+    leader = jnp.where(readers.leads, readers.number, NOBODY).astype(jnp.int32)
+    never = jnp.full(len(leader), NEVER, jnp.int32)
+    return Packets(leader, never, content, jnp.zeros_like(never) if heirs else None)
+
+
+def taken_over(
+    packet: Packets, chosen: Bool[jax.Array, " N"], number: jax.Array, step: jax.Array
+) -> Packets:
+    """Return the packets of agents of which the chosen ones have just taken the lead."""
+    assert packet.epoch is not None
+    leader = jnp.where(chosen, number, packet.leader)
+    stamp = jnp.where(chosen, step, packet.stamp)
+    return packet._replace(leader=leader, stamp=stamp, epoch=packet.epoch + chosen)
 
 
 def packet_size(channel: Channel, s: int, forward: int, m: int) -> int:
