@@ -141,6 +141,7 @@ class Recording(FrameNumbers):
     attributes: JsonObject
     events: tuple[JsonObject, ...] = ()
     radius: float | None = None
+    moving: Float[np.ndarray, "T N n"] | None = None
 
     def __repr__(self) -> str:
         """Return the name and the sizes."""

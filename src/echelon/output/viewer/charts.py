@@ -106,6 +106,10 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
 def _off_reference(run: Recording, reference: Float[Array, "T n"]) -> Float[Array, " T"]:
     """Return the largest distance of a leader from its place beside the reference."""
     leaders, measured = list(run.leaders), list(run.measured)
+    if run.presence is not None:
+        leads = (run.nearest_then == np.arange(run.agents)) & run.presence
+        away = (run.states - run.offsets - reference[:, None])[:, :, measured]
+        return np.where(leads, np.linalg.norm(away, axis=2), 0.0).max(axis=1)
     away = run.states[:, leaders] - run.offsets[leaders] - reference[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
         return np.linalg.norm(away[:, :, measured], axis=2).max(axis=1)

@@ -201,7 +201,9 @@ def _schedule(run: Recording) -> JsonObject | None:
         return None
     starts, weights, period = run.schedule[:3]
     rows = ["".join("1" if weight else "0" for weight in row) for row in weights]
-    return {"starts": starts.tolist(), "rows": rows, "period": period}
+    nearest = run.schedule.nearest
+    follow = {} if nearest is None else {"nearest": nearest.tolist()}
+    return {"starts": starts.tolist(), "rows": rows, "period": period, **follow}
 
 
 def facts(run: Recording) -> list[str]:
