@@ -108,11 +108,12 @@ def _gain(parts: Parts) -> Variables:
 def _ellipsoid(parts: Parts) -> Variables:
     """Return the ellipsoid about agents that keep apart; nothing where they do not."""
     safety, meters = parts.drive.safety, {"units": "m"}
-    if safety is None or safety.radii is None:
+    # What is not prepared may have no size yet.
+    if safety is None or not (safety.radii or safety.of_model):
         return {}
     return {
-        "ellipsoid_radius": ((), safety.radii[0], meters),
-        "ellipsoid_height": ((), safety.radii[2], meters),
+        "ellipsoid_radius": ((), safety.size[0], meters),
+        "ellipsoid_height": ((), safety.size[2], meters),
         "kept_distance": ((), safety.distance, meters),
     }
 

@@ -368,9 +368,8 @@ def _durations(data: Part) -> Iterator[Finding]:
 def _events(data: Part) -> Iterator[Finding]:
     """Yield events that are not one thing, and times for which nothing lasts."""
     events = data.get("events")
-    for index, event in enumerate(events if isinstance(events, list) else ()):
-        if not isinstance(event, dict):
-            continue
+    listed = enumerate(events if isinstance(events, list) else ())
+    for index, event in ((k, each) for k, each in listed if isinstance(each, dict)):
         got = [f"`{key}`" for key in ("lose", "cut", "join") if event.get(key) is not None]
         if len(got) != 1:
             text = f"got {' and '.join(got) or 'nothing that happens'}"

@@ -94,8 +94,9 @@ class Agent:
                 f"agent {agent!r} is not in this graph, whose agents are 0 to "
                 f"{parts.graph.agents - 1}."
             )
-        late = [part.delay for part in (parts.world.network, parts.world.sensing) if part]
-        horizon = dt * math.ceil(1.0 + max([0.0, *late]) / dt)
+        network, sensing = parts.world.network, parts.world.sensing
+        late = max(network.delay, network.jitter) if network else 0.0
+        horizon = dt * math.ceil(1.0 + max(late, sensing.delay if sensing else 0.0) / dt)
         prepared = prepare(parts, Settings(horizon=horizon, dt=dt, limits=limits))
         drive = prepared.parts.drive
         assert isinstance(drive, Laws)
