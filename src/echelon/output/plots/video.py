@@ -301,7 +301,7 @@ def _draw_inputs(ax: "Axes", run: Recording, keep: Array) -> None:
     loads, title = run.loads, "largest input"
     sizes = np.abs(run.inputs).max(axis=1)[keep]
     if loads is not None:
-        sizes, title = 100.0 * loads.max(axis=(1, 2))[keep], "largest input, % of limit"
+        sizes, title = 100.0 * np.nanmax(loads, axis=(1, 2))[keep], "largest input, % of limit"
     ax.plot(run.times[keep], sizes, color=draw.LEADER)
     ax.set_title(title, size=9, loc="left")
 

@@ -166,9 +166,9 @@ def _inputs(run: Recording, sheet: _Sheet) -> JsonObject:
     if loads is not None:
         percent = 100.0 * loads.reshape(len(loads), -1)
         lines = [
-            sheet.line("largest", percent.max(axis=1), 1, False),
-            sheet.line("mean", percent.mean(axis=1), "leader", False),
-            sheet.line("smallest", percent.min(axis=1), 0, False),
+            sheet.line("largest", np.nanmax(percent, axis=1), 1, False),
+            sheet.line("mean", np.nanmean(percent, axis=1), "leader", False),
+            sheet.line("smallest", np.nanmin(percent, axis=1), 0, False),
         ]
         marks = [{"value": 100.0, "name": "limit", "below": True}, {"value": 0.0, "name": "limit"}]
         title = "motors" if loads.shape[2] in (2, 4) else "inputs"
