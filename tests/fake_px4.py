@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil  # noqa: E402
 
-HOVER, OFFBOARD, LOST = 0.42, (6, 0), 0.5
+HOVER, OFFBOARD, LAND, LOST = 0.42, (6, 0), (4, 6), 0.5
 # From east, north, up to north, east, down; and from forward, left, up to forward, right, down.
 WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 BODY = np.diag([1.0, -1.0, -1.0])
@@ -64,9 +64,11 @@ class Px4:
             [roll, pitch, -message.body_yaw_rate, message.thrust / HOVER * self.weight]
         )
 
-    def acting(self, now):
+    def acting(self, now, height):
         if self.mode == OFFBOARD and now - self.came[-1] > LOST:
             self.mode, self.beat = (4, 3), -np.inf
+        if self.mode == LAND:
+            self.command = np.array([0.0, 0.0, 0.0, 0.95 * self.weight * (height > 0.05)])
         return self.command
 
     def send(self, now, p, v, q, w):
@@ -88,25 +90,27 @@ class Px4:
         self.wire.mav.odometry_send(int(1e6 * now), 1, 12, *numbers, [0.0] * 21, [0.0] * 21)
 
 
-def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=None):
-    """Serve vehicles in real time until the standard input ends."""
+def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=None, speed=1.0):
+    """Serve vehicles until the standard input ends; in slow motion with a speed below 1."""
     vehicles = Vehicles(starts, mass, gain, lag, **(response or IDENTIFIED))
     each = [Px4(port + k, mass * GRAVITY / gain) for k in range(len(starts))]
-    rows, dt, begun, steps = [], 0.002, time.monotonic(), 0
+    rows, dt, real, begun, steps = [], 0.002, 0.002 / speed, time.monotonic(), 0
     print("ready", flush=True)
     while True:
-        wait = max(0.0, begun + steps * dt - time.monotonic())
+        wait = max(0.0, begun + steps * real - time.monotonic())
         ends, _, _ = select.select([*(px4.wire.fd for px4 in each), sys.stdin], [], [], wait)
         if sys.stdin in ends:
             break
         now = time.monotonic()
         for px4 in each:
             px4.receive(now)
-        while begun + steps * dt <= now:
-            vehicles.command = np.array([px4.acting(now) for px4 in each])
+        while begun + steps * real <= now:
+            vehicles.command = np.array(
+                [px4.acting(now, z) for px4, z in zip(each, vehicles.p[:, 2], strict=True)]
+            )
             vehicles.step(dt)
             steps += 1
-        rows.append([now, *vehicles.p.ravel()])
+        rows.append([begun + steps * real, *vehicles.p.ravel()])
         for k, px4 in enumerate(each):
             px4.send(now, vehicles.p[k], vehicles.v[k], vehicles.q[k], vehicles.w[k])
     flown = np.array(rows)
