@@ -97,7 +97,8 @@ def _angles(run: Recording, kind: str, names: tuple[str, ...]) -> tuple[tuple[in
 def clipped_places(run: Recording, axes: tuple[int, ...]) -> tuple[Array, bool]:
     """Return places (T, N, k) within ten times the extent of leaders and goals.
 
-    Places that are not finite, and those of absent agents, are NaN. The second value is whether others were farther away.
+    Places that are not finite, and those of absent agents, are NaN. The second value is
+    whether others were farther away.
     """
     places, columns = run.states[:, :, list(axes)], list(axes)
     goals, leaders = run.goals([0])[0][:, columns], places[:, list(run.leaders)]
