@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from sentences import LINES
 
 import echelon.experiments.scenario.scenario
-from echelon.core.errors import ScenarioError, listing
+from echelon.agents.models import DoubleIntegrator
+from echelon.core.errors import EchelonError, ScenarioError, listing
 from echelon.experiments.scenario import key_paths, registry
 from echelon.experiments.scenario.checks import ROLES
 from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
@@ -600,3 +601,14 @@ def test_a_named_set_of_parameters_may_be_changed(load):
         echelon.EchelonError, match="got the parameter set `small`, but `pendulum` has none"
     ):
         echelon.build(load("model={name: pendulum, parameters: {set: small}}"))
+
+
+def test_a_misspelt_key_of_a_value_that_may_be_a_section_is_told_at_its_place(refused):
+    follower = "follower={law: stopping-point, observer: {x: 1}}"
+    text = "\n".join(refused(follower, "leader={law: stopping-point}"))
+    assert "follower.observer.x: got an unknown key, allowed are `push`, `scale`" in text
+
+
+def test_text_of_several_lines_is_told_in_one():
+    with pytest.raises(EchelonError, match="is 'a.nb', and must be a whole number"):
+        DoubleIntegrator("a\nb")

@@ -511,6 +511,20 @@ def test_stretches_that_no_step_reaches_are_not_counted_on():
     assert found.run.parts.graph.schedule.period == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(
+    ("period", "weight", "coupling"),
+    [(2.0, 1.0, 1e7), (2.0, 1.0, 1e308), (1e155, 1.0, 1.0), (1e308, 1e149, 1.0)],
+)
+def test_couplings_and_periods_beyond_all_numbers_have_a_rate_that_is_no_more(
+    period, weight, coupling
+):
+    chain, star = [(0, 1), (1, 2), (2, 3, weight)], [(0, 1), (0, 2), (2, 3)]
+    graph = ech.Graph.switching([(0.0, chain), (1.0, star)], period=period)
+    # Warnings are errors here.
+    found = promised(flight(graph, rate=3.0, coupling=coupling))
+    assert found.rate is None or 0.0 <= found.rate <= 3.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("told", [True, False])
 def test_graphs_that_take_turns_are_there_in_time_or_are_told_none(told):

@@ -14,7 +14,6 @@ from echelon.agents.models.chains import (
     Chains,
     chains_of,
     check_bounds,
-    flat_output,
     flatten,
     switch_on,
 )
@@ -45,7 +44,6 @@ _SPREAD = 0.125
 """Roots of a rate r are r, 1.125 r, 1.25 r, ..: distinct, as the certificate requires."""
 _REST = 1e-9
 """Of a bounded length: what floats leave of 0."""
-_SAMPLES = 16
 _LEAST = 1e-3
 """Of the push upward at the trim: what is left of it a thousandth of a radian from the border."""
 
@@ -266,27 +264,6 @@ class FlatLaw(Law):
                 f"{MOST_POINTS}, and {name} has {listing(map(str, degrees))}."
             )
         return places
-
-    def check_places(self, model: ControlAffine) -> None:
-        """Check that the flat outputs with the names of the position are the position.
-
-        Raises:
-            LawError: they are not; seen at samples.
-        """
-        self.places(model)
-        draw = np.random.default_rng(0)
-        # Near the trim and far from it.
-        sizes = np.repeat([0.5, 5.0, 50.0], _SAMPLES)[:, None]
-        away = sizes * draw.uniform(-1.0, 1.0, (len(sizes), len(model.state_names)))
-        states = jnp.asarray(np.asarray(model.trim[0], float) + away)
-        values = jax.vmap(lambda x: flat_output(model, tuple(model.position), x))(states)
-        off = np.abs(np.asarray(values - states[:, list(model.position_indices())])).max(axis=0)
-        wrong = np.flatnonzero(~(off <= _REST))
-        if len(wrong):
-            raise LawError(
-                f"`safety` needs the position of `{type(model).__name__}` among its flat outputs, "
-                f"and its output `{model.position[wrong[0]]}` is not the state of that name."
-            )
 
     def message(self, model: ControlAffine, x: State, v: Input, memory: FlatMemory) -> jax.Array:
         """Return zeta', (m,)."""

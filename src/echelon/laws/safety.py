@@ -22,6 +22,8 @@ from echelon.core.types import Array
 from echelon.laws.nearest_point import nearest_point
 
 AXES = ("x", "y", "z")
+_SIZES = np.repeat([0.5, 5.0, 50.0], 16)
+"""Of samples about the trim, at which outputs are compared with the position."""
 _DOWNWASH = 3.0
 """Height over width of the ellipsoid about a model with a radius: rotors blow downward."""
 _MOST_CORRECTIONS, _SOLVED = 60, 1e-9
@@ -94,12 +96,14 @@ class Safety:
         """Return it with radii, checked for a model.
 
         Raises:
-            LawError: the model has no position in x, y and z, or no radius.
+            LawError: the model has no position in x, y and z, or no radius, or its outputs with the
+                names of the position are other values, as seen at samples.
         """
         name, odd = type(model).__name__, [x for x in model.position if x not in AXES]
         if not model.position or odd:
             what = f"the position {listing(model.position)}" if odd else "no `position`"
             raise LawError(f"`safety` needs a position in x, y or z, and `{name}` has {what}.")
+        _check_position(model)
         if self.radii is not None:
             return self
         radius = model.radius
@@ -220,6 +224,23 @@ def hull_points(
         whole = np.atleast_1d(np.poly(-np.array(roots[:k])))[::-1]
         rows[k, : k + 1] = whole / whole[0]
     return jnp.asarray(rows, values.dtype) @ values
+
+
+def _check_position(model: ControlAffine) -> None:
+    """Check that outputs with the names of the position are the position, near the trim and far."""
+    names = [name for name in model.position if name in model.output_names]
+    both = model.output_names, model.state_names
+    outputs, states = (np.array([each.index(x) for x in names], int) for each in both)
+    draw = np.random.default_rng(0)
+    away = _SIZES[:, None] * draw.uniform(-1.0, 1.0, (len(_SIZES), len(model.state_names)))
+    x = jnp.asarray(np.asarray(model.trim[0], float) + away)
+    off = np.abs(np.asarray(jax.vmap(model.output)(x)[:, outputs] - x[:, states]))
+    wrong = np.flatnonzero(~(off.max(axis=0) <= _SOLVED))
+    if len(wrong):
+        raise LawError(
+            f"`safety` needs the position of `{type(model).__name__}` among its flat outputs, and "
+            f"its output `{names[wrong[0]]}` is not the state of that name."
+        )
 
 
 def _positive(value: object) -> bool:

@@ -167,7 +167,7 @@ class StoppingPoint(FlatLaw):
         if self.safety is None:
             return law
         law = dataclasses.replace(law, safety=self.safety.prepared(model))
-        law.check_places(model)
+        law.places(model)
         return law
 
     def following(self, leader: Law, model: ControlAffine) -> "StoppingPoint":

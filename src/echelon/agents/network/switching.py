@@ -73,6 +73,8 @@ class Schedule(NamedTuple):
         periods, span = 1, np.inf
         if self.period is not None:
             counts = self.period / dt * np.arange(1, _MOST_PERIODS + 1)
+            # Of periods of more steps than numbers have nothing is known.
+            counts = counts[counts < 2.0**53]
             whole = np.flatnonzero(np.abs(counts - np.round(counts)) <= _ROUNDED + 4e-16 * counts)
             if not len(whole):
                 return None

@@ -41,6 +41,7 @@ from echelon.experiments.scenario.world_parts import (
     plants_of,
     sensing_of,
 )
+from echelon.experiments.scenario.yaml import quoted
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
 from echelon.laws.safety import Safety
@@ -221,7 +222,7 @@ def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) ->
     named = getattr(part.cls, "named", None)
     if named is None:
         raise ModelError(
-            f"got the parameter set `{name}`, but `{part.name}` has none; give a mapping."
+            f"got the parameter set {quoted(name)}, but `{part.name}` has none; give a mapping."
         )
     check_names(part.cls, part.name, changes)
     with as_scenario_error(f"`{part.name}` refuses these parameters"):

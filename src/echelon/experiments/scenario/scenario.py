@@ -140,7 +140,9 @@ def _keys(path: KeyPath) -> list[str]:
 
 def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
     """Return the path and the sentence of a fault of the schema."""
-    path, kind, context = error["loc"], error["type"], error.get("ctx", {})
+    # Of a value that may also be a section, the path has the name of the section's class.
+    path = tuple(key for key in error["loc"] if key != law_sections.ObserverSpec.__name__)
+    kind, context = error["type"], error.get("ctx", {})
     if path and path[-1] == "[key]":
         kind = "the number of an agent" if kind == "int_type" else "a name"
         return path[:-1], f"got the key {quoted(path[-2])}, allowed is {kind}."

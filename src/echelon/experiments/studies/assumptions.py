@@ -163,6 +163,8 @@ def _printed_line(parts: Parts, promise: Promise) -> Statement:
     drifts = goal_drifts(parts.model, parts.formation.offsets, parts.drive)[some]
     count, n = goals.shape
     values, vectors = np.linalg.eigh(promise.loop.closed.P)
+    # Of a P that rounding makes indefinite the eigenvalues are those that it may have.
+    values = np.maximum(values, np.finfo(float).eps * np.abs(values).max())
     X = np.kron(np.eye(count), vectors @ np.diag(values**-0.5) @ vectors.T)
     D, F = np.zeros((count * n, count)), np.zeros((count * n, count))
     for i in range(count):
