@@ -42,6 +42,7 @@ JOURNEYS = [
     slow("networks"),
     slow("learning"),
     slow("crazyflie"),
+    slow("autopilots"),
     slow("matlab"),
     slow("onboard"),
 ]

@@ -34,7 +34,7 @@ TESTS = Path(__file__).parents[1]
 GRAPH = ech.Graph([(0, 1), (1, 2), (1, 3)])
 OFFSETS = {1: (0.6, 0.0, 0.0), 2: (0.6, 0.5, 0.0), 3: (0.6, -0.5, 0.0)}
 PATH = ech.references.Circle(center=(0.0, 0.0, 1.0), radius=0.6, rate=0.8)
-DT, SETTLED, SECONDS = 0.01, 8.0, 16.0
+DT, SETTLED, SECONDS = 0.01, 10.0, 18.0
 SPEED = float(os.environ.get("FLIGHT_SPEED", "1"))  # below 1 on a machine that others use
 
 
