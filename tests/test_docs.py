@@ -40,6 +40,7 @@ JOURNEYS = [
     slow(*FIRST, "troubleshooting"),
     slow("recipes", "sweeps", "comparing"),
     slow("networks"),
+    slow("events"),
     slow("learning"),
     slow("crazyflie"),
     slow("autopilots"),

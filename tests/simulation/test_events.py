@@ -1,5 +1,7 @@
 """Agents that are lost or join, links that are cut, and heirs that take the lead."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -190,3 +192,31 @@ def test_a_run_with_events_is_stored_and_verified(tmp_path):
     stored = ech.load(folder)
     assert np.array_equal(stored.presence, run.presence)
     assert ech.summary(stored)["event_outcomes"] == ech.summary(run)["event_outcomes"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("prediction", ["preview", "packet"])
+def test_single_agents_hand_the_lead_over_as_in_a_run(prediction):
+    """Each with a queue of its own; the leader stops at 1 s, and an heir of it at 2 s."""
+    dt, radio = 0.02, dataclasses.replace(RADIO, loss=0.0, prediction=prediction)
+    events = [Lose(0, 1.0), Lose(1, 2.0)]
+    parts = _parts(network=radio, events=events, leadership=ech.Leadership((1, 2), timeout=0.2))
+    run = ech.simulate(parts, ech.Settings(horizon=3.0, dt=dt, seed=3))
+    agents = [ech.Agent(parts, k, dt=dt) for k in range(4)]
+    states, under_way, leads = run.states[0].copy(), [], []
+    for k in range(150):
+        now = k * dt
+        for receiver, message in [x for x in under_way if x[1].time < now - 1e-9]:
+            agents[receiver].receive(message)
+        under_way = [x for x in under_way if x[1].time >= now - 1e-9]
+        inputs = np.zeros((4, 2))
+        for agent in agents:
+            if run.presence[k, agent.number]:
+                inputs[agent.number], message = agent.step(now, states[agent.number])
+                if message is not None and k % 2 == 0:
+                    near = [x for x in agents if agent.number in x.neighbours]
+                    under_way += [(x.number, message) for x in near if run.presence[k, x.number]]
+        assert inputs == pytest.approx(run.inputs[k], abs=1e-9)
+        states = run.states[k + 1]
+        leads.append([agent.leads for agent in agents])
+    assert np.array(leads)[-1].tolist() == [True, True, True, False]

@@ -153,7 +153,7 @@ def _is_time(value: object) -> bool:
 
 
 def _is_agent(value: object, agents: int) -> bool:
-    return isinstance(value, numbers.Integral) and 0 <= value < agents
+    return isinstance(value, numbers.Integral) and 0 <= int(value) < agents
 
 
 def _in_order(

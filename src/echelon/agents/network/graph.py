@@ -76,6 +76,10 @@ class Graph(GraphMatrices):
             finite; there is no leader or nothing but leaders; no leader reaches an agent.
     """
 
+    events: tuple[Event, ...]
+    heirs: tuple[int, ...]
+    before: "Graph"
+
     def __init__(
         self,
         edges: Iterable[Sequence[float]],

@@ -43,7 +43,8 @@ class Ellipsoid(NamedTuple):
         scaled = places * self.radius / self.radii(coordinates)
         apart = np.linalg.norm(scaled[:, None] - scaled, axis=2)
         np.fill_diagonal(apart, np.inf)
-        least = apart.min(axis=1)
+        # Absent agents are nowhere.
+        least = np.where(np.isfinite(apart), apart, np.inf).min(axis=1)
         return (least < self.limit - ROUNDING) * 1.0 + (least < self.touching)
 
 

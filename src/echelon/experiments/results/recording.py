@@ -141,6 +141,7 @@ class Recording(FrameNumbers):
     attributes: JsonObject
     events: tuple[JsonObject, ...] = ()
     radius: float | None = None
+    moving: Float[np.ndarray, "T N n"] | None = None
 
     def __repr__(self) -> str:
         """Return the name and the sizes."""
@@ -225,8 +226,11 @@ class Recording(FrameNumbers):
 
     @property
     def loads(self) -> Float[np.ndarray, "T N k"] | None:
-        """Loads of the inputs; None where they have none."""
-        return None if self.bounds is None else self.bounds.loads(self.inputs)
+        """Loads of the inputs, NaN of absent agents; None where they have none."""
+        loads = None if self.bounds is None else self.bounds.loads(self.inputs)
+        if loads is None or self.presence is None:
+            return loads
+        return np.where(self.presence[:, :, None], loads, np.nan)
 
 
 def read_recording(file: Path) -> Recording:

@@ -135,7 +135,10 @@ def events_of(
 def _event(spec: EventSpec) -> Event:
     if spec.cut is not None:
         return Cut(spec.cut, spec.at, spec.duration)
-    return Join(spec.join, spec.at) if spec.lose is None else Lose(spec.lose, spec.at)
+    if spec.join is not None:
+        return Join(spec.join, spec.at)
+    assert spec.lose is not None, "the schema holds that there is one of three"
+    return Lose(spec.lose, spec.at)
 
 
 def check_world(faults: FaultList, parts: Parts, dt: float) -> None:

@@ -1,7 +1,6 @@
 """Numbers that follow from the stored frames of a run, computed now or read from its dataset."""
 
 import abc
-import functools
 from collections.abc import Sequence
 from typing import Protocol, TypeAlias
 
@@ -87,7 +86,7 @@ class FrameNumbers(abc.ABC):
         """Each agent's distance from its goal."""
         return self.goal_distances()
 
-    @functools.cached_property
+    @property
     def presence(self: _Frames) -> Bool[Array, "T N"] | None:
         """Which agents are there in each frame; None where all always are."""
         schedule = self.schedule
@@ -95,7 +94,7 @@ class FrameNumbers(abc.ABC):
             return None
         return schedule.present[schedule.rows(self.times)]
 
-    @functools.cached_property
+    @property
     def nearest_then(self: _Frames) -> Int[Array, "T N"]:
         """The leader that each agent follows in each frame."""
         schedule = self.schedule

@@ -133,11 +133,19 @@ def taken_over(
     return packet._replace(leader=leader, stamp=stamp, epoch=packet.epoch + chosen)
 
 
-def packet_size(channel: Channel, s: int, forward: int, m: int) -> int:
-    """Return how many numbers a packet has, for signals (s,), a feed-forward and inputs (m,)."""
+def packet_size(channel: Channel, s: int, forward: int, m: int, heirs: bool = False) -> int:
+    """Return how many numbers a packet has, for signals (s,), a feed-forward and inputs (m,).
+
+    Where the leader has `heirs` it also says how its feed-forward changes, since it is carried on
+    for longer.
+    """
     if channel.messages is MessageContent.STATE:
         return forward
-    more = {Prediction.PREVIEW: 0, Prediction.NONE: forward, Prediction.PACKET: forward + m}
+    more = {
+        Prediction.PREVIEW: 0,
+        Prediction.NONE: forward,
+        Prediction.PACKET: forward + m + heirs * forward,
+    }
     return s + more[channel.prediction]
 
 
@@ -243,10 +251,30 @@ def content_of(
     if channel.prediction is Prediction.NONE:
         return jnp.concatenate([signal, forward])
     if channel.prediction is Prediction.PACKET:
-        return jnp.concatenate([signal, forward, u])
+        parts = jnp.concatenate([signal, forward, u])
+        if loop.succession is None:
+            return parts
+        return jnp.concatenate([parts, _slope(loop, t, x, offset, memory, forward)])
     deviation = loop.leader.deviation(loop.model, t, x, offset, memory)
     assert deviation is not None, "a channel with a preview has a leader with a plan"
     return deviation
+
+
+def _slope(
+    loop: Loop,
+    t: Scalar,
+    x: State,
+    offset: State,
+    memory: Memory,
+    forward: Float[jax.Array, " k"],
+) -> Float[jax.Array, " k"]:
+    """Return the rate at which the feed-forward of a leader with a plan changes, from a step on."""
+    deviation, dt = loop.leader.deviation(loop.model, t, x, offset, memory), loop.motion.dt
+    assert deviation is not None, "a leader with heirs has a plan"
+    expected = loop.leader.expected(loop.model, t + dt, deviation, jnp.asarray(dt, t.dtype), dt)
+    if expected is None or expected.feedforward is None:
+        return jnp.zeros_like(forward)
+    return (expected.feedforward - forward) / dt
 
 
 def _leaders(
@@ -280,8 +308,15 @@ def expected_of(
         return _expected(loop, t, content, age)
     if prediction is Prediction.NONE:
         return content[:s], content[s:]
+    time, slope = carried_time(age), None
+    if loop.succession is not None:
+        k = (len(content) - s - len(loop.model.input_names)) // 2
+        content, slope = content[:-k], content[-k:]
     signal, feedforward, u = parts_of(loop, s, content)
-    return loop.follower.carried(loop.model, signal, feedforward, u, carried_time(age)), feedforward
+    if slope is None:
+        return loop.follower.carried(loop.model, signal, feedforward, u, time), feedforward
+    mean = feedforward + 0.5 * time * slope
+    return loop.follower.carried(loop.model, signal, mean, u, time), feedforward + time * slope
 
 
 def parts_of(

@@ -22,6 +22,8 @@ from echelon.core.errors import SimulationError
 from echelon.core.types import Array
 
 _NO_HEIR = -1
+_ROUNDED = 1e-9
+"""s; what differences of times leave."""
 
 
 @final
@@ -88,5 +90,6 @@ class Succession(NamedTuple):
             waited: since each last heard of it, or began to listen, s.
         """
         rank = jnp.asarray(self.rank)[number]
-        late = jnp.asarray(waited) > jnp.asarray(self.timeout) * (rank + 1)
+        # Beyond rounding, so that all see the same step.
+        late = jnp.asarray(waited) > jnp.asarray(self.timeout) * (rank + 1) + _ROUNDED
         return (rank != _NO_HEIR) & (jnp.asarray(leader) != number) & late

@@ -4,7 +4,7 @@ This file sees only the interfaces of models and laws.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
 import jax
@@ -130,17 +130,28 @@ def row_at(switches: Switches, step: jax.Array) -> jax.Array:
     return rows[jnp.searchsorted(steps, step, side="right") - 1]
 
 
-def present_at(loop: Loop, step: jax.Array) -> Bool[jax.Array, " N"] | None:
+class Cast(Protocol):
+    """Who is there when, and who may lead: a loop, or a network by itself."""
+
+    @property
+    def switches(self) -> "Switches | None": ...  # noqa: D102
+    @property
+    def presence(self) -> "Presence | None": ...  # noqa: D102
+    @property
+    def succession(self) -> Succession | None: ...  # noqa: D102
+
+
+def present_at(loop: Cast, step: jax.Array) -> Bool[jax.Array, " N"] | None:
     """Return who is present at a step; None where all always are."""
     if loop.presence is None or loop.switches is None:
         return None
     return jnp.asarray(loop.presence.rows)[row_at(loop.switches, step)]
 
 
-def since_at(loop: Loop, step: jax.Array) -> jax.Array:
+def since_at(loop: Cast, step: jax.Array) -> jax.Array:
     """Return since when each agent has been there, s, (N,)."""
     if loop.presence is None or loop.switches is None:
-        return jnp.zeros(len(loop.order))
+        return jnp.zeros(())
     return jnp.asarray(loop.presence.since)[row_at(loop.switches, step)]
 
 

@@ -22,7 +22,7 @@ from echelon.simulation.step.knowledge import (
     understand,
     write,
 )
-from echelon.simulation.step.loop import Loop, Moment, WorldState, present_at, since_at
+from echelon.simulation.step.loop import Cast, Loop, Moment, WorldState, present_at, since_at
 
 
 def all_readers(agents: int, leaders: Array) -> Readers:
@@ -45,8 +45,9 @@ def begin_network(
     channel, readers = loop.channel, first_readers(loop)
     assert channel is not None
     links, s = len(loop.exchange.receivers), sent.shape[1]
-    size = packet_size(channel, s, forward, len(loop.model.input_names))
-    mail = no_mail(readers, links, sent, size, loop.succession is not None)
+    heirs = loop.succession is not None
+    size = packet_size(channel, s, forward, len(loop.model.input_names), heirs)
+    mail = no_mail(readers, links, sent, size, heirs)
     posts = channel.begin(Letters(sent, readers.number, mail.packet), links)
     return world._replace(in_flight=posts, mail=mail)
 
@@ -62,17 +63,17 @@ def read_messages(
     channel = loop.channel
     assert channel is not None
     mail = take(channel, exchange, now.step, now.world.in_flight, now.world.mail)
-    mail = mail._replace(packet=led_by_heirs(loop, now.step, mail.packet))
+    mail = mail._replace(packet=led_by_heirs(loop, now.step, mail.packet, loop.motion.dt))
     ages = Ages(*(age_of(now.step, x, loop.motion.dt) for x in (mail.stamp, mail.packet.stamp)))
     t, readers = now.step.astype(sent.dtype) * loop.motion.dt, readers_of(loop, mail.packet)
     return understand(loop, exchange, readers, t, mail, ages, sent, difference), mail
 
 
-def led_by_heirs(loop: Loop, step: jax.Array, packet: Packets) -> Packets:
-    """Return the packets after those heirs took the lead that hear of no leader."""
+def led_by_heirs(loop: Cast, step: jax.Array, packet: Packets, dt: Array | float) -> Packets:
+    """Return the packets after those heirs took the lead that hear of no leader; dt in s."""
     if loop.succession is None:
         return packet
-    dt, number = loop.motion.dt, jnp.arange(len(packet.leader), dtype=jnp.int32)
+    number = jnp.arange(len(packet.leader), dtype=jnp.int32)
     waited = jnp.minimum(age_of(step, packet.stamp, dt), step * dt - since_at(loop, step))
     silent = loop.succession.silent(number, packet.leader, waited)
     here = present_at(loop, step)

@@ -104,7 +104,8 @@ def control(loop: Loop, now: Moment) -> Control:
     else:
         knowledge, mail = read_messages(loop, exchange, now, sent, difference)
         z = knowledge.disagreement
-    packet = mail.packet if mail is not None else led_by_heirs(loop, now.step, now.world.led)
+    dt, led = loop.motion.dt, now.world.led
+    packet = mail.packet if mail is not None else led_by_heirs(loop, now.step, led, dt)
     leads = readers_of(loop, packet).leads
     near, seen = look_around(loop, now, leads, knowledge, mail)
     said, led = (_lead(loop, now, z),) * 2
