@@ -4,7 +4,7 @@
 
 sends to one port for each vehicle in real time until its standard input ends, and then writes what
 was flown. As PX4, it enters OFFBOARD only after setpoints at 2 Hz, obeys them there alone, and
-leaves it 0.5 s after the last one.
+leaves it 1 s after the last one.
 """
 
 import json
@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil  # noqa: E402
 
-HOVER, OFFBOARD, LAND, LOST = 0.42, (6, 0), (4, 6), 0.5
+HOVER, OFFBOARD, LAND, LOST = 0.42, (6, 0), (4, 6), 1.0
 # From east, north, up to north, east, down; and from forward, left, up to forward, right, down.
 WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 BODY = np.diag([1.0, -1.0, -1.0])
@@ -47,7 +47,7 @@ class Px4:
                 self.period = 1e-6 * message.param2
             elif kind == "COMMAND_LONG" and message.command == 176 and message.param1 == 1:
                 wanted = int(message.param2), int(message.param3)
-                steady = now - self.came[0] < 3 * LOST
+                steady = now - self.came[0] < 1.5
                 if wanted != OFFBOARD or steady:
                     self.mode, self.beat = wanted, -np.inf
 

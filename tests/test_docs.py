@@ -43,6 +43,7 @@ JOURNEYS = [
     slow("events"),
     slow("learning"),
     slow("crazyflie"),
+    slow("autopilots"),
     slow("matlab"),
     slow("onboard"),
 ]

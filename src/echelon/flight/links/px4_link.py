@@ -33,7 +33,7 @@ _BODY: Final = (8, 12)
 
 @final
 class Px4Link(Link):
-    """Sends attitudes, a yaw rate and a thrust; PX4 leaves OFFBOARD after 0.5 s without any.
+    """Sends attitudes, a yaw rate and a thrust; PX4 leaves OFFBOARD after 1 s without any.
 
     Raises:
         FlightError: no vehicle answers, or it does not tell its hover thrust.
