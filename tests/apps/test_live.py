@@ -170,7 +170,7 @@ def test_who_is_lost_or_joins_live_does_so_as_in_a_run(session):
 def test_a_leader_that_has_lost_all_others_goes_on_alone(session):
     for agent in (3, 2, 1):
         session.ask({"name": "lose", "value": agent})
-    session.settle()
+        session.settle()
     picture = session.swarm.advance()
     session.show(picture)
     assert picture.here.tolist() == [True, False, False, False]
