@@ -167,6 +167,16 @@ def test_who_is_lost_or_joins_live_does_so_as_in_a_run(session):
     assert session.swarm.here.all() and not session.knobs.events
 
 
+def test_a_leader_that_has_lost_all_others_goes_on_alone(session):
+    for agent in (3, 2, 1):
+        session.ask({"name": "lose", "value": agent})
+    session.settle()
+    picture = session.swarm.advance()
+    session.show(picture)
+    assert picture.here.tolist() == [True, False, False, False]
+    assert np.isnan(np.frombuffer(session.picture[16:], "<f4")[:2]).all()
+
+
 def test_events_of_a_scenario_are_changes_of_a_live_loop():
     events = [
         {"at": 2.0, "cut": [0, 1], "for": 1.5},

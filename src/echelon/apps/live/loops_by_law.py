@@ -22,7 +22,7 @@ class LoopsByLaw:
     def __init__(self, panel: Panel, swarm: LiveLoop, send: Callable[[JsonObject], None]) -> None:
         """Begin with one loop."""
         self.first, self.send = panel, send
-        self.ready = {(panel.law, False): (panel, swarm)}
+        self.ready = {(panel.law, swarm.eventful): (panel, swarm)}
 
     def prepare(self, law: str, eventful: bool) -> tuple[Panel, LiveLoop]:
         """Return the loop under a law with its panel, compiled if it is not yet.
@@ -35,8 +35,9 @@ class LoopsByLaw:
             EchelonError: the law is unknown, or does not fit these agents.
         """
         key = law, eventful
-        if key in self.ready:
-            return self.ready[key]
+        for usable in (key, (law, True)):
+            if usable in self.ready:
+                return self.ready[usable]
         check_choice("law", law, self.first.laws)
         what = "losses and arrivals" if eventful else f"the law `{law}`"
         self.send({"note": f"Compiling {what}; the loop continues meanwhile."})

@@ -56,7 +56,8 @@ def live(
     progress(1, 4)
     panel = Panel(scenario, experiment)
     progress(2, 4)
-    swarm = LiveLoop(parts, settings, panel.live)
+    eventful = any(change.lose is not None for change in scenario.live)
+    swarm = LiveLoop(parts, settings, panel.live, eventful)
     name = scenario.name
     if run is not None:
         _continue(swarm, run)

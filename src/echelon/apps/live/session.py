@@ -178,7 +178,8 @@ class Session:
         space, swarm, pair = self.space, self.swarm, self.closest
         here = np.ones(len(picture.states), bool) if picture.here is None else picture.here
         followers = [k for k in swarm.parts.graph.followers if here[k]]
-        errors, loads = picture.errors[followers], self._loads(picture)
+        errors = picture.errors[followers] if followers else np.full(1, np.nan)
+        loads = self._loads(picture)
         places = np.where(here[:, None], picture.states[:, list(space.axes)], np.nan)
         ends = (loads[here].max(), loads[here].min()) if loads.size else (np.nan, np.nan)
         goals = swarm.goals(picture)
