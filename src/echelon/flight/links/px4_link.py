@@ -151,7 +151,8 @@ def _connected(address: str) -> Any:
         ) from None
     try:
         wire = mavutil.mavlink_connection(address, dialect="common")
-    except (OSError, ValueError) as error:
+    # What is no address of a network is taken for a serial port, which needs pyserial.
+    except (ImportError, OSError, ValueError) as error:
         raise FlightError(f"`px4://{address}` cannot be opened: {error}.") from None
     if wire.wait_heartbeat(timeout=_PATIENCE) is None:
         wire.close()
