@@ -36,6 +36,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "figures": {"avoidance": "near"},
         "video": ("crossing", 1.0),
     },
+    "leader-lost": {"figures": {"trajectories": "heir"}, "video": ("heir", 1.5)},
     "paper-far": {"set": ("simulation.horizon=20",), "figures": {"trajectories": "far"}},
     "flock.yaml": {
         "figures": {

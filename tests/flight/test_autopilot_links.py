@@ -10,6 +10,7 @@ import pytest
 from fake_crazyflie import Crazyflie, packed
 
 from echelon.core.errors import FlightError, MissingExtraError
+from echelon.flight import __main__ as process
 from echelon.flight.links.cflib_link import CflibLink
 from echelon.flight.links.link import open_link
 from echelon.flight.links.px4_link import Px4Link
@@ -319,6 +320,30 @@ def test_px4_is_read_and_commanded_in_its_own_frames(px4):
     assert ("heartbeat", (18, 8, 0, 0, 0)) in wire.mav.sent
     link.close()
     assert wire.closed
+
+
+@pytest.mark.parametrize("error", [ImportError("No module named 'serial'"), OSError("no port")])
+def test_an_address_that_cannot_be_opened_is_one_sentence(px4, monkeypatch, error):
+    px4(HOVER)
+
+    def refuse(_, dialect):
+        raise error
+
+    monkeypatch.setattr(sys.modules["pymavlink"].mavutil, "mavlink_connection", refuse)
+    with pytest.raises(FlightError, match=f"`px4://rubbish` cannot be opened: {error}"):
+        Px4Link("rubbish", facts())
+
+
+def test_a_missing_library_ends_a_process_with_a_sentence_and_its_code(monkeypatch, capsys):
+    def missing(*_):
+        raise MissingExtraError("a Crazyflie needs cflib.")
+
+    monkeypatch.setattr(process, "_options", lambda: SimpleNamespace(folder=None))
+    monkeypatch.setattr(process, "Mission", missing)
+    with pytest.raises(SystemExit) as left:
+        process.main()
+    assert left.value.code == 4
+    assert capsys.readouterr().err == "echelon: a Crazyflie needs cflib.\n"
 
 
 def modes(wire):

@@ -109,6 +109,8 @@ def test_an_heir_leads_along_the_path(network):
     gap = run.states[-1, 1] - run.reference[-1] - run.offsets[1]
     assert np.abs(gap).max() < 5e-3
     assert (run.nearest_then[run.times >= 3.0] == 1).all()
+    agent, off = ech.summary(run)["event_outcomes"][0]["leader"]
+    assert agent == 1 and off < 0.3
 
 
 def test_losses_that_are_covered_are_guaranteed():
@@ -162,6 +164,12 @@ def test_events_that_cannot_be_are_refused_in_a_sentence(graph, events, words):
 def test_heirs_that_cannot_be_are_refused(heirs, words):
     with pytest.raises(EchelonError, match=words):
         _parts(leadership=ech.Leadership(heirs))
+
+
+def test_heirs_that_cannot_wait_for_messages_are_refused():
+    parts = _parts(network=RADIO, leadership=ech.Leadership((1,), timeout=0.05))
+    with pytest.raises(EchelonError, match="at least two periods of the network"):
+        ech.simulate(parts, SETTINGS)
 
 
 def test_heirs_of_a_leader_without_a_plan_are_refused():

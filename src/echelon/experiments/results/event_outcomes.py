@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Int
 
 from echelon.core.types import JsonObject
 from echelon.guarantees.promises.event_lines import events_in_words
@@ -21,6 +22,10 @@ class EventOutcome(NamedTuple):
         restored: from when on all of these stayed below 1 cm, s; None if they did not.
         until: of the last frame before the next event, s.
         unit: of errors.
+        leader: who leads from then on, and its largest distance from the path; None where that does
+            not change, or nobody follows a path.
+        near: the scaled distance to another agent at which one joins that keeps apart, m, where it
+            is less than what they keep; else None.
         guarantee: what is guaranteed through it, in words.
     """
 
@@ -30,11 +35,13 @@ class EventOutcome(NamedTuple):
     restored: float | None
     until: float
     unit: str
+    leader: tuple[int, float] | None
+    near: float | None
     guarantee: str
 
     def as_mapping(self) -> JsonObject:
         """Return what was observed, ready for JSON."""
-        names = ("at", "peak", "restored", "until")
+        names = ("at", "peak", "restored", "until", "leader", "near")
         return {name: getattr(self, name) for name in names}
 
     def sentence(self) -> str:
@@ -50,6 +57,13 @@ class EventOutcome(NamedTuple):
             seen = f"errors reach {size}, and are not below {limit} by {self.until:.4g} s"
         else:
             seen = f"errors reach {size}, and stay below {limit} from {self.restored:.4g} s on"
+        if self.leader is not None:
+            agent, off = self.leader
+            seen += (
+                f"; agent {agent} leads, {off:.3g} {self.unit}".rstrip() + " off the path at most"
+            )
+        if self.near is not None:
+            seen += f"; it joins {self.near:.3g} m from another agent, nearer than hulls keep"
         return f"{text}: {seen}. {self.guarantee}"
 
 
@@ -81,5 +95,30 @@ def _outcome(result: Result, event: JsonObject, end: float) -> EventOutcome:
         restored=restored,
         until=float(times[frames[-1]]) if len(frames) else event["at"],
         unit=result.length_unit,
+        leader=_new_leader(result, frames),
+        near=_too_near(result, event, frames),
         guarantee=event["guarantee"]["sentence"],
     )
+
+
+def _new_leader(result: Result, frames: Int[np.ndarray, " F"]) -> tuple[int, float] | None:
+    """Return who leads in frames but not before, and its largest distance from the path."""
+    if result.presence is None or result.reference is None or not len(frames) or not frames[0]:
+        return None
+    old, new = (int(result.nearest_then[k, 0]) for k in (frames[0] - 1, frames[0]))
+    if old == new:
+        return None
+    off = result.states[frames, new] - result.reference[frames] - result.offsets[new]
+    return new, float(np.linalg.norm(off[:, list(result.measured)], axis=1).max())
+
+
+def _too_near(result: Result, event: JsonObject, frames: Int[np.ndarray, " F"]) -> float | None:
+    """Return how near to another an agent joins that keeps apart, if that is too near."""
+    safety, here = result.drive.safety, result.presence
+    if safety is None or here is None or event["what"] != "join" or not len(frames):
+        return None
+    [agent], first = event["agents"], int(frames[0])
+    places = result.states[first][:, list(result.position)] * safety.scales(result.model)
+    others = here[first] & (np.arange(len(places)) != agent)
+    least = np.linalg.norm(places[others] - places[agent], axis=1).min(initial=np.inf)
+    return float(least) if least < safety.distance else None

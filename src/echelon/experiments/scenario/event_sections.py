@@ -85,12 +85,14 @@ class LiveSpec(BaseModel, **STRICT):
     noise: Annotated[NotNegative | None, Unit("1")] = None
     """Size of the noise, relative to that of `sensing`."""
     lose: int | None = None
-    """The number of an agent that falls silent: all its edges are removed."""
+    """The number of an agent that is lost: it falls silent, and its body is gone."""
     cut: Annotated[Annotated[tuple[int, int], Field(strict=False)] | None, Unit("agents")] = None
     """The two agents of an edge that is removed."""
     restore: Annotated[Annotated[tuple[int, int], Field(strict=False)] | None, Unit("agents")] = (
         None
     )
     """The two agents of an edge that is restored."""
+    join: int | None = None
+    """The number of a lost agent that joins again, in its initial state."""
     kick: Annotated[dict[int, Numbers] | None, Unit("the states'")] = None
     """By agent: jump of its states, in the states' units."""

@@ -147,5 +147,7 @@ def check_world(faults: FaultList, parts: Parts, dt: float) -> None:
         parts.world.check_agents(parts.model, parts.graph.agents)
     with faults.at("leadership"):
         parts.drive.check_heirs(parts.graph)
+        if parts.leadership is not None:
+            parts.leadership.check_network(parts.world.network)
     with faults.at("network"):
         parts.drive.check_world(parts.world, parts.graph, dt)

@@ -92,7 +92,10 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
         some = followers or slice(None)
         rows = np.where(here, errors, np.nan)[:, some]
         worst = np.where(here, errors, 0.0)[:, some].max(axis=1)
-        median = np.median(rows, axis=1) if here.all() else np.nanmedian(rows, axis=1)
+        median, anybody = np.full(len(rows), np.nan), here[:, some].any(axis=1)
+        # A number that is not finite is shown as such, but of agents that are not there.
+        middle = np.median if run.presence is None else np.nanmedian
+        median[anybody] = middle(rows[anybody], axis=1)
         lines = [sheet.line("worst", worst, 1, True), sheet.line("median", median, 0, True)]
     if run.reference is not None:
         away = _off_reference(run, run.reference)

@@ -87,6 +87,8 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         # Its own numbers first: whether they suit the laws is asked of a network that can be.
         channel = channel_of(parts, settings)
         drive.check_heirs(graph)
+        if parts.leadership is not None:
+            parts.leadership.check_network(parts.world.network)
         drive.check_world(parts.world, graph, settings.dt)
         problem = Problem(
             model,

@@ -107,7 +107,7 @@ class Result(FrameNumbers):
         if schedule is None or schedule.present is None:
             return np.tile(np.asarray(steps, float)[:, None], len(agents))
         times = self.settings.dt * np.arange(int(steps[0]))
-        here = np.asarray(schedule.present[schedule.rows(times)])[:, agents].all(axis=2)
+        here = np.asarray(schedule.present[schedule.rows(times)][:, agents].all(axis=2))
         first = self.settings.first_steady
         return np.array([here.sum(axis=0), here[first:].sum(axis=0)], float)
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from echelon.agents.network.channel import Network
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array
@@ -51,6 +52,19 @@ class Leadership:
         fine = isinstance(self.timeout, numbers.Real) and 0.0 < float(self.timeout) < math.inf
         if not fine:
             raise SimulationError(f"`timeout` is {self.timeout}, and must be positive and finite.")
+
+    def check_network(self, network: Network | None) -> None:
+        """Check that heirs wait longer than messages of a network that is not disturbed take.
+
+        Raises:
+            SimulationError: they do not.
+        """
+        least = 0.0 if network is None else 2.0 / network.rate + network.delay + network.jitter
+        if self.timeout < least:
+            raise SimulationError(
+                f"`timeout` of the leadership is {self.timeout:g} s, and must be at least two "
+                f"periods of the network, its delay and its jitter together, {least:g} s."
+            )
 
 
 class Succession(NamedTuple):
