@@ -76,7 +76,7 @@ class FlatMemory(NamedTuple):
 
     Attributes:
         chain: the states of the integrators before inputs, normalized (k,).
-        rate: zeta' that it commands, (m,), which followers may receive.
+        rate: zeta' that it commands, (m,), less that of its offset, which followers may receive.
         delivered: the normalized input (m,) that the actuators delivered in the step before.
         base, push: of the observer (m,): the speed that the model predicts but for the last half
             step, and the acceleration that the model lacks.
@@ -149,9 +149,12 @@ class FlatLoop(eqx.Module):
 
     def place(self, model: ControlAffine, x: State, offset: State, memory: FlatMemory) -> jax.Array:
         """Return zeta less the offset, (m,): where the agent would come to rest."""
+        return self.stop(self.flat_values(model, x, memory)) - self.shift(model, offset)
+
+    def shift(self, model: ControlAffine, offset: State) -> jax.Array:
+        """Return the flat outputs (m,) of an offset."""
         outputs = self.chains.outputs
-        shift = flat_output(model, outputs, offset) - flat_output(model, outputs, 0.0 * offset)
-        return self.stop(self.flat_values(model, x, memory)) - shift
+        return flat_output(model, outputs, offset) - flat_output(model, outputs, 0.0 * offset)
 
     def stop(self, values: jax.Array) -> jax.Array:
         """Return zeta (m,) of flat coordinates (r, m)."""
@@ -179,8 +182,12 @@ class FlatLoop(eqx.Module):
         rate: jax.Array,
         memory: FlatMemory,
         period: Scalar | float,
+        offset_rate: State | None = None,
     ) -> tuple[Input, FlatMemory]:
-        """Return the physical input that makes zeta move at a rate (m,), and the next memory."""
+        """Return the physical input that makes zeta move at a rate (m,), and the next memory.
+
+        The rate of the own offset (n,) is added to it.
+        """
         flat, values = (
             flatten(model, self.chains, x, memory.chain),
             self.flat_values(model, x, memory),
@@ -188,7 +195,8 @@ class FlatLoop(eqx.Module):
         degrees = np.array(self.chains.degrees)
         lower = np.arange(len(values))[:, None] < degrees - 1
         k = jnp.where(lower, jnp.asarray(self.weights, x.dtype), 0.0)
-        tops = rate - (k[:-1] * values[1:]).sum(axis=0)
+        tops = rate if offset_rate is None else rate + self.shift(model, offset_rate)
+        tops = tops - (k[:-1] * values[1:]).sum(axis=0)
         tops = jnp.asarray(self.stiffness, x.dtype) * tops
         if self.observer:
             tops = tops - jnp.where(degrees <= 2, memory.push, 0.0)

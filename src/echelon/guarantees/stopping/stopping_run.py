@@ -11,11 +11,12 @@ import scipy.linalg
 
 from echelon.agents.models.chains import flat_output, flatten
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.network.graph import Graph
 from echelon.core.compiled import cached_jit
 from echelon.core.enclosure.interval import point
 from echelon.core.linear import sampled_radius
-from echelon.core.rational import float_above
+from echelon.core.rational import float_above, norm_above
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind
@@ -27,6 +28,7 @@ from echelon.guarantees.messages.late_messages import (
 )
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.flat_states import flat_states_of
+from echelon.guarantees.stopping.moving_offsets import offset_sizes
 from echelon.guarantees.stopping.path_bounds import pieces_of
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
@@ -48,7 +50,7 @@ class StoppingRun(NamedTuple):
         parts: prepared.
         settings: how it is computed.
         states: (N, n) at the start.
-        flat: (N, r, m) the same in flat coordinates, less the offsets.
+        flat: (N, r, m) the same in flat coordinates, less the offsets and their derivatives.
         ahead: (r, m) of what the leader follows.
         late: what is guaranteed over its network; None for the ideal one.
     """
@@ -93,7 +95,9 @@ class StoppingRun(NamedTuple):
     @property
     def still(self) -> bool:
         """Whether the leader is where it stays, from the start on."""
-        outputs = range(len(self.law.ready.chains.outputs))
+        outputs, motion = range(len(self.law.ready.chains.outputs)), self.parts.formation.motion
+        if motion is not None and motion.moves(self.parts.graph.leaders):
+            return False
         return self.leader.reference is None and max(map(self.own_speed, outputs)) < _TOGETHER
 
     @property
@@ -141,6 +145,26 @@ class StoppingRun(NamedTuple):
         if self.network is None:
             return s
         return max(s, self.path_speed(output) - self.own_speed(output))
+
+    @property
+    def shifted(self) -> FormationMotion | None:
+        """How offsets move agents beside what they agree on; None where they do not."""
+        # With `safety` the rate of an offset is within the speed, like any other.
+        return None if self.law.safety is not None else self.parts.formation.motion
+
+    def offset_size(self, order: int, *outputs: int) -> Fraction:
+        """Return a bound of a derivative of offsets, the norm of some outputs, beside the path.
+
+        Raises:
+            GainError: none is known.
+        """
+        motion, chains = self.shifted, self.law.ready.chains
+        if motion is None:
+            return Fraction(0)
+        position, sizes = self.parts.model.position, offset_sizes(motion)[order]
+        names = [chains.outputs[k] for k in outputs]
+        sides = [sizes[position.index(name)] for name in names if name in position]
+        return norm_above(*sides) if sides else Fraction(0)
 
     def path_speed(self, output: int, until: float | None = None) -> float:
         """Return what |zeta_r'| of the leader's path does not pass until a time (s), or at all.
@@ -192,9 +216,14 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     drive = parts.drive
     assert isinstance(drive, Laws) and isinstance(drive.follower, StoppingPoint)
     assert isinstance(drive.leader, StoppingLeader)
-    offsets = jnp.asarray(parts.formation.offsets)
+    offsets = jnp.asarray(parts.formation.offsets_at([0.0])[0])
     flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
     run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
+    if run.shifted is not None:
+        places, moved = np.array(run.law.places_of(parts.model)), np.zeros_like(flat)
+        rates = _offset_rates(run.shifted, flat.shape[1] - 1)
+        moved[:, 1:, places] = np.asarray(rates)[:, 1:]
+        run = run._replace(flat=flat - moved)
     graph, leaderward = parts.graph, drive.follower.leaderward
     speed = min(map(run.law.speed_of, range(len(run.law.ready.chains.outputs))))
     avoiding = run.law.safety is not None
@@ -215,6 +244,12 @@ def _flat(
         return values.at[0].add(flat_output(model, chains.outputs, 0.0 * offset) - shift)
 
     return jax.vmap(one)(states, offsets)
+
+
+@cached_jit
+def _offset_rates(motion: FormationMotion, order: int) -> jax.Array:
+    start, rows = jnp.zeros(()), jnp.asarray(motion.places)
+    return jax.vmap(lambda row: motion.derivatives(row, start, order))(rows)
 
 
 # ---- what else it rests on -----------------------------------------------------------------------
@@ -281,13 +316,16 @@ def _switching_line(run: StoppingRun) -> Statement:
 def _offsets_line(run: StoppingRun) -> Statement:
     """Say whether all offsets are of flat outputs, and leave the errors of other states alone."""
     model = run.parts.model
+    motion = run.parts.formation.motion
     names = [model.state_names[k] for k in np.flatnonzero(np.ptp(run.parts.formation.offsets, 0))]
+    names += [] if motion is None else [model.state_names[k] for k in motion.axes]
     flat, measured = flat_states_of(model, run.law.ready.chains), model.position
     broken = next((name for name in names if name not in flat.outputs), None)
     moving = next((name for name in names if name not in flat.free), None)
     alone = {*measured} <= {*flat.outputs} and measured
     if broken is None and (moving is None or alone):
         text = "offsets of flat outputs are symmetries"
+        text += "" if motion is None else ", constant or not: zeta' has the rate of their own"
         return holds(Hypothesis.SYMMETRY, _PROOF, text)
     text, remedy = f"the offset of `{broken}` is not of a flat output", "offset flat outputs only"
     if broken is None:

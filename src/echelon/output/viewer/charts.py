@@ -91,7 +91,7 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
 def _off_reference(run: Recording, reference: Float[Array, "T n"]) -> Float[Array, " T"]:
     """Return the largest distance of a leader from its place beside the reference."""
     leaders, measured = list(run.leaders), list(run.measured)
-    away = run.states[:, leaders] - run.offsets[leaders] - reference[:, None]
+    away = run.states[:, leaders] - run.offsets_in()[..., leaders, :] - reference[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
         return np.linalg.norm(away[:, :, measured], axis=2).max(axis=1)
 

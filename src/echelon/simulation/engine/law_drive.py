@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, TypeVar, final
 import jax
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.world import World
 from echelon.core.errors import (
@@ -135,6 +136,26 @@ class Laws(Drive):
                 f"`{type(self.leader).__name__}` is about; use `packet`."
             )
         self.follower.check_late(graph, dt)
+
+    def check_motion(self, formation: Formation, graph: Graph) -> tuple[str, ...]:
+        """Return that a law of states lags behind, and which reshapes lead agents together.
+
+        Raises:
+            LawError: with `safety`, the leader's offset changes.
+        """
+        motion = formation.motion
+        assert motion is not None
+        if self.safety is not None and motion.moves(graph.leaders):
+            raise LawError(
+                "`safety` keeps agents apart that move relative to the leader, whose own offset "
+                "must be constant; leave out its new offset."
+            )
+        if type(self.follower).goal_offset is not Law.goal_offset:
+            return ()
+        return (
+            f"the law `{type(self.follower).__name__}` uses the position and the velocity of "
+            "offsets that change with time, and lags behind them; `stopping-point` does not.",
+        )
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of leaders and followers by their laws.

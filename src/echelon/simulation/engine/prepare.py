@@ -1,5 +1,7 @@
 """Checks and completes the parts of a run before it starts, whatever drives the agents."""
 
+import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -9,6 +11,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.formation import Formation
+from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.world.sensing import Sensors
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.identity import digest
@@ -21,6 +24,9 @@ from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.meter import Meter
 from echelon.simulation.step.motion import Motion
 from echelon.simulation.step.settings import Settings
+
+_MET = 1e-9
+"""m; agents without a radius that come so near to each other meet."""
 
 
 class Prepared(NamedTuple):
@@ -57,7 +63,7 @@ def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepare
     check_given(parts, settings)
     # By their bits too, since somebody may write to an array in them; a graph never changes.
     mutable = parts.model, parts.drive, parts.initial, parts.start_error, parts.world
-    bits = digest((mutable, parts.formation.offsets, settings))
+    bits = digest((mutable, parts.formation.offsets, parts.formation.motion, settings))
     key = None if bits is None else (parts, bits)
     prepared = _CACHE.get_or_make(key, lambda: _prepare(parts, settings, to_store))
     if to_store:
@@ -98,7 +104,9 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         )
         parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)
-    warnings += formation_warnings(model, formation)
+        if formation.motion is not None:
+            warnings += parts.drive.check_motion(formation, graph)
+    warnings += formation_warnings(model, formation, drive.safety is not None)
     # Model and drive may say the same; a dictionary keeps the first, and the order.
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
 
@@ -150,8 +158,32 @@ def _check_offsets(model: ControlAffine, parts: Parts) -> None:
         )
 
 
-def formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str, ...]:
-    """Return warnings of offsets that break a symmetry of the model, and of equal goals."""
+def formation_warnings(
+    model: ControlAffine, formation: Formation, safe: bool = False
+) -> tuple[str, ...]:
+    """Return warnings of offsets that break a symmetry of the model, and of agents that meet.
+
+    Agents that keep away from each other, which is `safe`, may have ways that meet.
+    """
+    if formation.motion is not None:
+        shapes = (shape_warnings(model, shape) for shape in formation.shapes)
+        warnings = itertools.chain(*shapes, () if safe else _meetings(model, formation.motion))
+        return tuple(dict.fromkeys(warnings))
+    return tuple(shape_warnings(model, formation))
+
+
+def _meetings(model: ControlAffine, motion: FormationMotion) -> Iterator[str]:
+    """Yield the reshapes in which agents touch on straight ways."""
+    for begin, i, j, apart in motion.meetings():
+        if apart <= 2.0 * (model.radius or 0.0) + _MET:
+            yield (
+                f"in the reshape at {begin:g} s agents {i} and {j} come within {apart:.3g} m of "
+                "each other; add `safety`, or choose other places."
+            )
+
+
+def shape_warnings(model: ControlAffine, formation: Formation) -> list[str]:
+    """Return the same of constant offsets."""
     broken = formation.broken_symmetries(model)
     sentences = [
         f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, "
@@ -165,4 +197,4 @@ def formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str,
     ]
     if len(pairs) > 3:
         sentences.append(f"{len(pairs) - 3} more pairs of agents have the same goal.")
-    return tuple(sentences)
+    return sentences

@@ -10,13 +10,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.exchange import Exchange
+from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.sensing import Sensors
-from echelon.core.types import Array, PyTree, States
+from echelon.core.types import Array, PyTree, Scalar, States
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law, Memory, without_certificates
 from echelon.simulation.step.drive import Problem
@@ -47,6 +49,7 @@ class Loop(eqx.Module):
         channel: what the network does to messages; None for the ideal network.
         sensors: of the agents' own states; None for exact ones.
         share: of the feed-forward that followers use; None for all of it.
+        moving: how the offsets change with time; None for constant ones.
     """
 
     model: ControlAffine
@@ -66,12 +69,36 @@ class Loop(eqx.Module):
     channel: Channel | None = None
     sensors: Sensors | None = None
     share: Array | None = None
+    moving: FormationMotion | None = None
 
     def with_motion(self, row: PyTree) -> "Loop":
         """Return the loop of one agent whose plant has the parameters of a row; None for no row."""
         if row is None:
             return self
         return dataclasses.replace(self, motion=self.motion.of_row(row))
+
+
+def offsets_at(
+    loop: Loop, law: Law, t: Scalar, agents: Array | jax.Array
+) -> tuple[Float[jax.Array, "K n"], Float[jax.Array, "K n"] | None]:
+    """Return what agents (K,) under a law take for their offsets at a time (s), and the rates.
+
+    There are no rates of constant offsets, or where the law does not use them.
+    """
+    offsets, motion = jnp.asarray(loop.offsets, t.dtype)[agents], loop.moving
+    if motion is None:
+        return offsets, None
+    rows = offsets, jnp.asarray(motion.places, t.dtype)[agents]
+    return jax.vmap(lambda base, row: law.goal_offset(loop.model, motion, base, row, t))(*rows)
+
+
+def goals_at(loop: Loop, t: Scalar) -> Float[jax.Array, "N n"] | None:
+    """Return the offsets of all agents at a time (s), as errors are measured; None if constant."""
+    motion = loop.moving
+    if motion is None:
+        return None
+    rows = jnp.asarray(loop.offsets, t.dtype), jnp.asarray(motion.places, t.dtype)
+    return jax.vmap(lambda base, row: motion.offset(base, row, t))(*rows)
 
 
 class Switches(NamedTuple):
@@ -170,6 +197,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         switches=Switches.of(graph, problem.settings),
         channel=problem.channel,
         sensors=problem.sensors,
+        moving=problem.formation.motion,
     )
 
 

@@ -21,7 +21,7 @@ from echelon.simulation.step.knowledge import (
     understand,
     write,
 )
-from echelon.simulation.step.loop import Loop, Moment, WorldState
+from echelon.simulation.step.loop import Loop, Moment, WorldState, offsets_at
 
 
 def all_readers(agents: int, leaders: Array) -> Readers:
@@ -135,8 +135,7 @@ def send_messages(
     channel, numbers = loop.channel, loop.leaders
     assert channel is not None
     t = now.step.astype(sent.dtype) * loop.motion.dt
-    offsets = jnp.asarray(loop.offsets, sent.dtype)
-    own = now.states[numbers], offsets[numbers], now.leader_memory
+    own = now.states[numbers], offsets_at(loop, loop.leader, t, numbers)[0], now.leader_memory
     rows = *own, sent[numbers], forward, inputs
     content = jax.vmap(lambda *row: content_of(loop, t, *row))(*rows)
     content = jnp.zeros_like(mail.packet.content).at[numbers].set(content)

@@ -13,7 +13,14 @@ from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act, limit_sides
-from echelon.simulation.step.loop import Loop, Moment, WorldState, exchange_at
+from echelon.simulation.step.loop import (
+    Loop,
+    Moment,
+    WorldState,
+    exchange_at,
+    goals_at,
+    offsets_at,
+)
 from echelon.simulation.step.messages import begin_network, read_messages, send_messages
 from echelon.simulation.step.meter import Sums, reference_at
 from echelon.simulation.step.motion import MotionState
@@ -135,9 +142,8 @@ def _act_all(
     near: Near | None = None,
 ) -> Action:
     """Return what some agents do, with what they are sent (K, k), remember and know of others."""
-    x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
-    # From the step number, since a sum of many dt would gather rounding.
-    t = now.step.astype(x.dtype) * loop.motion.dt
+    x, t = now.states, time_of(loop, now)
+    offsets, rates = offsets_at(loop, law, t, agents)
 
     # One time for all; of everything else, an agent sees its own row and no other.
     def one(
@@ -148,12 +154,19 @@ def _act_all(
         memory: Memory,
         row: PyTree,
         near: Near | None,
+        rate: State | None,
     ) -> Action:
-        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near)
+        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near, rate)
         return act(loop.with_motion(row), law, view, memory, leads)
 
     rows, near = jax.tree.map(lambda leaf: leaf[agents], (loop.motion.rows, near))
-    return jax.vmap(one)(x[agents], offsets[agents], z[agents], forward, memory, rows, near)
+    return jax.vmap(one)(x[agents], offsets, z[agents], forward, memory, rows, near, rates)
+
+
+def time_of(loop: Loop, now: Moment) -> jax.Array:
+    """Return the time (s) of a moment."""
+    # From the step number, since a sum of many dt would gather rounding.
+    return now.step.astype(now.states.dtype) * loop.motion.dt
 
 
 def _by_depth(loop: Loop, now: Moment, led: Action, z: Float[jax.Array, "N s"]) -> Action:
@@ -204,11 +217,21 @@ def signals(
 
 def _sent(loop: Loop, now: Moment) -> tuple[Float[jax.Array, "N s"], Difference]:
     """Return what all agents send to their neighbours, and how far two such values are apart."""
-    offsets = jnp.asarray(loop.offsets, now.states.dtype)
+    offsets = _all_offsets(loop, time_of(loop, now))
     sent = signals(loop, now, offsets)
     if sent is not None:
         return sent, operator.sub
     return now.states - offsets, jax.vmap(loop.model.difference)
+
+
+def _all_offsets(loop: Loop, t: jax.Array) -> Float[jax.Array, "N n"]:
+    """Return what all agents take for their offsets at a time (s)."""
+    if loop.moving is None:
+        return jnp.asarray(loop.offsets, t.dtype)
+    laws = (loop.leader, loop.leaders), (loop.follower, loop.followers)
+    return jnp.concatenate([offsets_at(loop, law, t, agents)[0] for law, agents in laws])[
+        loop.order
+    ]
 
 
 # ---- steps ---------------------------------------------------------------------------------------
@@ -240,7 +263,8 @@ def measured_step(
     followed = reference_at(reference, now.step - first, now.states)
     chatter = (acted.cut * now.cut < 0).any(axis=1)
     moment = now.step, now.states, acted.inputs
-    read = loop.meter.read(*moment, acted.limited, chatter, followed)
+    goals = goals_at(loop, time_of(loop, now))
+    read = loop.meter.read(*moment, acted.limited, chatter, followed, goals)
     active = loop.follower.active(acted.follower_memory)
     if active is not None:
         every = jnp.zeros(len(now.states), active.dtype).at[loop.followers].set(active)
