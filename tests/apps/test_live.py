@@ -265,6 +265,8 @@ def test_who_was_closest_is_kept_until_a_reset(session, swarm):
     assert session.closest.distance == pytest.approx(apart.min(), rel=1e-12)
     assert session.closest.agents == pairs[pair]
     assert session.closest.time == pytest.approx(0.04 * (frame + 1))
+    near, active = np.frombuffer(session.picture[16:], "<f4")[8:10]
+    assert near == pytest.approx(apart[-1].min(), rel=1e-6) and active == 0.0
     session.ask({"name": "reset"})
     session.settle()
     assert session.closest.time == 0.0
@@ -501,11 +503,12 @@ def test_a_growing_mode_is_told_at_once(panel):
 HELD = {"state": "holds", "short": "promised", "whole": "Promised.", "rate": 1.0, "causes": []}
 
 
-def badges_of(model, errors, pitch=None, begins=None):
+def badges_of(model, errors, pitch=None, begins=None, apart=None):
     """What the badge tells over time (s) of errors, one a second, of a leader and a follower."""
     told, names = [], model.state_names
     status = GuaranteeStatus(model, ech.Graph.path(2), told.append)
-    status.update(HELD | {"beyond": ["the guarantee does not cover this run: far"]})
+    kept = None if apart is None else 0.3
+    status.update(HELD | {"beyond": ["the guarantee does not cover this run: far"], "apart": kept})
     for second, error in enumerate(errors):
         if second == begins:
             status.begin()
@@ -513,7 +516,9 @@ def badges_of(model, errors, pitch=None, begins=None):
         if pitch is not None:
             states[1, names.index("pitch")] = pitch[second]
         size, none = np.array([0.0, error]), np.zeros(2, bool)
-        status.look(Picture(float(second), states, states, size, states, None, np.nan, none))
+        rows = float(second), states, states, size, states, None, np.nan, none
+        near = np.inf if apart is None else apart[second]
+        status.look(Picture(*rows, apart=near))
     return told
 
 
@@ -538,6 +543,16 @@ def test_a_first_swing_and_errors_of_no_size_take_no_promise_back():
     assert len(badges_of(model, [0.5, 1e-9, 1e-9, 1e-9, 0.5, 0.9], begins=4)) == 1
     fallen = badges_of(model, [0.5, 0.1, 0.1, 1.1, 9.0, 9.5, 4.7, 2.0], begins=4)
     assert [each["state"] for each in fallen] == ["holds", "lost", "edge", "holds"]
+
+
+def test_the_badge_of_distances_is_green_while_hulls_are_apart_whatever_the_errors():
+    errors, apart = [1.0, 9.0, 9.0, 9.0, 1.0], [0.4, 0.3, 0.28, 0.1, 0.3]
+    told = badges_of(ech.models.DoubleIntegrator(), errors, begins=1, apart=apart)
+    assert [each["state"] for each in told] == ["holds", "lost", "holds"]
+    assert told[1]["causes"] == [
+        "The hulls of two agents are 0.28 m apart, scaled, as after a kick; from 0.3 m on it is "
+        "guaranteed again that agents stay apart."
+    ]
 
 
 # ---- the server and the page ------------------------------------------------------------------

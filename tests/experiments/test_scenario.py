@@ -16,6 +16,7 @@ import echelon.experiments.scenario.scenario
 from echelon.core.errors import ScenarioError, listing
 from echelon.experiments.scenario import key_paths, registry
 from echelon.experiments.scenario.checks import ROLES
+from echelon.experiments.scenario.formation_sections import FormationSpec
 from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
 from echelon.experiments.scenario.named_class import accepted, resolve
 from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
@@ -27,7 +28,7 @@ from echelon.experiments.scenario.scenario import (
     load_scenario,
     scenario_from_mapping,
 )
-from echelon.experiments.scenario.sections import FormationSpec, GraphSpec
+from echelon.experiments.scenario.sections import GraphSpec
 from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.yaml import read_yaml
 

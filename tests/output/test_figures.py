@@ -8,7 +8,7 @@ from recordings import PROMISE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
-from echelon.experiments.results.avoidance import Avoidance
+from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
 from echelon.experiments.results.recording import MessageAges
 from echelon.output.plots.network import curves_of
 from echelon.output.plots.over_time import start_of
@@ -32,7 +32,8 @@ def run():
     late = MessageAges(
         np.full(own.states.shape[:2], 0.02), np.ones(shape), np.ones(shape, int), 0.5
     )
-    apart = Avoidance(own.times[::8], 0.3 + own.times[::8], np.sin(own.times[::8]) > 0.0, 0.25, 0.3)
+    times = own.times[::8]
+    apart = Avoidance(times, 0.3 + times, 1.0 * (np.sin(times) > 0.0), Ellipsoid(0.125, 0.375, 0.3))
     more = {"tracking": tracked(own), "lyapunov_rate": rate, "messages": late, "avoidance": apart}
     return dataclasses.replace(own, **more)
 

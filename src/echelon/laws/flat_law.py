@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.chains import Chains, chains_of, check_bounds, flatten, switch_on
 from echelon.agents.models.model import ControlAffine, FlatBound
-from echelon.agents.network.formation_motion import FormationMotion
+from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ModelError, listing
 from echelon.core.types import Array, Input, Scalar, State
@@ -221,20 +221,9 @@ class FlatLaw(Law):
         """Return zeta less the offset, (m,)."""
         return self.ready.place(model, x, offset, memory)
 
-    def goal_offset(
-        self,
-        model: ControlAffine,
-        motion: FormationMotion,
-        base: State,
-        row: Float[jax.Array, "K d"],
-        t: Scalar,
-    ) -> tuple[State, State]:
+    def goal_offset(self, model: ControlAffine, own: OwnOffset, t: Scalar) -> tuple[State, State]:
         """Return the stopping point q(D) xi / q(0) of an offset, and its rate, (n,) each."""
-        weights = jnp.asarray(self.ready.weights, t.dtype)[:, np.array(self.places_of(model))]
-        moved = motion.derivatives(row, t, len(weights))
-        axes = np.array(motion.axes)
-        stop = base.at[axes].set((weights * moved[:-1]).sum(axis=0))
-        return stop, (0.0 * base).at[axes].set((weights * moved[1:]).sum(axis=0))
+        return self.ready.stopping_offset(model, own, t)
 
     def hull(self, model: ControlAffine, x: State, memory: FlatMemory) -> Float[jax.Array, "r d"]:
         """Return the points in whose hull the position stays, the last one of zeta."""
@@ -258,7 +247,11 @@ class FlatLaw(Law):
         Raises:
             LawError: a coordinate is none, or their chains are too long or not of one length.
         """
-        name, chains, places = f"`{type(model).__name__}`", self.ready.chains, self.places_of(model)
+        name, chains, places = (
+            f"`{type(model).__name__}`",
+            self.ready.chains,
+            self.ready.places_of(model),
+        )
         degrees = [chains.degrees[k] for k in places]
         if len({*degrees}) > 1 or degrees[0] > MOST_POINTS:
             raise LawError(
@@ -266,20 +259,6 @@ class FlatLaw(Law):
                 f"{MOST_POINTS}, and {name} has {listing(map(str, degrees))}."
             )
         return places
-
-    def places_of(self, model: ControlAffine) -> list[int]:
-        """Return which flat outputs are the position, whatever their chains.
-
-        Raises:
-            LawError: a coordinate is none.
-        """
-        outputs = self.ready.chains.outputs
-        if not {*model.position} <= {*outputs}:
-            raise LawError(
-                "`safety` and formations that move need the position of "
-                f"`{type(model).__name__}` among its flat outputs, {listing(outputs)}."
-            )
-        return [outputs.index(x) for x in model.position]
 
     def message(self, model: ControlAffine, x: State, v: Input, memory: FlatMemory) -> jax.Array:
         """Return zeta' less that of the own offset, (m,)."""

@@ -16,7 +16,8 @@ import numpy as np
 
 from echelon.agents.models.chains import Chains, flat_output, flatten
 from echelon.agents.models.model import ControlAffine
-from echelon.core.errors import LawError
+from echelon.agents.network.formation_motion import OwnOffset
+from echelon.core.errors import LawError, listing
 from echelon.core.types import Array, Input, Scalar, State
 
 _LEAST_THRUST = 0.3
@@ -155,6 +156,29 @@ class FlatLoop(eqx.Module):
         """Return the flat outputs (m,) of an offset."""
         outputs = self.chains.outputs
         return flat_output(model, outputs, offset) - flat_output(model, outputs, 0.0 * offset)
+
+    def places_of(self, model: ControlAffine) -> list[int]:
+        """Return which flat outputs are the position.
+
+        Raises:
+            LawError: a coordinate is none.
+        """
+        outputs = self.chains.outputs
+        if not {*model.position} <= {*outputs}:
+            raise LawError(
+                "`safety` and formations that move need the position of "
+                f"`{type(model).__name__}` among its flat outputs, {listing(outputs)}."
+            )
+        return [outputs.index(x) for x in model.position]
+
+    def stopping_offset(
+        self, model: ControlAffine, own: OwnOffset, t: Scalar
+    ) -> tuple[State, State]:
+        """Return q(D) xi / q(0) of an offset that moves, and its rate, (n,) each."""
+        weights = jnp.asarray(self.weights, t.dtype)[:, np.array(self.places_of(model))]
+        moved, axes = own.derivatives(t, len(weights)), np.array(own.motion.axes)
+        stop = own.base.at[axes].set((weights * moved[:-1]).sum(axis=0))
+        return stop, (0.0 * own.base).at[axes].set((weights * moved[1:]).sum(axis=0))
 
     def stop(self, values: jax.Array) -> jax.Array:
         """Return zeta (m,) of flat coordinates (r, m)."""

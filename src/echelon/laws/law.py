@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.heading_symmetry import heading_index, rest_heading
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.network.formation_motion import FormationMotion
+from echelon.agents.network.formation_motion import OwnOffset
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.near import Near
 from echelon.agents.references.guide import Guide
@@ -44,8 +44,7 @@ class LocalView(eqx.Module):
             unless the law's `message` says otherwise.
         period: how long the input will be held, s; 0 where it is not known.
         near: the others, where the law keeps away from them; None elsewhere.
-        offset_rate: the rate of `offset` (n,), per s; None of an offset that is constant, or of
-            which the law uses no more.
+        offset_rate: of `offset` (n,), per s; None of a constant one, or if the law uses none.
 
     Raises:
         LawError: it is made of numbers while JAX computes in float32.
@@ -183,26 +182,13 @@ class Law(eqx.Module):
         return None
 
     def goal_offset(
-        self,
-        model: ControlAffine,
-        motion: FormationMotion,
-        base: State,
-        row: Float[jax.Array, "K d"],
-        t: Scalar,
+        self, model: ControlAffine, own: OwnOffset, t: Scalar
     ) -> tuple[State, State | None]:
         """Return what the law takes for an offset (n,) that moves, and its rate (n,) or None.
 
-        Unless replaced, it is the position, and the velocity where that is a state: agents lag
-        behind what changes faster.
-
-        Args:
-            model: the agent.
-            motion: of the formation.
-            base: the offset (n,) without the motion.
-            row: of the agent, of `motion.places`.
-            t: time, s.
+        Unless replaced, it is the position, and the velocity where that is a state: agents lag.
         """
-        return motion.offset(base, row, t), None
+        return own.state(t), None
 
     def signal_names(self, model: ControlAffine) -> tuple[str, ...]:
         """Return the names of what an agent sends for z, by which unlike agents use it."""
@@ -318,8 +304,7 @@ class Law(eqx.Module):
         """
         if type(self).signal is not Law.signal:
             return signal
-        count = jnp.ceil(time / _CARRIED).astype(int)
-        piece = time / jnp.maximum(count, 1)
+        count, piece = carried_pieces(time)
         return jax.lax.fori_loop(0, count, lambda _, x: rk4(model.velocity, x, u, piece), signal)
 
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
@@ -338,6 +323,15 @@ class Law(eqx.Module):
     @abc.abstractmethod
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return one agent's physical input (m,), before actuator limits, and its next memory."""
+
+
+def carried_pieces(time: Scalar) -> tuple[jax.Array, jax.Array]:
+    """Return in how many steps of the model a leader is carried on, and their length (s).
+
+    The time is in s.
+    """
+    count = jnp.ceil(time / _CARRIED).astype(int)
+    return count, time / jnp.maximum(count, 1)
 
 
 def declares(law: Law, name: str) -> bool:

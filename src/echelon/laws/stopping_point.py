@@ -236,16 +236,14 @@ class StoppingPoint(FlatLaw):
             pull, active = self._held_apart(model, view, view.near, pull)
             # What the filter lets through has the offset's rate in it.
             memory, moving = memory._replace(active=active), None
-        rate = view.feedforward - pull
-        return self.ready.obey(model, view.x, rate, memory, view.period, moving)
+        return self.ready.obey(
+            model, view.x, view.feedforward - pull, memory, view.period, moving
+        )
 
     def _held_apart(
         self, model: ControlAffine, view: LocalView, near: Near, pull: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the pull (m,) that keeps away from others, and how many act on it.
-
-        It contains the rate of the own offset, as far as the speeds allow.
-        """
+        """Return the pull (m,), less the offset's rate, that keeps away, and how many act on it."""
         assert self.safety is not None
         places = np.array(self.places(model))
         speeds = jnp.broadcast_to(jnp.asarray(self.speed, view.x.dtype), pull.shape)[places]

@@ -13,6 +13,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation_motion import (
     FormationMotion,
     OffsetMotion,
+    OwnOffset,
     Reshape,
     nearest_places,
 )
@@ -21,6 +22,7 @@ from echelon.core.compiled import cached_jit
 from echelon.core.errors import FormationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, States
+from echelon.core.words import amount
 
 # For an analytic model one random state would do, almost surely; kinks need more.
 _SAMPLES = 32
@@ -67,7 +69,8 @@ class Formation:
         agents, states = self.offsets.shape
         largest = np.abs(self.offsets).max(initial=0.0)
         moving = "" if self.motion is None else ", moving"
-        return f"Formation({agents} agents, {states} states, offsets up to {largest:.4g}{moving})"
+        size = f"{agents} agents, {amount(states, 'state')}"
+        return f"Formation({size}, offsets up to {largest:.4g}{moving})"
 
     def __hash__(self) -> int:
         """Hash what `__eq__` compares."""
@@ -338,7 +341,7 @@ def _whole_state(model: ControlAffine, agent: int, offset: Iterable[float]) -> n
         return full
     lengths = f"{len(axes)} (position) or {n} (all states)" if axes else f"{n} (all states)"
     raise FormationError(
-        f"the offset of agent {agent} has {values.size} numbers, and must have {lengths}."
+        f"the offset of agent {agent} has {amount(values.size, 'number')}, and must have {lengths}."
     )
 
 
@@ -370,7 +373,7 @@ def _offsets_at(
 ) -> Float[jax.Array, "T N n"]:
     def one(t: jax.Array) -> jax.Array:
         rows = jnp.asarray(offsets), jnp.asarray(motion.places)
-        return jax.vmap(lambda base, row: motion.offset(base, row, t))(*rows)
+        return jax.vmap(lambda *row: OwnOffset(motion, *row).state(t))(*rows)
 
     return jax.lax.map(one, times)
 

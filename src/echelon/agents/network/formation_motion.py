@@ -162,17 +162,6 @@ class FormationMotion(eqx.Module):
         """Return `place` and its first derivatives up to an order, (order + 1, d)."""
         return derivatives(lambda s: self.place(row, s), t, order)
 
-    def offset(self, base: State, row: Float[jax.Array, "K d"], t: Scalar) -> State:
-        """Return the offset (n,) at a time (s): its position, and its velocity where states are.
-
-        `base` are the other states' offsets.
-        """
-        place, speed = self.derivatives(row, t, 1)
-        base = base.at[np.array(self.axes)].set(place)
-        for k, state in enumerate(self.speeds):
-            base = base if state < 0 else base.at[state].add(speed[k])
-        return base
-
     @property
     def shapes(self) -> Iterator[Float[Array, "N d"]]:
         """The places at first and after each reshape, without motions of the whole shape."""
@@ -211,6 +200,27 @@ class FormationMotion(eqx.Module):
             apart = np.linalg.norm(first + np.clip(share, 0.0, 1.0)[:, None] * way, axis=1)
             least = int(apart.argmin())
             yield float(begin), int(i[least]), int(j[least]), self.least_scale * apart[least]
+
+
+@final
+class OwnOffset(NamedTuple):
+    """The offset of one agent: its row of `places` in a motion, and its offset (n,) without it."""
+
+    motion: FormationMotion
+    base: State
+    row: Float[jax.Array, "K d"]
+
+    def derivatives(self, t: Scalar, order: int) -> Float[jax.Array, "order d"]:
+        """Return the position and its derivatives up to an order at a time (s), (order + 1, d)."""
+        return self.motion.derivatives(self.row, t, order)
+
+    def state(self, t: Scalar) -> State:
+        """Return the offset (n,) at a time (s): its position, and its velocity where states are."""
+        place, speed = self.derivatives(t, 1)
+        offset = self.base.at[np.array(self.motion.axes)].set(place)
+        for k, index in enumerate(self.motion.speeds):
+            offset = offset if index < 0 else offset.at[index].add(speed[k])
+        return offset
 
 
 def blend(u: jax.Array) -> jax.Array:

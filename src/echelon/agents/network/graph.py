@@ -34,6 +34,7 @@ from echelon.agents.network.switching import Schedule, Stretch, unite
 from echelon.agents.network.tree import ordered_outward, outward_edges, parents_of
 from echelon.core.errors import GraphError
 from echelon.core.types import Array
+from echelon.core.words import amount
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -332,5 +333,5 @@ class Graph(GraphMatrices):
 
     def __repr__(self) -> str:
         """Say the size."""
-        edges = f"{len(self.edges)} {'directed ' * self.directed}edges"
+        edges = amount(len(self.edges), f"{'directed ' * self.directed}edge")
         return f"Graph({self.agents} agents, {edges}, leaders {list(self.leaders)})"

@@ -17,6 +17,7 @@ from echelon.apps.live.session import Session
 from echelon.apps.live.swarm import LiveLoop
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.core.types import JsonObject
+from echelon.core.words import amount
 from echelon.experiments.results.recording import Recording
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import Scenario
@@ -73,7 +74,7 @@ def _continue(swarm: LiveLoop, run: Recording) -> None:
     if not len(run.times) or run.states.shape[1:] != shape:
         got = "no state" if not len(run.times) else f"{run.agents} agents"
         raise SimulationError(
-            f"the run has {got}, and its scenario {shape[0]} agents of {shape[1]} states."
+            f"the run has {got}, and its scenario {shape[0]} agents of {amount(shape[1], 'state')}."
         )
     swarm.states, swarm.first = run.states[-1], round(run.times[-1] / swarm.settings.dt)
 

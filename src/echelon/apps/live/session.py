@@ -12,14 +12,16 @@ from jaxtyping import Float
 
 from echelon.apps.live.choices import under
 from echelon.apps.live.guarantee_status import GuaranteeStatus, lost
-from echelon.apps.live.header import scene
+from echelon.apps.live.header import foreseen_of
 from echelon.apps.live.knobs import Knobs
 from echelon.apps.live.panel import Panel, check_choice
 from echelon.apps.live.promiser import Promiser
 from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.core.types import Array, JsonObject
+from echelon.core.words import amount
 from echelon.experiments.scenario.scenario import Scenario
+from echelon.output.plots.space import space_of
 from echelon.output.viewer.replay import heard_by
 from echelon.simulation.engine.closest_pair import ClosestPair
 
@@ -46,7 +48,8 @@ class Session:
         """Check the events of the scenario; nothing runs before `start`."""
         self.scenario, self.panel, self.swarm = scenario, panel, swarm
         self.knobs, self.paused, self.watchers, self.ended = panel.start, False, 0, False
-        self.space, self.bounds = scene(swarm, swarm.settings)
+        self.run = foreseen_of(swarm, "")
+        self.space, self.bounds = space_of(self.run), self.run.bounds
         self.pending: list[Callable[[], None]] = []
         self.events: list[JsonObject] = []
         self.future = sorted(map(_as_event, scenario.live), key=lambda event: event["at"])
@@ -85,8 +88,8 @@ class Session:
         for agent, jump in kicks.items():
             if not 0 <= agent < agents or len(jump) != n:
                 raise SimulationError(
-                    f"`kick` got agent {agent} with {len(jump)} numbers, and must be of "
-                    f"agents 0 to {agents - 1} with {n}."
+                    f"`kick` got agent {agent} with {amount(len(jump), 'number')}, and "
+                    f"must be of agents 0 to {agents - 1} with {n}."
                 )
 
     # ---- the loop -------------------------------------------------------------------------------
@@ -144,20 +147,22 @@ class Session:
             self.status.lose()
             return
         self.status.look(picture)
-        self._look_for_closest(picture)
-        block = self._packed(picture)
+        block = self._packed(picture, self._closest_now(picture))
         with self.changed:
             self.picture, self.number = block, self.number + 1
             self.changed.notify_all()
 
-    def _look_for_closest(self, picture: Picture) -> None:
+    def _closest_now(self, picture: Picture) -> ClosestPair | None:
+        """Return the closest two agents, and remember the closest so far."""
         axes = self.panel.live.axes
-        if axes and len(picture.states) > 1:
-            pair = ClosestPair.of(picture.states[:, axes], picture.time)
-            if self.closest is None or pair.distance < self.closest.distance:
-                self.closest = pair
+        if not axes or len(picture.states) < 2:
+            return None
+        pair = ClosestPair.of(picture.states[:, axes] * self.run.scales, picture.time)
+        if self.closest is None or pair.distance < self.closest.distance:
+            self.closest = pair
+        return pair
 
-    def _packed(self, picture: Picture) -> bytes:
+    def _packed(self, picture: Picture, now: ClosestPair | None) -> bytes:
         space, swarm, pair = self.space, self.swarm, self.closest
         followers = list(swarm.parts.graph.followers)
         errors = picture.errors[followers]
@@ -167,6 +172,7 @@ class Session:
         parts = [
             np.array([errors.max(), np.median(errors), swarm.off_reference(picture)]),
             np.array([*ends, picture.lyapunov, self.factor, self.knobs.wind]),
+            np.array([np.nan if now is None else now.distance, swarm.active]),
             np.array(4 * [np.nan] if pair is None else [pair.time, pair.distance, *pair.agents]),
             picture.states[:, list(space.axes)],
             goals[:, list(space.axes)],

@@ -23,11 +23,13 @@ from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, PyTree
 from echelon.experiments.results.lyapunov import fixed_metric, potential
 from echelon.laws.law import Law
+from echelon.laws.together import separations
 from echelon.output.viewer.replay import link_shades
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.loop import Loop, Moment, Switches, assemble
+from echelon.simulation.step.nearby import all_hulls
 from echelon.simulation.step.sequence import begin
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain
@@ -45,7 +47,8 @@ class Picture(NamedTuple):
 
     `reference` (n,) is that of the leaders, None if they follow nothing; `lyapunov` is V, NaN if
     it does not exist; `beyond` (N,) marks the agents whose states or inputs are not finite, or are
-    too large for the stepper; `shades` (E,) are those of the links over a network.
+    too large for the stepper; `shades` (E,) are those of the links over a network; `apart` is the
+    least scaled distance between hulls of agents that keep apart, m, infinite of others.
     """
 
     time: float
@@ -57,6 +60,7 @@ class Picture(NamedTuple):
     lyapunov: float
     beyond: Array
     shades: Array = np.zeros(0)
+    apart: float = math.inf
 
 
 @final
@@ -166,6 +170,22 @@ class LiveLoop:
         """The number of steps so far."""
         return int(self.now.step)
 
+    @property
+    def active(self) -> float:
+        """How many others changed the rates of agents that keep apart, in the last step."""
+        active = self.loop.follower.active(self.now.follower_memory)
+        return 0.0 if active is None else float(np.sum(np.asarray(active)))
+
+    def _apart(self) -> float:
+        """Return the least scaled distance between hulls of agents that keep apart, m."""
+        safety = self.loop.follower.safety
+        if safety is None:
+            return math.inf
+        with precision(self.precision):
+            hulls = np.asarray(_hulls(self.loop, self.now), np.float64)
+        gaps = separations(hulls * safety.scales(self.loop.model))
+        return float((gaps + np.diag(np.full(len(gaps), np.inf))).min())
+
     def apply(self, knobs: Knobs) -> None:
         """Change the loop to these positions of the knobs."""
         self.potential = self._potential(knobs)
@@ -257,7 +277,8 @@ class LiveLoop:
         desired = None if reference is None else reference[counts[0]]
         beyond = np.logical_not(valid)
         shades = self._shades(int(counts[0]))
-        return Picture(time, states, inputs, errors, self.offsets, desired, V, beyond, shades)
+        rows = time, states, inputs, errors, self.offsets, desired, V, beyond, shades
+        return Picture(*rows, self._apart())
 
     def _shades(self, steps: int) -> Float[Array, " E"]:
         """Return how each link is drawn after some steps; nothing in the ideal network."""
@@ -302,6 +323,9 @@ class LiveLoop:
 @cached_jit
 def _reference_states(leader: Law, model: ControlAffine, times: jax.Array) -> jax.Array | None:
     return leader.reference_states(model, times)
+
+
+_hulls = cached_jit(all_hulls)
 
 
 def _inner(gain: Gain) -> Array:

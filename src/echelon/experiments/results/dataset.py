@@ -54,8 +54,8 @@ def dataset(result: Result) -> "xr.Dataset":
     `edge_weight`, `edge_heard` (whether each end of an edge receives from the other), of a
     switching graph `edge_weight_then` from each `stretch_start` on with its `graph_period`
     (infinite without repetition), of agents that keep apart `scaled_distance` and `active_rows` in
-    slices of the run from `slice_start` on with `touching_distance` and `kept_distance`,
-    the gain's `P`, `R` and `coupling`, the poles of the checked
+    slices of the run from `slice_start` on, with the radii of their ellipsoids and
+    `kept_distance`, the gain's `P`, `R` and `coupling`, the poles of the checked
     modes (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`, for directed graphs with the
     imaginary part `mode_eigenvalue_imaginary`), and the limits of the inputs u, `limit_low` <=
     `limit_matrix` u <= `limit_high`. Over a network that is late also `age` (of the oldest message
@@ -151,8 +151,6 @@ def _avoidance(result: Result) -> Variables:
         "slice_start": ("slice", numbers.times, {"units": "s"}),
         "scaled_distance": ("slice", numbers.distance, meters),
         "active_rows": ("slice", numbers.active),
-        "touching_distance": ((), numbers.touching, meters),
-        "kept_distance": ((), numbers.kept, meters),
     }
 
 

@@ -27,6 +27,7 @@ def labelled_parts(parts: Parts, settings: Settings) -> Labelled:
         "nearest_leader": ("agent", np.array(graph.nearest_leader())),
         **_edges(parts),
         **_gain(parts),
+        **_ellipsoid(parts),
         **_limits(model, settings),
     }
     coordinates = {
@@ -95,6 +96,18 @@ def _gain(parts: Parts) -> Variables:
         "P": (("state", "state_column"), gain.P),
         "R": (("input", "input_column"), gain.R),
         "coupling": ((), gain.coupling),
+    }
+
+
+def _ellipsoid(parts: Parts) -> Variables:
+    """Return the ellipsoid about agents that keep apart; nothing where they do not."""
+    safety, meters = parts.drive.safety, {"units": "m"}
+    if safety is None or safety.radii is None:
+        return {}
+    return {
+        "ellipsoid_radius": ((), safety.radii[0], meters),
+        "ellipsoid_height": ((), safety.radii[2], meters),
+        "kept_distance": ((), safety.distance, meters),
     }
 
 

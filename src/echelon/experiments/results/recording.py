@@ -17,8 +17,8 @@ from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
 from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
-from echelon.core.words import Verdict
-from echelon.experiments.results.avoidance import Avoidance
+from echelon.core.words import Verdict, amount
+from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
 from echelon.experiments.results.labelled import Labelled, read_labelled
 from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
 
@@ -100,7 +100,7 @@ class Recording(FrameNumbers):
         tracking: of the leaders; None without a reference.
         modes: None where the laws have no linearization.
         messages: over a network; None in the ideal one.
-        avoidance: how agents kept apart; None where they do not.
+        avoidance: how agents kept apart, without slices before they did; None where they do not.
         promise: as `Promise.as_mapping` returns it.
         horizon, dt: s.
         attributes: provenance and settings, as stored.
@@ -144,7 +144,8 @@ class Recording(FrameNumbers):
 
     def __repr__(self) -> str:
         """Return the name and the sizes."""
-        return f"Recording({self.name!r}, {self.agents} agents, {len(self.times)} frames)"
+        frames = amount(len(self.times), "frame")
+        return f"Recording({self.name!r}, {self.agents} agents, {frames})"
 
     @property
     def agents(self) -> int:
@@ -172,6 +173,31 @@ class Recording(FrameNumbers):
         """The agents that do not lead."""
         leaders = {*self.leaders}
         return tuple(k for k in range(self.agents) if k not in leaders)
+
+    @property
+    def ellipsoid(self) -> Ellipsoid | None:
+        """The ellipsoid about each agent, a ball where they do not keep apart; None of a point."""
+        if self.avoidance is not None:
+            return self.avoidance.ellipsoid
+        return None if self.radius is None else Ellipsoid(self.radius, self.radius, 2 * self.radius)
+
+    @property
+    def scales(self) -> Float[np.ndarray, " d"]:
+        """The factors of the position's coordinates in distances between agents."""
+        names, sizes = [self.state_names[k] for k in self.position], self.ellipsoid
+        return np.ones(len(names)) if sizes is None else sizes.radius / sizes.radii(names)
+
+    def near(self, frames: Int[np.ndarray, " F"]) -> Avoidance | None:
+        """Return how near agents came: over all steps if they keep apart, else in frames.
+
+        None of a single agent, and of agents without a size.
+        """
+        if self.avoidance is not None and len(self.avoidance.times):
+            return self.avoidance
+        distance = self.least_distances(frames, self.scales) if self.agents > 1 else None
+        if distance is None or self.ellipsoid is None:
+            return None
+        return Avoidance(self.times[frames], distance, 0.0 * distance, self.ellipsoid)
 
     @property
     def rate(self) -> float | None:
@@ -328,12 +354,15 @@ def _modes(values: Mapping[str, np.ndarray]) -> LoopPoles | None:
 
 
 def _avoidance(values: Mapping[str, np.ndarray]) -> Avoidance | None:
-    if "scaled_distance" not in values:
+    if "ellipsoid_radius" not in values:
         return None
-    limits = (float(values[name]) for name in ("touching_distance", "kept_distance"))
-    return Avoidance(
-        values["slice_start"], values["scaled_distance"], values["active_rows"], *limits
+    radius, height, limit = (
+        float(values[name]) for name in ("ellipsoid_radius", "ellipsoid_height", "kept_distance")
     )
+    times, distance, active = (
+        values.get(name, np.zeros(0)) for name in ("slice_start", "scaled_distance", "active_rows")
+    )
+    return Avoidance(times, distance, active, Ellipsoid(radius, height, limit))
 
 
 def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:

@@ -12,9 +12,11 @@ from pydantic import BaseModel
 
 from echelon.core.errors import did_you_mean, listing
 from echelon.core.limits import horizon_fault
+from echelon.core.words import amount
 from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.formation_sections import FormationSpec
 from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
-from echelon.experiments.scenario.sections import FormationSpec, GraphSpec, MotionSpec, ShapeSpec
+from echelon.experiments.scenario.sections import GraphSpec
 from echelon.experiments.scenario.values import foreign_keys, marked_keys
 from echelon.experiments.scenario.yaml import Document, KeyPath, is_or_are, quoted
 
@@ -230,7 +232,8 @@ def _weights(data: Part) -> Iterator[Finding]:
     if isinstance(edges, list) and isinstance(weights, list):
         if len(edges) != len(weights):
             message = (
-                f"got {len(weights)} weights for {len(edges)} edges, allowed is one for each edge"
+                f"got {amount(len(weights), 'weight')} for {amount(len(edges), 'edge')}, allowed "
+                "is one for each edge"
             )
             yield ("graph", "weights"), f"{message}."
         for index, edge in enumerate(edges):
@@ -333,34 +336,6 @@ def _members(data: Part) -> Iterator[Finding]:
         yield from _unknown((place, key), what, numbered, agents)
 
 
-def _motions(data: Part) -> Iterator[Finding]:
-    """Yield motions of the formation with no kind or several, and keys that theirs lacks."""
-    entries, agents = section(data, "formation").get("motion"), _agents(section(data, "graph"))
-    for index, entry in enumerate(entries if _is_list(entries) else []):
-        if not isinstance(entry, dict):
-            continue
-        place = "formation", "motion", index
-        kinds = [kind for kind in registry.MOTIONS if entry.get(kind) is not None]
-        if len(kinds) != 1:
-            got = listing(f"`{kind}`" for kind in kinds) if kinds else "none"
-            names = listing(f"`{kind}`" for kind in registry.MOTIONS)
-            yield place, f"got {got}, allowed is one of {names}."
-            continue
-        findings = [*_taken({"": entry}, ("",), MotionSpec, kinds[0], registry.MOTIONS)]
-        shape = section(entry, "reshape")
-        if shape.get("name") is not None and shape.get("offsets") is not None:
-            findings.append((("", "reshape"), "got `offsets` and `name`, allowed is one of them."))
-        choice = "offsets" if shape.get("name") is None else shape["name"]
-        choices = *registry.FORMATIONS, "offsets"
-        findings += _taken(entry, ("reshape",), ShapeSpec, choice, choices)
-        if agents is not None:
-            numbered = ((number, number) for number in section(shape, "offsets"))
-            path = "", "reshape", "offsets"
-            findings += _unknown(path, "an offset for agent", numbered, agents)
-        for path, text in findings:
-            yield (*place, *(path if path[0] else path[1:])), text
-
-
 def _following(data: Part) -> Iterator[Finding]:
     """Yield a leader's law that lacks its reference, and a reference that the law does not take."""
     law, reference = law_of(data, "leader"), data.get("reference")
@@ -407,7 +382,6 @@ def cross_faults(document: Document) -> Iterator[Finding]:
     yield from _schedule(data)
     yield from _grid(data)
     yield from _members(data)
-    yield from _motions(data)
     yield from _following(data)
     yield from _changed(data)
     yield from _durations(data)

@@ -6,11 +6,13 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
-from echelon.core.errors import FormationError
+from echelon.core.errors import FormationError, ScenarioError, listing
+from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.fault_list import FaultList
+from echelon.experiments.scenario.formation_sections import MotionSpec, ShapeKeys, ShapeSpec
 from echelon.experiments.scenario.named_class import named_class, offered
 from echelon.experiments.scenario.scenario import Scenario
-from echelon.experiments.scenario.sections import MotionSpec, ShapeSpec
+from echelon.experiments.scenario.values import foreign_keys, marked_keys
 
 
 def formation_of(
@@ -40,6 +42,7 @@ def _change(
     scenario: Scenario, spec: MotionSpec, model: ControlAffine, graph: Graph
 ) -> OffsetMotion | Reshape:
     """Return a motion of the formation."""
+    _check_keys(spec)
     if spec.rotate is not None:
         return Rotate(spec.rotate)
     if spec.scale is not None:
@@ -52,11 +55,34 @@ def _change(
         raise FormationError(
             f"got a reshape at {at:g} s, allowed is a time before the horizon, {horizon:g} s."
         )
+    _check_shape(spec.reshape)
     shape = _shape(spec.reshape, model, graph)
     return Reshape(shape.offsets, at, cast(float, spec.over), spec.assign == "nearest")
 
 
-def _shape(spec: ShapeSpec, model: ControlAffine, graph: Graph) -> Formation:
+def _check_keys(spec: MotionSpec) -> None:
+    """Check that a motion is of one kind, and has the keys of that."""
+    kinds = [kind for kind in registry.MOTIONS if getattr(spec, kind) is not None]
+    if len(kinds) != 1:
+        got = listing(f"`{kind}`" for kind in kinds) if kinds else "none"
+        allowed = listing(f"`{kind}`" for kind in registry.MOTIONS)
+        raise ScenarioError(f"got {got}, allowed is one of {allowed}.")
+    for key, mark in marked_keys(MotionSpec).items():
+        if kinds[0] in mark.needed_by and getattr(spec, key) is None:
+            raise ScenarioError(f"`{kinds[0]}` needs the key `{key}`, which is missing.")
+    for key in spec.model_fields_set & {*foreign_keys(MotionSpec, kinds[0])}:
+        raise ScenarioError(f"got `{key}`, which `{kinds[0]}` does not take.")
+
+
+def _check_shape(spec: ShapeSpec) -> None:
+    if spec.name is not None and spec.offsets is not None:
+        raise ScenarioError("got `offsets` and `name` of `reshape`, allowed is one of them.")
+    choice = spec.name or "offsets"
+    for key in spec.model_fields_set & {*foreign_keys(ShapeSpec, choice)}:
+        raise ScenarioError(f"got `{key}`, which the shape `{choice}` does not take.")
+
+
+def _shape(spec: ShapeKeys, model: ControlAffine, graph: Graph) -> Formation:
     if spec.name is None:
         return Formation.from_offsets(model, graph, spec.offsets or {})
     make = getattr(Formation, spec.name)

@@ -21,6 +21,7 @@ _COMMON_NAMES = {
     "simulation.dt": "step timestep time_step",
     "initial": "start starts initial_states x0",
     "graph": "topology edges links",
+    "graph.agents": "agents",
     "formation": "shape spacing",
     "reference": "path trajectory waypoints",
     "follower.law": "controller control law",
@@ -52,6 +53,14 @@ def key_paths(section: type[BaseModel], before: str = "") -> Iterator[tuple[str,
             yield from key_paths(inner, f"{before}{key}.")
 
 
+def places_of(key: object, scenario: type[BaseModel]) -> list[str]:
+    """Return the paths of the keys that a name may mean, the likeliest first."""
+    paths = [path for path, _, _ in key_paths(scenario)]
+    common = [path for path, names in _COMMON_NAMES.items() if str(key) in names.split()]
+    same = [path for path in paths if key in (path, path.rpartition(".")[2])]
+    return list(dict.fromkeys([*common, *sorted(same, key=lambda path: path.count("."))]))
+
+
 def meant(key: object, allowed: list[str], scenario: type[BaseModel]) -> str:
     """Return ` (did you mean ...?)` with what an unknown key may mean; empty if nothing is close.
 
@@ -60,11 +69,8 @@ def meant(key: object, allowed: list[str], scenario: type[BaseModel]) -> str:
         allowed: the keys that the section has.
         scenario: the class of the whole file.
     """
-    paths = [path for path, _, _ in key_paths(scenario)]
-    common = [path for path, names in _COMMON_NAMES.items() if str(key) in names.split()]
-    same = [path for path in paths if path.rpartition(".")[2] == key]
-    places = [*common, *sorted(same, key=lambda path: path.count("."))]
+    places = places_of(key, scenario)
     if not places:
         return did_you_mean(key, allowed)
-    first, *others = (f"`{path}`" for path in list(dict.fromkeys(places))[:3])
+    first, *others = (f"`{path}`" for path in places[:3])
     return f" (did you mean {' or '.join([', '.join([first, *others[:-1]]), *others[-1:]])}?)"

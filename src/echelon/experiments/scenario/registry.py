@@ -48,6 +48,10 @@ MODELS = _family(
     quadrotor=("Quadrotor", "quadrotor in space, 12 states, ZYX Euler angles, per-motor limits"),
     quadrotor_euler=("QuadrotorEuler", "quadrotor under computed torque, inputs are accelerations"),
     quadrotor_thrust=("QuadrotorThrust", "the same with its thrust as a 13th state: g is constant"),
+    crazyflie_attitude=(
+        "CrazyflieAttitude",
+        "Crazyflie under its own attitude controller, inputs are angles, yaw rate and thrust",
+    ),
     quadrotor_printed=(
         "PrintedQuadrotor",
         "literal: the paper's equations, without gravity or thrust rotation",

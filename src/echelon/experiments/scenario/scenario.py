@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from echelon.core.errors import ScenarioError, did_you_mean, listing
 from echelon.experiments.scenario import law_sections, sections
 from echelon.experiments.scenario.checks import cross_faults, law_of, number_of, section
+from echelon.experiments.scenario.formation_sections import FormationSpec
 from echelon.experiments.scenario.key_paths import key_paths, meant, sections_in
 from echelon.experiments.scenario.override import settle_overrides
 from echelon.experiments.scenario.values import STRICT, FolderName, Seed
@@ -45,7 +46,7 @@ class Scenario(BaseModel, **STRICT):
     model: sections.ModelSpec
     plant: sections.PlantSpec | None = None
     graph: sections.GraphSpec
-    formation: sections.FormationSpec = Field(default_factory=sections.FormationSpec)
+    formation: FormationSpec = Field(default_factory=FormationSpec)
     reference: sections.ReferenceSpec | None = None
     leader: law_sections.LeaderSpec = Field(default_factory=law_sections.LeaderSpec)
     follower: law_sections.FollowerSpec = Field(default_factory=law_sections.FollowerSpec)
@@ -150,8 +151,18 @@ def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
         )
     got = context.get("got", error["input"])
     allowed = _ALLOWED[kind].format(**context) if kind in _ALLOWED else error["msg"]
-    close = did_you_mean(got, context.get("names", "").split())
+    close = did_you_mean(got, context.get("names", "").split()) or _like_key(path)
     return path, f"got {quoted(got)}, allowed {allowed}{close}."
+
+
+def _like_key(path: KeyPath) -> str:
+    """Return what a key that its section does not name, but its class may take, may mean."""
+    try:
+        keys = _keys(path[:-1])
+        hint = "" if path[-1] in keys else did_you_mean(path[-1], keys)
+    except (StopIteration, LookupError):  # the value is within a key
+        return ""
+    return hint.replace("mean ", "mean the key ")
 
 
 def _with_defaults(data: Mapping[Any, Any]) -> dict[Any, Any]:

@@ -5,9 +5,9 @@ section, such as graphs, that take a key. The keys of laws and gains are in `law
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, final
+from typing import Annotated, final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from echelon.core.words import ENGINES, Estimation, MessageContent, NeighbourChoice, Prediction
 from echelon.experiments.scenario import registry
@@ -27,17 +27,12 @@ from echelon.experiments.scenario.values import (
     Seed,
     TakenBy,
     Unit,
+    either,
 )
 
 
-def _either(*keys: str) -> ConfigDict:
-    """Return the configuration of a section that has exactly one of the keys."""
-    extra: Any = {"oneOf": [{"required": [key]} for key in keys]}
-    return STRICT | ConfigDict(json_schema_extra=extra)
-
-
 @final
-class ModelSpec(BaseModel, **_either("name", "python")):
+class ModelSpec(BaseModel, **either("name", "python")):
     """The model of all agents: the name of a bundled model, or a class in a file of yours."""
 
     name: Annotated[str, OneOf(registry.MODELS)] | None = None
@@ -87,7 +82,7 @@ class StretchSpec(BaseModel, **STRICT):
 
 
 @final
-class GraphSpec(BaseModel, **_either("edges", "name")):
+class GraphSpec(BaseModel, **either("edges", "name")):
     """The communication graph: a list of edges, or the name of a generated graph.
 
     Agents are numbered from 0.
@@ -134,59 +129,6 @@ class GraphSpec(BaseModel, **_either("edges", "name")):
         return [(0.0, edges), *((stretch.at, stretch.edges) for stretch in self.schedule)]
 
 
-class ShapeSpec(BaseModel, **STRICT):
-    """A shape: offsets (default zero), or a name."""
-
-    offsets: Annotated[dict[int, Numbers] | None, Unit("the position's, mostly m")] = None
-    """Offset of each agent, as in `{1: [1, 0, 0]}`: a number for each coordinate of the position,
-    usually m, or for each state; default 0."""
-    name: Annotated[str, OneOf(registry.FORMATIONS)] | None = None
-    """Name of a shape."""
-    spacing: Annotated[Positive, Unit("m"), TakenBy(*registry.FORMATIONS)] = 1.0
-    """Distance between neighbours in the shape, m."""
-    columns: Annotated[Count | None, TakenBy("grid")] = None
-    """Columns of the shape `grid`."""
-
-
-@final
-class MotionSpec(BaseModel, **_either("rotate", "scale", "reshape", "python")):
-    """How offsets change with time; several act one after the other, reshapes first."""
-
-    rotate: Annotated[float | None, Unit("rad/s"), TakenBy("rotate")] = None
-    """Rate at which the shape turns about the vertical axis through the first leader, rad/s."""
-    scale: Annotated[Annotated[float, Field(gt=-1, lt=1)] | None, Unit("1"), TakenBy("scale")] = (
-        None
-    )
-    """Amplitude a: the shape is 1 + a sin(rate t) times as large."""
-    rate: Annotated[float | None, Unit("rad/s"), NeededBy("scale")] = None
-    """Rate of `scale`, rad/s."""
-    reshape: Annotated[ShapeSpec | None, TakenBy("reshape")] = None
-    """Another shape, with the keys of `formation`, to which agents move on straight lines."""
-    at: Annotated[NotNegative | None, Unit("s"), NeededBy("reshape")] = None
-    """Time at which the reshape begins, s."""
-    over: Annotated[Positive | None, Unit("s"), NeededBy("reshape")] = None
-    """How long it takes, s; position to fifth derivative are continuous."""
-    assign: Annotated[str, OneOf(registry.ASSIGNMENTS), TakenBy("reshape")] = "number"
-    """Which place each follower takes: the one of its `number`, or the `nearest`, so that the
-    squares of all ways add up to as little as possible."""
-    python: Annotated[ClassInFile | None, TakenBy("python")] = None
-    """`file.py:Class`, an `OffsetMotion` of yours, the file relative to the scenario file."""
-    parameters: Annotated[dict[str, Numeric], TakenBy("python")] = {}
-    """Parameters of that class."""
-
-
-@final
-class FormationSpec(ShapeSpec):
-    """Each agent's goal relative to the leader's: offsets (default zero) or a named shape."""
-
-    assign: Annotated[str, OneOf(registry.ASSIGNMENTS)] = "number"
-    """Which place each follower takes at first: the one of its `number`, or the `nearest` to its
-    start in `initial.states`, so that the squares of all ways add up to as little as possible."""
-    motion: Annotated[tuple[MotionSpec, ...], Field(strict=False)] = ()
-    """How the offsets change with time, as in `[{rotate: 0.5}, {reshape: {name: line}, at: 8,
-    over: 3}]`."""
-
-
 @final
 class ReferenceSpec(BaseModel):
     """What the leader tracks: the name of a bundled reference, or a class in a file of yours.
@@ -195,7 +137,7 @@ class ReferenceSpec(BaseModel):
     coordinates x, y, z, also of planar models.
     """
 
-    model_config = _either("name", "python") | ConfigDict(extra="allow")
+    model_config = either("name", "python") | ConfigDict(extra="allow")
     # narrower than the base's: pydantic checks the further keys by this type
     __pydantic_extra__: dict[str, Numeric] = Field(init=False)  # pyright: ignore
 

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import TypeAlias
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.network.formation_motion import (
@@ -20,6 +22,7 @@ from echelon.agents.network.formation_motion import (
     Rotate,
     Scale,
 )
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import GainError
 from echelon.core.memoize import memoize
 from echelon.core.types import Array, JsonObject
@@ -87,6 +90,13 @@ def _after(motion: OffsetMotion, sizes: Sequence[Sequence[Fraction]]) -> list[li
             )
             rows[-1].append(sum(terms, Fraction(0)))
     return rows
+
+
+@cached_jit
+def offset_rates(motion: FormationMotion, order: int) -> jax.Array:
+    """Return the offsets at the start with derivatives up to an order, (N, order + 1, d)."""
+    start, rows = jnp.zeros(()), jnp.asarray(motion.places)
+    return jax.vmap(lambda row: motion.derivatives(row, start, order))(rows)
 
 
 @functools.cache

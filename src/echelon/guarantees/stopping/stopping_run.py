@@ -28,7 +28,7 @@ from echelon.guarantees.messages.late_messages import (
 )
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.flat_states import flat_states_of
-from echelon.guarantees.stopping.moving_offsets import offset_sizes
+from echelon.guarantees.stopping.moving_offsets import offset_rates, offset_sizes
 from echelon.guarantees.stopping.path_bounds import pieces_of
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
@@ -217,13 +217,11 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     assert isinstance(drive, Laws) and isinstance(drive.follower, StoppingPoint)
     assert isinstance(drive.leader, StoppingLeader)
     offsets = jnp.asarray(parts.formation.offsets_at([0.0])[0])
-    flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
+    flat = np.array(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
     run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
     if run.shifted is not None:
-        places, moved = np.array(run.law.places_of(parts.model)), np.zeros_like(flat)
-        rates = _offset_rates(run.shifted, flat.shape[1] - 1)
-        moved[:, 1:, places] = np.asarray(rates)[:, 1:]
-        run = run._replace(flat=flat - moved)
+        places = np.array(drive.follower.ready.places_of(parts.model))
+        flat[:, 1:, places] -= np.asarray(offset_rates(run.shifted, flat.shape[1] - 1))[:, 1:]
     graph, leaderward = parts.graph, drive.follower.leaderward
     speed = min(map(run.law.speed_of, range(len(run.law.ready.chains.outputs))))
     avoiding = run.law.safety is not None
@@ -246,22 +244,16 @@ def _flat(
     return jax.vmap(one)(states, offsets)
 
 
-@cached_jit
-def _offset_rates(motion: FormationMotion, order: int) -> jax.Array:
-    start, rows = jnp.zeros(()), jnp.asarray(motion.places)
-    return jax.vmap(lambda row: motion.derivatives(row, start, order))(rows)
-
-
 # ---- what else it rests on -----------------------------------------------------------------------
 
 
 def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     """Yield the conditions of T5 beside the tube."""
-    n, c = len(run.parts.model.state_names), run.coupling
+    c = run.coupling
     yield _offsets_line(run)
     text = "in flat coordinates every agent is linear, with or without a trim"
     yield unneeded(Hypothesis.SMOOTH, _PROOF, text)
-    text = f"feedback turns all {n} states and the integrators before inputs into chains"
+    text = "feedback turns all states and the integrators before inputs into chains"
     yield unneeded(Hypothesis.DETECTABLE, _PROOF, text)
     text = run.law.information[1]
     if run.network is not None:

@@ -12,7 +12,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import JsonObject
-from echelon.core.words import Feedforward, Kind, Theorem
+from echelon.core.words import Feedforward, Kind, Theorem, amount
 from echelon.guarantees.messages.late_messages import LateMessages
 from echelon.guarantees.stopping.arrival import arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
@@ -181,7 +181,10 @@ def _graphs(run: StoppingRun) -> tuple[str, str]:
     schedule, law = run.parts.graph.schedule, run.law
     if law.feedforward is Feedforward.PARENT:
         # The speeds of the links add up in the tube.
-        return f"any tree in which none is more than {run.links} links from a leader", "this one"
+        return (
+            f"any tree in which none is more than {amount(run.links, 'link')} from a leader",
+            "this one",
+        )
     if schedule is None:
         return _ANY
     every = "eventually" if schedule.period is None else "in every period"

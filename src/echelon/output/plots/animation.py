@@ -16,6 +16,10 @@ if TYPE_CHECKING:
 
 _FEW = 60
 """Agents that are drawn as vehicles; more are drawn as dots, all of a kind by one artist."""
+_SOLID = ("space", "plane")
+"""Kinds of pictures in which agents have a size."""
+_NEAR: Any = np.array([[0.0, 0.0, 0.0, 1.0], [0.85, 0.56, 0.0, 1.0], [0.78, 0.2, 0.17, 1.0]])
+"""Colours of ellipsoids: none of their own, below the limit, overlapping."""
 _LINK, _GOAL, _SHADOW = "#4f5b68", "#d99000", "#d3d9e0"
 
 
@@ -106,10 +110,13 @@ class _Vehicles(MovingScene):
         self.rotors = PolyCollection([], linewidths=0.4, edgecolors="white")
         self.shadows = PolyCollection([], facecolors=_SHADOW, edgecolors="none")
         self.falls = LineCollection([], colors=_SHADOW, linewidths=0.8)
-        for part in (self.shadows, self.falls, self.trails, self.goals, self.arms, self.rotors):
+        self.shells = PolyCollection([], linewidths=0.8)
+        parts = self.shadows, self.falls, self.trails, self.goals, self.arms, self.rotors
+        for part in (*parts, self.shells):
             self.ax.add_collection(part)
         ground = [self.shadows, self.falls] if self.space.kind == "space" else []
         self.artists = [*ground, self.trails, self.links, self.goals, self.arms, self.rotors]
+        self.artists += [self.shells] if self.run.avoidance is not None else []
 
     def draw(self, now: Array, trail: Array, goals: Array, angles: Array | None) -> None:
         project = self.camera.project
@@ -117,6 +124,7 @@ class _Vehicles(MovingScene):
         rings = goals[list(self.run.followers)][:, None] + 0.55 * self.size * self.ring
         self.goals.set_verts(list(project(rings)[0]))
         self._shade(now)
+        self._surround(now)
         # Far vehicles first, so that near ones cover them.
         order = np.argsort(-project(now)[1], kind="stable")
         if self.space.shape != "quadrotor" or angles is None:
@@ -132,6 +140,23 @@ class _Vehicles(MovingScene):
         below = now * (1.0, 1.0, 0.0) + (0.0, 0.0, self.space.low[2])
         self.shadows.set_verts(list(project(below[:, None] + 0.35 * self.size * self.ring)[0]))
         self.falls.set_segments(list(project(np.stack([now, below], axis=1))[0]))
+
+    def _surround(self, now: Array) -> None:
+        """Draw the outlines of ellipsoids, coloured where another is too near."""
+        sizes, names = self.run.ellipsoid, self.space.names
+        if self.run.avoidance is None or sizes is None or self.space.kind not in _SOLID:
+            return
+        near: Any = sizes.too_near(now[:, : len(names)], names)
+        squares = np.resize(sizes.radii(names), 3) ** 2
+        # Where an ellipsoid with these semi-axes is touched by planes through a direction w.
+        w = self.ring[:, :1] * self.camera.axes[0] + self.ring[:, 1:2] * self.camera.axes[1]
+        outline = squares * w / np.sqrt((squares * w * w).sum(axis=1, keepdims=True))
+        self.shells.set_verts(list(self.camera.project(now[:, None] + outline)[0]))
+        edges = np.where(near[:, None] > 0.0, _NEAR[near.astype(int)], self.colours)
+        faces: Any = edges.copy()
+        faces[:, 3] = np.where(near > 0.0, 0.35, 0.1)
+        self.shells.set_edgecolor(edges)
+        self.shells.set_facecolor(faces)
 
     def _quadrotors(self, now: Array, angles: Array, order: Array) -> None:
         project, size, turns = self.camera.project, self.size, rotations(angles)

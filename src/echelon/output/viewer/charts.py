@@ -1,4 +1,4 @@
-"""The charts of the page: formation error, V and inputs over time."""
+"""The charts of the page: formation error, V, distances of agents and inputs over time."""
 
 from typing import NamedTuple
 
@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.metrics import SETTLED
+from echelon.experiments.results.quantity import settling_bound
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
 from echelon.output.plots.style import FLOOR
@@ -40,7 +41,18 @@ class _Sheet:
         log: bool,
         floor: float = FLOOR,
     ) -> JsonObject:
-        curve = np.asarray(values, np.float64)[self.frames]
+        return self.thinned(name, values[self.frames], colour, log, floor)
+
+    def thinned(
+        self,
+        name: str | None,
+        values: Array,
+        colour: int | str,
+        log: bool = False,
+        floor: float = FLOOR,
+    ) -> JsonObject:
+        """Take the values in `frames`."""
+        curve = np.asarray(values, np.float64)
         if log:
             # A logarithm has no 0, and values below the floor are rounding errors.
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -53,7 +65,8 @@ class _Sheet:
 def charts_of(run: Recording) -> Charts:
     """Return the charts of a run."""
     sheet = _Sheet(run)
-    descriptions = [_errors(run, sheet), *_lyapunov(run, sheet), _inputs(run, sheet)]
+    descriptions = [_errors(run, sheet), *_lyapunov(run, sheet)]
+    descriptions += [*_distances(run, sheet), _inputs(run, sheet)]
     times = [float(f"{t:.6g}") for t in run.times[sheet.frames]]
     return Charts(descriptions, times, Group(np.stack(sheet.columns, axis=1), gaps=True))
 
@@ -84,7 +97,7 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
         name = "leaders" if len(run.leaders) > 1 else "leader"
         lines.append(sheet.line(name, away, "leader", True))
     lines += _slope(run, errors[0].max(), 1.0)
-    marks = [{"value": SETTLED, "name": "1 cm" if run.length_unit else "0.01"}]
+    marks = [{"value": SETTLED, "name": settling_bound(run.length_unit)}]
     return _chart("formation error", run.length_unit, True, lines, marks)
 
 
@@ -116,6 +129,30 @@ def _lyapunov(run: Recording, sheet: _Sheet) -> list[JsonObject]:
     lines = [sheet.line("V", run.lyapunov, 0, True, FLOOR**2)]
     lines += _slope(run, float(run.lyapunov[0]), 2.0)
     return [_chart("Lyapunov function V", "", True, lines, [])]
+
+
+def _distances(run: Recording, sheet: _Sheet) -> list[JsonObject]:
+    near = run.near(sheet.frames)
+    if near is None:
+        return []
+    times = run.times[sheet.frames]
+    lines = [sheet.thinned("any two", near.over(times, near.distance), "leader")]
+    if near is run.avoidance:
+        rows = near.over(times, near.active)
+        lines.append(sheet.thinned("active rows", rows, 1) | {"strip": True})
+    return [distance_chart(run, lines)]
+
+
+def distance_chart(run: Recording, lines: list[JsonObject]) -> JsonObject:
+    """Return the chart of the smallest distance between agents, with its limits."""
+    sizes, marks = run.ellipsoid, list[JsonObject]()
+    if sizes is not None:
+        marks = [{"value": sizes.touching, "name": "touching", "below": True}]
+    title = "smallest distance"
+    if sizes is not None and run.avoidance is not None:
+        title = "smallest scaled distance"
+        marks.append({"value": sizes.limit, "name": "kept"})
+    return _chart(title, run.length_unit, False, lines, marks) | {"zero": True}
 
 
 def _inputs(run: Recording, sheet: _Sheet) -> JsonObject:

@@ -110,7 +110,8 @@ def _clock(run: Recording, frames: Array) -> dict[str, float]:
 
 def _closest(run: Recording) -> list[list[float]]:
     """Return each time at which two agents were closer than any before, how close, and who."""
-    return [[*map(_rounded, (pair.time, pair.distance)), *pair.agents] for pair in run.approaches()]
+    pairs = run.approaches(run.scales)
+    return [[*map(_rounded, (pair.time, pair.distance)), *pair.agents] for pair in pairs]
 
 
 def _rounded(value: float) -> float:
@@ -155,7 +156,8 @@ def header(run: Recording, space: Space) -> JsonObject:
         "edges": run.edges.tolist(),
         "heard": heard_by(run.heard),
         "schedule": _schedule(run),
-        "radius": run.radius,
+        "ellipsoid": ellipsoid_of(run, space),
+        "moments": [],
         "referenced": run.reference is not None,
         "offsets": [[float(f"{x:.7g}") for x in row] for row in run.offsets[:, list(space.axes)]],
         "space": {
@@ -170,6 +172,19 @@ def header(run: Recording, space: Space) -> JsonObject:
         "drawn": note,
         "thrust": False,
         "duration": float(run.times[-1]) if len(run.times) else run.horizon,
+    }
+
+
+def ellipsoid_of(run: Recording, space: Space) -> JsonObject | None:
+    """Return the ellipsoid about each agent along the axes of a picture; None of a point."""
+    sizes = run.ellipsoid
+    if sizes is None or not run.position:
+        return None
+    return {
+        "radii": sizes.radii(space.names).tolist(),
+        "touching": sizes.touching,
+        "limit": sizes.limit,
+        "kept": run.avoidance is not None,
     }
 
 
@@ -214,11 +229,21 @@ def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
     """Return the badge of a promise: its state `holds` or `lost`, a short and a whole text."""
     if not promise["promised"]:
         return {"state": "lost", "short": "no guarantee", "whole": promise["sentence"]}
+    apart = (promise.get("anywhere") or {}).get("separation")
+    if apart is not None:
+        return _badge_of_distances(apart["ideal"], promise)
     rate, kind = promise["rate"], promise["kind"]
     source = promise["theorem"] or kind
     short = f"guaranteed: {f'{rate:.3g} 1/s' if rate else 'V does not rise'}, {source}"
     whole = f"{promise['sentence']} {_rate_in_words(promise)}".rstrip()
     return {"state": "holds", "short": short, "whole": whole}
+
+
+def _badge_of_distances(ideal: bool, promise: Mapping[str, Any]) -> dict[str, str]:
+    """Return the badge of agents that keep apart, in the world of the theorem or in another."""
+    short = f"guaranteed: agents stay apart, {promise['theorem']}"
+    short = short if ideal else "distances observed, not proved"
+    return {"state": "holds" if ideal else "edge", "short": short, "whole": promise["sentence"]}
 
 
 def _rate_in_words(promise: Mapping[str, Any]) -> str:

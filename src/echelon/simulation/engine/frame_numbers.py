@@ -45,9 +45,11 @@ class _Frames(Protocol):
 
     def goal_distances(self, frames: FrameChoice = slice(None)) -> Float[Array, "F N"]: ...
 
-    def least_distances(self, frames: FrameChoice = slice(None)) -> Float[Array, " F"] | None: ...
+    def least_distances(
+        self, frames: FrameChoice = slice(None), scales: Float[Array, " d"] | float = 1.0
+    ) -> Float[Array, " F"] | None: ...
 
-    def approaches(self) -> list[ClosestPair]: ...
+    def approaches(self, scales: Float[Array, " d"] | float = 1.0) -> list[ClosestPair]: ...
 
 
 class FrameNumbers(abc.ABC):
@@ -93,33 +95,33 @@ class FrameNumbers(abc.ABC):
             return np.linalg.norm(self.deviations(frames)[:, :, list(self.measured)], axis=2)
 
     def least_distances(
-        self: _Frames, frames: FrameChoice = slice(None)
+        self: _Frames, frames: FrameChoice = slice(None), scales: Float[Array, " d"] | float = 1.0
     ) -> Float[Array, " F"] | None:
         """Return the smallest distance between two agents in frames, NaN if one is not finite.
 
-        None without a position.
+        None without a position. The position's coordinates are multiplied by `scales`.
         """
         if not self.position:
             return None
-        places = self.states[frames][:, :, list(self.position)]
+        places = self.states[frames][:, :, list(self.position)] * scales
         least = np.full(len(places), np.nan)
         finite = np.isfinite(places).all(axis=(1, 2))
         least[finite] = _least(places[finite])
         return least
 
-    def closest_pair(self: _Frames) -> ClosestPair | None:
+    def closest_pair(self: _Frames, scales: Float[Array, " d"] | float = 1.0) -> ClosestPair | None:
         """Return which agents were closest to each other in the stored frames, and when.
 
         None without a position, a second agent or a frame of finite numbers.
         """
-        pairs = self.approaches()
+        pairs = self.approaches(scales)
         return pairs[-1] if pairs else None
 
-    def approaches(self: _Frames) -> list[ClosestPair]:
+    def approaches(self: _Frames, scales: Float[Array, " d"] | float = 1.0) -> list[ClosestPair]:
         """Return the pairs that were closer than any in a frame before, in the order of time."""
         if not self.position or self.states.shape[1] < 2 or not len(self.times):
             return []
-        places, pairs = self.states[:, :, list(self.position)], list[ClosestPair]()
+        places, pairs = self.states[:, :, list(self.position)] * scales, list[ClosestPair]()
         least, bound = np.inf, -np.inf
         for k, motion in enumerate(_approach(places)):
             # No pair is closer than the closest of an earlier frame less what two agents moved.

@@ -164,8 +164,11 @@ class Laws(Drive):
             LawError: one is refused.
         """
         if isinstance(self.follower, FlatLaw) and self.safety is not None:
-            rows = problem.graph, problem.formation.offsets, problem.settings.dt
-            check_numbers(self.follower, problem.model, *rows)
+            motion, dt = problem.formation.motion, problem.settings.dt
+            least = 1.0 if motion is None else motion.least_scale
+            for shape in problem.formation.shapes:
+                rows = problem.graph, least * shape.offsets, dt
+                check_numbers(self.follower, problem.model, *rows)
         refused = self.refusals(problem.model, problem.graph, problem.states[None])
         for _, agent, text in refused:
             raise LawError(f"agent {agent} starts where its law has no meaning: {text}.")

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.near import Near
+from echelon.agents.network.switching import Schedule
 from echelon.agents.world.estimator import Estimate, Estimator
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, PyTree, Scalar, State
@@ -94,6 +95,7 @@ class OwnLaw(NamedTuple):
         weights: of their signals (rows, K); a graph that switches has several rows.
         signal_names, forward_names: of what it sends.
         source: whose feed-forward it uses; None for nobody's.
+        schedule: when which row of weights holds, of a graph that switches.
     """
 
     loop: Loop
@@ -104,6 +106,7 @@ class OwnLaw(NamedTuple):
     signal_names: tuple[str, ...]
     forward_names: tuple[str, ...]
     source: int | None
+    schedule: Schedule | None
 
     @property
     def law(self) -> Law:

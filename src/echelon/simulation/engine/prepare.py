@@ -1,7 +1,5 @@
 """Checks and completes the parts of a run before it starts, whatever drives the agents."""
 
-import itertools
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -10,23 +8,20 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Channel
-from echelon.agents.network.formation import Formation
-from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.world.sensing import Sensors
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.identity import digest
 from echelon.core.limits import excess_frames
 from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
+from echelon.core.words import amount
 from echelon.simulation.engine.initial import initial_states
+from echelon.simulation.engine.part_warnings import part_warnings
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.meter import Meter
 from echelon.simulation.step.motion import Motion
 from echelon.simulation.step.settings import Settings
-
-_MET = 1e-9
-"""m; agents without a radius that come so near to each other meet."""
 
 
 class Prepared(NamedTuple):
@@ -104,9 +99,9 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         )
         parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)
-        if formation.motion is not None:
-            warnings += parts.drive.check_motion(formation, graph)
-    warnings += formation_warnings(model, formation, drive.safety is not None)
+        if parts.formation.motion is not None:
+            warnings += parts.drive.check_motion(parts.formation, graph)
+    warnings += (*part_warnings(parts, problem.states, settings.horizon),)
     # Model and drive may say the same; a dictionary keeps the first, and the order.
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
 
@@ -154,47 +149,5 @@ def _check_offsets(model: ControlAffine, parts: Parts) -> None:
     if parts.formation.offsets.shape != shape:
         raise SimulationError(
             f"the formation has offsets {parts.formation.offsets.shape}, and {shape[0]} agents "
-            f"with {shape[1]} states need {shape}."
+            f"with {amount(shape[1], 'state')} need {shape}."
         )
-
-
-def formation_warnings(
-    model: ControlAffine, formation: Formation, safe: bool = False
-) -> tuple[str, ...]:
-    """Return warnings of offsets that break a symmetry of the model, and of agents that meet.
-
-    Agents that keep away from each other, which is `safe`, may have ways that meet.
-    """
-    if formation.motion is not None:
-        shapes = (shape_warnings(model, shape) for shape in formation.shapes)
-        warnings = itertools.chain(*shapes, () if safe else _meetings(model, formation.motion))
-        return tuple(dict.fromkeys(warnings))
-    return tuple(shape_warnings(model, formation))
-
-
-def _meetings(model: ControlAffine, motion: FormationMotion) -> Iterator[str]:
-    """Yield the reshapes in which agents touch on straight ways."""
-    for begin, i, j, apart in motion.meetings():
-        if apart <= 2.0 * (model.radius or 0.0) + _MET:
-            yield (
-                f"in the reshape at {begin:g} s agents {i} and {j} come within {apart:.3g} m of "
-                "each other; add `safety`, or choose other places."
-            )
-
-
-def shape_warnings(model: ControlAffine, formation: Formation) -> list[str]:
-    """Return the same of constant offsets."""
-    broken = formation.broken_symmetries(model)
-    sentences = [
-        f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, "
-        "so the agents settle off their goals."
-        # One warning is enough: the other offsets mostly break the same symmetry.
-        for agent, reason in list(broken.items())[:1]
-    ]
-    pairs = formation.coincident() if model.position else ()
-    sentences += [
-        f"agents {i} and {j} have the same goal, and would collide there." for i, j in pairs[:3]
-    ]
-    if len(pairs) > 3:
-        sentences.append(f"{len(pairs) - 3} more pairs of agents have the same goal.")
-    return sentences

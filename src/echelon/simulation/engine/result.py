@@ -16,6 +16,7 @@ from echelon.core.errors import Outcome
 from echelon.core.lazy_field import LazyField
 from echelon.core.pages import CellPage, notebook_page
 from echelon.core.types import Array
+from echelon.core.words import amount
 from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.traffic import Traffic, traffic
@@ -147,7 +148,7 @@ class Result(FrameNumbers):
         frames, agents = self.states.shape[:2]
         name = self.provenance.get("scenario", "")
         who = f"{name!r}, {agents} agents" if name else f"{agents} agents"
-        return f"Result({who}, {frames} frames, {self.message!r})"
+        return f"Result({who}, {amount(frames, 'frame')}, {self.message!r})"
 
     def _repr_html_(self) -> str:
         """Return the run as a notebook displays it: a table with its picture."""

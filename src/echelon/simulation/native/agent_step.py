@@ -102,6 +102,15 @@ def check_information(loop: Loop) -> None:
         raise Unsupported("a network that is not ideal")
     if loop.sensors is not None:
         raise Unsupported("agents that measure their states late or with noise")
+    check_distances(loop)
+
+
+def check_distances(loop: Loop) -> None:
+    """Check that agents keep no distances from each other.
+
+    Raises:
+        Unsupported: they do.
+    """
     if loop.follower.safety is not None:
         raise Unsupported("agents that keep away from each other")
 

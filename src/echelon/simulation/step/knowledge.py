@@ -5,6 +5,7 @@ each neighbour for the prediction plus the deviation that the neighbour last sen
 is a deviation, which hardly changes, and never a place, which does.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -239,32 +240,41 @@ def _leaders(
     assert channel is not None
     if channel.messages is MessageContent.STATE:
         signal, feedforward = sent, packet.content
-    elif channel.prediction is Prediction.NONE:
-        signal, feedforward = jnp.split(packet.content, [sent.shape[1]], axis=1)
     else:
-        carries = channel.prediction is Prediction.PACKET
         rows = packet.content, jnp.where(ages < jnp.inf, ages, 0.0)
-
-        def one(content: jax.Array, age: Scalar) -> tuple[jax.Array, jax.Array]:
-            if carries:
-                return _carried(loop, content, age, sent.shape[1])
-            return _expected(loop, t, content, age)
-
+        one = functools.partial(expected_of, loop, sent.shape[1], t)
         signal, feedforward = jax.vmap(one)(*rows)
     own = (packet.leader == readers.number)[:, None]
     return jnp.where(own | ~knows, sent, signal), jnp.where(knows, feedforward, 0.0)
 
 
-def _carried(
-    loop: Loop, content: Float[jax.Array, " p"], age: Scalar, s: int
+def expected_of(
+    loop: Loop, s: int, t: Scalar, content: Float[jax.Array, " p"], age: Scalar
 ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
-    """Return the signal and the feed-forward of a leader, from what it said an age (s) ago."""
+    """Return the signal (s,) and the feed-forward of a leader, by its packet of an age (s)."""
+    assert loop.channel is not None
+    prediction = loop.channel.prediction
+    if prediction is Prediction.PREVIEW:
+        return _expected(loop, t, content, age)
+    if prediction is Prediction.NONE:
+        return content[:s], content[s:]
+    signal, feedforward, u = parts_of(loop, s, content)
+    return loop.follower.carried(loop.model, signal, feedforward, u, carried_time(age)), feedforward
+
+
+def parts_of(
+    loop: Loop, s: int, content: Float[jax.Array, " p"]
+) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"], Input]:
+    """Return the signal (s,), the feed-forward and the input in a packet that is carried on."""
     m = len(loop.model.input_names)
-    signal, feedforward, u = content[:s], content[s:-m], content[-m:]
+    return content[:s], content[s:-m], content[-m:]
+
+
+def carried_time(age: Scalar) -> Scalar:
+    """Return how long (s) a leader is taken to have moved on since a packet of an age (s)."""
     # Nobody knows where a leader is that was not heard for long: its motion slows down.
     late = jnp.maximum(age - _CARRIED_FULLY, 0.0)
-    time = age - late + (1.0 - jnp.exp(-_SLOWING * late)) / _SLOWING
-    return loop.follower.carried(loop.model, signal, feedforward, u, time), feedforward
+    return age - late + (1.0 - jnp.exp(-_SLOWING * late)) / _SLOWING
 
 
 def _expected(

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.exchange import Exchange
-from echelon.agents.network.formation_motion import FormationMotion
+from echelon.agents.network.formation_motion import FormationMotion, OwnOffset
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.sensing import Sensors
 from echelon.core.types import Array, PyTree, Scalar, States
@@ -89,7 +89,7 @@ def offsets_at(
     if motion is None:
         return offsets, None
     rows = offsets, jnp.asarray(motion.places, t.dtype)[agents]
-    return jax.vmap(lambda base, row: law.goal_offset(loop.model, motion, base, row, t))(*rows)
+    return jax.vmap(lambda *row: law.goal_offset(loop.model, OwnOffset(motion, *row), t))(*rows)
 
 
 def goals_at(loop: Loop, t: Scalar) -> Float[jax.Array, "N n"] | None:
@@ -98,7 +98,7 @@ def goals_at(loop: Loop, t: Scalar) -> Float[jax.Array, "N n"] | None:
     if motion is None:
         return None
     rows = jnp.asarray(loop.offsets, t.dtype), jnp.asarray(motion.places, t.dtype)
-    return jax.vmap(lambda base, row: motion.offset(base, row, t))(*rows)
+    return jax.vmap(lambda *row: OwnOffset(motion, *row).state(t))(*rows)
 
 
 class Switches(NamedTuple):

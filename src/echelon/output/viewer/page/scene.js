@@ -74,6 +74,7 @@ class View {
     this.halo = this.add(halo(this.flat), this.material(VEHICLE), 3);
     this.makeLinks(lines);
     this.makeTrails(lines);
+    if (run.ellipsoid && run.agents <= 200 && ["space", "plane"].includes(run.space.kind)) this.ellipsoids = new Ellipsoids(this, lines);
     if (run.referenced) this.path = new Path(this, lines);
   }
 
@@ -301,12 +302,12 @@ class View {
   }
 
   show(moment) {
-    const { state, run } = this, { position: p, turn: q, motors: m, goal: g } = moment;
+    const { state, run } = this, { position: p, turn: q, motors: m, goal: g } = moment, near = this.ellipsoids?.marks(p);
     for (let i = 0; i < run.agents; i++) {
       let at = 4 * this.texel(i, 0);
       const exists = Number.isFinite(p[3 * i] + p[3 * i + 1] + p[3 * i + 2]);
       for (let k = 0; k < 3; k++) state[at + k] = exists ? p[3 * i + k] : 0;
-      state[at + 3] = !exists ? -1 : i === this.selected ? 1 : 0;
+      state[at + 3] = !exists ? -1 : (near?.[i] ?? 0) + (i === this.selected ? 1 : 0);
       for (let k = 0; k < 4; k++) (state[at + 4 + k] = q[4 * i + k]), (state[at + 8 + k] = m[4 * i + k]);
       at += 16;
       state[at] = g[3 * i], state[at + 1] = g[3 * i + 1], state[at + 2] = g[3 * i + 2];
