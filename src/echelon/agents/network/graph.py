@@ -253,6 +253,29 @@ class Graph(GraphMatrices):
         edges, weights = outward_edges(self)
         return Graph(edges, self.leaders, self.agents, True, weights.tolist())
 
+    def in_steps(self, dt: float) -> "Graph | None":
+        """Return the graph as it runs in steps of dt (s), to which switches are rounded up.
+
+        None where the rounding repeats only after many periods.
+
+        Raises:
+            GraphError: stretches that are shorter than a step are left out, and without them no
+                leader reaches an agent.
+        """
+        if self.schedule is None:
+            return self
+        schedule = self.schedule.in_steps(dt)
+        if schedule is None:
+            return None
+        starts, rows = schedule.starts, self.schedule.weights
+        if len(starts) == len(rows) and np.allclose(starts, self.schedule.starts, 0.0, 1e-9 * dt):
+            return self
+        graph = Graph.__new__(Graph)
+        graph.directed = self.directed
+        heavy = schedule.weights.max(axis=0)
+        graph._set(self.edges, heavy, self.agents, self.leaders, schedule)
+        return graph
+
     def spectrum(self) -> Spectrum:
         """Return the eigenvalues of the grounded Laplacian; computed once.
 

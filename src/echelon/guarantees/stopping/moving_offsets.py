@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import TypeAlias
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.network.formation_motion import (
@@ -22,9 +20,9 @@ from echelon.agents.network.formation_motion import (
     Rotate,
     Scale,
 )
-from echelon.core.compiled import cached_jit
 from echelon.core.errors import GainError
 from echelon.core.memoize import memoize
+from echelon.core.rational import norm_above
 from echelon.core.types import Array, JsonObject
 from echelon.guarantees.stopping.chain_response import largest_between
 
@@ -55,6 +53,21 @@ def offset_sizes(motion: FormationMotion) -> Sizes:
     for change in motion.motions:
         sizes = _after(change, sizes)
     return tuple(map(tuple, sizes))
+
+
+def size_beside(
+    motion: FormationMotion | None, position: Sequence[str], outputs: Sequence[str], order: int
+) -> Fraction:
+    """Return a bound of the length of some outputs' derivative of all offsets; 0 of constant ones.
+
+    Raises:
+        GainError: none is known.
+    """
+    if motion is None:
+        return Fraction(0)
+    sizes = offset_sizes(motion)[order]
+    sides = [sizes[position.index(name)] for name in outputs if name in position]
+    return norm_above(*sides) if sides else Fraction(0)
 
 
 def _lengths(motion: FormationMotion) -> tuple[list[Fraction], list[list[Fraction]]]:
@@ -90,13 +103,6 @@ def _after(motion: OffsetMotion, sizes: Sequence[Sequence[Fraction]]) -> list[li
             )
             rows[-1].append(sum(terms, Fraction(0)))
     return rows
-
-
-@cached_jit
-def offset_rates(motion: FormationMotion, order: int) -> jax.Array:
-    """Return the offsets at the start with derivatives up to an order, (N, order + 1, d)."""
-    start, rows = jnp.zeros(()), jnp.asarray(motion.places)
-    return jax.vmap(lambda row: motion.derivatives(row, start, order))(rows)
 
 
 @functools.cache

@@ -4,19 +4,15 @@ from collections.abc import Iterator
 from fractions import Fraction
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from echelon.agents.models.chains import flat_output, flatten
-from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.network.graph import Graph
-from echelon.core.compiled import cached_jit
 from echelon.core.enclosure.interval import point
+from echelon.core.errors import GraphError
 from echelon.core.linear import sampled_radius
-from echelon.core.rational import float_above, norm_above
+from echelon.core.rational import float_above
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind
@@ -27,8 +23,9 @@ from echelon.guarantees.messages.late_messages import (
     late_messages_of,
 )
 from echelon.guarantees.stopping.chain_response import Chain
+from echelon.guarantees.stopping.flat_starts import flat_starts
 from echelon.guarantees.stopping.flat_states import flat_states_of
-from echelon.guarantees.stopping.moving_offsets import offset_rates, offset_sizes
+from echelon.guarantees.stopping.moving_offsets import size_beside
 from echelon.guarantees.stopping.path_bounds import pieces_of
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
@@ -53,6 +50,7 @@ class StoppingRun(NamedTuple):
         flat: (N, r, m) the same in flat coordinates, less the offsets and their derivatives.
         ahead: (r, m) of what the leader follows.
         late: what is guaranteed over its network; None for the ideal one.
+        left_out: why nothing is known of how its graph switches in steps; empty elsewhere.
     """
 
     parts: Parts
@@ -61,6 +59,7 @@ class StoppingRun(NamedTuple):
     flat: Array
     ahead: Array
     late: LateMessages | Uncovered | None = None
+    left_out: str = ""
 
     @property
     def law(self) -> StoppingPoint:
@@ -158,13 +157,8 @@ class StoppingRun(NamedTuple):
         Raises:
             GainError: none is known.
         """
-        motion, chains = self.shifted, self.law.ready.chains
-        if motion is None:
-            return Fraction(0)
-        position, sizes = self.parts.model.position, offset_sizes(motion)[order]
-        names = [chains.outputs[k] for k in outputs]
-        sides = [sizes[position.index(name)] for name in names if name in position]
-        return norm_above(*sides) if sides else Fraction(0)
+        names = [self.law.ready.chains.outputs[k] for k in outputs]
+        return size_beside(self.shifted, self.parts.model.position, names, order)
 
     def path_speed(self, output: int, until: float | None = None) -> float:
         """Return what |zeta_r'| of the leader's path does not pass until a time (s), or at all.
@@ -216,13 +210,11 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     drive = parts.drive
     assert isinstance(drive, Laws) and isinstance(drive.follower, StoppingPoint)
     assert isinstance(drive.leader, StoppingLeader)
-    offsets = jnp.asarray(parts.formation.offsets_at([0.0])[0])
-    flat = np.array(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
+    flat = flat_starts(parts, drive.follower, states)
+    graph, left_out = _in_steps(parts.graph, settings.dt)
+    parts = parts if graph is parts.graph else parts.replace(graph=graph)
     run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
-    if run.shifted is not None:
-        places = np.array(drive.follower.ready.places_of(parts.model))
-        flat[:, 1:, places] -= np.asarray(offset_rates(run.shifted, flat.shape[1] - 1))[:, 1:]
-    graph, leaderward = parts.graph, drive.follower.leaderward
+    run, leaderward = run._replace(left_out=left_out), drive.follower.leaderward
     speed = min(map(run.law.speed_of, range(len(run.law.ready.chains.outputs))))
     avoiding = run.law.safety is not None
     following = Following(graph, leaderward, run.coupling, speed, run.still, run.apart, avoiding)
@@ -230,18 +222,16 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     return run._replace(late=late_messages_of(parts.world.network, following, *times))
 
 
-@cached_jit
-def _flat(
-    model: ControlAffine, law: StoppingPoint, states: jax.Array, offsets: jax.Array
-) -> jax.Array:
-    chains = law.ready.chains
-
-    def one(x: jax.Array, offset: jax.Array) -> jax.Array:
-        values = flatten(model, chains, x, law.begin(model, x).chain).values
-        shift = flat_output(model, chains.outputs, offset)
-        return values.at[0].add(flat_output(model, chains.outputs, 0.0 * offset) - shift)
-
-    return jax.vmap(one)(states, offsets)
+def _in_steps(graph: Graph, dt: float) -> tuple[Graph, str]:
+    """Return a graph as it runs in steps (s), or the graph and why nothing is known of that."""
+    rounded = f"switches are rounded up to steps of {dt:g} s"
+    try:
+        stepped = graph.in_steps(dt)
+    except GraphError as error:
+        return graph, f"{rounded}, and then {str(error).rstrip('.')}"
+    if stepped is None:
+        return graph, f"{rounded}, which are no part of the `period` and its small multiples"
+    return stepped, ""
 
 
 # ---- what else it rests on -----------------------------------------------------------------------
@@ -296,6 +286,10 @@ def _switching_line(run: StoppingRun) -> Statement:
     """Say along which edges the leader reaches everybody: checked when the graph was made."""
     schedule = run.parts.graph.schedule
     assert schedule is not None
+    if run.left_out:
+        remedy = "switch at multiples of `simulation.dt`"
+        name, reason = Hypothesis.SWITCHING, run.left_out
+        return fails(name, _PROOF, run.left_out, remedy=remedy, reason=reason)
     text = f"the leader reaches every agent along the edges from {schedule.starts[-1]:g} s on"
     if schedule.period is not None:
         text = (

@@ -16,6 +16,7 @@ from echelon.core.errors import (
     SimulationError,
     check_kind,
 )
+from echelon.core.identity import process_key
 from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
 from echelon.laws.flat_law import FlatLaw
@@ -97,8 +98,10 @@ class Laws(Drive):
         """
         leader, follower = (prepare_law(law, model, graph) for law in (self.leader, self.follower))
         follower = follower.following(leader, model)
-        same = leader is self.leader and follower is self.follower
-        return self if same else Laws(leader, follower)
+        drive = Laws(leader, follower)
+        same, key = leader is self.leader and follower is self.follower, process_key(drive)
+        # Caches use the identity of what is complete already.
+        return self if same or key is not None and key == process_key(self) else drive
 
     def check_world(self, world: World, graph: Graph, dt: float) -> None:
         """Check that both laws work with messages that are late.

@@ -21,13 +21,13 @@ from echelon.core.words import NeighbourChoice
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import channel_of
 from echelon.simulation.step.knowledge import (
-    HOP_LIFE,
     NOBODY,
     Knowledge,
     Letters,
     Mail,
     Readers,
     count_hops,
+    hop_life,
     no_mail,
     usable_age,
     write,
@@ -180,7 +180,7 @@ def _step(radio: _Radio, first: jax.Array, now: _Carry) -> _Carry:
     exchange = exchange_at(radio.exchange, radio.switches, now.step)
     mail = take(channel, exchange, now.step, now.posts, now.mail)
     ages = age_of(now.step, mail.stamp, radio.dt)
-    lasting = ages <= HOP_LIFE * channel.forget * radio.dt
+    lasting = ages <= hop_life(channel, radio.dt)
     hops = count_hops(exchange, readers, mail.hops, lasting, len(readers.number))
     used = (jnp.asarray(exchange.weights) > 0.0) & (ages <= usable_age(channel, radio.dt))
     if channel.hears is NeighbourChoice.LEADERWARD:

@@ -150,7 +150,7 @@ def understand(
     channel = loop.channel
     assert channel is not None
     leader, feedforward = _leaders(loop, readers, t, mail.packet, ages.packet, sent)
-    lasting = ages.link <= HOP_LIFE * channel.forget * loop.motion.dt
+    lasting = ages.link <= hop_life(channel, loop.motion.dt)
     hops = count_hops(exchange, readers, mail.hops, lasting, len(loop.order))
     knows = readers.leads | (ages.packet < jnp.inf)
     receivers = jnp.asarray(exchange.receivers)
@@ -175,6 +175,12 @@ def usable_age(channel: Channel, dt: Array | float) -> jax.Array:
     deviations = channel.messages is MessageContent.DEVIATION
     # Of a state there is no better guess than the last one, but never that of no message.
     return jnp.asarray(channel.forget * dt if deviations else np.finfo(np.float32).max)
+
+
+def hop_life(channel: Channel, dt: Array | float) -> jax.Array:
+    """Return the age (s) beyond which a hop count is not used."""
+    # Times a float: ten times the largest whole number would be negative.
+    return jnp.asarray(float(HOP_LIFE) * channel.forget * dt)
 
 
 def write(
