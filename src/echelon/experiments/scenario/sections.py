@@ -7,7 +7,7 @@ section, such as graphs, that take a key. The keys of laws and gains are in `law
 from collections.abc import Mapping
 from typing import Annotated, final
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from echelon.core.words import ENGINES, Estimation, MessageContent, NeighbourChoice, Prediction
 from echelon.experiments.scenario import registry
