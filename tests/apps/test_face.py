@@ -202,6 +202,8 @@ def test_an_ellipsoid_tells_who_is_too_near():
     # Scaled: .233 m overlapping, .28 m below the limit, .364 m, and far away.
     assert sizes.too_near(places, ("x", "y", "z")).tolist() == [2.0, 2.0, 1.0, 0.0]
     assert sizes.too_near(places[:, ::2], ("x", "z")).tolist() == [2.0, 2.0, 1.0, 0.0]
+    places[1] = np.nan
+    assert sizes.too_near(places, ("x", "y", "z")).tolist() == [0.0] * 4
 
 
 def test_a_moving_agent_moves_in_the_pictures(run):

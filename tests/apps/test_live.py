@@ -17,6 +17,7 @@ import echelon as ech
 from echelon.apps.live import promiser
 from echelon.apps.live import server as served
 from echelon.apps.live import swarm as looked
+from echelon.apps.live.attendance import as_changes
 from echelon.apps.live.guarantee_status import GuaranteeStatus
 from echelon.apps.live.panel import Panel
 from echelon.apps.live.promiser import Promiser, badge_of, first_look
@@ -135,12 +136,69 @@ def test_radio_gusts_lag_and_noise_are_knobs():
     assert shades.shape == (4,) and (shades <= fresh + 1e-9).all() and shades.max() > 0.0
 
 
-def test_an_agent_that_is_lost_has_no_links(panel, session):
-    session.apply(session.ask({"name": "lose", "value": 1}))
-    edges = panel.live.parts.graph.edges
-    assert session.knobs.cut == frozenset(np.flatnonzero((edges == 1).any(axis=1)).tolist())
-    with pytest.raises(SimulationError, match="`lose` got `99`, and must be the number"):
-        session.ask({"name": "lose", "value": 99})
+def shown(session, pictures):
+    """The states after each of some pictures."""
+    rows = []
+    for _ in range(pictures):
+        session.settle()
+        rows.append(session.swarm.advance().states)
+    return np.stack(rows)
+
+
+def test_who_is_lost_or_joins_live_does_so_as_in_a_run(session):
+    before = shown(session, 3)
+    session.ask({"name": "lose", "value": 3})
+    lost = shown(session, 3)
+    assert session.swarm.here.tolist() == [True, True, True, False]
+    session.ask({"name": "join", "value": 3})
+    joined = shown(session, 3)
+    events = [{"at": 0.12, "lose": 3}, {"at": 0.24, "join": 3}]
+    whole = ech.run(scenario(events=events))
+    seen = np.concatenate([before, lost, joined])
+    # The frame of a run at the time of an arrival is after it.
+    seen[5, 3] = whole.states[6, 3]
+    np.testing.assert_allclose(seen, whole.states[1:10], atol=1e-12)
+    saved = read_yaml(session.ask({"name": "save"})["text"], "saved").data["live"]
+    assert saved == events
+    badge = badge_of(session.panel, session.knobs)
+    assert badge["state"] == "lost" and "agent 3 joins at 0.24 s" in badge["whole"]
+    session.ask({"name": "reset"})
+    session.settle()
+    assert session.swarm.here.all() and not session.knobs.events
+
+
+def test_a_leader_that_has_lost_all_others_goes_on_alone(session):
+    for agent in (3, 2, 1):
+        session.ask({"name": "lose", "value": agent})
+        session.settle()
+    picture = session.swarm.advance()
+    session.show(picture)
+    assert picture.here.tolist() == [True, False, False, False]
+    assert np.isnan(np.frombuffer(session.picture[16:], "<f4")[:2]).all()
+
+
+def test_events_of_a_scenario_are_changes_of_a_live_loop():
+    events = [
+        {"at": 2.0, "cut": [0, 1], "for": 1.5},
+        {"at": 3.0, "join": 2},
+        {"at": 1.0, "lose": 1},
+    ]
+    assert sorted(as_changes(events), key=lambda change: change["at"]) == [
+        {"at": 0.0, "lose": 2},
+        {"at": 1.0, "lose": 1},
+        {"at": 2.0, "cut": [0, 1]},
+        {"at": 3.0, "join": 2},
+        {"at": 3.5, "restore": [0, 1]},
+    ]
+
+
+def test_what_cannot_happen_is_refused_in_a_sentence(session):
+    for name, agent, sentence in (
+        ("lose", 0, "agent 0 is lost, and nobody leads afterwards; name `heirs` in `leadership`."),
+        ("join", 2, "agent 2 cannot join, since it is there."),
+        ("lose", 99, "`lose` got `99`, and must be the number of an agent."),
+    ):
+        assert session.ask({"name": name, "value": agent}) == {"fault": sentence}
 
 
 KNOBS = {

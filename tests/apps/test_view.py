@@ -371,6 +371,49 @@ def test_agents_with_a_size_have_the_chart_with_twice_their_radius(browser, run,
         assert page.evaluate("echelon.player.view.ellipsoids.shown.value") == 0
 
 
+def test_who_is_lost_vanishes_an_heir_leads_and_the_event_is_marked(browser, run, tmp_path):
+    starts, weights = np.array([0.0, 2.0]), np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
+    here = np.array([[True] * 4, [False, True, True, True]])
+    schedule = Schedule(starts, weights, None, here, np.array([[0] * 4, [1] * 4]))
+    lost = dataclasses.replace(
+        run,
+        schedule=schedule,
+        reference=run.states[:, 0].copy(),
+        events=({"at": 2.0, "text": "agent 0 is lost"},),
+    )
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(lost), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        seek(page, 99)
+        assert page.evaluate("echelon.whereOnScreen(0)") is not None
+        assert page.locator(".moment").inner_text() == ""
+        seek(page, 100)
+        assert page.evaluate("echelon.whereOnScreen(0)") is None
+        assert page.locator(".moment").inner_text() == "2.00 s: agent 0 is lost"
+        assert page.locator("footer .mark").get_attribute("title") == "agent 0 is lost"
+        names = page.evaluate("[...document.querySelectorAll('.label')].map((x) => x.innerText)")
+        assert names[1:] == ["leader", "2", "3"]
+        # Goals are relative to the heir, and errors are of those that are there.
+        goal = run.states[100, 1, :3] + run.offsets[2, :3] - run.offsets[1, :3]
+        assert page.evaluate("echelon.goal(2)") == pytest.approx(goal, abs=1e-4)
+        away = np.linalg.norm(run.states[100, 2, :3] - goal)
+        assert f"2 {away:#.3g}" in page.locator(".chart").first.inner_text().replace("\n", " ")
+        seek(page, 50)
+        assert page.evaluate("echelon.run.leaders") == [0]
+
+
+def test_goals_of_a_formation_that_moves_are_where_they_are_at_each_time(browser, run, tmp_path):
+    moving = np.tile(run.offsets, (len(run.times), 1, 1))
+    moving[:, 2, 1] += 0.3 * run.times
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(dataclasses.replace(run, moving=moving)), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        for frame in (0, 80, 300):
+            seek(page, frame)
+            goal = run.states[frame, 0, :3] + moving[frame, 2, :3] - moving[frame, 0, :3]
+            assert page.evaluate("echelon.goal(2)") == pytest.approx(goal, abs=2e-4)
+
+
 def test_the_reference_is_drawn_and_the_leader_s_error_told(browser, run, tmp_path):
     reference = run.states[:, 0].copy()
     reference[:, 1] += 0.25

@@ -115,7 +115,14 @@ def test_defaults():
             "seed": 0,
             "leaders": (0,),
         },
-        "formation": {"offsets": None, "name": None, "spacing": 1.0, "columns": None},
+        "formation": {
+            "offsets": None,
+            "name": None,
+            "spacing": 1.0,
+            "columns": None,
+            "assign": "number",
+            "motion": (),
+        },
         "reference": None,
         "leader": {
             "law": "passive",
@@ -150,6 +157,8 @@ def test_defaults():
         "sensing": None,
         "safety": None,
         "network": None,
+        "events": (),
+        "leadership": None,
         "simulation": {
             "horizon": 30.0,
             "dt": 0.01,
@@ -280,7 +289,8 @@ def test_an_unknown_section_gets_a_guess(refused):
     assert refused(seed="sed: 0") == [
         "s.yaml:11: sed: got an unknown key, allowed are `name`, `model`, `plant`, `graph`,"
         " `formation`, `reference`, `leader`, `follower`, `safety`, `initial`,"
-        " `disturbance`, `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed`"
+        " `disturbance`, `actuator`, `sensing`, `network`, `events`, `leadership`, `simulation`,"
+        " `report`, `live`, `seed`"
         " (did you mean `seed`?)."
     ]
 
@@ -389,7 +399,8 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, got):
     assert str(caught.value) == (
         f"{file}:1: got {got}, allowed is a mapping with the keys `name`, `model`, `plant`,"
         " `graph`, `formation`, `reference`, `leader`, `follower`, `safety`, `initial`,"
-        " `disturbance`, `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed`."
+        " `disturbance`, `actuator`, `sensing`, `network`, `events`, `leadership`, `simulation`,"
+        " `report`, `live`, `seed`."
     )
 
 

@@ -6,7 +6,9 @@ import pytest
 
 import echelon as ech
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
+from echelon.apps.live.swarm import LiveLoop
 from echelon.core.errors import LawError, SimulationError
+from echelon.simulation.engine.gradient import gradient
 from echelon.simulation.engine.prepare import prepare
 
 AGENT = ech.models.DoubleIntegrator()
@@ -142,3 +144,21 @@ def test_quadrotors_follow_a_formation_that_turns_breathes_and_changes():
     errors = result.formation_errors.max(axis=1)
     assert errors[(result.times > 3.5)].max() < 1e-3
     assert errors[result.times > 8.5].max() < 1e-4
+
+
+def test_what_knows_constant_offsets_alone_refuses_others():
+    one, settings = parts([Rotate(0.5)]), ech.Settings(horizon=1.0, dt=0.01)
+
+    def total(sums):
+        return sums.errors[0].sum()
+
+    for message, use in (
+        (
+            "derivatives are of constant ones",
+            lambda: gradient(one, settings, lambda sums: sums.errors[0].sum(), ["P"]),
+        ),
+        ("the formation changes with time", lambda: ech.state_space(one)),
+        ("`echelon live` has knobs for its shape", lambda: LiveLoop(one, settings, None)),
+    ):
+        with pytest.raises(SimulationError, match=message):
+            use()

@@ -12,6 +12,8 @@ import echelon as ech
 from echelon.agents.network.near import Near
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
+from echelon.experiments.results.avoidance import avoidance
+from echelon.experiments.results.labelled_parts import labelled_parts
 from echelon.laws.nearest_point import nearest_point
 from echelon.laws.safety import hull_points
 
@@ -235,6 +237,20 @@ def test_agents_that_nobody_holds_back_fly_as_without():
     wide, free = (ech.simulate(each, settings) for each in parts)
     assert not wide.sums.avoidance.any()
     np.testing.assert_allclose(wide.inputs, free.inputs, atol=1e-12)
+
+
+class Round(ech.models.DoubleIntegrator):
+    """A cart with a radius."""
+
+    radius: float = 0.1
+
+
+def test_a_run_says_the_ellipsoids_of_its_model():
+    parts = crossing(ech.Safety(), model=Round())
+    result = ech.simulate(parts, ech.Settings(horizon=0.1, dt=0.02))
+    ellipsoid, data = avoidance(result).ellipsoid, labelled_parts(result.parts, result.settings)
+    assert (ellipsoid.radius, ellipsoid.height) == pytest.approx((0.1, 0.3))
+    assert float(data.variables["ellipsoid_radius"][1]) == 0.1
 
 
 def test_native_code_is_refused_and_auto_says_why_it_is_not_used():

@@ -433,6 +433,16 @@ def test_the_closest_pair_is_marked_beside_the_size_of_agents(long):
     assert "agents touch" not in lines_of(figures(long, ["distances"])["distances"], 3)
 
 
+def test_an_event_is_a_line_in_every_panel_with_its_words_in_one(long):
+    happened = dataclasses.replace(long, events=({"at": 5.0, "text": "agent 0 is lost"},))
+    figure = figures(happened, ["distances"])["distances"]
+    assert len(figure.axes) == 4
+    for ax in figure.axes:
+        assert any(list(line.get_xdata()) == [5.0, 5.0] for line in ax.get_lines())
+    words = [text.get_text() for ax in figure.axes for text in ax.texts]
+    assert words == ["agent 0 is lost "]
+
+
 def test_a_swarm_has_its_followers_in_the_legend_of_every_figure(flock):
     made = figures(flock, ("states", "trajectories", "formation", "inputs"))
     for name, figure in made.items():

@@ -257,11 +257,8 @@ class FlatLaw(Law):
         Raises:
             LawError: a coordinate is none, or their chains are too long or not of one length.
         """
-        name, chains, places = (
-            f"`{type(model).__name__}`",
-            self.ready.chains,
-            self.ready.places_of(model),
-        )
+        name, chains = f"`{type(model).__name__}`", self.ready.chains
+        places = self.ready.places_of(model)
         degrees = [chains.degrees[k] for k in places]
         if len({*degrees}) > 1 or degrees[0] > MOST_POINTS:
             raise LawError(

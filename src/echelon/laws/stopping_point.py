@@ -338,6 +338,9 @@ class StoppingLeader(FlatLaw):
         self, model: ControlAffine, view: LocalView, memory: FlatMemory
     ) -> tuple[Input, FlatMemory]:
         """Return the leader's input."""
+        if memory.active is not None:
+            # An heir that was held back when it took the lead gives way to nobody now.
+            memory = memory._replace(active=0.0 * memory.half)
         away = self.deviation(model, view.t, view.x, view.offset, memory)
         rate = self._rate(model, view.t, away, view.period)
         return self.ready.obey(model, view.x, rate, memory, view.period, view.offset_rate)

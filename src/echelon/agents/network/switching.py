@@ -24,11 +24,15 @@ class Schedule(NamedTuple):
         starts: (S,) s, ascending from 0: the start of each row of weights.
         weights: (S, E), not negative: 0 where an edge is absent.
         period: s, after which the rows repeat; None where the last row holds for ever.
+        present: (S, N) who is there; None where all always are.
+        nearest: (S, N) the leader that each agent follows; None where that never changes.
     """
 
     starts: Array
     weights: Array
     period: float | None
+    present: Array | None = None
+    nearest: Array | None = None
 
     @property
     def last(self) -> Array:
@@ -37,9 +41,14 @@ class Schedule(NamedTuple):
 
     def row(self, t: float) -> int:
         """Return which row holds at a time (s)."""
+        return int(self.rows(t))
+
+    def rows(self, times: Array | float) -> Array:
+        """Return which rows hold at times (T,) (s)."""
         # Rounded before the modulus: a time just below the period belongs to the first row.
-        t = t + _ROUNDED if self.period is None else (t + _ROUNDED) % self.period
-        return int(np.searchsorted(self.starts, t, side="right")) - 1
+        times = np.asarray(times, float) + _ROUNDED
+        times = times if self.period is None else times % self.period
+        return np.searchsorted(self.starts, times, side="right") - 1
 
     def switches(self, dt: float, horizon: float, first: int = 0) -> tuple[Array, Array]:
         """Return the first steps (K,) of rows and the rows (K,), in steps of dt (s).

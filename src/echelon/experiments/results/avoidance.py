@@ -43,7 +43,8 @@ class Ellipsoid(NamedTuple):
         scaled = places * self.radius / self.radii(coordinates)
         apart = np.linalg.norm(scaled[:, None] - scaled, axis=2)
         np.fill_diagonal(apart, np.inf)
-        least = apart.min(axis=1)
+        # Absent agents are nowhere.
+        least = np.where(np.isfinite(apart), apart, np.inf).min(axis=1)
         return (least < self.limit - ROUNDING) * 1.0 + (least < self.touching)
 
 
@@ -91,7 +92,7 @@ class Avoidance(NamedTuple):
 def avoidance(result: Result) -> Avoidance | None:
     """Return how agents of a run kept apart; None where they do not."""
     safety, sums, settings = result.drive.safety, result.sums, result.settings
-    if safety is None or safety.radii is None or not sums.steps[0]:
+    if safety is None or not sums.steps[0]:
         return None
     each = steps_per_slice(settings)
     count = -(-int(sums.steps[0]) // each)
@@ -101,5 +102,5 @@ def avoidance(result: Result) -> Avoidance | None:
         begins * settings.dt,
         sums.separation[:, :count].min(axis=0),
         sums.avoidance[:, :count].sum(axis=0) / steps,
-        Ellipsoid(safety.radii[0], safety.radii[2], safety.distance),
+        Ellipsoid(safety.size[0], safety.size[2], safety.distance),
     )

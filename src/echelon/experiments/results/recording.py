@@ -89,7 +89,7 @@ class Recording(FrameNumbers):
         nearest: each agent's nearest leader.
         edges: with `weights`; of a graph that switches, all edges that exist at some time.
         heard: whether each end of an edge receives from the other.
-        schedule: the weights over time; None where they are constant.
+        schedule: the weights over time, and who is there; None where they are constant.
         state_names, state_units, input_names, input_units: as texts.
         position: indices of the coordinates that a picture shows; none of an abstract agent.
         bounds: of the inputs; None without limits.
@@ -104,6 +104,7 @@ class Recording(FrameNumbers):
         promise: as `Promise.as_mapping` returns it.
         horizon, dt: s.
         attributes: provenance and settings, as stored.
+        events: what happened, by time: `at` (s), `what`, `agents`, `until` (s) and `text`.
         radius: of an agent, m; None without a size.
         moving: offsets over time; None of constant ones.
     """
@@ -139,6 +140,7 @@ class Recording(FrameNumbers):
     horizon: float
     dt: float
     attributes: JsonObject
+    events: tuple[JsonObject, ...] = ()
     radius: float | None = None
     moving: Float[np.ndarray, "T N n"] | None = None
 
@@ -229,8 +231,11 @@ class Recording(FrameNumbers):
 
     @property
     def loads(self) -> Float[np.ndarray, "T N k"] | None:
-        """Loads of the inputs; None where they have none."""
-        return None if self.bounds is None else self.bounds.loads(self.inputs)
+        """Loads of the inputs, NaN of absent agents; None where they have none."""
+        loads = None if self.bounds is None else self.bounds.loads(self.inputs)
+        if loads is None or self.presence is None:
+            return loads
+        return np.where(self.presence[:, :, None], loads, np.nan)
 
 
 def read_recording(file: Path) -> Recording:
@@ -299,6 +304,7 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         modes=_modes(arrays),
         messages=_messages(arrays),
         avoidance=_avoidance(arrays),
+        events=tuple(json.loads(attributes.get("events", "[]"))),
         promise=json.loads(attributes["promise"]),
         horizon=float(attributes["horizon"]),
         dt=float(attributes["dt"]),
@@ -328,8 +334,11 @@ def _schedule(values: Mapping[str, np.ndarray]) -> Schedule | None:
     if "stretch_start" not in values:
         return None
     period = float(values["graph_period"])
-    weights = values["edge_weight_then"]
-    return Schedule(values["stretch_start"], weights, period if np.isfinite(period) else None)
+    starts, weights = values["stretch_start"], values["edge_weight_then"]
+    present, nearest = values.get("present_then"), values.get("nearest_leader_then")
+    if present is None or nearest is None:
+        return Schedule(starts, weights, period if np.isfinite(period) else None)
+    return Schedule(starts, weights, None, present.astype(bool), nearest.astype(int))
 
 
 def _bounds(values: Mapping[str, np.ndarray]) -> InputBounds | None:

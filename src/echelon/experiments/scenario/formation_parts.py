@@ -34,8 +34,9 @@ def formation_of(
     for k, change in enumerate(spec.motion):
         with faults.at("formation", "motion", k):
             changes.append(_change(scenario, change, model, graph))
-    faults.settle()
-    return formation.moving(model, graph, changes) if changes else formation
+    # Of a motion with faults, which are noted, nothing else is said.
+    complete = changes and len(changes) == len(spec.motion)
+    return formation.moving(model, graph, changes) if complete else formation
 
 
 def _change(
@@ -64,9 +65,8 @@ def _check_keys(spec: MotionSpec) -> None:
     """Check that a motion is of one kind, and has the keys of that."""
     kinds = [kind for kind in registry.MOTIONS if getattr(spec, kind) is not None]
     if len(kinds) != 1:
-        got = listing(f"`{kind}`" for kind in kinds) if kinds else "none"
-        allowed = listing(f"`{kind}`" for kind in registry.MOTIONS)
-        raise ScenarioError(f"got {got}, allowed is one of {allowed}.")
+        got = " and ".join(f"`{kind}`" for kind in kinds) or "none"
+        raise ScenarioError(f"got {got}, allowed is one of {listing(registry.MOTIONS)}.")
     for key, mark in marked_keys(MotionSpec).items():
         if kinds[0] in mark.needed_by and getattr(spec, key) is None:
             raise ScenarioError(f"`{kinds[0]}` needs the key `{key}`, which is missing.")

@@ -16,9 +16,9 @@ from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import pen_of
-from echelon.output.plots.animation import MovingScene, moving_of
+from echelon.output.plots.animation import MovingScene, frame_after, moving_of
 from echelon.output.plots.camera import Camera, camera_for
-from echelon.output.plots.over_time import above, error_rounding, shade_rounding
+from echelon.output.plots.over_time import above, error_rounding, mark_events, shade_rounding
 from echelon.output.plots.space import Space, clipped_places, space_of
 from echelon.simulation.engine.result import Result
 
@@ -190,9 +190,7 @@ class _Film:
     def between(self, time: float) -> tuple[Array, Array, Array | None]:
         """Return places (N, 3), what trails have passed (K, N, 3), and angles at a time."""
         run = self.run
-        after = int(np.clip(np.searchsorted(run.times, time), 1, len(run.times) - 1))
-        first, last = run.times[after - 1 : after + 1]
-        share = float(np.clip((time - first) / (last - first), 0.0, 1.0))
+        after, share = frame_after(run.times, time)
         now = self.places[after - 1] + share * (self.places[after] - self.places[after - 1])
         begin = (
             0 if self.space.kind == "time" else np.searchsorted(run.times, time - self.moving.trail)
@@ -275,6 +273,7 @@ def _curves(figure: Any, run: Recording, ends: Array) -> list[Any]:
         show(axes[-1], run, keep)
         axes[-1].tick_params(labelsize=8)
         axes[-1].set_xlim(*ends)
+        mark_events(axes[-1], run, False)
     axes[-1].set_xlabel("time (s)", size=9)
     return [ax.axvline(ends[0], color=draw.COLOURS[0], linewidth=1.4) for ax in axes]
 
@@ -302,7 +301,7 @@ def _draw_inputs(ax: "Axes", run: Recording, keep: Array) -> None:
     loads, title = run.loads, "largest input"
     sizes = np.abs(run.inputs).max(axis=1)[keep]
     if loads is not None:
-        sizes, title = 100.0 * loads.max(axis=(1, 2))[keep], "largest input, % of limit"
+        sizes, title = 100.0 * np.nanmax(loads, axis=(1, 2))[keep], "largest input, % of limit"
     ax.plot(run.times[keep], sizes, color=draw.LEADER)
     ax.set_title(title, size=9, loc="left")
 

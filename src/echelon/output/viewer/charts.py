@@ -81,17 +81,22 @@ def _frames(run: Recording) -> Array:
 
 def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
     errors, followers = run.formation_errors, list(run.followers)
+    here = np.ones_like(errors, bool) if run.presence is None else run.presence
+    none = {} if run.presence is None else {"none": "\u2013 absent"}
     if 0 < len(followers) <= NAMED:
         lines = [
-            sheet.line(str(agent), errors[:, agent], place, True)
+            sheet.line(str(agent), np.where(here, errors, np.nan)[:, agent], place, True) | none
             for place, agent in enumerate(followers)
         ]
     else:
-        rows = errors[:, followers] if followers else errors
-        lines = [
-            sheet.line("worst", rows.max(axis=1), 1, True),
-            sheet.line("median", np.median(rows, axis=1), 0, True),
-        ]
+        some = followers or slice(None)
+        rows = np.where(here, errors, np.nan)[:, some]
+        worst = np.where(here, errors, 0.0)[:, some].max(axis=1)
+        median, anybody = np.full(len(rows), np.nan), here[:, some].any(axis=1)
+        # A number that is not finite is shown as such, but of agents that are not there.
+        middle = np.median if run.presence is None else np.nanmedian
+        median[anybody] = middle(rows[anybody], axis=1)
+        lines = [sheet.line("worst", worst, 1, True), sheet.line("median", median, 0, True)]
     if run.reference is not None:
         away = _off_reference(run, run.reference)
         name = "leaders" if len(run.leaders) > 1 else "leader"
@@ -104,6 +109,10 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
 def _off_reference(run: Recording, reference: Float[Array, "T n"]) -> Float[Array, " T"]:
     """Return the largest distance of a leader from its place beside the reference."""
     leaders, measured = list(run.leaders), list(run.measured)
+    if run.presence is not None:
+        leads = (run.nearest_then == np.arange(run.agents)) & run.presence
+        away = (run.states - run.offsets_in() - reference[:, None])[:, :, measured]
+        return np.where(leads, np.linalg.norm(away, axis=2), 0.0).max(axis=1)
     away = run.states[:, leaders] - run.offsets_in()[..., leaders, :] - reference[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
         return np.linalg.norm(away[:, :, measured], axis=2).max(axis=1)
@@ -160,9 +169,9 @@ def _inputs(run: Recording, sheet: _Sheet) -> JsonObject:
     if loads is not None:
         percent = 100.0 * loads.reshape(len(loads), -1)
         lines = [
-            sheet.line("largest", percent.max(axis=1), 1, False),
-            sheet.line("mean", percent.mean(axis=1), "leader", False),
-            sheet.line("smallest", percent.min(axis=1), 0, False),
+            sheet.line("largest", np.nanmax(percent, axis=1), 1, False),
+            sheet.line("mean", np.nanmean(percent, axis=1), "leader", False),
+            sheet.line("smallest", np.nanmin(percent, axis=1), 0, False),
         ]
         marks = [{"value": 100.0, "name": "limit", "below": True}, {"value": 0.0, "name": "limit"}]
         title = "motors" if loads.shape[2] in (2, 4) else "inputs"

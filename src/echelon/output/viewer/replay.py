@@ -48,6 +48,8 @@ def replay_data(run: Recording) -> bytes:
         angles = run.states[:, :, list(space.angles)]
         angles = space.sign * np.unwrap(np.where(np.isfinite(angles), angles, 0.0), axis=0)
         groups["angles"] = Group(_flat(angles[frames]))
+    if run.moving is not None:
+        groups["moving"] = Group(_flat(run.moving[frames][:, :, list(space.axes)]))
     if run.reference is not None:
         path = run.reference[frames][:, list(space.axes)]
         groups["reference"] = Group(path, gaps=True)
@@ -157,7 +159,7 @@ def header(run: Recording, space: Space) -> JsonObject:
         "heard": heard_by(run.heard),
         "schedule": _schedule(run),
         "ellipsoid": ellipsoid_of(run, space),
-        "moments": [],
+        "moments": [[event["at"], event["text"]] for event in run.events],
         "referenced": run.reference is not None,
         "offsets": [[float(f"{x:.7g}") for x in row] for row in run.offsets[:, list(space.axes)]],
         "space": {
@@ -197,9 +199,11 @@ def _schedule(run: Recording) -> JsonObject | None:
     """Return the schedule of edges, each graph as a text of 1 and 0."""
     if run.schedule is None:
         return None
-    starts, weights, period = run.schedule
+    starts, weights, period = run.schedule[:3]
     rows = ["".join("1" if weight else "0" for weight in row) for row in weights]
-    return {"starts": starts.tolist(), "rows": rows, "period": period}
+    nearest = run.schedule.nearest
+    follow = {} if nearest is None else {"nearest": nearest.tolist()}
+    return {"starts": starts.tolist(), "rows": rows, "period": period, **follow}
 
 
 def facts(run: Recording) -> list[str]:

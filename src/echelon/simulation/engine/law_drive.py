@@ -20,6 +20,7 @@ from echelon.core.identity import process_key
 from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
 from echelon.laws.flat_law import FlatLaw
+from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import leader_warnings, prepare_law
 from echelon.laws.safety import Safety
@@ -148,7 +149,7 @@ class Laws(Drive):
         """
         motion = formation.motion
         assert motion is not None
-        if self.safety is not None and motion.moves(graph.leaders):
+        if self.safety is not None and motion.moves([*graph.leaders, *graph.heirs]):
             raise LawError(
                 "`safety` keeps agents apart that move relative to the leader, whose own offset "
                 "must be constant; leave out its new offset."
@@ -159,6 +160,36 @@ class Laws(Drive):
             f"the law `{type(self.follower).__name__}` uses the position and the velocity of "
             "offsets that change with time, and lags behind them; `stopping-point` does not.",
         )
+
+    def check_heirs(self, graph: Graph) -> None:
+        """Check that followers can take the lead, and leaders can follow.
+
+        Raises:
+            SimulationError: they cannot.
+        """
+        if not graph.heirs:
+            return
+        name = f"`{type(self.leader).__name__}`"
+        if not self.leader.plans:
+            raise SimulationError(
+                f"got `heirs`, but a leader under the law {name} has no plan that they could carry "
+                "on; give it a `reference`."
+            )
+        if self.follower.feedforward is Feedforward.PARENT:
+            raise SimulationError(
+                "got `heirs`, but with `feedforward: parent` nobody knows who leads; use `relay`."
+            )
+        observers = {getattr(law, "observer", None) for law in (self.leader, self.follower)}
+        first, then = self.leader.init(), self.follower.init()
+        # How many others hold it back an heir forgets when it leads.
+        then = then._replace(active=None) if isinstance(then, FlatMemory) else then
+        trees = {*map(jax.tree.structure, (first, then))}
+        if len(trees) > 1 or len(observers) > 1:
+            raise SimulationError(
+                f"got `heirs`, but followers under `{type(self.follower).__name__}` remember other "
+                f"things than a leader under {name}, and could not take over; give both the same "
+                "kind of law, with the same `observer`."
+            )
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of leaders and followers by their laws.

@@ -207,7 +207,7 @@ class Chart {
     pen.rect(MARGIN.left, MARGIN.top - 2, w - MARGIN.left - MARGIN.right, h - MARGIN.top - MARGIN.bottom + 4);
     pen.clip();
     this.drawMarks(pen, w);
-    this.drawMoments(pen, h);
+    this.drawMoments(pen, w, h);
     for (const line of this.lines) line.strip ? this.drawStrip(pen, line, h) : this.drawLine(pen, line);
     this.nameMarks(pen, w);
     pen.restore();
@@ -248,16 +248,19 @@ class Chart {
   }
 
   // Events, as vertical lines with their words.
-  drawMoments(pen, h) {
-    for (const [time, words] of this.moments) {
+  drawMoments(pen, w, h) {
+    this.moments.forEach(([time, words], k) => {
       const x = Math.round(this.x(time)) + 0.5;
-      Object.assign(pen, { strokeStyle: themeColour("--axis"), fillStyle: themeColour("--faint"), lineWidth: 1, textAlign: "left", textBaseline: "top" });
+      Object.assign(pen, { strokeStyle: themeColour("--axis"), fillStyle: themeColour("--faint"), lineWidth: 1, textBaseline: "top" });
       pen.beginPath();
       pen.moveTo(x, MARGIN.top);
       pen.lineTo(x, h - MARGIN.bottom);
       pen.stroke();
-      pen.fillText(words, x + 3, MARGIN.top);
-    }
+      // Inside of the chart, and close events in two rows.
+      const left = x + pen.measureText(words).width > w - MARGIN.right;
+      pen.textAlign = left ? "right" : "left";
+      pen.fillText(words, x + (left ? -3 : 3), MARGIN.top + 12 * (k % 2));
+    });
   }
 
   // After the curves, which would cross the names.

@@ -145,8 +145,19 @@ class Live {
     const cut = new Set(state.cut.map(([i, j]) => `${i} ${j}`));
     this.run.edges.forEach(([i, j], edge) => this.view.cutLink(edge, cut.has(`${i} ${j}`)));
     this.state = state;
+    this.showMoments(state);
     this.paused = state.paused;
     this.pauseButton.replaceChildren(icon(this.paused ? "play" : "pause"));
+  }
+
+  // Shows who leads, and the events.
+  showMoments({ moments, nearest }) {
+    this.moments = moments;
+    this.charts.forEach((chart, place) => (chart.moments = moments.map(([time, words]) => [time, place ? "" : words])));
+    showMoment($("main"), moments.at(-1));
+    if (nearest.join() === this.nearest) return;
+    this.nearest = nearest.join();
+    this.view.setLeaders(nearest);
   }
 
   // ---- requests ----
@@ -197,7 +208,8 @@ class Live {
     };
     this.panel.append(make("div", { class: "buttons" },
       button("kick", "push the selected agent, else the first follower (k)", () => this.kick()),
-      button("lose", "cut all links of the selected agent, else of the first follower", () => this.lose()),
+      button("lose agent", "the selected agent is lost, else the last follower", () => this.lose()),
+      button("join", "the selected agent joins again, else the one lost last", () => this.join()),
       button("reset", "restart with the present controls", () => this.ask("reset")),
       button("save as scenario", "download a scenario file that repeats this session", () => this.save())));
     this.panel.append(make("p", { class: "hint" }, "click a link to cut or restore it, or an agent to select it"));
@@ -239,7 +251,18 @@ class Live {
   }
 
   lose() {
-    this.ask("lose", this.view.selected >= 0 ? this.view.selected : this.firstFollower);
+    const { selected } = this.view, present = [...Array(this.run.agents).keys()].filter((i) => !this.absent(i));
+    this.ask("lose", selected >= 0 ? selected : present.filter((i) => !this.run.leaders.includes(i)).at(-1) ?? present[0]);
+  }
+
+  absent(agent) {
+    return Number.isNaN(this.moment.position[3 * agent + 1]);
+  }
+
+  join() {
+    const { selected } = this.view, absent = [...Array(this.run.agents).keys()].filter((i) => this.absent(i));
+    if (selected >= 0 || absent.length) this.ask("join", selected >= 0 ? selected : absent.at(-1));
+    else this.showFault("Nobody is lost who could join; press `lose agent` first.");
   }
 
   kick() {

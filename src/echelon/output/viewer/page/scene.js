@@ -11,6 +11,7 @@ class View {
   constructor(element, run) {
     this.element = element;
     this.run = run;
+    this.first = new Set(run.leaders);
     this.flat = run.space.kind !== "space";
     this.software = isSoftware();
     this.renderer = new THREE.WebGLRenderer({ antialias: !this.software, alpha: true, powerPreference: "high-performance" });
@@ -149,11 +150,19 @@ class View {
   switchLinks(time) {
     const { schedule, edges } = this.run;
     if (!schedule) return;
-    const { starts, rows, period } = schedule;
-    const row = rows[Math.max(0, upper(starts, period ? (time + 1e-9) % period : time) - 1)];
-    if (row === this.row) return;
-    this.row = row;
+    const row = rowAt(schedule, time);
+    if (row === this.stretch) return;
+    this.stretch = row;
+    this.row = schedule.rows[row];
     edges.forEach((_, edge) => this.markLink(edge));
+    if (schedule.nearest) this.setLeaders(schedule.nearest[row]);
+  }
+
+  // Another agent may lead once the leader is lost.
+  setLeaders(nearest) {
+    this.run.leaders = [...new Set(nearest)];
+    this.setTheme();
+    this.labels.rename();
   }
 
   // The agents from which an agent receives now.
@@ -291,7 +300,8 @@ class View {
     const leads = new Set(run.leaders), many = run.agents > 200;
     let place = 0;
     for (let i = 0; i < run.agents; i++) {
-      const colour = leads.has(i) ? leader : rgb(PALETTE[many ? 0 : place++ % PALETTE.length]);
+      const colour = leads.has(i) ? leader : rgb(PALETTE[many ? 0 : place % PALETTE.length]);
+      place += this.first.has(i) ? 0 : 1;
       state.set([...colour, run.size * (many && leads.has(i) ? 1.25 : 1)], 4 * this.texel(i, 3));
     }
     this.draw();

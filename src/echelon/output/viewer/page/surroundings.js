@@ -296,17 +296,25 @@ class Backdrop {
 // Names of all agents, or of the leaders of a large swarm.
 class Labels {
   constructor(view) {
-    const { run } = view, leads = new Set(run.leaders);
+    const { run } = view;
     this.view = view;
     this.visible = true;
     const named = run.agents <= 12 ? [...Array(run.agents).keys()] : run.agents <= 60 ? run.leaders.slice(0, 12) : [];
     this.all = named.map((agent) => {
       const label = document.createElement("span");
-      label.className = leads.has(agent) ? "label leader" : "label";
-      label.textContent = leads.has(agent) ? (run.leaders.length > 1 ? `leader ${agent}` : "leader") : agent;
       view.element.append(label);
       return [agent, label];
     });
+    this.rename();
+  }
+
+  rename() {
+    const { leaders } = this.view.run;
+    for (const [agent, label] of this.all) {
+      const leads = leaders.includes(agent);
+      label.className = leads ? "label leader" : "label";
+      label.textContent = leads ? (leaders.length > 1 ? `leader ${agent}` : "leader") : agent;
+    }
   }
 
   place() {
