@@ -17,6 +17,7 @@ from echelon.agents.models import DoubleIntegrator
 from echelon.core.errors import EchelonError, ScenarioError, listing
 from echelon.experiments.scenario import key_paths, registry
 from echelon.experiments.scenario.checks import ROLES
+from echelon.experiments.scenario.formation_sections import FormationSpec
 from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
 from echelon.experiments.scenario.named_class import accepted, resolve
 from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
@@ -28,7 +29,7 @@ from echelon.experiments.scenario.scenario import (
     load_scenario,
     scenario_from_mapping,
 )
-from echelon.experiments.scenario.sections import FormationSpec, GraphSpec
+from echelon.experiments.scenario.sections import GraphSpec
 from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.yaml import read_yaml
 
@@ -115,7 +116,14 @@ def test_defaults():
             "seed": 0,
             "leaders": (0,),
         },
-        "formation": {"offsets": None, "name": None, "spacing": 1.0, "columns": None},
+        "formation": {
+            "offsets": None,
+            "name": None,
+            "spacing": 1.0,
+            "columns": None,
+            "assign": "number",
+            "motion": (),
+        },
         "reference": None,
         "leader": {
             "law": "passive",

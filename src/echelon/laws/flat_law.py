@@ -18,6 +18,7 @@ from echelon.agents.models.chains import (
     switch_on,
 )
 from echelon.agents.models.model import ControlAffine, FlatBound
+from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ModelError, listing
 from echelon.core.types import Array, Input, Scalar, State
@@ -228,6 +229,10 @@ class FlatLaw(Law):
         """Return zeta less the offset, (m,)."""
         return self.ready.place(model, x, offset, memory)
 
+    def goal_offset(self, model: ControlAffine, own: OwnOffset, t: Scalar) -> tuple[State, State]:
+        """Return the stopping point q(D) xi / q(0) of an offset, and its rate, (n,) each."""
+        return self.ready.stopping_offset(model, own, t)
+
     def hull(self, model: ControlAffine, x: State, memory: FlatMemory) -> Float[jax.Array, "r d"]:
         """Return the points in whose hull the position stays, the last one of zeta."""
         return self.hull_of(model, self.ready.flat_values(model, x, memory))
@@ -251,12 +256,7 @@ class FlatLaw(Law):
             LawError: a coordinate is none, or their chains are too long or not of one length.
         """
         name, chains = f"`{type(model).__name__}`", self.ready.chains
-        if not {*model.position} <= {*chains.outputs}:
-            raise LawError(
-                f"`safety` needs the position of {name} among its flat outputs, "
-                f"{listing(chains.outputs)}."
-            )
-        places = [chains.outputs.index(x) for x in model.position]
+        places = self.ready.places_of(model)
         degrees = [chains.degrees[k] for k in places]
         if len({*degrees}) > 1 or degrees[0] > MOST_POINTS:
             raise LawError(
@@ -266,7 +266,7 @@ class FlatLaw(Law):
         return places
 
     def message(self, model: ControlAffine, x: State, v: Input, memory: FlatMemory) -> jax.Array:
-        """Return zeta', (m,)."""
+        """Return zeta' less that of the own offset, (m,)."""
         return memory.rate
 
     def signal_names(self, model: ControlAffine) -> tuple[str, ...]:

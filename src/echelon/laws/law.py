@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.heading_symmetry import heading_index, rest_heading
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation_motion import OwnOffset
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.near import Near
 from echelon.agents.references.guide import Guide
@@ -43,6 +44,7 @@ class LocalView(eqx.Module):
             unless the law's `message` says otherwise.
         period: how long the input will be held, s; 0 where it is not known.
         near: the others, where the law keeps away from them; None elsewhere.
+        offset_rate: of `offset` (n,), per s; None of a constant one, or if the law uses none.
 
     Raises:
         LawError: it is made of numbers while JAX computes in float32.
@@ -55,6 +57,7 @@ class LocalView(eqx.Module):
     feedforward: Float[jax.Array, " k"]
     period: Scalar | float = 0.0
     near: Near | None = None
+    offset_rate: State | None = None
 
     def __check_init__(self) -> None:
         """Refuse to lose digits silently."""
@@ -177,6 +180,15 @@ class Law(eqx.Module):
     ) -> Float[jax.Array, " s"] | None:
         """Return what an agent sends to its neighbours, for z; None for x - offset."""
         return None
+
+    def goal_offset(
+        self, model: ControlAffine, own: OwnOffset, t: Scalar
+    ) -> tuple[State, State | None]:
+        """Return what the law takes for an offset (n,) that moves, and its rate (n,) or None.
+
+        Unless replaced, it is the position, and the velocity where that is a state: agents lag.
+        """
+        return own.state(t), None
 
     def signal_names(self, model: ControlAffine) -> tuple[str, ...]:
         """Return the names of what an agent sends for z, by which unlike agents use it."""

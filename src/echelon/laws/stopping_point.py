@@ -16,6 +16,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.agents.network.graph import Graph
+from echelon.agents.network.near import Near
 from echelon.agents.references.flatness import first_state, followed_states
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
@@ -221,16 +222,28 @@ class StoppingPoint(FlatLaw):
     ) -> tuple[Input, FlatMemory]:
         """Return the input of one agent."""
         pull = self.bounded(self.strength(view.period) * view.disagreement)
-        if self.safety is None or view.near is None:
-            return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period)
+        moving = view.offset_rate
+        if self.safety is not None and view.near is not None:
+            pull, active = self._held_apart(model, view, view.near, pull)
+            # What the filter lets through has the offset's rate in it.
+            memory, moving = memory._replace(active=active), None
+        return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period, moving)
+
+    def _held_apart(
+        self, model: ControlAffine, view: LocalView, near: Near, pull: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the pull (m,), less the offset's rate, that keeps away, and how many act on it."""
+        assert self.safety is not None
         places = np.array(self.places(model))
         speeds = jnp.broadcast_to(jnp.asarray(self.speeds, view.x.dtype), pull.shape)[places]
         scales = jnp.asarray(self.safety.scales(model), view.x.dtype)
-        rate, active = self.safety.filtered(-pull[places], view.near, scales, speeds)
+        rate = -pull[places]
+        if view.offset_rate is not None:
+            rate = rate + self.ready.shift(model, view.offset_rate)[places]
+            rate = rate * (speeds / jnp.maximum(jnp.abs(rate), speeds)).min()
+        rate, active = self.safety.filtered(rate, near, scales, speeds)
         # Where no row acts it is the same to the bit.
-        pull = pull.at[places].set(-rate)
-        memory = memory._replace(active=active)
-        return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period)
+        return pull.at[places].set(-rate), active
 
 
 @final
@@ -330,7 +343,7 @@ class StoppingLeader(FlatLaw):
             memory = memory._replace(active=0.0 * memory.half)
         away = self.deviation(model, view.t, view.x, view.offset, memory)
         rate = self._rate(model, view.t, away, view.period)
-        return self.ready.obey(model, view.x, rate, memory, view.period)
+        return self.ready.obey(model, view.x, rate, memory, view.period, view.offset_rate)
 
     def _rate(
         self, model: ControlAffine, t: Scalar, away: jax.Array, period: Scalar | float

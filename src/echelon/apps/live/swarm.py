@@ -19,7 +19,7 @@ from echelon.apps.live.attendance import attendance, room_for_events
 from echelon.apps.live.knobs import Knobs, LiveParts
 from echelon.apps.live.live_stepper import choose_stepper
 from echelon.core.compiled import cached_jit
-from echelon.core.errors import GraphError
+from echelon.core.errors import GraphError, SimulationError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, PyTree
 from echelon.experiments.results.lyapunov import fixed_metric, potential
@@ -84,6 +84,11 @@ class LiveLoop:
         self, parts: Parts, settings: Settings, panel: LiveParts, eventful: bool = False
     ) -> None:
         """Prepare the loop and its stepper."""
+        if parts.formation.motion is not None:
+            raise SimulationError(
+                "got a formation that changes, and `echelon live` has knobs for its shape; "
+                "remove `formation.motion`, or use `echelon run`."
+            )
         disturbance = parts.world.disturbance or Disturbance()
         world = dataclasses.replace(parts.world, disturbance=disturbance)
         parts = room_for_events(parts, settings.dt) if eventful else parts

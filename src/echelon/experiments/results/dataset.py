@@ -50,8 +50,9 @@ def dataset(result: Result) -> "xr.Dataset":
     """Return a run as a dataset with dimensions time, agent, state, input, edge.
 
     Variables: `states`, `inputs`, `error` (deviation from the goal relative to the leader),
-    `offset`, `nearest_leader`, `reference`, `tracking_error` (the leaders' outputs minus their
-    references'), `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`, `edge_agents`,
+    `offset` (and `moving_offset` over time where it changes), `nearest_leader`, `reference`,
+    `tracking_error` (the leaders' outputs minus their references'), `lyapunov`, `lyapunov_rate`,
+    `lyapunov_drift`, `saturated`, `edge_agents`,
     `edge_weight`, `edge_heard` (whether each end of an edge receives from the other), of a
     switching graph `edge_weight_then` from each `stretch_start` on with its `graph_period`
     (infinite without repetition), where agents are lost or join `presence` (1 where an agent is
@@ -91,6 +92,7 @@ def _labelled(result: Result) -> Labelled:
         **fixed.variables,
         **_presence(result),
         **_followed(result),
+        **_moving(result),
         **_poles(result),
         **_messages(result),
         **_avoidance(result),
@@ -109,6 +111,13 @@ def recording_of(run: Result | Recording) -> Recording:
         return run
     data = labelled(run)
     return recording(data.arrays(), data.attributes)
+
+
+def _moving(result: Result) -> Variables:
+    """Return offsets that change with time; nothing of constant ones."""
+    if result.formation.motion is None:
+        return {}
+    return {"moving_offset": (("time", "agent", "state"), result.offsets_in())}
 
 
 def _presence(result: Result) -> Variables:

@@ -42,7 +42,7 @@ def output_errors(result: Result, leader: int | None = None) -> Array | None:
     if result.reference is None or not len(result.times):
         return None
     leader = result.graph.leaders[0] if leader is None else leader
-    desired = result.reference + result.formation.offsets[leader]
+    desired = result.reference + result.offsets_in()[..., leader, :]
     with precision("float64"):
         return np.asarray(_output_errors(result.model, result.states[:, leader], desired))
 

@@ -20,7 +20,7 @@ from echelon.core.types import JsonObject
 from echelon.core.words import Verdict, amount
 from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
 from echelon.experiments.results.labelled import Labelled, read_labelled
-from echelon.simulation.engine.frame_numbers import FrameNumbers
+from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
 
 FORMAT, READ = 4, (3, 4)
 """Version of the format of `run.nc`, and those that are read; others are refused."""
@@ -84,7 +84,7 @@ class Recording(FrameNumbers):
         states: of all agents.
         inputs: as delivered by the actuators.
         reference: the leaders' reference state; None without one.
-        offsets: each agent's goal relative to its leader.
+        offsets: each agent's goal relative to its leader; the first one where it moves.
         leaders: their numbers.
         nearest: each agent's nearest leader.
         edges: with `weights`; of a graph that switches, all edges that exist at some time.
@@ -106,6 +106,7 @@ class Recording(FrameNumbers):
         attributes: provenance and settings, as stored.
         events: what happened, by time: `at` (s), `what`, `agents`, `until` (s) and `text`.
         radius: of an agent, m; None without a size.
+        moving: offsets over time; None of constant ones.
     """
 
     name: str
@@ -158,6 +159,10 @@ class Recording(FrameNumbers):
         """Edges along which only one end receives, as (sender, receiver)."""
         one = self.heard.sum(axis=1) == 1
         return np.where(self.heard[one, 1:], self.edges[one], self.edges[one, ::-1])
+
+    def offsets_in(self, frames: FrameChoice = slice(None)) -> Float[np.ndarray, "*F N n"]:
+        """Return the goal offsets in some frames, (F, N, n), or constant ones, (N, n)."""
+        return self.offsets if self.moving is None else self.moving[frames]
 
     def linked(self, time: float) -> Bool[np.ndarray, " E"]:
         """Return which edges exist at a time (s)."""
@@ -277,6 +282,7 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         inputs=arrays["inputs"],
         reference=arrays.get("reference"),
         offsets=arrays["offset"],
+        moving=arrays.get("moving_offset"),
         leaders=tuple(int(k) for k in np.flatnonzero(arrays["is_leader"])),
         nearest=arrays["nearest_leader"].astype(int),
         edges=arrays["edge_agents"].astype(int),

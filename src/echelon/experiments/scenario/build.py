@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, cast
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
-from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
@@ -18,6 +17,7 @@ from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.checks import ROLES, section
 from echelon.experiments.scenario.fault_list import FaultList
+from echelon.experiments.scenario.formation_parts import formation_of
 from echelon.experiments.scenario.law_sections import GainSpec, law_arguments
 from echelon.experiments.scenario.named_class import (
     NamedClass,
@@ -119,7 +119,7 @@ def _parts(
     disturbance = disturbance_of(scenario, faults, model)
     leadership = leadership_of(scenario, faults, graph)
     events = events_of(scenario, faults, graph, leadership)
-    formation = faults.part(lambda: _formation(scenario, model, graph), "formation")
+    formation = faults.part(lambda: formation_of(scenario, faults, model, graph), "formation")
     follower = faults.part(lambda: _follower(scenario, faults, model, graph), "follower")
     reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
     leader = faults.part(
@@ -270,14 +270,6 @@ def _read(part: NamedClass, file: Path, **offers: object) -> Any:
             f"{did_you_mean(surplus[0], accepted(read))}."
         )
     return read(file, **offered(read, offers), **part.arguments)
-
-
-def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Formation:
-    spec = scenario.formation
-    if spec.name is None:
-        return Formation.from_offsets(model, graph, spec.offsets or {})
-    make = getattr(Formation, spec.name)
-    return make(model, graph, **offered(make, {"spacing": spec.spacing, "columns": spec.columns}))
 
 
 def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, scenario: Scenario) -> Gain:

@@ -14,8 +14,9 @@ from echelon.core.errors import did_you_mean, listing
 from echelon.core.limits import horizon_fault
 from echelon.core.words import amount
 from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.formation_sections import FormationSpec
 from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
-from echelon.experiments.scenario.sections import FormationSpec, GraphSpec
+from echelon.experiments.scenario.sections import GraphSpec
 from echelon.experiments.scenario.values import foreign_keys, marked_keys
 from echelon.experiments.scenario.yaml import Document, KeyPath, is_or_are, quoted
 
@@ -381,8 +382,7 @@ def _events(data: Part) -> Iterator[Finding]:
 def cross_faults(document: Document) -> Iterator[Finding]:
     """Yield the path and the sentence of every fault that concerns more than one key.
 
-    Numbers that are not finite come first: where the schema rejects the same number, this sentence
-    is reported.
+    Numbers that are not finite come first: of the schema's sentence and this one it is reported.
     """
     data = document.data
     yield from _infinite(data, ())

@@ -4,7 +4,7 @@ from typing import Annotated, final
 
 from pydantic import BaseModel, Field
 
-from echelon.experiments.scenario.sections import Share, either
+from echelon.experiments.scenario.sections import Share
 from echelon.experiments.scenario.values import (
     STRICT,
     Agent,
@@ -13,6 +13,7 @@ from echelon.experiments.scenario.values import (
     Numbers,
     Positive,
     Unit,
+    either,
 )
 
 _Link = Annotated[Annotated[tuple[Agent, Agent], Field(strict=False)] | None, Unit("agents")]

@@ -41,7 +41,8 @@ def sections_in(annotation: object) -> Iterator[type[BaseModel]]:
 def key_paths(section: type[BaseModel], before: str = "") -> Iterator[tuple[str, str, str]]:
     """Yield the path of every key of a section, such as `network.delay`, its description and unit.
 
-    Changes of a live page are left out: no other command takes them.
+    Changes of a live page are left out: no other command takes them; so are the keys of the shape
+    of a reshape, which are those of `formation`.
     """
     for key, field in section.model_fields.items():
         inner = next(sections_in(field.annotation), None)
@@ -50,7 +51,7 @@ def key_paths(section: type[BaseModel], before: str = "") -> Iterator[tuple[str,
         unit = str(extra.get("unit", "")) if isinstance(extra, dict) else ""
         key = field.alias or key
         yield before + key, " ".join(text.split()), unit
-        if inner is not None and before + key != "live":
+        if inner is not None and before + key not in ("live", "formation.motion.reshape"):
             yield from key_paths(inner, f"{before}{key}.")
 
 

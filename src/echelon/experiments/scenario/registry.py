@@ -154,6 +154,15 @@ FORMATIONS = {
     "grid": "rows and columns",
 }
 
+MOTIONS = {
+    "rotate": "the shape turns",
+    "scale": "the shape grows and shrinks",
+    "reshape": "agents move to the places of another shape",
+    "python": "a class of yours",
+}
+ASSIGNMENTS = ("number", "nearest")
+"""Of agents to places."""
+
 INTEGRATORS = {
     "rk4": "classical Runge-Kutta of order 4, input held over the step",
     "euler": "x + dt (f + g u)",

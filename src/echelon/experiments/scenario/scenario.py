@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from echelon.core.errors import ScenarioError, did_you_mean, listing
 from echelon.experiments.scenario import event_sections, law_sections, sections
 from echelon.experiments.scenario.checks import cross_faults, law_of, number_of, section
+from echelon.experiments.scenario.formation_sections import FormationSpec
 from echelon.experiments.scenario.key_paths import key_paths, meant, sections_in
 from echelon.experiments.scenario.override import settle_overrides
 from echelon.experiments.scenario.values import STRICT, FolderName, Seed
@@ -45,7 +46,7 @@ class Scenario(BaseModel, **STRICT):
     model: sections.ModelSpec
     plant: sections.PlantSpec | None = None
     graph: sections.GraphSpec
-    formation: sections.FormationSpec = Field(default_factory=sections.FormationSpec)
+    formation: FormationSpec = Field(default_factory=FormationSpec)
     reference: sections.ReferenceSpec | None = None
     leader: law_sections.LeaderSpec = Field(default_factory=law_sections.LeaderSpec)
     follower: law_sections.FollowerSpec = Field(default_factory=law_sections.FollowerSpec)

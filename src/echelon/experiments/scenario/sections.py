@@ -5,7 +5,7 @@ section, such as graphs, that take a key. The keys of laws and gains are in `law
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, final
+from typing import Annotated, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -27,13 +27,8 @@ from echelon.experiments.scenario.values import (
     Seed,
     TakenBy,
     Unit,
+    either,
 )
-
-
-def either(*keys: str) -> ConfigDict:
-    """Return the configuration of a section that has exactly one of the keys."""
-    extra: Any = {"oneOf": [{"required": [key]} for key in keys]}
-    return STRICT | ConfigDict(json_schema_extra=extra)
 
 
 @final
@@ -132,21 +127,6 @@ class GraphSpec(BaseModel, **either("edges", "name")):
         if self.weights is not None:
             edges = tuple((i, j, w) for (i, j, _), w in zip(edges, self.weights, strict=True))
         return [(0.0, edges), *((stretch.at, stretch.edges) for stretch in self.schedule)]
-
-
-@final
-class FormationSpec(BaseModel, **STRICT):
-    """Each agent's goal relative to the leader's: offsets (default zero) or a named shape."""
-
-    offsets: Annotated[dict[int, Numbers] | None, Unit("the position's, mostly m")] = None
-    """Offset of each agent, as in `{1: [1, 0, 0]}`: a number for each coordinate of the position,
-    usually m, or for each state; default 0."""
-    name: Annotated[str, OneOf(registry.FORMATIONS)] | None = None
-    """Name of a shape."""
-    spacing: Annotated[Positive, Unit("m"), TakenBy(*registry.FORMATIONS)] = 1.0
-    """Distance between neighbours in the shape, m."""
-    columns: Annotated[Count | None, TakenBy("grid")] = None
-    """Columns of the shape `grid`."""
 
 
 @final

@@ -163,6 +163,10 @@ def _symmetric(case: Case) -> Statement:
     """Offsets are tried near the trim, and proved on the domain that a region speaks of."""
     name, parts, domain = Hypothesis.SYMMETRY, case.parts, case.domain
     model, formation = parts.model, parts.formation
+    if formation.motion is not None:
+        text, remedy = "offsets change with time", "use the law `stopping-point`"
+        reason = f"{text}, and the theorems about this law are of constant ones"
+        return fails(name, Kind.PROOF, text, remedy=remedy, reason=reason)
     if not np.ptp(formation.offsets, axis=0).any():
         return unneeded(name, Kind.PROOF, "there are none")
     broken = formation.broken_symmetries(model)

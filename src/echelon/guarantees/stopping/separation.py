@@ -72,9 +72,12 @@ class Separation(NamedTuple):
         text += f"overlap from these starts, for any number of agents and any graph, if {_EXACT} "
         text += "(T10), and each agent stays in its tube (T5). The inputs are held "
         text += f"for {self.step:.3g} s, which `safety.margin` has to allow for. "
-        text += "Convergence is not guaranteed while "
-        text += "agents hold each other back; without that, errors decay at "
-        text += f"{self.tube.rate:.3g} 1/s or faster eventually."
+        text += "Convergence is not guaranteed "
+        if self.tube.offsets is not None:
+            text += "while offsets change, whose rates are within the `speed` too."
+        else:
+            text += "while agents hold each other back; without that, errors decay at "
+            text += f"{self.tube.rate:.3g} 1/s or faster eventually."
         if not self.ideal:
             text = f"In this world distances are observed, not proved. In the ideal one: {text}"
         motors = self.tube.motor_load

@@ -5,15 +5,11 @@ from collections.abc import Iterator
 from fractions import Fraction
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from echelon.agents.models.chains import flat_output, flatten
-from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.network.graph import Graph
-from echelon.core.compiled import cached_jit
 from echelon.core.enclosure.interval import point
 from echelon.core.errors import GraphError
 from echelon.core.linear import sampled_radius
@@ -28,7 +24,9 @@ from echelon.guarantees.messages.late_messages import (
     late_messages_of,
 )
 from echelon.guarantees.stopping.chain_response import Chain
+from echelon.guarantees.stopping.flat_starts import flat_starts
 from echelon.guarantees.stopping.flat_states import flat_states_of
+from echelon.guarantees.stopping.moving_offsets import size_beside
 from echelon.guarantees.stopping.path_bounds import pieces_of
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
@@ -52,7 +50,7 @@ class StoppingRun(NamedTuple):
         parts: prepared.
         settings: how it is computed.
         states: (N, n) at the start.
-        flat: (N, r, m) the same in flat coordinates, less the offsets.
+        flat: (N, r, m) the same in flat coordinates, less the offsets and their derivatives.
         ahead: (r, m) of what the leader follows.
         late: what is guaranteed over its network; None for the ideal one.
         left_out: why nothing is known of how its graph switches in steps; empty elsewhere.
@@ -99,7 +97,9 @@ class StoppingRun(NamedTuple):
     @property
     def still(self) -> bool:
         """Whether the leader is where it stays, from the start on."""
-        outputs = range(len(self.law.ready.chains.outputs))
+        outputs, motion = range(len(self.law.ready.chains.outputs)), self.parts.formation.motion
+        if motion is not None and motion.moves(self.parts.graph.leaders):
+            return False
         return self.leader.reference is None and max(map(self.own_speed, outputs)) < _TOGETHER
 
     @property
@@ -152,6 +152,21 @@ class StoppingRun(NamedTuple):
             return s
         return max(s, self.path_speed(output) - self.own_speed(output))
 
+    @property
+    def shifted(self) -> FormationMotion | None:
+        """How offsets move agents beside what they agree on; None where they do not."""
+        # With `safety` the rate of an offset is within the speed, like any other.
+        return None if self.law.safety is not None else self.parts.formation.motion
+
+    def offset_size(self, order: int, *outputs: int) -> Fraction:
+        """Return a bound of a derivative of offsets, the norm of some outputs, beside the path.
+
+        Raises:
+            GainError: none is known.
+        """
+        names = [self.law.ready.chains.outputs[k] for k in outputs]
+        return size_beside(self.shifted, self.parts.model.position, names, order)
+
     def path_speed(self, output: int, until: float | None = None) -> float:
         """Return what |zeta_r'| of the leader's path does not pass until a time (s), or at all.
 
@@ -202,8 +217,7 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     drive = parts.drive
     assert isinstance(drive, Laws) and isinstance(drive.follower, StoppingPoint)
     assert isinstance(drive.leader, StoppingLeader)
-    offsets = jnp.asarray(parts.formation.offsets)
-    flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
+    flat = flat_starts(parts, drive.follower, states)
     graph, left_out = _in_steps(parts.graph, settings.dt)
     parts = parts if graph is parts.graph else parts.replace(graph=graph)
     run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
@@ -225,20 +239,6 @@ def _in_steps(graph: Graph, dt: float) -> tuple[Graph, str]:
     if stepped is None:
         return graph, f"{rounded}, which are no part of the `period` and its small multiples"
     return stepped, ""
-
-
-@cached_jit
-def _flat(
-    model: ControlAffine, law: StoppingPoint, states: jax.Array, offsets: jax.Array
-) -> jax.Array:
-    chains = law.ready.chains
-
-    def one(x: jax.Array, offset: jax.Array) -> jax.Array:
-        values = flatten(model, chains, x, law.begin(model, x).chain).values
-        shift = flat_output(model, chains.outputs, offset)
-        return values.at[0].add(flat_output(model, chains.outputs, 0.0 * offset) - shift)
-
-    return jax.vmap(one)(states, offsets)
 
 
 # ---- what else it rests on -----------------------------------------------------------------------
@@ -309,13 +309,16 @@ def _switching_line(run: StoppingRun) -> Statement:
 def _offsets_line(run: StoppingRun) -> Statement:
     """Say whether all offsets are of flat outputs, and leave the errors of other states alone."""
     model = run.parts.model
+    motion = run.parts.formation.motion
     names = [model.state_names[k] for k in np.flatnonzero(np.ptp(run.parts.formation.offsets, 0))]
+    names += [] if motion is None else [model.state_names[k] for k in motion.axes]
     flat, measured = flat_states_of(model, run.law.ready.chains), model.position
     broken = next((name for name in names if name not in flat.outputs), None)
     moving = next((name for name in names if name not in flat.free), None)
     alone = {*measured} <= {*flat.outputs} and measured
     if broken is None and (moving is None or alone):
         text = "offsets of flat outputs are symmetries"
+        text += "" if motion is None else ", constant or not: zeta' has the rate of their own"
         return holds(Hypothesis.SYMMETRY, _PROOF, text)
     text, remedy = f"the offset of `{broken}` is not of a flat output", "offset flat outputs only"
     if broken is None:

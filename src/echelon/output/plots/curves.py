@@ -244,7 +244,8 @@ def distances(run: Recording) -> "Figure | None":
     links = slice(None, None, -(-len(run.edges) // _LINKS) or 1)
     i, j = run.edges[links].T
     with np.errstate(over="ignore", invalid="ignore"):
-        desired = np.linalg.norm(run.offsets[i][:, columns] - run.offsets[j][:, columns], axis=1)
+        offsets = run.offsets_in()[..., columns]
+        desired = np.linalg.norm(offsets[..., i, :] - offsets[..., j, :], axis=-1)
 
     def show_links(ax: "Axes", frames: Array) -> None:
         with np.errstate(over="ignore", invalid="ignore"):

@@ -111,9 +111,9 @@ def _off_reference(run: Recording, reference: Float[Array, "T n"]) -> Float[Arra
     leaders, measured = list(run.leaders), list(run.measured)
     if run.presence is not None:
         leads = (run.nearest_then == np.arange(run.agents)) & run.presence
-        away = (run.states - run.offsets - reference[:, None])[:, :, measured]
+        away = (run.states - run.offsets_in() - reference[:, None])[:, :, measured]
         return np.where(leads, np.linalg.norm(away, axis=2), 0.0).max(axis=1)
-    away = run.states[:, leaders] - run.offsets[leaders] - reference[:, None]
+    away = run.states[:, leaders] - run.offsets_in()[..., leaders, :] - reference[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
         return np.linalg.norm(away[:, :, measured], axis=2).max(axis=1)
 

@@ -35,6 +35,7 @@ from echelon.simulation.engine.own_step import (
     hull_of,
     is_finite,
     measured_alone,
+    offset_alone,
     signal_of,
     step_alone,
     step_over_network,
@@ -197,16 +198,22 @@ class Agent:
         clock = None if self._stamps is None else self._stamps.clock
         return Received.TAKEN if self._others.take(message, clock) else received
 
-    def hello(self, x: ArrayLike) -> Message | None:
+    def hello(self, x: ArrayLike, t: float | None = None) -> Message | None:
         """Return the message of the agent at a state (n,), before it acts.
 
         If the state is not finite, it is the last message, None if there was none.
 
+        Args:
+            x: own state (n,).
+            t: time, s, which a formation that changes with time needs.
+
         Raises:
-            SimulationError: the state has another shape.
+            SimulationError: the state has another shape, or the time is needed.
         """
+        if t is None and self._loop.moving is not None:
+            raise SimulationError("the formation changes with time; call `hello(x, t)`.")
         with precision("float64"):
-            own = self._own(self._measured(self._state(x))[0])
+            own = self._own(self._measured(self._state(x))[0], jnp.asarray(float(t or 0.0)))
             signal, hull = (
                 signal_of(self._loop, self._law, own),
                 hull_of(self._loop, self._law, own),
@@ -240,7 +247,8 @@ class Agent:
         row = 0 if self._schedule is None else self._schedule.row(t)
         with precision("float64"):
             state, estimate = self._measured(self._state(x))
-            own, time = self._own(state), jnp.asarray(self._time)
+            time = jnp.asarray(self._time)
+            own = self._own(state, time)
             if self._stamps is None:
                 step = step_alone(
                     self._loop,
@@ -344,11 +352,15 @@ class Agent:
         before = self._estimator.begin(model, y) if before is None else before
         return measured_alone(self._estimator, model, before, y, jnp.asarray(not self._begun))
 
-    def _own(self, state: State) -> "OwnState":
+    def _own(self, state: State, time: jax.Array) -> "OwnState":
         # As in a run, where leaders may follow their heirs.
         law = self._law if self._loop.succession is None else self._loop.follower
         memory = self._memory if self._begun else begin_alone(self._loop, law, state)
-        return OwnState(state, jnp.asarray(self._loop.offsets[self.number]), memory)
+        if self._loop.moving is None:
+            return OwnState(state, jnp.asarray(self._loop.offsets[self.number]), memory)
+        number = jnp.asarray(self.number)
+        offset, rate = offset_alone(self._loop, self._law, time, number)
+        return OwnState(state, offset, memory, rate)
 
 
 def _names(loop: Loop, law: Law) -> tuple[tuple[str, ...], tuple[str, ...]]:

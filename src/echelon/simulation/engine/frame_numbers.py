@@ -15,7 +15,7 @@ _FEW = 8
 """Agents up to which comparing all pairs is faster than a search for the nearest."""
 
 
-_Some: TypeAlias = slice | Sequence[int] | Int[Array, " F"]
+FrameChoice: TypeAlias = slice | Sequence[int] | Int[Array, " F"]
 """Which frames."""
 
 
@@ -49,12 +49,14 @@ class _Frames(Protocol):
     @property
     def measured(self) -> tuple[int, ...]: ...
 
-    def deviations(self, frames: _Some = slice(None)) -> Float[Array, "F N n"]: ...
+    def offsets_in(self, frames: FrameChoice) -> Float[Array, "*F N n"]: ...
 
-    def goal_distances(self, frames: _Some = slice(None)) -> Float[Array, "F N"]: ...
+    def deviations(self, frames: FrameChoice = slice(None)) -> Float[Array, "F N n"]: ...
+
+    def goal_distances(self, frames: FrameChoice = slice(None)) -> Float[Array, "F N"]: ...
 
     def least_distances(
-        self, frames: _Some = slice(None), scales: Float[Array, " d"] | float = 1.0
+        self, frames: FrameChoice = slice(None), scales: Float[Array, " d"] | float = 1.0
     ) -> Float[Array, " F"] | None: ...
 
     def approaches(self, scales: Float[Array, " d"] | float = 1.0) -> list[ClosestPair]: ...
@@ -102,27 +104,27 @@ class FrameNumbers(abc.ABC):
             return np.tile(self.nearest, (len(self.times), 1))
         return schedule.nearest[schedule.rows(self.times)]
 
-    def deviations(self: _Frames, frames: _Some = slice(None)) -> Float[Array, "F N n"]:
+    def deviations(self: _Frames, frames: FrameChoice = slice(None)) -> Float[Array, "F N n"]:
         """Return `errors` in some frames; those of absent agents are zero."""
         # delta_i = y_i - y_0 (theory page), which V and the certified set are written in.
-        y = self.states[frames] - self.offsets
+        y = self.states[frames] - self.offsets_in(frames)
         if self.presence is None:
             return y - y[:, self.nearest]
         away = y - np.take_along_axis(y, self.nearest_then[frames][:, :, None], axis=1)
         return np.where(self.presence[frames][:, :, None], away, 0.0)
 
-    def goals(self: _Frames, frames: _Some = slice(None)) -> Float[Array, "F N n"]:
+    def goals(self: _Frames, frames: FrameChoice = slice(None)) -> Float[Array, "F N n"]:
         """Return the states that the agents would have without errors, in some frames."""
         return self.states[frames] - self.deviations(frames)
 
-    def goal_distances(self: _Frames, frames: _Some = slice(None)) -> Float[Array, "F N"]:
+    def goal_distances(self: _Frames, frames: FrameChoice = slice(None)) -> Float[Array, "F N"]:
         """Return `formation_errors` in some frames."""
         # Where a square overflows, the length is infinite.
         with np.errstate(over="ignore", invalid="ignore"):
             return np.linalg.norm(self.deviations(frames)[:, :, list(self.measured)], axis=2)
 
     def least_distances(
-        self: _Frames, frames: _Some = slice(None), scales: Float[Array, " d"] | float = 1.0
+        self: _Frames, frames: FrameChoice = slice(None), scales: Float[Array, " d"] | float = 1.0
     ) -> Float[Array, " F"] | None:
         """Return the smallest distance between two agents in frames, NaN if one is not finite.
 

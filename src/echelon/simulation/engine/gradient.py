@@ -52,6 +52,8 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
             one number;
             `settings.engine` is `native`, and native code is unavailable.
     """
+    if parts.formation.motion is not None:
+        raise SimulationError("got a formation that changes, but derivatives are of constant ones.")
     if parts.world.network is not None:
         raise SimulationError("got a network, but derivatives are of messages that are never late.")
     if parts.drive.safety is not None:

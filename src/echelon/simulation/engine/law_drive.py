@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, TypeVar, final
 import jax
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.world import World
 from echelon.core.errors import (
@@ -140,6 +141,26 @@ class Laws(Drive):
             )
         self.follower.check_late(graph, dt)
 
+    def check_motion(self, formation: Formation, graph: Graph) -> tuple[str, ...]:
+        """Return that a law of states lags behind, and which reshapes lead agents together.
+
+        Raises:
+            LawError: with `safety`, the leader's offset changes.
+        """
+        motion = formation.motion
+        assert motion is not None
+        if self.safety is not None and motion.moves([*graph.leaders, *graph.heirs]):
+            raise LawError(
+                "`safety` keeps agents apart that move relative to the leader, whose own offset "
+                "must be constant; leave out its new offset."
+            )
+        if type(self.follower).goal_offset is not Law.goal_offset:
+            return ()
+        return (
+            f"the law `{type(self.follower).__name__}` uses the position and the velocity of "
+            "offsets that change with time, and lags behind them; `stopping-point` does not.",
+        )
+
     def check_heirs(self, graph: Graph) -> None:
         """Check that followers can take the lead, and leaders can follow.
 
@@ -177,8 +198,11 @@ class Laws(Drive):
             LawError: one is refused.
         """
         if isinstance(self.follower, FlatLaw) and self.safety is not None:
-            rows = problem.graph, problem.formation.offsets, problem.settings.dt
-            check_numbers(self.follower, problem.model, *rows)
+            motion, dt = problem.formation.motion, problem.settings.dt
+            least = 1.0 if motion is None else motion.least_scale
+            for shape in problem.formation.shapes:
+                rows = problem.graph, least * shape.offsets, dt
+                check_numbers(self.follower, problem.model, *rows)
         refused = self.refusals(problem.model, problem.graph, problem.states[None])
         for _, agent, text in refused:
             raise LawError(f"agent {agent} starts where its law has no meaning: {text}.")

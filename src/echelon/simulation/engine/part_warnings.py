@@ -7,6 +7,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
+from echelon.agents.network.formation_motion import FormationMotion
 from echelon.core.errors import listing
 from echelon.core.numerics import precision
 from echelon.core.types import Array
@@ -15,6 +16,8 @@ from echelon.simulation.engine.parts import Parts
 
 _HALF_TURN = 3.0
 """Below half a turn in rad: no smaller spread is looked at, since `difference` is compiled."""
+_MET = 1e-9
+"""m; agents without a radius that come so near to each other meet."""
 _SETTLES = 3.0
 """Time constants after which an actuator has made 95 % of a step."""
 
@@ -27,7 +30,11 @@ def part_warnings(parts: Parts, states: Array, horizon: float) -> Iterator[str]:
         states: (N, n) at time zero.
         horizon: s.
     """
-    yield from _goals(parts.model, parts.formation)
+    for shape in parts.formation.shapes:
+        yield from _goals(parts.model, shape)
+    motion = parts.formation.motion
+    if motion is not None and parts.drive.safety is None:
+        yield from _meetings(parts.model, motion)
     yield from _starts(parts.model, states)
     yield from _spreads(parts)
     actuator = parts.world.actuator
@@ -61,6 +68,16 @@ def _goals(model: ControlAffine, formation: Formation) -> Iterator[str]:
             yield (
                 f"the goals of agents {i} and {j} are {closest.distance:.3g} m apart, and agents "
                 f"of radius {model.radius:.2g} m touch below {2.0 * model.radius:.3g} m."
+            )
+
+
+def _meetings(model: ControlAffine, motion: FormationMotion) -> Iterator[str]:
+    """Yield the reshapes in which agents touch on their straight ways."""
+    for begin, i, j, apart in motion.meetings():
+        if apart <= 2.0 * (model.radius or 0.0) + _MET:
+            yield (
+                f"in the reshape at {begin:g} s agents {i} and {j} come within {apart:.3g} m of "
+                "each other; add `safety`, or choose other places."
             )
 
 

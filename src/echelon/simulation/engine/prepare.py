@@ -59,7 +59,7 @@ def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepare
     check_given(parts, settings)
     # By their bits too, since somebody may write to an array in them; a graph never changes.
     mutable = parts.model, parts.drive, parts.initial, parts.start_error, parts.world
-    bits = digest((mutable, parts.formation.offsets, settings))
+    bits = digest((mutable, parts.formation.offsets, parts.formation.motion, settings))
     key = None if bits is None else (parts, bits)
     prepared = _CACHE.get_or_make(key, lambda: _prepare(parts, settings, to_store))
     if to_store:
@@ -106,6 +106,8 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         )
         parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)
+        if parts.formation.motion is not None:
+            warnings += parts.drive.check_motion(parts.formation, graph)
     warnings += (*part_warnings(parts, problem.states, settings.horizon),)
     # Model and drive may say the same; a dictionary keeps the first, and the order.
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))

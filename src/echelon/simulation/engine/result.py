@@ -18,7 +18,7 @@ from echelon.core.lazy_field import LazyField
 from echelon.core.pages import CellPage, notebook_page
 from echelon.core.types import Array
 from echelon.core.words import amount
-from echelon.simulation.engine.frame_numbers import FrameNumbers
+from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.traffic import Traffic, traffic
 from echelon.simulation.step.drive import Drive
@@ -134,8 +134,14 @@ class Result(FrameNumbers):
 
     @property
     def offsets(self) -> Array:
-        """The goal offsets, (N, n)."""
+        """The goal offsets, (N, n); of a formation that changes with time, the first ones."""
         return self.formation.offsets
+
+    def offsets_in(self, frames: FrameChoice = slice(None)) -> Float[Array, "*F N n"]:
+        """Return the goal offsets in some frames, (F, N, n), or constant ones, (N, n)."""
+        if self.formation.motion is None:
+            return self.offsets
+        return self.formation.offsets_at(self.times[frames])
 
     @property
     def nearest(self) -> Array:

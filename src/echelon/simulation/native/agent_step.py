@@ -87,6 +87,8 @@ def check_information(loop: Loop) -> None:
     Raises:
         Unsupported: they do not.
     """
+    if loop.moving is not None:
+        raise Unsupported("formations that change with time")
     if loop.channel is not None:
         raise Unsupported("a network that is not ideal")
     if loop.sensors is not None:

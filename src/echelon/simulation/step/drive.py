@@ -188,6 +188,17 @@ class Drive(eqx.Module):
             EchelonError: there is none, such as for a plan that violates a constraint.
         """
 
+    def check_motion(self, formation: Formation, graph: Graph) -> tuple[str, ...]:
+        """Return warnings of a formation that changes with time.
+
+        Raises:
+            EchelonError: the drive cannot follow it.
+        """
+        raise SimulationError(
+            "a formation that changes with time needs control laws, and plans and receding "
+            "horizons have constant offsets; leave out `motion`."
+        )
+
     @property
     def gain(self) -> "Gain | None":
         """The followers' gain; None where they have none."""

@@ -10,14 +10,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.exchange import Exchange
+from echelon.agents.network.formation_motion import FormationMotion, OwnOffset
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.sensing import Sensors
-from echelon.core.types import Array, PyTree, States
+from echelon.core.types import Array, PyTree, Scalar, States
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law, Memory, without_certificates
 from echelon.simulation.step.drive import Problem
@@ -51,6 +52,7 @@ class Loop(eqx.Module):
         channel: what the network does to messages; None for the ideal network.
         sensors: of the agents' own states; None for exact ones.
         share: of the feed-forward that followers use; None for all of it.
+        moving: how the offsets change with time; None for constant ones.
     """
 
     model: ControlAffine
@@ -72,12 +74,46 @@ class Loop(eqx.Module):
     channel: Channel | None = None
     sensors: Sensors | None = None
     share: Array | None = None
+    moving: FormationMotion | None = None
 
     def with_motion(self, row: PyTree) -> "Loop":
         """Return the loop of one agent whose plant has the parameters of a row; None for no row."""
         if row is None:
             return self
         return dataclasses.replace(self, motion=self.motion.of_row(row))
+
+
+def offsets_at(
+    loop: Loop, law: Law, t: Scalar, agents: Array | jax.Array
+) -> tuple[Float[jax.Array, "K n"], Float[jax.Array, "K n"] | None]:
+    """Return what agents (K,) under a law take for their offsets at a time (s), and the rates.
+
+    There are no rates of constant offsets, or where the law does not use them.
+    """
+    offsets, motion = jnp.asarray(loop.offsets, t.dtype)[agents], loop.moving
+    if motion is None:
+        return offsets, None
+    rows = offsets, jnp.asarray(motion.places, t.dtype)[agents]
+    return jax.vmap(lambda *row: law.goal_offset(loop.model, OwnOffset(motion, *row), t))(*rows)
+
+
+def all_offsets(loop: Loop, t: jax.Array) -> Float[jax.Array, "N n"]:
+    """Return what all agents take for their offsets at a time (s)."""
+    if loop.moving is None:
+        return jnp.asarray(loop.offsets, t.dtype)
+    laws = (loop.leader, loop.leaders), (loop.follower, loop.followers)
+    return jnp.concatenate([offsets_at(loop, law, t, agents)[0] for law, agents in laws])[
+        loop.order
+    ]
+
+
+def goals_at(loop: Loop, now: "Moment") -> Float[jax.Array, "N n"] | None:
+    """Return the offsets of all agents, as errors are measured; None of constant ones."""
+    motion, t = loop.moving, time_of(loop, now)
+    if motion is None:
+        return None
+    rows = jnp.asarray(loop.offsets, t.dtype), jnp.asarray(motion.places, t.dtype)
+    return jax.vmap(lambda *row: OwnOffset(motion, *row).state(t))(*rows)
 
 
 class Switches(NamedTuple):
@@ -249,6 +285,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         succession=Succession.of(graph, problem.leadership),
         channel=problem.channel,
         sensors=problem.sensors,
+        moving=problem.formation.motion,
     )
 
 
@@ -270,3 +307,9 @@ def begin_forgetful(loop: Loop, states: Any) -> Moment:
     cut: Any = np.zeros((len(states), len(loop.model.input_names)), np.int8)
     step: Any = np.zeros((), np.int32)
     return Moment(step, states, loop.leader.init(), loop.follower.init(), cut)
+
+
+def time_of(loop: Loop, now: Moment) -> jax.Array:
+    """Return the time (s) of a moment."""
+    # From the step number, since a sum of many dt would gather rounding.
+    return now.step.astype(now.states.dtype) * loop.motion.dt

@@ -22,7 +22,15 @@ from echelon.simulation.step.knowledge import (
     understand,
     write,
 )
-from echelon.simulation.step.loop import Cast, Loop, Moment, WorldState, present_at, since_at
+from echelon.simulation.step.loop import (
+    Cast,
+    Loop,
+    Moment,
+    WorldState,
+    offsets_at,
+    present_at,
+    since_at,
+)
 
 
 def all_readers(agents: int, leaders: Array) -> Readers:
@@ -192,8 +200,7 @@ def send_messages(
     channel, numbers = loop.channel, loop.leaders
     assert channel is not None
     t = now.step.astype(sent.dtype) * loop.motion.dt
-    offsets = jnp.asarray(loop.offsets, sent.dtype)
-    own = now.states[numbers], offsets[numbers], now.leader_memory
+    own = now.states[numbers], offsets_at(loop, loop.leader, t, numbers)[0], now.leader_memory
     rows = *own, sent[numbers], forward, inputs
     content = jax.vmap(lambda *row: content_of(loop, t, *row))(*rows)
     content = jnp.zeros_like(mail.packet.content).at[numbers].set(content)

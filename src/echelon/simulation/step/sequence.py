@@ -19,9 +19,13 @@ from echelon.simulation.step.loop import (
     Loop,
     Moment,
     WorldState,
+    all_offsets,
     exchange_at,
+    goals_at,
     nearest_at,
+    offsets_at,
     present_at,
+    time_of,
 )
 from echelon.simulation.step.messages import (
     begin_network,
@@ -186,9 +190,8 @@ def _act_all(
     near: Near | None = None,
 ) -> Action:
     """Return what some agents do, with what they are sent (K, k), remember and know of others."""
-    x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
-    # From the step number, since a sum of many dt would gather rounding.
-    t = now.step.astype(x.dtype) * loop.motion.dt
+    x, t = now.states, time_of(loop, now)
+    offsets, rates = offsets_at(loop, law, t, agents)
 
     # One time for all; of everything else, an agent sees its own row and no other.
     def one(
@@ -199,12 +202,13 @@ def _act_all(
         memory: Memory,
         row: PyTree,
         near: Near | None,
+        rate: State | None,
     ) -> Action:
-        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near)
+        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near, rate)
         return act(loop.with_motion(row), law, view, memory, leads)
 
     rows, near = jax.tree.map(lambda leaf: leaf[agents], (loop.motion.rows, near))
-    return jax.vmap(one)(x[agents], offsets[agents], z[agents], forward, memory, rows, near)
+    return jax.vmap(one)(x[agents], offsets, z[agents], forward, memory, rows, near, rates)
 
 
 def _by_depth(loop: Loop, now: Moment, led: Action, z: Float[jax.Array, "N s"]) -> Action:
@@ -255,7 +259,7 @@ def signals(
 
 def _sent(loop: Loop, now: Moment) -> tuple[Float[jax.Array, "N s"], Difference]:
     """Return what all agents send to their neighbours, and how far two such values are apart."""
-    offsets = jnp.asarray(loop.offsets, now.states.dtype)
+    offsets = all_offsets(loop, time_of(loop, now))
     sent = signals(loop, now, offsets)
     if sent is not None:
         return sent, operator.sub
@@ -342,7 +346,7 @@ def measured_step(
     chatter = (acted.cut * now.cut < 0).any(axis=1)
     moment, here = (now.step, now.states, acted.inputs), present_at(loop, now.step)
     meter = loop.meter if here is None else loop.meter.following(nearest_at(loop, now.step))
-    read = meter.read(*moment, acted.limited, chatter, followed)
+    read = meter.read(*moment, acted.limited, chatter, followed, goals_at(loop, now))
     active = loop.follower.active(acted.follower_memory)
     if active is not None:
         every = jnp.zeros(len(now.states), active.dtype).at[loop.followers].set(active)
