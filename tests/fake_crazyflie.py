@@ -160,20 +160,20 @@ class Crazyflie:
         return due
 
 
-def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=None):
-    """Serve vehicles in real time until the standard input ends."""
+def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=None, speed=1.0):
+    """Serve vehicles until the standard input ends; in slow motion with a speed below 1."""
     vehicles = Vehicles(starts, mass, gain, lag, **(response or IDENTIFIED))
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in starts]
     for k, end in enumerate(sockets):
         end.bind(("127.0.0.1", port + k))
         end.setblocking(False)
     crazyflies, peers = [Crazyflie() for _ in starts], [None] * len(starts)
-    rows, dt, begun, steps = [], 0.002, time.monotonic(), 0
+    rows, dt, real, begun, steps = [], 0.002, 0.002 / speed, time.monotonic(), 0
     print("ready", flush=True)
     while True:
         now = time.monotonic()
         ends, _, _ = select.select(
-            [*sockets, sys.stdin], [], [], max(0.0, begun + steps * dt - now)
+            [*sockets, sys.stdin], [], [], max(0.0, begun + steps * real - now)
         )
         if sys.stdin in ends:
             break
@@ -183,12 +183,12 @@ def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=No
             packet, peers[k] = end.recvfrom(64)
             for answer in crazyflies[k].answer(packet, now):
                 end.sendto(answer, peers[k])
-        while begun + steps * dt <= now:
+        while begun + steps * real <= now:
             vehicles.command = np.array([each.acting(now) for each in crazyflies])
             vehicles.step(dt)
             steps += 1
         state = vehicles.p, vehicles.v, vehicles.q, vehicles.w
-        rows.append([now, *vehicles.p.ravel()])
+        rows.append([begun + steps * real, *vehicles.p.ravel()])
         for k, each in enumerate(crazyflies):
             for packet in each.logged(*(part[k] for part in state), now):
                 if peers[k]:

@@ -149,6 +149,8 @@ def test_defaults():
         "sensing": None,
         "safety": None,
         "network": None,
+        "events": (),
+        "leadership": None,
         "simulation": {
             "horizon": 30.0,
             "dt": 0.01,
@@ -279,7 +281,8 @@ def test_an_unknown_section_gets_a_guess(refused):
     assert refused(seed="sed: 0") == [
         "s.yaml:11: sed: got an unknown key, allowed are `name`, `model`, `plant`, `graph`,"
         " `formation`, `reference`, `leader`, `follower`, `safety`, `initial`,"
-        " `disturbance`, `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed`"
+        " `disturbance`, `actuator`, `sensing`, `network`, `events`, `leadership`, `simulation`,"
+        " `report`, `live`, `seed`"
         " (did you mean `seed`?)."
     ]
 
@@ -388,7 +391,8 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, got):
     assert str(caught.value) == (
         f"{file}:1: got {got}, allowed is a mapping with the keys `name`, `model`, `plant`,"
         " `graph`, `formation`, `reference`, `leader`, `follower`, `safety`, `initial`,"
-        " `disturbance`, `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed`."
+        " `disturbance`, `actuator`, `sensing`, `network`, `events`, `leadership`, `simulation`,"
+        " `report`, `live`, `seed`."
     )
 
 

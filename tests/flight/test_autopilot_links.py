@@ -10,6 +10,7 @@ import pytest
 from fake_crazyflie import Crazyflie, packed
 
 from echelon.core.errors import FlightError, MissingExtraError
+from echelon.flight import __main__ as process
 from echelon.flight.links.cflib_link import CflibLink
 from echelon.flight.links.link import open_link
 from echelon.flight.links.px4_link import Px4Link
@@ -116,9 +117,18 @@ class Stub:
     def __init__(self):
         self.fake, self.configs, self.armed = Crazyflie(), [], []
         self.commander, self.connection_lost = Commander(self.fake), Callbacks()
-        self.param = SimpleNamespace(set_value=self.fake.parameters.__setitem__)
+        self.confirm = Callbacks()
+        self.param = SimpleNamespace(
+            set_value=self.set_value,
+            add_update_callback=lambda group, name, cb: self.confirm.append(cb),
+        )
         self.log = SimpleNamespace(add_config=self.configs.append)
         self.supervisor = SimpleNamespace(send_arming_request=self.armed.append)
+
+    def set_value(self, name, value):
+        self.fake.parameters[name] = value
+        for call in self.confirm:
+            call(name, str(value))
 
     def arrive(self, **values):
         names = self.configs[0].variables
@@ -137,14 +147,22 @@ def crazyflie(monkeypatch):
 
 def test_attitudes_reach_the_crazyflie_with_the_signs_of_echelon(crazyflie):
     link = CflibLink("", facts(), crazyflie)
-    assert crazyflie.armed == [True] and crazyflie.fake.parameters["stabilizer.controller"] == 2
-    assert not crazyflie.fake.locked and link.watchdog
+    assert crazyflie.armed == [] and crazyflie.fake.locked and link.watchdog
     link.send([0.1, 0.2, -0.3, 0.25])
+    assert crazyflie.armed == [True] and crazyflie.fake.parameters["stabilizer.controller"] == 2
+    assert not crazyflie.fake.locked
     assert crazyflie.fake.command == pytest.approx([0.1, 0.2, -0.3, 0.25], abs=4e-6)
     strong = CflibLink("radio://0/80/2M#0.72", facts(), crazyflie)
     crazyflie.fake.full = 0.72
     strong.send([0.0, 0.0, 0.0, 0.5])
     assert crazyflie.fake.command[3] == pytest.approx(0.5, abs=6e-6)
+
+
+def test_a_crazyflie_that_keeps_another_controller_is_refused(crazyflie, monkeypatch):
+    monkeypatch.setattr("echelon.flight.links.cflib_link._PATIENCE", 0.01)
+    crazyflie.param.set_value = lambda *_: None
+    with pytest.raises(FlightError, match="does not confirm its parameter `stabilizer.controller`"):
+        CflibLink("", facts(), crazyflie)
 
 
 def test_the_newest_state_is_read_once(crazyflie):
@@ -302,6 +320,30 @@ def test_px4_is_read_and_commanded_in_its_own_frames(px4):
     assert ("heartbeat", (18, 8, 0, 0, 0)) in wire.mav.sent
     link.close()
     assert wire.closed
+
+
+@pytest.mark.parametrize("error", [ImportError("No module named 'serial'"), OSError("no port")])
+def test_an_address_that_cannot_be_opened_is_one_sentence(px4, monkeypatch, error):
+    px4(HOVER)
+
+    def refuse(_, dialect):
+        raise error
+
+    monkeypatch.setattr(sys.modules["pymavlink"].mavutil, "mavlink_connection", refuse)
+    with pytest.raises(FlightError, match=f"`px4://rubbish` cannot be opened: {error}"):
+        Px4Link("rubbish", facts())
+
+
+def test_a_missing_library_ends_a_process_with_a_sentence_and_its_code(monkeypatch, capsys):
+    def missing(*_):
+        raise MissingExtraError("a Crazyflie needs cflib.")
+
+    monkeypatch.setattr(process, "_options", lambda: SimpleNamespace(folder=None))
+    monkeypatch.setattr(process, "Mission", missing)
+    with pytest.raises(SystemExit) as left:
+        process.main()
+    assert left.value.code == 4
+    assert capsys.readouterr().err == "echelon: a Crazyflie needs cflib.\n"
 
 
 def modes(wire):

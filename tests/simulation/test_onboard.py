@@ -356,29 +356,31 @@ def test_single_precision_compiles_and_is_numpys_own_to_the_bit(agent, tmp_path)
 # ---- machine code of a microcontroller -----------------------------------------------------------
 
 
+LARGEST = {"consensus": 4000, "stopping-point": 7000, "its-leader": 9000}
+"""Bytes of a tick."""
+
+
 @pytest.mark.skipif(not is_installed(), reason="no llvmlite")
-def test_machine_code_of_a_microcontroller_calls_nothing(agent):
+def test_machine_code_of_a_microcontroller_is_small_and_calls_nothing(agent, request):
     single = law_functions(agent.own_law, 32)
-    image = object_file(single.values())
-    names, _, undefined = symbols(image)
-    assert names == {f"law_{name}" for name in single} and not undefined
+    sizes, undefined = symbols(object_file(single.values()))
+    assert {*sizes} == {f"law_{name}" for name in single} and not undefined
+    assert sizes["law_tick"] <= LARGEST[request.node.callspec.params["agent"]], sizes
 
 
 def symbols(image):
-    """Return the global names, the size of the code, and what is undefined, of an ELF file."""
+    """Return the size of each function, and what is undefined, of an ELF file for ARM."""
     assert image[:5] == b"\x7fELF\x01" and struct.unpack_from("<H", image, 18) == (40,)
-    [start], (size, count) = (
-        struct.unpack_from("<I", image, 32),
-        struct.unpack_from("<HH", image, 46),
-    )
+    [start] = struct.unpack_from("<I", image, 32)
+    size, count = struct.unpack_from("<HH", image, 46)
     sections = [struct.unpack_from("<10I", image, start + k * size) for k in range(count)]
-    code = sum(s[5] for s in sections if s[1] == 1 and s[2] & 2)
     [table] = (s for s in sections if s[1] == 2)
     strings = sections[table[6]][4]
-    names, undefined = set(), set()
+    sizes, undefined = {}, set()
     for at in range(table[4] + 16, table[4] + table[5], 16):
-        name, _, _, info, _, section = struct.unpack_from("<IIIBBH", image, at)
+        name, _, length, info, _, section = struct.unpack_from("<IIIBBH", image, at)
         if info >> 4:
             text = image[strings + name : image.index(b"\0", strings + name)].decode()
-            (names if section else undefined).add(text)
-    return names, code, undefined
+            sizes |= {text: length} if section else {}
+            undefined |= set() if section else {text}
+    return sizes, undefined

@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from echelon.core.errors import FlightError
+from echelon.core.errors import EchelonError, FlightError
 from echelon.flight.agent_process import AgentProcess, Crew
 from echelon.flight.air import LOOPBACK, PORT, Address, Air, ports_of, read_address
 from echelon.flight.links.link import Link, open_link
@@ -25,7 +25,7 @@ def main() -> None:
     options = _options()
     try:
         code = _run(Mission(options.folder), options)
-    except FlightError as error:
+    except EchelonError as error:
         print(f"echelon: {error}", file=sys.stderr)
         code = error.exit_code
     except KeyboardInterrupt:

@@ -10,7 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from echelon.agents.models.chains import Chains, chains_of, check_bounds, flatten, switch_on
+from echelon.agents.models.chains import (
+    Chains,
+    chains_of,
+    check_bounds,
+    flat_output,
+    flatten,
+    switch_on,
+)
 from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ModelError, listing
@@ -38,6 +45,7 @@ _SPREAD = 0.125
 """Roots of a rate r are r, 1.125 r, 1.25 r, ..: distinct, as the certificate requires."""
 _REST = 1e-9
 """Of a bounded length: what floats leave of 0."""
+_SAMPLES = 16
 _LEAST = 1e-3
 """Of the push upward at the trim: what is left of it a thousandth of a radian from the border."""
 
@@ -55,10 +63,11 @@ class FlatLaw(Law):
         rate: the slowest root, in place of `roots`; the others follow from it.
         coupling: c > 0.
         speed: s, of all outputs or one each, in their units per second; infinite is linear. By
-            default what the model's bounds allow, computed by `prepared`.
+            default what the model's bounds allow.
         observer: of the acceleration that the model lacks, which is compensated; True for the
             default one, False for none.
         loop: of the model; computed by `prepared`.
+        speeds: s in use; computed by `prepared`.
     """
 
     roots: tuple[float, ...] | None = eqx.field(default=None, static=True)
@@ -67,6 +76,7 @@ class FlatLaw(Law):
     speed: Speed | None = eqx.field(default=None, converter=plain_speeds)
     observer: Observer = eqx.field(default=Observer(), static=True, converter=Observer.of)
     loop: FlatLoop | None = None
+    speeds: Speed | None = None
 
     def __check_init__(self) -> None:
         """Check that roots are distinct and positive, and other numbers positive."""
@@ -123,8 +133,8 @@ class FlatLaw(Law):
 
     def speed_of(self, output: int) -> float:
         """Return s of an output."""
-        assert self.speed is not None, "`prepared` finds the speeds"
-        return float(self.speed[output] if isinstance(self.speed, Sequence) else self.speed)
+        assert self.speeds is not None, "`prepared` finds the speeds"
+        return float(self.speeds[output] if isinstance(self.speeds, Sequence) else self.speeds)
 
     def build_loop(self, model: ControlAffine) -> FlatLoop:
         """Return the inner loop for a model.
@@ -185,7 +195,7 @@ class FlatLaw(Law):
     def bounded(self, x: jax.Array) -> jax.Array:
         """Return sigma(x) = x / sqrt(1 + (x/s)^2): odd, increasing, of slope 1 at 0, below s."""
         # By the inverse, which is 0 where s is infinite and sigma is linear.
-        inverse = 1.0 / jnp.asarray(self.speed, x.dtype)
+        inverse = 1.0 / jnp.asarray(self.speeds, x.dtype)
         return x * jax.lax.rsqrt(1.0 + (x * inverse) ** 2)
 
     # ---- what any agent does ----
@@ -257,6 +267,27 @@ class FlatLaw(Law):
             )
         return places
 
+    def check_places(self, model: ControlAffine) -> None:
+        """Check that the flat outputs with the names of the position are the position.
+
+        Raises:
+            LawError: they are not; seen at samples.
+        """
+        self.places(model)
+        draw = np.random.default_rng(0)
+        # Near the trim and far from it.
+        sizes = np.repeat([0.5, 5.0, 50.0], _SAMPLES)[:, None]
+        away = sizes * draw.uniform(-1.0, 1.0, (len(sizes), len(model.state_names)))
+        states = jnp.asarray(np.asarray(model.trim[0], float) + away)
+        values = jax.vmap(lambda x: flat_output(model, tuple(model.position), x))(states)
+        off = np.abs(np.asarray(values - states[:, list(model.position_indices())])).max(axis=0)
+        wrong = np.flatnonzero(~(off <= _REST))
+        if len(wrong):
+            raise LawError(
+                f"`safety` needs the position of `{type(model).__name__}` among its flat outputs, "
+                f"and its output `{model.position[wrong[0]]}` is not the state of that name."
+            )
+
     def message(self, model: ControlAffine, x: State, v: Input, memory: FlatMemory) -> jax.Array:
         """Return zeta', (m,)."""
         return memory.rate
@@ -304,11 +335,6 @@ class FlatLaw(Law):
 
 def _moves(speed: object) -> bool:
     return isinstance(speed, int | float) and speed > 0.0
-
-
-def waits_for_path(model: ControlAffine) -> bool:
-    """Tell whether the speeds that a model tolerates depend on the leader's path."""
-    return any(len(bound.outputs) > 1 for bound in model.flat_bounds or ())
 
 
 def _left(roots: tuple[float, ...], bound: FlatBound, slowest: float) -> float:

@@ -353,10 +353,10 @@ def check_gain_fits(
 
 
 def gain_of(law: Law) -> Gain | None:
-    """Return the gain of a law; None where it has none."""
+    """Return the gain of a law, of a prepared leader the one in use; None where it has none."""
     # By name, since a user's own law need not have one.
-    gain = getattr(law, "gain", None)
-    return gain if isinstance(gain, Gain) else None
+    named = (getattr(law, name, None) for name in ("regulator", "gain"))
+    return next((gain for gain in named if isinstance(gain, Gain)), None)
 
 
 def reference_of(law: object) -> Guide | None:

@@ -44,6 +44,7 @@ class Safety:
             pass each other on the right.
         margin: added to the distance that the filter keeps, m.
         reach: scaled distance up to which others are regarded, m.
+        of_model: the radii where none are given; set by `prepared`.
 
     Raises:
         LawError: a number is out of its range.
@@ -54,6 +55,7 @@ class Safety:
     swirl: float = 0.5
     margin: float = 0.05
     reach: float = 3.0
+    of_model: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -72,10 +74,16 @@ class Safety:
                 raise LawError(f"`{name}` of `safety` is {value}, and must be {allowed}.")
 
     @property
+    def size(self) -> tuple[float, ...]:
+        """The radii of the ellipsoid along x, y and z, m, as given or of the model."""
+        size = self.radii or self.of_model
+        assert size is not None, "`prepared` finds the radii"
+        return size
+
+    @property
     def touching(self) -> float:
         """The scaled distance at which two ellipsoids touch, m."""
-        assert self.radii is not None, "`prepared` finds the radii"
-        return 2.0 * self.radii[0]
+        return 2.0 * self.size[0]
 
     @property
     def distance(self) -> float:
@@ -97,12 +105,13 @@ class Safety:
         radius = model.radius
         if radius is None:
             raise LawError(f"`safety` needs `radii`, since `{name}` has no `radius`.")
-        return dataclasses.replace(self, radii=(radius, radius, _DOWNWASH * radius))
+        if not _positive(radius):
+            raise LawError(f"`radius` of `{name}` is {radius}, and must be positive, m.")
+        return dataclasses.replace(self, of_model=(radius, radius, _DOWNWASH * radius))
 
     def scales(self, model: ControlAffine) -> Array:
         """Return the factors (d,) of the position's coordinates in scaled distances."""
-        assert self.radii is not None, "`prepared` finds the radii"
-        return np.array([self.radii[0] / self.radii[AXES.index(x)] for x in model.position])
+        return np.array([self.size[0] / self.size[AXES.index(x)] for x in model.position])
 
     def needed_reach(self, speeds: Float[Array, " d"], scales: Float[Array, " d"]) -> float:
         """Return the distance beyond which no row can act, for agents of some speeds, m/s."""

@@ -31,7 +31,6 @@ from echelon.laws.flat_law import (
     SHARE,
     SPEED,
     FlatLaw,
-    waits_for_path,
 )
 from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Expected, Law, LocalView
@@ -58,16 +57,14 @@ class GraphDemand(eqx.Module):
             the mean over a period, or of the last one.
         heaviest: d_max, the largest sum of a follower's weights.
         links: how many speeds add up on the path from a leader.
-        waits: whether the speed is left out, and follows from the leader's path.
     """
 
     slowest: float
     heaviest: float
     links: int = 1
-    waits: bool = False
 
     @classmethod
-    def of(cls, graph: Graph, leaderward: bool, links: int, waits: bool) -> "GraphDemand":
+    def of(cls, graph: Graph, leaderward: bool, links: int) -> "GraphDemand":
         """Return it of a graph.
 
         Raises:
@@ -79,7 +76,7 @@ class GraphDemand(eqx.Module):
         if schedule is None:
             # With one-way edges the Laplacian is triangular: its eigenvalues are its diagonal.
             slowest = float(own.min()) if leaderward else graph.spectrum().low
-            return cls(slowest, float(own.max()), links, waits)
+            return cls(slowest, float(own.max()), links)
         share = np.eye(len(own))[-1]
         if schedule.period is not None:
             share = np.diff(schedule.starts, append=schedule.period) / schedule.period
@@ -90,7 +87,7 @@ class GraphDemand(eqx.Module):
                 f"the leader does not reach everybody from {schedule.starts[-1]:g} s on where "
                 "neighbours nearer to it alone are heard; set `hears: all`, or add edges there."
             )
-        return cls(slowest, float(own.max()), links, waits)
+        return cls(slowest, float(own.max()), links)
 
 
 @final
@@ -152,27 +149,25 @@ class StoppingPoint(FlatLaw):
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "StoppingPoint":
         """Find the model's chains, and the graph's properties for the coupling."""
-        if self.loop is not None:
-            return self
         links = 1
         if self.feedforward is Feedforward.PARENT:
             # Raises where the graph is no tree.
             graph.parents()
             links = int(graph.depths().max())
         loop = self.build_loop(model)
-        waits = self.speed is None and waits_for_path(model)
-        reach = GraphDemand.of(graph, self.leaderward, links, waits)
-        speed = self.speeds_within(model, loop.chains, SPEED, _share(links), links)
+        reach = GraphDemand.of(graph, self.leaderward, links)
+        speeds = self.speeds_within(model, loop.chains, SPEED, _share(links), links)
+        # All of it anew, since a law may come from a run of another model or graph.
         law = eqx.tree_at(
-            lambda law: (law.loop, law.reach, law.ahead, law.speed),
+            lambda law: (law.loop, law.reach, law.ahead, law.speeds),
             self,
-            (loop, reach, np.zeros_like(loop.weights), speed),
+            (loop, reach, np.zeros_like(loop.weights), speeds),
             is_leaf=lambda part: part is None,
         )
         if self.safety is None:
             return law
         law = dataclasses.replace(law, safety=self.safety.prepared(model))
-        law.places(model)
+        law.check_places(model)
         return law
 
     def following(self, leader: Law, model: ControlAffine) -> "StoppingPoint":
@@ -190,14 +185,10 @@ class StoppingPoint(FlatLaw):
             )
         ahead = beginning_of(leader, model)
         assert self.reach is not None
-        same = np.array_equal(np.asarray(self.ahead), ahead)
-        law = self if same else eqx.tree_at(lambda law: law.ahead, self, ahead)
-        if not self.reach.waits:
-            return law
-        free = eqx.tree_at(lambda law: law.speed, law, None, is_leaf=lambda x: x is None)
         links, slowest = self.reach.links, functools.partial(leader.slowest_along, model)
-        speed = free.speeds_within(model, self.loop.chains, SPEED, _share(links), links, slowest)
-        return eqx.tree_at(lambda law: law.speed, law, speed)
+        # A bound of several outputs leaves more speed where the path keeps away from it.
+        speeds = self.speeds_within(model, self.loop.chains, SPEED, _share(links), links, slowest)
+        return eqx.tree_at(lambda law: (law.ahead, law.speeds), self, (ahead, speeds))
 
     def check_late(self, graph: Graph, period: float) -> None:
         """Check that no stopping point passes its neighbours' within a step: c d_max dt <= 1."""
@@ -233,7 +224,7 @@ class StoppingPoint(FlatLaw):
         if self.safety is None or view.near is None:
             return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period)
         places = np.array(self.places(model))
-        speeds = jnp.broadcast_to(jnp.asarray(self.speed, view.x.dtype), pull.shape)[places]
+        speeds = jnp.broadcast_to(jnp.asarray(self.speeds, view.x.dtype), pull.shape)[places]
         scales = jnp.asarray(self.safety.scales(model), view.x.dtype)
         rate, active = self.safety.filtered(-pull[places], view.near, scales, speeds)
         # Where no row acts it is the same to the bit.
@@ -261,8 +252,6 @@ class StoppingLeader(FlatLaw):
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "StoppingLeader":
         """Find the model's chains, and check that it can be led along the reference."""
-        if self.loop is not None:
-            return self
         loop = self.build_loop(model)
         if self.reference is not None:
             check_reference(self.reference)
@@ -275,14 +264,14 @@ class StoppingLeader(FlatLaw):
             self.reference.fit(model)
         none = {"is_leaf": lambda part: part is None}
         law = eqx.tree_at(lambda law: law.loop, self, loop, **none)
-        speed = self.speeds_within(
+        speeds = self.speeds_within(
             model,
             loop.chains,
             LEAD_SPEED,
             LEAD_SHARE,
             slowest=functools.partial(law.slowest_along, model),
         )
-        return eqx.tree_at(lambda law: law.speed, law, speed, **none)
+        return eqx.tree_at(lambda law: law.speeds, law, speeds, **none)
 
     def path(self, model: ControlAffine, t: Scalar) -> jax.Array:
         """Return the flat outputs to follow with their derivatives, (r + 1, m)."""
@@ -336,6 +325,9 @@ class StoppingLeader(FlatLaw):
         self, model: ControlAffine, view: LocalView, memory: FlatMemory
     ) -> tuple[Input, FlatMemory]:
         """Return the leader's input."""
+        if memory.active is not None:
+            # An heir that was held back when it took the lead gives way to nobody now.
+            memory = memory._replace(active=0.0 * memory.half)
         away = self.deviation(model, view.t, view.x, view.offset, memory)
         rate = self._rate(model, view.t, away, view.period)
         return self.ready.obey(model, view.x, rate, memory, view.period)
@@ -368,7 +360,7 @@ class StoppingLeader(FlatLaw):
         period: Scalar | float,
     ) -> Expected:
         """Return zeta_r + D and zeta_r' - sigma(c D), with D' = -sigma(c D) from the deviation."""
-        inverse = 1.0 / jnp.asarray(self.speed, deviation.dtype)
+        inverse = 1.0 / jnp.asarray(self.speeds, deviation.dtype)
         away = saturated_decay(deviation, self.strength(period), inverse, age)
         there = self.ready.stop(self.path(model, t)[:-1])
         return Expected(there + away, self._rate(model, t, away, period))

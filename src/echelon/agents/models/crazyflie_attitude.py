@@ -36,10 +36,10 @@ ATTITUDE_PARAMETERS: dict[str, dict[str, float]] = {
                              29.74357219, 0.18),
     "firmware": _FIRMWARE,
 }  # fmt: skip
-"""Named parameter sets. The first three were identified from flights with the firmware's controller
-2 (Mellinger) by the authors of crazyflow (`so_rpy/params.toml`, learnsyslab, 2026): mass with
-markers, propellers L250, P250, and the thrust upgrade kit. `firmware` is that controller's default
-gains (Bitcraze, `controller_mellinger.c`, 2026), linearized without the motors' lag."""
+"""Named parameter sets. The first three were identified from flights by the authors of crazyflow
+(`so_rpy/params.toml`, learnsyslab, 2026), who fly the firmware's controller 2 (Mellinger): mass
+with markers, propellers L250, P250, and the thrust upgrade kit. `firmware` is that controller's
+default gains (Bitcraze, `controller_mellinger.c`, 2026), linearized without the motors' lag."""
 
 
 class CrazyflieAttitude(RigidVehicle):

@@ -35,6 +35,8 @@ from echelon.experiments.scenario.world_parts import (
     actuator_of,
     check_world,
     disturbance_of,
+    events_of,
+    leadership_of,
     network_of,
     plants_of,
     sensing_of,
@@ -114,6 +116,8 @@ def _parts(
     """Return all parts, from the model, the graph and the reference."""
     plant, plants = plants_of(scenario, faults, model)
     disturbance = disturbance_of(scenario, faults, model)
+    leadership = leadership_of(scenario, faults, graph)
+    events = events_of(scenario, faults, graph, leadership)
     formation = faults.part(lambda: _formation(scenario, model, graph), "formation")
     follower = faults.part(lambda: _follower(scenario, faults, model, graph), "follower")
     reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
@@ -145,6 +149,8 @@ def _parts(
             sensing_of(scenario, faults, model),
             plants,
         ),
+        events=events,
+        leadership=leadership,
     )
     faults.settle()
     check_world(faults, parts, scenario.simulation.dt)

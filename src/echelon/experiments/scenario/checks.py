@@ -365,6 +365,19 @@ def _durations(data: Part) -> Iterator[Finding]:
         yield ("simulation", "horizon"), f"{got}."
 
 
+def _events(data: Part) -> Iterator[Finding]:
+    """Yield events that are not one thing, and times for which nothing lasts."""
+    events = data.get("events")
+    listed = enumerate(events if isinstance(events, list) else ())
+    for index, event in ((k, each) for k, each in listed if isinstance(each, dict)):
+        got = [f"`{key}`" for key in ("lose", "cut", "join") if event.get(key) is not None]
+        if len(got) != 1:
+            text = f"got {' and '.join(got) or 'nothing that happens'}"
+            yield ("events", index), f"{text}, allowed is one of `lose`, `cut` and `join`."
+        elif event.get("for") is not None and got != ["`cut`"]:
+            yield ("events", index, "for"), f"got a key that {got[0]} does not take."
+
+
 def cross_faults(document: Document) -> Iterator[Finding]:
     """Yield the path and the sentence of every fault that concerns more than one key.
 
@@ -384,3 +397,4 @@ def cross_faults(document: Document) -> Iterator[Finding]:
     yield from _following(data)
     yield from _changed(data)
     yield from _durations(data)
+    yield from _events(data)

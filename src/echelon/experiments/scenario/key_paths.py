@@ -48,6 +48,7 @@ def key_paths(section: type[BaseModel], before: str = "") -> Iterator[tuple[str,
         text = field.description or (inner.__doc__ if inner is not None else "") or ""
         extra = field.json_schema_extra
         unit = str(extra.get("unit", "")) if isinstance(extra, dict) else ""
+        key = field.alias or key
         yield before + key, " ".join(text.split()), unit
         if inner is not None and before + key != "live":
             yield from key_paths(inner, f"{before}{key}.")

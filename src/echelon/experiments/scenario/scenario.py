@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
 
 from echelon.core.errors import ScenarioError, did_you_mean, listing
-from echelon.experiments.scenario import law_sections, sections
+from echelon.experiments.scenario import event_sections, law_sections, sections
 from echelon.experiments.scenario.checks import cross_faults, law_of, number_of, section
 from echelon.experiments.scenario.key_paths import key_paths, meant, sections_in
 from echelon.experiments.scenario.override import settle_overrides
@@ -55,9 +55,13 @@ class Scenario(BaseModel, **STRICT):
     actuator: sections.ActuatorSpec | None = None
     sensing: sections.SensingSpec | None = None
     network: sections.NetworkSpec | None = None
+    events: Annotated[tuple[event_sections.EventSpec, ...], Field(strict=False)] = ()
+    """What happens during the run, as in `[{at: 8.0, lose: 3}, {at: 12.0, join: 3}]`: agents are
+    lost or join, and links are cut, as in `[{at: 8.0, cut: [1, 2], for: 3.0}]`."""
+    leadership: event_sections.LeadershipSpec | None = None
     simulation: sections.SimulationSpec
     report: sections.ReportSpec = Field(default_factory=sections.ReportSpec)
-    live: Annotated[tuple[sections.LiveSpec, ...], Field(strict=False)] = ()
+    live: Annotated[tuple[event_sections.LiveSpec, ...], Field(strict=False)] = ()
     """Changes made during `echelon live`, which repeats them; no other command can."""
     seed: Seed = 0
     """Seed of everything random in the run."""
@@ -131,7 +135,7 @@ def _keys(path: KeyPath) -> list[str]:
         # The place in a list of sections has the keys of any other.
         if isinstance(key, str):
             part = next(sections_in(part.model_fields[key].annotation))
-    return list(part.model_fields)
+    return [field.alias or key for key, field in part.model_fields.items()]
 
 
 def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:

@@ -138,7 +138,8 @@ def _led_by(parts: Parts, gain: Gain) -> Parts:
     """Return the parts with another gain of the leaders."""
     drive = parts.drive
     assert isinstance(drive, Laws)
-    leader = eqx.tree_at(lambda law: law.gain, drive.leader, gain)
+    leader = drive.leader
+    leader = eqx.tree_at(lambda law: law.gain, leader, gain, is_leaf=lambda part: part is None)
     return parts.replace(drive=Laws(leader, drive.follower))
 
 

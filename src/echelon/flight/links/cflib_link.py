@@ -70,13 +70,13 @@ class CflibLink(Link):
     watchdog: ClassVar[bool] = True
 
     def __init__(self, address: str, facts: Mapping[str, Any], crazyflie: Any = None) -> None:
-        """Connect, start the log, unlock the thrust."""
+        """Connect, choose the controller, start the log."""
         self._route = _route_of(tuple(facts["inputs"]))
         self._states = check_states(facts["states"])
         uri, _, thrust = address.partition("#")
         self._full_thrust = _newtons(thrust) if thrust else _FULL_THRUST
         self._weight = facts["trim"].get("thrust", 0.5 * self._full_thrust)
-        self._end, self._down = math.inf, False
+        self._end, self._down, self._locked = math.inf, False, True
         self._arrival = threading.Condition()
         self._newest: Reading | None = None
         self._known: dict[str, float] = {}
@@ -98,6 +98,8 @@ class CflibLink(Link):
 
     def send(self, u: Sequence[float]) -> None:
         """Send an input."""
+        if self._locked:
+            self._unlock()
         if not self._route.full_state:
             self._manual(u, self._route.rates)
         # Before the first state there is nothing to accelerate from.
@@ -128,10 +130,10 @@ class CflibLink(Link):
         self._crazyflie.commander.send_setpoint_manual(*numbers, rates)
 
     def _prepare(self) -> None:
-        """Choose the controller, start the log and unlock the thrust."""
+        """Choose the controller, and start the log."""
         from cflib.crazyflie.log import LogConfig  # pyright: ignore[reportMissingImports]
 
-        self._crazyflie.param.set_value("stabilizer.controller", self._route.controller)
+        self._choose(self._route.controller)
         log = LogConfig("echelon", period_in_ms=10)
         for name, kind in LOG.items():
             log.add_variable(f"stateEstimateZ.{name}", kind)
@@ -142,6 +144,25 @@ class CflibLink(Link):
             raise FlightError(f"the Crazyflie has no log of its state: {error}.") from None
         log.data_received_cb.add_callback(self._receive)
         log.start()
+
+    def _choose(self, controller: int) -> None:
+        """Set the firmware's controller, and wait until it is set: inputs are for that one."""
+        chosen, parameters = threading.Event(), self._crazyflie.param
+
+        def confirm(_: str, value: str) -> None:
+            if value == str(controller):
+                chosen.set()
+
+        parameters.add_update_callback(group="stabilizer", name="controller", cb=confirm)
+        parameters.set_value("stabilizer.controller", controller)
+        if not chosen.wait(_PATIENCE):
+            raise FlightError(
+                "the Crazyflie does not confirm its parameter `stabilizer.controller`."
+            )
+
+    def _unlock(self) -> None:
+        """Arm, and unlock the thrust; not before the first input, since a dry run sends none."""
+        self._locked = False
         self._crazyflie.supervisor.send_arming_request(True)
         self._crazyflie.commander.send_setpoint(0.0, 0.0, 0.0, 0)
 

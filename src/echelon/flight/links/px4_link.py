@@ -33,7 +33,7 @@ _BODY: Final = (8, 12)
 
 @final
 class Px4Link(Link):
-    """Sends attitudes, a yaw rate and a thrust; PX4 leaves OFFBOARD after 0.5 s without any.
+    """Sends attitudes, a yaw rate and a thrust; PX4 leaves OFFBOARD after 1 s without any.
 
     Raises:
         FlightError: no vehicle answers, or it does not tell its hover thrust.
@@ -151,7 +151,8 @@ def _connected(address: str) -> Any:
         ) from None
     try:
         wire = mavutil.mavlink_connection(address, dialect="common")
-    except (OSError, ValueError) as error:
+    # What is no address of a network is taken for a serial port, which needs pyserial.
+    except (ImportError, OSError, ValueError) as error:
         raise FlightError(f"`px4://{address}` cannot be opened: {error}.") from None
     if wire.wait_heartbeat(timeout=_PATIENCE) is None:
         wire.close()

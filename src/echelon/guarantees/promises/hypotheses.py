@@ -19,6 +19,7 @@ from echelon.core.types import Array, States
 from echelon.core.words import Kind
 from echelon.guarantees.messages.network_lines import bias_line
 from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.event_lines import events_line
 from echelon.guarantees.promises.leaders import apart
 from echelon.guarantees.promises.modes import modes
 from echelon.laws.law import Law
@@ -45,6 +46,7 @@ def agent_lines(case: Case) -> Iterator[Statement]:
     yield _trim_within_limits(case)
     yield _exact(case)
     yield _agreement(case)
+    yield from events_line(case.parts)
 
 
 # ---- the agents and their leaders ---------------------------------------------------------------

@@ -14,6 +14,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.core.compiled import cached_jit
 from echelon.core.enclosure.interval import point
+from echelon.core.errors import GraphError
 from echelon.core.linear import sampled_radius
 from echelon.core.rational import float_above
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
@@ -51,6 +52,7 @@ class StoppingRun(NamedTuple):
         flat: (N, r, m) the same in flat coordinates, less the offsets.
         ahead: (r, m) of what the leader follows.
         late: what is guaranteed over its network; None for the ideal one.
+        left_out: why nothing is known of how its graph switches in steps; empty elsewhere.
     """
 
     parts: Parts
@@ -59,6 +61,7 @@ class StoppingRun(NamedTuple):
     flat: Array
     ahead: Array
     late: LateMessages | Uncovered | None = None
+    left_out: str = ""
 
     @property
     def law(self) -> StoppingPoint:
@@ -194,13 +197,27 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     assert isinstance(drive.leader, StoppingLeader)
     offsets = jnp.asarray(parts.formation.offsets)
     flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
+    graph, left_out = _in_steps(parts.graph, settings.dt)
+    parts = parts if graph is parts.graph else parts.replace(graph=graph)
     run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
-    graph, leaderward = parts.graph, drive.follower.leaderward
+    run, leaderward = run._replace(left_out=left_out), drive.follower.leaderward
     speed = min(map(run.law.speed_of, range(len(run.law.ready.chains.outputs))))
     avoiding = run.law.safety is not None
     following = Following(graph, leaderward, run.coupling, speed, run.still, run.apart, avoiding)
     times = settings.dt, settings.horizon, settings.steps
     return run._replace(late=late_messages_of(parts.world.network, following, *times))
+
+
+def _in_steps(graph: Graph, dt: float) -> tuple[Graph, str]:
+    """Return a graph as it runs in steps (s), or the graph and why nothing is known of that."""
+    rounded = f"switches are rounded up to steps of {dt:g} s"
+    try:
+        stepped = graph.in_steps(dt)
+    except GraphError as error:
+        return graph, f"{rounded}, and then {str(error).rstrip('.')}"
+    if stepped is None:
+        return graph, f"{rounded}, which are no part of the `period` and its small multiples"
+    return stepped, ""
 
 
 @cached_jit
@@ -269,6 +286,10 @@ def _switching_line(run: StoppingRun) -> Statement:
     """Say along which edges the leader reaches everybody: checked when the graph was made."""
     schedule = run.parts.graph.schedule
     assert schedule is not None
+    if run.left_out:
+        remedy = "switch at multiples of `simulation.dt`"
+        name, reason = Hypothesis.SWITCHING, run.left_out
+        return fails(name, _PROOF, run.left_out, remedy=remedy, reason=reason)
     text = f"the leader reaches every agent along the edges from {schedule.starts[-1]:g} s on"
     if schedule.period is not None:
         text = (

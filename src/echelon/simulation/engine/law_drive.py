@@ -15,9 +15,11 @@ from echelon.core.errors import (
     SimulationError,
     check_kind,
 )
+from echelon.core.identity import process_key
 from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
 from echelon.laws.flat_law import FlatLaw
+from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import leader_warnings, prepare_law
 from echelon.laws.safety import Safety
@@ -96,8 +98,10 @@ class Laws(Drive):
         """
         leader, follower = (prepare_law(law, model, graph) for law in (self.leader, self.follower))
         follower = follower.following(leader, model)
-        same = leader is self.leader and follower is self.follower
-        return self if same else Laws(leader, follower)
+        drive = Laws(leader, follower)
+        same, key = leader is self.leader and follower is self.follower, process_key(drive)
+        # Caches use the identity of what is complete already.
+        return self if same or key is not None and key == process_key(self) else drive
 
     def check_world(self, world: World, graph: Graph, dt: float) -> None:
         """Check that both laws work with messages that are late.
@@ -135,6 +139,36 @@ class Laws(Drive):
                 f"`{type(self.leader).__name__}` is about; use `packet`."
             )
         self.follower.check_late(graph, dt)
+
+    def check_heirs(self, graph: Graph) -> None:
+        """Check that followers can take the lead, and leaders can follow.
+
+        Raises:
+            SimulationError: they cannot.
+        """
+        if not graph.heirs:
+            return
+        name = f"`{type(self.leader).__name__}`"
+        if not self.leader.plans:
+            raise SimulationError(
+                f"got `heirs`, but a leader under the law {name} has no plan that they could carry "
+                "on; give it a `reference`."
+            )
+        if self.follower.feedforward is Feedforward.PARENT:
+            raise SimulationError(
+                "got `heirs`, but with `feedforward: parent` nobody knows who leads; use `relay`."
+            )
+        observers = {getattr(law, "observer", None) for law in (self.leader, self.follower)}
+        first, then = self.leader.init(), self.follower.init()
+        # How many others hold it back an heir forgets when it leads.
+        then = then._replace(active=None) if isinstance(then, FlatMemory) else then
+        trees = {*map(jax.tree.structure, (first, then))}
+        if len(trees) > 1 or len(observers) > 1:
+            raise SimulationError(
+                f"got `heirs`, but followers under `{type(self.follower).__name__}` remember other "
+                f"things than a leader under {name}, and could not take over; give both the same "
+                "kind of law, with the same `observer`."
+            )
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of leaders and followers by their laws.

@@ -8,6 +8,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Channel
+from echelon.agents.network.events import event_faults
 from echelon.agents.world.sensing import Sensors
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.identity import digest
@@ -77,12 +78,17 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         if to_store:
             # Before gains and plans, which may take long.
             check_memory(model, graph.agents, settings)
-        drive = parts.drive.prepare(model, graph)
+        _check_events(parts, settings)
+        # Laws are made for the graph as it is before anything happens to it.
+        drive = parts.drive.prepare(model, graph.before)
         # A complete drive stays the same object, since caches use its identity.
         parts = parts if drive is parts.drive else parts.replace(drive=drive)
         parts.world.check_agents(model, graph.agents)
         # Its own numbers first: whether they suit the laws is asked of a network that can be.
         channel = channel_of(parts, settings)
+        drive.check_heirs(graph)
+        if parts.leadership is not None:
+            parts.leadership.check_network(parts.world.network)
         drive.check_world(parts.world, graph, settings.dt)
         problem = Problem(
             model,
@@ -96,6 +102,7 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
             initial_states(parts, settings.seed),
             channel,
             sensors_of(parts, settings),
+            parts.leadership,
         )
         parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)
@@ -140,6 +147,17 @@ def check_memory(model: ControlAffine, agents: int, settings: Settings) -> None:
     excess = excess_frames(1 + -(-settings.steps // every), numbers, every)
     if excess is not None:
         raise SimulationError(f"the run {excess}.")
+
+
+def _check_events(parts: Parts, settings: Settings) -> None:
+    """Check that all that happens does so during the run."""
+    graph = parts.graph
+    for fault in event_faults(graph.before, graph.events, graph.heirs, settings.horizon):
+        raise SimulationError(f"{fault.text}.")
+    if graph.presence is not None and settings.devices > 1:
+        raise SimulationError(
+            f"`devices` is {settings.devices}, and must be 1 where agents are lost or join."
+        )
 
 
 def _check_offsets(model: ControlAffine, parts: Parts) -> None:

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from typing import final
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
+from echelon.agents.network.switching import Schedule
 from echelon.agents.world.world import World
 from echelon.core.errors import Outcome
 from echelon.core.lazy_field import LazyField
@@ -97,7 +99,27 @@ class Result(FrameNumbers):
     @property
     def saturated(self) -> Array:
         """The fraction of steps (N,) in which an actuator limit changed the agent's input."""
-        return self.sums.limited / max(1.0, float(self.sums.steps[0]))
+        return self.sums.limited / np.maximum(1.0, self.steps_present[0])
+
+    def steps_with(self, agents: Int[np.ndarray, "K k"]) -> Float[np.ndarray, "2 K"]:
+        """Return in how many steps, and of these in the steady window, all agents of a row are."""
+        steps, schedule = self.sums.steps, self.graph.schedule
+        if schedule is None or schedule.present is None:
+            return np.tile(np.asarray(steps, float)[:, None], len(agents))
+        times = self.settings.dt * np.arange(int(steps[0]))
+        here = np.asarray(schedule.present[schedule.rows(times)][:, agents].all(axis=2))
+        first = self.settings.first_steady
+        return np.array([here.sum(axis=0), here[first:].sum(axis=0)], float)
+
+    @functools.cached_property
+    def steps_present(self) -> Float[np.ndarray, "2 N"]:
+        """In how many steps, and of these in the steady window, each agent is there."""
+        return self.steps_with(np.arange(self.graph.agents)[:, None])
+
+    @property
+    def schedule(self) -> Schedule | None:
+        """When which links hold, and who is there; None where that never changes."""
+        return self.graph.schedule
 
     @property
     def chatter(self) -> Array:

@@ -4,7 +4,10 @@ They are traced from what `Agent` runs, as native code is. Rules about messages,
 is the newest, are no arithmetic, and are left to the program that receives them.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+import functools
+import math
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple, final
 
 import jax
@@ -20,7 +23,6 @@ from echelon.simulation.engine.own_step import (
     OwnState,
     begin_alone,
     gap_of,
-    is_finite,
     signal_of,
     step_with,
 )
@@ -31,7 +33,7 @@ from echelon.simulation.native.agent_step import (
     single,
     unflatten,
 )
-from echelon.simulation.scalars import Node, ScalarGraph, lower, needed, nodes
+from echelon.simulation.scalars import Node, ScalarGraph, lower, needed, nodes, rewritten
 from echelon.simulation.step.knowledge import (
     carried_time,
     content_of,
@@ -152,10 +154,12 @@ class _Traces:
             step = step_with(loop, leads, t, own, z, forward, None)
             action = step.action
             results = action.input, _flat(action.memory), step.signal, action.message
+            # A state less a constant is finite where the state is.
+            signal = () if type(self.law).signal is Law.signal else step.signal
             if not sends_packets:
-                return *results, step.finite
+                return *results, _flat((x, signal, action))
             content = content_of(loop, t, *own, step.signal, action.message, action.input)
-            return *results, content, step.finite & is_finite(content)
+            return *results, content, _flat((x, signal, action, content))
 
         outputs = ("u", "memory", "signal", "message", *(("content",) if sends_packets else ()))
         sizes = {"t": None, "x": self.n, "z": gap, "feed_forward": self.k, "memory": self.memory}
@@ -184,7 +188,7 @@ class _Traces:
                 leader, forward, _ = parts_of(loop, s, content)
             else:
                 leader, forward = expected_of(loop, s, t, content, age)
-            return leader, forward, is_finite((leader, forward))
+            return leader, forward, _flat((leader, forward))
 
         def pace(age: jax.Array) -> tuple[jax.Array]:
             rounds, duration = carried_pieces(carried_time(age))
@@ -193,7 +197,7 @@ class _Traces:
         def carry(content: jax.Array, duration: jax.Array) -> tuple[jax.Array, ...]:
             x, forward, u = parts_of(loop, s, content)
             moved = jnp.concatenate([rk4(loop.model.velocity, x, u, duration), forward, u])
-            return moved, is_finite(moved)
+            return moved, moved
 
         yield self._function(
             "expected",
@@ -226,7 +230,7 @@ class _Traces:
         def measure(y: jax.Array, flat: jax.Array) -> tuple[jax.Array, ...]:
             before = unflatten(like, flat[:-1])
             x, after = estimator.measure(model, before, y, flat[-1] == 0.0)
-            return x, jnp.append(_flat(after), flat[-1]), is_finite((x, after))
+            return x, jnp.append(_flat(after), flat[-1]), _flat((x, after))
 
         def deliver(u: jax.Array, flat: jax.Array) -> tuple[jax.Array]:
             return (jnp.append(_flat(estimator.act(unflatten(like, flat[:-1]), u)), 1.0),)
@@ -248,20 +252,58 @@ class _Traces:
         outputs: tuple[str, ...],
         sizes: Mapping[str, int | None],
     ) -> LawFunction:
-        """Return a function whose leaves have the names of its inputs."""
+        """Return a function whose leaves have the names of its inputs.
+
+        What `compute` returns after its outputs must be finite where it is valid.
+        """
         graph = ScalarGraph(self.bits)
         leaves = [
             single(graph.leaf(key)) if size is None else leaves_of(graph, key, range(size))
             for key, size in sizes.items()
         ]
         parts = [nodes(graph, part) for part in lower(compute, graph, leaves)]
+        exceptions = graph.exceptions_of(sum(parts, start=[]))
+        plain = rewritten(sum(parts, start=exceptions), _plainer)
+        parts = [[plain[node] for node in part] for part in parts]
         named = dict(zip(outputs, parts, strict=False))
         if len(parts) == len(outputs):
             return LawFunction(name, about, sizes, named)
-        [valid] = parts[-1]
-        for truth in graph.exceptions_of(sum(parts, start=[])):
+        valid = _all_finite(graph, parts[-1])
+        for truth in _fewer([plain[truth] for truth in exceptions]):
             valid = graph.make("and", valid, graph.make("not", truth))
         return LawFunction(name, about, sizes, named, valid)
+
+
+def _plainer(node: Node, args: Sequence[Node]) -> Node | bool | None:
+    """Return what replaces a node for one agent alone."""
+    if node.op == "unlikely":
+        # Of choices that save time where many agents take the same side.
+        return True
+    if node.op not in ("min", "max") or node.truth:
+        return None
+    for bound, x in (args, args[::-1]):
+        if bound.op == "constant" and not math.isnan(bound.value):
+            beyond = (bound, x) if node.op == "min" else (x, bound)
+            return node.graph.make("select", node.graph.make("lt", *beyond), bound, x)
+    return None
+
+
+def _all_finite(graph: ScalarGraph, numbers: Sequence[Node]) -> Node:
+    """Return whether numbers are finite, as their sum then is: one operation for each."""
+    total = functools.reduce(operator.add, dict.fromkeys(numbers))
+    return graph.make("lt", graph.make("abs", total), math.inf)
+
+
+def _fewer(truths: Sequence[Node]) -> list[Node]:
+    """Return truths of which one holds where one of others does: angles are compared together."""
+    together, others = dict[Node, Node](), list[Node]()
+    for truth in truths:
+        bound, x = truth.args if truth.op == "lt" else (truth, truth)
+        if bound.op == "constant" and x.at_least_0:
+            together[bound] = together[bound] + x if bound in together else x
+        else:
+            others.append(truth)
+    return [*others, *(x.graph.make("lt", bound, x) for bound, x in together.items())]
 
 
 def _flat(tree: PyTree) -> jax.Array:

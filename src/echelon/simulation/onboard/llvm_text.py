@@ -41,17 +41,19 @@ _HELPERS = {
   ret float %r
 """,
     "law_min": """
-  %less = fcmp olt float %a, %b
-  %none = fcmp uno float %a, %a
-  %first = or i1 %less, %none
-  %r = select i1 %first, float %a, float %b
+  %first = fcmp olt float %a, %b
+  %none = fcmp uno float %a, %b
+  %sum = fadd float %a, %b
+  %other = select i1 %none, float %sum, float %b
+  %r = select i1 %first, float %a, float %other
   ret float %r
 """,
     "law_max": """
-  %more = fcmp ogt float %a, %b
-  %none = fcmp uno float %a, %a
-  %first = or i1 %more, %none
-  %r = select i1 %first, float %a, float %b
+  %first = fcmp ogt float %a, %b
+  %none = fcmp uno float %a, %b
+  %sum = fadd float %a, %b
+  %other = select i1 %none, float %sum, float %b
+  %r = select i1 %first, float %a, float %other
   ret float %r
 """,
     "law_fma": """
@@ -164,6 +166,7 @@ _LLVM = Syntax(
     "  {} = {}",
     ("float", "i1"),
     {name: _called(name, "i1" if name == "law_bit" else "float") for name in _HELPERS},
+    deep=False,
 )
 
 

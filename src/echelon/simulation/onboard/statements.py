@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+from echelon.simulation.codegen.scheduling import depth_first, lateness
 from echelon.simulation.onboard.law_functions import LawFunction
 from echelon.simulation.scalars import Node, needed
 
@@ -43,6 +44,8 @@ class Syntax(NamedTuple):
         number, truth: an assignment, with the places of a name and an expression.
         kinds: of numbers and of truths.
         helpers: functions by name, each after those that it calls.
+        deep: whether each result is computed before the next is begun, so that a compiler needs
+            less of the stack; LLVM finds an order itself.
     """
 
     operations: Mapping[str, str]
@@ -53,6 +56,7 @@ class Syntax(NamedTuple):
     truth: str
     kinds: tuple[str, str]
     helpers: Mapping[str, str]
+    deep: bool = True
 
     def used_helpers(self, text: str) -> str:
         """Return the functions that a text calls, directly or not."""
@@ -73,7 +77,8 @@ class Statements(NamedTuple):
 def statements(function: LawFunction, syntax: Syntax) -> Statements:
     """Return the assignments that compute the results of a function."""
     lines, words = list[str](), dict[Node, str]()
-    for node in needed(function.results):
+    nodes = needed(function.results)
+    for node in depth_first(function.results, lateness(nodes)) if syntax.deep else nodes:
         if node.op == "constant":
             words[node] = syntax.literal(node.value)
         elif node.op == "leaf":

@@ -38,11 +38,13 @@ class Packets(NamedTuple):
         leader: its number.
         stamp: the step at which it said so; `NEVER` for no packet.
         content: a row of numbers, which depends on the prediction.
+        epoch: how often the lead was taken over; None without heirs.
     """
 
     leader: Int[jax.Array, " N"]
     stamp: Int[jax.Array, " N"]
     content: Float[jax.Array, "N p"]
+    epoch: Int[jax.Array, " N"] | None = None
 
 
 class Letters(NamedTuple):
@@ -102,26 +104,48 @@ class Knowledge(NamedTuple):
 # ---- one agent, or many --------------------------------------------------------------------------
 
 
-def no_mail(readers: Readers, links: int, sent: Float[jax.Array, "N s"], packet: int) -> Mail:
+def no_mail(
+    readers: Readers, links: int, sent: Float[jax.Array, "N s"], packet: int, heirs: bool = False
+) -> Mail:
     """Return the mail before the first message, for signals as sent and packets (packet,)."""
-    agents = len(readers.number)
     return Mail(
         jnp.full(links, NEVER, jnp.int32),
         jnp.zeros((links, sent.shape[1]), sent.dtype),
         jnp.full(links, NOBODY, jnp.int32),
-        Packets(
-            jnp.where(readers.leads, readers.number, NOBODY).astype(jnp.int32),
-            jnp.full(agents, NEVER, jnp.int32),
-            jnp.zeros((agents, packet), sent.dtype),
-        ),
+        no_packets(readers, jnp.zeros((len(readers.number), packet), sent.dtype), heirs),
     )
 
 
-def packet_size(channel: Channel, s: int, forward: int, m: int) -> int:
-    """Return how many numbers a packet has, for signals (s,), a feed-forward and inputs (m,)."""
+def no_packets(readers: Readers, content: Float[jax.Array, "N p"], heirs: bool) -> Packets:
+    """Return the packets before the first one, with epochs where there are heirs."""
+    leader = jnp.where(readers.leads, readers.number, NOBODY).astype(jnp.int32)
+    never = jnp.full(len(leader), NEVER, jnp.int32)
+    return Packets(leader, never, content, jnp.zeros_like(never) if heirs else None)
+
+
+def taken_over(
+    packet: Packets, chosen: Bool[jax.Array, " N"], number: jax.Array, step: jax.Array
+) -> Packets:
+    """Return the packets of agents of which the chosen ones have just taken the lead."""
+    assert packet.epoch is not None
+    leader = jnp.where(chosen, number, packet.leader)
+    stamp = jnp.where(chosen, step, packet.stamp)
+    return packet._replace(leader=leader, stamp=stamp, epoch=packet.epoch + chosen)
+
+
+def packet_size(channel: Channel, s: int, forward: int, m: int, heirs: bool = False) -> int:
+    """Return how many numbers a packet has, for signals (s,), a feed-forward and inputs (m,).
+
+    Where the leader has `heirs` it also says how its feed-forward changes, since it is carried on
+    for longer.
+    """
     if channel.messages is MessageContent.STATE:
         return forward
-    more = {Prediction.PREVIEW: 0, Prediction.NONE: forward, Prediction.PACKET: forward + m}
+    more = {
+        Prediction.PREVIEW: 0,
+        Prediction.NONE: forward,
+        Prediction.PACKET: forward + m + heirs * forward,
+    }
     return s + more[channel.prediction]
 
 
@@ -150,7 +174,7 @@ def understand(
     channel = loop.channel
     assert channel is not None
     leader, feedforward = _leaders(loop, readers, t, mail.packet, ages.packet, sent)
-    lasting = ages.link <= HOP_LIFE * channel.forget * loop.motion.dt
+    lasting = ages.link <= hop_life(channel, loop.motion.dt)
     hops = count_hops(exchange, readers, mail.hops, lasting, len(loop.order))
     knows = readers.leads | (ages.packet < jnp.inf)
     receivers = jnp.asarray(exchange.receivers)
@@ -175,6 +199,12 @@ def usable_age(channel: Channel, dt: Array | float) -> jax.Array:
     deviations = channel.messages is MessageContent.DEVIATION
     # Of a state there is no better guess than the last one, but never that of no message.
     return jnp.asarray(channel.forget * dt if deviations else np.finfo(np.float32).max)
+
+
+def hop_life(channel: Channel, dt: Array | float) -> jax.Array:
+    """Return the age (s) beyond which a hop count is not used."""
+    # Times a float: ten times the largest whole number would be negative.
+    return jnp.asarray(float(HOP_LIFE) * channel.forget * dt)
 
 
 def write(
@@ -221,10 +251,30 @@ def content_of(
     if channel.prediction is Prediction.NONE:
         return jnp.concatenate([signal, forward])
     if channel.prediction is Prediction.PACKET:
-        return jnp.concatenate([signal, forward, u])
+        parts = jnp.concatenate([signal, forward, u])
+        if loop.succession is None:
+            return parts
+        return jnp.concatenate([parts, _slope(loop, t, x, offset, memory, forward)])
     deviation = loop.leader.deviation(loop.model, t, x, offset, memory)
     assert deviation is not None, "a channel with a preview has a leader with a plan"
     return deviation
+
+
+def _slope(
+    loop: Loop,
+    t: Scalar,
+    x: State,
+    offset: State,
+    memory: Memory,
+    forward: Float[jax.Array, " k"],
+) -> Float[jax.Array, " k"]:
+    """Return the rate at which the feed-forward of a leader with a plan changes, from a step on."""
+    deviation, dt = loop.leader.deviation(loop.model, t, x, offset, memory), loop.motion.dt
+    assert deviation is not None, "a leader with heirs has a plan"
+    expected = loop.leader.expected(loop.model, t + dt, deviation, jnp.asarray(dt, t.dtype), dt)
+    if expected is None or expected.feedforward is None:
+        return jnp.zeros_like(forward)
+    return (expected.feedforward - forward) / dt
 
 
 def _leaders(
@@ -258,8 +308,15 @@ def expected_of(
         return _expected(loop, t, content, age)
     if prediction is Prediction.NONE:
         return content[:s], content[s:]
+    time, slope = carried_time(age), None
+    if loop.succession is not None:
+        k = (len(content) - s - len(loop.model.input_names)) // 2
+        content, slope = content[:-k], content[-k:]
     signal, feedforward, u = parts_of(loop, s, content)
-    return loop.follower.carried(loop.model, signal, feedforward, u, carried_time(age)), feedforward
+    if slope is None:
+        return loop.follower.carried(loop.model, signal, feedforward, u, time), feedforward
+    mean = feedforward + 0.5 * time * slope
+    return loop.follower.carried(loop.model, signal, mean, u, time), feedforward + time * slope
 
 
 def parts_of(

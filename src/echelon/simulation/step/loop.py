@@ -4,12 +4,13 @@ This file sees only the interfaces of models and laws.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel
@@ -20,6 +21,7 @@ from echelon.core.types import Array, PyTree, States
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law, Memory, without_certificates
 from echelon.simulation.step.drive import Problem
+from echelon.simulation.step.leadership import Succession
 from echelon.simulation.step.meter import Meter
 from echelon.simulation.step.motion import Motion
 from echelon.simulation.step.settings import Settings
@@ -44,6 +46,8 @@ class Loop(eqx.Module):
         levels: (D, W) the places of followers among the followers, level by level, likewise.
         order: (N,) from leaders and followers to the agents' own order.
         switches: when the graph switches; None where it does not.
+        presence: who is there; None where all always are.
+        succession: the heirs, which act with the leaders; None without any.
         channel: what the network does to messages; None for the ideal network.
         sensors: of the agents' own states; None for exact ones.
         share: of the feed-forward that followers use; None for all of it.
@@ -63,6 +67,8 @@ class Loop(eqx.Module):
     levels: Array | None
     order: Array
     switches: "Switches | None"
+    presence: "Presence | None" = None
+    succession: Succession | None = None
     channel: Channel | None = None
     sensors: Sensors | None = None
     share: Array | None = None
@@ -87,12 +93,77 @@ class Switches(NamedTuple):
         return None if schedule is None else cls(*schedule.switches(settings.dt, settings.horizon))
 
 
+class Presence(eqx.Module):
+    """Who is there in each of S stretches of the graph.
+
+    Attributes:
+        rows: (S, N) whether an agent is.
+        nearest: (S, N) whom it follows.
+        since: (S, N) since when it has been there, s.
+        returns: whether one that is lost joins again.
+    """
+
+    rows: Array
+    nearest: Array
+    since: Array
+    # Static, since it decides what a moment has.
+    returns: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, graph: Graph) -> "Presence | None":
+        """Return who is there when; None where all always are."""
+        schedule = graph.schedule
+        if schedule is None or schedule.present is None or schedule.nearest is None:
+            return None
+        since = np.where(schedule.present, 0.0, np.inf)
+        for k in range(1, len(since)):
+            stays = schedule.present[k - 1]
+            since[k] = np.where(stays, since[k - 1], schedule.starts[k])
+        joins = (np.diff(schedule.present.astype(int), axis=0) > 0).any(axis=0)
+        returns = bool((schedule.present[0] & joins).any())
+        return cls(schedule.present, schedule.nearest, since, returns)
+
+
+def row_at(switches: Switches, step: jax.Array) -> jax.Array:
+    """Return which row of the weights holds at a step."""
+    steps, rows = map(jnp.asarray, switches)
+    return rows[jnp.searchsorted(steps, step, side="right") - 1]
+
+
+class Cast(Protocol):
+    """Who is there when, and who may lead: a loop, or a network by itself."""
+
+    @property
+    def switches(self) -> "Switches | None": ...  # noqa: D102
+    @property
+    def presence(self) -> "Presence | None": ...  # noqa: D102
+    @property
+    def succession(self) -> Succession | None: ...  # noqa: D102
+
+
+def present_at(loop: Cast, step: jax.Array) -> Bool[jax.Array, " N"] | None:
+    """Return who is present at a step; None where all always are."""
+    if loop.presence is None or loop.switches is None:
+        return None
+    return jnp.asarray(loop.presence.rows)[row_at(loop.switches, step)]
+
+
+def since_at(loop: Cast, step: jax.Array) -> jax.Array:
+    """Return since when each agent has been there, s, (N,)."""
+    if loop.presence is None or loop.switches is None:
+        return jnp.zeros(())
+    return jnp.asarray(loop.presence.since)[row_at(loop.switches, step)]
+
+
+def nearest_at(loop: Loop, step: jax.Array) -> jax.Array:
+    """Return whom each agent follows at a step, (N,), where some are absent at times."""
+    assert loop.presence is not None and loop.switches is not None
+    return jnp.asarray(loop.presence.nearest)[row_at(loop.switches, step)]
+
+
 def exchange_at(exchange: Exchange, switches: Switches | None, step: jax.Array) -> Exchange:
     """Return an exchange with the weights that hold at a step."""
-    if switches is None:
-        return exchange
-    steps, rows = map(jnp.asarray, switches)
-    return exchange.during(rows[jnp.searchsorted(steps, step, side="right") - 1])
+    return exchange if switches is None else exchange.during(row_at(switches, step))
 
 
 def stretch_at(loop: Loop, step: int) -> tuple[int, int]:
@@ -115,6 +186,9 @@ class WorldState(NamedTuple):
         measured: (d, N, n) the states of the last d steps, where agents measure theirs late.
         seen: messages about places, as `Sightings`, where agents keep away from each other.
         estimates: of agents that estimate their states, as `Estimate`.
+        starts: (N, n) the initial states, where agents are lost and join again.
+        led: what each agent last received of its leader, as `Packets`, in the ideal network with
+            heirs.
     """
 
     in_flight: PyTree = None
@@ -123,6 +197,8 @@ class WorldState(NamedTuple):
     measured: PyTree = None
     seen: PyTree = None
     estimates: PyTree = None
+    starts: PyTree = None
+    led: PyTree = None
 
 
 class Moment(NamedTuple):
@@ -148,7 +224,8 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
     """Return the loop of prepared laws."""
     graph = problem.graph
     leader = leader if problem.channel is None else leader.predictable(problem.model)
-    leaders, followers = np.array(graph.leaders), np.array(graph.followers)
+    leaders = np.array([*graph.leaders, *graph.heirs])
+    followers = np.array([k for k in graph.followers if k not in graph.heirs], int)
     by_depth = follower.feedforward is Feedforward.PARENT
     nearest = np.array(graph.nearest_leader())
     return Loop(
@@ -168,6 +245,8 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         # Leaders act first, and this puts what all did back into the agents' own order.
         order=np.argsort(np.concatenate([leaders, followers])),
         switches=Switches.of(graph, problem.settings),
+        presence=Presence.of(graph),
+        succession=Succession.of(graph, problem.leadership),
         channel=problem.channel,
         sensors=problem.sensors,
     )

@@ -4,6 +4,7 @@ A mean over stored frames would depend on how many are stored, and its first fra
 much as all the steps after it.
 """
 
+import dataclasses
 from types import ModuleType
 from typing import NamedTuple, TypeAlias, TypeVar, final
 
@@ -246,14 +247,40 @@ class Meter(eqx.Module):
             avoidance=jnp.zeros((len(states), self.slices), states.dtype),
         )
 
+    def following(self, nearest: jax.Array) -> "Meter":
+        """Return a meter of errors relative to these leaders (N,)."""
+        return dataclasses.replace(self, nearest=nearest)
+
+    def of_present(self, read: Sums, here: Bool[jax.Array, " N"]) -> Sums:
+        """Return the sums of a step without the agents, leaders and edges that are absent."""
+        nothing, leads = self.zero_sums(), here[self.leaders]
+        masks = dict.fromkeys(("effort", "limited", "unsettled", "chatter"), here)
+        masks |= dict.fromkeys(("inside", "separation", "avoidance"), here[:, None])
+        masks |= {"errors": here[None], "tracking": leads[None], "outputs": leads[:, None]}
+        masks["spacing"] = here[self.edges].all(axis=1)
+        return read._replace(
+            **{
+                name: jnp.where(mask, getattr(read, name), getattr(nothing, name))
+                for name, mask in masks.items()
+            }
+        )
+
     def of_slice(
-        self, step: jax.Array, states: States, active: Float[jax.Array, " N"]
+        self,
+        step: jax.Array,
+        states: States,
+        active: Float[jax.Array, " N"],
+        here: Bool[jax.Array, " N"] | None = None,
     ) -> dict[str, jax.Array]:
-        """Return the terms `separation` and `avoidance` of a step, where agents keep apart."""
+        """Return the terms `separation` and `avoidance` of a step, where agents keep apart.
+
+        They are of the agents that are present, (N,), if not all are.
+        """
         nothing, at = self.zero_sums(), step // jnp.asarray(self.per_slice)
         places = states[:, np.array(self.measured)] * jnp.asarray(self.scales[None], states.dtype)
         squares = ((places[:, None] - places[None]) ** 2).sum(axis=2)
         others = jnp.where(jnp.eye(len(states), dtype=bool), jnp.inf, squares)
+        others = others if here is None else jnp.where(here[None], others, jnp.inf)
         return {
             "separation": nothing.separation.at[:, at].set(jnp.sqrt(others.min(axis=1))),
             "avoidance": nothing.avoidance.at[:, at].set(active),
