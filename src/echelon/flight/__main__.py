@@ -61,7 +61,7 @@ def _run(mission: Mission, options: argparse.Namespace) -> int:
         and not options.link.startswith("udp")
     ):
         raise FlightError(
-            f"`--speed` is {options.speed:g}, and must be above 0 and at most 1; of real vehicles 1."
+            f"`--speed` is {options.speed:g}, and must be above 0 and at most 1; 1 if real."
         )
     if options.seconds is not None and not options.seconds > 0.0:
         raise FlightError(f"`--seconds` is {options.seconds:g}, and must be above 0.")

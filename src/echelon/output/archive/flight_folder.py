@@ -51,7 +51,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     agents = parts.graph.agents
     files, guaranteed = dict[str, str | bytes](), promise(parts, settings).sentence()
     for k in range(agents):
-        law = python_law(parts, settings, k, formation, guaranteed)
+        law = python_law(parts.replace(leadership=None), settings, k, formation, guaranteed)
         files |= {f"law-{k}/{name}": text for name, text in law.items()}
     facts = json.loads(files["law-0/law.json"])
     vehicles = _vehicles(parts, settings)
@@ -62,7 +62,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         "horizon": settings.horizon,
         "sizes": [len(facts["signal"]), facts["network"]["content"]],
         "leader": min(parts.graph.leaders),
-        "leadership": None,
+        "leadership": _leadership(parts),
         "weather": {"delay": network.delay, "jitter": network.jitter, "loss": network.loss},
         **_places(parts.model),
         "fence": _fence(parts, settings),
@@ -70,6 +70,12 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         "vehicles": vehicles[0],
     }
     return {**files, **vehicles[1], "flight.json": json.dumps(described, indent=2) + "\n"}
+
+
+def _leadership(parts: Parts) -> JsonObject | None:
+    """Return who takes the lead after the leader; None for nobody."""
+    rule = parts.leadership
+    return None if rule is None else {"heirs": list(rule.heirs), "timeout": rule.timeout}
 
 
 def _network(parts: Parts) -> Network:
