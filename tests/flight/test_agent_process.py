@@ -16,7 +16,7 @@ from echelon.flight.wire import GROUND, Drop, Letter, Packet, Wire
 
 DT, KEY = 0.01, b"k" * 32
 FLIGHT = {
-    "dt": DT,
+    **{"dt": DT, "leadership": None},
     "position": [0],
     "velocity": [1],
     "tilt": [],

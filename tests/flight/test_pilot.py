@@ -2,6 +2,7 @@
 
 import types
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -17,7 +18,7 @@ from echelon.simulation.onboard.python_text import python_text
 CARTS, DT = ech.models.DoubleIntegrator(), 0.01
 
 
-def parts_of(law, **network):
+def parts_of(law, sensing=None, **network):
     graph = ech.Graph([(0, 1), (1, 2), (1, 3)])
     offsets = {1: (1.0, 0.0), 2: (1.0, 0.8), 3: (1.0, -0.8)}
     circle = ech.references.Circle(rate=0.5)
@@ -28,7 +29,7 @@ def parts_of(law, **network):
         leader = ech.laws.StoppingLeader(reference=circle)
         drive = ech.Laws(leader, ech.laws.StoppingPoint())
     places = ech.Formation.from_offsets(CARTS, graph, offsets)
-    world = ech.World(network=ech.Network(rate=25.0, **network))
+    world = ech.World(network=ech.Network(rate=25.0, **network), sensing=sensing)
     return ech.Parts(CARTS, graph, places, drive, world=world)
 
 
@@ -64,11 +65,13 @@ def as_message(letter, names):
     return ech.Message(letter.sender, (names, letter.value), None, letter.time, hops, packet)
 
 
+NOISE = ech.Sensing(noise={"position": 0.05}, estimator="constant-gain")
 CASES = {
     "preview": ("stopping-point", 2, {}),
     "its-leader": ("stopping-point", 0, {}),
     "leaderward": ("stopping-point", 1, {"hears": "leaderward"}),
     "carried": ("consensus", 1, {"prediction": "packet", "hears": "leaderward"}),
+    "estimated": ("stopping-point", 1, {"sensing": NOISE}),
 }
 
 
@@ -115,6 +118,35 @@ def test_who_hears_nobody_flies_by_the_plan_and_then_holds():
         speeds.append(np.hypot(*x[2:]))
     # By the plan it follows the leader on its circle, and later it stands still.
     assert min(speeds[60:100]) > 0.3 and max(speeds[350:]) < 1e-3
+
+
+def test_an_heir_leads_by_the_plan_when_its_leader_is_lost():
+    leadership = {"heirs": [1], "timeout": 0.3}
+    agents = [ech.Agent(parts_of("stopping-point"), k, DT) for k in (0, 1, 2)]
+    pilots = [pilot_of(agent, leadership=leadership, hold=1.0)[0] for agent in agents]
+    x, places, epochs = [[0.0] * 4, [1.0, 0.0, 0.0, 0.0], [1.0, 0.8, 0.0, 0.0]], [], []
+    for k in range(1_000):
+        letters = []
+        # The leader is lost after 3 s.
+        for who in range(k > 300, 3):
+            ticked = pilots[who].tick(k * DT, x[who])
+            letters.append(ticked.letter)
+            a, b, c, d = x[who]
+            x[who] = [a + DT * c, b + DT * d, c + DT * ticked.u[0], d + DT * ticked.u[1]]
+        for letter in [each for each in letters if each is not None and k % 4 == 0]:
+            for pilot in pilots:
+                pilot.box.receive(letter, k * DT)
+        places.append([p[:2] for p in x])
+        epochs.append(pilots[2].box.packet.epoch if k > 10 else 0)
+    assert epochs[330] == 0 and set(epochs[345:]) == {1}
+    circle = ech.references.Circle(rate=0.5)
+    for k in (700, 999):
+        leader = np.asarray(circle(jnp.asarray(k * DT)))[:2]
+        for who, offset in ((1, (1.0, 0.0)), (2, (1.0, 0.8))):
+            assert np.linalg.norm(np.array(places[k][who]) - leader - offset) < 0.02
+    # The old leader, back again, does not take the lead from it.
+    assert pilots[1].box.receive(pilots[0].tick(10.0, x[0]).letter, 10.0) is None
+    assert [pilot.box.packet.leader for pilot in pilots] == [1, 1, 1]
 
 
 def test_what_is_not_finite_repeats_the_last_input():

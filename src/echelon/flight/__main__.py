@@ -15,7 +15,7 @@ from echelon.flight.links.link import Link, open_link
 from echelon.flight.mission import Mission
 from echelon.flight.plan_clock import PlanClock
 from echelon.flight.supervisor import Fault
-from echelon.flight.wire import GROUND, wire_of
+from echelon.flight.wire import GROUND, require_key, wire_of
 
 _READY = 5.0  # s, in which a vehicle says its state
 
@@ -55,6 +55,16 @@ def _options() -> argparse.Namespace:
 
 
 def _run(mission: Mission, options: argparse.Namespace) -> int:
+    if (
+        not 0.0 < options.speed <= 1.0
+        or options.speed != 1.0
+        and not options.link.startswith("udp")
+    ):
+        raise FlightError(
+            f"`--speed` is {options.speed:g}, and must be above 0 and at most 1; 1 if real."
+        )
+    if options.seconds is not None and not options.seconds > 0.0:
+        raise FlightError(f"`--seconds` is {options.seconds:g}, and must be above 0.")
     # Imported where they are used: an agent's process stays small.
     if options.vehicles:
         from echelon.flight.vehicles import Vehicles, simulated
@@ -92,16 +102,10 @@ def _ways(
     return listen, [read_address(text, "--to") for text in options.to.split(",")]
 
 
-def _key(options: argparse.Namespace) -> Path:
-    if options.key is None:
-        raise FlightError("give `--key` with the key file of the formation.")
-    return options.key
-
-
 def _fly(mission: Mission, options: argparse.Namespace) -> int:
     """Fly one agent."""
     law, facts = mission.law(options.agent)
-    wire = wire_of(mission.facts, options.agent, _key(options))
+    wire = wire_of(mission.facts, options.agent, require_key(options.key))
     listen, to = _ways(mission, options.agent, options)
     air, link = Air(listen, to, options.interface), open_link(options.link, facts)
     if options.dry_run:
@@ -135,7 +139,7 @@ def _watch(mission: Mission, options: argparse.Namespace) -> int:
     from echelon.output.viewer.serve import serve, serving
 
     listen, to = _ways(mission, GROUND, options)
-    wire = wire_of(mission.facts, GROUND, _key(options))
+    wire = wire_of(mission.facts, GROUND, require_key(options.key))
     ground = Ground(Air(listen, to, options.interface), wire, mission.agents)
     with serving(serve(page_of(ground))) as address:
         print(f"echelon: ground station at {address}. Ctrl-C quits.", file=sys.stderr, flush=True)
@@ -153,7 +157,12 @@ def _fly_all(mission: Mission, options: argparse.Namespace) -> int:
 
     seconds = mission.facts["horizon"] if options.seconds is None else options.seconds
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for k in range(mission.agents):
+        mission.law(k)
     together = Together(mission, seconds, options.speed, options.port)
+    if options.dry_run:
+        print("All checks passed; nothing was started.")
+        return 0
     with serving(serve(page_of(together.ground))) as address, flying(together):
         print(f"The ground station is at {address}.")
         for k in range(mission.agents):
@@ -162,15 +171,17 @@ def _fly_all(mission: Mission, options: argparse.Namespace) -> int:
         print(f"All are ready; the plan takes {seconds:g} s.", flush=True)
         while together.time() < seconds:
             time.sleep(0.05)
-        errors = together.errors()
-    last = max(0.0, seconds - 4.0)
-    for k in range(mission.agents):
-        if k != mission.facts["leader"]:
-            worst = 1e3 * errors.worst(k, last)
-            print(f"- agent {k}: {worst:.1f} mm from its place at most, in the last 4 s")
-    if errors.late:
-        print(f"The simulation was late {errors.late} times: the machine is slow; use `--speed`.")
-    return 0
+        errors, faults = together.errors(), together.ground.faults
+    since = max(0.0, seconds - 4.0)
+    for k in set(range(mission.agents)) - {mission.facts["leader"]}:
+        worst = 1e3 * errors.worst(k, since)
+        print(f"- agent {k}: {worst:.1f} mm from its place at most, in the last 4 s")
+    early = [k for k, fault in faults.items() if fault not in (Fault.NONE, Fault.END)]
+    if early:
+        print(f"{len(early)} agents descended before the end.")
+    if errors.late or Fault.STALE in faults.values():
+        print("This machine did not keep up with the vehicles; with `--speed 0.2` it may.")
+    return int(bool(early))
 
 
 if __name__ == "__main__":

@@ -61,7 +61,8 @@ class AgentProcess:
         flight = crew.flight
         self._crew, self._seconds, self._dt = crew, seconds, flight["dt"]
         self._supervisor = Supervisor(flight, Fence(**flight["fence"]))
-        self._pilot = Pilot(crew.law, crew.facts, hold=2.0 * crew.facts["network"]["forget"])
+        hold = 2.0 * crew.facts["network"]["forget"]
+        self._pilot = Pilot(crew.law, crew.facts, flight["leadership"], hold)
         self._reading: Reading | None = None
         self._began, self._ticked, self._fell = time.monotonic(), -math.inf, math.inf
         self._sent, self._reported, self._signals = -math.inf, -math.inf, 0

@@ -22,7 +22,7 @@ _MODES: Final = ("ready", "flies", "descends")
 
 @final
 class Ground:
-    """What the ground station knows and says; its thread ends with the process.
+    """What the ground station knows and says, by a thread of its own until `close`.
 
     Args:
         air: to the agents.
@@ -42,8 +42,9 @@ class Ground:
         self._air, self._wire, self._agents, self._watch = air, wire, agents, watch
         self._reports = dict[int, tuple[float, Report]]()
         self._start: float | None = None
-        self._stopped, self._said = False, -math.inf
-        threading.Thread(target=self._run, daemon=True).start()
+        self._stopped, self._said, self._closed = False, -math.inf, False
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
 
     def start(self, at: float) -> None:
         """Let the plan start at a time, s since 1970, once."""
@@ -53,10 +54,21 @@ class Ground:
         """Let everybody level and descend."""
         self._stopped, self._said = True, -math.inf
 
+    def close(self) -> None:
+        """End."""
+        self._closed = True
+        self._thread.join()
+        self._air.close()
+
     def report(self, number: int) -> Report | None:
         """Return the last report of an agent that is alive; None of one that is silent."""
         heard, report = self._reports.get(number, (-math.inf, None))
         return report if time.monotonic() - heard < _SILENT else None
+
+    @property
+    def faults(self) -> dict[int, Fault]:
+        """The fault of each agent that was ever heard."""
+        return {k: _fault(report) for k, (_, report) in self._reports.items()}
 
     @property
     def ready(self) -> bool:
@@ -65,7 +77,7 @@ class Ground:
         return all(x is not None and math.isfinite(x.x) and x.mode < 2 for x in reports)
 
     def _run(self) -> None:
-        while True:
+        while not self._closed:
             for datagram in self._air.receive():
                 opened = self._wire.open(datagram, None, time.time())
                 if not isinstance(opened, Drop) and isinstance(opened.body, Report):
@@ -97,7 +109,7 @@ class Ground:
         if heard is None or report is None:
             return {"agent": number, "mode": "not heard yet"}
         silent = time.monotonic() - heard
-        fault = list(Fault)[report.fault] if report.fault < len(Fault) else Fault.NONE
+        fault = _fault(report)
         counts = zip(Drop, report.dropped, strict=True)
         return {
             "agent": number,
@@ -111,6 +123,10 @@ class Ground:
             "battery": _number(report.battery, 2),
             "dropped": [f"{n} {why.value}" for why, n in counts if n],
         }
+
+
+def _fault(report: Report) -> Fault:
+    return list(Fault)[report.fault] if report.fault < len(Fault) else Fault.NONE
 
 
 def _number(value: float, digits: int) -> float | None:

@@ -23,16 +23,24 @@ class Letterbox:
         hears: the numbers of the neighbours.
         leaders: of those whose packets count; the lowest one first.
         own: the agent's number, if it leads.
+        heirs: of those that may lead later, with a higher epoch.
 
     Attributes:
         letters: of each neighbour; None before the first.
         packet: None before the first.
     """
 
-    def __init__(self, hears: Sequence[int], leaders: Collection[int], own: int | None) -> None:
+    def __init__(
+        self,
+        hears: Sequence[int],
+        leaders: Collection[int],
+        own: int | None,
+        heirs: Collection[int] = (),
+    ) -> None:
         """Receive nothing yet."""
         self.letters = dict[int, Letter | None].fromkeys(hears)
         self._leaders, self._own = frozenset(leaders), own
+        self._heirs = frozenset(heirs)
         self.packet: Packet | None = None
 
     def receive(self, letter: Letter, clock: float) -> Drop | None:
@@ -44,7 +52,7 @@ class Letterbox:
             return Drop.PACKET
         if max(letter.time, packet.time) > clock + _AHEAD:
             return Drop.AHEAD
-        if packet.leader not in self._leaders or packet.epoch != 0:
+        if packet.leader not in (self._heirs if packet.epoch else self._leaders):
             return Drop.PACKET
         if self._wins(packet):
             self.packet = packet
@@ -56,8 +64,8 @@ class Letterbox:
         return None
 
     def _wins(self, packet: Packet) -> bool:
-        """Tell whether a packet is of a leader with a lower number, or newer."""
-        if self._own is not None and packet.leader >= self._own:
+        """Tell whether a packet is of a later epoch, a leader with a lower number, or newer."""
+        if self._own is not None and packet.leader >= self._own and not packet.epoch:
             return False
         return self.packet is None or _rank(packet) > _rank(self.packet)
 

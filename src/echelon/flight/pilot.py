@@ -31,6 +31,8 @@ class Pilot:
     Args:
         law: the module `law.py`.
         facts: the content of law.json.
+        leadership: `heirs`, who takes the lead in which order, and the `timeout` (s) of each; None
+            for nobody.
         hold: age (s) of the newest letter of anybody from which on a follower no longer flies by
             the plan, but holds the place where it would come to rest.
 
@@ -38,25 +40,49 @@ class Pilot:
         box: what it received.
     """
 
-    def __init__(self, law: ModuleType, facts: Mapping[str, Any], hold: float = math.inf) -> None:
+    def __init__(
+        self,
+        law: ModuleType,
+        facts: Mapping[str, Any],
+        leadership: Mapping[str, Any] | None = None,
+        hold: float = math.inf,
+    ) -> None:
         """Begin without a memory."""
         self._law, self._facts, self._hold = law, facts, hold
         self._number, self.leads = facts["agent"], facts["leads"]
         self._network = facts["network"]
         self._leaderward = self._network["uses"] == "leaderward"
         own = self._number if self.leads else None
-        self.box = Letterbox(facts["hears"], self._network["leaders"], own)
+        heirs = [] if leadership is None else leadership["heirs"]
+        self.box = Letterbox(facts["hears"], self._network["leaders"], own, heirs)
+        self._patience = math.inf
+        if leadership is not None and self._number in heirs:
+            self._patience = leadership["timeout"] * (heirs.index(self._number) + 1)
+        self._began: float | None = None
         self._memory: list[float] | None = None
+        self._estimate: list[float] | None = None
         self._last: Ticked | None = None
 
-    def tick(self, t: float, x: list[float]) -> Ticked:
-        """Return what the agent does at a time of the plan (s) in a state (n,)."""
+    def tick(self, t: float, y: list[float]) -> Ticked:
+        """Return what the agent does at a time of the plan (s) where it measures a state (n,)."""
+        if not hasattr(self._law, "measure"):
+            return self._act(t, y)
+        before = self._law.estimate(y) if self._estimate is None else self._estimate
+        x, estimate, valid = self._law.measure(y, before)
+        ticked = self._act(t, x)
+        if valid and ticked.valid:
+            self._estimate = self._law.deliver(ticked.u, estimate)
+        return ticked
+
+    def _act(self, t: float, x: list[float]) -> Ticked:
+        """Return what the agent does in a state (n,)."""
         memory = self._law.begin(x) if self._memory is None else self._memory
+        self._inherit(t)
         leader, forward = self._expected(t, x, memory)
         ages = self.box.ages(t)
         hops = self._hops(ages)
         z = self._disagreement(x, memory, leader, ages, hops)
-        if not self.leads and min(ages, default=0.0) > self._hold:
+        if not self._in_lead and min(ages, default=0.0) > self._hold:
             z, forward = [0.0] * len(z), [0.0] * len(forward)
         u, after, _, _, *content, valid = self._law.tick(t, x, z, forward, memory)
         if not valid:
@@ -64,6 +90,22 @@ class Pilot:
         letter = self._letter(t, x, memory, leader, hops, content)
         self._memory, self._last = after, Ticked(u, letter, True)
         return self._last
+
+    @property
+    def _in_lead(self) -> bool:
+        """Whether it leads, from the beginning or as an heir."""
+        return self.leads or self.box.packet is not None and self.box.packet.leader == self._number
+
+    def _inherit(self, t: float) -> None:
+        """Take the lead by the plan, if it is an heir that has heard of no leader for long."""
+        packet = self.box.packet
+        self._began = t if self._began is None else self._began
+        waited = t - (self._began if packet is None else packet.time)
+        if self.leads or not (self._in_lead or waited > self._patience):
+            return
+        epoch = 0 if packet is None else packet.epoch
+        plan = (0.0,) * self._network["content"]
+        self.box.packet = Packet(self._number, t, plan, epoch if self._in_lead else epoch + 1)
 
     def _expected(
         self, t: float, x: list[float], memory: list[float]
@@ -86,7 +128,7 @@ class Pilot:
         lasting = [x.hops for x, age in letters if x and age <= self._network["forget_hops"]]
         nearest = min(lasting, default=NOBODY)
         # Agents that are cut off together would count each other up for ever.
-        if self.leads:
+        if self._in_lead:
             return 0
         return nearest + 1 if nearest + 1 < self._network["agents"] else NOBODY
 
@@ -111,6 +153,9 @@ class Pilot:
             if near or not self._leaderward:
                 place = [a + b for a, b in zip(leader, away, strict=True)]
                 terms.append((weight, self._law.difference(x, memory, place)))
+        if self._in_lead and not self.leads:
+            # An heir follows the plan alone.
+            terms = [(sum(self._facts["weights"]), self._law.difference(x, memory, leader))]
         if not self._leaderward:
             return _weighted(terms, nothing)
         total = sum(weight for weight, _ in terms)

@@ -156,6 +156,7 @@ class Together:
                 process.wait(2.0)
             except subprocess.TimeoutExpired:
                 process.kill()
+        self.ground.close()
 
     def errors(self) -> "Errors":
         """Return what the vehicles say of themselves."""

@@ -136,6 +136,17 @@ _REPORT: Final = struct.Struct(f"<BBdd{_FIELDS - 4}f{len(Drop)}I")
 _START: Final = struct.Struct("<d")
 
 
+def require_key(file: Path | None) -> Path:
+    """Return the key file.
+
+    Raises:
+        FlightError: none is named.
+    """
+    if file is None:
+        raise FlightError("give `--key` with the key file, which all agents and the ground share.")
+    return file
+
+
 def read_key(file: Path) -> bytes:
     """Return the key of a formation, which its owner alone may read.
 

@@ -11,6 +11,9 @@ import typer
 from echelon.apps.cli import options
 from echelon.apps.cli.status import STATUS
 from echelon.core.errors import FlightError
+from echelon.flight.links.link import check_scheme
+from echelon.flight.mission import FACTS
+from echelon.flight.wire import read_key, require_key
 from echelon.output.archive.folder import check_empty
 
 _SCENARIO = "The name of a bundled scenario, a YAML file, or a folder that `--out` wrote."
@@ -55,10 +58,9 @@ def fly(
     out: _Out = None,
 ) -> None:
     """Fly a scenario: a process for each agent, which needs neither JAX nor NumPy."""
-    if out is None and agent is None and not every and not ground:
-        raise FlightError("give `--agent` with a number, `--all`, `--ground`, or `--out`.")
+    _check(agent, every, ground, key, link, out)
     folder = Path(scenario)
-    if not (folder / "flight.json").is_file():
+    if not (folder / FACTS).is_file():
         folder = _prepare(scenario, set_ or [], out)
     if out is not None:
         print(f"- Written to {folder}; `echelon fly {folder} --all` flies it.")
@@ -74,6 +76,22 @@ def fly(
     sys.stdout.flush()
     # In place of this process, which holds JAX.
     os.execv(sys.executable, [sys.executable, "-m", "echelon.flight", str(folder), *words])
+
+
+def _check(
+    agent: int | None, every: bool, ground: bool, key: Path | None, link: str, out: Path | None
+) -> None:
+    """Check what can be, before the laws are written, which takes long.
+
+    Raises:
+        FlightError: options do not fit each other, or the key cannot be used.
+    """
+    tasks = [agent is not None, every, ground, out is not None]
+    if sum(tasks) != 1:
+        raise FlightError("give one of `--agent` with a number, `--all`, `--ground` and `--out`.")
+    check_scheme(link)
+    if agent is not None or ground:
+        read_key(require_key(key))
 
 
 def _prepare(scenario: str, changes: list[str], out: Path | None) -> Path:

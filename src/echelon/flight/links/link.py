@@ -92,21 +92,35 @@ class Link(abc.ABC):
         """Let go of the link; the vehicle is left to its watchdog. It never raises."""
 
 
+def check_scheme(address: str) -> str:
+    """Return the scheme of an address such as `udp` or `px4://udpin:127.0.0.1:14540`.
+
+    Raises:
+        FlightError: there is no such link.
+    """
+    scheme = address.partition("://")[0]
+    if scheme not in LINKS:
+        raise FlightError(f"`--link` is `{address}`, and must begin with {listing(LINKS)}.")
+    return scheme
+
+
 def open_link(address: str, facts: Mapping[str, Any]) -> Link:
-    """Return the link of an address such as `udp` or `px4://udpin:127.0.0.1:14540`.
+    """Return the link of an address.
 
     Raises:
         FlightError: there is no such link, or it cannot serve the law.
     """
-    scheme, _, rest = address.partition("://")
-    if scheme not in LINKS:
-        raise FlightError(f"`--link` is `{address}`, and must begin with {listing(LINKS)}.")
+    scheme, inputs = check_scheme(address), tuple(facts["inputs"])
     module, _, name = LINKS[scheme].partition(":")
     link: type[Link] = getattr(importlib.import_module(module), name)
-    inputs = tuple(facts["inputs"])
-    if link.inputs not in (None, inputs):
+    if link.inputs is not None and link.inputs != inputs:
         raise FlightError(
             f"the link `{scheme}` sends {listing(link.inputs)}, and the law has the inputs "
             f"{listing(inputs)}; use a model with the link's inputs."
         )
-    return link(rest, facts)
+    if not link.watchdog and any("torque" in each for each in inputs):
+        raise FlightError(
+            f"the law sends torques, and the vehicle of the link `{scheme}` has no watchdog that "
+            "levels it when they stop; use a model with attitudes or rates as inputs."
+        )
+    return link(address.partition("://")[2], facts)

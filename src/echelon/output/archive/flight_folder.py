@@ -1,6 +1,5 @@
 """The folder of a flight: flight.json, the law of each agent, and its simulated vehicles."""
 
-import dataclasses
 import json
 import math
 import py_compile
@@ -39,8 +38,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     """Return the files of a flight by name.
 
     Args:
-        parts: of the formation; what they say of sensors is of the simulated vehicles alone, whose
-            autopilots measure.
+        parts: of the formation; what they say of plants, wind and sensors is of simulated vehicles.
         settings: of the run.
         formation: a text that is equal for all agents of the formation alone.
 
@@ -51,10 +49,9 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     """
     network = _network(parts)
     agents = parts.graph.agents
-    flown = parts.replace(world=dataclasses.replace(parts.world, sensing=None))
     files, guaranteed = dict[str, str | bytes](), promise(parts, settings).sentence()
     for k in range(agents):
-        law = python_law(flown, settings, k, formation, guaranteed)
+        law = python_law(parts.replace(leadership=None), settings, k, formation, guaranteed)
         files |= {f"law-{k}/{name}": text for name, text in law.items()}
     facts = json.loads(files["law-0/law.json"])
     vehicles = _vehicles(parts, settings)
@@ -65,6 +62,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         "horizon": settings.horizon,
         "sizes": [len(facts["signal"]), facts["network"]["content"]],
         "leader": min(parts.graph.leaders),
+        "leadership": _leadership(parts),
         "weather": {"delay": network.delay, "jitter": network.jitter, "loss": network.loss},
         **_places(parts.model),
         "fence": _fence(parts, settings),
@@ -72,6 +70,12 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         "vehicles": vehicles[0],
     }
     return {**files, **vehicles[1], "flight.json": json.dumps(described, indent=2) + "\n"}
+
+
+def _leadership(parts: Parts) -> JsonObject | None:
+    """Return who takes the lead after the leader; None for nobody."""
+    rule = parts.leadership
+    return None if rule is None else {"heirs": list(rule.heirs), "timeout": rule.timeout}
 
 
 def _network(parts: Parts) -> Network:
@@ -89,6 +93,8 @@ def _network(parts: Parts) -> Network:
         raise FlightError("the graph of the scenario switches, which no flight does yet.")
     if network.bursts.share:
         raise FlightError("`network.bursts` has no counterpart in a flight; use `network.loss`.")
+    if parts.world.sensing is not None and parts.world.sensing.delay:
+        raise FlightError("`sensing.delay` has no counterpart in a flight; leave it out.")
     return network
 
 
