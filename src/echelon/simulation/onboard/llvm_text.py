@@ -11,7 +11,9 @@ from echelon.simulation.codegen import is_installed, object_code
 from echelon.simulation.onboard.law_functions import LawFunction
 from echelon.simulation.onboard.statements import Syntax, statements
 
-_PROCESSOR = ("thumbv7em-none-eabihf", "cortex-m4")
+# With all four parts: of three LLVM takes the last one for the system, and passes numbers in
+# registers of the processor, where callers do not look for them.
+_PROCESSOR = ("thumbv7em-none-unknown-eabihf", "cortex-m4")
 _UNARY = {"abs": "fabs", "sqrt": "sqrt"}
 _OWN = ("floor", "ceil", "rint", "pow2", "exponent", "mantissa", "root_guess")
 _FUSED = ("fma", "fms", "fnma")
