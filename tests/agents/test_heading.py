@@ -97,7 +97,6 @@ BUNDLED = [
     QUADROTOR,
     ech.models.QuadrotorEuler(),
     ech.models.QuadrotorThrust(),
-    ech.models.CrazyflieAttitude(),
     ech.models.Unicycle(),
     ech.models.UnicyclePoint(),
 ]

@@ -39,9 +39,9 @@ def check(
 
 
 def _print(result: "CheckResult", every: bool) -> None:
-    from echelon.output.reports.check_report import check_report, check_sentences, grouped
+    from echelon.output.reports.check_report import check_report, grouped
 
     if every:
-        tables.print_statements(grouped(result.lines), check_sentences(result))
+        tables.print_statements(grouped(result.lines), result.promise.sentence())
     else:
         print(check_report(result))

@@ -17,11 +17,10 @@ __all__ = ["CheckResult", "check"]
 
 
 class CheckResult(NamedTuple):
-    """All lines, including the hypotheses of the promise; the promise; warnings of the parts."""
+    """All lines, including the hypotheses of the promise, and the promise."""
 
     lines: tuple[Statement, ...]
     promise: Promise
-    warnings: tuple[str, ...] = ()
 
     @property
     def promised(self) -> bool:
@@ -31,8 +30,7 @@ class CheckResult(NamedTuple):
     def as_mapping(self) -> JsonObject:
         """Return it ready for JSON."""
         lines = [line.as_mapping() for line in self.lines]
-        warnings = list(self.warnings)
-        return {"promise": self.promise.as_mapping(), "lines": lines, "warnings": warnings}
+        return {"promise": self.promise.as_mapping(), "lines": lines}
 
 
 def check(parts: Parts, settings: Settings) -> CheckResult:
@@ -41,7 +39,7 @@ def check(parts: Parts, settings: Settings) -> CheckResult:
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
-    parts, _, warnings = prepare(parts, settings)
+    parts = prepare(parts, settings).parts
     guarantee = promise(parts, settings)
     with precision("float64"):
         lines = (
@@ -51,4 +49,4 @@ def check(parts: Parts, settings: Settings) -> CheckResult:
             killing_line(parts, guarantee),
             *margin_lines(parts, guarantee),
         )
-    return CheckResult(lines, guarantee, warnings)
+    return CheckResult(lines, guarantee)

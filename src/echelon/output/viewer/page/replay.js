@@ -22,9 +22,7 @@ class Pane {
   show(frame) {
     const { run } = this, moment = run.at(frame);
     this.view.show(moment);
-    const last = (rows) => rows[upper(rows.map(([time]) => time), moment.time) - 1];
-    showClosest(this.closest, last(run.closest), run);
-    showMoment(this.part, last(run.moments));
+    showClosest(this.closest, run.closest[upper(run.closest.map(([time]) => time), moment.time) - 1], run);
     for (const chart of this.charts) chart.point(moment.time);
     return moment;
   }
@@ -105,8 +103,7 @@ class Player {
     this.button.addEventListener("click", () => this.play(!this.playing));
     this.scrub.addEventListener("input", () => (this.play(false), this.seek(Number(this.scrub.value))));
     speed.addEventListener("change", () => (this.speed = Number(speed.value)));
-    const marks = run.moments.map(([time, words]) => make("i", { class: "mark", title: words, style: `left: calc(8px + ${run.frameOf(time) / last} * (100% - 16px))` }));
-    $("footer").append(this.button, this.clock, make("span", { class: "track" }, this.scrub, ...marks), speed, this.views.box);
+    $("footer").append(this.button, this.clock, this.scrub, speed, this.views.box);
   }
 
   listen() {
@@ -162,9 +159,8 @@ class Player {
 function readCharts(run) {
   if (!run.series) return [];
   const curve = (c) => Array.from({ length: run.series.frames }, (_, k) => valueOf(run.series, c, k, 0));
-  return run.charts.map((chart, place) => ({
+  return run.charts.map((chart) => ({
     ...chart,
-    moments: place ? run.moments.map(([time]) => [time, ""]) : run.moments,
     times: run.chartTimes,
     lines: chart.lines.map((line) => ({ ...line, values: line.ends ? run.chartTimes.map((t) => line.ends[0] + line.ends[1] * t) : curve(line.series) })),
   }));
