@@ -80,6 +80,43 @@ BASES: list[dict[str, Any]] = [
         "follower": {"law": "agreement"},
         "simulation": {"horizon": 0.1, "dt": 0.05, "limits": False, "precision": "float32"},
     },
+    {
+        "name": "radio",
+        "model": {"name": "double-integrator", "parameters": {"dimension": 2}},
+        "graph": {"edges": [[0, 1], [1, 2], [1, 3]], "directed": True, "leaders": [0]},
+        "formation": {"offsets": {1: [1.0, 0.0], 2: [2.0, 0.0], 3: [2.0, 1.0]}},
+        "reference": {"name": "circle", "radius": 1.0, "rate": 0.5, "center": [0, 0, 1]},
+        "leader": {"law": "stopping-point", "speed": 1.0},
+        "follower": {"law": "stopping-point", "rate": 4.0, "speed": [1.0, 0.8]},
+        "network": {
+            "rate": 25.0,
+            "delay": 0.04,
+            "jitter": 0.02,
+            "loss": 0.1,
+            "bursts": {"share": 0.1, "length": 0.2},
+            "forget": 0.6,
+        },
+        "sensing": {"delay": 0.02, "noise": {"position": 0.01}},
+        "actuator": {"lag": 0.03},
+        "initial": {"spread": {"position": 0.5}},
+        "simulation": {"horizon": 0.2, "dt": 0.02},
+    },
+    {
+        "name": "apart",
+        "model": {"name": "double-integrator", "parameters": {"dimension": 2}},
+        "graph": {
+            "edges": [[0, 1], [1, 2]],
+            "schedule": [{"at": 0.1, "edges": [[0, 2], [1, 2, 0.5]]}],
+            "period": 0.2,
+            "leaders": [0],
+        },
+        "formation": {"offsets": {1: [1.0, 0.0], 2: [2.0, 0.0]}},
+        "leader": {"law": "stopping-point"},
+        "follower": {"law": "stopping-point", "rate": 3.0, "coupling": 4.0, "observer": False},
+        "safety": {"radii": [0.1, 0.1, 0.3], "gain": 4.0, "margin": 0.02, "reach": 4.0},
+        "initial": {"states": {1: [0.5, 0.5, 0.0, 0.0]}},
+        "simulation": {"horizon": 0.2, "dt": 0.02},
+    },
 ]
 
 ODD: list[Any] = [
@@ -122,6 +159,8 @@ SIZED = ["graph.agents", "graph.rows", "graph.columns", "graph.leaders.0", "grap
 SIZED += ["model.parameters.dimension", "formation.columns", "simulation.horizon", "simulation.dt"]
 SIZED += ["simulation.store_every", "disturbance.hold", "report.steady_window", "seed"]
 SIZED += ["formation.spacing", "reference.rate", "follower.gain.coupling", "graph.edges.1.2"]
+SIZED += ["network.delay", "network.jitter", "network.forget", "network.rate", "sensing.delay"]
+SIZED += ["actuator.lag", "safety.reach", "follower.rate", "follower.coupling", "graph.period"]
 NUMBERS = [0, 1, 2, 3, 0.1, 1e-8, 1e-300, 1e16, 1e155, 1.7e308]
 MARKS = [b"{", b"]", b": ", b"\n", b"&a ", b"*a", b"\xff", b"- ", b"!!x "]
 WORDS = ["dt", "horizon", "gain", "name", "python", "file", "set", "0", "x", "position", "é", "*"]

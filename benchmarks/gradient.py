@@ -18,7 +18,9 @@ from engine import flock
 
 import echelon as ech
 from echelon.core.numerics import precision
-from echelon.simulation.engine.gradient import DifferentiableRun, Native, by_jax
+from echelon.simulation.engine.differentiable_run import DifferentiableRun
+from echelon.simulation.engine.jax_gradient import by_jax
+from echelon.simulation.engine.native_gradient import Native
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.simulate import sample_reference
 from echelon.simulation.native.stepper import NativeStepper

@@ -31,6 +31,12 @@ RUNS: dict[str, dict[str, Any]] = {
         "figures": {"trajectories": "space", "inputs": "motors"},
         "video": ("paper", 1.5),
     },
+    "crossing": {
+        "set": ("simulation.horizon=8",),
+        "figures": {"avoidance": "near"},
+        "video": ("crossing", 1.0),
+    },
+    "leader-lost": {"figures": {"trajectories": "heir"}, "video": ("heir", 1.5)},
     "paper-far": {"set": ("simulation.horizon=20",), "figures": {"trajectories": "far"}},
     "flock.yaml": {
         "figures": {

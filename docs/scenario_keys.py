@@ -35,6 +35,8 @@ def keys_page() -> str:
         inner = _referred(what, schema["$defs"])
         if inner is not None:
             parts += _section(f"`{name}`", inner, schema["$defs"])
+    title, defs = "an entry of `motion`, of the formation", schema["$defs"]
+    parts += _section(title, defs["MotionSpec"], defs)
     parts += _section("`gain`, of leader or follower", schema["$defs"]["GainSpec"], schema["$defs"])
     parts += [*_named("References", registry.REFERENCES), *_named("Models", registry.MODELS)]
     return "\n".join(parts)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from echelon.agents.models import (
+    CrazyflieAttitude,
     DoubleIntegrator,
     Linear,
     Pendulum,
@@ -38,5 +39,6 @@ MODELS = {
     "printed": PrintedQuadrotor(),
     "euler": QuadrotorEuler(gravity=3.7),
     "thrust": QuadrotorThrust(),
+    "attitude": CrazyflieAttitude(),
 }
 FLAT_MODELS = {name: model for name, model in MODELS.items() if model.flat_outputs}

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import xarray as xr
 
+from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
 from echelon.experiments.results.recording import InputBounds, LoopPoles, Recording, TrackingErrors
 
 PROMISE = {
@@ -83,6 +84,15 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
         state_names=names,
         position=position,
         **own,
+    )
+
+
+def separated(run):
+    """A recording of agents that keep .3 m apart, in ellipsoids three times as high as wide."""
+    begins = np.arange(0.0, run.times[-1], 1.0)
+    sizes = Ellipsoid(0.125, 0.375, 0.3)
+    return dataclasses.replace(
+        run, avoidance=Avoidance(begins, 0.3 + 0.1 * begins, 6.0 - begins, sizes)
     )
 
 

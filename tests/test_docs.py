@@ -40,8 +40,10 @@ JOURNEYS = [
     slow(*FIRST, "troubleshooting"),
     slow("recipes", "sweeps", "comparing"),
     slow("networks"),
+    slow("events"),
     slow("learning"),
     slow("crazyflie"),
+    slow("autopilots"),
     slow("matlab"),
     slow("onboard"),
 ]

@@ -296,7 +296,7 @@ def test_every_dependency_is_imported_or_has_its_reason():
         "pyarrow": "what pandas writes Parquet with",
     }
     extras = project()["optional-dependencies"]
-    optional = ("certify", "cluster", "fast", "optimal", "video", "parquet")
+    optional = ("certify", "cluster", "crazyflie", "fast", "optimal", "parquet", "px4", "video")
     names = [*project()["dependencies"], *itertools.chain(*(extras[name] for name in optional))]
     required = {re.match(r"[\w-]+", name)[0].replace("-", "_") for name in names}
     found = {

@@ -89,6 +89,7 @@ from .simulation.engine.law_drive import Laws as Laws
 from .simulation.engine.parts import Parts as Parts
 from .simulation.engine.result import Result as Result
 from .simulation.engine.simulate import simulate as simulate
+from .simulation.step.leadership import Leadership as Leadership
 from .simulation.step.settings import Settings as Settings
 from .synthesis import (
     certificates as certificates,

@@ -117,6 +117,7 @@ def test_what_is_set_from_outside_is_below_every_declaration(monkeypatch):
 @pytest.mark.parametrize(
     "name", [f"{kind}Integrator" for kind in ("Single", "Double")] + ["Unicycle", "Pendulum"]
     + ["VanDerPol", "Quadrotor", "PlanarQuadrotor", "QuadrotorEuler", "QuadrotorThrust"]
+    + ["CrazyflieAttitude"]
 )  # fmt: skip
 def test_every_bundled_model_declares_at_the_class_that_moves(name):
     kind, interface = getattr(ech.models, name), ech.ControlAffine

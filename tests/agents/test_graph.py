@@ -400,3 +400,9 @@ def test_an_edge_is_of_agents_that_there_are(edges, agents, said):
 def test_a_number_of_agents_is_whole(make, agents):
     with pytest.raises(errors.GraphError, match="^the number of agents is .*whole number.*4.$"):
         make(agents)
+
+
+def test_weights_of_which_eigenvalues_overflow_are_refused_on_a_graph_that_switches():
+    graph = Graph.switching([(0.0, [(0, 1)]), (1.0, [(0, 1, 1.7e308)])])
+    with pytest.raises(errors.GraphError, match="add up to 1.7e"):
+        graph.spectrum()

@@ -97,6 +97,7 @@ BUNDLED = [
     QUADROTOR,
     ech.models.QuadrotorEuler(),
     ech.models.QuadrotorThrust(),
+    ech.models.CrazyflieAttitude(),
     ech.models.Unicycle(),
     ech.models.UnicyclePoint(),
 ]

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 import echelon.agents.models
 from echelon.agents.models import (
     ControlAffine,
+    CrazyflieAttitude,
     DoubleIntegrator,
     Heading,
     Limits,
@@ -33,6 +34,7 @@ from echelon.agents.models import (
     UnicyclePoint,
     VanDerPol,
 )
+from echelon.agents.models.crazyflie_attitude import ATTITUDE_PARAMETERS
 from echelon.agents.models.model_check import check_model
 from echelon.agents.models.rigid_body import body_rates, euler_rates, free_spin
 from echelon.core import numerics
@@ -106,6 +108,13 @@ EQUATIONS = {
         *x[9:12],
         *u[1:],
         u[0],
+    ],
+    CrazyflieAttitude: lambda m, x, u: [
+        *x[3:6],
+        *(m.thrust_gain * u[3] / m.mass * rotation(x[6:9])[:, 2] - [0.0, 0.0, m.gravity]),
+        *x[9:12],
+        *(m.command_gain * u[:2] - m.stiffness * x[6:8] - m.rate_damping * x[9:11]),
+        m.yaw_damping * (u[2] - x[11]),
     ],
 }
 
@@ -395,7 +404,10 @@ def test_the_flat_state_contains_the_path_and_its_speed(model):
             assert x[model.state_names.index(f"v{name}")] == pytest.approx(float(rows[1, k]))
 
 
-@pytest.mark.parametrize("name", [*SPACE, "planar", "planar crazyflie", "euler", "thrust"])
+STILL = [*SPACE, "planar", "planar crazyflie", "euler", "thrust", "attitude"]
+
+
+@pytest.mark.parametrize("name", STILL)
 def test_standing_still_is_flown_by_the_trim(name):
     model = MODELS[name]
     rows = np.zeros((model.flat_order + 1, len(model.flat_outputs)))
@@ -445,6 +457,21 @@ def test_under_computed_torque_quadrotors_fly_what_rotations_and_differences_say
     assert u[1:] == pytest.approx(bend, abs=1e-6) and u[0] == pytest.approx(lift[1] - 3.7, abs=1e-9)
     assert (y[:12] == x).all() and y[12] == u[0] and (v[1:] == u[1:]).all()
     assert v[0] == pytest.approx((lift[2] - lift[0]) / 2e-5, abs=1e-6)
+
+
+def test_commands_fly_what_their_equations_ask_of_angles_and_thrust():
+    model, t = CrazyflieAttitude(), 0.4
+    path = Smooth(4, 2, drift=0.3)
+    with precision("float64"):
+        rows = jnp.asarray(path.derivatives(t, 4))
+        zeta, rate, bend = attitude_by_rotations(path, model.gravity, t)
+        x, u = map(np.asarray, model.flat(rows))
+    back = model.stiffness * zeta + model.rate_damping * rate
+    assert x[6:9] == pytest.approx(zeta, abs=1e-12) and x[9:12] == pytest.approx(rate, abs=1e-8)
+    assert u[:2] == pytest.approx((bend + back)[:2] / model.command_gain, abs=1e-8)
+    assert u[2] == pytest.approx(rate[2] + bend[2] / model.yaw_damping, abs=1e-7)
+    lift = np.linalg.norm(np.asarray(rows)[2, :3] + [0.0, 0.0, model.gravity])
+    assert u[3] == pytest.approx(model.mass * lift / model.thrust_gain, rel=1e-12)
 
 
 # ---- physics ----
@@ -611,6 +638,30 @@ def test_a_named_quadrotor_takes_changes():
     model = Quadrotor.named("paper", allow_unphysical=True, mass=0.03)
     assert model.mass == 0.03
     assert model.inertia == (6.4893e-6, 16.4562e-6, 29.5435e-6)
+
+
+def test_the_firmware_s_gains_are_those_of_its_set():
+    """Mellinger's attitude controller by hand: gains of 65535ths, an error of twice the angle."""
+    model = CrazyflieAttitude.named("firmware")
+    motor = 0.12 / 65535
+    tilt = 2 * 0.0325 * motor / 16.613656e-6  # rad/s^2 a unit; half of it goes to each motor
+    slower = 1 + 200 * tilt  # its feedback of the angular acceleration
+    assert model.stiffness == pytest.approx(2 * 70000 * tilt / slower, rel=1e-3)
+    assert model.rate_damping == pytest.approx(20000 * tilt / slower, rel=1e-3)
+    assert model.yaw_damping == pytest.approx(12000 * 4 * 0.006993 * motor / 29.261652e-6, rel=1e-3)
+    assert model.command_gain == model.stiffness and model.motor_thrust == 0.12
+
+
+@pytest.mark.parametrize("name", ATTITUDE_PARAMETERS)
+def test_a_held_command_ends_in_a_steady_tilt_and_turn(name):
+    model = CrazyflieAttitude.named(name)
+    u = np.array([0.1, -0.05, 0.4, model.trim[1][3]])
+    with numerics.precision("float64"):
+        flow = jax.jit(lambda x: model.velocity(x, jnp.asarray(u)))
+        end = solve_ivp(lambda t, x: np.asarray(flow(x)), (0.0, 2.0), np.zeros(12), rtol=1e-9).y
+        assert check_model(model) == ()
+    assert end[6:8, -1] == pytest.approx(model.command_gain / model.stiffness * u[:2], rel=1e-4)
+    assert end[11, -1] == pytest.approx(0.4, rel=1e-4)
 
 
 class Tank(ControlAffine):

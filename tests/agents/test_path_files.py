@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 
 import echelon as ech
 from echelon.agents.models.chains import chains_of
@@ -206,6 +207,26 @@ def test_verify_computes_the_guarantee_from_the_path_in_the_folder(tmp_path, ech
     path.write_text(path.read_text("utf-8").replace("-0.5", "-0.9"), "utf-8")
     code, said, _ = echelon("verify", tmp_path / "run")
     assert code == 1 and "Refused" in said
+
+
+def test_all_paths_are_written_with_the_file_of_crazyswarm2_that_lists_them(tmp_path, echelon):
+    write_points(tmp_path)
+    file, out = written(tmp_path), tmp_path / "swarm"
+    offset = "formation.offsets={1: [1, 0.5, 0]}"
+    code, said, _ = echelon("path", file, "--set", offset, "--all", "--out", out)
+    assert code == 0 and f"Written to {out}: 2 paths of 3 pieces, 4 s." in said
+    robots = YAML(typ="safe").load(out / "crazyflies.yaml")["robots"]
+    begins = [at(Polynomials.read(out / f"{name}.csv"), [0.0])[0, 0] for name in robots]
+    assert [*robots] == ["agent0", "agent1"] and begins[1] - begins[0] == pytest.approx(
+        [1, 0.5, 0, 0]
+    )
+    for robot, begin in zip(robots.values(), begins, strict=True):
+        assert robot["initial_position"] == pytest.approx([*begin[:2], 0.0], abs=1e-4)
+    assert len({robot["uri"] for robot in robots.values()}) == 2
+    code, _, errors = echelon("path", file, "--all", "--out", out)
+    assert code == 2 and "is not empty" in errors
+    code, _, errors = echelon("path", file, "--all", "--agent", 1, "--out", tmp_path / "two")
+    assert code == 2 and "`--all` writes the goals of all agents; leave out `--agent`." in errors
 
 
 def test_the_command_writes_the_leaders_path_and_a_followers_goal(tmp_path, echelon):

@@ -10,17 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from oracles import rotation
-from recordings import as_file, flown
+from recordings import as_file, flown, separated
 from runs import made_up
 
 import echelon as ech
 from echelon.apps.cli.explain_command import _names_and_keys
-from echelon.core.errors import MissingExtraError
+from echelon.core.errors import MissingExtraError, OutputError
+from echelon.experiments.results.avoidance import Ellipsoid
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.recording import FORMAT, read_recording
 from echelon.experiments.scenario.registry import families
 from echelon.experiments.scenario.scenario import key_meanings
-from echelon.output.archive.export import table
+from echelon.output.archive.export import export, table
 from echelon.output.plots import animation, video
 from echelon.output.plots import style as draw
 from echelon.output.plots.camera import camera_for
@@ -108,6 +109,14 @@ def test_a_row_is_of_an_agent_at_a_time(run):
     assert rows[rows.leader].agent.unique().tolist() == [0]
 
 
+def test_a_run_without_frames_is_exported_to_no_file(here, run):
+    empty = {name: getattr(run, name)[:0] for name in ("times", "states", "inputs")}
+    for kind in ("csv", "npz", "html"):
+        with pytest.raises(OutputError, match="^the run has no stored frame; an export needs at"):
+            export(dataclasses.replace(run, **empty), here / f"run.{kind}")
+    assert not list(here.glob("run.*"))
+
+
 def test_an_unknown_format_is_refused_with_those_there_are(echelon, file):
     code, _, fault = echelon("export", file, "--to", "xls")
     assert code == 2
@@ -169,6 +178,32 @@ def test_a_picture_names_the_closest_pair_and_warns_of_those_that_touch(run):
         closest = run.closest_pair()
         assert "{} and {} at".format(*closest.agents) in text.get_text()
         assert (text.get_color() == draw.COLOURS[1]) == warns
+
+
+def test_a_video_of_agents_that_keep_apart_has_their_distance_its_limits_and_rows():
+    run = separated(flown(seconds=2.5, rate=20.0))
+    film = video._Film(run, (960, 540), run.times[[0, -1]])
+    titles = [ax.get_title(loc="left") for ax in film.figure.axes]
+    near = film.figure.axes[titles.index("smallest scaled distance (m), active rows")]
+    assert {"kept", "touching"} == {text.get_text() for text in near.texts}
+    line, *limits = [each.get_xydata() for each in near.get_lines()]
+    steps = np.floor(run.times + 1e-9)
+    np.testing.assert_allclose(line[:, 1], 0.3 + 0.1 * steps)
+    assert [float(each[0, 1]) for each in limits[:2]] == [0.3, 0.25]
+    (text,) = [t for t in film.ax.texts if t.get_text().startswith("smallest scaled distance ")]
+    assert text.get_color() == draw.COLOURS[1]
+    [*film.pictures(np.array([0.4, 2.0]))]
+    assert len(film.moving.shells.get_paths()) == 4
+
+
+def test_an_ellipsoid_tells_who_is_too_near():
+    sizes = Ellipsoid(0.125, 0.375, 0.3)
+    places = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.7], [0.28, 0.0, 0.7], [5.0, 0.0, 0.0]])
+    # Scaled: .233 m overlapping, .28 m below the limit, .364 m, and far away.
+    assert sizes.too_near(places, ("x", "y", "z")).tolist() == [2.0, 2.0, 1.0, 0.0]
+    assert sizes.too_near(places[:, ::2], ("x", "z")).tolist() == [2.0, 2.0, 1.0, 0.0]
+    places[1] = np.nan
+    assert sizes.too_near(places, ("x", "y", "z")).tolist() == [0.0] * 4
 
 
 def test_a_moving_agent_moves_in_the_pictures(run):

@@ -17,6 +17,7 @@ import echelon as ech
 from echelon.apps.live import promiser
 from echelon.apps.live import server as served
 from echelon.apps.live import swarm as looked
+from echelon.apps.live.attendance import as_changes
 from echelon.apps.live.guarantee_status import GuaranteeStatus
 from echelon.apps.live.panel import Panel
 from echelon.apps.live.promiser import Promiser, badge_of, first_look
@@ -135,12 +136,69 @@ def test_radio_gusts_lag_and_noise_are_knobs():
     assert shades.shape == (4,) and (shades <= fresh + 1e-9).all() and shades.max() > 0.0
 
 
-def test_an_agent_that_is_lost_has_no_links(panel, session):
-    session.apply(session.ask({"name": "lose", "value": 1}))
-    edges = panel.live.parts.graph.edges
-    assert session.knobs.cut == frozenset(np.flatnonzero((edges == 1).any(axis=1)).tolist())
-    with pytest.raises(SimulationError, match="`lose` got `99`, and must be the number"):
-        session.ask({"name": "lose", "value": 99})
+def shown(session, pictures):
+    """The states after each of some pictures."""
+    rows = []
+    for _ in range(pictures):
+        session.settle()
+        rows.append(session.swarm.advance().states)
+    return np.stack(rows)
+
+
+def test_who_is_lost_or_joins_live_does_so_as_in_a_run(session):
+    before = shown(session, 3)
+    session.ask({"name": "lose", "value": 3})
+    lost = shown(session, 3)
+    assert session.swarm.here.tolist() == [True, True, True, False]
+    session.ask({"name": "join", "value": 3})
+    joined = shown(session, 3)
+    events = [{"at": 0.12, "lose": 3}, {"at": 0.24, "join": 3}]
+    whole = ech.run(scenario(events=events))
+    seen = np.concatenate([before, lost, joined])
+    # The frame of a run at the time of an arrival is after it.
+    seen[5, 3] = whole.states[6, 3]
+    np.testing.assert_allclose(seen, whole.states[1:10], atol=1e-12)
+    saved = read_yaml(session.ask({"name": "save"})["text"], "saved").data["live"]
+    assert saved == events
+    badge = badge_of(session.panel, session.knobs)
+    assert badge["state"] == "lost" and "agent 3 joins at 0.24 s" in badge["whole"]
+    session.ask({"name": "reset"})
+    session.settle()
+    assert session.swarm.here.all() and not session.knobs.events
+
+
+def test_a_leader_that_has_lost_all_others_goes_on_alone(session):
+    for agent in (3, 2, 1):
+        session.ask({"name": "lose", "value": agent})
+        session.settle()
+    picture = session.swarm.advance()
+    session.show(picture)
+    assert picture.here.tolist() == [True, False, False, False]
+    assert np.isnan(np.frombuffer(session.picture[16:], "<f4")[:2]).all()
+
+
+def test_events_of_a_scenario_are_changes_of_a_live_loop():
+    events = [
+        {"at": 2.0, "cut": [0, 1], "for": 1.5},
+        {"at": 3.0, "join": 2},
+        {"at": 1.0, "lose": 1},
+    ]
+    assert sorted(as_changes(events), key=lambda change: change["at"]) == [
+        {"at": 0.0, "lose": 2},
+        {"at": 1.0, "lose": 1},
+        {"at": 2.0, "cut": [0, 1]},
+        {"at": 3.0, "join": 2},
+        {"at": 3.5, "restore": [0, 1]},
+    ]
+
+
+def test_what_cannot_happen_is_refused_in_a_sentence(session):
+    for name, agent, sentence in (
+        ("lose", 0, "agent 0 is lost, and nobody leads afterwards; name `heirs` in `leadership`."),
+        ("join", 2, "agent 2 cannot join, since it is there."),
+        ("lose", 99, "`lose` got `99`, and must be the number of an agent."),
+    ):
+        assert session.ask({"name": name, "value": agent}) == {"fault": sentence}
 
 
 KNOBS = {
@@ -265,6 +323,8 @@ def test_who_was_closest_is_kept_until_a_reset(session, swarm):
     assert session.closest.distance == pytest.approx(apart.min(), rel=1e-12)
     assert session.closest.agents == pairs[pair]
     assert session.closest.time == pytest.approx(0.04 * (frame + 1))
+    near, active = np.frombuffer(session.picture[16:], "<f4")[8:10]
+    assert near == pytest.approx(apart[-1].min(), rel=1e-6) and active == 0.0
     session.ask({"name": "reset"})
     session.settle()
     assert session.closest.time == 0.0
@@ -501,11 +561,12 @@ def test_a_growing_mode_is_told_at_once(panel):
 HELD = {"state": "holds", "short": "promised", "whole": "Promised.", "rate": 1.0, "causes": []}
 
 
-def badges_of(model, errors, pitch=None, begins=None):
+def badges_of(model, errors, pitch=None, begins=None, apart=None):
     """What the badge tells over time (s) of errors, one a second, of a leader and a follower."""
     told, names = [], model.state_names
     status = GuaranteeStatus(model, ech.Graph.path(2), told.append)
-    status.update(HELD | {"beyond": ["the guarantee does not cover this run: far"]})
+    kept = None if apart is None else 0.3
+    status.update(HELD | {"beyond": ["the guarantee does not cover this run: far"], "apart": kept})
     for second, error in enumerate(errors):
         if second == begins:
             status.begin()
@@ -513,7 +574,9 @@ def badges_of(model, errors, pitch=None, begins=None):
         if pitch is not None:
             states[1, names.index("pitch")] = pitch[second]
         size, none = np.array([0.0, error]), np.zeros(2, bool)
-        status.look(Picture(float(second), states, states, size, states, None, np.nan, none))
+        rows = float(second), states, states, size, states, None, np.nan, none
+        near = np.inf if apart is None else apart[second]
+        status.look(Picture(*rows, apart=near))
     return told
 
 
@@ -538,6 +601,16 @@ def test_a_first_swing_and_errors_of_no_size_take_no_promise_back():
     assert len(badges_of(model, [0.5, 1e-9, 1e-9, 1e-9, 0.5, 0.9], begins=4)) == 1
     fallen = badges_of(model, [0.5, 0.1, 0.1, 1.1, 9.0, 9.5, 4.7, 2.0], begins=4)
     assert [each["state"] for each in fallen] == ["holds", "lost", "edge", "holds"]
+
+
+def test_the_badge_of_distances_is_green_while_hulls_are_apart_whatever_the_errors():
+    errors, apart = [1.0, 9.0, 9.0, 9.0, 1.0], [0.4, 0.3, 0.28, 0.1, 0.3]
+    told = badges_of(ech.models.DoubleIntegrator(), errors, begins=1, apart=apart)
+    assert [each["state"] for each in told] == ["holds", "lost", "holds"]
+    assert told[1]["causes"] == [
+        "The hulls of two agents are 0.28 m apart, scaled, as after a kick; from 0.3 m on it is "
+        "guaranteed again that agents stay apart."
+    ]
 
 
 # ---- the server and the page ------------------------------------------------------------------

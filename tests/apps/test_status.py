@@ -56,7 +56,7 @@ def test_every_command_says_what_it_does_before_heavy_libraries_are_loaded(here)
         },
         "compare": "compare paper",
         "doctor": "doctor",
-        "law": "law paper --agent 1",
+        "fly": "fly paper --all",
         "verify": "verify run.nc",
         **{name: f"{name} run.nc" for name in ("view", "plot", "report")},
         "video": "video run.nc a.gif",

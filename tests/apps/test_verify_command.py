@@ -239,7 +239,9 @@ def test_what_another_version_made_is_refused_with_a_hint(runs, echelon, here):
     assert echelon("verify", "run")[0] == 0
     in_json("summary.json", lambda d: d["promise"].update(sentence="Old words."))(here / "run")
     code, out, _ = echelon("verify", "run")
-    assert code == 1 and "It was made by echelon 0.0.1 (" in out
+    told = " ".join(out.split())
+    assert code == 1 and "echelon 0.0.1 (" in told and "which may state more, or the same" in told
+    assert "To compute it again by this one: echelon run run --out OTHER" in told
     assert max(map(len, out.splitlines())) <= 80
 
 

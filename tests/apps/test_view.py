@@ -11,7 +11,7 @@ import zlib
 import numpy as np
 import pytest
 from browser import chromium, opened, until
-from recordings import flown, swinging
+from recordings import flown, separated, swinging
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
@@ -323,6 +323,95 @@ def test_the_smallest_distance_so_far_has_its_pair_its_time_and_the_size_of_vehi
             words = f"so far {number} m, agents {i} and {j} at {run.times[least.argmin()]:.2f} s"
             assert words in shown.inner_text() and "touch below 0.140 m" in shown.inner_text()
             assert ("touch" in shown.get_attribute("class").split()) == (frame >= 120)
+
+
+def marks(page):
+    """Of each agent 2 below the kept distance, 4 where ellipsoids overlap, else 0."""
+    return page.evaluate("[...echelon.player.view.ellipsoids.marks(echelon.run.moment.position)]")
+
+
+def test_ellipsoids_are_marked_below_the_limit_and_the_chart_has_distance_and_rows(
+    browser, run, tmp_path
+):
+    states = run.states.copy()
+    # Scaled to a third in height: .267 m between the limits, .233 m overlapping, .333 m beyond.
+    for frame, high in ((100, 0.8), (150, 0.7), (200, 1.0)):
+        states[frame, 2, :3] = states[frame, 3, :3] + [0.0, 0.0, high]
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(separated(dataclasses.replace(run, states=states))), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        for frame, mark in ((100, 2), (150, 4), (200, 0)):
+            seek(page, frame)
+            assert marks(page) == [0, 0, mark, mark]
+            told = page.locator(".chart").nth(2).inner_text().replace("\n", " ")
+            second = frame // 50
+            assert f"any two {0.3 + 0.1 * second:#.3g}" in told
+            assert f"active rows {6.0 - second:.2f}" in told
+        assert "smallest scaled distance, m" in told
+        shown = page.locator(".closest").inner_text()
+        scaled = states[:, :, :3] * [1.0, 1.0, 1.0 / 3.0]
+        gaps = np.linalg.norm(scaled[:, :, None] - scaled[:, None], axis=3) + 9.0 * np.eye(4)
+        least = f"{gaps[:201].min():#.3g} m"
+        assert shown.startswith(f"overlap: smallest scaled distance so far {least}, agents ")
+        assert page.evaluate("echelon.player.view.ellipsoids.shown.value") == 1
+        page.get_by_role("button", name="ellipsoids").click()
+        assert page.evaluate("echelon.player.view.ellipsoids.shown.value") == 0
+
+
+def test_agents_with_a_size_have_the_chart_with_twice_their_radius(browser, run, tmp_path):
+    path = tmp_path / "run.html"
+    sized = dataclasses.replace(run, radius=0.07)
+    path.write_text(replay_page(sized), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        seek(page, 80)
+        told = page.locator(".chart").nth(2).inner_text().replace("\n", " ")
+        least = sized.least_distances([80])[0]
+        assert "smallest distance, m" in told and f"any two {least:#.3g}"[:12] in told
+        assert page.evaluate("echelon.run.charts[2].marks.map((mark) => mark.value)") == [0.14]
+        assert page.evaluate("echelon.player.view.ellipsoids.shown.value") == 0
+
+
+def test_who_is_lost_vanishes_an_heir_leads_and_the_event_is_marked(browser, run, tmp_path):
+    starts, weights = np.array([0.0, 2.0]), np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
+    here = np.array([[True] * 4, [False, True, True, True]])
+    schedule = Schedule(starts, weights, None, here, np.array([[0] * 4, [1] * 4]))
+    lost = dataclasses.replace(
+        run,
+        schedule=schedule,
+        reference=run.states[:, 0].copy(),
+        events=({"at": 2.0, "text": "agent 0 is lost"},),
+    )
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(lost), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        seek(page, 99)
+        assert page.evaluate("echelon.whereOnScreen(0)") is not None
+        assert page.locator(".moment").inner_text() == ""
+        seek(page, 100)
+        assert page.evaluate("echelon.whereOnScreen(0)") is None
+        assert page.locator(".moment").inner_text() == "2.00 s: agent 0 is lost"
+        assert page.locator("footer .mark").get_attribute("title") == "agent 0 is lost"
+        names = page.evaluate("[...document.querySelectorAll('.label')].map((x) => x.innerText)")
+        assert names[1:] == ["leader", "2", "3"]
+        # Goals are relative to the heir, and errors are of those that are there.
+        goal = run.states[100, 1, :3] + run.offsets[2, :3] - run.offsets[1, :3]
+        assert page.evaluate("echelon.goal(2)") == pytest.approx(goal, abs=1e-4)
+        away = np.linalg.norm(run.states[100, 2, :3] - goal)
+        assert f"2 {away:#.3g}" in page.locator(".chart").first.inner_text().replace("\n", " ")
+        seek(page, 50)
+        assert page.evaluate("echelon.run.leaders") == [0]
+
+
+def test_goals_of_a_formation_that_moves_are_where_they_are_at_each_time(browser, run, tmp_path):
+    moving = np.tile(run.offsets, (len(run.times), 1, 1))
+    moving[:, 2, 1] += 0.3 * run.times
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(dataclasses.replace(run, moving=moving)), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        for frame in (0, 80, 300):
+            seek(page, frame)
+            goal = run.states[frame, 0, :3] + moving[frame, 2, :3] - moving[frame, 0, :3]
+            assert page.evaluate("echelon.goal(2)") == pytest.approx(goal, abs=2e-4)
 
 
 def test_the_reference_is_drawn_and_the_leader_s_error_told(browser, run, tmp_path):
@@ -720,6 +809,16 @@ def test_the_badge_says_which_rate_it_has_and_is_not_green_over_a_run_that_was_l
     assert slow["whole"].endswith("0.5 1/s is that of the slowest mode.")
     turns = promise_badge(told | {"rate": 0.452, "slowest_mode": -1.32})
     assert "0.452 1/s holds for all graphs" in turns["whole"]
+    for ideal, state, short in (
+        (True, "holds", "guaranteed: agents stay apart, T10"),
+        (False, "edge", "distances observed, not proved"),
+    ):
+        apart = {"rate": None, "theorem": "T10", "anywhere": {"separation": {"ideal": ideal}}}
+        assert promise_badge(told | apart) | {"whole": ""} == {
+            "state": state,
+            "short": short,
+            "whole": "",
+        }
     promise = dict(run.promise) | told | {"rate": 0.5, "slowest_mode": -0.5}
     for outcome, state in (("completed", "holds"), ("left_chart", "lost"), ("diverged", "lost")):
         ended = dict(run.attributes) | {"outcome": outcome, "message": "It ended so."}

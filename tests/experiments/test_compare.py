@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -74,11 +75,12 @@ def test_the_paragraph_names_the_row_with_the_least_number(planar):
     assert "do not bring every follower within 1 cm" in text
 
 
-def row_of(label, settles, effort, computing):
+def row_of(label, settles, effort, computing, unit="m"):
     """A method of one follower, with the numbers that the paragraph reads."""
     follower = FollowerMetrics(1, 0.1, 0.1, settles, effort, 0.0)
     numbers = Metrics((LeaderMetrics(None, None, {}),), (follower,), (), None, 0.0, 1.0)
-    return ComparisonRow(label, RunNumbers(None, numbers, None, computing))
+    run = SimpleNamespace(length_unit=unit)
+    return ComparisonRow(label, RunNumbers(run, numbers, None, computing))
 
 
 def test_what_is_said_of_those_that_settle_is_said_to_be_of_them():
@@ -95,6 +97,16 @@ def test_what_is_said_of_those_that_settle_is_said_to_be_of_them():
     # One that settles is the best of nothing.
     text = " ".join(verdict(Comparison("mine", rows[:2], 5.0, 1.0, ())))
     assert "a settles (2 s)." in text and "Of those" not in text and "effort" not in text
+
+
+@pytest.mark.parametrize(("unit", "within", "error"), [("m", "1 cm", "0.1 m"), ("", "0.01", "0.1")])
+def test_errors_have_metres_where_there_is_a_position_alone(unit, within, error):
+    rows = row_of("a", 2.0, 5.0, 2e-3, unit), row_of("b", None, 6.0, 9e-3, unit)
+    text = " ".join(verdict(Comparison("mine", rows, 5.0, 1.0, ())))
+    assert f"b does not bring every follower within {within}." in text
+    assert f"a has the smallest error over the whole run ({error}; next b, 0.1)." in text
+    text = " ".join(verdict(Comparison("mine", rows[:1], 5.0, 1.0, ())))
+    assert text.startswith(f"a brings every follower within {within}.")
 
 
 def test_a_number_of_the_table_is_in_every_table_that_it_names(planar, monkeypatch):

@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 from sentences import LINES
 
 import echelon.experiments.scenario.scenario
-from echelon.core.errors import ScenarioError, listing
+from echelon.agents.models import DoubleIntegrator
+from echelon.core.errors import EchelonError, ScenarioError, listing
 from echelon.experiments.scenario import key_paths, registry
 from echelon.experiments.scenario.checks import ROLES
+from echelon.experiments.scenario.formation_sections import FormationSpec
 from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
 from echelon.experiments.scenario.named_class import accepted, resolve
 from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
@@ -27,7 +29,7 @@ from echelon.experiments.scenario.scenario import (
     load_scenario,
     scenario_from_mapping,
 )
-from echelon.experiments.scenario.sections import FormationSpec, GraphSpec
+from echelon.experiments.scenario.sections import GraphSpec
 from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.yaml import read_yaml
 
@@ -114,7 +116,14 @@ def test_defaults():
             "seed": 0,
             "leaders": (0,),
         },
-        "formation": {"offsets": None, "name": None, "spacing": 1.0, "columns": None},
+        "formation": {
+            "offsets": None,
+            "name": None,
+            "spacing": 1.0,
+            "columns": None,
+            "assign": "number",
+            "motion": (),
+        },
         "reference": None,
         "leader": {
             "law": "passive",
@@ -149,6 +158,8 @@ def test_defaults():
         "sensing": None,
         "safety": None,
         "network": None,
+        "events": (),
+        "leadership": None,
         "simulation": {
             "horizon": 30.0,
             "dt": 0.01,
@@ -279,7 +290,8 @@ def test_an_unknown_section_gets_a_guess(refused):
     assert refused(seed="sed: 0") == [
         "s.yaml:11: sed: got an unknown key, allowed are `name`, `model`, `plant`, `graph`,"
         " `formation`, `reference`, `leader`, `follower`, `safety`, `initial`,"
-        " `disturbance`, `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed`"
+        " `disturbance`, `actuator`, `sensing`, `network`, `events`, `leadership`, `simulation`,"
+        " `report`, `live`, `seed`"
         " (did you mean `seed`?)."
     ]
 
@@ -388,7 +400,8 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, got):
     assert str(caught.value) == (
         f"{file}:1: got {got}, allowed is a mapping with the keys `name`, `model`, `plant`,"
         " `graph`, `formation`, `reference`, `leader`, `follower`, `safety`, `initial`,"
-        " `disturbance`, `actuator`, `sensing`, `network`, `simulation`, `report`, `live`, `seed`."
+        " `disturbance`, `actuator`, `sensing`, `network`, `events`, `leadership`, `simulation`,"
+        " `report`, `live`, `seed`."
     )
 
 
@@ -596,3 +609,14 @@ def test_a_named_set_of_parameters_may_be_changed(load):
         echelon.EchelonError, match="got the parameter set `small`, but `pendulum` has none"
     ):
         echelon.build(load("model={name: pendulum, parameters: {set: small}}"))
+
+
+def test_a_misspelt_key_of_a_value_that_may_be_a_section_is_told_at_its_place(refused):
+    follower = "follower={law: stopping-point, observer: {x: 1}}"
+    text = "\n".join(refused(follower, "leader={law: stopping-point}"))
+    assert "follower.observer.x: got an unknown key, allowed are `push`, `scale`" in text
+
+
+def test_text_of_several_lines_is_told_in_one():
+    with pytest.raises(EchelonError, match="is 'a.nb', and must be a whole number"):
+        DoubleIntegrator("a\nb")

@@ -151,7 +151,7 @@ def test_a_run_repeats_a_sampled_loop_by_its_own_recursion(tmp_path):
         ({"A": np.eye(2), "B": np.eye(3)}, "the shapes of `Linear` are A (2, 2), B (3, 3)"),
         ({"A": np.array([["a"]]), "B": np.eye(1)}, "`A` of `Linear` "),
         ({"A": np.diag([0.5, -0.5]), "B": np.eye(2), "Ts": 0.1}, "A has the eigenvalue -0.5"),
-        ({"A": np.eye(2), "B": np.eye(2), "Ts": -1.0}, "the step of a discrete-time model is -1"),
+        ({"A": np.eye(2), "B": np.eye(2), "Ts": -1.0}, "`step` of `Linear` is -1"),
         ({"A": 1j * np.eye(2), "B": np.eye(2)}, "`A` of `Linear` "),
         (b"no matrices at all, but a text", "is not a MATLAB file that can be read"),
         (None, "cannot be read: No such file"),

@@ -591,7 +591,8 @@ def test_a_sweep_writes_its_folder_and_is_complete(here):
     assert done.exit_code == 0, done.output
     names = {"scenario.yaml", "inputs", "sweep.nc", "sweep.txt", "figures"}
     assert {path.name for path in (here / "o").iterdir()} == names
-    assert "3 runs: 3 completed." in (here / "o" / "sweep.txt").read_text()
+    told = (here / "o" / "sweep.txt").read_text()
+    assert "3 runs: 3 completed." in told and "Settled to 0.01:" in told and " m;" not in told
     again = CliRunner().invoke(app, ["sweep", "--resume", "o"])
     assert again.exit_code == 0 and "nothing to do" in again.output
     over = CliRunner().invoke(app, call)

@@ -349,6 +349,15 @@ def test_without_losses_ages_are_those_of_the_clock():
     assert ages_of(channel(loss=1.0), 0.005, 12000, 6, 2).first_packet is None
 
 
+@pytest.mark.parametrize("share", [0.0, 0.1])
+def test_outages_that_never_end_have_an_age(share):
+    network = Network(rate=25.0, bursts=Bursts(share, 2.0**63), loss=0.1, forget=1.0)
+    ages = ages_of(network.prepared(0.02, 100.0, 0), 0.02, 5000, 6, 2)
+    # The whole run, and the delay.
+    assert np.isfinite(ages.mean) and ages.mean < 101.0
+    assert (ages.mean < 0.1) == (share == 0.0)
+
+
 @pytest.mark.parametrize("jitter", [0.0, 0.06])
 def test_the_newest_message_is_never_older_than_stated(jitter):
     draw, net = np.random.default_rng(5), channel(delay=0.02, jitter=jitter, loss=0.5)

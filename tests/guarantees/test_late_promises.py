@@ -13,7 +13,10 @@ import echelon as ech
 from echelon.agents.world.sensing import Sensing
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Theorem, Verdict
+from echelon.guarantees.messages.delayed_step import all_decay
+from echelon.guarantees.messages.own_delay import late_step
 from echelon.guarantees.promises.promise import promise
+from echelon.simulation.engine.prepare import prepare
 
 CART = ech.models.DoubleIntegrator(2)
 CIRCLE = ech.references.Circle(radius=2.0, rate=0.7)
@@ -309,7 +312,7 @@ def delayed_radius(c, root, dt, delay):
     A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
     whole = scipy.linalg.expm(dt * np.block([[A, B], [np.zeros((1, 3))]]))
     K = root * np.array([[c, c / root + 1.0]])
-    loop = np.zeros((2 + 2 * delay, 2 + 2 * delay))
+    loop = np.zeros((2 + 2 * delay, 2 + 2 * delay), np.result_type(K))
     loop[:2, :2], loop[:2, -2:] = whole[:2, :2], loop[:2, -2:] - whole[:2, 2:] @ K
     loop[2:, :-2] += np.eye(2 * delay)
     return np.abs(np.linalg.eigvals(loop)).max()
@@ -324,6 +327,60 @@ def test_margins_of_own_states_are_those_of_the_delayed_loop():
     # Followers 1 and 2 hear one other, follower 3 two.
     radii = [[delayed_radius(8.0 * d, root, DT, k) for d in (1, 2)] for k in (most, most + 1)]
     assert max(radii[0]) < 1.0 < max(radii[1])
+
+
+def cycled(count, weight):
+    """Arrows to many followers of different weights, three of which hear each other in a circle."""
+    arrows = [(0, k, 0.5 + 3.5 * k / count) for k in range(1, count - 2)]
+    circle = count - 2, count - 1, count
+    arrows += [(0, k, 0.5) for k in circle]
+    arrows += [(i, j, weight) for i, j in zip(circle, circle[1:] + circle[:1], strict=True)]
+    return arrows
+
+
+def test_margins_of_own_states_count_every_eigenvalue_of_a_directed_graph():
+    world = {"sensing": Sensing(delay=0.01)}
+    parts = parts_of(None, cycled(50, 2.0), world=world, observer=False, coupling=8.0)
+    guarantee = said(parts)
+    line, root = guarantee.hypotheses[Hypothesis.OWN_STATE], guarantee.run.law.slowest_root
+    most, L = round(line.number / DT), parts.graph.grounded_laplacian().toarray()
+    values = np.linalg.eigvals(L)
+    assert np.iscomplexobj(values)
+    radii = [max(delayed_radius(8.0 * d, root, DT, k) for d in values) for k in (most, most + 1)]
+    assert radii[0] < 1.0 < radii[1]
+
+
+def test_turns_along_the_circle_count_as_eigenvalues_do():
+    world = {"sensing": Sensing(delay=0.01)}
+    ready = prepare(parts_of(None, world=world, coupling=1.5), SETTINGS)
+    with jax.enable_x64(True):
+        step = late_step(ready.problem, ready.parts.drive.follower, 0.03)
+    draw = np.random.default_rng(0)
+    seen = set()
+    for delay in (0, 2, 4):
+        own = draw.uniform(0.01, 6.0, 12) + 1j * draw.uniform(0.0, 4.0, 12) * (
+            draw.random(12) < 0.6
+        )
+        stable = [step.radius(each, delay) < 1.0 for each in own]
+        assert [all_decay(step, each[None], False, delay) for each in own] == stable
+        few = np.sort_complex(own[stable])
+        assert len(few) > 1 and all_decay(step, few, False, delay)
+        seen |= set(stable)
+        # An interval decays as far as all that is in it.
+        ends = np.geomspace(0.05, 8.0, 128)
+        radii = np.array([step.radius(each, delay) for each in ends])
+        last = int((radii < 1.0).argmin()) if (radii >= 1.0).any() else len(ends)
+        assert all_decay(step, ends[: last - 8], True, delay)
+        assert last == len(ends) or not all_decay(step, ends[: last + 1], True, delay)
+    assert seen == {True, False}
+
+
+def test_margins_of_own_states_of_a_plant_are_said_to_be_those_of_the_model():
+    world = {"sensing": Sensing(delay=0.01), "plant": ech.models.DoubleIntegrator(2, drag=0.5)}
+    line = said(parts_of(None, world=world)).hypotheses[Hypothesis.OWN_STATE]
+    assert "for agents as in the model, unlike these plants" in line.text
+    line = said(parts_of(None, world={"sensing": Sensing(delay=0.01)}))
+    assert "unlike" not in line.hypotheses[Hypothesis.OWN_STATE].text
 
 
 def test_within_the_margin_late_messages_of_any_age_are_borne_both_ways():

@@ -8,8 +8,10 @@ import pytest
 
 import echelon as ech
 from echelon.core.statement import Hypothesis
-from echelon.core.words import Theorem
+from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.stopping import separation
+from echelon.guarantees.stopping.flat_states import FlatStates
 from echelon.guarantees.verifier.verify import verify
 
 MODEL = ech.models.DoubleIntegrator()
@@ -24,6 +26,15 @@ def guaranteed(safety=ech.Safety(radii=(0.1, 0.1, 0.3)), settings=SETTINGS, **wo
     formation = ech.Formation.from_offsets(MODEL, graph, offsets)
     parts = ech.Parts(MODEL, graph, formation, drive, initial=starts, world=ech.World(**world))
     return parts, promise(parts, settings)
+
+
+def test_a_position_that_was_seen_at_samples_alone_is_not_called_proved(monkeypatch):
+    parts, value = guaranteed()
+    assert value.separation.kind is value.tube.kind is Kind.PROOF
+    # As of outputs whose equations no trace follows.
+    monkeypatch.setattr(separation, "flat_states_of", lambda *_: FlatStates((), ()))
+    seen = promise(parts, SETTINGS._replace(horizon=2.0))
+    assert seen.separation.kind is Kind.SAMPLES and seen.sentence().startswith("Seen at samples")
 
 
 def test_distances_are_guaranteed_and_convergence_is_not():

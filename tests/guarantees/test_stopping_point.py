@@ -481,6 +481,50 @@ def test_a_turn_that_begins_between_two_times_is_bounded_from_its_beginning(begi
         x = flows[graph.schedule.row((k + 0.5) * dt)] @ x
 
 
+def test_a_switch_between_two_steps_counts_from_the_next_step_on():
+    # Until the switch nobody hears the leader; it is at 0.1 s, and the run takes it at 0.4 s.
+    cut, chain, dt = [(1, 2), (2, 3)], [(0, 1), (1, 2), (2, 3)], 0.4
+    late = ech.Graph.switching([(0.0, cut), (0.1, chain)], agents=4)
+    run = {"rate": 1.0, "coupling": 0.5, "speed": np.inf}
+    flights = (flight(graph, **run) for graph in (late, late.in_steps(dt)))
+    arrivals = [promised(each, dt=dt, horizon=40.0).tube.arrival for each in flights]
+    assert arrivals[0] == arrivals[1] > 0.0
+    assert late.in_steps(dt).schedule.starts.tolist() == [0.0, 0.4]
+    assert late.in_steps(0.05) is late
+
+
+def test_stretches_that_no_step_reaches_are_not_counted_on():
+    chain, cut = [(0, 1), (1, 2), (2, 3)], [(1, 2), (2, 3)]
+    graph = ech.Graph.switching([(0.0, cut), (0.002, chain)], agents=4, period=0.01)
+    steps, rows = graph.schedule.switches(0.01, 1.0)
+    assert set(rows[steps < 100].tolist()) == {0}
+    none = promised(flight(graph, rate=3.0))
+    assert not none.promised and "rounded up to steps of 0.01 s" in none.sentence()
+    odd = ech.Graph.switching([(0.0, cut), (0.5, chain)], agents=4, period=float(np.pi))
+    assert not promised(flight(odd, rate=3.0)).promised
+    third = ech.Graph.switching([(0.0, cut), (0.1, chain)], agents=4, period=1 / 3)
+    found = promised(flight(third, rate=3.0))
+    assert found.promised
+    assert found.run.parts.graph.schedule.starts.tolist() == pytest.approx(
+        [0.0, 0.1, 0.34, 0.44, 0.67, 0.77]
+    )
+    assert found.run.parts.graph.schedule.period == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("period", "weight", "coupling"),
+    [(2.0, 1.0, 1e7), (2.0, 1.0, 1e308), (1e155, 1.0, 1.0), (1e308, 1e149, 1.0)],
+)
+def test_couplings_and_periods_beyond_all_numbers_have_a_rate_that_is_no_more(
+    period, weight, coupling
+):
+    chain, star = [(0, 1), (1, 2), (2, 3, weight)], [(0, 1), (0, 2), (2, 3)]
+    graph = ech.Graph.switching([(0.0, chain), (1.0, star)], period=period)
+    # Warnings are errors here.
+    found = promised(flight(graph, rate=3.0, coupling=coupling))
+    assert found.rate is None or 0.0 <= found.rate <= 3.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("told", [True, False])
 def test_graphs_that_take_turns_are_there_in_time_or_are_told_none(told):

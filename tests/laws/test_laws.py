@@ -220,8 +220,8 @@ def test_under_computed_torque_a_leader_stays_on_its_circle_but_for_held_inputs(
 
 def test_a_tracking_gain_is_the_model_s_riccati_gain_unless_given():
     law = prepared(Tracking(Hover()), QUAD)
-    assert np.array_equal(law.gain.P, synthesize(QUAD, LINE, Riccati()).P)
-    assert law.gain.coupling == 1.0
+    assert np.array_equal(law.regulator.P, synthesize(QUAD, LINE, Riccati()).P)
+    assert law.gain is None and law.regulator.coupling == 1.0
 
 
 def test_headings_of_a_tracking_leader_are_compared_by_the_shorter_way():

@@ -12,6 +12,8 @@ import echelon as ech
 from echelon.agents.network.near import Near
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
+from echelon.experiments.results.avoidance import avoidance
+from echelon.experiments.results.labelled_parts import labelled_parts
 from echelon.laws.nearest_point import nearest_point
 from echelon.laws.safety import hull_points
 
@@ -63,6 +65,30 @@ def test_points_that_coincide_but_for_rounding_are_not_around_the_origin():
     with precision("float64"):
         value = np.asarray(jax.jit(nearest_point)(points))
     np.testing.assert_allclose(value, place[:, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("width", [1.0, 0.3, 0.1, 0.02, 1e-3, 1e-4, 1e-6])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_the_nearest_point_of_a_thin_hull_is_off_by_what_its_precision_leaves(width, kind):
+    draw, count = np.random.default_rng(3), 2000
+    # Agents on their way to rest: hulls along a line, over whose inside the origin is.
+    points = draw.normal(size=(count, 4, 3)) * np.array([1.0, width, 0.05 * width])
+    shares = draw.dirichlet(np.ones(4), size=count)
+    points -= np.einsum("kr,krd->kd", shares, points)[:, None]
+    points += draw.normal(size=(count, 1, 3)) * np.array([0.0, 0.0, 0.25])
+    turn = np.linalg.qr(draw.normal(size=(count, 3, 3)))[0]
+    points = np.einsum("krd,kde->kre", points, turn).astype(kind)
+    with precision(kind.__name__):
+        value = np.asarray(jax.jit(nearest_point)(jnp.asarray(points)))
+    assert value.dtype == kind
+    true = np.linalg.norm(exact(points.astype(float)), axis=1)
+    off = np.linalg.norm(value.astype(float), axis=1) - true
+    # A point of the hull, up to rounding, and so never nearer than the nearest one.
+    size, eps = np.linalg.norm(points, axis=2).max(axis=1), np.finfo(kind).eps
+    # The second computation itself leaves 1e-9.
+    assert (off >= -8.0 * eps * size - 1e-9).all()
+    away = np.sqrt(eps) * size
+    assert (off <= 8.0 * eps * size + np.minimum(away, away**2 / (2.0 * true + 1e-300))).all()
 
 
 # ---- the filter ----------------------------------------------------------------------------------
@@ -213,15 +239,44 @@ def test_agents_that_nobody_holds_back_fly_as_without():
     np.testing.assert_allclose(wide.inputs, free.inputs, atol=1e-12)
 
 
+class Round(ech.models.DoubleIntegrator):
+    """A cart with a radius."""
+
+    radius: float = 0.1
+
+
+def test_a_run_says_the_ellipsoids_of_its_model():
+    parts = crossing(ech.Safety(), model=Round())
+    result = ech.simulate(parts, ech.Settings(horizon=0.1, dt=0.02))
+    ellipsoid, data = avoidance(result).ellipsoid, labelled_parts(result.parts, result.settings)
+    assert (ellipsoid.radius, ellipsoid.height) == pytest.approx((0.1, 0.3))
+    assert float(data.variables["ellipsoid_radius"][1]) == 0.1
+
+
 def test_native_code_is_refused_and_auto_says_why_it_is_not_used():
     parts = crossing(ROUND)
     with pytest.raises(EchelonError, match="no native code for agents that keep away"):
         ech.simulate(parts, ech.Settings(horizon=0.1, dt=0.02, engine="native"))
 
 
+class Elsewhere(ech.models.DoubleIntegrator):
+    """A cart whose outputs have the names of places, and are twice as far."""
+
+    output_names = ("x", "y")
+    flat_outputs = ("x", "y")
+    flat_chains = None
+
+    def output(self, x):
+        return 2.0 * x[:2]
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
+        (
+            lambda: crossing(ROUND).replace(model=Elsewhere()),
+            "its output `x` is not the state of that name",
+        ),
         (lambda: crossing(ech.Safety()), "`radii`, since `DoubleIntegrator` has no `radius`"),
         (lambda: crossing(ech.Safety(radii=(0.1, 0.2, 0.1))), "the first two equal"),
         (lambda: crossing(ech.Safety(radii=(0.1, 0.1, 0.0))), "three positive numbers"),

@@ -42,6 +42,8 @@ class Promised:
 class Found:
     """A check with as many lines as there are, each made by a function."""
 
+    warnings = ()
+
     def __init__(self, make):
         self.promise = Promised()
         self.lines = tuple(map(make, (*Hypothesis, *Topic)))

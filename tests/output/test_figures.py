@@ -8,7 +8,7 @@ from recordings import PROMISE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
-from echelon.experiments.results.avoidance import Avoidance
+from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
 from echelon.experiments.results.recording import MessageAges
 from echelon.output.plots.network import curves_of
 from echelon.output.plots.over_time import start_of
@@ -32,7 +32,8 @@ def run():
     late = MessageAges(
         np.full(own.states.shape[:2], 0.02), np.ones(shape), np.ones(shape, int), 0.5
     )
-    apart = Avoidance(own.times[::8], 0.3 + own.times[::8], np.sin(own.times[::8]) > 0.0, 0.25, 0.3)
+    times = own.times[::8]
+    apart = Avoidance(times, 0.3 + times, 1.0 * (np.sin(times) > 0.0), Ellipsoid(0.125, 0.375, 0.3))
     more = {"tracking": tracked(own), "lyapunov_rate": rate, "messages": late, "avoidance": apart}
     return dataclasses.replace(own, **more)
 
@@ -430,6 +431,16 @@ def test_the_closest_pair_is_marked_beside_the_size_of_agents(long):
     assert lines[text].tolist() == [[closest.time, closest.distance]]
     assert set(lines["agents touch"][:, 1]) == {0.14}
     assert "agents touch" not in lines_of(figures(long, ["distances"])["distances"], 3)
+
+
+def test_an_event_is_a_line_in_every_panel_with_its_words_in_one(long):
+    happened = dataclasses.replace(long, events=({"at": 5.0, "text": "agent 0 is lost"},))
+    figure = figures(happened, ["distances"])["distances"]
+    assert len(figure.axes) == 4
+    for ax in figure.axes:
+        assert any(list(line.get_xdata()) == [5.0, 5.0] for line in ax.get_lines())
+    words = [text.get_text() for ax in figure.axes for text in ax.texts]
+    assert words == ["agent 0 is lost "]
 
 
 def test_a_swarm_has_its_followers_in_the_legend_of_every_figure(flock):

@@ -363,6 +363,14 @@ def test_a_run_of_one_frame_is_drawn_as_dots(runs, name, tmp_path):
     assert all(line.get_marker() not in ("None", "", " ", None) for line in lines)
 
 
+def test_a_leader_at_rest_has_no_path_to_draw(runs):
+    moving = runs("quadrotor")
+    still = np.broadcast_to(moving.states[:1], moving.states.shape)
+    for states, reference in ((still, None), (still, still[:, 0]), (still + 1e-9, None)):
+        assert "leader_3d" not in figures(cut(moving, states, reference))
+    assert "leader_3d" in figures(cut(moving, still, moving.reference))
+
+
 def test_a_run_of_no_frame_has_no_figures(runs, tmp_path):
     run = runs("quadrotor")
     empty = cut(run, run.states[:0], None)

@@ -69,48 +69,6 @@ def test_a_broken_symmetry_warns_and_names_the_agent():
     )
 
 
-def test_coincident_goals_warn():
-    model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(3)
-    result = simulate(
-        model,
-        graph,
-        ech.Formation.from_offsets(model, graph, {1: (1.0, 0.0), 2: (1.0, 0.0)}),
-        leader=ech.laws.Agreement(),
-        follower=ech.laws.Agreement(),
-        horizon=1.0,
-        dt=0.1,
-    )
-    assert result.warnings == ("agents 1 and 2 have the same goal, and would collide there.",)
-
-
-@pytest.mark.slow
-def test_a_weak_coupling_is_named_as_the_cause_of_growth():
-    result = run("paper-line", "follower.gain.coupling=0.5", "simulation.horizon=30")
-    text = " ".join(ech.report(result).split())
-    assert (
-        "Cause: coupling 0.5 is below the edge 2.524 of what this gain guarantees" in text
-        or "diverged" in text
-    )
-
-
-@pytest.mark.study
-def test_a_swarm_shows_best_median_and_worst():
-    model, graph = ech.models.SingleIntegrator(2), ech.Graph.star(30)
-    result = simulate(
-        model,
-        graph,
-        ech.Formation.grid(model, graph),
-        leader=ech.laws.TrimInput(),
-        follower=ech.laws.Agreement(),
-        initial={"position": 1.0},
-        horizon=2.0,
-        dt=0.1,
-    )
-    text = ech.report(result)
-    for kind in ("best (follower", "median (follower", "worst (follower"):
-        assert kind in text
-
-
 def test_the_unicycles_relay_is_told_to_the_reader():
     text = " ".join(ech.report(run("unicycle", "simulation.horizon=1")).split())
     assert "follower: neighbours' states; the leader's input of the same step." in text

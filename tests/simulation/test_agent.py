@@ -259,6 +259,11 @@ def plant(model, x, u):
         return np.asarray(model.velocity(jax.numpy.asarray(x), jax.numpy.asarray(u)))
 
 
+def test_an_agent_on_a_network_whose_jitter_is_longer_than_its_delay_has_one():
+    parts = late_parts("consensus", jitter=0.4, forget=2.0)
+    assert ech.Agent(parts, 1, dt=0.01).neighbours
+
+
 def test_late_damaged_and_forged_messages_change_nothing():
     parts = late_parts("stopping-point", delay=0.05)
     leader, agent, twin = (ech.Agent(parts, k, 0.01) for k in (0, 1, 1))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 import echelon as ech
 from echelon.agents.network.channel import NEVER
 from echelon.core.errors import EchelonError, SimulationError
+from echelon.simulation.step.knowledge import hop_life
 from echelon.simulation.step.sequence import begin, step
 
 DT = 0.01
@@ -45,6 +46,30 @@ def arrivals_of(channel, steps):
 
     start = channel.begin(example, 5), jnp.full(5, NEVER, jnp.int32)
     return jax.lax.scan(step, start, jnp.arange(steps, dtype=jnp.int32))[1]
+
+
+@pytest.mark.parametrize("forget", [1e6, 2e6, 1e7, 1e9, 1e300])
+def test_hop_counts_are_never_forgotten_where_forgetting_takes_ages(forget):
+    channel = ech.Network(forget=forget).prepared(DT, 10.0, 0)
+    for bits in (False, True):
+        with jax.enable_x64(bits):
+            ages = jax.jit(hop_life)(channel, DT)
+            assert float(ages) >= 10.0 * min(forget, 1e6)
+            assert ages.dtype == (np.float64 if bits else np.float32)
+
+
+@pytest.mark.parametrize(
+    ("network", "sentence"),
+    [
+        (ech.Network(jitter=1e12, forget=1e13), "`jitter` of the network is 1e\\+12 s"),
+        (ech.Network(rate=1e-300, forget=1e308), "`rate` of the network is 1e-300 Hz"),
+        (ech.Network(rate=1e-9, forget=1e12), "`rate` of the network is 1e-09 Hz"),
+        (ech.Network(rate=1e300), "`rate` of the network is 1e\\+300 Hz"),
+    ],
+)
+def test_numbers_that_no_count_of_steps_holds_are_refused(network, sentence):
+    with pytest.raises(SimulationError, match=sentence):
+        network.prepared(DT, 10.0, 0)
 
 
 @settings(max_examples=25, deadline=None)

@@ -1,9 +1,11 @@
 """Exported laws, in Python and in C, compute what `Agent` computes."""
 
 import ctypes
+import functools
 import math
 import re
 import shutil
+import struct
 import subprocess
 
 import jax
@@ -11,8 +13,10 @@ import numpy as np
 import pytest
 
 import echelon as ech
+from echelon.simulation.codegen import is_installed
 from echelon.simulation.onboard.c_text import c_text, header_text
 from echelon.simulation.onboard.law_functions import LawFunction, law_functions
+from echelon.simulation.onboard.llvm_text import object_file
 from echelon.simulation.onboard.python_text import python_text
 from echelon.simulation.scalars import ScalarGraph, Unsupported
 from echelon.simulation.scalars.scalar_graph import OPERATIONS
@@ -30,28 +34,30 @@ def as_python(functions, folder):
     return {f.name: scope[f.name] for f in functions}
 
 
-def as_read_c(functions, folder):
+def as_read_c(functions, folder, bits=64):
     """Evaluate the assignments of the C text one by one, with NumPy's functions as helpers."""
-    text, scope = c_text(functions, "A law."), dict(NUMPY_TWINS)
+    both = (functions, ()) if bits == 64 else ((), functions)
+    text, scope = c_text(*both, "A law."), twins(np.float64 if bits == 64 else np.float32)
     for _, name, arguments, body in re.findall(
         r"^(void|int) law_(\w+)\(([^)]*)\)\n\{\n(.*?)^\}", text, re.M | re.S
     ):
         names = [argument.split()[-1].lstrip("*") for argument in arguments.split(", ")]
         lines = [f"def {name}({', '.join(names)}):", *map(read, body.splitlines())]
         exec("\n".join(lines), scope)
-    return {f.name: with_outputs(f, scope[f.name], list) for f in functions}
+    return {f.name: with_outputs(f, scope[f.name], scope["array"]) for f in functions}
 
 
 def read(line):
     """Return a line of C as one of Python."""
-    line = re.sub(r"^(    )?const (double|int) ", r"    ", line.rstrip(";"))
+    line = re.sub(r"^(    )?const (law_real|int) ", r"    ", line.rstrip(";"))
     line = re.sub(r"\(void\)\w+", "pass", line)
     line = re.sub(r"if \((.*)\)$", r"if \1:", line)
     line = re.sub(r" = (\S+) \? (.+) : (.+)$", r" = \2 if \1 else \3", line)
+    line = re.sub(r"(?<![\w.])(\d[\d.]*(?:e[+-]?\d+)?)f\b", r"real(\1)", line)
     line = re.sub(r" = (\S+) / (\S+)$", r" = divide(\1, \2)", line)
     line = line.replace("&&", "and").replace("||", "or")
     line = re.sub(r"!(?!=)", "not ", line)
-    return line.replace("(double)INFINITY", "inf").replace("(double)NAN", "nan")
+    return line.replace("(law_real)INFINITY", "inf").replace("(law_real)NAN", "nan")
 
 
 def frexp(a):
@@ -59,49 +65,60 @@ def frexp(a):
     return (2.0 * half, exponent - 1) if half < math.sqrt(0.5) else (half, exponent)
 
 
-NUMPY_TWINS = {
-    "inf": math.inf,
-    "nan": math.nan,
-    "divide": lambda a, b: float(np.divide(a, b)),
-    "sqrt": lambda a: float(np.sqrt(a)),
-    "law_abs": abs,
-    "law_bit": lambda a, place: (int(np.float64(a).view(np.uint64)) >> place) % 2 == 1,
-    "law_exponent": lambda a: float(frexp(a)[1]),
-    "law_mantissa": lambda a: float(frexp(a)[0]),
-    "law_single": lambda a: float(np.float32(a)),
-    "law_pow2": lambda a: float(np.ldexp(1.0, int(a))),
-    "law_root_guess": lambda a: float(
-        (np.uint64(0x5FE6EB50C7B537A9) - (np.float64(a).view(np.uint64) >> np.uint64(1))).view(
-            np.float64
-        )
-    ),
-    **{
-        f"law_{name}": lambda *a, of=of: float(of(*a))
-        for name, of in {
-            "floor": np.floor,
-            "ceil": np.ceil,
-            "rint": np.rint,
-            "min": np.minimum,
-            "max": np.maximum,
-            "copysign": np.copysign,
-        }.items()
-    },
-}
+def twins(real):
+    """Return the helpers of the C text by NumPy's functions, in its precision."""
+    bits, guess = np.uint64, 0x5FE6EB50C7B537A9
+    if real is np.float32:
+        bits, guess = np.uint32, 0x5F375A86
+    number = float if real is np.float64 else real
+    plain = {name: getattr(np, name) for name in ("floor", "ceil", "rint", "copysign")}
+    plain |= {"min": np.minimum, "max": np.maximum}
+    return {
+        "inf": number(math.inf),
+        "nan": number(math.nan),
+        "real": number,
+        "array": lambda values: [number(x) for x in values],
+        "divide": lambda a, b: number(np.divide(a, b)),
+        "sqrt": lambda a: number(np.sqrt(a)),
+        "sqrtf": lambda a: number(np.sqrt(a)),
+        "law_abs": abs,
+        "law_bit": lambda a, place: (int(real(a).view(bits)) >> place) % 2 == 1,
+        "law_exponent": lambda a: number(frexp(a)[1]),
+        "law_mantissa": lambda a: number(frexp(a)[0]),
+        "law_single": lambda a: float(np.float32(a)),
+        "law_pow2": lambda a: number(np.ldexp(real(1.0), int(a))),
+        "law_root_guess": lambda a: number(
+            (bits(guess) - (real(a).view(bits) >> bits(1))).view(real)
+        ),
+        **{f"law_{name}": lambda *a, of=of: number(of(*a)) for name, of in plain.items()},
+    }
 
 
-def as_compiled_c(functions, folder):
-    (folder / "law.c").write_text(c_text(functions, "A law."))
+def as_compiled_c(functions, folder, bits=64):
+    both = (functions, ()) if bits == 64 else ((), functions)
+    real, place = (np.float64, ctypes.c_double) if bits == 64 else (np.float32, ctypes.c_float)
+    (folder / "law.c").write_text(c_text(*both, "A law."))
     (folder / "law.h").write_text(header_text(functions, "A law.", {}))
-    options = [*FLAGS, "-ffp-contract=off", "-O2", "-shared", "-fPIC", "-o", "law.so", "law.c"]
+    options = [
+        *FLAGS,
+        *(["-DLAW_SINGLE"] if bits == 32 else []),
+        "-ffp-contract=off",
+        "-O2",
+        "-shared",
+        "-fPIC",
+        "-o",
+        "law.so",
+        "law.c",
+    ]
     subprocess.run([COMPILER, *options, "-lm"], cwd=folder, check=True)
     library = ctypes.CDLL(str(folder / "law.so"))
     result = {}
     for f in functions:
         function = getattr(library, f"law_{f.name}")
         both = {**f.inputs, **{name: len(part) for name, part in f.outputs.items()}}
-        pointer = np.ctypeslib.ndpointer(np.float64)
-        function.argtypes = [ctypes.c_double if n is None else pointer for n in both.values()]
-        result[f.name] = with_outputs(f, function, np.array)
+        pointer = np.ctypeslib.ndpointer(real)
+        function.argtypes = [place if n is None else pointer for n in both.values()]
+        result[f.name] = with_outputs(f, function, functools.partial(np.array, dtype=real))
     return result
 
 
@@ -214,7 +231,7 @@ def agent(request):
 
 
 def test_a_law_by_itself_steps_as_the_agent_does(agent, tmp_path):
-    functions, own = law_functions(agent.own_law), agent.own_law
+    functions, own = law_functions(agent.own_law).values(), agent.own_law
     runs = {way: way(functions, tmp_path) for way in WAYS}
     trim, draws = np.array(own.loop.model.trim[0]), np.random.default_rng(0)
     memory = {way: run["begin"](trim.tolist()) for way, run in runs.items()}
@@ -233,7 +250,7 @@ def test_a_law_by_itself_steps_as_the_agent_does(agent, tmp_path):
             inputs = time, x.tolist(), z, forward.tolist(), before
             *results, valid = run["tick"](*inputs)
             memory[way] = results[1]
-            assert valid and run["hello"](x.tolist(), before) == results[2]
+            assert valid and run["signal"](x.tolist(), before) == results[2]
             for got, value in zip(results, expected, strict=True):
                 size = max(1.0, np.abs(value).max(initial=0.0))
                 np.testing.assert_allclose(got, value, rtol=0, atol=1e-14 * size)
@@ -257,7 +274,7 @@ def receive(agent, draws):
 
 
 def test_what_is_not_finite_is_not_valid(agent, tmp_path):
-    own, functions = agent.own_law, law_functions(agent.own_law)
+    own, functions = agent.own_law, law_functions(agent.own_law).values()
     trim = list(map(float, own.loop.model.trim[0]))
     sizes = {f.name: f.inputs for f in functions}["tick"]
     for way in WAYS:
@@ -286,21 +303,87 @@ def carts(graph=PAIR, **more):
 
 
 APART = ech.Safety(radii=(0.085, 0.085, 0.085))
-REFUSED = {
-    "a network that is not ideal": lambda: carts().replace(
-        world=ech.World(network=ech.Network(rate=50.0, delay=0.02))
-    ),
-    "agents that measure their states late or with noise": lambda: carts().replace(
-        world=ech.World(sensing=ech.Sensing(delay=0.01))
-    ),
-    "a graph that switches": lambda: carts(
-        graph=ech.Graph.switching([(0.0, [(0, 1), (1, 2)]), (1.0, [(0, 1), (0, 2)])])
-    ),
-    "agents that keep away from each other": lambda: carts(safety=APART),
-}
 
 
-@pytest.mark.parametrize("reason", REFUSED)
-def test_what_a_law_file_does_not_know_is_refused(reason):
-    with pytest.raises(Unsupported, match=re.escape(reason)):
-        law_functions(ech.Agent(REFUSED[reason](), 1, 0.01).own_law)
+def test_laws_that_keep_agents_apart_are_refused():
+    with pytest.raises(Unsupported, match="agents that keep away from each other"):
+        law_functions(ech.Agent(carts(safety=APART), 1, 0.01).own_law)
+
+
+# ---- single precision ----------------------------------------------------------------------------
+
+
+def test_single_precision_is_that_of_its_own_trace(agent, tmp_path):
+    """The text in single precision, evaluated by NumPy's own, against double precision."""
+    own, draws = agent.own_law, np.random.default_rng(2)
+    double, single = law_functions(own), law_functions(own, 32)
+    exact, rounded = as_python(double.values(), tmp_path), as_read_c(single.values(), tmp_path, 32)
+    trim = np.array(own.loop.model.trim[0])
+    sizes = single["tick"].inputs
+    memory = exact["begin"](trim.tolist())
+    for k in range(40):
+        x = (trim + 0.1 * draws.normal(size=len(trim))).tolist()
+        forward = (0.1 * draws.normal(size=sizes["feed_forward"])).tolist()
+        z = (0.3 * draws.normal(size=sizes["z"])).tolist()
+        rows = k * own.loop.motion.dt, x, z, forward, memory
+        *results, valid = exact["tick"](*rows)
+        *ours, fine = rounded["tick"](*rows)
+        assert valid and fine
+        for got, value in zip(ours, results, strict=True):
+            size = max(1.0, np.abs(value).max(initial=0.0))
+            np.testing.assert_allclose(got, value, rtol=0, atol=3e-5 * size)
+        memory = results[1]
+
+
+@pytest.mark.skipif(COMPILER is None, reason="no C compiler")
+def test_single_precision_compiles_and_is_numpys_own_to_the_bit(agent, tmp_path):
+    own, draws = agent.own_law, np.random.default_rng(3)
+    single = law_functions(own, 32).values()
+    compiled, rounded = as_compiled_c(single, tmp_path, 32), as_read_c(single, tmp_path, 32)
+    trim = list(map(float, own.loop.model.trim[0]))
+    sizes = {f.name: f.inputs for f in single}["tick"]
+    memory = compiled["begin"](trim)
+    for k in range(10):
+        rows = [
+            0.1 * draws.normal(size=size).astype(np.float32)
+            for size in (sizes["z"], sizes["feed_forward"])
+        ]
+        x = (np.array(trim) + 0.1 * draws.normal(size=len(trim))).astype(np.float32)
+        inputs = np.float32(0.01 * k), x, *rows, memory
+        assert compiled["tick"](*inputs) == rounded["tick"](*inputs)
+
+
+# ---- machine code of a microcontroller -----------------------------------------------------------
+
+
+LARGEST = {"consensus": 4000, "stopping-point": 7000, "its-leader": 9000}
+"""Bytes of a tick."""
+
+
+@pytest.mark.skipif(not is_installed(), reason="no llvmlite")
+def test_machine_code_of_a_microcontroller_is_small_and_calls_nothing(agent, request):
+    single = law_functions(agent.own_law, 32)
+    image = object_file(single.values())
+    sizes, undefined = symbols(image)
+    assert {*sizes} == {f"law_{name}" for name in single} and not undefined
+    assert sizes["law_tick"] <= LARGEST[request.node.callspec.params["agent"]], sizes
+    # "VFP registers" for numbers, as compilers pass them for this triple (Tag_ABI_VFP_args).
+    assert b"\x1c\x01" in image[image.index(b"aeabi\0") :][:80]
+
+
+def symbols(image):
+    """Return the size of each function, and what is undefined, of an ELF file for ARM."""
+    assert image[:5] == b"\x7fELF\x01" and struct.unpack_from("<H", image, 18) == (40,)
+    [start] = struct.unpack_from("<I", image, 32)
+    size, count = struct.unpack_from("<HH", image, 46)
+    sections = [struct.unpack_from("<10I", image, start + k * size) for k in range(count)]
+    [table] = (s for s in sections if s[1] == 2)
+    strings = sections[table[6]][4]
+    sizes, undefined = {}, set()
+    for at in range(table[4] + 16, table[4] + table[5], 16):
+        name, _, length, info, _, section = struct.unpack_from("<IIIBBH", image, at)
+        if info >> 4:
+            text = image[strings + name : image.index(b"\0", strings + name)].decode()
+            sizes |= {text: length} if section else {}
+            undefined |= set() if section else {text}
+    return sizes, undefined

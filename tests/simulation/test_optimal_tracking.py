@@ -90,7 +90,7 @@ def test_a_leader_with_an_offset_flies_beside_the_plan():
 
 
 def test_it_is_planned_once():
-    assert LAW.prepared(QUADROTOR, TREE) is LAW
+    assert LAW.prepared(QUADROTOR, TREE).states is LAW.states
 
 
 @pytest.mark.study

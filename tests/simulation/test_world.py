@@ -166,7 +166,7 @@ def test_air_drags_an_agent_along():
         ),
         (
             lambda: ech.World(disturbance=ech.Disturbance(air=(1.0,), drag=1.0)),
-            "`drag` with an `air` of 1 numbers",
+            "`drag` with an `air` of 1 number,",
         ),
         (lambda: ech.World(disturbance=ech.Disturbance(air=(1.0, 0.0))), "`air` .* without `drag`"),
         (lambda: ech.World(disturbance=ech.Disturbance(time=1.0)), "`time` .* without `rms`"),

@@ -61,6 +61,10 @@ class OutputError(EchelonError):
     """Results cannot be written where they were requested."""
 
 
+class FlightError(EchelonError):
+    """A flight cannot begin, or the link to a vehicle failed."""
+
+
 class MissingExtraError(EchelonError):
     """An optional part of echelon is not installed."""
 

@@ -25,6 +25,7 @@ class Hypothesis(Word):
     HEADING_FRAME = "law turns with the heading"
     SAMPLING = "step, input held"
     SWITCHING = "graphs that take turns"
+    EVENTS = "events of the run"
     REGION = "region of the gain"
     SET = "certified set"
     STARTS = "starts in the certified set"

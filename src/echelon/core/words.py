@@ -9,6 +9,11 @@ from typing import Self
 from echelon.core.errors import SimulationError, check_name
 
 
+def amount(count: int, noun: str, nouns: str = "") -> str:
+    """Return a count with its noun, such as `1 agent`; `nouns` is an irregular plural."""
+    return f"{count} {noun if count == 1 else nouns or noun + 's'}"
+
+
 class Word(enum.Enum):
     """A word with a meaning: its name stands in tables and files, its value is the meaning."""
 

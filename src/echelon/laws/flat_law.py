@@ -10,8 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from echelon.agents.models.chains import Chains, chains_of, check_bounds, flatten, switch_on
+from echelon.agents.models.chains import (
+    Chains,
+    chains_of,
+    check_bounds,
+    flatten,
+    switch_on,
+)
 from echelon.agents.models.model import ControlAffine, FlatBound
+from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ModelError, listing
 from echelon.core.types import Array, Input, Scalar, State
@@ -55,10 +62,11 @@ class FlatLaw(Law):
         rate: the slowest root, in place of `roots`; the others follow from it.
         coupling: c > 0.
         speed: s, of all outputs or one each, in their units per second; infinite is linear. By
-            default what the model's bounds allow, computed by `prepared`.
+            default what the model's bounds allow.
         observer: of the acceleration that the model lacks, which is compensated; True for the
             default one, False for none.
         loop: of the model; computed by `prepared`.
+        speeds: s in use; computed by `prepared`.
     """
 
     roots: tuple[float, ...] | None = eqx.field(default=None, static=True)
@@ -67,6 +75,7 @@ class FlatLaw(Law):
     speed: Speed | None = eqx.field(default=None, converter=plain_speeds)
     observer: Observer = eqx.field(default=Observer(), static=True, converter=Observer.of)
     loop: FlatLoop | None = None
+    speeds: Speed | None = None
 
     def __check_init__(self) -> None:
         """Check that roots are distinct and positive, and other numbers positive."""
@@ -123,8 +132,8 @@ class FlatLaw(Law):
 
     def speed_of(self, output: int) -> float:
         """Return s of an output."""
-        assert self.speed is not None, "`prepared` finds the speeds"
-        return float(self.speed[output] if isinstance(self.speed, Sequence) else self.speed)
+        assert self.speeds is not None, "`prepared` finds the speeds"
+        return float(self.speeds[output] if isinstance(self.speeds, Sequence) else self.speeds)
 
     def build_loop(self, model: ControlAffine) -> FlatLoop:
         """Return the inner loop for a model.
@@ -185,7 +194,7 @@ class FlatLaw(Law):
     def bounded(self, x: jax.Array) -> jax.Array:
         """Return sigma(x) = x / sqrt(1 + (x/s)^2): odd, increasing, of slope 1 at 0, below s."""
         # By the inverse, which is 0 where s is infinite and sigma is linear.
-        inverse = 1.0 / jnp.asarray(self.speed, x.dtype)
+        inverse = 1.0 / jnp.asarray(self.speeds, x.dtype)
         return x * jax.lax.rsqrt(1.0 + (x * inverse) ** 2)
 
     # ---- what any agent does ----
@@ -220,6 +229,10 @@ class FlatLaw(Law):
         """Return zeta less the offset, (m,)."""
         return self.ready.place(model, x, offset, memory)
 
+    def goal_offset(self, model: ControlAffine, own: OwnOffset, t: Scalar) -> tuple[State, State]:
+        """Return the stopping point q(D) xi / q(0) of an offset, and its rate, (n,) each."""
+        return self.ready.stopping_offset(model, own, t)
+
     def hull(self, model: ControlAffine, x: State, memory: FlatMemory) -> Float[jax.Array, "r d"]:
         """Return the points in whose hull the position stays, the last one of zeta."""
         return self.hull_of(model, self.ready.flat_values(model, x, memory))
@@ -243,12 +256,7 @@ class FlatLaw(Law):
             LawError: a coordinate is none, or their chains are too long or not of one length.
         """
         name, chains = f"`{type(model).__name__}`", self.ready.chains
-        if not {*model.position} <= {*chains.outputs}:
-            raise LawError(
-                f"`safety` needs the position of {name} among its flat outputs, "
-                f"{listing(chains.outputs)}."
-            )
-        places = [chains.outputs.index(x) for x in model.position]
+        places = self.ready.places_of(model)
         degrees = [chains.degrees[k] for k in places]
         if len({*degrees}) > 1 or degrees[0] > MOST_POINTS:
             raise LawError(
@@ -258,7 +266,7 @@ class FlatLaw(Law):
         return places
 
     def message(self, model: ControlAffine, x: State, v: Input, memory: FlatMemory) -> jax.Array:
-        """Return zeta', (m,)."""
+        """Return zeta' less that of the own offset, (m,)."""
         return memory.rate
 
     def signal_names(self, model: ControlAffine) -> tuple[str, ...]:
@@ -304,11 +312,6 @@ class FlatLaw(Law):
 
 def _moves(speed: object) -> bool:
     return isinstance(speed, int | float) and speed > 0.0
-
-
-def waits_for_path(model: ControlAffine) -> bool:
-    """Tell whether the speeds that a model tolerates depend on the leader's path."""
-    return any(len(bound.outputs) > 1 for bound in model.flat_bounds or ())
 
 
 def _left(roots: tuple[float, ...], bound: FlatBound, slowest: float) -> float:

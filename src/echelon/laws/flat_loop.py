@@ -16,7 +16,8 @@ import numpy as np
 
 from echelon.agents.models.chains import Chains, flat_output, flatten
 from echelon.agents.models.model import ControlAffine
-from echelon.core.errors import LawError
+from echelon.agents.network.formation_motion import OwnOffset
+from echelon.core.errors import LawError, listing
 from echelon.core.types import Array, Input, Scalar, State
 
 _LEAST_THRUST = 0.3
@@ -76,7 +77,7 @@ class FlatMemory(NamedTuple):
 
     Attributes:
         chain: the states of the integrators before inputs, normalized (k,).
-        rate: zeta' that it commands, (m,), which followers may receive.
+        rate: zeta' that it commands, (m,), less that of its offset, which followers may receive.
         delivered: the normalized input (m,) that the actuators delivered in the step before.
         base, push: of the observer (m,): the speed that the model predicts but for the last half
             step, and the acceleration that the model lacks.
@@ -149,9 +150,35 @@ class FlatLoop(eqx.Module):
 
     def place(self, model: ControlAffine, x: State, offset: State, memory: FlatMemory) -> jax.Array:
         """Return zeta less the offset, (m,): where the agent would come to rest."""
+        return self.stop(self.flat_values(model, x, memory)) - self.shift(model, offset)
+
+    def shift(self, model: ControlAffine, offset: State) -> jax.Array:
+        """Return the flat outputs (m,) of an offset."""
         outputs = self.chains.outputs
-        shift = flat_output(model, outputs, offset) - flat_output(model, outputs, 0.0 * offset)
-        return self.stop(self.flat_values(model, x, memory)) - shift
+        return flat_output(model, outputs, offset) - flat_output(model, outputs, 0.0 * offset)
+
+    def places_of(self, model: ControlAffine) -> list[int]:
+        """Return which flat outputs are the position.
+
+        Raises:
+            LawError: a coordinate is none.
+        """
+        outputs = self.chains.outputs
+        if not {*model.position} <= {*outputs}:
+            raise LawError(
+                "`safety` and formations that move need the position of "
+                f"`{type(model).__name__}` among its flat outputs, {listing(outputs)}."
+            )
+        return [outputs.index(x) for x in model.position]
+
+    def stopping_offset(
+        self, model: ControlAffine, own: OwnOffset, t: Scalar
+    ) -> tuple[State, State]:
+        """Return q(D) xi / q(0) of an offset that moves, and its rate, (n,) each."""
+        weights = jnp.asarray(self.weights, t.dtype)[:, np.array(self.places_of(model))]
+        moved, axes = own.derivatives(t, len(weights)), np.array(own.motion.axes)
+        stop = own.base.at[axes].set((weights * moved[:-1]).sum(axis=0))
+        return stop, (0.0 * own.base).at[axes].set((weights * moved[1:]).sum(axis=0))
 
     def stop(self, values: jax.Array) -> jax.Array:
         """Return zeta (m,) of flat coordinates (r, m)."""
@@ -179,8 +206,12 @@ class FlatLoop(eqx.Module):
         rate: jax.Array,
         memory: FlatMemory,
         period: Scalar | float,
+        offset_rate: State | None = None,
     ) -> tuple[Input, FlatMemory]:
-        """Return the physical input that makes zeta move at a rate (m,), and the next memory."""
+        """Return the physical input that makes zeta move at a rate (m,), and the next memory.
+
+        The rate of the own offset (n,) is added to it.
+        """
         flat, values = (
             flatten(model, self.chains, x, memory.chain),
             self.flat_values(model, x, memory),
@@ -188,7 +219,8 @@ class FlatLoop(eqx.Module):
         degrees = np.array(self.chains.degrees)
         lower = np.arange(len(values))[:, None] < degrees - 1
         k = jnp.where(lower, jnp.asarray(self.weights, x.dtype), 0.0)
-        tops = rate - (k[:-1] * values[1:]).sum(axis=0)
+        tops = rate if offset_rate is None else rate + self.shift(model, offset_rate)
+        tops = tops - (k[:-1] * values[1:]).sum(axis=0)
         tops = jnp.asarray(self.stiffness, x.dtype) * tops
         if self.observer:
             tops = tops - jnp.where(degrees <= 2, memory.push, 0.0)

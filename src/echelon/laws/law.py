@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.heading_symmetry import heading_index, rest_heading
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation_motion import OwnOffset
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.near import Near
 from echelon.agents.references.guide import Guide
@@ -43,6 +44,7 @@ class LocalView(eqx.Module):
             unless the law's `message` says otherwise.
         period: how long the input will be held, s; 0 where it is not known.
         near: the others, where the law keeps away from them; None elsewhere.
+        offset_rate: of `offset` (n,), per s; None of a constant one, or if the law uses none.
 
     Raises:
         LawError: it is made of numbers while JAX computes in float32.
@@ -55,6 +57,7 @@ class LocalView(eqx.Module):
     feedforward: Float[jax.Array, " k"]
     period: Scalar | float = 0.0
     near: Near | None = None
+    offset_rate: State | None = None
 
     def __check_init__(self) -> None:
         """Refuse to lose digits silently."""
@@ -178,6 +181,15 @@ class Law(eqx.Module):
         """Return what an agent sends to its neighbours, for z; None for x - offset."""
         return None
 
+    def goal_offset(
+        self, model: ControlAffine, own: OwnOffset, t: Scalar
+    ) -> tuple[State, State | None]:
+        """Return what the law takes for an offset (n,) that moves, and its rate (n,) or None.
+
+        Unless replaced, it is the position, and the velocity where that is a state: agents lag.
+        """
+        return own.state(t), None
+
     def signal_names(self, model: ControlAffine) -> tuple[str, ...]:
         """Return the names of what an agent sends for z, by which unlike agents use it."""
         return model.state_names
@@ -292,8 +304,7 @@ class Law(eqx.Module):
         """
         if type(self).signal is not Law.signal:
             return signal
-        count = jnp.ceil(time / _CARRIED).astype(int)
-        piece = time / jnp.maximum(count, 1)
+        count, piece = carried_pieces(time)
         return jax.lax.fori_loop(0, count, lambda _, x: rk4(model.velocity, x, u, piece), signal)
 
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
@@ -312,6 +323,15 @@ class Law(eqx.Module):
     @abc.abstractmethod
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return one agent's physical input (m,), before actuator limits, and its next memory."""
+
+
+def carried_pieces(time: Scalar) -> tuple[jax.Array, jax.Array]:
+    """Return in how many steps of the model a leader is carried on, and their length (s).
+
+    The time is in s.
+    """
+    count = jnp.ceil(time / _CARRIED).astype(int)
+    return count, time / jnp.maximum(count, 1)
 
 
 def declares(law: Law, name: str) -> bool:
@@ -345,10 +365,10 @@ def check_gain_fits(
 
 
 def gain_of(law: Law) -> Gain | None:
-    """Return the gain of a law; None where it has none."""
+    """Return the gain of a law, of a prepared leader the one in use; None where it has none."""
     # By name, since a user's own law need not have one.
-    gain = getattr(law, "gain", None)
-    return gain if isinstance(gain, Gain) else None
+    named = (getattr(law, name, None) for name in ("regulator", "gain"))
+    return next((gain for gain in named if isinstance(gain, Gain)), None)
 
 
 def reference_of(law: object) -> Guide | None:

@@ -19,7 +19,9 @@ from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import check_reference
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError
+from echelon.core.identity import process_key
 from echelon.core.linear import symmetric_part
+from echelon.core.memoize import BoundedCache
 from echelon.core.types import Array, Input
 from echelon.laws.law import LocalView, Memory
 from echelon.laws.path_leader import PathLeader
@@ -32,6 +34,8 @@ _MOST = 50_000
 _HELD = 1500
 """Intervals (of 0.02 s: 30 s) for which the end is held at least, so that a short path has the gain
 of a long one: what the beginning leaves of P falls at twice the slowest mode."""
+_SWEEPS = BoundedCache[tuple[Array, Array]](4, lambda swept: swept[0].nbytes, 2**26)
+"""Gains that were swept last, and their slowest decay."""
 
 
 class PathLQR(PathLeader):
@@ -57,16 +61,15 @@ class PathLQR(PathLeader):
         return ("the reference, all of it before the start",)
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "PathLQR":
-        """Sweep the gain, once.
+        """Sweep the gain, once for a model and a path.
 
         Raises:
             LawError: the model cannot follow the reference, or no feedback stabilizes it there.
         """
-        if self.gains is not None:
-            return self
         check_reference(self.reference)
         self.reference.fit(model)
-        gains, decay = sweep(model, self.reference, self.horizon)
+        about = model, self.reference, self.horizon
+        gains, decay = _SWEEPS.get_or_make(process_key(about), lambda: sweep(*about))
         return PathLQR(self.reference, self.horizon, gains, decay)
 
     def own_mode(self, model: ControlAffine) -> float | None:

@@ -22,6 +22,8 @@ from echelon.core.types import Array
 from echelon.laws.nearest_point import nearest_point
 
 AXES = ("x", "y", "z")
+_SIZES = np.repeat([0.5, 5.0, 50.0], 16)
+"""Of samples about the trim, at which outputs are compared with the position."""
 _DOWNWASH = 3.0
 """Height over width of the ellipsoid about a model with a radius: rotors blow downward."""
 _MOST_CORRECTIONS, _SOLVED = 60, 1e-9
@@ -44,6 +46,7 @@ class Safety:
             pass each other on the right.
         margin: added to the distance that the filter keeps, m.
         reach: scaled distance up to which others are regarded, m.
+        of_model: the radii where none are given; set by `prepared`.
 
     Raises:
         LawError: a number is out of its range.
@@ -54,6 +57,7 @@ class Safety:
     swirl: float = 0.5
     margin: float = 0.05
     reach: float = 3.0
+    of_model: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -72,10 +76,16 @@ class Safety:
                 raise LawError(f"`{name}` of `safety` is {value}, and must be {allowed}.")
 
     @property
+    def size(self) -> tuple[float, ...]:
+        """The radii of the ellipsoid along x, y and z, m, as given or of the model."""
+        size = self.radii or self.of_model
+        assert size is not None, "`prepared` finds the radii"
+        return size
+
+    @property
     def touching(self) -> float:
         """The scaled distance at which two ellipsoids touch, m."""
-        assert self.radii is not None, "`prepared` finds the radii"
-        return 2.0 * self.radii[0]
+        return 2.0 * self.size[0]
 
     @property
     def distance(self) -> float:
@@ -86,23 +96,26 @@ class Safety:
         """Return it with radii, checked for a model.
 
         Raises:
-            LawError: the model has no position in x, y and z, or no radius.
+            LawError: the model has no position in x, y and z, or no radius, or its outputs with the
+                names of the position are other values, as seen at samples.
         """
         name, odd = type(model).__name__, [x for x in model.position if x not in AXES]
         if not model.position or odd:
             what = f"the position {listing(model.position)}" if odd else "no `position`"
             raise LawError(f"`safety` needs a position in x, y or z, and `{name}` has {what}.")
+        _check_position(model)
         if self.radii is not None:
             return self
         radius = model.radius
         if radius is None:
             raise LawError(f"`safety` needs `radii`, since `{name}` has no `radius`.")
-        return dataclasses.replace(self, radii=(radius, radius, _DOWNWASH * radius))
+        if not _positive(radius):
+            raise LawError(f"`radius` of `{name}` is {radius}, and must be positive, m.")
+        return dataclasses.replace(self, of_model=(radius, radius, _DOWNWASH * radius))
 
     def scales(self, model: ControlAffine) -> Array:
         """Return the factors (d,) of the position's coordinates in scaled distances."""
-        assert self.radii is not None, "`prepared` finds the radii"
-        return np.array([self.radii[0] / self.radii[AXES.index(x)] for x in model.position])
+        return np.array([self.size[0] / self.size[AXES.index(x)] for x in model.position])
 
     def needed_reach(self, speeds: Float[Array, " d"], scales: Float[Array, " d"]) -> float:
         """Return the distance beyond which no row can act, for agents of some speeds, m/s."""
@@ -211,6 +224,23 @@ def hull_points(
         whole = np.atleast_1d(np.poly(-np.array(roots[:k])))[::-1]
         rows[k, : k + 1] = whole / whole[0]
     return jnp.asarray(rows, values.dtype) @ values
+
+
+def _check_position(model: ControlAffine) -> None:
+    """Check that outputs with the names of the position are the position, near the trim and far."""
+    names = [name for name in model.position if name in model.output_names]
+    both = model.output_names, model.state_names
+    outputs, states = (np.array([each.index(x) for x in names], int) for each in both)
+    draw = np.random.default_rng(0)
+    away = _SIZES[:, None] * draw.uniform(-1.0, 1.0, (len(_SIZES), len(model.state_names)))
+    x = jnp.asarray(np.asarray(model.trim[0], float) + away)
+    off = np.abs(np.asarray(jax.vmap(model.output)(x)[:, outputs] - x[:, states]))
+    wrong = np.flatnonzero(~(off.max(axis=0) <= _SOLVED))
+    if len(wrong):
+        raise LawError(
+            f"`safety` needs the position of `{type(model).__name__}` among its flat outputs, and "
+            f"its output `{names[wrong[0]]}` is not the state of that name."
+        )
 
 
 def _positive(value: object) -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.agents.network.graph import Graph
+from echelon.agents.network.near import Near
 from echelon.agents.references.flatness import first_state, followed_states
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
@@ -31,7 +32,6 @@ from echelon.laws.flat_law import (
     SHARE,
     SPEED,
     FlatLaw,
-    waits_for_path,
 )
 from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Expected, Law, LocalView
@@ -58,16 +58,14 @@ class GraphDemand(eqx.Module):
             the mean over a period, or of the last one.
         heaviest: d_max, the largest sum of a follower's weights.
         links: how many speeds add up on the path from a leader.
-        waits: whether the speed is left out, and follows from the leader's path.
     """
 
     slowest: float
     heaviest: float
     links: int = 1
-    waits: bool = False
 
     @classmethod
-    def of(cls, graph: Graph, leaderward: bool, links: int, waits: bool) -> "GraphDemand":
+    def of(cls, graph: Graph, leaderward: bool, links: int) -> "GraphDemand":
         """Return it of a graph.
 
         Raises:
@@ -79,7 +77,7 @@ class GraphDemand(eqx.Module):
         if schedule is None:
             # With one-way edges the Laplacian is triangular: its eigenvalues are its diagonal.
             slowest = float(own.min()) if leaderward else graph.spectrum().low
-            return cls(slowest, float(own.max()), links, waits)
+            return cls(slowest, float(own.max()), links)
         share = np.eye(len(own))[-1]
         if schedule.period is not None:
             share = np.diff(schedule.starts, append=schedule.period) / schedule.period
@@ -90,7 +88,7 @@ class GraphDemand(eqx.Module):
                 f"the leader does not reach everybody from {schedule.starts[-1]:g} s on where "
                 "neighbours nearer to it alone are heard; set `hears: all`, or add edges there."
             )
-        return cls(slowest, float(own.max()), links, waits)
+        return cls(slowest, float(own.max()), links)
 
 
 @final
@@ -152,21 +150,19 @@ class StoppingPoint(FlatLaw):
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "StoppingPoint":
         """Find the model's chains, and the graph's properties for the coupling."""
-        if self.loop is not None:
-            return self
         links = 1
         if self.feedforward is Feedforward.PARENT:
             # Raises where the graph is no tree.
             graph.parents()
             links = int(graph.depths().max())
         loop = self.build_loop(model)
-        waits = self.speed is None and waits_for_path(model)
-        reach = GraphDemand.of(graph, self.leaderward, links, waits)
-        speed = self.speeds_within(model, loop.chains, SPEED, _share(links), links)
+        reach = GraphDemand.of(graph, self.leaderward, links)
+        speeds = self.speeds_within(model, loop.chains, SPEED, _share(links), links)
+        # All of it anew, since a law may come from a run of another model or graph.
         law = eqx.tree_at(
-            lambda law: (law.loop, law.reach, law.ahead, law.speed),
+            lambda law: (law.loop, law.reach, law.ahead, law.speeds),
             self,
-            (loop, reach, np.zeros_like(loop.weights), speed),
+            (loop, reach, np.zeros_like(loop.weights), speeds),
             is_leaf=lambda part: part is None,
         )
         if self.safety is None:
@@ -190,14 +186,10 @@ class StoppingPoint(FlatLaw):
             )
         ahead = beginning_of(leader, model)
         assert self.reach is not None
-        same = np.array_equal(np.asarray(self.ahead), ahead)
-        law = self if same else eqx.tree_at(lambda law: law.ahead, self, ahead)
-        if not self.reach.waits:
-            return law
-        free = eqx.tree_at(lambda law: law.speed, law, None, is_leaf=lambda x: x is None)
         links, slowest = self.reach.links, functools.partial(leader.slowest_along, model)
-        speed = free.speeds_within(model, self.loop.chains, SPEED, _share(links), links, slowest)
-        return eqx.tree_at(lambda law: law.speed, law, speed)
+        # A bound of several outputs leaves more speed where the path keeps away from it.
+        speeds = self.speeds_within(model, self.loop.chains, SPEED, _share(links), links, slowest)
+        return eqx.tree_at(lambda law: (law.ahead, law.speeds), self, (ahead, speeds))
 
     def check_late(self, graph: Graph, period: float) -> None:
         """Check that no stopping point passes its neighbours' within a step: c d_max dt <= 1."""
@@ -230,16 +222,28 @@ class StoppingPoint(FlatLaw):
     ) -> tuple[Input, FlatMemory]:
         """Return the input of one agent."""
         pull = self.bounded(self.strength(view.period) * view.disagreement)
-        if self.safety is None or view.near is None:
-            return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period)
+        moving = view.offset_rate
+        if self.safety is not None and view.near is not None:
+            pull, active = self._held_apart(model, view, view.near, pull)
+            # What the filter lets through has the offset's rate in it.
+            memory, moving = memory._replace(active=active), None
+        return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period, moving)
+
+    def _held_apart(
+        self, model: ControlAffine, view: LocalView, near: Near, pull: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the pull (m,), less the offset's rate, that keeps away, and how many act on it."""
+        assert self.safety is not None
         places = np.array(self.places(model))
-        speeds = jnp.broadcast_to(jnp.asarray(self.speed, view.x.dtype), pull.shape)[places]
+        speeds = jnp.broadcast_to(jnp.asarray(self.speeds, view.x.dtype), pull.shape)[places]
         scales = jnp.asarray(self.safety.scales(model), view.x.dtype)
-        rate, active = self.safety.filtered(-pull[places], view.near, scales, speeds)
+        rate = -pull[places]
+        if view.offset_rate is not None:
+            rate = rate + self.ready.shift(model, view.offset_rate)[places]
+            rate = rate * (speeds / jnp.maximum(jnp.abs(rate), speeds)).min()
+        rate, active = self.safety.filtered(rate, near, scales, speeds)
         # Where no row acts it is the same to the bit.
-        pull = pull.at[places].set(-rate)
-        memory = memory._replace(active=active)
-        return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period)
+        return pull.at[places].set(-rate), active
 
 
 @final
@@ -261,8 +265,6 @@ class StoppingLeader(FlatLaw):
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "StoppingLeader":
         """Find the model's chains, and check that it can be led along the reference."""
-        if self.loop is not None:
-            return self
         loop = self.build_loop(model)
         if self.reference is not None:
             check_reference(self.reference)
@@ -275,14 +277,14 @@ class StoppingLeader(FlatLaw):
             self.reference.fit(model)
         none = {"is_leaf": lambda part: part is None}
         law = eqx.tree_at(lambda law: law.loop, self, loop, **none)
-        speed = self.speeds_within(
+        speeds = self.speeds_within(
             model,
             loop.chains,
             LEAD_SPEED,
             LEAD_SHARE,
             slowest=functools.partial(law.slowest_along, model),
         )
-        return eqx.tree_at(lambda law: law.speed, law, speed, **none)
+        return eqx.tree_at(lambda law: law.speeds, law, speeds, **none)
 
     def path(self, model: ControlAffine, t: Scalar) -> jax.Array:
         """Return the flat outputs to follow with their derivatives, (r + 1, m)."""
@@ -336,9 +338,12 @@ class StoppingLeader(FlatLaw):
         self, model: ControlAffine, view: LocalView, memory: FlatMemory
     ) -> tuple[Input, FlatMemory]:
         """Return the leader's input."""
+        if memory.active is not None:
+            # An heir that was held back when it took the lead gives way to nobody now.
+            memory = memory._replace(active=0.0 * memory.half)
         away = self.deviation(model, view.t, view.x, view.offset, memory)
         rate = self._rate(model, view.t, away, view.period)
-        return self.ready.obey(model, view.x, rate, memory, view.period)
+        return self.ready.obey(model, view.x, rate, memory, view.period, view.offset_rate)
 
     def _rate(
         self, model: ControlAffine, t: Scalar, away: jax.Array, period: Scalar | float
@@ -368,7 +373,7 @@ class StoppingLeader(FlatLaw):
         period: Scalar | float,
     ) -> Expected:
         """Return zeta_r + D and zeta_r' - sigma(c D), with D' = -sigma(c D) from the deviation."""
-        inverse = 1.0 / jnp.asarray(self.speed, deviation.dtype)
+        inverse = 1.0 / jnp.asarray(self.speeds, deviation.dtype)
         away = saturated_decay(deviation, self.strength(period), inverse, age)
         there = self.ready.stop(self.path(model, t)[:-1])
         return Expected(there + away, self._rate(model, t, away, period))

@@ -31,11 +31,13 @@ class Tracking(PathLeader):
         gain: the tracking gain, used with coupling 1; the model's Riccati gain when left out.
         reaction: the followers' gain, when the leader reacts to them.
         turns: whether the gains turn with the reference's heading; set by `prepared`.
+        regulator: the tracking gain in use; set by `prepared`.
     """
 
     gain: Gain | None = None
     reaction: Gain | None = None
     turns: bool = eqx.field(default=False, static=True)
+    regulator: Gain | None = None
 
     @property
     def information(self) -> tuple[str, ...]:
@@ -48,7 +50,7 @@ class Tracking(PathLeader):
         self.reference.fit(model)
         if self.reaction is not None:
             check_gain_fits(self, model, self.reaction.P.shape, self.reaction.R.shape)
-        gain = tracking_gain(self, model, graph, self.gain)
+        regulator = tracking_gain(self, model, self.gain)
         # Checked here, since a run would only say that the leader diverged at once.
         begin = follow_at(model, self.reference, np.zeros(1))
         if not all(np.isfinite(part).all() for part in begin):
@@ -56,11 +58,8 @@ class Tracking(PathLeader):
                 f"the reference `{type(self.reference).__name__}` cannot be followed by "
                 f"`{type(model).__name__}`: its flat state and input are not finite at t = 0 s."
             )
-        # A complete law stays the same object, so that what was computed of it is found again.
         turns = model.heading is not None and not self.keeps_heading(model)
-        if gain is self.gain and turns is self.turns:
-            return self
-        return Tracking(self.reference, gain, self.reaction, turns)
+        return Tracking(self.reference, self.gain, self.reaction, turns, regulator)
 
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return (x_r, u_r) at time t."""
@@ -68,20 +67,20 @@ class Tracking(PathLeader):
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the leader's input."""
-        if self.gain is None:
+        if self.regulator is None:
             raise LawError("`Tracking` has no gain yet; call `prepared(model, graph)` first.")
         state, u = self.target(model, view.t)
         heading = self.heading(model, view.t, view.x) if self.turns else None
         # With several leaders each follows the reference at an offset of its own.
         error = model.difference(view.x, state + view.offset)
-        v = self.gain.feedback(model, view.x, error, heading)
+        v = self.regulator.feedback(model, view.x, error, heading)
         # Normalized inputs are added, and the trim once: it is in u already.
         if self.reaction is not None:
             v = v + self.reaction.feedback(model, view.x, view.disagreement, heading)
         return u - model.physical(v, trim=False), memory
 
 
-def tracking_gain(law: Law, model: ControlAffine, graph: Graph, gain: Gain | None) -> Gain:
+def tracking_gain(law: Law, model: ControlAffine, gain: Gain | None) -> Gain:
     """Return a leader's own gain with coupling 1, the model's Riccati gain where it is None.
 
     Raises:

@@ -1,5 +1,6 @@
 """Agents: the interface `ControlAffine` and the bundled members."""
 
+from echelon.agents.models.crazyflie_attitude import CrazyflieAttitude
 from echelon.agents.models.heading import Heading
 from echelon.agents.models.integrator import DoubleIntegrator, SingleIntegrator
 from echelon.agents.models.linear_agent import Linear
@@ -14,6 +15,7 @@ from echelon.agents.models.van_der_pol import VanDerPol
 
 __all__ = [
     "ControlAffine",
+    "CrazyflieAttitude",
     "DoubleIntegrator",
     "Heading",
     "Limits",

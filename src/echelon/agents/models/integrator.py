@@ -40,7 +40,7 @@ class Integrator(ControlAffine):
         # True is an integer to Python, and no dimension.
         integral = isinstance(dimension, numbers.Integral) and not isinstance(dimension, bool)
         if not integral or dimension < 1:
-            raise ModelError(f"{name} is {dimension}, and must be a whole number of at least 1.")
+            raise ModelError(f"{name} is {dimension!r}, and must be a whole number of at least 1.")
         excess = excess_states(self.order * dimension)
         if excess is not None:
             raise ModelError(f"{name} is too large: {excess}.")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.matlab_file import read_matrices
-from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model import ControlAffine, check_positive
 from echelon.core.errors import ModelError
 from echelon.core.types import Array, InputMap, Output, PathLike, State
 
@@ -86,8 +86,7 @@ class Linear(ControlAffine):
                 or as for `Linear`.
         """
         sampled = cls(A, B, C, names)
-        if not (np.isfinite(step) and step > 0.0):
-            raise ModelError(f"the step of a discrete-time model is {step} s, and must be above 0.")
+        check_positive(sampled, step=step)
         return cls(*_continuous(sampled.A, sampled.B, float(step)), C, names)
 
     @classmethod

@@ -16,6 +16,7 @@ from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.trace import check_function, error_summary
 from echelon.core.types import Array
+from echelon.core.words import amount
 
 # Far above the rounding of T/m - g, far below the error of a trim typed with a few digits.
 _TRIM_TOLERANCE = 1e-9
@@ -173,8 +174,9 @@ def _check_limits(model: ControlAffine, name: str, m: int) -> None:
     if type(model).limit is ControlAffine.limit:
         if k != m or not _has_inverse(np.asarray(limits.matrix, float)):
             raise ModelError(
-                f"`input_limits` of `{name}` has {k} rows for {m} inputs, which does not define "
-                "the input that is delivered beyond the limits; add the method `limit`."
+                f"`input_limits` of `{name}` has {amount(k, 'row')} for {amount(m, 'input')}, "
+                "which does not define the input that is delivered beyond the limits; add the "
+                "method `limit`."
             )
 
 

@@ -13,16 +13,16 @@ from echelon.agents.models.rigid_vehicle import THRUST_TWICE, UPRIGHT, RigidVehi
 from echelon.core.numerics import derivatives as derivatives_of
 from echelon.core.types import Input, InputMap, Scalar, State
 
-_GROUPS = {
+EULER_GROUPS = {
     "position": ("x", "y", "z"),
     "velocity": ("vx", "vy", "vz"),
     "attitude": ("roll", "pitch", "yaw"),
     "rate": ("roll_rate", "pitch_rate", "yaw_rate"),
 }
-_NAMES = tuple(name for group in _GROUPS.values() for name in group)
+EULER_STATES = tuple(name for group in EULER_GROUPS.values() for name in group)
 
 
-def _flown(path: jax.Array, gravity: float) -> tuple[State, jax.Array, jax.Array]:
+def flown_along(path: jax.Array, gravity: float) -> tuple[State, jax.Array, jax.Array]:
     """Return the 12 states that fly a path (5, 4), the thrust with its rate (2,), and zetaddot."""
     lift, now = lift_along(path, gravity), jnp.zeros((), path.dtype)
 
@@ -45,8 +45,8 @@ class QuadrotorEuler(RigidVehicle):
 
     gravity: float = 9.81
 
-    state_names = _NAMES
-    state_groups = _GROUPS
+    state_names = EULER_STATES
+    state_groups = EULER_GROUPS
     input_names = ("thrust", "roll_acceleration", "pitch_acceleration", "yaw_acceleration")
     input_units = ("m/s^2",) + ("rad/s^2",) * 3
     flat_chains, flat_bounds = THRUST_TWICE, UPRIGHT
@@ -69,7 +69,7 @@ class QuadrotorEuler(RigidVehicle):
 
         The path is given with its first four derivatives, (5, 4).
         """
-        x, thrust, bend = _flown(derivatives, self.gravity)
+        x, thrust, bend = flown_along(derivatives, self.gravity)
         return x, jnp.append(thrust[0], bend)
 
 
@@ -82,9 +82,9 @@ class QuadrotorThrust(RigidVehicle):
 
     gravity: float = 9.81
 
-    state_names = (*_NAMES, "thrust")
+    state_names = (*EULER_STATES, "thrust")
     state_units = (*RigidVehicle.state_units, "m/s^2")
-    state_groups = _GROUPS
+    state_groups = EULER_GROUPS
     input_names = ("thrust_rate", "roll_acceleration", "pitch_acceleration", "yaw_acceleration")
     input_units = ("m/s^3",) + ("rad/s^2",) * 3
     flat_chains = FlatChains((4, 4, 4, 2), (1, 0, 0, 0))
@@ -109,5 +109,5 @@ class QuadrotorThrust(RigidVehicle):
 
         The path is given with its first four derivatives, (5, 4).
         """
-        x, thrust, bend = _flown(derivatives, self.gravity)
+        x, thrust, bend = flown_along(derivatives, self.gravity)
         return jnp.append(x, thrust[0]), jnp.append(thrust[1], bend)

@@ -23,6 +23,7 @@ from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 
 NEVER = -1
 """The stamp of a message that never came, and the arrival of one that never does."""
+_MOST = 2**30
 _ROUNDING = 1e-6
 """Of a step: what divisions of times leave of whole numbers."""
 
@@ -111,18 +112,19 @@ class Network:
             SimulationError: its rate does not divide that of the control steps, or no message
                 would arrive within the horizon.
         """
-        every = round(1.0 / (self.rate * dt))
+        every = _steps(1.0, self.rate * dt)
         if every < 1 or abs(every * self.rate * dt - 1.0) > _ROUNDING:
             near = 1.0 / (max(1, every) * dt)
             raise SimulationError(
                 f"`rate` of the network is {self.rate:g} Hz, and must be the control rate "
                 f"{1.0 / dt:g} Hz divided by a whole number, such as {near:g} Hz."
             )
-        if self.delay > horizon:
-            raise SimulationError(
-                f"`delay` of the network is {self.delay:g} s, and must be at most the horizon, "
-                f"{horizon:g} s, within which otherwise no message arrives."
-            )
+        for name, late in (("delay", self.delay), ("jitter", self.jitter)):
+            if late > horizon:
+                raise SimulationError(
+                    f"`{name}` of the network is {late:g} s, and must be at most the horizon, "
+                    f"{horizon:g} s, within which otherwise no message arrives."
+                )
         delay = max(1, math.ceil(self.delay / dt - _ROUNDING))
         jitter = math.floor(self.jitter / dt + _ROUNDING)
         ends = min(1.0, 1.0 / max(self.bursts.length * self.rate, 1.0))
@@ -131,7 +133,7 @@ class Network:
             every=np.asarray(every, np.int32),
             delay=np.asarray(delay, np.int32),
             jitter=np.asarray(jitter, np.int32),
-            forget=np.asarray(min(round(self.forget / dt), 2**30), np.int32),
+            forget=np.asarray(_steps(self.forget, dt), np.int32),
             loss=np.asarray(self.loss),
             share=np.asarray(share),
             begins=np.asarray(min(1.0, ends * share / (1.0 - share))),
@@ -178,6 +180,11 @@ _RANGES: Mapping[tuple[str, ...], tuple[str, Callable[[float], bool]]] = {
     ("bursts.share",): ("at least 0 and below 1", lambda x: 0.0 <= x < 1.0),
 }
 """What is allowed of the numbers of a network, all of them finite."""
+
+
+def _steps(time: float, step: float) -> int:
+    """Return how many steps a time takes, at most so many as whole numbers of 32 bits count."""
+    return _MOST if time >= _MOST * step else round(time / step)
 
 
 def _check_number(name: str, value: object, allowed: str, fits: Callable[[float], bool]) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from echelon.core.errors import GraphError
 from echelon.core.limits import excess_agents, excess_edges
 from echelon.core.types import Array
+from echelon.core.words import amount
 
 
 def split_weights(edges: Iterable[Sequence[float]]) -> tuple[Array, Array]:
@@ -105,7 +106,8 @@ def give_weights(edges: Iterable[Sequence[float]], weights: Sequence[float]) -> 
     edges, weights = [list(edge) for edge in edges], list(weights)
     if len(edges) != len(weights):
         raise GraphError(
-            f"there are {len(edges)} edges and {len(weights)} weights; give one weight per edge."
+            f"got {amount(len(edges), 'edge')} and {amount(len(weights), 'weight')}; give one "
+            "weight per edge."
         )
     for edge in edges:
         if len(edge) != 2:

@@ -1,17 +1,28 @@
 """The formation: each agent's goal offset xi_i from the leader, its rigidity and symmetry."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import final
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation_motion import (
+    FormationMotion,
+    OffsetMotion,
+    OwnOffset,
+    Reshape,
+    nearest_places,
+)
 from echelon.agents.network.graph import Graph
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import FormationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, States
+from echelon.core.words import amount
 
 # For an analytic model one random state would do, almost surely; kinks need more.
 _SAMPLES = 32
@@ -24,14 +35,19 @@ class Formation:
     """Goal offsets xi (N, n), one row per agent; xi_i is agent i's goal minus the leader's state.
 
     Attributes:
-        offsets: (N, n) float64.
+        offsets: (N, n) float64; of a formation that moves, without its motion.
+        motion: how they change with time; None for constant ones. `moving` returns a formation with
+            one.
 
     Raises:
         FormationError: the offsets are not a finite matrix.
     """
 
-    def __init__(self, offsets: Sequence[Sequence[float]] | Array) -> None:
+    def __init__(
+        self, offsets: Sequence[Sequence[float]] | Array, motion: FormationMotion | None = None
+    ) -> None:
         """Store the offsets, read-only."""
+        self.motion = motion
         self.offsets = np.array(offsets, dtype=np.float64)
         if self.offsets.ndim != 2 or not np.isfinite(self.offsets).all():
             raise FormationError(
@@ -42,13 +58,19 @@ class Formation:
 
     def __eq__(self, other: object) -> bool:
         """Tell whether two formations have the same offsets."""
-        return isinstance(other, Formation) and np.array_equal(self.offsets, other.offsets)
+        return (
+            isinstance(other, Formation)
+            and np.array_equal(self.offsets, other.offsets)
+            and bool(eqx.tree_equal(self.motion, other.motion))
+        )
 
     def __repr__(self) -> str:
         """Say the size and the largest offset."""
         agents, states = self.offsets.shape
         largest = np.abs(self.offsets).max(initial=0.0)
-        return f"Formation({agents} agents, {states} states, offsets up to {largest:.4g})"
+        moving = "" if self.motion is None else ", moving"
+        size = f"{agents} agents, {amount(states, 'state')}"
+        return f"Formation({size}, offsets up to {largest:.4g}{moving})"
 
     def __hash__(self) -> int:
         """Hash what `__eq__` compares."""
@@ -160,6 +182,61 @@ class Formation:
         full[:, axes[:used]] = spacing * plan[:, :used]
         return cls(full)
 
+    def moving(
+        self, model: ControlAffine, graph: Graph, changes: Sequence[OffsetMotion | Reshape]
+    ) -> "Formation":
+        """Return a formation whose offsets begin like these and change with time.
+
+        Args:
+            model: defines the position.
+            graph: defines the leaders; the first one is the centre.
+            changes: reshapes, and motions of the whole shape in the order in which they act.
+
+        Raises:
+            FormationError: the model has no position, or a change does not fit it or the others.
+        """
+        return Formation(
+            self.offsets, FormationMotion.of(model, graph.leaders, self.offsets, changes)
+        )
+
+    def nearest(
+        self, model: ControlAffine, graph: Graph, starts: Mapping[int, Sequence[float]]
+    ) -> "Formation":
+        """Return the formation in which followers with known starts (n,) share their places anew.
+
+        The squares of their ways add up to as little as possible.
+
+        Raises:
+            FormationError: there are too many agents.
+        """
+        axes, others = list(model.position_indices()), {*graph.followers} & {*starts}
+        agents = np.array(sorted(others), int)
+        before = np.array([starts[agent] for agent in agents.tolist()], float)
+        order = np.arange(graph.agents)
+        if len(agents) and axes:
+            places = self.offsets[agents][:, axes]
+            order[agents] = agents[nearest_places((), before[:, axes], places)]
+        return Formation(self.offsets[order], self.motion)
+
+    @property
+    def shapes(self) -> "Iterator[Formation]":
+        """The shapes that it has at first and after each reshape, without motions of the whole."""
+        if self.motion is None:
+            yield self
+            return
+        for places in self.motion.shapes:
+            offsets = self.offsets.copy()
+            offsets[:, list(self.motion.axes)] = places
+            yield Formation(offsets)
+
+    def offsets_at(self, times: Sequence[float] | Array) -> Float[Array, "T N n"]:
+        """Return the offsets at times (s), read-only."""
+        times = np.asarray(times, float)
+        if self.motion is None:
+            return np.broadcast_to(self.offsets, (len(times), *self.offsets.shape))
+        with precision("float64"):
+            return np.asarray(_offsets_at(self.motion, self.offsets, jnp.asarray(times)))
+
     def displacement(self, i: int, j: int) -> Array:
         """Return d_ij = xi_j - xi_i (paper, Definition 3)."""
         return self.offsets[j] - self.offsets[i]
@@ -264,7 +341,7 @@ def _whole_state(model: ControlAffine, agent: int, offset: Iterable[float]) -> n
         return full
     lengths = f"{len(axes)} (position) or {n} (all states)" if axes else f"{n} (all states)"
     raise FormationError(
-        f"the offset of agent {agent} has {values.size} numbers, and must have {lengths}."
+        f"the offset of agent {agent} has {amount(values.size, 'number')}, and must have {lengths}."
     )
 
 
@@ -288,6 +365,17 @@ def _describe_change(
             state = model.state_names[int(np.argmax(per_state))]
             return f"it changes the {name} of `{state}` by up to {per_state.max():.3g}"
     return None
+
+
+@cached_jit
+def _offsets_at(
+    motion: FormationMotion, offsets: Float[jax.Array, "N n"], times: Float[jax.Array, " T"]
+) -> Float[jax.Array, "T N n"]:
+    def one(t: jax.Array) -> jax.Array:
+        rows = jnp.asarray(offsets), jnp.asarray(motion.places)
+        return jax.vmap(lambda *row: OwnOffset(motion, *row).state(t))(*rows)
+
+    return jax.lax.map(one, times)
 
 
 @cached_jit

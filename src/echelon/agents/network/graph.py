@@ -3,6 +3,7 @@
 It is undirected or directed, weighted or not, with one or more leaders, and may switch in time.
 """
 
+import copy
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, final
 
@@ -26,6 +27,7 @@ from echelon.agents.network.eigenvalues import (
     switching_spectrum,
     symmetric_spectrum,
 )
+from echelon.agents.network.events import Event, check_heirs, event_faults, schedule_of
 from echelon.agents.network.matrices import GraphMatrices
 from echelon.agents.network.radius import advising, pairs_within
 from echelon.agents.network.reach import check_reached, nearest_leaders
@@ -34,6 +36,7 @@ from echelon.agents.network.switching import Schedule, Stretch, unite
 from echelon.agents.network.tree import ordered_outward, outward_edges, parents_of
 from echelon.core.errors import GraphError
 from echelon.core.types import Array
+from echelon.core.words import amount
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -64,11 +67,18 @@ class Graph(GraphMatrices):
         followers: all other agents, sorted.
         directed: whether edges carry information one way.
         schedule: when which weights hold; None where they never change.
+        events: what happens to it, by time.
+        heirs: who leads when the leader is lost, the first that is present.
+        before: the graph without its events.
 
     Raises:
         GraphError: an edge is a self-loop, repeated or out of range; a weight is not positive and
             finite; there is no leader or nothing but leaders; no leader reaches an agent.
     """
+
+    events: tuple[Event, ...]
+    heirs: tuple[int, ...]
+    before: "Graph"
 
     def __init__(
         self,
@@ -94,6 +104,7 @@ class Graph(GraphMatrices):
         schedule: Schedule | None,
     ) -> None:
         self.edges, self.weights, self.agents, self.schedule = edges, weights, agents, schedule
+        self.events, self.heirs, self.before = (), (), self
         self.leaders = check_leaders(leaders, self.agents)
         self.followers = tuple(np.delete(np.arange(self.agents), self.leaders).tolist())
         if not self.followers:
@@ -190,6 +201,28 @@ class Graph(GraphMatrices):
         """Return the same graph with more edges."""
         return Graph([*self._triples(), *more], self.leaders, self.agents, self.directed)
 
+    def with_events(self, events: Sequence[Event], heirs: Sequence[int] = ()) -> "Graph":
+        """Return the same graph, to which something happens; other events are replaced.
+
+        Args:
+            events: losses and arrivals of agents, and cuts of links.
+            heirs: who leads when the leader is lost, the first that is present.
+
+        Raises:
+            GraphError: an event is not possible, or leaves somebody without a path to the leader.
+        """
+        before, events, heirs = self.before, tuple(events), tuple(heirs)
+        if (events, heirs) == (self.events, self.heirs):
+            return self
+        check_heirs(before, heirs)
+        for fault in event_faults(before, events, heirs):
+            raise GraphError(f"{fault.text}.")
+        graph, events = copy.copy(before), tuple(sorted(events, key=lambda event: event.at))
+        graph.heirs, graph.before, graph._spectrum = heirs, before, None
+        graph.events = events
+        graph.schedule = schedule_of(before, events, heirs) if events else before.schedule
+        return graph
+
     def _triples(self) -> list[list[float]]:
         return np.column_stack([self.edges, self.weights]).tolist()
 
@@ -251,6 +284,29 @@ class Graph(GraphMatrices):
         """
         edges, weights = outward_edges(self)
         return Graph(edges, self.leaders, self.agents, True, weights.tolist())
+
+    def in_steps(self, dt: float) -> "Graph | None":
+        """Return the graph as it runs in steps of dt (s), to which switches are rounded up.
+
+        None where the rounding repeats only after many periods.
+
+        Raises:
+            GraphError: stretches that are shorter than a step are left out, and without them no
+                leader reaches an agent.
+        """
+        if self.schedule is None:
+            return self
+        schedule = self.schedule.in_steps(dt)
+        if schedule is None:
+            return None
+        starts, rows = schedule.starts, self.schedule.weights
+        if len(starts) == len(rows) and np.allclose(starts, self.schedule.starts, 0.0, 1e-9 * dt):
+            return self
+        graph = Graph.__new__(Graph)
+        graph.directed = self.directed
+        heavy = schedule.weights.max(axis=0)
+        graph._set(self.edges, heavy, self.agents, self.leaders, schedule)
+        return graph
 
     def spectrum(self) -> Spectrum:
         """Return the eigenvalues of the grounded Laplacian; computed once.
@@ -328,9 +384,9 @@ class Graph(GraphMatrices):
     def _constants(self) -> tuple[object, ...]:
         schedule = self.schedule
         times = schedule and (*(x.tobytes() for x in schedule[:2]), schedule.period)
-        return self.agents, self.leaders, self.directed, times
+        return self.agents, self.leaders, self.directed, times, self.events, self.heirs
 
     def __repr__(self) -> str:
         """Say the size."""
-        edges = f"{len(self.edges)} {'directed ' * self.directed}edges"
+        edges = amount(len(self.edges), f"{'directed ' * self.directed}edge")
         return f"Graph({self.agents} agents, {edges}, leaders {list(self.leaders)})"

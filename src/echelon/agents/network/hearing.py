@@ -8,6 +8,7 @@ import scipy.sparse.csgraph as csgraph
 from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.graph import Graph
 from echelon.core.types import Array
+from echelon.core.words import amount
 
 _NAMED = 12
 """Up to so many followers, or leaders, are named one by one."""
@@ -85,8 +86,9 @@ def _by_leader(graph: Graph, near: Array, hops: Array) -> Iterator[str]:
         direct = int((hops[nearest] == 1).sum())
         far = f", the farthest through {hops[nearest].max() - 1}" if direct < len(nearest) else ""
         verb = "hears" if direct == 1 else "hear"
-        if len(nearest):
-            yield f"of {len(nearest)} followers nearest to leader {leader} {direct} {verb} it{far}"
+        if count := len(nearest):
+            some = amount(count, "follower")
+            yield f"of {some} nearest to leader {leader} {direct} {verb} it{far}"
 
 
 def _in_total(graph: Graph, near: Array, hops: Array) -> Iterator[str]:

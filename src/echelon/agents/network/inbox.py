@@ -40,7 +40,7 @@ class Packet(NamedTuple):
         leader: its number.
         time: when it said so, s.
         content: its deviation from its plan, or what else the prediction needs (p,).
-        epoch: how often the leadership was handed over; 0, as it never is yet.
+        epoch: how often heirs took the lead over.
     """
 
     leader: int
@@ -186,6 +186,7 @@ class Stamps:
         size: of a packet's content.
         own: the agent's number, if it leads.
         needs_packet: whether a message says nothing without one.
+        heirs: of the leader, whose packets of later epochs count too.
 
     Attributes:
         time: (K,) when the last message of each neighbour was sent, s; -inf for none.
@@ -195,14 +196,36 @@ class Stamps:
     """
 
     def __init__(
-        self, links: int, leaders: Sequence[int], size: int, own: int | None, needs_packet: bool
+        self,
+        links: int,
+        leaders: Sequence[int],
+        size: int,
+        own: int | None,
+        needs_packet: bool,
+        heirs: Sequence[int] = (),
     ) -> None:
         """Store nothing yet."""
         self.needs_packet = needs_packet
         self.time, self.hops = np.full(links, -np.inf), np.full(links, _FAR)
         self.packet: Packet | None = None
         self.clock = 0.0
-        self._leaders, self._size, self._own = frozenset(leaders), size, own
+        self._leaders, self._size, self._own = frozenset((*leaders, *heirs)), size, own
+        self._last_epoch, self._epoch = _FAR * bool(heirs), 0
+
+    @property
+    def leads(self) -> bool:
+        """Whether the agent leads."""
+        return self._own is not None
+
+    @property
+    def epoch(self) -> int:
+        """The epoch of the leader that it follows, or in which it leads."""
+        return self._epoch if self.leads or self.packet is None else self.packet.epoch
+
+    def take_lead(self, own: int) -> None:
+        """Lead from now on, in the next epoch."""
+        self._epoch, self._own = self.epoch + 1, own
+        self.packet = Packet(own, self.clock, (0.0,) * self._size, self._epoch)
 
     def take(self, message: Message, place: int) -> Received | None:
         """Store the time, hops and packet of a message; return why it is not used, if so."""
@@ -230,16 +253,20 @@ class Stamps:
     def _fault(self, packet: Packet) -> Received | None:
         """Return why a packet is not used; None if it is."""
         whole = all(isinstance(x, numbers.Integral) for x in (packet.leader, packet.epoch))
-        # Nobody hands the leadership over yet, and a packet of a later epoch would win for ever.
-        if not whole or packet.leader not in self._leaders or packet.epoch != 0:
+        # Where nobody hands the lead over, a packet of a later epoch would win for ever.
+        fine = whole and packet.leader in self._leaders and 0 <= packet.epoch <= self._last_epoch
+        if not fine:
             return Received.NO_MESSAGE
         values = read_values((tuple(map(str, range(self._size))), packet.content))
         return values if isinstance(values, Received) else None
 
     def _wins(self, packet: Packet) -> bool:
-        """Tell whether a packet is of a leader with a lower number, or newer."""
-        if self._own is not None and packet.leader >= self._own:
-            return False
+        """Tell whether a packet is of a later epoch, a leader with a lower number, or newer."""
+        if self._own is not None:
+            if (packet.epoch, -packet.leader) <= (self._epoch, -self._own):
+                return False
+            # One of several leaders stays one.
+            self._own = None if self._last_epoch else self._own
         if self.packet is None:
             return True
         rank = [(x.epoch, -x.leader, x.time) for x in (packet, self.packet)]

@@ -64,13 +64,29 @@ class GraphMatrices(abc.ABC):
         A = sp.csr_array(A)
         return sp.csr_array(sp.diags_array(A.sum(axis=1)) - A)[rows][:, rows]
 
+    @property
+    def presence(self) -> Array | None:
+        """Who is there in each stretch of time, (S, N); None where all always are."""
+        return None if self.schedule is None else self.schedule.present
+
     def stretches(self, leaderward: bool = False) -> tuple[sp.csr_array, ...]:
         """Return the grounded Laplacian of each stretch of time; one where nothing switches.
 
-        With `leaderward` each agent uses only the neighbours that are nearer to a leader.
+        With `leaderward` each agent uses only the neighbours that are nearer to a leader. Who is
+        absent counts as one that hears the leader alone, with the largest weights of all, and so
+        does an heir that leads: nobody hears the one, and the other follows the leader's path.
         """
-        rows = self.weights[None] if self.schedule is None else self.schedule.weights
-        return tuple(self._grounded_laplacian(row, leaderward) for row in rows)
+        schedule, rows = self.schedule, self.weights[None]
+        if schedule is None or schedule.present is None or schedule.nearest is None:
+            rows = rows if schedule is None else schedule.weights
+            return tuple(self._grounded_laplacian(row, leaderward) for row in rows)
+        followers = np.asarray(self.followers)
+        apart = ~schedule.present | (schedule.nearest == np.arange(self.agents))
+        heaviest = float(self.grounded_laplacian().diagonal().max())
+        return tuple(
+            _apart(self._grounded_laplacian(row, leaderward), out, heaviest)
+            for row, out in zip(schedule.weights, apart[:, followers], strict=True)
+        )
 
     def inverse_grounded(self) -> Array:
         """Return the paper's M = L^-1 of Assumption 6 as a dense matrix (for small graphs)."""
@@ -118,3 +134,9 @@ class GraphMatrices(abc.ABC):
         if self.schedule is not None:
             exchange = exchange.during(self.schedule.row(t))
         return exchange(y, exchange.along_edges(y))
+
+
+def _apart(L: sp.csr_array, out: Array, weight: float) -> sp.csr_array:
+    """Return a grounded Laplacian in which some followers (F,) hear the leader alone."""
+    kept = sp.diags_array((~out).astype(float))
+    return sp.csr_array(kept @ L + sp.diags_array(weight * out))

@@ -1,11 +1,14 @@
 """The agents that leaders reach, along the edges of one stretch of time or of all stretches."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
 from echelon.agents.network.edges import name_agents
 from echelon.agents.network.matrices import GraphMatrices
+from echelon.agents.network.switching import Schedule
 from echelon.core.errors import GraphError
 from echelon.core.types import Array
 
@@ -53,8 +56,12 @@ def _cut_off(graph: GraphMatrices, lost: Array) -> str:
     return f"the graph is disconnected: {who}."
 
 
-def lost_along(graph: GraphMatrices, weights: Array) -> Array:
-    """Return the agents that no leader reaches along the edges that have a weight (E,)."""
+def lost_along(graph: GraphMatrices, weights: Array, leaders: Sequence[int] | None = None) -> Array:
+    """Return the agents that no leader reaches along the edges that have a weight (E,).
+
+    The leaders are those of the graph where none are named.
+    """
+    leaders = graph.leaders if leaders is None else leaders
     if not graph.directed:
         # One direction of each edge is enough, which halves the time for millions of edges.
         present = weights > 0.0
@@ -62,9 +69,9 @@ def lost_along(graph: GraphMatrices, weights: Array) -> Array:
         links = sp.coo_array((np.ones(len(edges)), edges.T), (graph.agents, graph.agents))
         count, label = csgraph.connected_components(links.tocsr(), directed=False)
         led = np.zeros(count, bool)
-        led[label[list(graph.leaders)]] = True
+        led[label[list(leaders)]] = True
         return np.flatnonzero(~led[label])
-    among = {"indices": graph.leaders, "unweighted": True, "min_only": True}
+    among = {"indices": leaders, "unweighted": True, "min_only": True}
     return np.flatnonzero(np.isinf(csgraph.dijkstra(graph.outgoing(weights), **among)))
 
 
@@ -77,12 +84,21 @@ def nearest_leaders(graph: GraphMatrices) -> tuple[int, ...]:
     return tuple(np.array(graph.leaders)[np.argmin(hops, axis=0)].tolist())
 
 
+def unreached(graph: GraphMatrices, schedule: Schedule, row: int) -> Array:
+    """Return the agents that are present in a row of a schedule, and that no leader reaches."""
+    if schedule.present is None or schedule.nearest is None:
+        return lost_along(graph, schedule.weights[row])
+    here = np.flatnonzero(schedule.present[row])
+    leaders = np.unique(schedule.nearest[row, here]).tolist()
+    return np.intersect1d(lost_along(graph, schedule.weights[row], leaders), here)
+
+
 def lost_at_times(graph: GraphMatrices) -> str:
     """Return which agents leaders do not reach at some time, and when; empty if there are none."""
-    if graph.schedule is None:
-        return ""
-    for span, weights in zip(graph.schedule.spans(), graph.schedule.weights, strict=True):
-        lost = lost_along(graph, weights)
+    schedule = graph.schedule
+    for row, span in enumerate(schedule.spans() if schedule is not None else ()):
+        assert schedule is not None
+        lost = unreached(graph, schedule, row)
         if len(lost):
             return f"{name_agents(lost)} no path to a leader {span}"
     return ""

@@ -13,6 +13,8 @@ Stretch: TypeAlias = tuple[float, Iterable[Sequence[float]]]
 """Start (s) and edges of a stretch of time."""
 _ROUNDED = 1e-9
 """Share of a step by which rounding may put a switch before the step that it belongs to."""
+_MOST_PERIODS = 20
+"""After so many periods at most, their rounding to steps is to repeat."""
 
 
 class Schedule(NamedTuple):
@@ -22,11 +24,15 @@ class Schedule(NamedTuple):
         starts: (S,) s, ascending from 0: the start of each row of weights.
         weights: (S, E), not negative: 0 where an edge is absent.
         period: s, after which the rows repeat; None where the last row holds for ever.
+        present: (S, N) who is there; None where all always are.
+        nearest: (S, N) the leader that each agent follows; None where that never changes.
     """
 
     starts: Array
     weights: Array
     period: float | None
+    present: Array | None = None
+    nearest: Array | None = None
 
     @property
     def last(self) -> Array:
@@ -35,9 +41,14 @@ class Schedule(NamedTuple):
 
     def row(self, t: float) -> int:
         """Return which row holds at a time (s)."""
+        return int(self.rows(t))
+
+    def rows(self, times: Array | float) -> Array:
+        """Return which rows hold at times (T,) (s)."""
         # Rounded before the modulus: a time just below the period belongs to the first row.
-        t = t + _ROUNDED if self.period is None else (t + _ROUNDED) % self.period
-        return int(np.searchsorted(self.starts, t, side="right")) - 1
+        times = np.asarray(times, float) + _ROUNDED
+        times = times if self.period is None else times % self.period
+        return np.searchsorted(self.starts, times, side="right") - 1
 
     def switches(self, dt: float, horizon: float, first: int = 0) -> tuple[Array, Array]:
         """Return the first steps (K,) of rows and the rows (K,), in steps of dt (s).
@@ -52,6 +63,27 @@ class Schedule(NamedTuple):
         # Of two switches at one step the later one counts.
         last = np.append(np.diff(steps) > 0, True)
         return steps[last], rows[last]
+
+    def in_steps(self, dt: float) -> "Schedule | None":
+        """Return the schedule as it runs in steps of dt (s), to which switches are rounded up.
+
+        Rows that are shorter than a step may be left out. None where the rounding repeats only
+        after many periods, or never.
+        """
+        periods, span = 1, np.inf
+        if self.period is not None:
+            counts = self.period / dt * np.arange(1, _MOST_PERIODS + 1)
+            # Of periods of more steps than numbers have nothing is known.
+            counts = counts[counts < 2.0**53]
+            whole = np.flatnonzero(np.abs(counts - np.round(counts)) <= _ROUNDED + 4e-16 * counts)
+            if not len(whole):
+                return None
+            periods = int(whole[0]) + 1
+            span = round(float(counts[whole[0]]))
+        steps, rows = self.switches(dt, (periods - 0.5) * (self.period or 0.0))
+        # What begins at the end belongs to the next period.
+        steps, rows = steps[steps < span], rows[steps < span]
+        return Schedule(steps * dt, self.weights[rows], None if span == np.inf else span * dt)
 
     def spans(self) -> Iterator[str]:
         """Yield the time span of each row, in words."""

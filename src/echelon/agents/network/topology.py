@@ -34,8 +34,8 @@ def recommend_leaders(graph: Graph, count: int = 1) -> tuple[int, ...]:
     """
     if not 0 <= count < len(graph.followers):
         raise GraphError(
-            f"{count} more leaders are requested, and from 0 to {len(graph.followers) - 1} of the "
-            f"{len(graph.followers)} followers can become one."
+            f"`count` is {count}, and must be from 0 to {len(graph.followers) - 1}, so that a "
+            "follower remains."
         )
     _check_mutual(graph)
     chosen = list[int]()
@@ -56,7 +56,7 @@ def recommend_edges(graph: Graph, count: int = 1) -> tuple[tuple[int, int], ...]
     free = graph.agents * (graph.agents - 1) // 2 - len(graph.edges)
     if not 0 <= count <= free:
         raise GraphError(
-            f"{count} more edges are requested, and from 0 to {free} pairs are not linked yet."
+            f"`count` is {count}, and must be from 0 to {free}, the pairs that are not linked yet."
         )
     _check_mutual(graph)
     chosen = list[tuple[int, int]]()

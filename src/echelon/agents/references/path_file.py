@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from echelon.core.errors import ReferenceError, listing
 from echelon.core.types import Array, PathLike
+from echelon.core.words import amount
 
 _MOST = 100_000
 """Rows; a path of an hour with 25 points per second has fewer."""
@@ -106,7 +107,8 @@ def _row(place: str, head: Sequence[str], cells: Sequence[str]) -> list[float]:
     cells = cells[:-1] if len(cells) == len(head) + 1 and not cells[-1].strip() else cells
     if len(cells) != len(head):
         raise ReferenceError(
-            f"the line of the path at {place} has {len(cells)} numbers, and must have {len(head)}."
+            f"the line of the path at {place} has {amount(len(cells), 'number')}, and must have "
+            f"{len(head)}."
         )
     try:
         numbers = list(map(float, cells))

@@ -19,6 +19,7 @@ from echelon.core.draws import Draw, key_of, normals
 from echelon.core.errors import ModelError, SimulationError, did_you_mean, listing
 from echelon.core.numerics import Field
 from echelon.core.types import Array, Input, State
+from echelon.core.words import amount
 
 
 @final
@@ -154,7 +155,7 @@ class Disturbance:
         velocity = plant.state_groups.get("velocity", ())
         if len(velocity) != len(plant.position) or len(self.air) not in (0, len(velocity)):
             raise SimulationError(
-                f"got `drag` with an `air` of {len(self.air)} numbers, and "
+                f"got `drag` with an `air` of {amount(len(self.air), 'number')}, and "
                 f"`{type(plant).__name__}` has {len(velocity)} states in its group `velocity` for "
                 f"{len(plant.position)} coordinates; allowed is a number for each."
             )

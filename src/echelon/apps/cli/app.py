@@ -23,10 +23,11 @@ from echelon.apps.cli.design_command import design
 from echelon.apps.cli.doctor_command import doctor
 from echelon.apps.cli.explain_command import explain
 from echelon.apps.cli.export_command import export
+from echelon.apps.cli.fly_command import fly
 from echelon.apps.cli.init_command import init
-from echelon.apps.cli.law_command import law
 from echelon.apps.cli.list_command import list_, schema
 from echelon.apps.cli.live_command import live
+from echelon.apps.cli.options import EchelonCommand
 from echelon.apps.cli.path_command import path
 from echelon.apps.cli.plot_command import plot
 from echelon.apps.cli.report_command import report
@@ -138,8 +139,8 @@ def _guarded(command: Callable[..., None]) -> Callable[..., None]:
 
 # Listed here instead of decorated in their files, so that the order is that of `--help`.
 _COMMANDS: tuple[Callable[..., None], ...] = (
-    *(init, run, sweep, view, live, plot, video, report, export, path, law),
+    *(init, run, sweep, view, live, fly, plot, video, report, export, path),
     *(check, design, tune, compare, verify, list_, explain, doctor, schema),
 )
 for _command in _COMMANDS:
-    app.command(_command.__name__.rstrip("_"))(_guarded(_command))
+    app.command(_command.__name__.rstrip("_"), cls=EchelonCommand)(_guarded(_command))

@@ -39,9 +39,9 @@ def check(
 
 
 def _print(result: "CheckResult", every: bool) -> None:
-    from echelon.output.reports.check_report import check_report, grouped
+    from echelon.output.reports.check_report import check_report, check_sentences, grouped
 
     if every:
-        tables.print_statements(grouped(result.lines), result.promise.sentence())
+        tables.print_statements(grouped(result.lines), check_sentences(result))
     else:
         print(check_report(result))

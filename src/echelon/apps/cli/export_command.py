@@ -1,29 +1,62 @@
-"""`echelon export`: a run's numbers for other programs."""
+"""`echelon export`: a run's numbers, or one agent's law, for other programs."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from echelon.apps.cli import options
 from echelon.apps.cli.console import write_file
-from echelon.apps.cli.options import OverwriteOption, RunArgument
 from echelon.apps.cli.status import STATUS
-from echelon.output.archive.folder import claim_file
+from echelon.core.errors import OutputError
+from echelon.output.archive.folder import check_empty, check_exists, claim_file
+
+_LAW = "law"
 
 
 def export(
-    run: RunArgument,
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="RUN", help="The folder of a run, or its `run.nc`; a scenario for a law."
+        ),
+    ],
     to: Annotated[
-        str, typer.Option("--to", help="csv, parquet, npz, mat, nc, json, html.")
-    ] = "csv",
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Output file (default: run.csv, run.npz, ...).")
+        str | None,
+        typer.Option("--to", help="csv (the default), parquet, npz, mat, nc, json, html; law."),
     ] = None,
-    force: OverwriteOption = False,
+    agent: Annotated[
+        int | None, typer.Option(help="Write the law of this agent of a scenario.")
+    ] = None,
+    set_: options.SetOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Output (default: run.csv, run.npz, ...; a folder law-AGENT)."),
+    ] = None,
+    force: options.OverwriteOption = False,
 ) -> None:
-    """Write a run's states, inputs and errors for pandas, NumPy, MATLAB or a spreadsheet."""
+    """Write a run for pandas, NumPy, MATLAB or a spreadsheet, or an agent's law as source code.
+
+    The law runs without echelon, on the agent's own computer: as Python, and as C.
+    """
+    if agent is None and to == _LAW or agent is not None and to not in (None, _LAW):
+        raise OutputError(
+            "`--to law` needs `--agent`, the number of an agent."
+            if agent is None
+            else f"`--agent` is of a law, and `--to` is `{to}`; leave out one of them."
+        )
+    if agent is not None:
+        _write_law(source, agent, set_ or [], Path(f"law-{agent}") if out is None else out)
+        return
+    if set_:
+        raise OutputError("`--set` is of a scenario, and a run is written as it is; leave it out.")
+    _write_run(Path(source), to or "csv", out, force)
+
+
+def _write_run(run: Path, to: str, out: Path | None, force: bool) -> None:
     from echelon.output.archive.export import content_of
 
+    check_exists(run)
     content = content_of(to)
     file = Path(f"run.{to}") if out is None else out
     claim_file(file, force)
@@ -31,3 +64,18 @@ def export(
     from echelon.output.archive.load_folder import load
 
     write_file(file, content(load(run)))
+
+
+def _write_law(scenario: str, agent: int, changes: list[str], folder: Path) -> None:
+    from echelon.experiments.scenario.scenario import load_scenario
+
+    loaded = load_scenario(scenario, changes)
+    STATUS.begin(f"writing the law of agent {agent} of {loaded.name}")
+    check_empty(folder)
+    from echelon.experiments.scenario.build import build
+    from echelon.experiments.scenario.self_contained import content_of_files
+    from echelon.output.archive.law_folder import law_files, save_law
+
+    files = law_files(*build(loaded), agent, content_of_files(loaded))
+    save_law(files, folder)
+    print(f"- Written to {folder}: {', '.join(files)}.")

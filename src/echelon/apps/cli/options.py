@@ -1,11 +1,12 @@
 """Options and arguments that several commands share."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, final
 
 import typer
+from typer.core import TyperCommand
 
-from echelon.core.errors import OutputError
+from echelon.core.errors import OutputError, ScenarioError
 from echelon.output.archive.folder import check_exists
 
 
@@ -52,3 +53,43 @@ SetOption = Annotated[
         help="Change a value of the scenario, as in simulation.horizon=10.",
     ),
 ]
+
+
+@final
+class EchelonCommand(TyperCommand):
+    """A command that names the scenario's key where an option is not one of its own."""
+
+    # Typer's types of these are private, and differ between its versions.
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Return the remaining arguments.
+
+        Raises:
+            ScenarioError: an option is a key of the scenario, which `--set` changes.
+        """
+        words = [*args]
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:
+            # Of all errors of an option, only that of an unknown one offers others.
+            if hasattr(error, "possibilities") and any(each.name == "set_" for each in self.params):
+                _name_key(str(getattr(error, "option_name", "")), words, str(self.name))
+            raise
+
+
+def _name_key(option: str, words: list[str], command: str) -> None:
+    """Raise an error with `--set KEY=VALUE` for an option that is a key of the scenario."""
+    # Not above: pydantic takes long to load.
+    from echelon.experiments.scenario.key_paths import places_of
+    from echelon.experiments.scenario.scenario import Scenario
+
+    places = places_of(option.lstrip("-").replace("-", "_"), Scenario)
+    if not places:
+        return
+    text = " ".join(words).partition(option)[2]
+    value = text[1:].split()[:1]
+    shown = value[0] if value and not value[0].startswith("--") else "VALUE"
+    keys = " or ".join(f"`--set {place}={shown}`" for place in places[:2])
+    raise ScenarioError(
+        f"`{option}` is no option of `{command}`; use {keys}, which changes that key of the "
+        "scenario."
+    )

@@ -8,9 +8,11 @@ import typer
 from echelon.apps.cli import options
 from echelon.apps.cli.status import STATUS
 from echelon.core.files import write_atomic
-from echelon.output.archive.folder import claim_file, write_errors
+from echelon.output.archive.crazyswarm_file import swarm_text
+from echelon.output.archive.folder import check_empty, claim_file, write_errors
 
 if TYPE_CHECKING:
+    from echelon.agents.references.polynomials import Polynomials
     from echelon.simulation.engine.parts import Parts
 
 _MEMORY = 31
@@ -23,17 +25,29 @@ def path(
     agent: Annotated[
         int | None, typer.Option(help="Write this agent's goal, which is offset from the path.")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", help="Output file.")] = Path("path.csv"),
+    every: Annotated[
+        bool, typer.Option("--all", help="Write all agents' goals and crazyflies.yaml: a folder.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Output file or folder (default: path.csv, path).")
+    ] = None,
     force: options.OverwriteOption = False,
 ) -> None:
     """Write the leader's path as polynomials of degree 7, the CSV file of Crazyswarm2."""
+    from echelon.core.errors import FormationError
     from echelon.experiments.scenario.scenario import load_scenario
 
+    if every and agent is not None:
+        raise FormationError("`--all` writes the goals of all agents; leave out `--agent`.")
     loaded = load_scenario(scenario, set_ or [])
     STATUS.begin(f"fitting the path of {loaded.name}")
     from echelon.experiments.scenario.self_contained import files_of
 
-    claim_file(out, force, files_of(loaded))
+    target = out or Path("path" if every else "path.csv")
+    if every:
+        check_empty(target)
+    else:
+        claim_file(target, force, files_of(loaded))
     from echelon.agents.references.polynomials import Polynomials
     from echelon.agents.references.reference import Reference
     from echelon.core.errors import ReferenceError
@@ -49,22 +63,38 @@ def path(
         )
     pieces = Polynomials.of(reference, settings.horizon)
     count, length = len(pieces.knots) - 1, float(pieces.knots[-1])
-    if agent is not None:
-        pieces = pieces.moved(_offset(parts, agent))
-    with write_errors(out):
-        write_atomic(out, pieces.text())
-    print(f"- Written to {out}: {count} pieces, {length:g} s.")
+    agents = range(parts.graph.agents) if every else [agent]
+    moved = [pieces.moved(_offset(parts, k)) for k in agents]
+    with write_errors(target):
+        if every:
+            target.mkdir(parents=True, exist_ok=True)
+        for file, text in _files(target, every, moved).items():
+            write_atomic(file, text)
+    many = f"{len(moved)} paths of " if every else ""
+    print(f"- Written to {target}: {many}{count} pieces, {length:g} s.")
     for warning in parts.drive.warnings(parts.model, parts.graph, settings):
         print(f"- Warning: {warning}")
     if count > _MEMORY:
         print(f"- Warning: the memory of a Crazyflie holds {_MEMORY} pieces.")
 
 
-def _offset(parts: "Parts", agent: int) -> "list[float]":
-    """Return the offset (x, y, z, yaw) of an agent's goal from the leader's state."""
+def _files(target: Path, every: bool, paths: "list[Polynomials]") -> dict[Path, str]:
+    """Return the file of a path, or those of all agents and the one that lists them."""
+    texts = [path.text() for path in paths]
+    if not every:
+        return {target: texts[0]}
+    begins = [path.coefficients[-1, 0].tolist() for path in paths]
+    files = {target / f"agent{k}.csv": text for k, text in enumerate(texts)}
+    return {**files, target / "crazyflies.yaml": swarm_text(begins)}
+
+
+def _offset(parts: "Parts", agent: int | None) -> "list[float]":
+    """Return the offset (x, y, z, yaw) of an agent's goal from the path, 0 for the path itself."""
     from echelon.agents.references.reference import COORDINATES
     from echelon.core.errors import FormationError
 
+    if agent is None:
+        return [0.0] * len(COORDINATES)
     if not 0 <= agent < parts.graph.agents:
         raise FormationError(
             f"`--agent` is {agent}, and agents are numbered from 0 to {parts.graph.agents - 1}."

@@ -12,6 +12,7 @@ from echelon.apps.cli.console import print_folder
 from echelon.apps.cli.job import Job, check_inputs
 from echelon.apps.cli.status import STATUS
 from echelon.apps.cli.stop import STOP, Ended
+from echelon.core.words import amount
 
 if TYPE_CHECKING:
     from echelon.experiments.sweeps.plan import Sweep
@@ -130,7 +131,7 @@ def _compute(
         STOP.check()
 
     stored = tuple(results)
-    STATUS.begin(f"simulating {plan.scenario.name}, {plan.count} runs", not quiet)
+    STATUS.begin(f"simulating {plan.scenario.name}, {amount(plan.count, 'run')}", not quiet)
     try:
         STOP.aside(lambda: compute(plan, store, progress, stored, threads, cluster))
     except KeyboardInterrupt:

@@ -116,11 +116,12 @@ def _cell(value: object) -> str:
     return "-" if value is None else str(value)
 
 
-def print_statements(groups: "Mapping[str, Iterable[Statement]]", sentence: str) -> None:
-    """Print a sentence and all statements, each on one line where the output is no terminal."""
+def print_statements(groups: "Mapping[str, Iterable[Statement]]", sentences: Iterable[str]) -> None:
+    """Print sentences and all statements, each on one line where the output is no terminal."""
     out = console()
     flat = not out.is_terminal
-    out.print(sentence, highlight=False, markup=False, soft_wrap=flat)
+    for sentence in sentences:
+        out.print(sentence, highlight=False, markup=False, soft_wrap=flat)
     heads = ("statement", "verdict", "kind", "number", "reason, or what to change")
     for title, lines in groups.items():
         rows = ((x.name, str(x.verdict), str(x.kind), x.number_text, x.explanation) for x in lines)

@@ -8,6 +8,7 @@ import typer
 
 from echelon.apps.cli import options, tables
 from echelon.apps.cli.status import STATUS
+from echelon.core.words import amount
 from echelon.output.archive.folder import claim_design
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ def _print(summary: "JsonObject") -> None:
             table.add_row(name, *(_numbers(summary[when][name]) for when in ("before", "after")))
     tables.console().print(table)
     trials = len(summary["costs"])
-    print(f"{trials} trial{'s' * (trials != 1)}. {summary['after']['promise']['sentence']}")
+    print(f"{amount(trials, 'trial')}. {summary['after']['promise']['sentence']}")
 
 
 def _numbers(value: float | list[float]) -> str:

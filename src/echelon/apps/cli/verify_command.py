@@ -1,6 +1,7 @@
 """`echelon verify`: whether a gain and the guarantee of a run are as their files state."""
 
 import json
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -67,7 +68,7 @@ def _advice(
     from echelon.guarantees.verifier.verify import MODEL, PROMISE
 
     if verification.verdict == "refused":
-        yield from _other_version(files)
+        yield from _other_version(file, files)
     elif any(x.open and x.claim.startswith((PROMISE, MODEL)) for x in verification.findings):
         if scenario is not None:
             yield f"`--scenario {scenario}`: {obstacle}."
@@ -76,10 +77,11 @@ def _advice(
         yield f"To check the rest, with code that you trust: {command}"
 
 
-def _other_version(files: "ClaimFiles") -> "Iterator[str]":
-    """Yield that a run was made by another version, if its summary says so."""
+def _other_version(file: Path, files: "ClaimFiles") -> "Iterator[str]":
+    """Yield that a run was written by another version, if its summary says so, and what to do."""
     if files.claims is None:
         return
+    from echelon.apps.cli.verify_report import WIDTH
     from echelon.core.provenance import versions
     from echelon.guarantees.verifier.strict_json import read_json
 
@@ -87,5 +89,6 @@ def _other_version(files: "ClaimFiles") -> "Iterator[str]":
     names = [f"{made.get('echelon')} ({made.get('git')})"] if isinstance(made, dict) else []
     current = f"{ours['echelon']} ({ours.get('git')})"
     if names and names[0] != current:
-        yield f"It was made by echelon {ascii(names[0])[1:-1]}, and this is {current}."
-        yield "Another version may compute or word the same guarantee in another way."
+        wrote = f"echelon {ascii(names[0])[1:-1]} wrote it, and this is {current}, which may "
+        yield from textwrap.wrap(f"{wrote}state more, or the same in other words.", WIDTH)
+        yield f"To compute it again by this one: echelon run {file} --out OTHER"

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from echelon.guarantees.verifier.findings import Finding
     from echelon.guarantees.verifier.verify import Verification
 
-_WIDTH = 80
+WIDTH = 80
 _TITLES = ("claim", "stored", "recomputed", "verdict")
 _DEPTHS = {"promise.anywhere.": 3, "promise.": 2}
 """Entries of a guarantee that are rows by themselves; of others, the first key is."""
@@ -49,7 +49,7 @@ def print_verification(verification: "Verification", run: Path | None) -> None:
 
 def _print(text: str) -> None:
     # Words are not broken, so that a path can be copied.
-    lines = textwrap.wrap(text, _WIDTH, break_long_words=False, break_on_hyphens=False)
+    lines = textwrap.wrap(text, WIDTH, break_long_words=False, break_on_hyphens=False)
     print("\n".join(lines))
 
 
@@ -58,7 +58,7 @@ def _print_rows(title: str, rows: Iterable[Iterable[str]]) -> None:
     if rows:
         table = tables.plain_table(_TITLES, rows)
         table.title, table.title_justify = title, "left"
-        tables.console(_WIDTH).print(table)
+        tables.console(WIDTH).print(table)
 
 
 def _reasons(findings: Iterable["Finding"]) -> Iterator[str]:

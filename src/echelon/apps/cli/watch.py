@@ -35,10 +35,11 @@ class WatchedRun:
 
         prepared = prepare(*experiment)
         parts, settings = prepared.parts, prepared.problem.settings
+        self.formation = parts.formation
         guarantee = promise(parts, settings).as_mapping()
         self.run = foreseen(parts, settings, prepared.problem.states, scenario.name, guarantee)
         # The V of a P that turns is computed only at the end.
-        P = fixed_metric(parts)
+        P = None if parts.formation.motion is not None else fixed_metric(parts)
         self.potential = None if P is None else potential(parts.model, parts.graph, P)
         self.page = Growing(self.run)
 
@@ -49,7 +50,7 @@ class WatchedRun:
         # An agent without finite numbers cannot be drawn; the page says so at the end.
         if stretch.finite:
             with contextlib.suppress(OutputError):
-                self.page.add(so_far(self.run, stretch, self.potential))
+                self.page.add(so_far(self.run, stretch, self.potential, self.formation))
 
     def show_all(self, folder: Path) -> None:
         """Show the complete run until Ctrl-C."""

@@ -15,6 +15,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.apps.live.swarm import Picture
 from echelon.core.types import JsonObject
+from echelon.experiments.results.avoidance import ROUNDING
 from echelon.simulation.step.meter import SETTLED, outside
 
 _TRANSIENT = 2.0
@@ -32,7 +33,8 @@ _LARGE = (
 class GuaranteeStatus:
     """The badge of a guarantee, which is withdrawn while the state is not covered.
 
-    It is restored once all agents are in their domain and errors have halved.
+    It is restored once all agents are in their domain and errors have halved; of agents that keep
+    apart, once their hulls are as far apart as they keep.
 
     Args:
         model: of the agents.
@@ -54,6 +56,7 @@ class GuaranteeStatus:
     def restart(self) -> None:
         """Forget all errors, as after a reset."""
         self.departure, self.peak, self.lost, self.reference = "", 0.0, False, 0.0
+        self.near = np.inf
         self.begin()
         self.fresh = True
 
@@ -90,6 +93,7 @@ class GuaranteeStatus:
             self.large = not self.fresh and size > max(_GROWTH * self.reference, SETTLED)
         withdrawn = self.departure or self.growing or self.large
         self.peak = max(self.peak, size) if withdrawn else size
+        self.near = picture.apart
         halved, departure = size <= 0.5 * self.peak, self._departure(picture)
         self.departure = (self.departure or departure) if departure or not halved else ""
         self.large = self.large and not halved
@@ -125,9 +129,21 @@ class GuaranteeStatus:
         """Return 0 if the guarantee covers the state, 1 if that is not known, 2 if it does not."""
         if not self.badge.get("beyond"):
             return 0
+        if self.badge.get("apart") is not None:
+            return 2 * bool(self.departure or self.lost or self._too_near())
         if self.departure or self.growing or self.lost:
             return 2
         return int(self.large and not self.badge.get("anywhere"))
+
+    def _too_near(self) -> str:
+        """Return a sentence about hulls that are nearer than they keep; empty if none are."""
+        kept = self.badge.get("apart")
+        if kept is None or self.near >= kept - ROUNDING:
+            return ""
+        return (
+            f"The hulls of two agents are {self.near:.3g} m apart, scaled, as after a kick; from "
+            f"{kept:.3g} m on it is guaranteed again that agents stay apart."
+        )
 
     def _current(self) -> JsonObject:
         """Return the badge for the present state."""
@@ -136,7 +152,9 @@ class GuaranteeStatus:
             return self.badge
         if self.severity == 1:
             return self._replaced("edge", f"{self.badge['short']}, for small errors", [_LARGE])
-        causes = [cause for cause in (*self.badge["beyond"], self.departure) if cause]
+        near = self._too_near()
+        beyond = [] if near else self.badge["beyond"]
+        causes = [cause for cause in (near, *beyond, self.departure) if cause]
         return self._replaced("lost", "the guarantee does not cover this state", causes)
 
     def _replaced(self, state: str, short: str, causes: list[str]) -> JsonObject:

@@ -6,10 +6,10 @@ from echelon.apps.live.panel import Panel
 from echelon.apps.live.swarm import LiveLoop
 from echelon.core.types import JsonObject
 from echelon.experiments.results.foreseen import foreseen
-from echelon.experiments.results.recording import InputBounds
+from echelon.experiments.results.recording import Recording
 from echelon.output.plots.space import Space, space_of
+from echelon.output.viewer.charts import distance_chart
 from echelon.output.viewer.replay import header, motor_loads
-from echelon.simulation.step.settings import Settings
 
 _AHEAD, _APART = 60.0, 0.1
 """Seconds of the reference that are drawn, and seconds between two places of it."""
@@ -17,7 +17,7 @@ _AHEAD, _APART = 60.0, 0.1
 
 def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: JsonObject) -> JsonObject:
     """Return the header of a loop's page."""
-    run = foreseen(swarm.parts, swarm.settings, np.asarray(swarm.states), name)
+    run = foreseen_of(swarm, name)
     space = space_of(run)
     loads = motor_loads(run, space)
     return {
@@ -35,6 +35,7 @@ def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: JsonObject) -> 
         "path": _path(swarm, space),
         "unit": run.length_unit,
         "limited": run.loads is not None,
+        "near": distance_chart(run, []) if run.ellipsoid and run.agents > 1 else None,
         "messages": swarm.parts.world.network is not None,
     }
 
@@ -54,7 +55,6 @@ def _path(swarm: LiveLoop, space: Space) -> list[list[float]]:
     return np.round(places, 4).tolist()
 
 
-def scene(swarm: LiveLoop, settings: Settings) -> tuple[Space, InputBounds | None]:
-    """Return the space that agents are drawn in, and the bounds of their inputs."""
-    run = foreseen(swarm.parts, settings, np.asarray(swarm.states), "")
-    return space_of(run), run.bounds if settings.limits else None
+def foreseen_of(swarm: LiveLoop, name: str) -> Recording:
+    """Return a recording with all of a loop but its frames."""
+    return foreseen(swarm.parts, swarm.settings, np.asarray(swarm.states), name)

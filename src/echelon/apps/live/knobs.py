@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.linearization import linearize
 from echelon.agents.network.channel import Network
+from echelon.agents.network.events import Event
 from echelon.agents.network.graph import Graph
 from echelon.apps.live.choices import shapes_of
 from echelon.core.numerics import precision
@@ -42,6 +43,7 @@ class Knobs(NamedTuple):
         cut: indices of the cut edges.
         method: of the gain; None for the scenario's own.
         shape: of the formation; None for the scenario's own.
+        events: agents that were lost and joined, by time.
     """
 
     coupling: float | None
@@ -59,6 +61,7 @@ class Knobs(NamedTuple):
     cut: frozenset[int] = frozenset()
     method: str | None = None
     shape: str | None = None
+    events: tuple[Event, ...] = ()
 
 
 @final
@@ -183,14 +186,15 @@ class LiveParts:
     def loop(self, knobs: Knobs) -> LinearLoop | None:
         """Return the closed loop near the trim, as a guarantee judges it.
 
-        None without a gain, on a switching graph, whose modes are not those of one matrix, and with
-        late messages.
+        None without a gain, on a switching graph, whose modes are not those of one matrix, after
+        events, and with late messages.
 
         Raises:
             GraphError: the cut links disconnect the graph.
         """
         gain, parts = self.gain(knobs), self.parts
-        if gain is None or parts.graph.schedule is not None or parts.world.network is not None:
+        switches = parts.graph.schedule is not None or knobs.events
+        if gain is None or switches or parts.world.network is not None:
             return None
         gain = eqx.tree_at(lambda gain: gain.coupling, gain, knobs.coupling)
         assert isinstance(parts.drive, Laws)

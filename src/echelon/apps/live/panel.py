@@ -5,6 +5,7 @@ from typing import Any, final
 
 import numpy as np
 
+from echelon.apps.live.attendance import KINDS, as_entries, happened
 from echelon.apps.live.choices import AS_GIVEN
 from echelon.apps.live.knobs import Knobs, LiveParts
 from echelon.apps.live.sliders import SLIDERS
@@ -77,18 +78,21 @@ class Panel:
             for name, span in self.ranges.items()
         ]
 
-    def change(self, knobs: Knobs, name: str, value: Any) -> Knobs:
-        """Return the knobs after a change of one control; numbers are clamped.
+    def change(self, knobs: Knobs, name: str, value: Any, at: float = 0.0) -> Knobs:
+        """Return the knobs after a change of one control at a time (s); numbers are clamped.
 
         Raises:
             SimulationError: there is no such control, or the value is not allowed.
+            GraphError: an agent cannot be lost or join.
             ScenarioError: the chosen method finds no gain for these agents.
         """
         if name in ("cut", "restore"):
             edge = {self.edge(value)}
             return knobs._replace(cut=knobs.cut | edge if name == "cut" else knobs.cut - edge)
-        if name == "lose":
-            return knobs._replace(cut=knobs.cut | self._links(value))
+        if name in KINDS:
+            at = max(at, self.experiment.settings.dt)
+            events = happened(self.live.parts.graph, knobs.events, name, value, at)
+            return knobs._replace(events=events)
         if name in self.options:
             return self._choose(knobs, name, value)
         if name not in self.ranges:
@@ -123,13 +127,6 @@ class Panel:
         coupling = self.start.coupling if gain is None else round(gain.coupling, 9)
         return changed._replace(weight=1.0, coupling=coupling)
 
-    def _links(self, agent: Any) -> frozenset[int]:
-        """Return the indices of the edges of an agent."""
-        graph = self.live.parts.graph
-        if type(agent) is not int or not 0 <= agent < graph.agents:
-            raise SimulationError(f"`lose` got `{agent}`, and must be the number of an agent.")
-        return frozenset(np.flatnonzero((graph.edges == agent).any(axis=1)).tolist())
-
     def edge(self, pair: Any) -> int:
         """Return the index of the edge between two agents.
 
@@ -158,11 +155,17 @@ class Panel:
             slider.write(self.live, knobs, data)
         if knobs.cut:
             data["graph"] = self._graph(knobs)
+        if knobs.events:
+            data["events"] = as_entries(knobs.events)
+            # A scenario's events are before its end.
+            end = knobs.events[-1].at + data["simulation"]["horizon"]
+            data["simulation"] = data["simulation"] | {"horizon": end}
         return scenario_from_mapping(data, self.scenario.folder)
 
     def _graph(self, knobs: Knobs) -> JsonObject:
         """Return the graph without the cut edges as a scenario states it."""
-        graph, schedule = self.live.parts.graph, self.live.parts.graph.schedule
+        graph = self.live.parts.graph.before
+        schedule = graph.schedule
         section: JsonObject = {"leaders": list(graph.leaders), "agents": graph.agents}
         section |= {"directed": True} if graph.directed else {}
         weights = [graph.weights] if schedule is None else schedule.weights

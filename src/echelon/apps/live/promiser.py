@@ -143,7 +143,9 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
         # A scenario that is refused has no guarantee, such as one with a disconnected graph.
         cause = str(error).removeprefix("mapping: ")
         return {"state": "lost", "short": "no guarantee", "whole": cause, "causes": [cause]}
-    badge: JsonObject = promise_badge(guarantee.as_mapping())
+    stated = guarantee.as_mapping()
+    badge: JsonObject = promise_badge(stated)
+    badge["apart"] = ((stated["anywhere"] or {}).get("separation") or {}).get("distance")
     badge["causes"] = [cause.sentence() for cause in guarantee.causes]
     badge["edge"], badge["end"] = guarantee.edge, _end(panel, knobs, guarantee.edge)
     badge["rate"], certified = guarantee.rate, guarantee.certified

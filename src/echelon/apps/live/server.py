@@ -2,6 +2,7 @@
 
 import abc
 import contextlib
+import copy
 import json
 import time
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from echelon.apps.live.attendance import as_changes
 from echelon.apps.live.header import live_header
 from echelon.apps.live.panel import Panel
 from echelon.apps.live.promiser import pending_badge
@@ -17,9 +19,10 @@ from echelon.apps.live.session import Session
 from echelon.apps.live.swarm import LiveLoop
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.core.types import JsonObject
+from echelon.core.words import amount
 from echelon.experiments.results.recording import Recording
 from echelon.experiments.scenario.build import build
-from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.output.viewer.pack import pack
 from echelon.output.viewer.page import page
 from echelon.output.viewer.serve import Handler, serve
@@ -45,6 +48,7 @@ def live(
     Raises:
         EchelonError: a part is invalid, or the loop is too slow for real time.
     """
+    scenario = with_changes(scenario)
     experiment = build(scenario)
     parts, settings = experiment
     if not isinstance(parts.drive, Laws):
@@ -52,7 +56,8 @@ def live(
     progress(1, 4)
     panel = Panel(scenario, experiment)
     progress(2, 4)
-    swarm = LiveLoop(parts, settings, panel.live)
+    eventful = any(change.lose is not None for change in scenario.live)
+    swarm = LiveLoop(parts, settings, panel.live, eventful)
     name = scenario.name
     if run is not None:
         _continue(swarm, run)
@@ -61,6 +66,16 @@ def live(
     progress(3, 4)
     header = live_header(swarm, panel, name, pending_badge())
     return Session(scenario, panel, swarm), page(f"{name}, live", pack(header, {}))
+
+
+def with_changes(scenario: Scenario) -> Scenario:
+    """Return a scenario with its events as changes of the live loop."""
+    data = copy.deepcopy(scenario.data)
+    events = data.pop("events", None)
+    if not events:
+        return scenario
+    data["live"] = [*data.get("live", []), *as_changes(events)]
+    return scenario_from_mapping(data, scenario.folder)
 
 
 def _continue(swarm: LiveLoop, run: Recording) -> None:
@@ -73,7 +88,7 @@ def _continue(swarm: LiveLoop, run: Recording) -> None:
     if not len(run.times) or run.states.shape[1:] != shape:
         got = "no state" if not len(run.times) else f"{run.agents} agents"
         raise SimulationError(
-            f"the run has {got}, and its scenario {shape[0]} agents of {shape[1]} states."
+            f"the run has {got}, and its scenario {shape[0]} agents of {amount(shape[1], 'state')}."
         )
     swarm.states, swarm.first = run.states[-1], round(run.times[-1] / swarm.settings.dt)
 

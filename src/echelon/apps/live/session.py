@@ -10,21 +10,30 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 from jaxtyping import Float
 
-from echelon.apps.live.choices import under
+from echelon.apps.live.attendance import KINDS
 from echelon.apps.live.guarantee_status import GuaranteeStatus, lost
-from echelon.apps.live.header import scene
+from echelon.apps.live.header import foreseen_of
 from echelon.apps.live.knobs import Knobs
-from echelon.apps.live.panel import Panel, check_choice
+from echelon.apps.live.loops_by_law import LoopsByLaw
+from echelon.apps.live.panel import Panel
 from echelon.apps.live.promiser import Promiser
 from echelon.apps.live.swarm import LiveLoop, Picture
-from echelon.core.errors import EchelonError, SimulationError
+from echelon.core.errors import (
+    EchelonError,
+    GraphError,
+    LawError,
+    ScenarioError,
+    SimulationError,
+)
 from echelon.core.types import Array, JsonObject
+from echelon.core.words import amount
 from echelon.experiments.scenario.scenario import Scenario
+from echelon.output.plots.space import space_of
 from echelon.output.viewer.replay import heard_by
 from echelon.simulation.engine.closest_pair import ClosestPair
 
 if TYPE_CHECKING:
-    from echelon.experiments.scenario.sections import LiveSpec
+    from echelon.experiments.scenario.event_sections import LiveSpec
 
 _PICTURE, _MESSAGE = 0, 1
 _EMPTY = struct.pack("<I", _MESSAGE) + b"{}"
@@ -46,15 +55,16 @@ class Session:
         """Check the events of the scenario; nothing runs before `start`."""
         self.scenario, self.panel, self.swarm = scenario, panel, swarm
         self.knobs, self.paused, self.watchers, self.ended = panel.start, False, 0, False
-        self.space, self.bounds = scene(swarm, swarm.settings)
+        self.run = foreseen_of(swarm, "")
+        self.space, self.bounds = space_of(self.run), self.run.bounds
         self.pending: list[Callable[[], None]] = []
         self.events: list[JsonObject] = []
         self.future = sorted(map(_as_event, scenario.live), key=lambda event: event["at"])
         self.picture, self.number, self.messages = b"", 0, list[bytes]()
         self.changed, self.lost, self.factor = threading.Condition(), False, 1.0
         self.closest: ClosestPair | None = None
-        # Loops by law; events are saved for the scenario of the first.
-        self.first, self.loops = panel, {panel.law: (panel, swarm)}
+        # Changes are saved for the scenario of the first law.
+        self.first, self.loops = panel, LoopsByLaw(panel, swarm, self.send)
         self._check()
         model, graph = swarm.parts.model, swarm.parts.graph
         self.status = GuaranteeStatus(model, graph, lambda badge: self.send({"promise": badge}))
@@ -66,16 +76,19 @@ class Session:
         Raises:
             SimulationError: an event is not possible.
         """
-        panel = self.panel
+        panel, happened = self.panel, ()
         for event in self.future:
             try:
                 if "law" in event:
-                    panel = self.loops[self.prepare(str(event["law"]))][0]
+                    panel = self.loops.prepare(str(event["law"]), bool(happened))[0]
                 for name, value in event.items():
                     if name == "kick":
                         self._check_kick(value)
                     elif name not in ("at", "law"):
-                        panel.change(panel.start, name, value)
+                        start = panel.start._replace(events=happened)
+                        happened = panel.change(start, name, value, event["at"]).events
+                if happened:
+                    self.loops.prepare(panel.law, True)
             except EchelonError as error:
                 message = _without_place(error)
                 raise SimulationError(f"`live` at {event['at']:g} s: {message}") from error
@@ -85,8 +98,8 @@ class Session:
         for agent, jump in kicks.items():
             if not 0 <= agent < agents or len(jump) != n:
                 raise SimulationError(
-                    f"`kick` got agent {agent} with {len(jump)} numbers, and must be of "
-                    f"agents 0 to {agents - 1} with {n}."
+                    f"`kick` got agent {agent} with {amount(len(jump), 'number')}, and "
+                    f"must be of agents 0 to {agents - 1} with {n}."
                 )
 
     # ---- the loop -------------------------------------------------------------------------------
@@ -144,31 +157,38 @@ class Session:
             self.status.lose()
             return
         self.status.look(picture)
-        self._look_for_closest(picture)
-        block = self._packed(picture)
+        block = self._packed(picture, self._closest_now(picture))
         with self.changed:
             self.picture, self.number = block, self.number + 1
             self.changed.notify_all()
 
-    def _look_for_closest(self, picture: Picture) -> None:
+    def _closest_now(self, picture: Picture) -> ClosestPair | None:
+        """Return the closest two agents, and remember the closest so far."""
         axes = self.panel.live.axes
-        if axes and len(picture.states) > 1:
-            pair = ClosestPair.of(picture.states[:, axes], picture.time)
-            if self.closest is None or pair.distance < self.closest.distance:
-                self.closest = pair
+        here = np.arange(len(picture.states)) if picture.here is None else picture.here.nonzero()[0]
+        if not axes or len(here) < 2:
+            return None
+        pair = ClosestPair.of(picture.states[here][:, axes] * self.run.scales, picture.time)
+        pair = pair._replace(agents=tuple(here[list(pair.agents)].tolist()))
+        if self.closest is None or pair.distance < self.closest.distance:
+            self.closest = pair
+        return pair
 
-    def _packed(self, picture: Picture) -> bytes:
+    def _packed(self, picture: Picture, now: ClosestPair | None) -> bytes:
         space, swarm, pair = self.space, self.swarm, self.closest
-        followers = list(swarm.parts.graph.followers)
-        errors = picture.errors[followers]
+        here = np.ones(len(picture.states), bool) if picture.here is None else picture.here
+        followers = [k for k in swarm.parts.graph.followers if here[k]]
+        errors = picture.errors[followers] if followers else np.full(1, np.nan)
         loads = self._loads(picture)
-        ends = (loads.max(), loads.min()) if loads.size else (np.nan, np.nan)
+        places = np.where(here[:, None], picture.states[:, list(space.axes)], np.nan)
+        ends = (loads[here].max(), loads[here].min()) if loads.size else (np.nan, np.nan)
         goals = swarm.goals(picture)
         parts = [
             np.array([errors.max(), np.median(errors), swarm.off_reference(picture)]),
             np.array([*ends, picture.lyapunov, self.factor, self.knobs.wind]),
+            np.array([np.nan if now is None else now.distance, swarm.active]),
             np.array(4 * [np.nan] if pair is None else [pair.time, pair.distance, *pair.agents]),
-            picture.states[:, list(space.axes)],
+            places,
             goals[:, list(space.axes)],
             space.sign * picture.states[:, list(space.angles)],
             np.clip(loads, 0.0, 1.0),
@@ -227,7 +247,9 @@ class Session:
         knobs = {name: getattr(self.knobs, name) for name in self.panel.ranges}
         cut = [graph.edges[k].tolist() for k in sorted(self.knobs.cut)]
         chosen = {"law": self.panel.law, "method": self.knobs.method, "shape": self.knobs.shape}
-        return {"knobs": knobs, "chosen": chosen, "cut": cut, "paused": self.paused}
+        state = {"knobs": knobs, "chosen": chosen, "cut": cut, "paused": self.paused}
+        moments = [[event.at, str(event)] for event in self.knobs.events]
+        return {**state, "moments": moments, "nearest": self.swarm.nearest.tolist()}
 
     def _panel_message(self) -> JsonObject:
         """Return the controls and the information flow of the present law."""
@@ -248,14 +270,18 @@ class Session:
         if name in ("pause", "reset"):
             self._later(lambda: self._pause(bool(value)) if name == "pause" else self._reset())
             return {}
-        if name == "law":
-            try:
-                event = {name: self.prepare(str(value))}
-            except EchelonError as error:
-                # A valid request, but these agents cannot have the law.
-                return {"fault": _without_place(error)}
-        else:
-            event = self._event(str(name), value)
+        try:
+            if name == "law":
+                event = {name: self.loops.prepare(str(value), bool(self.knobs.events))[0].law}
+            else:
+                event = self._event(str(name), value)
+                if name in KINDS:
+                    self.loops.prepare(self.panel.law, True)
+        except (ScenarioError, GraphError, LawError, SimulationError) as error:
+            if name not in ("law", *KINDS):
+                raise
+            # A valid request, but it is not possible for these agents.
+            return {"fault": _without_place(error)}
         self._later(lambda: self.apply(event))
         return event
 
@@ -273,7 +299,8 @@ class Session:
             if type(value) is not int or not 0 <= value < self.swarm.parts.graph.agents:
                 raise SimulationError(f"`kick` got `{value}`, and must be the number of an agent.")
             return {"kick": {value: self._kick()}}
-        knobs = self.panel.change(self.knobs, name, value)
+        now = self.swarm.steps * self.swarm.settings.dt
+        knobs = self.panel.change(self.knobs, name, value, now)
         if name not in self.panel.ranges:
             return {name: list(map(int, value)) if name in ("cut", "restore") else value}
         clamped, span = getattr(knobs, name), self.panel.ranges[name]
@@ -306,7 +333,9 @@ class Session:
             elif name == "law":
                 knobs = self._switch_law(str(value), knobs)
             elif name != "at":
-                knobs = self.panel.change(knobs, name, value)
+                knobs = self.panel.change(knobs, name, value, now)
+                if name in KINDS:
+                    self._make_room()
         # After the changes, so that a refused event is not saved.
         self.events.append({"at": now, **{k: v for k, v in event.items() if k != "at"}})
         if knobs != self.knobs:
@@ -316,36 +345,23 @@ class Session:
             self.promiser.ask(self.panel, knobs)
             self.send(self.state())
 
-    def prepare(self, law: str) -> str:
-        """Compile the loop under another law, while this one runs, and return the law.
-
-        Raises:
-            EchelonError: the law is unknown, or does not fit these agents.
-        """
-        if law in self.loops:
-            return law
-        check_choice("law", law, self.panel.laws)
-        self.send({"note": f"Compiling the law `{law}`; the loop continues meanwhile."})
-        try:
-            scenario, experiment = under(self.first.scenario, law)
-            panel = Panel(scenario, experiment)
-            self.loops[law] = panel, LiveLoop(*experiment, panel.live)
-            # The first step compiles the rest.
-            self.loops[law][1].advance()
-        finally:
-            self.send({"note": ""})
-        return law
+    def _make_room(self) -> None:
+        """Continue from here in the loop in which agents can be lost and join."""
+        before = self.swarm
+        self.panel, self.swarm = self.loops.prepare(self.panel.law, True)
+        if self.swarm is not before:
+            self.swarm.states, self.swarm.first = before.states, before.first
+            self.swarm.take_over(before)
 
     def _switch_law(self, law: str, knobs: Knobs) -> Knobs:
         """Continue from here under another law, with its initial memory."""
-        self.prepare(law)
         before = self.swarm
-        self.panel, self.swarm = self.loops[law]
+        self.panel, self.swarm = self.loops.prepare(law, bool(knobs.events))
         self.swarm.states, self.swarm.first = before.states, before.first
         self.swarm.proceed(np.asarray(before.now.states, float), before.steps)
         self.status.begin()
         self.send(self._panel_message())
-        names = {"shape", "cut", *self.panel.ranges} - {"coupling"}
+        names = {"shape", "cut", "events", *self.panel.ranges} - {"coupling"}
         return self.panel.start._replace(**{name: getattr(knobs, name) for name in names})
 
     def _pause(self, paused: bool) -> None:
@@ -354,6 +370,9 @@ class Session:
 
     def _reset(self) -> None:
         """Restart from the initial states, with the knobs as they are."""
+        # At the start nobody has been lost.
+        self.knobs = self.knobs._replace(events=())
+        self.swarm.apply(self.knobs)
         self.swarm.restart()
         self.status.restart()
         self.closest = None
@@ -366,7 +385,7 @@ class Session:
         graph = self.swarm.parts.graph
         for edge in sorted(self.knobs.cut):
             self.events.append({"at": 0.0, "cut": graph.edges[edge].tolist()})
-        self.send({"reset": True, "note": ""})
+        self.send({"reset": True, "note": "", **self.state()})
         self.show(self.swarm.advance(still=True))
 
 

@@ -15,19 +15,22 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import NEVER, Channel
 from echelon.agents.network.hearing import edges_of
 from echelon.agents.world.disturbance import Disturbance
+from echelon.apps.live.attendance import attendance, room_for_events
 from echelon.apps.live.knobs import Knobs, LiveParts
 from echelon.apps.live.live_stepper import choose_stepper
 from echelon.core.compiled import cached_jit
-from echelon.core.errors import GraphError
+from echelon.core.errors import GraphError, SimulationError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, PyTree
 from echelon.experiments.results.lyapunov import fixed_metric, potential
 from echelon.laws.law import Law
+from echelon.laws.together import separations
 from echelon.output.viewer.replay import link_shades
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.loop import Loop, Moment, Switches, assemble
+from echelon.simulation.step.nearby import all_hulls
 from echelon.simulation.step.sequence import begin
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain
@@ -45,7 +48,9 @@ class Picture(NamedTuple):
 
     `reference` (n,) is that of the leaders, None if they follow nothing; `lyapunov` is V, NaN if
     it does not exist; `beyond` (N,) marks the agents whose states or inputs are not finite, or are
-    too large for the stepper; `shades` (E,) are those of the links over a network.
+    too large for the stepper; `shades` (E,) are those of the links over a network; `apart` is the
+    least scaled distance between hulls of agents that keep apart, m, infinite of others; `here`
+    (N,) marks who is there, None where all always are.
     """
 
     time: float
@@ -57,6 +62,8 @@ class Picture(NamedTuple):
     lyapunov: float
     beyond: Array
     shades: Array = np.zeros(0)
+    apart: float = math.inf
+    here: Array | None = None
 
 
 @final
@@ -67,15 +74,24 @@ class LiveLoop:
         parts: of a scenario.
         settings: of it.
         panel: the numbers that its knobs set.
+        eventful: whether agents can be lost and join, which no native code steps.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
 
-    def __init__(self, parts: Parts, settings: Settings, panel: LiveParts) -> None:
+    def __init__(
+        self, parts: Parts, settings: Settings, panel: LiveParts, eventful: bool = False
+    ) -> None:
         """Prepare the loop and its stepper."""
+        if parts.formation.motion is not None:
+            raise SimulationError(
+                "got a formation that changes, and `echelon live` has knobs for its shape; "
+                "remove `formation.motion`, or use `echelon run`."
+            )
         disturbance = parts.world.disturbance or Disturbance()
         world = dataclasses.replace(parts.world, disturbance=disturbance)
+        parts = room_for_events(parts, settings.dt) if eventful else parts
         prepared = prepare(parts.replace(world=world), settings)
         problem, drive = prepared.problem, prepared.parts.drive
         assert isinstance(drive, Laws)
@@ -91,6 +107,7 @@ class LiveLoop:
         # The share of the feed-forward is a number of the loop, so that a knob can change it.
         self.loop: Loop = dataclasses.replace(loop, follower=law, share=np.asarray(1.0))
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
+        self.eventful = eventful
         if loop.channel is not None:
             self.loop = dataclasses.replace(self.loop, channel=self._roomy(loop.channel))
         assert loop.motion.wind is not None
@@ -99,7 +116,7 @@ class LiveLoop:
         self.potentials: dict[Hashable, Callable[[Array], Array]] = {}
         self.states, self.first = problem.states, 0
         self.measured = list(problem.meter.measured)
-        self.nearest = np.array(parts.graph.nearest_leader())
+        self.nearest, self.here = np.array(parts.graph.nearest_leader()), None
         self.weights = np.asarray(loop.exchange.weights, np.float64)
         self.place = edges_of(parts.graph, loop.exchange)
         self.edge = self.place[0]
@@ -108,6 +125,7 @@ class LiveLoop:
         self.potential = self._potential(panel.start)
         self.ahead = range(0)
         self._look_ahead(0)
+        self._count(panel.start)
         engine = choose_stepper(self.loop, self._variant(), self.states, settings)
         self.stepper = engine.stepper
         self.precision: Precision = engine.precision
@@ -156,6 +174,31 @@ class LiveLoop:
             now = begin(self.loop, jnp.asarray(states))
             self.now: Moment = now._replace(step=jnp.asarray(step, jnp.int32))
 
+    def take_over(self, other: "LiveLoop") -> None:
+        """Proceed from where another loop of the same laws is, with as much memory as fits."""
+        self.proceed(np.asarray(other.now.states, float), other.steps)
+        mine, memory, begun = self.now, other.now, self.now.world
+
+        def same(one: PyTree, two: PyTree) -> PyTree:
+            ours, theirs = (jax.tree.structure(x) for x in (one, two))
+            shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(x)] for x in (one, two)]
+            if ours != theirs or shapes[0] != shapes[1]:
+                return one
+            return jax.tree.map(lambda x, y: jnp.asarray(y, jnp.asarray(x).dtype), one, two)
+
+        with precision(self.precision):
+            world = begun._replace(
+                **{
+                    name: same(getattr(begun, name), getattr(memory.world, name))
+                    for name in begun._fields
+                }
+            )
+            if begun.starts is not None:
+                world = world._replace(starts=jnp.asarray(self.states, mine.states.dtype))
+            names = ("leader_memory", "follower_memory", "cut")
+            parts = {name: same(getattr(mine, name), getattr(memory, name)) for name in names}
+            self.now = mine._replace(world=world, **parts)
+
     @property
     def engine(self) -> str:
         """What computes the steps, `native` or `jax`."""
@@ -166,10 +209,28 @@ class LiveLoop:
         """The number of steps so far."""
         return int(self.now.step)
 
+    @property
+    def active(self) -> float:
+        """How many others changed the rates of agents that keep apart, in the last step."""
+        active = self.loop.follower.active(self.now.follower_memory)
+        return 0.0 if active is None else float(np.sum(np.asarray(active)))
+
+    def _apart(self) -> float:
+        """Return the least scaled distance between hulls of agents that keep apart, m."""
+        safety = self.loop.follower.safety
+        if safety is None:
+            return math.inf
+        with precision(self.precision):
+            hulls = np.asarray(_hulls(self.loop, self.now), np.float64)
+        hulls = hulls if self.here is None else hulls[self.here]
+        gaps = separations(hulls * safety.scales(self.loop.model))
+        return float((gaps + np.diag(np.full(len(gaps), np.inf))).min())
+
     def apply(self, knobs: Knobs) -> None:
         """Change the loop to these positions of the knobs."""
         self.potential = self._potential(knobs)
         self.offsets = self.panel.offsets(knobs)
+        self._count(knobs)
         weights = self.weights.copy()
         weights[..., np.isin(self.edge, list(knobs.cut))] = 0.0
         loop = eqx.tree_at(
@@ -178,6 +239,15 @@ class LiveLoop:
             (self.offsets, weights, self.panel.wind(knobs)),
         )
         self.loop = self._in_world(eqx.tree_at(self._adjustable, loop, self._numbers(knobs)), knobs)
+
+    def _count(self, knobs: Knobs) -> None:
+        """Let those be there who are after the events of the knobs."""
+        if self.loop.presence is None:
+            return
+        law, graph = self.loop.follower, self.parts.graph
+        now = attendance(graph, knobs.events, law.leaderward, self.settings.dt)
+        self.loop, self.weights = now.put_into(self.loop), now.weights
+        self.here, self.nearest = now.present[-1], now.nearest[-1]
 
     def _roomy(self, channel: Channel) -> Channel:
         """Return a channel with memory for the longest delay, and the code of outages."""
@@ -214,7 +284,7 @@ class LiveLoop:
     def _potential(self, knobs: Knobs) -> Callable[[Array], Array] | None:
         """Return the function that computes V; None without a P or for a disconnected graph."""
         P, gain = fixed_metric(self.parts), self.panel.gain(knobs)
-        if P is None:
+        if P is None or knobs.events:
             return None
         P = P if gain is None else gain.P
         key = knobs.cut, knobs.method, knobs.weight
@@ -245,10 +315,10 @@ class LiveLoop:
         with precision(self.precision):
             chunk = self.stepper.advance(self.now, counts, reference)
         self.now, states, inputs = chunk.now, chunk.states[-1], chunk.inputs[-1]
-        y = states - self.offsets
+        y, here = states - self.offsets, self.here
         with np.errstate(over="ignore", invalid="ignore"):
             deviation = (y - y[self.nearest])[:, self.measured]
-            errors = np.linalg.norm(deviation, axis=1)
+            errors = np.linalg.norm(deviation, axis=1) * (1.0 if here is None else here)
         valid = np.isfinite(inputs).all(axis=1) & (np.abs(states) < _FAR).all(axis=1)
         # Which agent it is nobody knows.
         valid &= not np.any(chunk.inexact)
@@ -257,7 +327,8 @@ class LiveLoop:
         desired = None if reference is None else reference[counts[0]]
         beyond = np.logical_not(valid)
         shades = self._shades(int(counts[0]))
-        return Picture(time, states, inputs, errors, self.offsets, desired, V, beyond, shades)
+        rows = time, states, inputs, errors, self.offsets, desired, V, beyond, shades
+        return Picture(*rows, self._apart(), here)
 
     def _shades(self, steps: int) -> Float[Array, " E"]:
         """Return how each link is drawn after some steps; nothing in the ideal network."""
@@ -279,7 +350,7 @@ class LiveLoop:
         """Return the goals: of leaders relative to the reference, NaN if they follow nothing."""
         y = picture.states - picture.offsets
         goals = y[self.nearest] + picture.offsets
-        leaders = list(self.parts.graph.leaders)
+        leaders = np.unique(self.nearest)
         if picture.reference is None:
             goals[leaders] = np.nan
         else:
@@ -288,7 +359,7 @@ class LiveLoop:
 
     def off_reference(self, picture: Picture) -> float:
         """Return the largest distance of a leader from the reference, NaN if there is none."""
-        leaders = list(self.parts.graph.leaders)
+        leaders = np.unique(self.nearest)
         away = (picture.states - self.goals(picture))[leaders][:, self.measured]
         return float(np.linalg.norm(away, axis=1).max())
 
@@ -302,6 +373,9 @@ class LiveLoop:
 @cached_jit
 def _reference_states(leader: Law, model: ControlAffine, times: jax.Array) -> jax.Array | None:
     return leader.reference_states(model, times)
+
+
+_hulls = cached_jit(all_hulls)
 
 
 def _inner(gain: Gain) -> Array:

@@ -46,7 +46,7 @@ class FollowerMetrics(NamedTuple):
     settling_time: Annotated[
         float | None,
         Quantity(
-            "time after which the error stays below 1 cm",
+            "time after which the error stays below 1 cm, or 0.01 without a position",
             "s",
             column="within {settled}\nfrom, s",
             key="settling_time_s",

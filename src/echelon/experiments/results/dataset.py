@@ -19,6 +19,7 @@ from echelon.experiments.results.agent_metrics import (
     steady_error,
 )
 from echelon.experiments.results.avoidance import avoidance
+from echelon.experiments.results.event_outcomes import event_outcomes
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.labelled_parts import labelled_parts
 from echelon.experiments.results.lyapunov import lyapunov
@@ -27,6 +28,7 @@ from echelon.experiments.results.quantity import Shown
 from echelon.experiments.results.recording import Recording, recording
 from echelon.experiments.results.run_groups import SUM, group_of
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
+from echelon.guarantees.promises.event_lines import events_in_words
 from echelon.guarantees.promises.promise import promise
 from echelon.laws.law import gain_of
 from echelon.simulation.engine.law_drive import Laws
@@ -48,13 +50,16 @@ def dataset(result: Result) -> "xr.Dataset":
     """Return a run as a dataset with dimensions time, agent, state, input, edge.
 
     Variables: `states`, `inputs`, `error` (deviation from the goal relative to the leader),
-    `offset`, `nearest_leader`, `reference`, `tracking_error` (the leaders' outputs minus their
-    references'), `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`, `edge_agents`,
+    `offset` (and `moving_offset` over time where it changes), `nearest_leader`, `reference`,
+    `tracking_error` (the leaders' outputs minus their references'), `lyapunov`, `lyapunov_rate`,
+    `lyapunov_drift`, `saturated`, `edge_agents`,
     `edge_weight`, `edge_heard` (whether each end of an edge receives from the other), of a
     switching graph `edge_weight_then` from each `stretch_start` on with its `graph_period`
-    (infinite without repetition), of agents that keep apart `scaled_distance` and `active_rows` in
-    slices of the run from `slice_start` on with `touching_distance` and `kept_distance`,
-    the gain's `P`, `R` and `coupling`, the poles of the checked
+    (infinite without repetition), where agents are lost or join `presence` (1 where an agent is
+    there) and from each `stretch_start` on `present_then` and `nearest_leader_then`, of agents that
+    keep apart `scaled_distance` and `active_rows` in slices of the run from `slice_start` on, with
+    the radii of their ellipsoids and `kept_distance`, the gain's `P`, `R` and `coupling`, the poles
+    of the checked
     modes (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`, for directed graphs with the
     imaginary part `mode_eigenvalue_imaginary`), and the limits of the inputs u, `limit_low` <=
     `limit_matrix` u <= `limit_high`. Over a network that is late also `age` (of the oldest message
@@ -85,7 +90,9 @@ def _labelled(result: Result) -> Labelled:
         "inputs": (("time", "agent", "input"), result.inputs),
         "saturated": ("agent", result.saturated),
         **fixed.variables,
+        **_presence(result),
         **_followed(result),
+        **_moving(result),
         **_poles(result),
         **_messages(result),
         **_avoidance(result),
@@ -104,6 +111,20 @@ def recording_of(run: Result | Recording) -> Recording:
         return run
     data = labelled(run)
     return recording(data.arrays(), data.attributes)
+
+
+def _moving(result: Result) -> Variables:
+    """Return offsets that change with time; nothing of constant ones."""
+    if result.formation.motion is None:
+        return {}
+    return {"moving_offset": (("time", "agent", "state"), result.offsets_in())}
+
+
+def _presence(result: Result) -> Variables:
+    """Return which agents are there; nothing where all always are."""
+    if result.presence is None:
+        return {}
+    return {"presence": (("time", "agent"), result.presence.astype(np.int8))}
 
 
 def _followed(result: Result) -> Variables:
@@ -142,8 +163,6 @@ def _avoidance(result: Result) -> Variables:
         "slice_start": ("slice", numbers.times, {"units": "s"}),
         "scaled_distance": ("slice", numbers.distance, meters),
         "active_rows": ("slice", numbers.active),
-        "touching_distance": ((), numbers.touching, meters),
-        "kept_distance": ((), numbers.kept, meters),
     }
 
 
@@ -231,6 +250,7 @@ def statement(parts: Parts, settings: Settings, name: str) -> JsonObject:
         "gain": _gain_numbers(gain),
         "leader_gain": _gain_numbers(leader_gain_of(parts.drive)),
         "promise": promise(parts, settings).as_mapping(),
+        **({"events": events_in_words(parts, promise(parts, settings))} if parts.events else {}),
         "lambda_min": spectrum.low,
         "lambda_max": spectrum.high,
     }
@@ -250,7 +270,7 @@ def leader_gain_of(drive: Drive) -> Gain | None:
 
 _NUMBERS = tuple(x.key or name for name, x in shown_in(RUN_NUMBERS, Shown.SUMMARY).items())
 OBSERVED = ("outcome", "leader", "leaders", "followers", "edges", *_NUMBERS)
-OBSERVED += ("steady_window_s", "warnings", "engine", "wall_time_s", "versions")
+OBSERVED += ("event_outcomes", "steady_window_s", "warnings", "engine", "wall_time_s", "versions")
 """The other entries of a summary, which only the run itself gives."""
 
 
@@ -270,6 +290,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
             for row in _listed(numbers.edges, _distance_error)
         ],
         **RunNumbers(result, numbers, guarantee).json(Shown.SUMMARY),
+        **_outcomes(result),
         "steady_window_s": numbers.steady_window,
         "warnings": list(result.warnings),
         "engine": result.engine,
@@ -278,6 +299,13 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
             key[8:]: text for key, text in result.provenance.items() if key.startswith("version_")
         },
     }
+
+
+def _outcomes(result: Result) -> JsonObject:
+    """Return what followed the events; nothing without any."""
+    if not result.parts.events:
+        return {}
+    return {"event_outcomes": [outcome.as_mapping() for outcome in event_outcomes(result)]}
 
 
 def _listed(rows: Sequence[_Row], error: Callable[[_Row], float]) -> Sequence[_Row]:

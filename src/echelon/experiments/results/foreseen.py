@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from echelon.agents.network.formation import Formation
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.labelled_parts import labelled_parts
@@ -58,6 +59,8 @@ def foreseen(
         "saturated": np.zeros(agents),
     }
     frames |= {} if reference is None else {"reference": reference}
+    if parts.formation.motion is not None:
+        frames["moving_offset"] = parts.formation.offsets_at(times)
     attributes = {"scenario": name, "outcome": "completed", "message": ""}
     attributes["promise"] = json.dumps(promise)
     return recording(fixed.arrays() | frames, fixed.attributes | attributes)
@@ -72,13 +75,16 @@ def _ahead(
     if path is None:
         return np.broadcast_to(start, (len(times), *np.shape(start))).copy(), None
     reference = np.asarray(path, float)
-    states = reference[:, None] + parts.formation.offsets
+    states = reference[:, None] + parts.formation.offsets_at(times)
     states[0] = start
     return states, reference
 
 
 def so_far(
-    run: Recording, stretch: Stretch, potential: Callable[[Array], Array] | None
+    run: Recording,
+    stretch: Stretch,
+    potential: Callable[[Array], Array] | None,
+    formation: Formation,
 ) -> Recording:
     """Return a part of a run as a recording.
 
@@ -86,13 +92,16 @@ def so_far(
         run: as returned by `foreseen`.
         stretch: the part, with finite numbers.
         potential: V (T,) of states minus offsets (T, N, n); None where there is none.
+        formation: of the run.
     """
+    moving = None if formation.motion is None else formation.offsets_at(stretch.times)
     return dataclasses.replace(
         run,
         times=stretch.times,
         states=stretch.states,
         inputs=stretch.inputs,
         reference=stretch.reference,
+        moving=moving,
         lyapunov=None if potential is None else _in_blocks(potential, stretch.states - run.offsets),
     )
 

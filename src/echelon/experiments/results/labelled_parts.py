@@ -8,6 +8,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.core.types import JsonObject
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.recording import FORMAT
+from echelon.guarantees.promises.event_lines import as_mapping
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 
@@ -27,6 +28,7 @@ def labelled_parts(parts: Parts, settings: Settings) -> Labelled:
         "nearest_leader": ("agent", np.array(graph.nearest_leader())),
         **_edges(parts),
         **_gain(parts),
+        **_ellipsoid(parts),
         **_limits(model, settings),
     }
     coordinates = {
@@ -60,6 +62,7 @@ def _attributes(parts: Parts, settings: Settings) -> JsonObject:
         "position": " ".join(parts.model.position),
         "directed": int(parts.graph.directed),
         "format": FORMAT,
+        **({"events": json.dumps([*map(as_mapping, parts.events)])} if parts.events else {}),
     }
 
 
@@ -76,6 +79,10 @@ def _edges(parts: Parts) -> Variables:
         variables["edge_weight_then"] = (("stretch", "edge"), schedule.weights)
         period = np.inf if schedule.period is None else schedule.period
         variables["graph_period"] = ((), period, {"units": "s"})
+    if schedule is not None and schedule.present is not None:
+        over = ("stretch", "agent")
+        variables["present_then"] = (over, schedule.present.astype(np.int8))
+        variables["nearest_leader_then"] = (over, schedule.nearest)
     return variables
 
 
@@ -95,6 +102,19 @@ def _gain(parts: Parts) -> Variables:
         "P": (("state", "state_column"), gain.P),
         "R": (("input", "input_column"), gain.R),
         "coupling": ((), gain.coupling),
+    }
+
+
+def _ellipsoid(parts: Parts) -> Variables:
+    """Return the ellipsoid about agents that keep apart; nothing where they do not."""
+    safety, meters = parts.drive.safety, {"units": "m"}
+    # What is not prepared may have no size yet.
+    if safety is None or not (safety.radii or safety.of_model):
+        return {}
+    return {
+        "ellipsoid_radius": ((), safety.size[0], meters),
+        "ellipsoid_height": ((), safety.size[2], meters),
+        "kept_distance": ((), safety.distance, meters),
     }
 
 

@@ -93,8 +93,9 @@ _COMPUTED: "WeakKeyDictionary[Result, Lyapunov | None]" = WeakKeyDictionary()
 def lyapunov(result: Result) -> Lyapunov | None:
     """Return V along a run, in float64, computed once.
 
-    None where the followers' law has no P or no frame was stored, and on directed or switching
-    graphs, where V is not a sum over edges and need not decrease (theory page, T7).
+    None where the followers' law has no P or no frame was stored, where offsets change with time,
+    and on directed or switching graphs, where V is not a sum over edges and need not decrease
+    (theory page, T7).
     """
     if result not in _COMPUTED:
         _COMPUTED[result] = _lyapunov(result)
@@ -104,6 +105,8 @@ def lyapunov(result: Result) -> Lyapunov | None:
 def _lyapunov(result: Result) -> Lyapunov | None:
     P, graph, offsets = result.drive.metric(result.model), result.graph, result.formation.offsets
     if P is None or not len(result.times) or not goes_both_ways(graph):
+        return None
+    if result.formation.motion is not None:
         return None
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
         x, u = result.states, result.inputs

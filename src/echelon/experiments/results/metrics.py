@@ -42,7 +42,7 @@ def output_errors(result: Result, leader: int | None = None) -> Array | None:
     if result.reference is None or not len(result.times):
         return None
     leader = result.graph.leaders[0] if leader is None else leader
-    desired = result.reference + result.formation.offsets[leader]
+    desired = result.reference + result.offsets_in()[..., leader, :]
     with precision("float64"):
         return np.asarray(_output_errors(result.model, result.states[:, leader], desired))
 
@@ -61,12 +61,13 @@ def _root_mean(total: float | np.floating, steps: float | np.floating) -> float 
 
 def _leaders(result: Result, exists: bool) -> tuple[LeaderMetrics, ...]:
     names, sums = result.model.output_names, result.sums
-    has_errors, (steps, steady) = exists and result.reference is not None, sums.steps
+    has_errors = exists and result.reference is not None
 
     def one(k: int, agent: int) -> LeaderMetrics:
         saturated = float(result.saturated[agent])
         if not has_errors:
             return LeaderMetrics(None, None, dict.fromkeys(names), agent, saturated)
+        steps, steady = result.steps_present[:, agent]
         outputs = (_root_mean(total, steps) for total in sums.outputs[k])
         return LeaderMetrics(
             _root_mean(sums.tracking[0, k], steps),
@@ -82,16 +83,17 @@ def _leaders(result: Result, exists: bool) -> tuple[LeaderMetrics, ...]:
 def _followers(result: Result, exists: bool) -> tuple[FollowerMetrics, ...]:
     sums, saturated = result.sums, result.saturated
     last = result.goal_distances([-1])[0] if exists and len(result.times) else None
+    counts = result.steps_present
     nothing = FollowerMetrics(0, None, None, None, None, 0.0)
     return tuple(
         nothing._replace(agent=agent, saturated=float(saturated[agent]))
         if last is None
         else FollowerMetrics(
             agent=agent,
-            rmse=_root_mean(sums.errors[0, agent], sums.steps[0]),
-            steady_rmse=_root_mean(sums.errors[1, agent], sums.steps[1]),
+            rmse=_root_mean(sums.errors[0, agent], counts[0, agent]),
+            steady_rmse=_root_mean(sums.errors[1, agent], counts[1, agent]),
             settling_time=_settling_time(result, agent, float(last[agent])),
-            effort=_root_mean(sums.effort[agent], sums.steps[0]),
+            effort=_root_mean(sums.effort[agent], counts[0, agent]),
             saturated=float(saturated[agent]),
         )
         for agent in result.graph.followers
@@ -105,13 +107,22 @@ def _settling_time(result: Result, agent: int, last: float) -> float | None:
     """
     if not last <= SETTLED:
         return None
-    return float((result.sums.unsettled[agent] + 1) * result.settings.dt)
+    first, settings = float(result.sums.unsettled[agent]) + 1.0, result.settings
+    if result.presence is not None:
+        there = settings.dt * np.arange(int(result.sums.steps[0]) + 1)
+        assert result.schedule is not None and result.schedule.present is not None
+        steps = np.flatnonzero(result.schedule.present[result.schedule.rows(there), agent])
+        # Of one that was lost the last error is that before.
+        if not len(steps) or first > steps[-1]:
+            return None
+        first = max(first, float(steps[0]))
+    return first * settings.dt
 
 
 def _edges(result: Result, exists: bool) -> tuple[EdgeMetrics, ...]:
-    steps = result.sums.steps[0] if exists else 0.0
+    steps = result.steps_with(result.graph.edges)[0] * exists
     pairs = ((int(i), int(j)) for i, j in result.graph.edges)
     return tuple(
-        EdgeMetrics(pair, _root_mean(total, steps))
-        for pair, total in zip(pairs, result.sums.spacing, strict=True)
+        EdgeMetrics(pair, _root_mean(total, count))
+        for pair, total, count in zip(pairs, result.sums.spacing, steps, strict=True)
     )

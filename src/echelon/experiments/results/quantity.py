@@ -8,6 +8,11 @@ ERROR = "error"
 """In place of a unit: that of the formation errors."""
 
 
+def settling_bound(unit: str) -> str:
+    """Return the error below which a follower has settled, for errors in m or without a unit."""
+    return "1 cm" if unit else "0.01"
+
+
 @final
 class Shown(enum.Flag):
     """Where a number of a run appears, besides the glossary."""

@@ -17,10 +17,10 @@ from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
 from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
-from echelon.core.words import Verdict
-from echelon.experiments.results.avoidance import Avoidance
+from echelon.core.words import Verdict, amount
+from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
 from echelon.experiments.results.labelled import Labelled, read_labelled
-from echelon.simulation.engine.frame_numbers import FrameNumbers
+from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
 
 FORMAT, READ = 4, (3, 4)
 """Version of the format of `run.nc`, and those that are read; others are refused."""
@@ -84,12 +84,12 @@ class Recording(FrameNumbers):
         states: of all agents.
         inputs: as delivered by the actuators.
         reference: the leaders' reference state; None without one.
-        offsets: each agent's goal relative to its leader.
+        offsets: each agent's goal relative to its leader; the first one where it moves.
         leaders: their numbers.
         nearest: each agent's nearest leader.
         edges: with `weights`; of a graph that switches, all edges that exist at some time.
         heard: whether each end of an edge receives from the other.
-        schedule: the weights over time; None where they are constant.
+        schedule: the weights over time, and who is there; None where they are constant.
         state_names, state_units, input_names, input_units: as texts.
         position: indices of the coordinates that a picture shows; none of an abstract agent.
         bounds: of the inputs; None without limits.
@@ -100,11 +100,13 @@ class Recording(FrameNumbers):
         tracking: of the leaders; None without a reference.
         modes: None where the laws have no linearization.
         messages: over a network; None in the ideal one.
-        avoidance: how agents kept apart; None where they do not.
+        avoidance: how agents kept apart, without slices before they did; None where they do not.
         promise: as `Promise.as_mapping` returns it.
         horizon, dt: s.
         attributes: provenance and settings, as stored.
+        events: what happened, by time: `at` (s), `what`, `agents`, `until` (s) and `text`.
         radius: of an agent, m; None without a size.
+        moving: offsets over time; None of constant ones.
     """
 
     name: str
@@ -138,11 +140,14 @@ class Recording(FrameNumbers):
     horizon: float
     dt: float
     attributes: JsonObject
+    events: tuple[JsonObject, ...] = ()
     radius: float | None = None
+    moving: Float[np.ndarray, "T N n"] | None = None
 
     def __repr__(self) -> str:
         """Return the name and the sizes."""
-        return f"Recording({self.name!r}, {self.agents} agents, {len(self.times)} frames)"
+        frames = amount(len(self.times), "frame")
+        return f"Recording({self.name!r}, {self.agents} agents, {frames})"
 
     @property
     def agents(self) -> int:
@@ -155,6 +160,10 @@ class Recording(FrameNumbers):
         one = self.heard.sum(axis=1) == 1
         return np.where(self.heard[one, 1:], self.edges[one], self.edges[one, ::-1])
 
+    def offsets_in(self, frames: FrameChoice = slice(None)) -> Float[np.ndarray, "*F N n"]:
+        """Return the goal offsets in some frames, (F, N, n), or constant ones, (N, n)."""
+        return self.offsets if self.moving is None else self.moving[frames]
+
     def linked(self, time: float) -> Bool[np.ndarray, " E"]:
         """Return which edges exist at a time (s)."""
         if self.schedule is None:
@@ -166,6 +175,31 @@ class Recording(FrameNumbers):
         """The agents that do not lead."""
         leaders = {*self.leaders}
         return tuple(k for k in range(self.agents) if k not in leaders)
+
+    @property
+    def ellipsoid(self) -> Ellipsoid | None:
+        """The ellipsoid about each agent, a ball where they do not keep apart; None of a point."""
+        if self.avoidance is not None:
+            return self.avoidance.ellipsoid
+        return None if self.radius is None else Ellipsoid(self.radius, self.radius, 2 * self.radius)
+
+    @property
+    def scales(self) -> Float[np.ndarray, " d"]:
+        """The factors of the position's coordinates in distances between agents."""
+        names, sizes = [self.state_names[k] for k in self.position], self.ellipsoid
+        return np.ones(len(names)) if sizes is None else sizes.radius / sizes.radii(names)
+
+    def near(self, frames: Int[np.ndarray, " F"]) -> Avoidance | None:
+        """Return how near agents came: over all steps if they keep apart, else in frames.
+
+        None of a single agent, and of agents without a size.
+        """
+        if self.avoidance is not None and len(self.avoidance.times):
+            return self.avoidance
+        distance = self.least_distances(frames, self.scales) if self.agents > 1 else None
+        if distance is None or self.ellipsoid is None:
+            return None
+        return Avoidance(self.times[frames], distance, 0.0 * distance, self.ellipsoid)
 
     @property
     def rate(self) -> float | None:
@@ -197,8 +231,11 @@ class Recording(FrameNumbers):
 
     @property
     def loads(self) -> Float[np.ndarray, "T N k"] | None:
-        """Loads of the inputs; None where they have none."""
-        return None if self.bounds is None else self.bounds.loads(self.inputs)
+        """Loads of the inputs, NaN of absent agents; None where they have none."""
+        loads = None if self.bounds is None else self.bounds.loads(self.inputs)
+        if loads is None or self.presence is None:
+            return loads
+        return np.where(self.presence[:, :, None], loads, np.nan)
 
 
 def read_recording(file: Path) -> Recording:
@@ -245,6 +282,7 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         inputs=arrays["inputs"],
         reference=arrays.get("reference"),
         offsets=arrays["offset"],
+        moving=arrays.get("moving_offset"),
         leaders=tuple(int(k) for k in np.flatnonzero(arrays["is_leader"])),
         nearest=arrays["nearest_leader"].astype(int),
         edges=arrays["edge_agents"].astype(int),
@@ -266,6 +304,7 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         modes=_modes(arrays),
         messages=_messages(arrays),
         avoidance=_avoidance(arrays),
+        events=tuple(json.loads(attributes.get("events", "[]"))),
         promise=json.loads(attributes["promise"]),
         horizon=float(attributes["horizon"]),
         dt=float(attributes["dt"]),
@@ -295,8 +334,11 @@ def _schedule(values: Mapping[str, np.ndarray]) -> Schedule | None:
     if "stretch_start" not in values:
         return None
     period = float(values["graph_period"])
-    weights = values["edge_weight_then"]
-    return Schedule(values["stretch_start"], weights, period if np.isfinite(period) else None)
+    starts, weights = values["stretch_start"], values["edge_weight_then"]
+    present, nearest = values.get("present_then"), values.get("nearest_leader_then")
+    if present is None or nearest is None:
+        return Schedule(starts, weights, period if np.isfinite(period) else None)
+    return Schedule(starts, weights, None, present.astype(bool), nearest.astype(int))
 
 
 def _bounds(values: Mapping[str, np.ndarray]) -> InputBounds | None:
@@ -321,12 +363,15 @@ def _modes(values: Mapping[str, np.ndarray]) -> LoopPoles | None:
 
 
 def _avoidance(values: Mapping[str, np.ndarray]) -> Avoidance | None:
-    if "scaled_distance" not in values:
+    if "ellipsoid_radius" not in values:
         return None
-    limits = (float(values[name]) for name in ("touching_distance", "kept_distance"))
-    return Avoidance(
-        values["slice_start"], values["scaled_distance"], values["active_rows"], *limits
+    radius, height, limit = (
+        float(values[name]) for name in ("ellipsoid_radius", "ellipsoid_height", "kept_distance")
     )
+    times, distance, active = (
+        values.get(name, np.zeros(0)) for name in ("slice_start", "scaled_distance", "active_rows")
+    )
+    return Avoidance(times, distance, active, Ellipsoid(radius, height, limit))
 
 
 def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:

@@ -14,6 +14,7 @@ _GROUPS = {
     "graph": {"edge", "end"},
     "links": {"time", "edge", "end"},
     "schedule": {"stretch", "edge"},
+    "agents": {"stretch", "agent"},
     "gain": {"state", "state_column"},
     "input_weight": {"input", "input_column"},
     "limits": {"limit", "input"},

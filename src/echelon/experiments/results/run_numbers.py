@@ -154,7 +154,7 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         shown=Shown.SWEEP | Shown.DISTRIBUTION,
     ),
     "worst_settling_time": Quantity(
-        "time after which the errors of all followers stay below 1 cm",
+        "time after which the errors of all followers stay below 1 cm, or 0.01 without a position",
         "s",
         "settling time",
         of=lambda run: run.worst("settling_time"),

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, cast
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
-from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
@@ -18,6 +17,7 @@ from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.checks import ROLES, section
 from echelon.experiments.scenario.fault_list import FaultList
+from echelon.experiments.scenario.formation_parts import formation_of
 from echelon.experiments.scenario.law_sections import GainSpec, law_arguments
 from echelon.experiments.scenario.named_class import (
     NamedClass,
@@ -35,10 +35,13 @@ from echelon.experiments.scenario.world_parts import (
     actuator_of,
     check_world,
     disturbance_of,
+    events_of,
+    leadership_of,
     network_of,
     plants_of,
     sensing_of,
 )
+from echelon.experiments.scenario.yaml import quoted
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
 from echelon.laws.safety import Safety
@@ -114,7 +117,9 @@ def _parts(
     """Return all parts, from the model, the graph and the reference."""
     plant, plants = plants_of(scenario, faults, model)
     disturbance = disturbance_of(scenario, faults, model)
-    formation = faults.part(lambda: _formation(scenario, model, graph), "formation")
+    leadership = leadership_of(scenario, faults, graph)
+    events = events_of(scenario, faults, graph, leadership)
+    formation = faults.part(lambda: formation_of(scenario, faults, model, graph), "formation")
     follower = faults.part(lambda: _follower(scenario, faults, model, graph), "follower")
     reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
     leader = faults.part(
@@ -145,6 +150,8 @@ def _parts(
             sensing_of(scenario, faults, model),
             plants,
         ),
+        events=events,
+        leadership=leadership,
     )
     faults.settle()
     check_world(faults, parts, scenario.simulation.dt)
@@ -215,7 +222,7 @@ def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) ->
     named = getattr(part.cls, "named", None)
     if named is None:
         raise ModelError(
-            f"got the parameter set `{name}`, but `{part.name}` has none; give a mapping."
+            f"got the parameter set {quoted(name)}, but `{part.name}` has none; give a mapping."
         )
     check_names(part.cls, part.name, changes)
     with as_scenario_error(f"`{part.name}` refuses these parameters"):
@@ -263,14 +270,6 @@ def _read(part: NamedClass, file: Path, **offers: object) -> Any:
             f"{did_you_mean(surplus[0], accepted(read))}."
         )
     return read(file, **offered(read, offers), **part.arguments)
-
-
-def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Formation:
-    spec = scenario.formation
-    if spec.name is None:
-        return Formation.from_offsets(model, graph, spec.offsets or {})
-    make = getattr(Formation, spec.name)
-    return make(model, graph, **offered(make, {"spacing": spec.spacing, "columns": spec.columns}))
 
 
 def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, scenario: Scenario) -> Gain:

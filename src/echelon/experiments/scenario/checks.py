@@ -12,9 +12,11 @@ from pydantic import BaseModel
 
 from echelon.core.errors import did_you_mean, listing
 from echelon.core.limits import horizon_fault
+from echelon.core.words import amount
 from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.formation_sections import FormationSpec
 from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
-from echelon.experiments.scenario.sections import FormationSpec, GraphSpec
+from echelon.experiments.scenario.sections import GraphSpec
 from echelon.experiments.scenario.values import foreign_keys, marked_keys
 from echelon.experiments.scenario.yaml import Document, KeyPath, is_or_are, quoted
 
@@ -230,7 +232,8 @@ def _weights(data: Part) -> Iterator[Finding]:
     if isinstance(edges, list) and isinstance(weights, list):
         if len(edges) != len(weights):
             message = (
-                f"got {len(weights)} weights for {len(edges)} edges, allowed is one for each edge"
+                f"got {amount(len(weights), 'weight')} for {amount(len(edges), 'edge')}, allowed "
+                "is one for each edge"
             )
             yield ("graph", "weights"), f"{message}."
         for index, edge in enumerate(edges):
@@ -363,11 +366,23 @@ def _durations(data: Part) -> Iterator[Finding]:
         yield ("simulation", "horizon"), f"{got}."
 
 
+def _events(data: Part) -> Iterator[Finding]:
+    """Yield events that are not one thing, and times for which nothing lasts."""
+    events = data.get("events")
+    listed = enumerate(events if isinstance(events, list) else ())
+    for index, event in ((k, each) for k, each in listed if isinstance(each, dict)):
+        got = [f"`{key}`" for key in ("lose", "cut", "join") if event.get(key) is not None]
+        if len(got) != 1:
+            text = f"got {' and '.join(got) or 'nothing that happens'}"
+            yield ("events", index), f"{text}, allowed is one of `lose`, `cut` and `join`."
+        elif event.get("for") is not None and got != ["`cut`"]:
+            yield ("events", index, "for"), f"got a key that {got[0]} does not take."
+
+
 def cross_faults(document: Document) -> Iterator[Finding]:
     """Yield the path and the sentence of every fault that concerns more than one key.
 
-    Numbers that are not finite come first: where the schema rejects the same number, this sentence
-    is reported.
+    Numbers that are not finite come first: of the schema's sentence and this one it is reported.
     """
     data = document.data
     yield from _infinite(data, ())
@@ -382,3 +397,4 @@ def cross_faults(document: Document) -> Iterator[Finding]:
     yield from _following(data)
     yield from _changed(data)
     yield from _durations(data)
+    yield from _events(data)

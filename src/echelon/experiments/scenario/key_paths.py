@@ -21,6 +21,7 @@ _COMMON_NAMES = {
     "simulation.dt": "step timestep time_step",
     "initial": "start starts initial_states x0",
     "graph": "topology edges links",
+    "graph.agents": "agents",
     "formation": "shape spacing",
     "reference": "path trajectory waypoints",
     "follower.law": "controller control law",
@@ -40,16 +41,26 @@ def sections_in(annotation: object) -> Iterator[type[BaseModel]]:
 def key_paths(section: type[BaseModel], before: str = "") -> Iterator[tuple[str, str, str]]:
     """Yield the path of every key of a section, such as `network.delay`, its description and unit.
 
-    Changes of a live page are left out: no other command takes them.
+    Changes of a live page are left out: no other command takes them; so are the keys of the shape
+    of a reshape, which are those of `formation`.
     """
     for key, field in section.model_fields.items():
         inner = next(sections_in(field.annotation), None)
         text = field.description or (inner.__doc__ if inner is not None else "") or ""
         extra = field.json_schema_extra
         unit = str(extra.get("unit", "")) if isinstance(extra, dict) else ""
+        key = field.alias or key
         yield before + key, " ".join(text.split()), unit
-        if inner is not None and before + key != "live":
+        if inner is not None and before + key not in ("live", "formation.motion.reshape"):
             yield from key_paths(inner, f"{before}{key}.")
+
+
+def places_of(key: object, scenario: type[BaseModel]) -> list[str]:
+    """Return the paths of the keys that a name may mean, the likeliest first."""
+    paths = [path for path, _, _ in key_paths(scenario)]
+    common = [path for path, names in _COMMON_NAMES.items() if str(key) in names.split()]
+    same = [path for path in paths if key in (path, path.rpartition(".")[2])]
+    return list(dict.fromkeys([*common, *sorted(same, key=lambda path: path.count("."))]))
 
 
 def meant(key: object, allowed: list[str], scenario: type[BaseModel]) -> str:
@@ -60,11 +71,8 @@ def meant(key: object, allowed: list[str], scenario: type[BaseModel]) -> str:
         allowed: the keys that the section has.
         scenario: the class of the whole file.
     """
-    paths = [path for path, _, _ in key_paths(scenario)]
-    common = [path for path, names in _COMMON_NAMES.items() if str(key) in names.split()]
-    same = [path for path in paths if path.rpartition(".")[2] == key]
-    places = [*common, *sorted(same, key=lambda path: path.count("."))]
+    places = places_of(key, scenario)
     if not places:
         return did_you_mean(key, allowed)
-    first, *others = (f"`{path}`" for path in list(dict.fromkeys(places))[:3])
+    first, *others = (f"`{path}`" for path in places[:3])
     return f" (did you mean {' or '.join([', '.join([first, *others[:-1]]), *others[-1:]])}?)"

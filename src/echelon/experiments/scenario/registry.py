@@ -48,6 +48,10 @@ MODELS = _family(
     quadrotor=("Quadrotor", "quadrotor in space, 12 states, ZYX Euler angles, per-motor limits"),
     quadrotor_euler=("QuadrotorEuler", "quadrotor under computed torque, inputs are accelerations"),
     quadrotor_thrust=("QuadrotorThrust", "the same with its thrust as a 13th state: g is constant"),
+    crazyflie_attitude=(
+        "CrazyflieAttitude",
+        "Crazyflie under its own attitude controller, inputs are angles, yaw rate and thrust",
+    ),
     quadrotor_printed=(
         "PrintedQuadrotor",
         "literal: the paper's equations, without gravity or thrust rotation",
@@ -149,6 +153,15 @@ FORMATIONS = {
     "circle": "agents on a circle around the leader",
     "grid": "rows and columns",
 }
+
+MOTIONS = {
+    "rotate": "the shape turns",
+    "scale": "the shape grows and shrinks",
+    "reshape": "agents move to the places of another shape",
+    "python": "a class of yours",
+}
+ASSIGNMENTS = ("number", "nearest")
+"""Of agents to places."""
 
 INTEGRATORS = {
     "rk4": "classical Runge-Kutta of order 4, input held over the step",

@@ -13,8 +13,9 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
 
 from echelon.core.errors import ScenarioError, did_you_mean, listing
-from echelon.experiments.scenario import law_sections, sections
+from echelon.experiments.scenario import event_sections, law_sections, sections
 from echelon.experiments.scenario.checks import cross_faults, law_of, number_of, section
+from echelon.experiments.scenario.formation_sections import FormationSpec
 from echelon.experiments.scenario.key_paths import key_paths, meant, sections_in
 from echelon.experiments.scenario.override import settle_overrides
 from echelon.experiments.scenario.values import STRICT, FolderName, Seed
@@ -45,7 +46,7 @@ class Scenario(BaseModel, **STRICT):
     model: sections.ModelSpec
     plant: sections.PlantSpec | None = None
     graph: sections.GraphSpec
-    formation: sections.FormationSpec = Field(default_factory=sections.FormationSpec)
+    formation: FormationSpec = Field(default_factory=FormationSpec)
     reference: sections.ReferenceSpec | None = None
     leader: law_sections.LeaderSpec = Field(default_factory=law_sections.LeaderSpec)
     follower: law_sections.FollowerSpec = Field(default_factory=law_sections.FollowerSpec)
@@ -55,9 +56,13 @@ class Scenario(BaseModel, **STRICT):
     actuator: sections.ActuatorSpec | None = None
     sensing: sections.SensingSpec | None = None
     network: sections.NetworkSpec | None = None
+    events: Annotated[tuple[event_sections.EventSpec, ...], Field(strict=False)] = ()
+    """What happens during the run, as in `[{at: 8.0, lose: 3}, {at: 12.0, join: 3}]`: agents are
+    lost or join, and links are cut, as in `[{at: 8.0, cut: [1, 2], for: 3.0}]`."""
+    leadership: event_sections.LeadershipSpec | None = None
     simulation: sections.SimulationSpec
     report: sections.ReportSpec = Field(default_factory=sections.ReportSpec)
-    live: Annotated[tuple[sections.LiveSpec, ...], Field(strict=False)] = ()
+    live: Annotated[tuple[event_sections.LiveSpec, ...], Field(strict=False)] = ()
     """Changes made during `echelon live`, which repeats them; no other command can."""
     seed: Seed = 0
     """Seed of everything random in the run."""
@@ -131,12 +136,14 @@ def _keys(path: KeyPath) -> list[str]:
         # The place in a list of sections has the keys of any other.
         if isinstance(key, str):
             part = next(sections_in(part.model_fields[key].annotation))
-    return list(part.model_fields)
+    return [field.alias or key for key, field in part.model_fields.items()]
 
 
 def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
     """Return the path and the sentence of a fault of the schema."""
-    path, kind, context = error["loc"], error["type"], error.get("ctx", {})
+    # Of a value that may also be a section, the path has the name of the section's class.
+    path = tuple(key for key in error["loc"] if key != law_sections.ObserverSpec.__name__)
+    kind, context = error["type"], error.get("ctx", {})
     if path and path[-1] == "[key]":
         kind = "the number of an agent" if kind == "int_type" else "a name"
         return path[:-1], f"got the key {quoted(path[-2])}, allowed is {kind}."
@@ -150,8 +157,18 @@ def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
         )
     got = context.get("got", error["input"])
     allowed = _ALLOWED[kind].format(**context) if kind in _ALLOWED else error["msg"]
-    close = did_you_mean(got, context.get("names", "").split())
+    close = did_you_mean(got, context.get("names", "").split()) or _like_key(path)
     return path, f"got {quoted(got)}, allowed {allowed}{close}."
+
+
+def _like_key(path: KeyPath) -> str:
+    """Return what a key that its section does not name, but its class may take, may mean."""
+    try:
+        keys = _keys(path[:-1])
+        hint = "" if path[-1] in keys else did_you_mean(path[-1], keys)
+    except (StopIteration, LookupError):  # the value is within a key
+        return ""
+    return hint.replace("mean ", "mean the key ")
 
 
 def _with_defaults(data: Mapping[Any, Any]) -> dict[Any, Any]:

@@ -5,7 +5,7 @@ section, such as graphs, that take a key. The keys of laws and gains are in `law
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, final
+from typing import Annotated, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -27,17 +27,12 @@ from echelon.experiments.scenario.values import (
     Seed,
     TakenBy,
     Unit,
+    either,
 )
 
 
-def _either(*keys: str) -> ConfigDict:
-    """Return the configuration of a section that has exactly one of the keys."""
-    extra: Any = {"oneOf": [{"required": [key]} for key in keys]}
-    return STRICT | ConfigDict(json_schema_extra=extra)
-
-
 @final
-class ModelSpec(BaseModel, **_either("name", "python")):
+class ModelSpec(BaseModel, **either("name", "python")):
     """The model of all agents: the name of a bundled model, or a class in a file of yours."""
 
     name: Annotated[str, OneOf(registry.MODELS)] | None = None
@@ -87,7 +82,7 @@ class StretchSpec(BaseModel, **STRICT):
 
 
 @final
-class GraphSpec(BaseModel, **_either("edges", "name")):
+class GraphSpec(BaseModel, **either("edges", "name")):
     """The communication graph: a list of edges, or the name of a generated graph.
 
     Agents are numbered from 0.
@@ -135,21 +130,6 @@ class GraphSpec(BaseModel, **_either("edges", "name")):
 
 
 @final
-class FormationSpec(BaseModel, **STRICT):
-    """Each agent's goal relative to the leader's: offsets (default zero) or a named shape."""
-
-    offsets: Annotated[dict[int, Numbers] | None, Unit("the position's, mostly m")] = None
-    """Offset of each agent, as in `{1: [1, 0, 0]}`: a number for each coordinate of the position,
-    usually m, or for each state; default 0."""
-    name: Annotated[str, OneOf(registry.FORMATIONS)] | None = None
-    """Name of a shape."""
-    spacing: Annotated[Positive, Unit("m"), TakenBy(*registry.FORMATIONS)] = 1.0
-    """Distance between neighbours in the shape, m."""
-    columns: Annotated[Count | None, TakenBy("grid")] = None
-    """Columns of the shape `grid`."""
-
-
-@final
 class ReferenceSpec(BaseModel):
     """What the leader tracks: the name of a bundled reference, or a class in a file of yours.
 
@@ -157,7 +137,7 @@ class ReferenceSpec(BaseModel):
     coordinates x, y, z, also of planar models.
     """
 
-    model_config = _either("name", "python") | ConfigDict(extra="allow")
+    model_config = either("name", "python") | ConfigDict(extra="allow")
     # narrower than the base's: pydantic checks the further keys by this type
     __pydantic_extra__: dict[str, Numeric] = Field(init=False)  # pyright: ignore
 
@@ -345,53 +325,3 @@ class ReportSpec(BaseModel, **STRICT):
     steady_window: Annotated[Positive, Unit("s")] = Field(default_factory=lambda: 1.0)
     """Length of the last part of the run, which counts as steady, s; default, and where it would
     not be shorter than the run, a fifth of the horizon."""
-
-
-@final
-class LiveSpec(BaseModel, **STRICT):
-    """A change made during `echelon live`, which repeats it; `echelon run` rejects it."""
-
-    at: Annotated[NotNegative, Unit("s")]
-    """Time of the change, s."""
-    law: str | None = None
-    """The followers' law from then on; its memory starts anew."""
-    coupling: Annotated[Positive | None, Unit("1")] = None
-    """The coupling from then on."""
-    weight: Annotated[Positive | None, Unit("1")] = None
-    """Weight of the inputs in the Riccati equation of the gain, relative to the scenario's."""
-    feedforward: Annotated[Annotated[float, Field(ge=0.0, le=1.0)] | None, Unit("1")] = None
-    """Share of the feed-forward of `follower.feedforward` that followers receive: 1 all, 0
-    nothing."""
-    method: str | None = None
-    """The method of the followers' gain, with the coupling that it chooses; `scenario` for the
-    scenario's."""
-    shape: str | None = None
-    """Shape of the formation, by a name of `formation`; `scenario` for the scenario's."""
-    size: Annotated[Positive | None, Unit("1")] = None
-    """Size of the formation, relative to that of `formation`."""
-    turn: Annotated[float | None, Unit("deg")] = None
-    """Rotation of the formation about its first leader, degrees."""
-    wind: Annotated[float | None, Unit("the states', per s")] = None
-    """Wind on the first velocity, or on the first position, added to `disturbance`."""
-    delay: Annotated[NotNegative | None, Unit("s")] = None
-    """Delay of the messages of `network`, s."""
-    loss: Annotated[Share | None, Unit("1")] = None
-    """Share of these messages that is lost."""
-    outages: Annotated[Share | None, Unit("1")] = None
-    """Share of the time that each link of `network` is out."""
-    gusts: Annotated[NotNegative | None, Unit("1")] = None
-    """Size of the random wind, relative to that of `disturbance`."""
-    lag: Annotated[Positive | None, Unit("s")] = None
-    """Lag of the actuators, s, where `actuator` has one."""
-    noise: Annotated[NotNegative | None, Unit("1")] = None
-    """Size of the noise, relative to that of `sensing`."""
-    lose: int | None = None
-    """The number of an agent that falls silent: all its edges are removed."""
-    cut: Annotated[Annotated[tuple[int, int], Field(strict=False)] | None, Unit("agents")] = None
-    """The two agents of an edge that is removed."""
-    restore: Annotated[Annotated[tuple[int, int], Field(strict=False)] | None, Unit("agents")] = (
-        None
-    )
-    """The two agents of an edge that is restored."""
-    kick: Annotated[dict[int, Numbers] | None, Unit("the states'")] = None
-    """By agent: jump of its states, in the states' units."""

@@ -26,6 +26,12 @@ STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, use_attribute_docs
 """The configuration of every section."""
 
 
+def either(*keys: str) -> ConfigDict:
+    """Return the configuration of a section that has exactly one of the keys."""
+    extra: Any = {"oneOf": [{"required": [key]} for key in keys]}
+    return STRICT | ConfigDict(json_schema_extra=extra)
+
+
 @final
 class Allowed:
     """Marks a type with one phrase for what is allowed, whichever part of it fails.

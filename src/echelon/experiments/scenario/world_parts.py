@@ -1,18 +1,30 @@
-"""Builds the world of a scenario: plants, disturbances, actuators, sensors and network."""
+"""Builds the world of a scenario: plants, wind, actuators, sensors, network, and what happens."""
 
 from typing import Any
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Bursts, Network
+from echelon.agents.network.events import (
+    Cut,
+    Event,
+    Join,
+    Lose,
+    check_heirs,
+    event_faults,
+)
+from echelon.agents.network.graph import Graph
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.plant import check_plant, vary_parameters
 from echelon.agents.world.sensing import Sensing
+from echelon.core.errors import ScenarioError
+from echelon.experiments.scenario.event_sections import EventSpec
 from echelon.experiments.scenario.fault_list import FaultList
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.sections import PlantSpec, VariationSpec
 from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.leadership import Leadership
 
 
 def plants_of(
@@ -96,9 +108,46 @@ def network_of(scenario: Scenario, faults: FaultList) -> Network | None:
     return network
 
 
+def leadership_of(scenario: Scenario, faults: FaultList, graph: Graph) -> Leadership | None:
+    """Return who takes the lead after the leader; None for nobody."""
+    spec = scenario.leadership
+    if spec is None:
+        return None
+    with faults.at("leadership", "heirs"):
+        check_heirs(graph, spec.heirs)
+    faults.settle()
+    return Leadership(**spec.model_dump())
+
+
+def events_of(
+    scenario: Scenario, faults: FaultList, graph: Graph, leadership: Leadership | None
+) -> list[Event]:
+    """Return what happens during the run; a fault is noted at its event."""
+    events = [_event(spec) for spec in scenario.events]
+    heirs = () if leadership is None else leadership.heirs
+    for k, text in event_faults(graph, events, heirs, scenario.simulation.horizon):
+        with faults.at("events", k):
+            raise ScenarioError(f"{text}.")
+    faults.settle()
+    return events
+
+
+def _event(spec: EventSpec) -> Event:
+    if spec.cut is not None:
+        return Cut(spec.cut, spec.at, spec.duration)
+    if spec.join is not None:
+        return Join(spec.join, spec.at)
+    assert spec.lose is not None, "the schema holds that there is one of three"
+    return Lose(spec.lose, spec.at)
+
+
 def check_world(faults: FaultList, parts: Parts, dt: float) -> None:
     """Record what of a world does not suit the agents or their laws."""
     with faults.at("plant", "agents"):
         parts.world.check_agents(parts.model, parts.graph.agents)
+    with faults.at("leadership"):
+        parts.drive.check_heirs(parts.graph)
+        if parts.leadership is not None:
+            parts.leadership.check_network(parts.world.network)
     with faults.at("network"):
         parts.drive.check_world(parts.world, parts.graph, dt)

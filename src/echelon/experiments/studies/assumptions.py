@@ -13,7 +13,7 @@ from echelon.agents.network.hearing import who_hears_whom
 from echelon.agents.references.demand import ReferenceDemand, infeasible, reference_demand, too_fast
 from echelon.core.linear import eigenvalue_text
 from echelon.core.statement import Hypothesis, Statement, Topic, fails, holds, unneeded, vacuous
-from echelon.core.words import Kind, Verdict
+from echelon.core.words import Kind, Verdict, amount
 from echelon.experiments.studies.finite_condition import finite_condition
 from echelon.guarantees.promises.hypotheses import goal_drifts
 from echelon.guarantees.promises.promise import Promise
@@ -35,7 +35,7 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     low, high = graph.spectrum().low, graph.spectrum().high
     # The interface of models has no time, so every model meets it.
     yield holds(Topic.AUTONOMOUS, _PROOF, "f and g depend on x alone")
-    other, size = _other_graph(graph), f"{graph.agents} agents, {len(graph.edges)} edges"
+    other, size = _other_graph(graph), f"{graph.agents} agents, {amount(len(graph.edges), 'edge')}"
     remedy = "T7 and T8 of the theory page apply instead"
     if other:
         yield fails(Topic.GRAPH, _PROOF, other, len(graph.edges), size, remedy=remedy)
@@ -45,7 +45,7 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
         text = "connected and static" + ("" if unit else "; weights need not be 1")
         yield holds(Topic.GRAPH, _PROOF, text, len(graph.edges), size)
     followers, leaders = len(graph.followers), len(graph.leaders)
-    roles = f"{leaders} leader{'s' * (leaders > 1)}, {followers} follower{'s' * (followers > 1)}"
+    roles = f"{amount(leaders, 'leader')}, {amount(followers, 'follower')}"
     yield holds(Topic.PARENTS, _PROOF, who_hears_whom(graph), leaders, roles)
     extremes = f"lambda_min {low:.6g}, lambda_max {high:.6g}"
     yield holds(Topic.GROUNDED, _PROOF, "for the grounded Laplacian", low, extremes)
@@ -163,6 +163,8 @@ def _printed_line(parts: Parts, promise: Promise) -> Statement:
     drifts = goal_drifts(parts.model, parts.formation.offsets, parts.drive)[some]
     count, n = goals.shape
     values, vectors = np.linalg.eigh(promise.loop.closed.P)
+    # Of a P that rounding makes indefinite the eigenvalues are those that it may have.
+    values = np.maximum(values, np.finfo(float).eps * np.abs(values).max())
     X = np.kron(np.eye(count), vectors @ np.diag(values**-0.5) @ vectors.T)
     D, F = np.zeros((count * n, count)), np.zeros((count * n, count))
     for i in range(count):

@@ -17,10 +17,11 @@ __all__ = ["CheckResult", "check"]
 
 
 class CheckResult(NamedTuple):
-    """All lines, including the hypotheses of the promise, and the promise."""
+    """All lines, including the hypotheses of the promise; the promise; warnings of the parts."""
 
     lines: tuple[Statement, ...]
     promise: Promise
+    warnings: tuple[str, ...] = ()
 
     @property
     def promised(self) -> bool:
@@ -30,7 +31,8 @@ class CheckResult(NamedTuple):
     def as_mapping(self) -> JsonObject:
         """Return it ready for JSON."""
         lines = [line.as_mapping() for line in self.lines]
-        return {"promise": self.promise.as_mapping(), "lines": lines}
+        warnings = list(self.warnings)
+        return {"promise": self.promise.as_mapping(), "lines": lines, "warnings": warnings}
 
 
 def check(parts: Parts, settings: Settings) -> CheckResult:
@@ -39,7 +41,7 @@ def check(parts: Parts, settings: Settings) -> CheckResult:
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
-    parts = prepare(parts, settings).parts
+    parts, _, warnings = prepare(parts, settings)
     guarantee = promise(parts, settings)
     with precision("float64"):
         lines = (
@@ -49,4 +51,4 @@ def check(parts: Parts, settings: Settings) -> CheckResult:
             killing_line(parts, guarantee),
             *margin_lines(parts, guarantee),
         )
-    return CheckResult(lines, guarantee)
+    return CheckResult(lines, guarantee, warnings)

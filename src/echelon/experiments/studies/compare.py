@@ -189,7 +189,7 @@ def _row(
 def _with_starts(parts: Parts, settings: Settings) -> Parts:
     """Return the parts with random starts drawn once, the leader's error included."""
     with precision("float64"):
-        drive = parts.drive.prepare(parts.model, parts.graph)
+        drive = parts.drive.prepare(parts.model, parts.graph.before)
         states = initial_states(parts.replace(drive=drive), settings.seed)
     # The states contain the leader's error already.
     return parts.replace(initial=states, start_error={})
@@ -230,7 +230,7 @@ class _Watch:
 
 def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
     """Return the label of the scenario's drive; None if another row has the same drive."""
-    drive = parts.drive.prepare(parts.model, parts.graph)
+    drive = parts.drive.prepare(parts.model, parts.graph.before)
     others = (row.flight.result.drive for row in rows if row.flight is not None)
     # By value, gains included: the scenario may describe one of the methods.
     if any(eqx.tree_equal(drive, other) for other in others):

@@ -18,6 +18,7 @@ from echelon.agents.references import Lemniscate
 from echelon.core import disk_cache, numerics
 from echelon.core.errors import ModelError
 from echelon.core.provenance import versions
+from echelon.core.words import amount
 from echelon.experiments.results.metrics import metrics
 from echelon.experiments.scenario import registry
 from echelon.laws.consensus import Consensus
@@ -46,7 +47,7 @@ def facts() -> dict[str, str]:
         f"{device.platform}:{device.id} ({device.device_kind})" for device in jax.devices()
     )
     count = processors()
-    native = f"{vectors()}; {count} thread{'s' * (count != 1)}, as many as processors"
+    native = f"{vectors()}; {amount(count, 'thread')}, as many as processors"
     return {**versions(), "devices": devices, "native code": native}
 
 

@@ -10,7 +10,7 @@ from echelon.agents.models.linearization import trim_slopes
 from echelon.agents.models.model import ControlAffine
 from echelon.core.statement import Hypothesis, Statement, Topic, fails, holds, unneeded, vacuous
 from echelon.core.types import Array
-from echelon.core.words import Feedforward, Kind
+from echelon.core.words import Feedforward, Kind, amount
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.promise import AgreementModes, Promise
 from echelon.simulation.engine.parts import Parts
@@ -170,7 +170,7 @@ def _string_line(parts: Parts, loop: LinearLoop) -> Iterator[Statement]:
         return
     gain = margins.string_gain(loop.closed).gain
     depth = int(graph.depths().max())
-    number = gain**depth, f"{gain:.3g}, {gain**depth:.3g} over {depth} links"
+    number = gain**depth, f"{gain:.3g}, {gain**depth:.3g} over {amount(depth, 'link')}"
     # On a directed graph a branch is such a chain under any feed-forward.
     if parts.drive.feedforward is Feedforward.PARENT or graph.directed:
         text = (

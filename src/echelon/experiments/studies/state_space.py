@@ -114,6 +114,8 @@ def _check(parts: Parts) -> None:
         fault = f"the agents are driven by `{type(parts.drive).__name__}`, and not by laws"
     elif parts.graph.schedule is not None:
         fault = "the graph switches, and a linear system has one graph"
+    elif parts.formation.motion is not None:
+        fault = "the formation changes with time, and a linear system has one"
     elif size > _MOST:
         fault = f"the agents have {size} states, and at most {_MOST} are allowed"
     elif at_trim(parts.model).bends.any() or at_trim(parts.model).gap is not None:

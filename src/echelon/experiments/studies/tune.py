@@ -22,7 +22,8 @@ from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import Scenario, ScenarioLike, as_scenario
 from echelon.experiments.studies.design import with_gain
 from echelon.guarantees.promises.promise import Promise, promise
-from echelon.simulation.engine.gradient import Cost, Gradient, gradient
+from echelon.simulation.engine.differentiable_run import Cost, Gradient
+from echelon.simulation.engine.gradient import gradient
 from echelon.simulation.step.meter import Sums
 from echelon.synthesis.gains.gain import Gain, synthesize
 from echelon.synthesis.gains.riccati import Riccati

@@ -149,7 +149,7 @@ def succeeded(dataset: "xr.Dataset", error: float | None = None) -> "xr.DataArra
     Args:
         dataset: of a sweep.
         error: bound on every follower's final error; if None, all followers must have settled
-            (stay below 1 cm).
+            (stay below 1 cm, or 0.01 without a position).
     """
     reached = dataset["outcome"] == OUTCOMES[Outcome.COMPLETED]
     if error is None:

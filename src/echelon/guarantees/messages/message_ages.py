@@ -67,7 +67,9 @@ def ages_of(channel: Channel, dt: float, steps: int, links: int, hops: int) -> M
     starts, step = _outages(channel)
     # One for each number of messages that are lost in a row at the end.
     rest = np.eye(2) - step
-    again = float((starts[0] @ np.linalg.inv(rest)).sum()) if channel.loss < 1.0 else steps / every
+    # What is lost for good is as old as the run, as in an outage that does not end.
+    ends = channel.loss < 1.0 and step[1, 1] < 1.0
+    again = float((starts[0] @ np.linalg.inv(rest)).sum()) if ends else steps / every
     mean = dt * (delay + 0.5 * jitter + 0.5 * (every - 1) + every * again)
     return MessageAges(lost, arrived, int(channel.forget) + 1, hops, dt, mean)
 
@@ -106,7 +108,7 @@ def _outages(channel: Channel) -> tuple[Array, Array]:
         float(x) for x in (channel.loss, channel.share, channel.begins, channel.ends)
     )
     if not channel.bursty:
-        begins = share = 0.0
+        begins, share, ends = 0.0, 0.0, 1.0
     loss, stays = min(1.0, loss + _GRID * (loss > 0.0)), min(1.0, 1.0 - ends + _GRID)
     begins = min(1.0, begins + _GRID * (begins > 0.0))
     step = np.array([[1.0 - begins, begins], [1.0 - stays, stays]]) @ np.diag([loss, 1.0])

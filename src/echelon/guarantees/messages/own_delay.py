@@ -1,8 +1,7 @@
 """How late agents may know their own states, with motors that lag and inputs that are held (T9.5).
 
-One agent's step is linearized at the trim as it runs: law, memory, motors and integrator. With what
-it hears as an input h it is s+ = A s + B y + E z, z = d o - h, o = F y + G s, where y is its state
-some steps ago and o its deviation.
+One agent's step is linearized at the trim as it runs: law, memory, motors and integrator, of the
+model as the law knows it.
 """
 
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from echelon.core.compiled import cached_jit
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Estimation, Kind
+from echelon.guarantees.messages.delayed_step import EDGE, LateStep, all_decay
 from echelon.laws.law import LocalView
 from echelon.laws.stopping_point import StoppingPoint
 from echelon.simulation.step.action import act
@@ -30,69 +30,12 @@ from echelon.simulation.step.motion import Motion
 
 _MOST, _LARGEST = 1.0, 1000
 """Delays that are looked at, s, and matrices for them."""
-_MANY = 13
+_FEW = 13
 """Different factors of agents that hear each other, the leader's among them."""
+_EACH = 10
+"""Steps up to which every delay is looked at."""
 _STEADY = 3
 """Steps until a memory at rest repeats."""
-_EDGE = 1.0 - 1e-9
-"""Of a spectral radius: what rounding leaves of 1."""
-_DECAYED, _LONGEST = 1e-6, 50_000
-"""Of a response, beyond which it is not summed, and after how many steps nothing is known of it."""
-
-
-class LateStep(NamedTuple):
-    """A step of one agent at rest, linearized; y is its state some steps ago.
-
-    Attributes:
-        A, B, E: s+ = A s + B y + E z of s = (x, memory, motors).
-        G, F: its deviation o = G s + F y.
-        states: how many entries of s are x.
-    """
-
-    A: Array
-    B: Array
-    E: Array
-    G: Array
-    F: Array
-    states: int
-
-    def loop(self, own: complex, delay: int) -> Array:
-        """Return the matrix of a step with z = own * o, for a delay in steps."""
-        A, B = self.A + own * self.E @ self.G, self.B + own * self.E @ self.F
-        n, size = self.states, len(A)
-        whole = np.zeros((size + n * delay, size + n * delay), np.result_type(A, own))
-        whole[:size, :size] = A
-        if not delay:
-            whole[:size, :n] += B
-            return whole
-        whole[:size, size + n * (delay - 1) :] = B
-        whole[size : size + n, :n] = np.eye(n)
-        whole[size + n :, size:-n] = np.eye(n * (delay - 1))
-        return whole
-
-    def radius(self, own: complex, delay: int) -> float:
-        """Return the spectral radius of the same."""
-        return float(np.abs(np.linalg.eigvals(self.loop(own, delay))).max())
-
-    def passed_on(self, own: float, delay: int) -> float:
-        """Return the largest sum over time of |o|, over what is heard as an impulse of size own.
-
-        It is 1 where an agent follows what it hears without going beyond it.
-        """
-        whole = sp.csr_array(self.loop(own, delay))
-        n, size, m = self.states, len(self.A), self.E.shape[1]
-        x, total = np.zeros((size + n * delay, m)), np.zeros((m, m))
-        x[:size] = -own * self.E
-        first = 0.0
-        for _ in range(_LONGEST):
-            late = x[:n] if not delay else x[-n:]
-            o = np.abs(self.G @ x[:size] + self.F @ late)
-            largest = float(np.abs(x).max())
-            first = max(first, largest)
-            total, x = total + o, whole @ x
-            if largest < _DECAYED * first:
-                return float(total.sum(axis=1).max())
-        return np.inf
 
 
 class OwnCase(NamedTuple):
@@ -104,6 +47,7 @@ class OwnCase(NamedTuple):
         law: of the followers.
         own: (K,) factors on z of single loops, real or complex: sums of weights over a network,
             eigenvalues of the graph on the ideal one.
+        between: whether all real factors between the least and the largest count too.
         heard: grounded Laplacian of followers that hear each other over a network; else None.
     """
 
@@ -111,6 +55,7 @@ class OwnCase(NamedTuple):
     world: World
     law: StoppingPoint
     own: Array
+    between: bool
     heard: sp.csr_array | None
 
 
@@ -122,7 +67,7 @@ def own_delay_line(case: OwnCase) -> Statement | None:
     if not lag and not delay:
         return None
     name, kind = Hypothesis.OWN_STATE, Kind.LINEARIZATION
-    if case.heard is not None and len(case.own) > _MANY:
+    if case.heard is not None and len(case.own) > _FEW:
         text = "no margin is known of agents that hear each other with many sums of weights"
         return unneeded(name, kind, text)
     step = late_step(case.problem, case.law, lag)
@@ -130,17 +75,20 @@ def own_delay_line(case: OwnCase) -> Statement | None:
     estimated = world.sensing is not None and world.sensing.estimator is not Estimation.NONE
     text += f"lag {1e3 * lag:.3g} ms, " * bool(lag) + "without the estimator, " * estimated
     text += f"inputs held for {1e3 * dt:.3g} ms: "
+    if world.plant is not None or world.plants:
+        text += "for agents as in the model, unlike these plants, "
     if step is None:
         return unneeded(name, kind, f"{text}the model has no linearization at its trim")
     most = longest_delay(case, step)
     shown = "none" if most < 0 else f"{1e3 * most * dt:.3g} ms"
     number = max(most, 0) * dt, shown
-    if most >= delay:
+    if most >= delay and _decays(case, step, delay):
         text += f"the linearized loop decays with own states up to {shown} late"
+        text += ", at the delays that were tried" * (most > _EACH)
         return holds(name, kind, text, *number)
     decays = "does not decay" if case.heard is None else "is not known to decay"
     text += f"the linearized loop {decays}"
-    if most >= 0:
+    if 0 <= most < delay:
         text += f", but with own states {'that are current' if not most else f'up to {shown} late'}"
     remedy = "lower `coupling` or `roots`"
     remedy += "" if case.heard is None else ", or set `graph.directed: true`"
@@ -153,7 +101,7 @@ def longest_delay(case: OwnCase, step: LateStep) -> int:
     most = min(round(_MOST / case.problem.settings.dt), (_LARGEST - size) // step.states)
     while last < most:
         # Every one at first, and then every tenth part of it.
-        more = min(most, last + 1 + max(last, 0) // 10)
+        more = min(most, last + 1 + max(last, 0) // _EACH)
         if not _decays(case, step, more):
             return bisect_whole(lambda k: _decays(case, step, k), last, more)
         last = more
@@ -170,7 +118,12 @@ def bisect_whole(fits: Callable[[int], bool], low: int, high: int) -> int:
 
 def _decays(case: OwnCase, step: LateStep, delay: int) -> bool:
     """Tell whether every loop decays, and together those that hear each other."""
-    if not all(step.radius(own, delay) < _EDGE for own in case.own):
+    # The loops of a conjugate pair mirror each other.
+    own = np.unique(case.own[np.imag(case.own) >= 0.0])
+    if len(own) > _FEW or case.between:
+        if not all_decay(step, own, case.between, delay):
+            return False
+    elif not all(step.radius(each, delay) < EDGE for each in own):
         return False
     if case.heard is None:
         return True

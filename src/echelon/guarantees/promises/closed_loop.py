@@ -212,6 +212,8 @@ def _edge(gain: Gain, linear: Linearization, low: float) -> float | None:
     if claim.edge is None or not low > 0.0:
         return None
     rho = 2.0 * claim.edge * claim.lambda_min
+    if not np.isfinite(rho):
+        return None
     closed = linear.A - 0.5 * rho * linear.B @ gain.R_inverse @ linear.B.T @ gain.P
     return 0.5 * rho / low if falls(gain.P, closed[None], _SLACK) else None
 

@@ -103,11 +103,13 @@ class ModeMatrices(NamedTuple):
         each = matrix_exponential(span * (J - slowest[..., None, None] * np.eye(J.shape[-1])))
         product, logs = each[0], span * slowest.sum(axis=0)
         for flow in each[1:]:
-            sizes = np.linalg.norm(product, axis=(1, 2))
+            # A flow that is 0 stays 0, and so does its size.
+            sizes = np.maximum(np.linalg.norm(product, axis=(1, 2)), np.finfo(float).tiny)
             # Sizes apart, since a product of two hundred would be beyond all numbers.
             logs += np.log(sizes)
             product = flow @ (product / sizes[:, None, None])
         radii = np.abs(np.linalg.eigvals(product)).max(axis=1)
+        radii = np.maximum(radii, np.finfo(float).tiny)
         return float((logs + np.log(radii)).max() / (span * len(J)))
 
     def hardest(self) -> "ModeMatrices":

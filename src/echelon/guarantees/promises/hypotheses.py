@@ -19,6 +19,7 @@ from echelon.core.types import Array, States
 from echelon.core.words import Kind
 from echelon.guarantees.messages.network_lines import bias_line
 from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.event_lines import events_line
 from echelon.guarantees.promises.leaders import apart
 from echelon.guarantees.promises.modes import modes
 from echelon.laws.law import Law
@@ -45,6 +46,7 @@ def agent_lines(case: Case) -> Iterator[Statement]:
     yield _trim_within_limits(case)
     yield _exact(case)
     yield _agreement(case)
+    yield from events_line(case.parts)
 
 
 # ---- the agents and their leaders ---------------------------------------------------------------
@@ -161,6 +163,10 @@ def _symmetric(case: Case) -> Statement:
     """Offsets are tried near the trim, and proved on the domain that a region speaks of."""
     name, parts, domain = Hypothesis.SYMMETRY, case.parts, case.domain
     model, formation = parts.model, parts.formation
+    if formation.motion is not None:
+        text, remedy = "offsets change with time", "use the law `stopping-point`"
+        reason = f"{text}, and the theorems about this law are of constant ones"
+        return fails(name, Kind.PROOF, text, remedy=remedy, reason=reason)
     if not np.ptp(formation.offsets, axis=0).any():
         return unneeded(name, Kind.PROOF, "there are none")
     broken = formation.broken_symmetries(model)

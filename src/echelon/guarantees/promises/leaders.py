@@ -13,14 +13,13 @@ from echelon.agents.network.graph import Graph
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, States
 from echelon.guarantees.promises.closed_loop import all_alike
-from echelon.laws.law import Law
+from echelon.laws.law import Law, gain_of
 from echelon.laws.trim_input import TrimInput
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import simulate
 from echelon.simulation.step.meter import measured_states
 from echelon.simulation.step.settings import Settings
-from echelon.synthesis.gains.gain import Gain
 
 _SAME = 1e-12
 """Relative to the states; starts that differ by less were meant to agree, and offsets rounded."""
@@ -80,13 +79,14 @@ def leaders_of(parts: Parts, states: Array) -> Leaders:
 
 def _slowest(model: ControlAffine, law: object) -> float | None:
     """Return the slowest mode of a leader that follows something, or is left alone."""
-    (A, B), gain = linearize(model), getattr(law, "gain", None)
-    if isinstance(law, Law) and law.metric(model) is not None:
+    A, B = linearize(model)
+    if not isinstance(law, Law) or law.metric(model) is not None:
         return None
-    if isinstance(gain, Gain):
+    gain = gain_of(law)
+    if gain is not None:
         A = A - gain.coupling * B @ np.linalg.solve(gain.R, B.T @ gain.P)
     elif not isinstance(law, TrimInput):
-        return law.own_mode(model) if isinstance(law, Law) else None
+        return law.own_mode(model)
     return float(np.linalg.eigvals(A).real.max())
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from echelon.core.linear import sampled_radius
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded, vacuous
-from echelon.core.words import Kind, Theorem
+from echelon.core.words import Kind, Theorem, amount
 from echelon.guarantees.promises.case import Case
 from echelon.guarantees.promises.frozen_laws import longest_step
 from echelon.guarantees.promises.turning import turning
@@ -119,7 +119,7 @@ def _decaying(case: Case) -> Statement:
             text = f"`{type(drive.follower).__name__}` inherits `metric` of a law whose methods it "
             text, remedy = f"{text}replaces", "declare `metric` in its own class"
         return fails(name, _LINEAR, text, remedy=remedy, reason=text)
-    text = f"over {loop.certificate.modes} eigenvalues of the graph"
+    text = f"over {amount(loop.certificate.modes, 'eigenvalue')} of the graph"
     if case.fed_by_parents:
         text = "over the edges' weights, as parents' inputs are fed forward"
     elif len(loop.closed.eigenvalues) > loop.certificate.modes:
@@ -168,7 +168,9 @@ def _along(case: Case) -> Statement:
     growth, states = frozen.growth(), len(frozen.times)
     number = growth.rate, f"{growth.rate:.3g} 1/s"
     if not growth.lost:
-        text = f"small errors decay over {states} states of it, each frozen until the next"
+        text = (
+            f"small errors decay over {amount(states, 'state')} of it, each frozen until the next"
+        )
         return holds(name, Kind.SAMPLES, text, *number)
     grown = f"{np.exp(min(growth.most, 99.0)):.2g}-fold on a part of it"
     grown = f"at {growth.rate:.3g} 1/s" if growth.rate >= 0.0 else grown

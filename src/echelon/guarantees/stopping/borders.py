@@ -9,7 +9,7 @@ import numpy as np
 
 from echelon.agents.models.model import FlatBound
 from echelon.core.errors import GainError, listing
-from echelon.core.rational import root_bounds
+from echelon.core.rational import float_below, root_bounds
 from echelon.core.types import Array
 from echelon.guarantees.stopping.chain_clearance import (
     Clearance,
@@ -42,6 +42,7 @@ class Border(NamedTuple):
         turn: by what angle (deg) a velocity as large as the leader's may be off it at the start;
             infinite where the bound is of no velocity.
         data: what is claimed, and what it was computed of; ready for JSON.
+        beside: whether offsets that change with time move agents in the bounded derivative.
     """
 
     bound: FlatBound
@@ -52,6 +53,7 @@ class Border(NamedTuple):
     led: bool
     turn: float
     data: dict[str, object]
+    beside: bool = False
 
     @property
     def many(self) -> bool:
@@ -85,13 +87,16 @@ def border_of(run: StoppingRun, bound: FlatBound) -> Border:
     places = [chains.outputs.index(name) for name in bound.outputs]
     chain = run.chain(places[0])
     least = least_on_path(run.leader, run.parts.model, run.settings.horizon, places, order + 1)
+    beside = run.offset_size(order + 1, *places)
+    # What followers stay near to is the path with their offsets.
+    least = float_below(Fraction(least) - beside) if beside else least
     allowed = Fraction(least) - Fraction(bound.above) - _ROUNDED
     fastest = float(allowed / chain.gain(order)) / math.sqrt(len(places))
     speeds = [run.own_speed(k) for k in places]
     own, s = _together(speeds), _together(map(run.speed, places))
     led = max(speeds) < _LEVEL and _is_on_path(run, places)
     none = Fraction(-1), 0.0
-    border = Border(bound, *none, least, fastest, led, math.inf, {})
+    border = Border(bound, *none, least, fastest, led, math.inf, {}, bool(beside))
     if own is None or s is None:
         return border
     case = _BorderCase(run, bound, places, chain, own, s, allowed)

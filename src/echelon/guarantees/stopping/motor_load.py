@@ -135,6 +135,8 @@ class _MotorCase(NamedTuple):
         leader = _largest([_start(flat) for flat in off])
         leader = leader._replace(speeds=_speeds([run.own_speed(k) for k in range(4)]))
         demands = _path_demands(run.leader, run.parts.model, run.settings.horizon, chain)
+        if run.shifted is not None:
+            demands = tuple(_beside(run, demand) for demand in demands)
         base = _pushed(chain, demands, leader, speeds)
         away = (run.flat - run.flat[list(graph.nearest_leader())])[list(graph.followers)]
         starts = [_start(flat) for flat in np.unique(away, axis=0)]
@@ -173,7 +175,8 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
         float_above(motors.largest),
         float(most),
         float_above(motors.tilt),
-        _alone(frame, case.chain, case.base, ahead),
+        # Of an agent that starts as its leader but for one thing, offsets that change are another.
+        None if run.shifted is not None else _alone(frame, case.chain, case.base, ahead),
         _data(case, run.law.roots_for(3), starts, ahead),
     )
     text = "the motors suffice from these starts at all times"
@@ -218,6 +221,15 @@ def _path_demands(
     pieces = pieces_of(leader, model, horizon, _OUTPUTS, max(_DEGREES))
     spans = ((piece.begin, piece.end) for piece in slices_of(chain))
     return tuple(_demand(pieces, *span) for span in spans)
+
+
+def _beside(run: StoppingRun, demand: MotorDemand) -> MotorDemand:
+    """Return the demand of a path with offsets that change with time."""
+    aside, up = ([run.offset_size(k, *axes) for k in (2, 3, 4)] for axes in ((0, 1), (2,)))
+    x, y, z = (a + b for a, b in zip(demand.sideways, aside, strict=True))
+    upward = demand.upward[0] + up[1], demand.upward[1] + up[2]
+    low, high = demand.low - up[0], demand.high + up[0]
+    return demand._replace(sideways=(x, y, z), low=low, high=high, upward=upward)
 
 
 def _demand(pieces: Pieces, begin: Fraction, end: Fraction | None) -> MotorDemand:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
+from echelon.guarantees.stopping.flat_states import flat_states_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 from echelon.guarantees.stopping.tube import Tube
 from echelon.laws.safety import AXES, Safety
@@ -33,6 +34,7 @@ class Separation(NamedTuple):
         step: for which inputs are held, s.
         ideal: whether the run is one that the theorem covers.
         tube: of the agents' other states.
+        kind: of the argument: that of the tube, or weaker.
     """
 
     safety: Safety
@@ -45,11 +47,7 @@ class Separation(NamedTuple):
     step: float
     ideal: bool
     tube: Tube
-
-    @property
-    def kind(self) -> Kind:
-        """Of the argument, which rests on the tube's flat coordinates."""
-        return self.tube.kind
+    kind: Kind
 
     @property
     def theorem(self) -> Theorem:
@@ -69,14 +67,17 @@ class Separation(NamedTuple):
 
     def sentence(self) -> str:
         """Return what is guaranteed."""
-        radii = " x ".join(f"{self.safety.radii[AXES.index(x)]:.4g}" for x in self.axes)  # pyright: ignore
+        radii = " x ".join(f"{self.safety.size[AXES.index(x)]:.4g}" for x in self.axes)
         text = f"{self.kind.value}: ellipsoids about the agents with radii of {radii} m never "
         text += f"overlap from these starts, for any number of agents and any graph, if {_EXACT} "
         text += "(T10), and each agent stays in its tube (T5). The inputs are held "
         text += f"for {self.step:.3g} s, which `safety.margin` has to allow for. "
-        text += "Convergence is not guaranteed while "
-        text += "agents hold each other back; without that, errors decay at "
-        text += f"{self.tube.rate:.3g} 1/s or faster eventually."
+        text += "Convergence is not guaranteed "
+        if self.tube.offsets is not None:
+            text += "while offsets change, whose rates are within the `speed` too."
+        else:
+            text += "while agents hold each other back; without that, errors decay at "
+            text += f"{self.tube.rate:.3g} 1/s or faster eventually."
         if not self.ideal:
             text = f"In this world distances are observed, not proved. In the ideal one: {text}"
         motors = self.tube.motor_load
@@ -86,7 +87,7 @@ class Separation(NamedTuple):
         """Return it ready for JSON."""
         numbers = {name: getattr(self.safety, name) for name in ("gain", "margin", "reach")}
         return {
-            "radii": list(self.safety.radii or ()),
+            "radii": list(self.safety.size),
             **numbers,
             "distance": self.safety.distance,
             "least": self.least,
@@ -110,4 +111,8 @@ def separation_of(run: StoppingRun, tube: Tube | None, disturbed: bool) -> Separ
     i, j = sorted(np.unravel_index(apart.argmin(), apart.shape))
     speeds = np.array([run.law.speed_of(k) for k in run.law.places(model)])
     rows = (int(i), int(j)), hulls[i] - hulls[j], scales, speeds, tuple(model.position)
-    return Separation(safety, float(apart[i, j]), *rows, run.settings.dt, not disturbed, tube)
+    # That outputs are the position follows from the equations, or the law has seen it at samples.
+    exact = {*model.position} <= {*flat_states_of(model, run.law.ready.chains).outputs}
+    kind = min(tube.kind, tube.kind if exact else Kind.SAMPLES, key=lambda kind: kind.strength)
+    step, ideal = run.settings.dt, not disturbed
+    return Separation(safety, float(apart[i, j]), *rows, step, ideal, tube, kind)

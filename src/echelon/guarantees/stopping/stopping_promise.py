@@ -30,8 +30,8 @@ from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.settings import Settings
 
-_MODES = 12
-"""Of a large graph, which stand for all."""
+_BETWEEN = 128
+"""Factors from the least to the largest eigenvalue of a graph whose others are not computed."""
 
 
 @final
@@ -151,15 +151,16 @@ def _own_line(run: StoppingRun, problem: Problem) -> Statement | None:
     if parts.graph.schedule is not None or network is None and parts.world.network is not None:
         # What is known of the ideal network is not true of one that no theorem covers.
         return None
-    heard = None
+    heard, between = None, False
     if network is None:
         own = agreement_modes(parts.graph, law)
+        between = not law.leaderward and len(own) < parts.graph.spectrum().total
+        own = np.geomspace(own[0], own[-1], _BETWEEN) if between else own
     else:
         own = network.sums
         [L] = parts.graph.stretches(law.leaderward)
         heard = L if network.ways is None else None
-    if heard is None and len(own) > _MODES:
-        own = np.sort(own)[np.linspace(0, len(own) - 1, _MODES).round().astype(int)]
     # A leader answers to its path as a follower with this factor would.
     led = float(run.leader.strength(run.settings.dt)) / run.coupling
-    return own_delay_line(OwnCase(problem, parts.world, law, np.append(own, led), heard))
+    case = OwnCase(problem, parts.world, law, np.append(own, led), between, heard)
+    return own_delay_line(case)

@@ -1,19 +1,17 @@
 """A run in flat coordinates, and the hypotheses of theorem T5 beside its tube."""
 
+import math
 from collections.abc import Iterator
 from fractions import Fraction
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from echelon.agents.models.chains import flat_output, flatten
-from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.network.graph import Graph
-from echelon.core.compiled import cached_jit
 from echelon.core.enclosure.interval import point
+from echelon.core.errors import GraphError
 from echelon.core.linear import sampled_radius
 from echelon.core.rational import float_above
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
@@ -26,7 +24,9 @@ from echelon.guarantees.messages.late_messages import (
     late_messages_of,
 )
 from echelon.guarantees.stopping.chain_response import Chain
+from echelon.guarantees.stopping.flat_starts import flat_starts
 from echelon.guarantees.stopping.flat_states import flat_states_of
+from echelon.guarantees.stopping.moving_offsets import size_beside
 from echelon.guarantees.stopping.path_bounds import pieces_of
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
@@ -37,6 +37,8 @@ from echelon.simulation.step.settings import Settings
 _PROOF = Kind.PROOF
 _BELOW = 1.0 - 1e-9
 """So little below a bound that nothing reaches; without chains a step at it has a radius of 1."""
+_LONGEST = 14.0
+"""Logarithm of c lambda times s; of a graph that lasts longer no exponential is computed."""
 _TOGETHER = 1e-9
 """In flat coordinates; leaders that start nearer to each other differ by rounding."""
 
@@ -48,9 +50,10 @@ class StoppingRun(NamedTuple):
         parts: prepared.
         settings: how it is computed.
         states: (N, n) at the start.
-        flat: (N, r, m) the same in flat coordinates, less the offsets.
+        flat: (N, r, m) the same in flat coordinates, less the offsets and their derivatives.
         ahead: (r, m) of what the leader follows.
         late: what is guaranteed over its network; None for the ideal one.
+        left_out: why nothing is known of how its graph switches in steps; empty elsewhere.
     """
 
     parts: Parts
@@ -59,6 +62,7 @@ class StoppingRun(NamedTuple):
     flat: Array
     ahead: Array
     late: LateMessages | Uncovered | None = None
+    left_out: str = ""
 
     @property
     def law(self) -> StoppingPoint:
@@ -93,7 +97,9 @@ class StoppingRun(NamedTuple):
     @property
     def still(self) -> bool:
         """Whether the leader is where it stays, from the start on."""
-        outputs = range(len(self.law.ready.chains.outputs))
+        outputs, motion = range(len(self.law.ready.chains.outputs)), self.parts.formation.motion
+        if motion is not None and motion.moves(self.parts.graph.leaders):
+            return False
         return self.leader.reference is None and max(map(self.own_speed, outputs)) < _TOGETHER
 
     @property
@@ -120,8 +126,12 @@ class StoppingRun(NamedTuple):
         flow = np.eye(len(self.parts.graph.followers))
         spans = np.diff(schedule.starts, append=schedule.period)
         for span, L in zip(spans, whole, strict=True):
+            heaviest = max(float(L.diagonal().max()), np.finfo(float).tiny)
+            if not math.log(c) + math.log(span) + math.log(heaviest) < _LONGEST:
+                return 0.0
             flow = scipy.linalg.expm(-c * span * L.toarray()) @ flow
-        return -float(np.log(np.abs(np.linalg.eigvals(flow)).max())) / schedule.period
+        left = max(float(np.abs(np.linalg.eigvals(flow)).max()), np.finfo(float).tiny)
+        return -math.log(left) / schedule.period
 
     def chain(self, output: int) -> Chain:
         """Return the chain of an output.
@@ -141,6 +151,21 @@ class StoppingRun(NamedTuple):
         if self.network is None:
             return s
         return max(s, self.path_speed(output) - self.own_speed(output))
+
+    @property
+    def shifted(self) -> FormationMotion | None:
+        """How offsets move agents beside what they agree on; None where they do not."""
+        # With `safety` the rate of an offset is within the speed, like any other.
+        return None if self.law.safety is not None else self.parts.formation.motion
+
+    def offset_size(self, order: int, *outputs: int) -> Fraction:
+        """Return a bound of a derivative of offsets, the norm of some outputs, beside the path.
+
+        Raises:
+            GainError: none is known.
+        """
+        names = [self.law.ready.chains.outputs[k] for k in outputs]
+        return size_beside(self.shifted, self.parts.model.position, names, order)
 
     def path_speed(self, output: int, until: float | None = None) -> float:
         """Return what |zeta_r'| of the leader's path does not pass until a time (s), or at all.
@@ -192,10 +217,11 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     drive = parts.drive
     assert isinstance(drive, Laws) and isinstance(drive.follower, StoppingPoint)
     assert isinstance(drive.leader, StoppingLeader)
-    offsets = jnp.asarray(parts.formation.offsets)
-    flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
+    flat = flat_starts(parts, drive.follower, states)
+    graph, left_out = _in_steps(parts.graph, settings.dt)
+    parts = parts if graph is parts.graph else parts.replace(graph=graph)
     run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
-    graph, leaderward = parts.graph, drive.follower.leaderward
+    run, leaderward = run._replace(left_out=left_out), drive.follower.leaderward
     speed = min(map(run.law.speed_of, range(len(run.law.ready.chains.outputs))))
     avoiding = run.law.safety is not None
     following = Following(graph, leaderward, run.coupling, speed, run.still, run.apart, avoiding)
@@ -203,18 +229,16 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     return run._replace(late=late_messages_of(parts.world.network, following, *times))
 
 
-@cached_jit
-def _flat(
-    model: ControlAffine, law: StoppingPoint, states: jax.Array, offsets: jax.Array
-) -> jax.Array:
-    chains = law.ready.chains
-
-    def one(x: jax.Array, offset: jax.Array) -> jax.Array:
-        values = flatten(model, chains, x, law.begin(model, x).chain).values
-        shift = flat_output(model, chains.outputs, offset)
-        return values.at[0].add(flat_output(model, chains.outputs, 0.0 * offset) - shift)
-
-    return jax.vmap(one)(states, offsets)
+def _in_steps(graph: Graph, dt: float) -> tuple[Graph, str]:
+    """Return a graph as it runs in steps (s), or the graph and why nothing is known of that."""
+    rounded = f"switches are rounded up to steps of {dt:g} s"
+    try:
+        stepped = graph.in_steps(dt)
+    except GraphError as error:
+        return graph, f"{rounded}, and then {str(error).rstrip('.')}"
+    if stepped is None:
+        return graph, f"{rounded}, which are no part of the `period` and its small multiples"
+    return stepped, ""
 
 
 # ---- what else it rests on -----------------------------------------------------------------------
@@ -222,11 +246,11 @@ def _flat(
 
 def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     """Yield the conditions of T5 beside the tube."""
-    n, c = len(run.parts.model.state_names), run.coupling
+    c = run.coupling
     yield _offsets_line(run)
     text = "in flat coordinates every agent is linear, with or without a trim"
     yield unneeded(Hypothesis.SMOOTH, _PROOF, text)
-    text = f"feedback turns all {n} states and the integrators before inputs into chains"
+    text = "feedback turns all states and the integrators before inputs into chains"
     yield unneeded(Hypothesis.DETECTABLE, _PROOF, text)
     text = run.law.information[1]
     if run.network is not None:
@@ -269,6 +293,10 @@ def _switching_line(run: StoppingRun) -> Statement:
     """Say along which edges the leader reaches everybody: checked when the graph was made."""
     schedule = run.parts.graph.schedule
     assert schedule is not None
+    if run.left_out:
+        remedy = "switch at multiples of `simulation.dt`"
+        name, reason = Hypothesis.SWITCHING, run.left_out
+        return fails(name, _PROOF, run.left_out, remedy=remedy, reason=reason)
     text = f"the leader reaches every agent along the edges from {schedule.starts[-1]:g} s on"
     if schedule.period is not None:
         text = (
@@ -281,13 +309,16 @@ def _switching_line(run: StoppingRun) -> Statement:
 def _offsets_line(run: StoppingRun) -> Statement:
     """Say whether all offsets are of flat outputs, and leave the errors of other states alone."""
     model = run.parts.model
+    motion = run.parts.formation.motion
     names = [model.state_names[k] for k in np.flatnonzero(np.ptp(run.parts.formation.offsets, 0))]
+    names += [] if motion is None else [model.state_names[k] for k in motion.axes]
     flat, measured = flat_states_of(model, run.law.ready.chains), model.position
     broken = next((name for name in names if name not in flat.outputs), None)
     moving = next((name for name in names if name not in flat.free), None)
     alone = {*measured} <= {*flat.outputs} and measured
     if broken is None and (moving is None or alone):
         text = "offsets of flat outputs are symmetries"
+        text += "" if motion is None else ", constant or not: zeta' has the rate of their own"
         return holds(Hypothesis.SYMMETRY, _PROOF, text)
     text, remedy = f"the offset of `{broken}` is not of a flat output", "offset flat outputs only"
     if broken is None:
@@ -323,9 +354,13 @@ def _step_line(run: StoppingRun) -> Statement:
 
 def _radius(run: StoppingRun) -> float:
     """Return the spectral radius of a step in flat coordinates, the highest derivatives held."""
-    strength = np.array([run.leader.strength(run.settings.dt)])
-    followed = _step_radius(run, run.law.ready, run.coupling * _strengths(run))
-    return max(followed, _step_radius(run, run.leader.ready, strength))
+    own = np.array([run.leader.strength(run.settings.dt)])
+    with np.errstate(over="ignore"):
+        strengths = run.coupling * _strengths(run)
+    if not np.isfinite(strengths).all():
+        return np.inf
+    followed = _step_radius(run, run.law.ready, strengths)
+    return max(followed, _step_radius(run, run.leader.ready, own))
 
 
 def _step_radius(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:

@@ -11,13 +11,15 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
-from echelon.core.words import Feedforward, Kind, Theorem
+from echelon.core.types import JsonObject
+from echelon.core.words import Feedforward, Kind, Theorem, amount
 from echelon.guarantees.messages.late_messages import LateMessages
 from echelon.guarantees.stopping.arrival import arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
 from echelon.guarantees.stopping.flat_states import flat_states_of
 from echelon.guarantees.stopping.motor_load import MotorLoad, motor_load_of
+from echelon.guarantees.stopping.moving_offsets import offsets_mapping
 from echelon.guarantees.stopping.path_smoothness import path_fault
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 
@@ -43,6 +45,7 @@ class Tube(NamedTuple):
         motor_load: None where motors have no limits, may not suffice, or were left out.
         graphs: which graphs are meant, and this one, in words.
         network: what T9 says; None for the ideal network.
+        offsets: how they change with time, and bounds of that; None of constant ones.
         kind: of the argument: the chains' responses and the path are enclosed in rationals; what
             somebody's class states of its flat coordinates or its motors was seen at samples.
     """
@@ -58,6 +61,7 @@ class Tube(NamedTuple):
     graphs: tuple[str, str] = _ANY
     network: LateMessages | None = None
     kind: Kind = _PROOF
+    offsets: JsonObject | None = None
 
     @property
     def theorem(self) -> Theorem:
@@ -67,7 +71,10 @@ class Tube(NamedTuple):
     def sentence(self) -> str:
         """Return what is promised, in one sentence."""
         text = f"{self.kind.value}: errors converge to zero from {self.who}, for any number of "
-        text += f"agents and {self.graphs[0]}, if the model is exact and {self._received()}. "
+        text += f"agents and {self.graphs[0]}, if the model is exact and {self._received()}"
+        # Held inputs leave a rest where offsets go on changing.
+        text += ". " if self.offsets is None else "; offsets may change as they do, and inputs of "
+        text += "" if self.offsets is None else "continuous time follow them exactly. "
         text += f"On {self.graphs[1]} they decay at {self.rate:.3g} 1/s or faster eventually"
         if self.network is not None:
             text += f"{self.network.faster()}. {self.network.sentence(self.arrival)}"
@@ -99,6 +106,7 @@ class Tube(NamedTuple):
             "borders": list(self.borders),
             "motors": None if self.motor_load is None else self.motor_load.as_mapping(),
             **({} if self.network is None else {"network": self.network.as_mapping()}),
+            **({} if self.offsets is None else {"offsets": self.offsets}),
         }
 
 
@@ -121,6 +129,7 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     except GainError as error:
         text = str(error).rstrip(".")
         remedy = "choose `roots` of a larger common unit" if "unit" in text else "use equal starts"
+        remedy = "use `rotate`, `scale` and `reshape`" if "motion" in text else remedy
         return _nothing(text, remedy)
     text = "T5: largest speed and derivatives of outputs per speed that agreement asks, for any "
     number = gains[-1], ", ".join(f"{gain:.4g}" for gain in gains)
@@ -133,6 +142,7 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     lines = [inner, *(_by(known.kind, model, line) for line in _set_lines(run, borders))]
     if any(line.fails for line in lines):
         return None, lines
+    motion = run.parts.formation.motion
     tube = Tube(
         run.rate,
         gains,
@@ -145,6 +155,7 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
         _graphs(run),
         run.network,
         known.kind,
+        motion and offsets_mapping(motion),
     )
     if brief:
         return tube, lines
@@ -170,7 +181,10 @@ def _graphs(run: StoppingRun) -> tuple[str, str]:
     schedule, law = run.parts.graph.schedule, run.law
     if law.feedforward is Feedforward.PARENT:
         # The speeds of the links add up in the tube.
-        return f"any tree in which none is more than {run.links} links from a leader", "this one"
+        return (
+            f"any tree in which none is more than {amount(run.links, 'link')} from a leader",
+            "this one",
+        )
     if schedule is None:
         return _ANY
     every = "eventually" if schedule.period is None else "in every period"
@@ -222,8 +236,8 @@ def _set_line(run: StoppingRun, border: Border) -> Statement:
     bound, steepest = border.bound, border.steepest
     number = steepest, f"{steepest:.3g} off"
     if border.fastest > 0.0 and steepest > 0.0:
-        text = f"any place, with {bound.within}, and {border.speeds} so far off the leader's, "
-        text = f"{text}which keeps to its path in {border.outputs}"
+        text = f"any place, with {bound.within}, and {border.speeds} so far off {_whose([border])}"
+        text = f"{text}, which keeps to its path in {border.outputs}"
         return holds(Hypothesis.SET, _PROOF, text, *number)
     if not border.fastest > 0.0:
         text = f"on the leader's path {border.what()} comes to {border.path:.3g}, and the chart "
@@ -254,7 +268,13 @@ def _who(run: StoppingRun, borders: Sequence[Border]) -> str:
         free = f"{free} of the followers, with {within}, their {speeds} as at these starts"
         return f"{free}, and the leader as at these starts"
     off = " and ".join(f"{b.speeds} within {b.steepest:.3g}{_angle(b)}" for b in borders)
-    return f"{free}, with {within}, and {off} of the leader's, which keeps to its path there"
+    return f"{free}, with {within}, and {off} of {_whose(borders)}, which keeps to its path there"
+
+
+def _whose(borders: Sequence[Border]) -> str:
+    """Return off whose speed starts are measured."""
+    beside = any(border.beside for border in borders)
+    return "that of the own offset and the leader's" if beside else "the leader's"
 
 
 def _angle(border: Border) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from echelon.core.types import Array
+from echelon.core.words import amount
 from echelon.guarantees.verifier import algebra, exact_minors
 from echelon.guarantees.verifier.findings import (
     DECIDED,
@@ -117,7 +118,7 @@ def _widest(P: Array, region: SavedRegion) -> float:
 def _check_rate(facts: Facts, region: SavedRegion) -> Iterator[Finding]:
     """Check the rate at every vertex: by exact minors for a proof, otherwise by eigenvalues."""
     result, slack, decided = slowest(facts, region, *_split_hull(facts, region.hull))
-    claim = f"rate at {len(region.hull)} vertices, 1/s"
+    claim = f"rate at {amount(len(region.hull), 'vertex', 'vertices')}, 1/s"
     if region.kind == "proof":
         yield decide(claim, result >= region.rate, region.rate, result, "eigenvalues")
         yield from _proof(facts, region)

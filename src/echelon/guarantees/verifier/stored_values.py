@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from echelon.core.types import Array
+from echelon.core.words import amount
 from echelon.guarantees.verifier.findings import Finding
 
 SAME = 1e-6
@@ -81,9 +82,9 @@ def _shown(value: object) -> str:
     """Return a value for a table; of a text or a list only what it is."""
     array = _array(value)
     if array is not None:
-        return f"{' x '.join(map(str, array.shape))} numbers"
+        return f"{' x '.join(map(str, array.shape))} number{'s' * (array.size != 1)}"
     if isinstance(value, dict | list):
-        return f"{len(value)} values"
+        return amount(len(value), "value")
     if isinstance(value, str):
         return "text" if len(value) > 12 else ascii(value)[1:-1]
     return f"{value:.10g}" if isinstance(value, float) else str(value).lower()

@@ -14,6 +14,7 @@ import numpy as np
 from echelon.core.types import Array, JsonObject
 from echelon.guarantees.verifier.findings import Finding, compare, decide
 from echelon.guarantees.verifier.motor_claims import motor_findings
+from echelon.guarantees.verifier.offset_claims import offset_findings
 from echelon.guarantees.verifier.separation_claims import separation_findings
 
 FORMAT = "echelon tube 1"
@@ -42,6 +43,8 @@ def tube_findings(tube: JsonObject) -> Iterator[Finding]:
         yield from _check_margin(border, roots, name)
     if tube.get("motors") is not None:
         yield from motor_findings(tube["motors"])
+    if tube.get("offsets") is not None:
+        yield from offset_findings(tube["offsets"])
     if tube.get("separation") is not None:
         yield from separation_findings(tube["separation"])
 

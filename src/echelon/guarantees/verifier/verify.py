@@ -122,7 +122,7 @@ def judge(findings: Sequence[Finding], note: str = "") -> Verification:
     """Return the verdict on findings, with a note; of nothing at all it is `incomplete`."""
     claims = {name: [x.claim for x in findings if x.verdict == name] for name in VERDICTS}
     held = [f"{len(claims['holds'])} claims hold as stored"] if claims["holds"] else []
-    agree = ["all values agree with the scenario"] if claims["recomputed"] else []
+    agree = ["all values that follow from the scenario agree"] if claims["recomputed"] else []
     text = ", and ".join(held + agree) or "no claim was checked"
     false, open_ = claims["refused"], claims["not checked"]
     if false:

@@ -78,7 +78,8 @@ def export(run: "Result", path: "PathLike", force: bool = False) -> Path:
         force: whether to replace a file.
 
     Raises:
-        OutputError: there is no such format, the file exists, or it cannot be written.
+        OutputError: there is no such format, the run has no stored frame, the file exists, or it
+            cannot be written.
         MissingExtraError: pyarrow, of Parquet, or the page's three.js is not installed.
     """
     from echelon.output.archive.folder import claim_file, write_errors
@@ -96,11 +97,19 @@ def export(run: "Result", path: "PathLike", force: bool = False) -> Path:
 def content_of(kind: str, what: str = "`--to` is") -> "Callable[[Result], bytes]":
     """Return the writer of a format; `what` begins the message if there is none.
 
+    The writer refuses a run without a stored frame.
+
     Raises:
         OutputError: there is no such format.
     """
     check_name(what, kind, _WRITERS, OutputError)
-    return _WRITERS[kind]
+
+    def content(run: "Result") -> bytes:
+        if not len(run.times):
+            raise OutputError("the run has no stored frame; an export needs at least one.")
+        return _WRITERS[kind](run)
+
+    return content
 
 
 def _csv(run: "Result") -> bytes:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 from echelon import __version__
@@ -15,20 +16,25 @@ from echelon.simulation.engine.own_step import OwnLaw
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.onboard.c_text import c_text, header_text
 from echelon.simulation.onboard.law_functions import LawFunction, law_functions
+from echelon.simulation.onboard.llvm_text import object_file
 from echelon.simulation.onboard.python_text import python_text
 from echelon.simulation.scalars import Unsupported
+from echelon.simulation.step.knowledge import HOP_LIFE
 from echelon.simulation.step.settings import Settings
 
 _EXCLUDES = (
     "state estimation, message formats and time-outs, the vehicle's own control loops, and a "
     "supervisor that stops it",
-    "late or lost messages: the guarantee assumes that `z` is of the current step",
     "other steps than `dt`",
 )
+_CURRENT = "late or lost messages: the guarantee assumes that `z` is of the current step"
+_LATE = "other networks than `network`"
 
 
-def law_files(parts: Parts, settings: Settings, agent: int, formation: str) -> dict[str, str]:
-    """Return the files of one agent's law by name.
+def law_files(
+    parts: Parts, settings: Settings, agent: int, formation: str
+) -> dict[str, str | bytes]:
+    """Return the files of one agent's law by name; machine code where llvmlite is installed.
 
     Args:
         parts: of the whole formation.
@@ -40,54 +46,131 @@ def law_files(parts: Parts, settings: Settings, agent: int, formation: str) -> d
         OutputError: the law has no scalar operations; with the file and line of a user's code.
         EchelonError: there is no such agent, or the parts do not fit each other.
     """
+    own, double = _traced(parts, settings, agent)
+    single, functions = law_functions(own, 32), double.values()
+    about, constants = _head(settings, agent, formation)
+    files: dict[str, str | bytes] = {
+        "law.py": python_text(functions, about, constants),
+        "law.c": c_text(functions, single.values(), about),
+        "law.h": header_text(functions, about, constants | _sizes(double)),
+    }
+    image = object_file(single.values())
+    files |= {} if image is None else {"law.o": image}
+    guaranteed = promise(parts, settings).sentence()
+    return {**files, "law.json": _facts(own, double, constants, guaranteed, files)}
+
+
+def python_law(
+    parts: Parts, settings: Settings, agent: int, formation: str, guaranteed: str
+) -> dict[str, str | bytes]:
+    """Return law.py and law.json of one agent, as `law_files`, with the sentence of `promise`."""
+    own, functions = _traced(parts, settings, agent)
+    about, constants = _head(settings, agent, formation)
+    files: dict[str, str | bytes] = {"law.py": python_text(functions.values(), about, constants)}
+    return {**files, "law.json": _facts(own, functions, constants, guaranteed, files)}
+
+
+def _traced(parts: Parts, settings: Settings, agent: int) -> tuple[OwnLaw, dict[str, LawFunction]]:
     own = Agent(parts, agent, settings.dt, settings.limits).own_law
     try:
-        functions = law_functions(own)
+        return own, law_functions(own)
     except Unsupported as error:
         raise OutputError(
             f"the law of agent {agent} cannot be exported: there is no code for {error}."
         ) from None
+
+
+def _head(settings: Settings, agent: int, formation: str) -> tuple[str, dict[str, float | str]]:
+    """Return the comment at the head of each file, and the constants."""
     mark = hashlib.sha256(f"{__version__}\n{settings.dt!r}\n{formation}".encode()).hexdigest()
     about = f"The law of agent {agent}, by echelon {__version__}; see law.json."
-    constants = {"AGENT": agent, "DT": settings.dt, "FORMATION": mark}
-    sizes = {name.upper(): size for f in functions for name, size in f.inputs.items() if size}
-    sizes |= {name.upper(): len(part) for name, part in functions[-1].outputs.items()}
-    texts = {
-        "law.py": python_text(functions, about, constants),
-        "law.c": c_text(functions, about),
-        "law.h": header_text(functions, about, constants | sizes),
-    }
+    return about, {"AGENT": agent, "DT": settings.dt, "FORMATION": mark}
+
+
+def _facts(
+    own: OwnLaw,
+    functions: Mapping[str, LawFunction],
+    constants: Mapping[str, float | str],
+    guaranteed: str,
+    files: Mapping[str, str | bytes],
+) -> str:
+    """Return law.json."""
+    dt = float(constants["DT"])
     described = {
-        "agent": agent,
-        "formation": mark,
+        "agent": constants["AGENT"],
+        "formation": constants["FORMATION"],
         **_description(own, functions),
-        "dt": settings.dt,
-        "guaranteed": promise(parts, settings).sentence(),
-        "excluded": _EXCLUDES,
+        "dt": dt,
+        "network": network_facts(own, dt, functions),
+        "guaranteed": guaranteed,
+        "excluded": [*_EXCLUDES, _CURRENT if own.loop.channel is None else _LATE],
         "echelon": __version__,
-        "sha256": {k: hashlib.sha256(v.encode()).hexdigest() for k, v in texts.items()},
+        "sha256": {name: _digest(content) for name, content in files.items()},
     }
-    return {**texts, "law.json": json.dumps(described, indent=2) + "\n"}
+    return json.dumps(described, indent=2) + "\n"
 
 
-def _description(own: OwnLaw, functions: tuple[LawFunction, ...]) -> JsonObject:
+def _digest(content: str | bytes) -> str:
+    return hashlib.sha256(content.encode() if isinstance(content, str) else content).hexdigest()
+
+
+def _sizes(functions: Mapping[str, LawFunction]) -> dict[str, int]:
+    """Return how many numbers each array of the functions has."""
+    sizes = {name: size for f in functions.values() for name, size in f.inputs.items() if size}
+    sizes |= {name: len(x) for f in functions.values() for name, x in f.outputs.items()}
+    return {name.upper(): size for name, size in sizes.items()}
+
+
+def _description(own: OwnLaw, functions: Mapping[str, LawFunction]) -> JsonObject:
     """Return whom an agent hears, and the names and units of its numbers."""
     model = own.loop.model
     return {
         "leads": own.leads,
         "hears": list(own.neighbours),
         "weights": own.weights[0].tolist(),
+        "switching": _switching(own),
         "feed_forward_from": own.source,
         "states": dict(zip(model.state_names, model.state_units, strict=True)),
         "inputs": dict(zip(model.input_names, model.input_units, strict=True)),
+        "trim": dict(zip(model.input_names, model.trim[1], strict=True)),
         "signal": list(own.signal_names),
         "message": list(own.forward_names),
-        "memory": len(functions[0].outputs["memory"]),
-        "operations": {f.name: f.operations for f in functions},
+        "memory": len(functions["begin"].outputs["memory"]),
+        "operations": {name: f.operations for name, f in functions.items()},
     }
 
 
-def save_law(files: dict[str, str], folder: Path) -> None:
+def _switching(own: OwnLaw) -> JsonObject | None:
+    """Return when which weights hold, of a graph that switches; a period repeats."""
+    if own.schedule is None:
+        return None
+    starts, weights = own.schedule.starts.tolist(), own.weights.tolist()
+    return {"starts": starts, "weights": weights, "period": own.schedule.period}
+
+
+def network_facts(
+    own: OwnLaw, dt: float, functions: Mapping[str, LawFunction]
+) -> JsonObject | None:
+    """Return what an agent needs for messages that are late; None in the ideal network."""
+    channel, loop = own.loop.channel, own.loop
+    if channel is None:
+        return None
+    expected, forget = functions.get("expected"), float(channel.forget) * dt
+    size = len(own.forward_names) if expected is None else expected.inputs["content"]
+    return {
+        "period": int(channel.every) * dt,
+        "messages": str(channel.messages),
+        "prediction": str(channel.prediction),
+        "uses": str(channel.hears),
+        "forget": forget,
+        "forget_hops": HOP_LIFE * forget,
+        "agents": len(loop.order),
+        "leaders": loop.leaders.tolist(),
+        "content": size,
+    }
+
+
+def save_law(files: Mapping[str, str | bytes], folder: Path) -> None:
     """Write the files into a folder that is new or empty.
 
     Raises:

@@ -58,4 +58,4 @@ def label(run: Recording, k: int) -> str:
 
 def reference_of(run: Recording, leader: int) -> Array | None:
     """Return the desired states (T, n) of a leader; None without a reference."""
-    return None if run.reference is None else run.reference + run.offsets[leader]
+    return None if run.reference is None else run.reference + run.offsets_in()[..., leader, :]

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
 
 _FEW = 60
 """Agents that are drawn as vehicles; more are drawn as dots, all of a kind by one artist."""
+_SOLID = ("space", "plane")
+"""Kinds of pictures in which agents have a size."""
+_NEAR: Any = np.array([[0.0, 0.0, 0.0, 1.0], [0.85, 0.56, 0.0, 1.0], [0.78, 0.2, 0.17, 1.0]])
+"""Colours of ellipsoids: none of their own, below the limit, overlapping."""
 _LINK, _GOAL, _SHADOW = "#4f5b68", "#d99000", "#d3d9e0"
 
 
@@ -45,11 +49,13 @@ class MovingScene(abc.ABC):
         self.colours: Any = to_rgba_array(
             [pen_of(run, agent)["color"] for agent in range(run.agents)]
         )
-        self.size, self.offsets = body_width(run, space), scene_offsets(run, space)
+        self.size = body_width(run, space)
+        every = [run.offsets] if run.moving is None else run.moving
+        self.offsets = np.stack([scene_offsets(rows, space) for rows in every])
         thick = 1.1 if run.agents <= _FEW else 0.4
         self.links = _stroke(ax, color=_LINK, linewidth=thick, alpha=0.8)
         self.heads = _heads_on(ax) if run.agents <= _FEW and len(run.arrows) else None
-        self.clock = ax.text(14, ax.get_ylim()[1] - 26, "", size=13)
+        self.clock = ax.text(14, ax.get_ylim()[1] - 12, "", size=13, va="top")
         self.artists: list[Any] = []
         self.prepare()
         self.artists += [self.clock] if self.heads is None else [self.heads, self.clock]
@@ -64,15 +70,28 @@ class MovingScene(abc.ABC):
 
     def show(self, time: float, now: Array, trail: Array, angles: Array | None) -> None:
         """Move all artists to a time."""
-        self.clock.set_text(f"{time:.2f} s")
+        past = [event for event in self.run.events if event["at"] <= time]
+        last = "\n{at:.4g} s: {text}".format(**past[-1]) if past else ""
+        self.clock.set_text(f"{time:.2f} s{last}")
         links = self.run.linked(time)
         _set_lines(self.links, self.camera.project(now[self.run.edges[links]])[0])
         if self.heads is not None:
             self.heads.set_verts(self._heads(now, links))
-        goals = now[self.run.nearest] + self.offsets - self.offsets[self.run.nearest]
+        offsets, schedule = self._offsets(time), self.run.schedule
+        nearest = self.run.nearest
+        if schedule is not None and schedule.nearest is not None:
+            nearest = schedule.nearest[schedule.row(time)]
+        goals = np.where(np.isfinite(now), now[nearest] + offsets - offsets[nearest], np.nan)
         if self.space.kind == "time":
             goals[:, 0] = now[:, 0]
         self.draw(now, trail, goals, angles)
+
+    def _offsets(self, time: float) -> Array:
+        """Return the offsets (N, 3) at a time."""
+        if len(self.offsets) < 2:
+            return self.offsets[0]
+        after, share = frame_after(self.run.times, time)
+        return (1.0 - share) * self.offsets[after - 1] + share * self.offsets[after]
 
     def _heads(self, now: Array, links: Array) -> list[Array]:
         """Return the arrow heads of one-way links, at the edge of the receivers' bodies."""
@@ -106,10 +125,13 @@ class _Vehicles(MovingScene):
         self.rotors = PolyCollection([], linewidths=0.4, edgecolors="white")
         self.shadows = PolyCollection([], facecolors=_SHADOW, edgecolors="none")
         self.falls = LineCollection([], colors=_SHADOW, linewidths=0.8)
-        for part in (self.shadows, self.falls, self.trails, self.goals, self.arms, self.rotors):
+        self.shells = PolyCollection([], linewidths=0.8)
+        parts = self.shadows, self.falls, self.trails, self.goals, self.arms, self.rotors
+        for part in (*parts, self.shells):
             self.ax.add_collection(part)
         ground = [self.shadows, self.falls] if self.space.kind == "space" else []
         self.artists = [*ground, self.trails, self.links, self.goals, self.arms, self.rotors]
+        self.artists += [self.shells] if self.run.avoidance is not None else []
 
     def draw(self, now: Array, trail: Array, goals: Array, angles: Array | None) -> None:
         project = self.camera.project
@@ -117,6 +139,7 @@ class _Vehicles(MovingScene):
         rings = goals[list(self.run.followers)][:, None] + 0.55 * self.size * self.ring
         self.goals.set_verts(list(project(rings)[0]))
         self._shade(now)
+        self._surround(now)
         # Far vehicles first, so that near ones cover them.
         order = np.argsort(-project(now)[1], kind="stable")
         if self.space.shape != "quadrotor" or angles is None:
@@ -132,6 +155,23 @@ class _Vehicles(MovingScene):
         below = now * (1.0, 1.0, 0.0) + (0.0, 0.0, self.space.low[2])
         self.shadows.set_verts(list(project(below[:, None] + 0.35 * self.size * self.ring)[0]))
         self.falls.set_segments(list(project(np.stack([now, below], axis=1))[0]))
+
+    def _surround(self, now: Array) -> None:
+        """Draw the outlines of ellipsoids, coloured where another is too near."""
+        sizes, names = self.run.ellipsoid, self.space.names
+        if self.run.avoidance is None or sizes is None or self.space.kind not in _SOLID:
+            return
+        near: Any = sizes.too_near(now[:, : len(names)], names)
+        squares = np.resize(sizes.radii(names), 3) ** 2
+        # Where an ellipsoid with these semi-axes is touched by planes through a direction w.
+        w = self.ring[:, :1] * self.camera.axes[0] + self.ring[:, 1:2] * self.camera.axes[1]
+        outline = squares * w / np.sqrt((squares * w * w).sum(axis=1, keepdims=True))
+        self.shells.set_verts(list(self.camera.project(now[:, None] + outline)[0]))
+        edges = np.where(near[:, None] > 0.0, _NEAR[near.astype(int)], self.colours)
+        faces: Any = edges.copy()
+        faces[:, 3] = np.where(near > 0.0, 0.35, 0.1)
+        self.shells.set_edgecolor(edges)
+        self.shells.set_facecolor(faces)
 
     def _quadrotors(self, now: Array, angles: Array, order: Array) -> None:
         project, size, turns = self.camera.project, self.size, rotations(angles)
@@ -204,10 +244,17 @@ def _set_lines(stroke: Any, lines: Array) -> None:
     stroke.set_data(*np.concatenate([lines, gaps], axis=1).reshape(-1, 2).T)
 
 
-def scene_offsets(run: Recording, space: Space) -> Array:
-    """Return the offsets of agents in the scene, (N, 3)."""
-    offsets = np.zeros((run.agents, 3))
-    columns = run.offsets[:, list(space.axes)]
+def frame_after(times: Array, time: float) -> tuple[int, float]:
+    """Return the frame after a time (s), and the share of the way to it from the one before."""
+    after = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1))
+    first, last = times[after - 1 : after + 1]
+    return after, float(np.clip((time - first) / (last - first), 0.0, 1.0))
+
+
+def scene_offsets(rows: Array, space: Space) -> Array:
+    """Return offsets (N, n) as they are in the scene, (N, 3)."""
+    offsets = np.zeros((len(rows), 3))
+    columns = rows[:, list(space.axes)]
     first = 1 if space.kind == "time" else 0
     offsets[:, first : first + columns.shape[1]] = columns
     offsets[:, :2] *= space.stretch

@@ -7,6 +7,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.experiments.results.metrics import SETTLED, output_errors
+from echelon.experiments.results.quantity import settling_bound
 from echelon.experiments.studies.compare import Comparison
 from echelon.output.plots import style as draw
 from echelon.output.plots.canvas import canvas, frame
@@ -99,7 +100,8 @@ def _over_time(runs: _Runs, lines: dict[int, Array], text: str) -> "Figure":
         name = draw.say_zero(name, values)
         draw.plot(ax, run.times[keep], values[keep], label=name, **_pen(k))
         curves.append(values)
-    ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
+    mark = settling_bound(runs[0][2].length_unit)
+    ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label=mark, zorder=1)
     ax.set_ylabel(text)
     draw.logarithmic(ax, *curves, np.array([SETTLED]))
     return draw.finish(figure)

@@ -244,7 +244,8 @@ def distances(run: Recording) -> "Figure | None":
     links = slice(None, None, -(-len(run.edges) // _LINKS) or 1)
     i, j = run.edges[links].T
     with np.errstate(over="ignore", invalid="ignore"):
-        desired = np.linalg.norm(run.offsets[i][:, columns] - run.offsets[j][:, columns], axis=1)
+        offsets = run.offsets_in()[..., columns]
+        desired = np.linalg.norm(offsets[..., i, :] - offsets[..., j, :], axis=-1)
 
     def show_links(ax: "Axes", frames: Array) -> None:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -306,7 +307,7 @@ def ages(run: Recording) -> "Figure | None":
 def avoidance(run: Recording) -> "Figure | None":
     """Return how near agents came that keep apart, and how many held each other back, over time."""
     numbers = run.avoidance
-    if numbers is None:
+    if numbers is None or not len(numbers.times):
         return None
 
     def slices(frames: Array) -> tuple[Array, Array]:
@@ -315,11 +316,13 @@ def avoidance(run: Recording) -> "Figure | None":
 
     def show_near(ax: "Axes", frames: Array) -> None:
         within, times = slices(frames)
-        draw.plot(ax, times, numbers.distance[within], color=draw.LEADER, label="any two agents")
+        draw.plot(
+            ax, times, numbers.distance[within], color=draw.LEADER, label="smallest of any two"
+        )
         look = {"color": "0.5", "linewidth": 0.8, "zorder": 1}
-        ax.axhline(numbers.kept, label="kept by hulls", linestyle=":", **look)
-        ax.axhline(numbers.touching, label="touching", linestyle="-", **look)
-        ax.set_ylabel(draw.label("smallest scaled distance", "m"))
+        ax.axhline(numbers.ellipsoid.limit, label="kept by hulls", linestyle=":", **look)
+        ax.axhline(numbers.ellipsoid.touching, label="touching", linestyle="-", **look)
+        ax.set_ylabel(draw.label("scaled distance", "m"))
         ax.set_ylim(bottom=0.0)
 
     def show_held(ax: "Axes", frames: Array) -> None:

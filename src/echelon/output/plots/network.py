@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from echelon.agents.network.switching import Schedule
 from echelon.core.types import Array
 from echelon.experiments.results.recording import LoopPoles, Recording
 from echelon.output.plots import style as draw
@@ -148,7 +149,9 @@ def _near_leaders(run: Recording) -> Recording:
     )
     agents = np.sort(np.argsort(far, kind="stable")[:MOST])
     links = np.isin(run.edges, agents).all(axis=1)
-    schedule = run.schedule and run.schedule._replace(weights=run.schedule.weights[:, links])
+    schedule = run.schedule and Schedule(
+        run.schedule.starts, run.schedule.weights[:, links], run.schedule.period
+    )
     return dataclasses.replace(
         run,
         **{name: getattr(run, name)[:, agents] for name in ("states", "inputs")},

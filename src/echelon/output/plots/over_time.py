@@ -75,7 +75,20 @@ def over_time(
             ax.set_ylabel(ax.get_ylabel() if ax is row[0] else "")
     for part, ax in zip(parts, axes[-1], strict=True):
         _label_time(ax, run, part)
+    for row in axes:
+        for ax in row:
+            mark_events(ax, run, row is axes[0] and ax is row[-1])
     return figure, axes
+
+
+def mark_events(ax: "Axes", run: Recording, named: bool) -> None:
+    """Draw a line at the time of each event, with what happened."""
+    for event in run.events:
+        ax.axvline(event["at"], color="0.55", linewidth=0.8, linestyle=(0, (3.0, 2.0)), zorder=1)
+        if named:
+            where = {"transform": ax.get_xaxis_transform(), "rotation": 90, "va": "top"}
+            look = {"ha": "right", "size": 7, "color": "0.35", "clip_on": True}
+            ax.text(event["at"], 0.98, f"{event['text']} ", **where, **look)
 
 
 def _parts(run: Recording, narrow_start: bool) -> list[Int[np.ndarray, " F"]]:

@@ -97,13 +97,16 @@ def _angles(run: Recording, kind: str, names: tuple[str, ...]) -> tuple[tuple[in
 def clipped_places(run: Recording, axes: tuple[int, ...]) -> tuple[Array, bool]:
     """Return places (T, N, k) within ten times the extent of leaders and goals.
 
-    Places that are not finite are NaN. The second value is whether others were farther away.
+    Places that are not finite, and those of absent agents, are NaN. The second value is
+    whether others were farther away.
     """
     places, columns = run.states[:, :, list(axes)], list(axes)
     goals, leaders = run.goals([0])[0][:, columns], places[:, list(run.leaders)]
     points = np.concatenate([leaders.reshape(-1, len(axes)), goals, places[0]])
     low, high = _corners(points)
     reach, finite = max(1.0, float((high - low).max())), np.isfinite(places)
+    if run.presence is not None:
+        finite &= run.presence[:, :, None]
     clipped = np.clip(places, low - _FAR * reach, high + _FAR * reach)
     return np.where(finite, clipped, np.nan), bool(((clipped != places) & finite).any())
 
@@ -145,7 +148,9 @@ def _extent(run: Recording, axes: tuple[int, ...], places: Array) -> tuple[Array
         + [goals + shift for shift in _corners(motion)]
     )
     low, high = _corners(points)
-    margin = 0.15 * float((high - low).max()) or 1.0
+    # Agents that keep apart go around each other.
+    away = 0.15 if run.avoidance is None else 1.0
+    margin = away * float((high - low).max()) or 1.0
     least, most = _corners(places.reshape(-1, len(axes)))
     return (
         np.maximum(np.minimum(low, least), low - margin),

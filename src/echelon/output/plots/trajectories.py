@@ -22,8 +22,12 @@ _DENSE = 60  # edges; of a larger graph so many snapshots would hide each other
 _EDGES = 5000  # a graph with more edges would be a black patch
 
 
-def leader(run: Recording) -> "Figure":
-    """Return the leaders, each with its reference."""
+_STILL = 1e-6
+"""Part of its largest coordinate within which a leader is at rest."""
+
+
+def leader(run: Recording) -> "Figure | None":
+    """Return the leaders, each with its reference; None if all are at rest."""
     axes, leaders = _space(run), list(run.leaders)
     if not axes:
         return states_over_time(run, leaders)
@@ -32,6 +36,10 @@ def leader(run: Recording) -> "Figure":
     states = [reference_of(run, agent) for agent in leaders]
     references = [row[keep][:, axes] for row in states if row is not None]
     paths, cut = draw.drop_runaways(paths, paths[:, :1], *references)
+    lines = [*paths, *references]
+    moves = any(np.ptp(line, axis=0).max() > _STILL * np.abs(line).max() for line in lines)
+    if len(keep) > 1 and not moves:
+        return None
     figure, ax = _canvas(run, axes)
     for name, path in zip(["reference", *[None] * len(references)], references):
         draw.plot(ax, path, label=name, **agent_style.REFERENCE)

@@ -16,9 +16,9 @@ from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import pen_of
-from echelon.output.plots.animation import MovingScene, moving_of
+from echelon.output.plots.animation import MovingScene, frame_after, moving_of
 from echelon.output.plots.camera import Camera, camera_for
-from echelon.output.plots.over_time import above, error_rounding, shade_rounding
+from echelon.output.plots.over_time import above, error_rounding, mark_events, shade_rounding
 from echelon.output.plots.space import Space, clipped_places, space_of
 from echelon.simulation.engine.result import Result
 
@@ -190,9 +190,7 @@ class _Film:
     def between(self, time: float) -> tuple[Array, Array, Array | None]:
         """Return places (N, 3), what trails have passed (K, N, 3), and angles at a time."""
         run = self.run
-        after = int(np.clip(np.searchsorted(run.times, time), 1, len(run.times) - 1))
-        first, last = run.times[after - 1 : after + 1]
-        share = float(np.clip((time - first) / (last - first), 0.0, 1.0))
+        after, share = frame_after(run.times, time)
         now = self.places[after - 1] + share * (self.places[after] - self.places[after - 1])
         begin = (
             0 if self.space.kind == "time" else np.searchsorted(run.times, time - self.moving.trail)
@@ -244,12 +242,16 @@ def draw_floor(ax: "Axes", camera: Camera, space: Space) -> None:
 
 def _name_closest(ax: "Axes", run: Recording) -> None:
     """Write which agents came closest to each other, in a warning colour if they touched."""
-    closest = run.closest_pair()
+    closest, sizes = run.closest_pair(run.scales), run.ellipsoid
     if closest is not None:
-        text = "smallest distance {:.3g} m: {} and {} at {:.4g} s".format(
-            closest.distance, *closest.agents, closest.time
+        text = "smallest {}distance {:.3g} m: {} and {} at {:.4g} s".format(
+            "scaled " * (run.avoidance is not None),
+            closest.distance,
+            *closest.agents,
+            closest.time,
         )
-        colour = draw.COLOURS[1] if closest.touch(run.radius) else "0.45"
+        touch = closest.touch(None if sizes is None else sizes.radius)
+        colour = draw.COLOURS[1] if touch else "0.45"
         ax.text(14, 32, text, color=colour, size=9)
 
 
@@ -260,18 +262,20 @@ def _nice(value: float) -> float:
 
 
 def _curves(figure: Any, run: Recording, ends: Array) -> list[Any]:
-    """Draw the formation error and the inputs between two times, and return their cursors."""
-    left = (_SCENE + 62) / _WIDTH
-    errors = figure.add_axes((left, 0.58, 0.985 - left, 0.34), facecolor="none")
-    inputs = figure.add_axes((left, 0.1, 0.985 - left, 0.34), facecolor="none")
+    """Draw numbers of a run between two times, and return their cursors."""
     within = np.flatnonzero((run.times >= ends[0]) & (run.times <= ends[1]))
     keep = within[draw.thin(len(within))]
-    _draw_errors(errors, run, keep)
-    _draw_inputs(inputs, run, keep)
-    for ax in (errors, inputs):
-        ax.tick_params(labelsize=8)
-        ax.set_xlim(*ends)
-    return [ax.axvline(ends[0], color=draw.COLOURS[0], linewidth=1.4) for ax in (errors, inputs)]
+    shows = [_draw_errors, *[draw_near] * (run.avoidance is not None), _draw_inputs]
+    left, tall, axes = (_SCENE + 62) / _WIDTH, 0.96 / len(shows), list["Axes"]()
+    for place, show in enumerate(shows):
+        box = (left, 0.95 - tall * (place + 1) + 0.11, 0.985 - left, tall - 0.13)
+        axes.append(figure.add_axes(box, facecolor="none"))
+        show(axes[-1], run, keep)
+        axes[-1].tick_params(labelsize=8)
+        axes[-1].set_xlim(*ends)
+        mark_events(axes[-1], run, False)
+    axes[-1].set_xlabel("time (s)", size=9)
+    return [ax.axvline(ends[0], color=draw.COLOURS[0], linewidth=1.4) for ax in axes]
 
 
 def _draw_errors(ax: "Axes", run: Recording, keep: Array) -> None:
@@ -297,7 +301,26 @@ def _draw_inputs(ax: "Axes", run: Recording, keep: Array) -> None:
     loads, title = run.loads, "largest input"
     sizes = np.abs(run.inputs).max(axis=1)[keep]
     if loads is not None:
-        sizes, title = 100.0 * loads.max(axis=(1, 2))[keep], "largest input, % of limit"
+        sizes, title = 100.0 * np.nanmax(loads, axis=(1, 2))[keep], "largest input, % of limit"
     ax.plot(run.times[keep], sizes, color=draw.LEADER)
     ax.set_title(title, size=9, loc="left")
-    ax.set_xlabel("time (s)", size=9)
+
+
+def draw_near(ax: "Axes", run: Recording, keep: Array) -> None:
+    """Draw the smallest distance and its limits, and how many rows act, along the bottom."""
+    near = run.near(keep)
+    if near is None:
+        return
+    distance, active = (near.over(run.times[keep], each) for each in (near.distance, near.active))
+    ax.plot(run.times[keep], distance, color=draw.LEADER)
+    for value, name, side in (
+        (near.ellipsoid.limit, "kept", "bottom"),
+        (near.ellipsoid.touching, "touching", "top"),
+    ):
+        ax.axhline(value, color=draw.COLOURS[1], linewidth=0.9)
+        where = {"transform": ax.get_yaxis_transform(), "ha": "right", "va": side, "size": 7}
+        ax.text(1.0, value, name, color=draw.COLOURS[1], **where)
+    ax.set_ylim(0.0, 1.05 * max(np.nanmax(distance), near.ellipsoid.limit))
+    rows = active * 0.25 * ax.get_ylim()[1] / max(1.0, active.max())
+    ax.fill_between(run.times[keep], rows, step="post", color=draw.COLOURS[1], alpha=0.3)
+    ax.set_title("smallest scaled distance (m), active rows", size=9, loc="left")

@@ -112,9 +112,9 @@ def _falls(result: Result, steady: float) -> bool:
     """Return whether the first leader was still approaching its reference at the end."""
     assert result.reference is not None
     first = result.graph.leaders[0]
-    away = result.states[-1, first] - result.formation.offsets[first] - result.reference[-1]
+    away = result.states[-1, first] - result.offsets_in([-1])[..., first, :] - result.reference[-1]
     with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.linalg.norm(away[list(result.measured)])) < 0.5 * steady
+        return float(np.linalg.norm(away[..., list(result.measured)])) < 0.5 * steady
 
 
 def _chatter(result: Result) -> Iterator[Cause]:

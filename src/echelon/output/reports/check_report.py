@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import final
 
 from echelon.core.statement import Hypothesis, Statement, Topic
-from echelon.core.words import Verdict
+from echelon.core.words import Verdict, amount
 from echelon.experiments.studies.check import CheckResult
 
 WIDTH, HEIGHT = 80, 40
@@ -51,8 +51,14 @@ def check_report(check: CheckResult) -> str:
     return next((text for text in texts if text.count("\n") < HEIGHT), texts[-1])
 
 
+def check_sentences(check: CheckResult) -> list[str]:
+    """Return what is guaranteed, and the warnings."""
+    return [check.promise.sentence(), *(f"Warning: {text}" for text in check.warnings)]
+
+
 def _text(check: CheckResult, detail: _Detail) -> Iterator[str]:
-    yield from textwrap.wrap(check.promise.sentence(), WIDTH)
+    for sentence in check_sentences(check):
+        yield from textwrap.wrap(sentence, WIDTH)
     width = max(len(line.name) for line in check.lines)
     for title, lines in grouped(check.lines).items():
         yield from ("", f"{title}:")
@@ -80,7 +86,7 @@ def _listed(lines: list[Statement], detail: _Detail) -> Iterator[str]:
     verdict = lines[0].verdict
     numbers = verdict is Verdict.HOLDS and detail is _Detail.NUMBERS
     names = [f"{x.name} ({x.number_text})" if numbers and x.number_text else x.name for x in lines]
-    text = f"{len(lines)} lines" if detail is _Detail.COUNTS else "; ".join(names)
+    text = amount(len(lines), "line") if detail is _Detail.COUNTS else "; ".join(names)
     yield from _wrapped(f"{verdict}: {text}", " ", "   ")
 
 

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 from echelon.core.errors import Outcome
 from echelon.core.types import JsonObject
-from echelon.experiments.results.quantity import ERROR, Shown
+from echelon.core.words import amount
+from echelon.experiments.results.quantity import ERROR, Shown, settling_bound
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.guarantees.promises.promise import Promise
@@ -69,7 +70,10 @@ def _errors_table(comparison: Comparison, printed: bool) -> "Table":
         f", {text}" for text in comparison.conditions
     )
     columns = [f"{head}\n{whole}" for head in heads] + [f"{head}\n{last}" for head in heads]
-    table = _table(title, [*columns, AGENT_NUMBERS["settling_time"].column.format(settled="1 cm")])
+    within = AGENT_NUMBERS["settling_time"].column.format(
+        settled=settling_bound(_unit(comparison.rows))
+    )
+    table = _table(title, [*columns, within])
     for row in comparison.rows:
         table.add_row(row.label, *_errors(row, bool(followers)))
     if printed:
@@ -78,6 +82,12 @@ def _errors_table(comparison: Comparison, printed: bool) -> "Table":
             cells = [f"{value:.3g}" for value in values]
             table.add_row(f"printed, {method}", *cells, *[""] * (len(columns) - len(cells) + 1))
     return table
+
+
+def _unit(rows: Sequence[ComparisonRow]) -> str:
+    """Return the unit of the errors, which all methods share."""
+    units = (row.flight.result.length_unit for row in rows if row.flight is not None)
+    return next(units, "")
 
 
 def _followers(comparison: Comparison) -> Sequence[int]:
@@ -168,10 +178,10 @@ def _remarks(row: ComparisonRow) -> Iterator[str]:
 
 def _solver_times(figures: SolverStats) -> str:
     return (
-        f"{figures.solver} computed {figures.solves} plans with {figures.failures} failures, in "
-        f"{figures.median_ms:.3g} ms (median; 99th percentile {figures.p99_ms:.3g}, worst "
-        f"{figures.worst_ms:.3g}) each; iterations: median {figures.iterations_median:.3g}, worst "
-        f"{figures.iterations_worst}."
+        f"{figures.solver} computed {amount(figures.solves, 'plan')} with "
+        f"{amount(figures.failures, 'failure')}, in {figures.median_ms:.3g} ms (median; 99th "
+        f"percentile {figures.p99_ms:.3g}, worst {figures.worst_ms:.3g}) each; iterations: "
+        f"median {figures.iterations_median:.3g}, worst {figures.iterations_worst}."
     )
 
 
@@ -210,10 +220,12 @@ def _among_settled(some: bool, sentence: str) -> str:
 
 def _unsettled(runs: Sequence[ComparisonRow], settled: Sequence[ComparisonRow]) -> str:
     labels = [row.label for row in runs if row not in settled]
+    within = settling_bound(_unit(runs))
     if not labels:
-        return f"All {len(runs)} methods bring every follower within 1 cm."
+        who = f"All {len(runs)} methods bring" if len(runs) > 1 else f"{runs[0].label} brings"
+        return f"{who} every follower within {within}."
     verb = "does" if len(labels) == 1 else "do"
-    return f"{_listed(labels)} {verb} not bring every follower within 1 cm."
+    return f"{_listed(labels)} {verb} not bring every follower within {within}."
 
 
 def _closest(rows: Sequence[ComparisonRow]) -> str:
@@ -237,7 +249,7 @@ def _best(rows: Sequence[ComparisonRow], claim: str, name: str) -> str:
     if not ranking:
         return ""
     (least, label), *others = ranking
-    unit = RUN_NUMBERS[name].unit.replace(ERROR, "m")
+    unit = RUN_NUMBERS[name].unit.replace(ERROR, _unit(rows))
     text = f"{label} {claim} ({least:.3g} {unit}".rstrip()
     if others:
         text += f"; next {others[0][1]}, {others[0][0]:.3g}"
@@ -249,12 +261,13 @@ def _leader(rows: Sequence[ComparisonRow]) -> str:
     if not values:
         return ""
     least, most = min(values, key=values.__getitem__), max(values, key=values.__getitem__)
+    unit = f" {_unit(rows)}".rstrip()
     # Most methods share the leader's law, so that its runs differ by rounding only.
     if values[most] <= 1.001 * values[least]:
-        return f"The leader's error is the same under all methods, {values[least]:.3g} m."
+        return f"The leader's error is the same under all methods, {values[least]:.3g}{unit}."
     return (
-        f"The leader's error is smallest under {least}, {values[least]:.3g} m against "
-        f"{values[most]:.3g} m under {most}."
+        f"The leader's error is smallest under {least}, {values[least]:.3g}{unit} against "
+        f"{values[most]:.3g}{unit} under {most}."
     )
 
 

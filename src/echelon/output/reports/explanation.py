@@ -7,8 +7,10 @@ import numpy as np
 from echelon.agents.network.hearing import who_hears_whom
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
+from echelon.core.words import amount
 from echelon.experiments.results.agent_metrics import Metrics
 from echelon.experiments.results.avoidance import avoidance
+from echelon.experiments.results.event_outcomes import event_outcomes
 from echelon.experiments.results.lyapunov import Lyapunov, lyapunov
 from echelon.guarantees.promises.covering import coverage
 from echelon.guarantees.promises.promise import Promise, promise
@@ -22,6 +24,7 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
     return (
         *_outcome(result, numbers),
         *_closest(result, numbers),
+        *(outcome.sentence() for outcome in event_outcomes(result)),
         *(cause.sentence() for cause in causes(result, numbers, guarantee)),
         *_world(result),
         *_guarantee(result, guarantee),
@@ -41,18 +44,19 @@ def _outcome(result: Result, numbers: Metrics) -> Iterator[str]:
             f"{last:.4g}{unit} at {result.times[-1]:g} s."
         )
         return
-    times = [follower.settling_time for follower in numbers.followers]
+    here = np.ones(result.graph.agents, bool) if result.presence is None else result.presence[-1]
+    there = " that are there" * (not here.all())
+    times = [follower.settling_time for follower in numbers.followers if here[follower.agent]]
     settled = [time for time in times if time is not None]
-    if len(settled) == len(times):
-        yield (
-            f"All {len(times)} followers stay within 0.01{unit} of their goals "
-            f"from {max(settled):.3g} s on."
-        )
+    count, late = len(times), len(times) - len(settled)
+    if not late:
+        who = "The follower stays" if count == 1 else f"All {count} followers{there} stay"
+        goals = "its goal" if count == 1 else "their goals"
+        yield f"{who} within 0.01{unit} of {goals} from {max(settled):.3g} s on."
     else:
-        yield (
-            f"{len(times) - len(settled)} of {len(times)} followers have not settled to 0.01{unit} "
-            f"by {result.times[-1]:g} s."
-        )
+        who = "The follower" if count == 1 else f"{late} of {count} followers{there}"
+        verb = "has" if late == 1 else "have"
+        yield f"{who} {verb} not settled to 0.01{unit} by {result.times[-1]:g} s."
 
 
 def _closest(result: Result, numbers: Metrics) -> Iterator[str]:
@@ -133,7 +137,7 @@ def _lyapunov_trend(result: Result, guarantee: Promise) -> Iterator[str]:
             reason = "since `dt` is too long for an input that is held between steps"
         elif not disturbed:
             reason = f"as theory allows: {_exception(v, guarantee)}"
-        yield f"V increased in {increases} of {len(v.value) - 1} frames, {reason}."
+        yield f"V increased in {increases} of {amount(len(v.value) - 1, 'frame')}, {reason}."
     else:
         yield f"V never increased: {v.value[0]:.3g} at the start, {v.value[-1]:.3g} at the end."
 

@@ -12,7 +12,7 @@ from echelon.experiments.results.agent_metrics import (
     steady_error,
 )
 from echelon.experiments.results.metrics import metrics
-from echelon.experiments.results.quantity import quantities
+from echelon.experiments.results.quantity import quantities, settling_bound
 from echelon.output.reports.explanation import explain
 from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
 from echelon.simulation.engine.result import Result
@@ -61,7 +61,7 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
     texts = {
         "unit": result.length_unit and f", {result.length_unit}",
         "window": numbers.steady_window,
-        "settled": "1 cm" if result.length_unit else "0.01",
+        "settled": settling_bound(result.length_unit),
     }
     columns = ["agent", *(quantity.column.format(**texts) for quantity in _COLUMNS.values())]
     if printed:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from echelon.core.types import Array, JsonObject
-from echelon.experiments.results.run_numbers import RUN_NUMBERS
+from echelon.core.words import amount
+from echelon.experiments.results.quantity import settling_bound
 from echelon.experiments.sweeps.axes import SEED
 from echelon.experiments.sweeps.numbers import SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
@@ -41,14 +42,15 @@ def sweep_report(data: "xr.Dataset") -> str:
         f"{count} {name.replace('_', ' ')}" for name, count in summary["outcomes"].items()
     )
     done = summary["runs"] - summary["outcomes"].get("missing", 0)
-    lines = [f"- {summary['runs']} runs: {outcomes}."]
-    lines += [f"- Settled to 1 cm: {_share(summary['settled'], done)}."]
+    lines = [f"- {amount(summary['runs'], 'run')}: {outcomes}."]
+    within = settling_bound(data["worst_final_error"].attrs.get("units", ""))
+    lines += [f"- Settled to {within}: {_share(summary['settled'], done)}."]
     lines += [f"- With a guarantee: {summary['promised']} of {summary['runs']}."]
     for name, values in summary["quantiles"].items():
         if values is not None:
             low, median, high = (f"{value:.3g}" for value in values)
             label = name.replace("_", " ").capitalize()
-            unit = " s" if RUN_NUMBERS[name].unit == "s" else ""
+            unit = f" {data[name].attrs.get('units', '')}".rstrip()
             lines.append(f"- {label}: median {median}{unit}; 5 to 95 %: {low} to {high}{unit}.")
     return "\n".join([*lines, *_warnings(data), *_cases(data)])
 
@@ -56,7 +58,7 @@ def sweep_report(data: "xr.Dataset") -> str:
 def _warnings(data: "xr.Dataset") -> list[str]:
     """Return a line for each of the most common warnings."""
     counts = Counter(line for text in data["warnings"].values.flat for line in text.splitlines())
-    return [f"- Warning ({n} runs): {line}" for line, n in counts.most_common(_WARNINGS)]
+    return [f"- Warning ({amount(n, 'run')}): {line}" for line, n in counts.most_common(_WARNINGS)]
 
 
 def _cases(data: "xr.Dataset") -> list[str]:

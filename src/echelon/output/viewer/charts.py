@@ -1,4 +1,4 @@
-"""The charts of the page: formation error, V and inputs over time."""
+"""The charts of the page: formation error, V, distances of agents and inputs over time."""
 
 from typing import NamedTuple
 
@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.metrics import SETTLED
+from echelon.experiments.results.quantity import settling_bound
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
 from echelon.output.plots.style import FLOOR
@@ -40,7 +41,18 @@ class _Sheet:
         log: bool,
         floor: float = FLOOR,
     ) -> JsonObject:
-        curve = np.asarray(values, np.float64)[self.frames]
+        return self.thinned(name, values[self.frames], colour, log, floor)
+
+    def thinned(
+        self,
+        name: str | None,
+        values: Array,
+        colour: int | str,
+        log: bool = False,
+        floor: float = FLOOR,
+    ) -> JsonObject:
+        """Take the values in `frames`."""
+        curve = np.asarray(values, np.float64)
         if log:
             # A logarithm has no 0, and values below the floor are rounding errors.
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -53,7 +65,8 @@ class _Sheet:
 def charts_of(run: Recording) -> Charts:
     """Return the charts of a run."""
     sheet = _Sheet(run)
-    descriptions = [_errors(run, sheet), *_lyapunov(run, sheet), _inputs(run, sheet)]
+    descriptions = [_errors(run, sheet), *_lyapunov(run, sheet)]
+    descriptions += [*_distances(run, sheet), _inputs(run, sheet)]
     times = [float(f"{t:.6g}") for t in run.times[sheet.frames]]
     return Charts(descriptions, times, Group(np.stack(sheet.columns, axis=1), gaps=True))
 
@@ -68,30 +81,39 @@ def _frames(run: Recording) -> Array:
 
 def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
     errors, followers = run.formation_errors, list(run.followers)
+    here = np.ones_like(errors, bool) if run.presence is None else run.presence
+    none = {} if run.presence is None else {"none": "\u2013 absent"}
     if 0 < len(followers) <= NAMED:
         lines = [
-            sheet.line(str(agent), errors[:, agent], place, True)
+            sheet.line(str(agent), np.where(here, errors, np.nan)[:, agent], place, True) | none
             for place, agent in enumerate(followers)
         ]
     else:
-        rows = errors[:, followers] if followers else errors
-        lines = [
-            sheet.line("worst", rows.max(axis=1), 1, True),
-            sheet.line("median", np.median(rows, axis=1), 0, True),
-        ]
+        some = followers or slice(None)
+        rows = np.where(here, errors, np.nan)[:, some]
+        worst = np.where(here, errors, 0.0)[:, some].max(axis=1)
+        median, anybody = np.full(len(rows), np.nan), here[:, some].any(axis=1)
+        # A number that is not finite is shown as such, but of agents that are not there.
+        middle = np.median if run.presence is None else np.nanmedian
+        median[anybody] = middle(rows[anybody], axis=1)
+        lines = [sheet.line("worst", worst, 1, True), sheet.line("median", median, 0, True)]
     if run.reference is not None:
         away = _off_reference(run, run.reference)
         name = "leaders" if len(run.leaders) > 1 else "leader"
         lines.append(sheet.line(name, away, "leader", True))
     lines += _slope(run, errors[0].max(), 1.0)
-    marks = [{"value": SETTLED, "name": "1 cm" if run.length_unit else "0.01"}]
+    marks = [{"value": SETTLED, "name": settling_bound(run.length_unit)}]
     return _chart("formation error", run.length_unit, True, lines, marks)
 
 
 def _off_reference(run: Recording, reference: Float[Array, "T n"]) -> Float[Array, " T"]:
     """Return the largest distance of a leader from its place beside the reference."""
     leaders, measured = list(run.leaders), list(run.measured)
-    away = run.states[:, leaders] - run.offsets[leaders] - reference[:, None]
+    if run.presence is not None:
+        leads = (run.nearest_then == np.arange(run.agents)) & run.presence
+        away = (run.states - run.offsets_in() - reference[:, None])[:, :, measured]
+        return np.where(leads, np.linalg.norm(away, axis=2), 0.0).max(axis=1)
+    away = run.states[:, leaders] - run.offsets_in()[..., leaders, :] - reference[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
         return np.linalg.norm(away[:, :, measured], axis=2).max(axis=1)
 
@@ -118,14 +140,38 @@ def _lyapunov(run: Recording, sheet: _Sheet) -> list[JsonObject]:
     return [_chart("Lyapunov function V", "", True, lines, [])]
 
 
+def _distances(run: Recording, sheet: _Sheet) -> list[JsonObject]:
+    near = run.near(sheet.frames)
+    if near is None:
+        return []
+    times = run.times[sheet.frames]
+    lines = [sheet.thinned("any two", near.over(times, near.distance), "leader")]
+    if near is run.avoidance:
+        rows = near.over(times, near.active)
+        lines.append(sheet.thinned("active rows", rows, 1) | {"strip": True})
+    return [distance_chart(run, lines)]
+
+
+def distance_chart(run: Recording, lines: list[JsonObject]) -> JsonObject:
+    """Return the chart of the smallest distance between agents, with its limits."""
+    sizes, marks = run.ellipsoid, list[JsonObject]()
+    if sizes is not None:
+        marks = [{"value": sizes.touching, "name": "touching", "below": True}]
+    title = "smallest distance"
+    if sizes is not None and run.avoidance is not None:
+        title = "smallest scaled distance"
+        marks.append({"value": sizes.limit, "name": "kept"})
+    return _chart(title, run.length_unit, False, lines, marks) | {"zero": True}
+
+
 def _inputs(run: Recording, sheet: _Sheet) -> JsonObject:
     loads = run.loads
     if loads is not None:
         percent = 100.0 * loads.reshape(len(loads), -1)
         lines = [
-            sheet.line("largest", percent.max(axis=1), 1, False),
-            sheet.line("mean", percent.mean(axis=1), "leader", False),
-            sheet.line("smallest", percent.min(axis=1), 0, False),
+            sheet.line("largest", np.nanmax(percent, axis=1), 1, False),
+            sheet.line("mean", np.nanmean(percent, axis=1), "leader", False),
+            sheet.line("smallest", np.nanmin(percent, axis=1), 0, False),
         ]
         marks = [{"value": 100.0, "name": "limit", "below": True}, {"value": 0.0, "name": "limit"}]
         title = "motors" if loads.shape[2] in (2, 4) else "inputs"

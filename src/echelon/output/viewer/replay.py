@@ -48,6 +48,8 @@ def replay_data(run: Recording) -> bytes:
         angles = run.states[:, :, list(space.angles)]
         angles = space.sign * np.unwrap(np.where(np.isfinite(angles), angles, 0.0), axis=0)
         groups["angles"] = Group(_flat(angles[frames]))
+    if run.moving is not None:
+        groups["moving"] = Group(_flat(run.moving[frames][:, :, list(space.axes)]))
     if run.reference is not None:
         path = run.reference[frames][:, list(space.axes)]
         groups["reference"] = Group(path, gaps=True)
@@ -110,7 +112,8 @@ def _clock(run: Recording, frames: Array) -> dict[str, float]:
 
 def _closest(run: Recording) -> list[list[float]]:
     """Return each time at which two agents were closer than any before, how close, and who."""
-    return [[*map(_rounded, (pair.time, pair.distance)), *pair.agents] for pair in run.approaches()]
+    pairs = run.approaches(run.scales)
+    return [[*map(_rounded, (pair.time, pair.distance)), *pair.agents] for pair in pairs]
 
 
 def _rounded(value: float) -> float:
@@ -155,7 +158,8 @@ def header(run: Recording, space: Space) -> JsonObject:
         "edges": run.edges.tolist(),
         "heard": heard_by(run.heard),
         "schedule": _schedule(run),
-        "radius": run.radius,
+        "ellipsoid": ellipsoid_of(run, space),
+        "moments": [[event["at"], event["text"]] for event in run.events],
         "referenced": run.reference is not None,
         "offsets": [[float(f"{x:.7g}") for x in row] for row in run.offsets[:, list(space.axes)]],
         "space": {
@@ -173,6 +177,19 @@ def header(run: Recording, space: Space) -> JsonObject:
     }
 
 
+def ellipsoid_of(run: Recording, space: Space) -> JsonObject | None:
+    """Return the ellipsoid about each agent along the axes of a picture; None of a point."""
+    sizes = run.ellipsoid
+    if sizes is None or not run.position:
+        return None
+    return {
+        "radii": sizes.radii(space.names).tolist(),
+        "touching": sizes.touching,
+        "limit": sizes.limit,
+        "kept": run.avoidance is not None,
+    }
+
+
 def heard_by(heard: Array) -> list[int]:
     """Return the receivers of each edge: 1 its second end, 2 its first, 3 both, 0 none."""
     return (heard @ (2, 1)).tolist()
@@ -182,9 +199,11 @@ def _schedule(run: Recording) -> JsonObject | None:
     """Return the schedule of edges, each graph as a text of 1 and 0."""
     if run.schedule is None:
         return None
-    starts, weights, period = run.schedule
+    starts, weights, period = run.schedule[:3]
     rows = ["".join("1" if weight else "0" for weight in row) for row in weights]
-    return {"starts": starts.tolist(), "rows": rows, "period": period}
+    nearest = run.schedule.nearest
+    follow = {} if nearest is None else {"nearest": nearest.tolist()}
+    return {"starts": starts.tolist(), "rows": rows, "period": period, **follow}
 
 
 def facts(run: Recording) -> list[str]:
@@ -214,11 +233,21 @@ def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
     """Return the badge of a promise: its state `holds` or `lost`, a short and a whole text."""
     if not promise["promised"]:
         return {"state": "lost", "short": "no guarantee", "whole": promise["sentence"]}
+    apart = (promise.get("anywhere") or {}).get("separation")
+    if apart is not None:
+        return _badge_of_distances(apart["ideal"], promise)
     rate, kind = promise["rate"], promise["kind"]
     source = promise["theorem"] or kind
     short = f"guaranteed: {f'{rate:.3g} 1/s' if rate else 'V does not rise'}, {source}"
     whole = f"{promise['sentence']} {_rate_in_words(promise)}".rstrip()
     return {"state": "holds", "short": short, "whole": whole}
+
+
+def _badge_of_distances(ideal: bool, promise: Mapping[str, Any]) -> dict[str, str]:
+    """Return the badge of agents that keep apart, in the world of the theorem or in another."""
+    short = f"guaranteed: agents stay apart, {promise['theorem']}"
+    short = short if ideal else "distances observed, not proved"
+    return {"state": "holds" if ideal else "edge", "short": short, "whole": promise["sentence"]}
 
 
 def _rate_in_words(promise: Mapping[str, Any]) -> str:

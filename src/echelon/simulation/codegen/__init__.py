@@ -5,7 +5,13 @@ from echelon.simulation.codegen.block_copy import copy_rows
 from echelon.simulation.codegen.factoring import factored
 from echelon.simulation.codegen.kernel_plan import SHIFTED, SLOTS, TASK, Body, Plan, stride
 from echelon.simulation.codegen.kernel_text import program
-from echelon.simulation.codegen.machine_code import Code, aligned, is_installed, vectors
+from echelon.simulation.codegen.machine_code import (
+    Code,
+    aligned,
+    is_installed,
+    object_code,
+    vectors,
+)
 from echelon.simulation.codegen.scheduling import shared
 from echelon.simulation.codegen.tape import contribution_widths, from_tape
 
@@ -23,6 +29,7 @@ __all__ = [
     "from_tape",
     "has_flag",
     "is_installed",
+    "object_code",
     "program",
     "shared",
     "stride",

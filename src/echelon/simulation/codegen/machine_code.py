@@ -5,7 +5,7 @@ import hashlib
 import platform
 from functools import cache
 from types import ModuleType
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -85,14 +85,14 @@ class Code:
             reloc="pic" if _LINKED else "default",
         )
         stored = _cache_file(text, binding, folder)
-        object_code = None if stored is None else disk_cache.read(stored)
-        if object_code is None:
-            object_code = self._compile(binding, text)
+        image = None if stored is None else disk_cache.read(stored)
+        if image is None:
+            image = _compiled(binding, self._machine, text)
             if stored is not None:
-                disk_cache.write(stored, object_code)
+                disk_cache.write(stored, image)
         self._jit = binding.create_lljit_compiler(self._machine, use_jit_link=_LINKED)
         name = f"kernel_{hashlib.sha256(text.encode()).hexdigest()[:12]}"
-        builder = binding.JITLibraryBuilder().add_object_img(object_code).export_symbol("run")
+        builder = binding.JITLibraryBuilder().add_object_img(image).export_symbol("run")
         self._library = builder.link(self._jit, name)
         self._run = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(self._library["run"])
 
@@ -100,18 +100,34 @@ class Code:
         """Run the kernel with the arguments in 64-bit slots: addresses and whole numbers."""
         self._run(slots.ctypes.data)
 
-    def _compile(self, binding: ModuleType, text: str) -> bytes:
-        try:
-            module = binding.parse_assembly(text)
-            module.verify()
-        except RuntimeError as error:
-            raise Unsupported(f"code that LLVM rejects ({error_summary(error)})") from error
-        options = binding.create_pipeline_tuning_options(speed_level=2)
-        # The text consists of vectors already, a lane for each agent.
-        options.loop_vectorization = options.slp_vectorization = False
-        passes = binding.create_pass_builder(self._machine, options)
-        passes.getModulePassManager().run(module, passes)
-        return self._machine.emit_object(module)
+
+def object_code(text: str, triple: str, cpu: str) -> bytes:
+    """Return the object file of a text for another processor.
+
+    Raises:
+        MissingExtraError: llvmlite is not installed.
+        Unsupported: LLVM rejects the text.
+    """
+    binding = llvm()
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()
+    target = binding.Target.from_triple(triple)
+    machine = target.create_target_machine(cpu=cpu, opt=2, reloc="static")
+    return _compiled(binding, machine, f'target triple = "{triple}"\n{text}')
+
+
+def _compiled(binding: ModuleType, machine: Any, text: str) -> bytes:
+    try:
+        module = binding.parse_assembly(text)
+        module.verify()
+    except RuntimeError as error:
+        raise Unsupported(f"code that LLVM rejects ({error_summary(error)})") from error
+    options = binding.create_pipeline_tuning_options(speed_level=2)
+    # Kernels consist of vectors already, a lane for each agent.
+    options.loop_vectorization = options.slp_vectorization = False
+    passes = binding.create_pass_builder(machine, options)
+    passes.getModulePassManager().run(module, passes)
+    return machine.emit_object(module)
 
 
 def _cache_file(

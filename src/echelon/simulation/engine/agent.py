@@ -35,6 +35,7 @@ from echelon.simulation.engine.own_step import (
     hull_of,
     is_finite,
     measured_alone,
+    offset_alone,
     signal_of,
     step_alone,
     step_over_network,
@@ -94,13 +95,20 @@ class Agent:
                 f"agent {agent!r} is not in this graph, whose agents are 0 to "
                 f"{parts.graph.agents - 1}."
             )
-        late = [part.delay for part in (parts.world.network, parts.world.sensing) if part]
-        horizon = dt * math.ceil(1.0 + max([0.0, *late]) / dt)
+        network, sensing = parts.world.network, parts.world.sensing
+        late = max(network.delay, network.jitter) if network else 0.0
+        late = max([late, sensing.delay if sensing else 0.0, *(e.at for e in parts.events)])
+        horizon = dt * math.ceil(1.0 + late / dt)
         prepared = prepare(parts, Settings(horizon=horizon, dt=dt, limits=limits))
         drive = prepared.parts.drive
         assert isinstance(drive, Laws)
         with precision("float64"):
             self._loop = assemble(prepared.problem, drive.leader, drive.follower)
+        if self._loop.succession is not None and network is None:
+            raise SimulationError(
+                "got `leadership` without a network, in which single agents know at once who "
+                "leads; give the parts' world a `network`."
+            )
         self.number, graph = int(agent), parts.graph
         self.leads = agent in graph.leaders
         self._law = self._loop.leader if self.leads else self._loop.follower
@@ -111,7 +119,7 @@ class Agent:
         self._schedule = graph.schedule
         with precision("float64"):
             self._names = _names(self._loop, self._law)
-        self._stamps = self._stamps_of(graph.leaders)
+        self._stamps = self._stamps_of(graph.leaders, graph.heirs)
         self._source = self._source_in(parts)
         self._inbox = Inbox(self.neighbours, self._source, *self._names, stamps=self._stamps)
         self._others = self._surroundings(graph.agents)
@@ -119,18 +127,33 @@ class Agent:
         self._estimator = None if sensors is None else sensors.estimator
         self._estimate: Estimate | None = None
         self._memory: Memory | None = None
-        self._begun, self._time, self.blind = False, -math.inf, 0
+        self._begun, self._time, self.blind, self._since = False, -math.inf, 0, math.inf
         self._last: tuple[Array, Message | None] = np.array(self._loop.model.trim[1], float), None
 
-    def _stamps_of(self, leaders: Sequence[int]) -> Stamps | None:
+    def _stamps_of(self, leaders: Sequence[int], heirs: Sequence[int]) -> Stamps | None:
         """Return where times and packets are stored; None in the ideal network."""
         channel = self._loop.channel
         if channel is None:
             return None
-        size = packet_size(channel, *self._sizes)
+        size = packet_size(channel, *self._sizes, bool(heirs))
         own = self.number if self.leads else None
         deviation = channel.messages is MessageContent.DEVIATION
-        return Stamps(len(self.neighbours), leaders, size, own, deviation)
+        return Stamps(len(self.neighbours), leaders, size, own, deviation, heirs)
+
+    def _succeed(self, stamps: Stamps) -> None:
+        """Take the lead if nobody was heard to lead for long, or leave it to whoever has it."""
+        succession, packet = self._loop.succession, stamps.packet
+        if succession is None:
+            return
+        self._since = min(self._since, self._time)
+        last = -math.inf if packet is None else packet.time
+        leader = self.number if stamps.leads else NOBODY if packet is None else packet.leader
+        waited = min(self._time - last, self._time - self._since)
+        rows = (np.array([value]) for value in (self.number, leader, waited))
+        if succession.silent(*rows)[0]:
+            stamps.take_lead(self.number)
+        self.leads = stamps.leads
+        self._law = self._loop.leader if self.leads else self._loop.follower
 
     def _surroundings(self, agents: int) -> Surroundings | None:
         """Return where the hulls of others are stored; None where agents do not keep apart."""
@@ -148,7 +171,8 @@ class Agent:
     def own_law(self) -> OwnLaw:
         """Its law, and whom it hears."""
         offset, heard = self._loop.offsets[self.number], (self.neighbours, self._weights)
-        return OwnLaw(self._loop, self.leads, offset, *heard, *self._names, self._source)
+        rest = self._source, self._schedule
+        return OwnLaw(self._loop, self.leads, offset, *heard, *self._names, *rest)
 
     @property
     def _sizes(self) -> tuple[int, int, int]:
@@ -174,16 +198,22 @@ class Agent:
         clock = None if self._stamps is None else self._stamps.clock
         return Received.TAKEN if self._others.take(message, clock) else received
 
-    def hello(self, x: ArrayLike) -> Message | None:
+    def hello(self, x: ArrayLike, t: float | None = None) -> Message | None:
         """Return the message of the agent at a state (n,), before it acts.
 
         If the state is not finite, it is the last message, None if there was none.
 
+        Args:
+            x: own state (n,).
+            t: time, s, which a formation that changes with time needs.
+
         Raises:
-            SimulationError: the state has another shape.
+            SimulationError: the state has another shape, or the time is needed.
         """
+        if t is None and self._loop.moving is not None:
+            raise SimulationError("the formation changes with time; call `hello(x, t)`.")
         with precision("float64"):
-            own = self._own(self._measured(self._state(x))[0])
+            own = self._own(self._measured(self._state(x))[0], jnp.asarray(float(t or 0.0)))
             signal, hull = (
                 signal_of(self._loop, self._law, own),
                 hull_of(self._loop, self._law, own),
@@ -213,10 +243,12 @@ class Agent:
         self._time = float(t)
         if self._stamps is not None:
             self._stamps.clock = self._time
+            self._succeed(self._stamps)
         row = 0 if self._schedule is None else self._schedule.row(t)
         with precision("float64"):
             state, estimate = self._measured(self._state(x))
-            own, time = self._own(state), jnp.asarray(self._time)
+            time = jnp.asarray(self._time)
+            own = self._own(state, time)
             if self._stamps is None:
                 step = step_alone(
                     self._loop,
@@ -250,7 +282,10 @@ class Agent:
         hulls = jnp.asarray(self._others.hulls.reshape(others, -1, d))
         numbers = np.delete(np.arange(others + 1), self.number)
         known = ~jnp.isnan(hulls).any(axis=(1, 2))
-        return Near(hulls, jnp.asarray(np.isin(numbers, self._loop.leaders)), known)
+        leaders, packet = self._loop.leaders, self._stamps and self._stamps.packet
+        if self._loop.succession is not None and packet is not None:
+            leaders = [packet.leader]
+        return Near(hulls, jnp.asarray(np.isin(numbers, leaders)), known)
 
     def _with_hull(self, message: Message | None, hull: jax.Array | None) -> Message | None:
         if message is None or hull is None or self._others is None:
@@ -264,7 +299,8 @@ class Agent:
     def _mail(self, stamps: Stamps) -> tuple[Mail, Ages]:
         """Return what the agent keeps of what it received, and its ages (s)."""
         assert self._loop.channel is not None
-        packet, size = stamps.packet, packet_size(self._loop.channel, *self._sizes)
+        size = packet_size(self._loop.channel, *self._sizes, self._loop.succession is not None)
+        packet = stamps.packet
         leader = self.number if self.leads else NOBODY
         leader = leader if packet is None else packet.leader
         content = np.zeros(size) if packet is None else np.asarray(packet.content)
@@ -286,7 +322,8 @@ class Agent:
             return self._message(step.signal, step.action.message)
         packet, leader = self._stamps.packet, int(step.letter.packet.leader[0])
         if leader == self.number:
-            packet = Packet(leader, self._time, tuple(step.letter.packet.content[0].tolist()))
+            content = tuple(step.letter.packet.content[0].tolist())
+            packet = Packet(leader, self._time, content, self._stamps.epoch)
         if packet is None and self._stamps.needs_packet:
             return None
         message = self._message(step.letter.value[0])
@@ -315,9 +352,15 @@ class Agent:
         before = self._estimator.begin(model, y) if before is None else before
         return measured_alone(self._estimator, model, before, y, jnp.asarray(not self._begun))
 
-    def _own(self, state: State) -> "OwnState":
-        memory = self._memory if self._begun else begin_alone(self._loop, self._law, state)
-        return OwnState(state, jnp.asarray(self._loop.offsets[self.number]), memory)
+    def _own(self, state: State, time: jax.Array) -> "OwnState":
+        # As in a run, where leaders may follow their heirs.
+        law = self._law if self._loop.succession is None else self._loop.follower
+        memory = self._memory if self._begun else begin_alone(self._loop, law, state)
+        if self._loop.moving is None:
+            return OwnState(state, jnp.asarray(self._loop.offsets[self.number]), memory)
+        number = jnp.asarray(self.number)
+        offset, rate = offset_alone(self._loop, self._law, time, number)
+        return OwnState(state, offset, memory, rate)
 
 
 def _names(loop: Loop, law: Law) -> tuple[tuple[str, ...], tuple[str, ...]]:

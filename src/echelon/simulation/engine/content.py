@@ -24,7 +24,8 @@ def content_of(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> Hashab
     """
     if not isinstance(parts, Parts):
         return None
-    acting = digest((_acting(parts), settings, parts.formation.offsets))
+    shape = parts.formation.offsets, parts.formation.motion
+    acting = digest((_acting(parts), settings, shape))
     # A graph never changes, so that it is known by who it is.
     return None if acting is None else (acting, parts.graph, wrt)
 
@@ -44,7 +45,7 @@ def copied(tree: _T) -> _T:
     def alone(leaf: object) -> object:
         # A formation is a leaf to JAX, although it contains an array.
         if isinstance(leaf, Formation):
-            return Formation(leaf.offsets)
+            return Formation(leaf.offsets, leaf.motion)
         return leaf.copy() if isinstance(leaf, np.ndarray) else leaf
 
     return jax.tree.map(alone, tree)

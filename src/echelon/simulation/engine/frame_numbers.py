@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from typing import Protocol, TypeAlias
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from echelon.agents.network.switching import Schedule
 from echelon.core.types import Array
 from echelon.simulation.engine.closest_pair import ClosestPair
 
@@ -14,7 +15,7 @@ _FEW = 8
 """Agents up to which comparing all pairs is faster than a search for the nearest."""
 
 
-_Some: TypeAlias = slice | Sequence[int] | Int[Array, " F"]
+FrameChoice: TypeAlias = slice | Sequence[int] | Int[Array, " F"]
 """Which frames."""
 
 
@@ -34,18 +35,31 @@ class _Frames(Protocol):
     def nearest(self) -> Int[Array, " N"]: ...
 
     @property
+    def schedule(self) -> Schedule | None: ...
+
+    @property
+    def presence(self) -> Bool[Array, "T N"] | None: ...
+
+    @property
+    def nearest_then(self) -> Int[Array, "T N"]: ...
+
+    @property
     def position(self) -> tuple[int, ...]: ...
 
     @property
     def measured(self) -> tuple[int, ...]: ...
 
-    def deviations(self, frames: _Some = slice(None)) -> Float[Array, "F N n"]: ...
+    def offsets_in(self, frames: FrameChoice) -> Float[Array, "*F N n"]: ...
 
-    def goal_distances(self, frames: _Some = slice(None)) -> Float[Array, "F N"]: ...
+    def deviations(self, frames: FrameChoice = slice(None)) -> Float[Array, "F N n"]: ...
 
-    def least_distances(self, frames: _Some = slice(None)) -> Float[Array, " F"] | None: ...
+    def goal_distances(self, frames: FrameChoice = slice(None)) -> Float[Array, "F N"]: ...
 
-    def approaches(self) -> list[ClosestPair]: ...
+    def least_distances(
+        self, frames: FrameChoice = slice(None), scales: Float[Array, " d"] | float = 1.0
+    ) -> Float[Array, " F"] | None: ...
+
+    def approaches(self, scales: Float[Array, " d"] | float = 1.0) -> list[ClosestPair]: ...
 
 
 class FrameNumbers(abc.ABC):
@@ -74,49 +88,77 @@ class FrameNumbers(abc.ABC):
         """Each agent's distance from its goal."""
         return self.goal_distances()
 
-    def deviations(self: _Frames, frames: _Some = slice(None)) -> Float[Array, "F N n"]:
-        """Return `errors` in some frames."""
-        # delta_i = y_i - y_0 (theory page), which V and the certified set are written in.
-        y = self.states[frames] - self.offsets
-        return y - y[:, self.nearest]
+    @property
+    def presence(self: _Frames) -> Bool[Array, "T N"] | None:
+        """Which agents are there in each frame; None where all always are."""
+        schedule = self.schedule
+        if schedule is None or schedule.present is None:
+            return None
+        return schedule.present[schedule.rows(self.times)]
 
-    def goals(self: _Frames, frames: _Some = slice(None)) -> Float[Array, "F N n"]:
+    @property
+    def nearest_then(self: _Frames) -> Int[Array, "T N"]:
+        """The leader that each agent follows in each frame."""
+        schedule = self.schedule
+        if schedule is None or schedule.nearest is None:
+            return np.tile(self.nearest, (len(self.times), 1))
+        return schedule.nearest[schedule.rows(self.times)]
+
+    def deviations(self: _Frames, frames: FrameChoice = slice(None)) -> Float[Array, "F N n"]:
+        """Return `errors` in some frames; those of absent agents are zero."""
+        # delta_i = y_i - y_0 (theory page), which V and the certified set are written in.
+        y = self.states[frames] - self.offsets_in(frames)
+        if self.presence is None:
+            return y - y[:, self.nearest]
+        away = y - np.take_along_axis(y, self.nearest_then[frames][:, :, None], axis=1)
+        return np.where(self.presence[frames][:, :, None], away, 0.0)
+
+    def goals(self: _Frames, frames: FrameChoice = slice(None)) -> Float[Array, "F N n"]:
         """Return the states that the agents would have without errors, in some frames."""
         return self.states[frames] - self.deviations(frames)
 
-    def goal_distances(self: _Frames, frames: _Some = slice(None)) -> Float[Array, "F N"]:
+    def goal_distances(self: _Frames, frames: FrameChoice = slice(None)) -> Float[Array, "F N"]:
         """Return `formation_errors` in some frames."""
         # Where a square overflows, the length is infinite.
         with np.errstate(over="ignore", invalid="ignore"):
             return np.linalg.norm(self.deviations(frames)[:, :, list(self.measured)], axis=2)
 
-    def least_distances(self: _Frames, frames: _Some = slice(None)) -> Float[Array, " F"] | None:
+    def least_distances(
+        self: _Frames, frames: FrameChoice = slice(None), scales: Float[Array, " d"] | float = 1.0
+    ) -> Float[Array, " F"] | None:
         """Return the smallest distance between two agents in frames, NaN if one is not finite.
 
-        None without a position.
+        None without a position. The position's coordinates are multiplied by `scales`.
         """
         if not self.position:
             return None
-        places = self.states[frames][:, :, list(self.position)]
+        places = self.states[frames][:, :, list(self.position)] * scales
+        if self.presence is not None:
+            here = self.presence[frames]
+            each = (place[who] for place, who in zip(places, here, strict=True))
+            some = (_least(place[None])[0] if len(place) > 1 else np.inf for place in each)
+            return np.array([*some])
         least = np.full(len(places), np.nan)
         finite = np.isfinite(places).all(axis=(1, 2))
         least[finite] = _least(places[finite])
         return least
 
-    def closest_pair(self: _Frames) -> ClosestPair | None:
+    def closest_pair(self: _Frames, scales: Float[Array, " d"] | float = 1.0) -> ClosestPair | None:
         """Return which agents were closest to each other in the stored frames, and when.
 
         None without a position, a second agent or a frame of finite numbers.
         """
-        pairs = self.approaches()
+        pairs = self.approaches(scales)
         return pairs[-1] if pairs else None
 
-    def approaches(self: _Frames) -> list[ClosestPair]:
+    def approaches(self: _Frames, scales: Float[Array, " d"] | float = 1.0) -> list[ClosestPair]:
         """Return the pairs that were closer than any in a frame before, in the order of time."""
         if not self.position or self.states.shape[1] < 2 or not len(self.times):
             return []
-        places, pairs = self.states[:, :, list(self.position)], list[ClosestPair]()
+        places, pairs = self.states[:, :, list(self.position)] * scales, list[ClosestPair]()
         least, bound = np.inf, -np.inf
+        if self.presence is not None:
+            return _approaches_of_some(places, self.presence, self.times)
         for k, motion in enumerate(_approach(places)):
             # No pair is closer than the closest of an earlier frame less what two agents moved.
             bound = bound - motion if np.isfinite(motion) else -np.inf
@@ -128,6 +170,22 @@ class FrameNumbers(abc.ABC):
                 least = bound
                 pairs.append(pair)
         return pairs
+
+
+def _approaches_of_some(
+    places: Float[Array, "T N k"], presence: Bool[Array, "T N"], times: Float[Array, " T"]
+) -> list[ClosestPair]:
+    """Return `approaches` of the agents that are present in each frame."""
+    pairs = list[ClosestPair]()
+    for place, here, time in zip(places, presence, times.tolist(), strict=True):
+        who = np.flatnonzero(here)
+        if len(who) < 2 or not np.isfinite(place[who]).all():
+            continue
+        pair = ClosestPair.of(place[who], time)
+        if not pairs or pair.distance < pairs[-1].distance:
+            first, other = who[list(pair.agents)].tolist()
+            pairs.append(pair._replace(agents=(first, other)))
+    return pairs
 
 
 def _approach(places: Float[Array, "T N k"]) -> Float[Array, " T"]:

@@ -61,7 +61,7 @@ class Starts:
             raise SimulationError(f"an initial spread is {least}, and must not be negative.")
         self.named = {key: value for key, value in named.items() if not isinstance(key, str)}
         leaders = np.asarray(parts.drive.start(model), np.float64) + self.error
-        self.goals = leaders + parts.formation.offsets
+        self.goals = leaders + parts.formation.offsets_at([0.0])[0]
 
     def __call__(self, seed: int) -> Float[Array, "N n"]:
         """Return the states (N, n) for a seed."""

@@ -124,7 +124,7 @@ class JaxFormations(Stepper):
         return Chunk(now, states, inputs, on_host(sums))
 
 
-_ALL = Moment(None, 0, 0, 0, 0, WorldState(*(0,) * 6))  # type: ignore[arg-type]
+_ALL = Moment(None, 0, 0, 0, 0, WorldState(*(0,) * len(WorldState._fields)))  # type: ignore[arg-type]
 """All are at the same step."""
 
 

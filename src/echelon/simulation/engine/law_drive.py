@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, TypeVar, final
 import jax
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.world import World
 from echelon.core.errors import (
@@ -15,9 +16,11 @@ from echelon.core.errors import (
     SimulationError,
     check_kind,
 )
+from echelon.core.identity import process_key
 from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
 from echelon.laws.flat_law import FlatLaw
+from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import leader_warnings, prepare_law
 from echelon.laws.safety import Safety
@@ -96,8 +99,10 @@ class Laws(Drive):
         """
         leader, follower = (prepare_law(law, model, graph) for law in (self.leader, self.follower))
         follower = follower.following(leader, model)
-        same = leader is self.leader and follower is self.follower
-        return self if same else Laws(leader, follower)
+        drive = Laws(leader, follower)
+        same, key = leader is self.leader and follower is self.follower, process_key(drive)
+        # Caches use the identity of what is complete already.
+        return self if same or key is not None and key == process_key(self) else drive
 
     def check_world(self, world: World, graph: Graph, dt: float) -> None:
         """Check that both laws work with messages that are late.
@@ -136,6 +141,56 @@ class Laws(Drive):
             )
         self.follower.check_late(graph, dt)
 
+    def check_motion(self, formation: Formation, graph: Graph) -> tuple[str, ...]:
+        """Return that a law of states lags behind, and which reshapes lead agents together.
+
+        Raises:
+            LawError: with `safety`, the leader's offset changes.
+        """
+        motion = formation.motion
+        assert motion is not None
+        if self.safety is not None and motion.moves([*graph.leaders, *graph.heirs]):
+            raise LawError(
+                "`safety` keeps agents apart that move relative to the leader, whose own offset "
+                "must be constant; leave out its new offset."
+            )
+        if type(self.follower).goal_offset is not Law.goal_offset:
+            return ()
+        return (
+            f"the law `{type(self.follower).__name__}` uses the position and the velocity of "
+            "offsets that change with time, and lags behind them; `stopping-point` does not.",
+        )
+
+    def check_heirs(self, graph: Graph) -> None:
+        """Check that followers can take the lead, and leaders can follow.
+
+        Raises:
+            SimulationError: they cannot.
+        """
+        if not graph.heirs:
+            return
+        name = f"`{type(self.leader).__name__}`"
+        if not self.leader.plans:
+            raise SimulationError(
+                f"got `heirs`, but a leader under the law {name} has no plan that they could carry "
+                "on; give it a `reference`."
+            )
+        if self.follower.feedforward is Feedforward.PARENT:
+            raise SimulationError(
+                "got `heirs`, but with `feedforward: parent` nobody knows who leads; use `relay`."
+            )
+        observers = {getattr(law, "observer", None) for law in (self.leader, self.follower)}
+        first, then = self.leader.init(), self.follower.init()
+        # How many others hold it back an heir forgets when it leads.
+        then = then._replace(active=None) if isinstance(then, FlatMemory) else then
+        trees = {*map(jax.tree.structure, (first, then))}
+        if len(trees) > 1 or len(observers) > 1:
+            raise SimulationError(
+                f"got `heirs`, but followers under `{type(self.follower).__name__}` remember other "
+                f"things than a leader under {name}, and could not take over; give both the same "
+                "kind of law, with the same `observer`."
+            )
+
     def accept(self, problem: Problem) -> None:
         """Check the starts of leaders and followers by their laws.
 
@@ -143,8 +198,11 @@ class Laws(Drive):
             LawError: one is refused.
         """
         if isinstance(self.follower, FlatLaw) and self.safety is not None:
-            rows = problem.graph, problem.formation.offsets, problem.settings.dt
-            check_numbers(self.follower, problem.model, *rows)
+            motion, dt = problem.formation.motion, problem.settings.dt
+            least = 1.0 if motion is None else motion.least_scale
+            for shape in problem.formation.shapes:
+                rows = problem.graph, least * shape.offsets, dt
+                check_numbers(self.follower, problem.model, *rows)
         refused = self.refusals(problem.model, problem.graph, problem.states[None])
         for _, agent, text in refused:
             raise LawError(f"agent {agent} starts where its law has no meaning: {text}.")

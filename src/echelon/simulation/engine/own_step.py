@@ -11,6 +11,7 @@ from jaxtyping import Float
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.near import Near
+from echelon.agents.network.switching import Schedule
 from echelon.agents.world.estimator import Estimate, Estimator
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, PyTree, Scalar, State
@@ -25,7 +26,7 @@ from echelon.simulation.step.knowledge import (
     understand,
     write,
 )
-from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.loop import Loop, offsets_at
 from echelon.simulation.step.nearby import less_expected
 
 Signal: TypeAlias = Float[jax.Array, " s"]
@@ -33,17 +34,28 @@ Signal: TypeAlias = Float[jax.Array, " s"]
 
 
 class OwnState(NamedTuple):
-    """What an agent knows without messages: its state (n,), its offset (n,) and its memory."""
+    """What an agent knows without messages: its state (n,), its offset (n,) and its memory.
+
+    `rate` (n,) is of the offset, as in `LocalView`.
+    """
 
     x: State
     offset: State
     memory: Memory
+    rate: State | None = None
 
 
 @cached_jit
 def begin_alone(loop: Loop, law: Law, x: State) -> Memory:
     """Return the memory of an agent that begins at x."""
     return law.begin(loop.model, x)
+
+
+@cached_jit
+def offset_alone(loop: Loop, law: Law, t: Scalar, agent: jax.Array) -> tuple[State, State | None]:
+    """Return what an agent takes for its offset (n,) at a time (s), and its rate, or None."""
+    offset, rate = offsets_at(loop, law, t, agent[None])
+    return offset[0], None if rate is None else rate[0]
 
 
 @cached_jit
@@ -57,7 +69,7 @@ def measured_alone(
 @cached_jit
 def signal_of(loop: Loop, law: Law, own: OwnState) -> Signal:
     """Return what the agent sends to its neighbours."""
-    signal = law.signal(loop.model, *own)
+    signal = law.signal(loop.model, *own[:3])
     return own.x - own.offset if signal is None else signal
 
 
@@ -83,6 +95,7 @@ class OwnLaw(NamedTuple):
         weights: of their signals (rows, K); a graph that switches has several rows.
         signal_names, forward_names: of what it sends.
         source: whose feed-forward it uses; None for nobody's.
+        schedule: when which row of weights holds, of a graph that switches.
     """
 
     loop: Loop
@@ -93,6 +106,7 @@ class OwnLaw(NamedTuple):
     signal_names: tuple[str, ...]
     forward_names: tuple[str, ...]
     source: int | None
+    schedule: Schedule | None
 
     @property
     def law(self) -> Law:
@@ -139,7 +153,7 @@ def gap_of(loop: Loop, leads: bool, own: OwnState, received: Signal) -> Float[ja
 
 def _difference(loop: Loop, law: Law, own: OwnState) -> Callable[..., jax.Array]:
     """Return the difference of two signals: the model's, where they are states."""
-    return loop.model.difference if law.signal(loop.model, *own) is None else jnp.subtract
+    return loop.model.difference if law.signal(loop.model, *own[:3]) is None else jnp.subtract
 
 
 def step_with(
@@ -159,7 +173,7 @@ def step_with(
         alone = alone.at[-1].set(law.heading(model, t, own.x))
     forward = jnp.where(jnp.isnan(forward), alone, forward)
     forward = jnp.zeros(len(model.input_names)) if leads else forward
-    rows = z, forward, loop.motion.dt, _gaps(near, hull)
+    rows = z, forward, loop.motion.dt, _gaps(near, hull), own.rate
     action = act(loop, law, LocalView(t, own.x, own.offset, *rows), own.memory, leads)
     return Step(signal, action, is_finite((own.x, signal, action, hull)), hull=hull)
 
@@ -192,11 +206,12 @@ def step_over_network(
     z = knowledge.disagreement[0]
     hull = hull_of(loop, law, own)
     hull = None if hull is None else less_expected(loop, t, hull, knowledge.leader[0])
-    view = LocalView(t, own.x, own.offset, z, forward, loop.motion.dt, _gaps(near, hull))
+    rows = z, forward, loop.motion.dt, _gaps(near, hull), own.rate
+    view = LocalView(t, own.x, own.offset, *rows)
     action = act(loop, law, view, own.memory, leads)
     content = mail.packet.content
     if leads:
-        content = content_of(loop, t, *own, signal, action.message, action.input)[None]
+        content = content_of(loop, t, *own[:3], signal, action.message, action.input)[None]
     step = jnp.zeros((), jnp.int32)
     assert loop.channel is not None
     letter, _ = write(

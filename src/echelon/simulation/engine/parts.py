@@ -8,12 +8,14 @@ import numpy as np
 from jaxtyping import Bool
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.events import Event
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import heard_along
 from echelon.agents.world.world import World
 from echelon.core.errors import check_kind
 from echelon.simulation.step.drive import Drive, Information
+from echelon.simulation.step.leadership import Leadership
 
 Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.ndarray | None
 """Spreads by state or group, or states (n,) by agent, or the states (N, n) of all."""
@@ -34,8 +36,12 @@ class Parts:
             (N, n).
         start_error: what is added to the leaders' starts, per state or group.
         world: what the laws do not know: a plant that differs from the model, wind and noise.
+        events: what happens during the run: agents that are lost or join, and links that are cut.
+            The graph becomes one that switches; laws and gains know nothing of it.
+        leadership: who takes the lead when nobody hears of the leader any more; None for nobody.
 
     Raises:
+        GraphError: an event is not possible, or leaves somebody without a path to the leader.
         SimulationError: a part is not of the kind of its place.
         ModelError: a spread or an error names no state and no group of states.
     """
@@ -47,6 +53,8 @@ class Parts:
     initial: Initial = None
     start_error: Mapping[str, float] = dataclasses.field(default_factory=dict)
     world: World = dataclasses.field(default_factory=World)
+    events: Sequence[Event] = ()
+    leadership: Leadership | None = None
 
     def __post_init__(self) -> None:
         """Check that each part is of the kind of its place, and that names are states."""
@@ -54,11 +62,20 @@ class Parts:
         kinds = {"graph": Graph, "formation": Formation, "drive": Drive, "world": World}
         for place, kind in kinds.items():
             check_kind(place, getattr(self, place), kind)
+        if self.leadership is not None:
+            check_kind("leadership", self.leadership, Leadership)
+        object.__setattr__(self, "events", tuple(self.events))
+        object.__setattr__(self, "graph", self.graph.with_events(self.events, self.heirs))
         if isinstance(self.model, ControlAffine):
             for named in (self.initial, self.start_error):
                 for name in named if isinstance(named, Mapping) else ():
                     if isinstance(name, str):
                         self.model.states_called(name)
+
+    @property
+    def heirs(self) -> tuple[int, ...]:
+        """Who takes the lead after the leader, in this order."""
+        return () if self.leadership is None else tuple(self.leadership.heirs)
 
     @property
     def information(self) -> Information:

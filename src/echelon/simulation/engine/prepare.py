@@ -8,14 +8,16 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Channel
-from echelon.agents.network.formation import Formation
+from echelon.agents.network.events import event_faults
 from echelon.agents.world.sensing import Sensors
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.identity import digest
 from echelon.core.limits import excess_frames
 from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
+from echelon.core.words import amount
 from echelon.simulation.engine.initial import initial_states
+from echelon.simulation.engine.part_warnings import part_warnings
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.meter import Meter
@@ -57,7 +59,7 @@ def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepare
     check_given(parts, settings)
     # By their bits too, since somebody may write to an array in them; a graph never changes.
     mutable = parts.model, parts.drive, parts.initial, parts.start_error, parts.world
-    bits = digest((mutable, parts.formation.offsets, settings))
+    bits = digest((mutable, parts.formation.offsets, parts.formation.motion, settings))
     key = None if bits is None else (parts, bits)
     prepared = _CACHE.get_or_make(key, lambda: _prepare(parts, settings, to_store))
     if to_store:
@@ -76,12 +78,17 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         if to_store:
             # Before gains and plans, which may take long.
             check_memory(model, graph.agents, settings)
-        drive = parts.drive.prepare(model, graph)
+        _check_events(parts, settings)
+        # Laws are made for the graph as it is before anything happens to it.
+        drive = parts.drive.prepare(model, graph.before)
         # A complete drive stays the same object, since caches use its identity.
         parts = parts if drive is parts.drive else parts.replace(drive=drive)
         parts.world.check_agents(model, graph.agents)
         # Its own numbers first: whether they suit the laws is asked of a network that can be.
         channel = channel_of(parts, settings)
+        drive.check_heirs(graph)
+        if parts.leadership is not None:
+            parts.leadership.check_network(parts.world.network)
         drive.check_world(parts.world, graph, settings.dt)
         problem = Problem(
             model,
@@ -95,10 +102,13 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
             initial_states(parts, settings.seed),
             channel,
             sensors_of(parts, settings),
+            parts.leadership,
         )
         parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)
-    warnings += formation_warnings(model, formation)
+        if parts.formation.motion is not None:
+            warnings += parts.drive.check_motion(parts.formation, graph)
+    warnings += (*part_warnings(parts, problem.states, settings.horizon),)
     # Model and drive may say the same; a dictionary keeps the first, and the order.
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
 
@@ -141,28 +151,21 @@ def check_memory(model: ControlAffine, agents: int, settings: Settings) -> None:
         raise SimulationError(f"the run {excess}.")
 
 
+def _check_events(parts: Parts, settings: Settings) -> None:
+    """Check that all that happens does so during the run."""
+    graph = parts.graph
+    for fault in event_faults(graph.before, graph.events, graph.heirs, settings.horizon):
+        raise SimulationError(f"{fault.text}.")
+    if graph.presence is not None and settings.devices > 1:
+        raise SimulationError(
+            f"`devices` is {settings.devices}, and must be 1 where agents are lost or join."
+        )
+
+
 def _check_offsets(model: ControlAffine, parts: Parts) -> None:
     shape = (parts.graph.agents, len(model.state_names))
     if parts.formation.offsets.shape != shape:
         raise SimulationError(
             f"the formation has offsets {parts.formation.offsets.shape}, and {shape[0]} agents "
-            f"with {shape[1]} states need {shape}."
+            f"with {amount(shape[1], 'state')} need {shape}."
         )
-
-
-def formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str, ...]:
-    """Return warnings of offsets that break a symmetry of the model, and of equal goals."""
-    broken = formation.broken_symmetries(model)
-    sentences = [
-        f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, "
-        "so the agents settle off their goals."
-        # One warning is enough: the other offsets mostly break the same symmetry.
-        for agent, reason in list(broken.items())[:1]
-    ]
-    pairs = formation.coincident() if model.position else ()
-    sentences += [
-        f"agents {i} and {j} have the same goal, and would collide there." for i, j in pairs[:3]
-    ]
-    if len(pairs) > 3:
-        sentences.append(f"{len(pairs) - 3} more pairs of agents have the same goal.")
-    return tuple(sentences)

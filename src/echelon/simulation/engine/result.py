@@ -6,16 +6,19 @@ from collections.abc import Mapping
 from typing import final
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
+from echelon.agents.network.switching import Schedule
 from echelon.agents.world.world import World
 from echelon.core.errors import Outcome
 from echelon.core.lazy_field import LazyField
 from echelon.core.pages import CellPage, notebook_page
 from echelon.core.types import Array
-from echelon.simulation.engine.frame_numbers import FrameNumbers
+from echelon.core.words import amount
+from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.traffic import Traffic, traffic
 from echelon.simulation.step.drive import Drive
@@ -96,7 +99,27 @@ class Result(FrameNumbers):
     @property
     def saturated(self) -> Array:
         """The fraction of steps (N,) in which an actuator limit changed the agent's input."""
-        return self.sums.limited / max(1.0, float(self.sums.steps[0]))
+        return self.sums.limited / np.maximum(1.0, self.steps_present[0])
+
+    def steps_with(self, agents: Int[np.ndarray, "K k"]) -> Float[np.ndarray, "2 K"]:
+        """Return in how many steps, and of these in the steady window, all agents of a row are."""
+        steps, schedule = self.sums.steps, self.graph.schedule
+        if schedule is None or schedule.present is None:
+            return np.tile(np.asarray(steps, float)[:, None], len(agents))
+        times = self.settings.dt * np.arange(int(steps[0]))
+        here = np.asarray(schedule.present[schedule.rows(times)][:, agents].all(axis=2))
+        first = self.settings.first_steady
+        return np.array([here.sum(axis=0), here[first:].sum(axis=0)], float)
+
+    @functools.cached_property
+    def steps_present(self) -> Float[np.ndarray, "2 N"]:
+        """In how many steps, and of these in the steady window, each agent is there."""
+        return self.steps_with(np.arange(self.graph.agents)[:, None])
+
+    @property
+    def schedule(self) -> Schedule | None:
+        """When which links hold, and who is there; None where that never changes."""
+        return self.graph.schedule
 
     @property
     def chatter(self) -> Array:
@@ -111,8 +134,14 @@ class Result(FrameNumbers):
 
     @property
     def offsets(self) -> Array:
-        """The goal offsets, (N, n)."""
+        """The goal offsets, (N, n); of a formation that changes with time, the first ones."""
         return self.formation.offsets
+
+    def offsets_in(self, frames: FrameChoice = slice(None)) -> Float[Array, "*F N n"]:
+        """Return the goal offsets in some frames, (F, N, n), or constant ones, (N, n)."""
+        if self.formation.motion is None:
+            return self.offsets
+        return self.formation.offsets_at(self.times[frames])
 
     @property
     def nearest(self) -> Array:
@@ -140,7 +169,7 @@ class Result(FrameNumbers):
         frames, agents = self.states.shape[:2]
         name = self.provenance.get("scenario", "")
         who = f"{name!r}, {agents} agents" if name else f"{agents} agents"
-        return f"Result({who}, {frames} frames, {self.message!r})"
+        return f"Result({who}, {amount(frames, 'frame')}, {self.message!r})"
 
     def _repr_html_(self) -> str:
         """Return the run as a notebook displays it: a table with its picture."""

@@ -21,19 +21,26 @@ from echelon.core.words import NeighbourChoice
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import channel_of
 from echelon.simulation.step.knowledge import (
-    HOP_LIFE,
     NOBODY,
     Knowledge,
     Letters,
     Mail,
     Readers,
     count_hops,
+    hop_life,
     no_mail,
     usable_age,
     write,
 )
-from echelon.simulation.step.loop import Switches, exchange_at
-from echelon.simulation.step.messages import age_of, all_readers, links_with, take
+from echelon.simulation.step.leadership import Succession
+from echelon.simulation.step.loop import Presence, Switches, exchange_at
+from echelon.simulation.step.messages import (
+    age_of,
+    all_readers,
+    led_by_heirs,
+    links_with,
+    take,
+)
 from echelon.simulation.step.settings import Settings
 
 
@@ -88,7 +95,8 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
         readers = all_readers(graph.agents, np.array(graph.leaders))
         switches = Switches.of(graph, settings)
         numbers = np.asarray(steps), np.asarray(settings.dt)
-        radio = _Radio(channel, exchange, switches, readers, receives, *numbers)
+        cast = Presence.of(graph), Succession.of(graph, parts.leadership)
+        radio = _Radio(channel, exchange, switches, readers, receives, *numbers, *cast)
         followed = _follow(radio, ends.astype(np.int32))
         stamps, losses, counted = jax.tree.map(np.asarray, followed)
     shape = len(times), len(graph.edges), 2
@@ -108,7 +116,10 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
 
 
 class _Radio(NamedTuple):
-    """The network of a run: who `receives` (K,) what, in a run of so many steps of dt (s)."""
+    """The network of a run: who `receives` (K,) what, in a run of so many steps of dt (s).
+
+    Also who is there, and who takes the lead.
+    """
 
     channel: Channel
     exchange: Exchange
@@ -117,6 +128,8 @@ class _Radio(NamedTuple):
     receives: Bool[Array, " K"]
     steps: Array
     dt: Array
+    presence: Presence | None
+    succession: Succession | None
 
 
 class _Counts(NamedTuple):
@@ -161,7 +174,7 @@ def _follow(
         return now, (now.stamps, now.losses)
 
     agents, links = len(radio.readers.number), len(radio.receives)
-    mail = no_mail(radio.readers, links, jnp.zeros((agents, 0)), 0)
+    mail = no_mail(radio.readers, links, jnp.zeros((agents, 0)), 0, radio.succession is not None)
     letters = Letters(jnp.zeros((agents, 0)), jnp.full(agents, NOBODY, jnp.int32), mail.packet)
     zero, none = jnp.zeros((), int), jnp.zeros(links, int)
     counts = _Counts(zero, zero, zero, zero, jnp.zeros(()), jnp.zeros(()))
@@ -179,8 +192,12 @@ def _step(radio: _Radio, first: jax.Array, now: _Carry) -> _Carry:
     channel, readers = radio.channel, radio.readers
     exchange = exchange_at(radio.exchange, radio.switches, now.step)
     mail = take(channel, exchange, now.step, now.posts, now.mail)
+    if radio.succession is not None:
+        packet = led_by_heirs(radio, now.step, mail.packet, radio.dt)
+        mail = mail._replace(packet=packet)
+        readers = readers._replace(leads=packet.leader == readers.number)
     ages = age_of(now.step, mail.stamp, radio.dt)
-    lasting = ages <= HOP_LIFE * channel.forget * radio.dt
+    lasting = ages <= hop_life(channel, radio.dt)
     hops = count_hops(exchange, readers, mail.hops, lasting, len(readers.number))
     used = (jnp.asarray(exchange.weights) > 0.0) & (ages <= usable_age(channel, radio.dt))
     if channel.hears is NeighbourChoice.LEADERWARD:

@@ -75,17 +75,8 @@ class BlockRows(NamedTuple):
         wind, q = loop.motion.wind, len(loop.model.output_names)
         noisy = wind is not None and wind.noise is not None
         memory = max(memory_size(law) for law in (loop.leader, loop.follower))
-        sizes = [
-            n,
-            n,
-            n if wind else 0,
-            m if noisy else 0,
-            memory,
-            m,
-            message_size(loop),
-            m,
-            varying,
-        ]
+        sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m]
+        sizes += [message_size(loop), m, varying]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q, 1]
         return cls(*row_ranges(sizes))
 
@@ -96,12 +87,27 @@ def check_information(loop: Loop) -> None:
     Raises:
         Unsupported: they do not.
     """
+    if loop.moving is not None:
+        raise Unsupported("formations that change with time")
     if loop.channel is not None:
         raise Unsupported("a network that is not ideal")
     if loop.sensors is not None:
         raise Unsupported("agents that measure their states late or with noise")
-    if loop.follower.safety is not None:
-        raise Unsupported("agents that keep away from each other")
+    check_distances(loop)
+
+
+def check_distances(loop: Loop) -> None:
+    """Check that agents keep no distances from each other, are always there and have no heirs.
+
+    Raises:
+        Unsupported: they are not so.
+    """
+    for part, text in (
+        (loop.follower.safety, "agents that keep away from each other"),
+        (loop.presence or loop.succession, "agents that are lost, join or take the lead"),
+    ):
+        if part is not None:
+            raise Unsupported(text)
 
 
 def memory_size(law: Law) -> int:

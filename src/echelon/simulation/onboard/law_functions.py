@@ -1,15 +1,23 @@
 """What one agent computes on board, as functions on graphs of scalars.
 
-They are traced from what `Agent` runs, as native code is.
+They are traced from what `Agent` runs, as native code is. Rules about messages, such as which one
+is the newest, are no arithmetic, and are left to the program that receives them.
 """
 
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+import functools
+import math
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple, final
 
 import jax
 import jax.numpy as jnp
 
+from echelon.agents.world.estimator import Estimate, Estimator
+from echelon.core.numerics import rk4
 from echelon.core.types import PyTree
+from echelon.core.words import MessageContent, Prediction
+from echelon.laws.law import Law, carried_pieces
 from echelon.simulation.engine.own_step import (
     OwnLaw,
     OwnState,
@@ -19,13 +27,20 @@ from echelon.simulation.engine.own_step import (
     step_with,
 )
 from echelon.simulation.native.agent_step import (
-    check_information,
+    check_distances,
     leaves_of,
     memory_size,
     single,
     unflatten,
 )
-from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, needed, nodes
+from echelon.simulation.scalars import Node, ScalarGraph, lower, needed, nodes, rewritten
+from echelon.simulation.step.knowledge import (
+    carried_time,
+    content_of,
+    expected_of,
+    packet_size,
+    parts_of,
+)
 
 
 class LawFunction(NamedTuple):
@@ -57,91 +72,238 @@ class LawFunction(NamedTuple):
         return sum(node.op not in ("constant", "leaf") for node in needed(self.results))
 
 
-def law_functions(own: OwnLaw) -> tuple[LawFunction, ...]:
-    """Return what an agent computes: `begin`, `hello`, `difference` and `tick`.
+def law_functions(own: OwnLaw, bits: int = 64) -> dict[str, LawFunction]:
+    """Return what an agent computes, by name, in double or single precision (64 or 32 bits).
 
     Raises:
         Unsupported: the agent needs more than them, or its law has no scalar operations; with the
             file and line of a user's code.
     """
-    check_information(own.loop)
-    if len(own.weights) > 1:
-        raise Unsupported("a graph that switches")
-    loop, law, memory = own.loop, own.law, memory_size(own.law)
-    n, s, k = len(loop.model.state_names), len(own.signal_names), len(own.forward_names)
+    check_distances(own.loop)
+    return {function.name: function for function in _Traces(own, bits).all()}
 
-    def state(x: jax.Array, flat: jax.Array) -> OwnState:
-        return OwnState(x, jnp.asarray(own.offset), unflatten(law.init(), flat))
 
-    def gap(x: jax.Array, flat: jax.Array, received: jax.Array) -> tuple[jax.Array]:
-        return (gap_of(loop, own.leads, state(x, flat), received),)
+@final
+class _Traces:
+    """Traces the functions of one agent in a precision (bits)."""
 
-    def tick(
-        t: jax.Array, x: jax.Array, z: jax.Array, forward: jax.Array, flat: jax.Array
-    ) -> tuple[jax.Array, ...]:
-        step = step_with(loop, own.leads, t, state(x, flat), z, forward, None)
-        action = step.action
-        return action.input, _flat(action.memory), step.signal, action.message, step.finite
+    def __init__(self, own: OwnLaw, bits: int) -> None:
+        self.own, self.bits = own, bits
+        self.loop, self.law = own.loop, own.law
+        self.memory = memory_size(self.law)
+        self.n, self.s = len(self.loop.model.state_names), len(own.signal_names)
+        self.k, self.m = len(own.forward_names), len(self.loop.model.input_names)
 
-    begin = _function(
-        "begin",
-        "the memory of an agent that begins at x",
-        lambda x: (_flat(begin_alone(loop, law, x)),),
-        ("memory",),
-        {"x": n},
-    )
-    hello = _function(
-        "hello",
-        "what the agent sends to its neighbours before it acts",
-        lambda x, flat: (signal_of(loop, law, state(x, flat)),),
-        ("signal",),
-        {"x": n, "memory": memory},
-    )
-    heard = {"x": n, "memory": memory, "received": s}
-    difference = _function(
-        "difference",
-        "the difference of the own signal from a received one, 0 where that is NaN",
-        gap,
-        ("gap",),
-        heard,
-    )
-    sizes = {"t": None, "x": n, "z": len(difference.outputs["gap"])}
-    return (
-        begin,
-        hello,
-        difference,
-        _function(
+    def all(self) -> Iterator[LawFunction]:
+        """Yield all functions that the agent needs."""
+        yield self._begin()
+        yield self._signal()
+        difference = self._difference()
+        yield difference
+        yield self._tick(len(difference.outputs["gap"]))
+        channel = self.loop.channel
+        if channel is not None and channel.messages is MessageContent.DEVIATION:
+            yield from self._expectation(channel.prediction)
+        sensors = self.loop.sensors
+        if sensors is not None and sensors.estimator is not None:
+            yield from self._estimation(sensors.estimator)
+
+    def _state(self, x: jax.Array, flat: jax.Array) -> OwnState:
+        return OwnState(x, jnp.asarray(self.own.offset), unflatten(self.law.init(), flat))
+
+    # ---- in any network ----
+
+    def _begin(self) -> LawFunction:
+        return self._function(
+            "begin",
+            "the memory of an agent that begins at x",
+            lambda x: (_flat(begin_alone(self.loop, self.law, x)),),
+            ("memory",),
+            {"x": self.n},
+        )
+
+    def _signal(self) -> LawFunction:
+        return self._function(
+            "signal",
+            "the agent's signal, before it acts",
+            lambda x, flat: (signal_of(self.loop, self.law, self._state(x, flat)),),
+            ("signal",),
+            {"x": self.n, "memory": self.memory},
+        )
+
+    def _difference(self) -> LawFunction:
+        def gap(x: jax.Array, flat: jax.Array, other: jax.Array) -> tuple[jax.Array]:
+            return (gap_of(self.loop, self.own.leads, self._state(x, flat), other),)
+
+        return self._function(
+            "difference",
+            "the difference of the own signal from another one, 0 where that is NaN",
+            gap,
+            ("gap",),
+            {"x": self.n, "memory": self.memory, "received": self.s},
+        )
+
+    def _tick(self, gap: int) -> LawFunction:
+        loop, leads = self.loop, self.own.leads
+        sends_packets = leads and loop.channel is not None
+
+        def tick(
+            t: jax.Array, x: jax.Array, z: jax.Array, forward: jax.Array, flat: jax.Array
+        ) -> tuple[jax.Array, ...]:
+            own = self._state(x, flat)
+            step = step_with(loop, leads, t, own, z, forward, None)
+            action = step.action
+            results = action.input, _flat(action.memory), step.signal, action.message
+            # A state less a constant is finite where the state is.
+            signal = () if type(self.law).signal is Law.signal else step.signal
+            if not sends_packets:
+                return *results, _flat((x, signal, action))
+            content = content_of(loop, t, *own, step.signal, action.message, action.input)
+            return *results, content, _flat((x, signal, action, content))
+
+        outputs = ("u", "memory", "signal", "message", *(("content",) if sends_packets else ()))
+        sizes = {"t": None, "x": self.n, "z": gap, "feed_forward": self.k, "memory": self.memory}
+        return self._function(
             "tick",
             "a step at t (s), with z, the sum of weights times `difference`, and the feed-forward "
             "that was received, NaN if none was",
             tick,
-            ("u", "memory", "signal", "message"),
-            {**sizes, "feed_forward": k, "memory": memory},
-        ),
-    )
+            outputs,
+            sizes,
+        )
+
+    # ---- where messages are late ----
+
+    def _expectation(self, prediction: Prediction) -> Iterator[LawFunction]:
+        """Yield where a leader is expected, and how it is carried on."""
+        loop, follower, s = self.loop, self.loop.follower, self.s
+        assert loop.channel is not None
+        size = packet_size(loop.channel, s, self.k, self.m)
+        # A state is carried on in a loop, each round of which is a function here.
+        plain = type(follower).carried is Law.carried and type(follower).signal is Law.signal
+        in_rounds = plain and prediction is Prediction.PACKET
+
+        def expected(t: jax.Array, content: jax.Array, age: jax.Array) -> tuple[jax.Array, ...]:
+            if in_rounds:
+                leader, forward, _ = parts_of(loop, s, content)
+            else:
+                leader, forward = expected_of(loop, s, t, content, age)
+            return leader, forward, _flat((leader, forward))
+
+        def pace(age: jax.Array) -> tuple[jax.Array]:
+            rounds, duration = carried_pieces(carried_time(age))
+            return (jnp.stack([rounds.astype(age.dtype), duration]),)
+
+        def carry(content: jax.Array, duration: jax.Array) -> tuple[jax.Array, ...]:
+            x, forward, u = parts_of(loop, s, content)
+            moved = jnp.concatenate([rk4(loop.model.velocity, x, u, duration), forward, u])
+            return moved, moved
+
+        yield self._function(
+            "expected",
+            "the signal and the feed-forward that a leader is expected to have at t (s), by its "
+            "packet of an age (s)",
+            expected,
+            ("leader", "feed_forward"),
+            {"t": None, "content": size, "age": None},
+        )
+        if in_rounds:
+            about = "how many rounds of `carry`, and of which duration (s), make up an age (s)"
+            yield self._function("pace", about, pace, ("pace",), {"age": None})
+            about = "a packet of a leader that has moved on for a duration (s)"
+            sizes = {"content": size, "duration": None}
+            yield self._function("carry", about, carry, ("content",), sizes)
+
+    # ---- where states are measured ----
+
+    def _estimation(self, estimator: Estimator) -> Iterator[LawFunction]:
+        """Yield what an agent makes of measurements: numbers, the last of which is 0 at first."""
+        model, zero = self.loop.model, jnp.zeros
+        like = Estimate(
+            zero(self.n), zero(len(estimator.pushed)), zero((estimator.late + 1, self.m))
+        )
+        size = sum(part.size for part in like) + 1
+
+        def estimate(y: jax.Array) -> tuple[jax.Array]:
+            return (jnp.append(_flat(estimator.begin(model, y)), 0.0),)
+
+        def measure(y: jax.Array, flat: jax.Array) -> tuple[jax.Array, ...]:
+            before = unflatten(like, flat[:-1])
+            x, after = estimator.measure(model, before, y, flat[-1] == 0.0)
+            return x, jnp.append(_flat(after), flat[-1]), _flat((x, after))
+
+        def deliver(u: jax.Array, flat: jax.Array) -> tuple[jax.Array]:
+            return (jnp.append(_flat(estimator.act(unflatten(like, flat[:-1]), u)), 1.0),)
+
+        about = "the estimate of an agent whose first measurement is y"
+        yield self._function("estimate", about, estimate, ("estimate",), {"y": self.n})
+        about = "the state x that the agent assumes at a measurement y, and its estimate"
+        sizes = {"y": self.n, "estimate": size}
+        yield self._function("measure", about, measure, ("x", "estimate"), sizes)
+        about = "the estimate after the inputs u were applied"
+        sizes = {"u": self.m, "estimate": size}
+        yield self._function("deliver", about, deliver, ("estimate",), sizes)
+
+    def _function(
+        self,
+        name: str,
+        about: str,
+        compute: Callable[..., PyTree],
+        outputs: tuple[str, ...],
+        sizes: Mapping[str, int | None],
+    ) -> LawFunction:
+        """Return a function whose leaves have the names of its inputs.
+
+        What `compute` returns after its outputs must be finite where it is valid.
+        """
+        graph = ScalarGraph(self.bits)
+        leaves = [
+            single(graph.leaf(key)) if size is None else leaves_of(graph, key, range(size))
+            for key, size in sizes.items()
+        ]
+        parts = [nodes(graph, part) for part in lower(compute, graph, leaves)]
+        exceptions = graph.exceptions_of(sum(parts, start=[]))
+        plain = rewritten(sum(parts, start=exceptions), _plainer)
+        parts = [[plain[node] for node in part] for part in parts]
+        named = dict(zip(outputs, parts, strict=False))
+        if len(parts) == len(outputs):
+            return LawFunction(name, about, sizes, named)
+        valid = _all_finite(graph, parts[-1])
+        for truth in _fewer([plain[truth] for truth in exceptions]):
+            valid = graph.make("and", valid, graph.make("not", truth))
+        return LawFunction(name, about, sizes, named, valid)
 
 
-def _function(
-    name: str,
-    about: str,
-    compute: Callable[..., PyTree],
-    outputs: tuple[str, ...],
-    sizes: Mapping[str, int | None],
-) -> LawFunction:
-    """Return a function whose leaves have the names of its inputs."""
-    graph = ScalarGraph()
-    leaves = [
-        single(graph.leaf(key)) if size is None else leaves_of(graph, key, range(size))
-        for key, size in sizes.items()
-    ]
-    parts = [nodes(graph, part) for part in lower(compute, graph, leaves)]
-    named = dict(zip(outputs, parts, strict=False))
-    if len(parts) == len(outputs):
-        return LawFunction(name, about, sizes, named)
-    [valid] = parts[-1]
-    for truth in graph.exceptions_of(sum(parts, start=[])):
-        valid = graph.make("and", valid, graph.make("not", truth))
-    return LawFunction(name, about, sizes, named, valid)
+def _plainer(node: Node, args: Sequence[Node]) -> Node | bool | None:
+    """Return what replaces a node for one agent alone."""
+    if node.op == "unlikely":
+        # Of choices that save time where many agents take the same side.
+        return True
+    if node.op not in ("min", "max") or node.truth:
+        return None
+    for bound, x in (args, args[::-1]):
+        if bound.op == "constant" and not math.isnan(bound.value):
+            beyond = (bound, x) if node.op == "min" else (x, bound)
+            return node.graph.make("select", node.graph.make("lt", *beyond), bound, x)
+    return None
+
+
+def _all_finite(graph: ScalarGraph, numbers: Sequence[Node]) -> Node:
+    """Return whether numbers are finite, as their sum then is: one operation for each."""
+    total = functools.reduce(operator.add, dict.fromkeys(numbers))
+    return graph.make("lt", graph.make("abs", total), math.inf)
+
+
+def _fewer(truths: Sequence[Node]) -> list[Node]:
+    """Return truths of which one holds where one of others does: angles are compared together."""
+    together, others = dict[Node, Node](), list[Node]()
+    for truth in truths:
+        bound, x = truth.args if truth.op == "lt" else (truth, truth)
+        if bound.op == "constant" and x.at_least_0:
+            together[bound] = together[bound] + x if bound in together else x
+        else:
+            others.append(truth)
+    return [*others, *(x.graph.make("lt", bound, x) for bound, x in together.items())]
 
 
 def _flat(tree: PyTree) -> jax.Array:

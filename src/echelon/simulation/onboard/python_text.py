@@ -1,7 +1,8 @@
 """The law of one agent in plain Python: floats, lists and `math`."""
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping
 
 from echelon.simulation.onboard.law_functions import LawFunction
 from echelon.simulation.onboard.statements import COMMON, Syntax, statements
@@ -81,6 +82,14 @@ def law_single(a):
 """,
 }
 
+
+def _literal(value: float | bool) -> str:
+    """Return a plain number, to the bit."""
+    if isinstance(value, bool) or math.isfinite(value):
+        return repr(value)
+    return "math.nan" if math.isnan(value) else f"{'-' * (value < 0.0)}math.inf"
+
+
 _PYTHON = Syntax(
     {
         **COMMON,
@@ -92,15 +101,18 @@ _PYTHON = Syntax(
         "not": "not {0}",
         "select": "{1} if {0} else {2}",
     },
+    _literal,
+    "{}",
+    "    {word} = {name}[{place}]",
     "    {} = {}",
     "    {} = {}",
-    ("math.inf", "math.nan", "True", "False"),
+    ("float", "bool"),
     _HELPERS,
 )
 
 
 def python_text(
-    functions: Sequence[LawFunction], about: str, constants: Mapping[str, float | str]
+    functions: Collection[LawFunction], about: str, constants: Mapping[str, float | str]
 ) -> str:
     """Return the functions as a module with constants by name; `about` is its docstring."""
     body = "\n\n".join(map(_function_text, functions))

@@ -1,9 +1,9 @@
 """A graph of scalars as assignments of a programming language, one for each operation."""
 
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+from echelon.simulation.codegen.scheduling import depth_first, lateness
 from echelon.simulation.onboard.law_functions import LawFunction
 from echelon.simulation.scalars import Node, needed
 
@@ -36,26 +36,27 @@ class Syntax(NamedTuple):
     """How a language writes what differs between languages.
 
     Attributes:
-        operations: operation -> text, with the places of its operands.
+        operations: operation -> text, with the places of its operands and of its type, `kind`.
+        literal: returns a plain number, to the bit.
+        word: a name, with the place of a plain one.
+        entry: an assignment, with the places of a `word`, and of the `name` and `place` of a number
+            in an array.
         number, truth: an assignment, with the places of a name and an expression.
-        special: the texts of infinity, NaN, true and false.
+        kinds: of numbers and of truths.
         helpers: functions by name, each after those that it calls.
+        deep: whether each result is computed before the next is begun, so that a compiler needs
+            less of the stack; LLVM finds an order itself.
     """
 
     operations: Mapping[str, str]
+    literal: Callable[[float | bool], str]
+    word: str
+    entry: str
     number: str
     truth: str
-    special: tuple[str, str, str, str]
+    kinds: tuple[str, str]
     helpers: Mapping[str, str]
-
-    def literal(self, value: float | bool) -> str:
-        """Return a plain number, to the bit."""
-        infinite, nan, true, false = self.special
-        if isinstance(value, bool):
-            return true if value else false
-        if math.isnan(value):
-            return nan
-        return repr(value) if math.isfinite(value) else f"{'-' * (value < 0.0)}{infinite}"
+    deep: bool = True
 
     def used_helpers(self, text: str) -> str:
         """Return the functions that a text calls, directly or not."""
@@ -76,19 +77,17 @@ class Statements(NamedTuple):
 def statements(function: LawFunction, syntax: Syntax) -> Statements:
     """Return the assignments that compute the results of a function."""
     lines, words = list[str](), dict[Node, str]()
-    for node in needed(function.results):
+    nodes = needed(function.results)
+    for node in depth_first(function.results, lateness(nodes)) if syntax.deep else nodes:
         if node.op == "constant":
             words[node] = syntax.literal(node.value)
-            continue
-        if node.op == "leaf":
+        elif node.op == "leaf":
             name, *place = node.value
-            word = "".join(map(str, node.value))
-            expression = f"{name}[{place[0]}]" if place else ""
+            words[node] = word = syntax.word.format("".join(map(str, node.value)))
+            lines += [syntax.entry.format(word=word, name=name, place=k) for k in place]
         else:
-            word = f"v{len(lines)}"
-            expression = syntax.operations[node.op].format(*(words[a] for a in node.args))
-        words[node] = word
-        if expression:
-            pattern = syntax.truth if node.truth else syntax.number
-            lines.append(pattern.format(word, expression))
+            words[node] = word = syntax.word.format(f"v{len(lines)}")
+            pattern, kind = syntax.operations[node.op], syntax.kinds[node.truth]
+            expression = pattern.format(*(words[a] for a in node.args), kind=kind)
+            lines.append((syntax.truth if node.truth else syntax.number).format(word, expression))
     return Statements(lines, words)

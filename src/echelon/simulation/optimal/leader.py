@@ -17,11 +17,13 @@ from echelon.agents.references.demand import reference_warnings
 from echelon.agents.references.flatness import followed_states, reference_targets
 from echelon.agents.references.guide import Guide
 from echelon.core.errors import LawError
+from echelon.core.identity import process_key
+from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.laws.tracking import tracking_gain
-from echelon.simulation.optimal.formation_plan import plan_tracking
+from echelon.simulation.optimal.formation_plan import Trajectory, plan_tracking
 from echelon.simulation.optimal.objectives import TrackingOptions, grid
 from echelon.synthesis.gains.gain import Gain
 
@@ -29,6 +31,7 @@ _STEP = 0.005
 """Runge-Kutta step of the plan, s."""
 _BETWEEN = 4
 """Runge-Kutta steps from the beginning of an interval of the plan to now."""
+_PLANS = BoundedCache[Trajectory](8)
 
 
 class OptimalTracking(Law):
@@ -45,10 +48,12 @@ class OptimalTracking(Law):
         limits: whether the plan keeps to the actuators' limits.
         planning: options of the planning problem.
         gain: of the feedback, used with coupling 1; the model's Riccati gain when left out.
+        regulator, states, inputs: the gain in use and the plan; set by `prepared`.
     """
 
     reference: Guide
     gain: Gain | None
+    regulator: Gain | None
     states: Array | None
     inputs: Array | None
     horizon: float = eqx.field(static=True)
@@ -66,7 +71,8 @@ class OptimalTracking(Law):
         gain: Gain | None = None,
     ) -> None:
         """Store the problem, which `prepared` solves."""
-        self.reference, self.gain, self.states, self.inputs = reference, gain, None, None
+        self.reference, self.gain = reference, gain
+        self.regulator, self.states, self.inputs = None, None, None
         self.horizon, self.limits = horizon, limits
         self.start_error = tuple((start_error or {}).items())
         self.planning = TrackingOptions() if planning is None else planning
@@ -83,21 +89,23 @@ class OptimalTracking(Law):
             PlanError: there is no plan, or the model cannot follow a reference.
             MissingExtraError: casadi is not installed.
         """
+        gain = tracking_gain(self, model, self.gain)
+        own = self.reference, self.horizon, self.start_error, self.limits, self.planning
         # `simulate` prepares every law, prepared or not, and a plan takes seconds.
-        if self.states is not None:
-            return self
-        gain = tracking_gain(self, model, graph, self.gain)
-        times = grid(self.horizon, _STEP, self.planning.interval)
-        targets = reference_targets(model, self.reference, times.times)
-        start = targets.states[0] + model.per_state(dict(self.start_error))
-        plan = plan_tracking(model, start, targets, times, self.planning, self.limits)
+        plan = _PLANS.get_or_make(process_key((model, own)), lambda: self._plan(model))
         return eqx.tree_at(
-            lambda law: (law.gain, law.states, law.inputs),
+            lambda law: (law.regulator, law.states, law.inputs),
             self,
             (gain, plan.states, plan.inputs),
             # None is an empty tree to JAX, and could not be replaced.
             is_leaf=lambda leaf: leaf is None,
         )
+
+    def _plan(self, model: ControlAffine) -> Trajectory:
+        times = grid(self.horizon, _STEP, self.planning.interval)
+        targets = reference_targets(model, self.reference, times.times)
+        start = targets.states[0] + model.per_state(dict(self.start_error))
+        return plan_tracking(model, start, targets, times, self.planning, self.limits)
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
         """Return a warning for each part of the reference that the leader cannot follow."""
@@ -141,8 +149,8 @@ class OptimalTracking(Law):
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the leader's input."""
         state, u = self.target(model, view.t)
-        assert self.gain is not None  # `prepared` completes it together with the plan
+        assert self.regulator is not None  # `prepared` completes it together with the plan
         error = model.difference(view.x, state + view.offset)
         heading = None if model.heading is None else self.heading(model, view.t, view.x)
-        v = self.gain.feedback(model, view.x, error, heading)
+        v = self.regulator.feedback(model, view.x, error, heading)
         return u - model.physical(v, trim=False), memory

@@ -1,8 +1,17 @@
 """A function for JAX as a graph of scalar operations."""
 
 from echelon.simulation.scalars.lowering import lower
-from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph, needed
+from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph, needed, rewritten
 from echelon.simulation.scalars.traced_entries import Unsupported, nodes
 from echelon.simulation.scalars.whole_numbers import may_be_exception
 
-__all__ = ["Node", "ScalarGraph", "Unsupported", "lower", "may_be_exception", "needed", "nodes"]
+__all__ = [
+    "Node",
+    "ScalarGraph",
+    "Unsupported",
+    "lower",
+    "may_be_exception",
+    "needed",
+    "nodes",
+    "rewritten",
+]

@@ -23,6 +23,7 @@ from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.core.words import Feedforward, Frame
 from echelon.laws.law import Law
 from echelon.laws.safety import Safety
+from echelon.simulation.step.leadership import Leadership
 from echelon.simulation.step.meter import Meter, Sums
 from echelon.simulation.step.motion import Motion
 from echelon.simulation.step.settings import Settings
@@ -48,6 +49,7 @@ class Problem(NamedTuple):
         states: (N, n) at the beginning.
         channel: what the network does to messages; None for the ideal network.
         sensors: of the agents' own states; None for exact ones.
+        leadership: who takes the lead after the leader; None for nobody.
     """
 
     model: ControlAffine
@@ -59,6 +61,7 @@ class Problem(NamedTuple):
     states: Array
     channel: Channel | None = None
     sensors: Sensors | None = None
+    leadership: Leadership | None = None
 
 
 class Chunk(NamedTuple):
@@ -185,6 +188,17 @@ class Drive(eqx.Module):
             EchelonError: there is none, such as for a plan that violates a constraint.
         """
 
+    def check_motion(self, formation: Formation, graph: Graph) -> tuple[str, ...]:
+        """Return warnings of a formation that changes with time.
+
+        Raises:
+            EchelonError: the drive cannot follow it.
+        """
+        raise SimulationError(
+            "a formation that changes with time needs control laws, and plans and receding "
+            "horizons have constant offsets; leave out `motion`."
+        )
+
     @property
     def gain(self) -> "Gain | None":
         """The followers' gain; None where they have none."""
@@ -239,6 +253,18 @@ class Drive(eqx.Module):
                     f"got `{name}`, but `{type(self).__name__}` optimizes inputs from exact states "
                     f"that arrive at once; use control laws, or remove `{name}`."
                 )
+
+    def check_heirs(self, graph: Graph) -> None:
+        """Check that agents may be lost or join, and that heirs may take the lead.
+
+        Raises:
+            EchelonError: they may not.
+        """
+        if graph.presence is not None or graph.heirs:
+            raise SimulationError(
+                f"agents are lost or join, or have heirs, but `{type(self).__name__}` optimizes "
+                "inputs of agents that are all there; use control laws."
+            )
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of a run under a drive that is prepared.

@@ -5,6 +5,7 @@ each neighbour for the prediction plus the deviation that the neighbour last sen
 is a deviation, which hardly changes, and never a place, which does.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -37,11 +38,13 @@ class Packets(NamedTuple):
         leader: its number.
         stamp: the step at which it said so; `NEVER` for no packet.
         content: a row of numbers, which depends on the prediction.
+        epoch: how often the lead was taken over; None without heirs.
     """
 
     leader: Int[jax.Array, " N"]
     stamp: Int[jax.Array, " N"]
     content: Float[jax.Array, "N p"]
+    epoch: Int[jax.Array, " N"] | None = None
 
 
 class Letters(NamedTuple):
@@ -101,26 +104,48 @@ class Knowledge(NamedTuple):
 # ---- one agent, or many --------------------------------------------------------------------------
 
 
-def no_mail(readers: Readers, links: int, sent: Float[jax.Array, "N s"], packet: int) -> Mail:
+def no_mail(
+    readers: Readers, links: int, sent: Float[jax.Array, "N s"], packet: int, heirs: bool = False
+) -> Mail:
     """Return the mail before the first message, for signals as sent and packets (packet,)."""
-    agents = len(readers.number)
     return Mail(
         jnp.full(links, NEVER, jnp.int32),
         jnp.zeros((links, sent.shape[1]), sent.dtype),
         jnp.full(links, NOBODY, jnp.int32),
-        Packets(
-            jnp.where(readers.leads, readers.number, NOBODY).astype(jnp.int32),
-            jnp.full(agents, NEVER, jnp.int32),
-            jnp.zeros((agents, packet), sent.dtype),
-        ),
+        no_packets(readers, jnp.zeros((len(readers.number), packet), sent.dtype), heirs),
     )
 
 
-def packet_size(channel: Channel, s: int, forward: int, m: int) -> int:
-    """Return how many numbers a packet has, for signals (s,), a feed-forward and inputs (m,)."""
+def no_packets(readers: Readers, content: Float[jax.Array, "N p"], heirs: bool) -> Packets:
+    """Return the packets before the first one, with epochs where there are heirs."""
+    leader = jnp.where(readers.leads, readers.number, NOBODY).astype(jnp.int32)
+    never = jnp.full(len(leader), NEVER, jnp.int32)
+    return Packets(leader, never, content, jnp.zeros_like(never) if heirs else None)
+
+
+def taken_over(
+    packet: Packets, chosen: Bool[jax.Array, " N"], number: jax.Array, step: jax.Array
+) -> Packets:
+    """Return the packets of agents of which the chosen ones have just taken the lead."""
+    assert packet.epoch is not None
+    leader = jnp.where(chosen, number, packet.leader)
+    stamp = jnp.where(chosen, step, packet.stamp)
+    return packet._replace(leader=leader, stamp=stamp, epoch=packet.epoch + chosen)
+
+
+def packet_size(channel: Channel, s: int, forward: int, m: int, heirs: bool = False) -> int:
+    """Return how many numbers a packet has, for signals (s,), a feed-forward and inputs (m,).
+
+    Where the leader has `heirs` it also says how its feed-forward changes, since it is carried on
+    for longer.
+    """
     if channel.messages is MessageContent.STATE:
         return forward
-    more = {Prediction.PREVIEW: 0, Prediction.NONE: forward, Prediction.PACKET: forward + m}
+    more = {
+        Prediction.PREVIEW: 0,
+        Prediction.NONE: forward,
+        Prediction.PACKET: forward + m + heirs * forward,
+    }
     return s + more[channel.prediction]
 
 
@@ -149,7 +174,7 @@ def understand(
     channel = loop.channel
     assert channel is not None
     leader, feedforward = _leaders(loop, readers, t, mail.packet, ages.packet, sent)
-    lasting = ages.link <= HOP_LIFE * channel.forget * loop.motion.dt
+    lasting = ages.link <= hop_life(channel, loop.motion.dt)
     hops = count_hops(exchange, readers, mail.hops, lasting, len(loop.order))
     knows = readers.leads | (ages.packet < jnp.inf)
     receivers = jnp.asarray(exchange.receivers)
@@ -174,6 +199,12 @@ def usable_age(channel: Channel, dt: Array | float) -> jax.Array:
     deviations = channel.messages is MessageContent.DEVIATION
     # Of a state there is no better guess than the last one, but never that of no message.
     return jnp.asarray(channel.forget * dt if deviations else np.finfo(np.float32).max)
+
+
+def hop_life(channel: Channel, dt: Array | float) -> jax.Array:
+    """Return the age (s) beyond which a hop count is not used."""
+    # Times a float: ten times the largest whole number would be negative.
+    return jnp.asarray(float(HOP_LIFE) * channel.forget * dt)
 
 
 def write(
@@ -220,10 +251,30 @@ def content_of(
     if channel.prediction is Prediction.NONE:
         return jnp.concatenate([signal, forward])
     if channel.prediction is Prediction.PACKET:
-        return jnp.concatenate([signal, forward, u])
+        parts = jnp.concatenate([signal, forward, u])
+        if loop.succession is None:
+            return parts
+        return jnp.concatenate([parts, _slope(loop, t, x, offset, memory, forward)])
     deviation = loop.leader.deviation(loop.model, t, x, offset, memory)
     assert deviation is not None, "a channel with a preview has a leader with a plan"
     return deviation
+
+
+def _slope(
+    loop: Loop,
+    t: Scalar,
+    x: State,
+    offset: State,
+    memory: Memory,
+    forward: Float[jax.Array, " k"],
+) -> Float[jax.Array, " k"]:
+    """Return the rate at which the feed-forward of a leader with a plan changes, from a step on."""
+    deviation, dt = loop.leader.deviation(loop.model, t, x, offset, memory), loop.motion.dt
+    assert deviation is not None, "a leader with heirs has a plan"
+    expected = loop.leader.expected(loop.model, t + dt, deviation, jnp.asarray(dt, t.dtype), dt)
+    if expected is None or expected.feedforward is None:
+        return jnp.zeros_like(forward)
+    return (expected.feedforward - forward) / dt
 
 
 def _leaders(
@@ -239,32 +290,48 @@ def _leaders(
     assert channel is not None
     if channel.messages is MessageContent.STATE:
         signal, feedforward = sent, packet.content
-    elif channel.prediction is Prediction.NONE:
-        signal, feedforward = jnp.split(packet.content, [sent.shape[1]], axis=1)
     else:
-        carries = channel.prediction is Prediction.PACKET
         rows = packet.content, jnp.where(ages < jnp.inf, ages, 0.0)
-
-        def one(content: jax.Array, age: Scalar) -> tuple[jax.Array, jax.Array]:
-            if carries:
-                return _carried(loop, content, age, sent.shape[1])
-            return _expected(loop, t, content, age)
-
+        one = functools.partial(expected_of, loop, sent.shape[1], t)
         signal, feedforward = jax.vmap(one)(*rows)
     own = (packet.leader == readers.number)[:, None]
     return jnp.where(own | ~knows, sent, signal), jnp.where(knows, feedforward, 0.0)
 
 
-def _carried(
-    loop: Loop, content: Float[jax.Array, " p"], age: Scalar, s: int
+def expected_of(
+    loop: Loop, s: int, t: Scalar, content: Float[jax.Array, " p"], age: Scalar
 ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
-    """Return the signal and the feed-forward of a leader, from what it said an age (s) ago."""
+    """Return the signal (s,) and the feed-forward of a leader, by its packet of an age (s)."""
+    assert loop.channel is not None
+    prediction = loop.channel.prediction
+    if prediction is Prediction.PREVIEW:
+        return _expected(loop, t, content, age)
+    if prediction is Prediction.NONE:
+        return content[:s], content[s:]
+    time, slope = carried_time(age), None
+    if loop.succession is not None:
+        k = (len(content) - s - len(loop.model.input_names)) // 2
+        content, slope = content[:-k], content[-k:]
+    signal, feedforward, u = parts_of(loop, s, content)
+    if slope is None:
+        return loop.follower.carried(loop.model, signal, feedforward, u, time), feedforward
+    mean = feedforward + 0.5 * time * slope
+    return loop.follower.carried(loop.model, signal, mean, u, time), feedforward + time * slope
+
+
+def parts_of(
+    loop: Loop, s: int, content: Float[jax.Array, " p"]
+) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"], Input]:
+    """Return the signal (s,), the feed-forward and the input in a packet that is carried on."""
     m = len(loop.model.input_names)
-    signal, feedforward, u = content[:s], content[s:-m], content[-m:]
+    return content[:s], content[s:-m], content[-m:]
+
+
+def carried_time(age: Scalar) -> Scalar:
+    """Return how long (s) a leader is taken to have moved on since a packet of an age (s)."""
     # Nobody knows where a leader is that was not heard for long: its motion slows down.
     late = jnp.maximum(age - _CARRIED_FULLY, 0.0)
-    time = age - late + (1.0 - jnp.exp(-_SLOWING * late)) / _SLOWING
-    return loop.follower.carried(loop.model, signal, feedforward, u, time), feedforward
+    return age - late + (1.0 - jnp.exp(-_SLOWING * late)) / _SLOWING
 
 
 def _expected(

@@ -4,22 +4,25 @@ This file sees only the interfaces of models and laws.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.exchange import Exchange
+from echelon.agents.network.formation_motion import FormationMotion, OwnOffset
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.sensing import Sensors
-from echelon.core.types import Array, PyTree, States
+from echelon.core.types import Array, PyTree, Scalar, States
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law, Memory, without_certificates
 from echelon.simulation.step.drive import Problem
+from echelon.simulation.step.leadership import Succession
 from echelon.simulation.step.meter import Meter
 from echelon.simulation.step.motion import Motion
 from echelon.simulation.step.settings import Settings
@@ -44,9 +47,12 @@ class Loop(eqx.Module):
         levels: (D, W) the places of followers among the followers, level by level, likewise.
         order: (N,) from leaders and followers to the agents' own order.
         switches: when the graph switches; None where it does not.
+        presence: who is there; None where all always are.
+        succession: the heirs, which act with the leaders; None without any.
         channel: what the network does to messages; None for the ideal network.
         sensors: of the agents' own states; None for exact ones.
         share: of the feed-forward that followers use; None for all of it.
+        moving: how the offsets change with time; None for constant ones.
     """
 
     model: ControlAffine
@@ -63,15 +69,51 @@ class Loop(eqx.Module):
     levels: Array | None
     order: Array
     switches: "Switches | None"
+    presence: "Presence | None" = None
+    succession: Succession | None = None
     channel: Channel | None = None
     sensors: Sensors | None = None
     share: Array | None = None
+    moving: FormationMotion | None = None
 
     def with_motion(self, row: PyTree) -> "Loop":
         """Return the loop of one agent whose plant has the parameters of a row; None for no row."""
         if row is None:
             return self
         return dataclasses.replace(self, motion=self.motion.of_row(row))
+
+
+def offsets_at(
+    loop: Loop, law: Law, t: Scalar, agents: Array | jax.Array
+) -> tuple[Float[jax.Array, "K n"], Float[jax.Array, "K n"] | None]:
+    """Return what agents (K,) under a law take for their offsets at a time (s), and the rates.
+
+    There are no rates of constant offsets, or where the law does not use them.
+    """
+    offsets, motion = jnp.asarray(loop.offsets, t.dtype)[agents], loop.moving
+    if motion is None:
+        return offsets, None
+    rows = offsets, jnp.asarray(motion.places, t.dtype)[agents]
+    return jax.vmap(lambda *row: law.goal_offset(loop.model, OwnOffset(motion, *row), t))(*rows)
+
+
+def all_offsets(loop: Loop, t: jax.Array) -> Float[jax.Array, "N n"]:
+    """Return what all agents take for their offsets at a time (s)."""
+    if loop.moving is None:
+        return jnp.asarray(loop.offsets, t.dtype)
+    laws = (loop.leader, loop.leaders), (loop.follower, loop.followers)
+    return jnp.concatenate([offsets_at(loop, law, t, agents)[0] for law, agents in laws])[
+        loop.order
+    ]
+
+
+def goals_at(loop: Loop, now: "Moment") -> Float[jax.Array, "N n"] | None:
+    """Return the offsets of all agents, as errors are measured; None of constant ones."""
+    motion, t = loop.moving, time_of(loop, now)
+    if motion is None:
+        return None
+    rows = jnp.asarray(loop.offsets, t.dtype), jnp.asarray(motion.places, t.dtype)
+    return jax.vmap(lambda *row: OwnOffset(motion, *row).state(t))(*rows)
 
 
 class Switches(NamedTuple):
@@ -87,12 +129,77 @@ class Switches(NamedTuple):
         return None if schedule is None else cls(*schedule.switches(settings.dt, settings.horizon))
 
 
+class Presence(eqx.Module):
+    """Who is there in each of S stretches of the graph.
+
+    Attributes:
+        rows: (S, N) whether an agent is.
+        nearest: (S, N) whom it follows.
+        since: (S, N) since when it has been there, s.
+        returns: whether one that is lost joins again.
+    """
+
+    rows: Array
+    nearest: Array
+    since: Array
+    # Static, since it decides what a moment has.
+    returns: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, graph: Graph) -> "Presence | None":
+        """Return who is there when; None where all always are."""
+        schedule = graph.schedule
+        if schedule is None or schedule.present is None or schedule.nearest is None:
+            return None
+        since = np.where(schedule.present, 0.0, np.inf)
+        for k in range(1, len(since)):
+            stays = schedule.present[k - 1]
+            since[k] = np.where(stays, since[k - 1], schedule.starts[k])
+        joins = (np.diff(schedule.present.astype(int), axis=0) > 0).any(axis=0)
+        returns = bool((schedule.present[0] & joins).any())
+        return cls(schedule.present, schedule.nearest, since, returns)
+
+
+def row_at(switches: Switches, step: jax.Array) -> jax.Array:
+    """Return which row of the weights holds at a step."""
+    steps, rows = map(jnp.asarray, switches)
+    return rows[jnp.searchsorted(steps, step, side="right") - 1]
+
+
+class Cast(Protocol):
+    """Who is there when, and who may lead: a loop, or a network by itself."""
+
+    @property
+    def switches(self) -> "Switches | None": ...  # noqa: D102
+    @property
+    def presence(self) -> "Presence | None": ...  # noqa: D102
+    @property
+    def succession(self) -> Succession | None: ...  # noqa: D102
+
+
+def present_at(loop: Cast, step: jax.Array) -> Bool[jax.Array, " N"] | None:
+    """Return who is present at a step; None where all always are."""
+    if loop.presence is None or loop.switches is None:
+        return None
+    return jnp.asarray(loop.presence.rows)[row_at(loop.switches, step)]
+
+
+def since_at(loop: Cast, step: jax.Array) -> jax.Array:
+    """Return since when each agent has been there, s, (N,)."""
+    if loop.presence is None or loop.switches is None:
+        return jnp.zeros(())
+    return jnp.asarray(loop.presence.since)[row_at(loop.switches, step)]
+
+
+def nearest_at(loop: Loop, step: jax.Array) -> jax.Array:
+    """Return whom each agent follows at a step, (N,), where some are absent at times."""
+    assert loop.presence is not None and loop.switches is not None
+    return jnp.asarray(loop.presence.nearest)[row_at(loop.switches, step)]
+
+
 def exchange_at(exchange: Exchange, switches: Switches | None, step: jax.Array) -> Exchange:
     """Return an exchange with the weights that hold at a step."""
-    if switches is None:
-        return exchange
-    steps, rows = map(jnp.asarray, switches)
-    return exchange.during(rows[jnp.searchsorted(steps, step, side="right") - 1])
+    return exchange if switches is None else exchange.during(row_at(switches, step))
 
 
 def stretch_at(loop: Loop, step: int) -> tuple[int, int]:
@@ -115,6 +222,9 @@ class WorldState(NamedTuple):
         measured: (d, N, n) the states of the last d steps, where agents measure theirs late.
         seen: messages about places, as `Sightings`, where agents keep away from each other.
         estimates: of agents that estimate their states, as `Estimate`.
+        starts: (N, n) the initial states, where agents are lost and join again.
+        led: what each agent last received of its leader, as `Packets`, in the ideal network with
+            heirs.
     """
 
     in_flight: PyTree = None
@@ -123,6 +233,8 @@ class WorldState(NamedTuple):
     measured: PyTree = None
     seen: PyTree = None
     estimates: PyTree = None
+    starts: PyTree = None
+    led: PyTree = None
 
 
 class Moment(NamedTuple):
@@ -148,7 +260,8 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
     """Return the loop of prepared laws."""
     graph = problem.graph
     leader = leader if problem.channel is None else leader.predictable(problem.model)
-    leaders, followers = np.array(graph.leaders), np.array(graph.followers)
+    leaders = np.array([*graph.leaders, *graph.heirs])
+    followers = np.array([k for k in graph.followers if k not in graph.heirs], int)
     by_depth = follower.feedforward is Feedforward.PARENT
     nearest = np.array(graph.nearest_leader())
     return Loop(
@@ -168,8 +281,11 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         # Leaders act first, and this puts what all did back into the agents' own order.
         order=np.argsort(np.concatenate([leaders, followers])),
         switches=Switches.of(graph, problem.settings),
+        presence=Presence.of(graph),
+        succession=Succession.of(graph, problem.leadership),
         channel=problem.channel,
         sensors=problem.sensors,
+        moving=problem.formation.motion,
     )
 
 
@@ -191,3 +307,9 @@ def begin_forgetful(loop: Loop, states: Any) -> Moment:
     cut: Any = np.zeros((len(states), len(loop.model.input_names)), np.int8)
     step: Any = np.zeros((), np.int32)
     return Moment(step, states, loop.leader.init(), loop.follower.init(), cut)
+
+
+def time_of(loop: Loop, now: Moment) -> jax.Array:
+    """Return the time (s) of a moment."""
+    # From the step number, since a sum of many dt would gather rounding.
+    return now.step.astype(now.states.dtype) * loop.motion.dt

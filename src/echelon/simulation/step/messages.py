@@ -18,10 +18,19 @@ from echelon.simulation.step.knowledge import (
     content_of,
     no_mail,
     packet_size,
+    taken_over,
     understand,
     write,
 )
-from echelon.simulation.step.loop import Loop, Moment, WorldState
+from echelon.simulation.step.loop import (
+    Cast,
+    Loop,
+    Moment,
+    WorldState,
+    offsets_at,
+    present_at,
+    since_at,
+)
 
 
 def all_readers(agents: int, leaders: Array) -> Readers:
@@ -30,20 +39,23 @@ def all_readers(agents: int, leaders: Array) -> Readers:
     return Readers(numbers, jnp.zeros(agents, bool).at[leaders].set(True))
 
 
-def _all(loop: Loop) -> Readers:
-    return all_readers(len(loop.order), loop.leaders)
+def first_readers(loop: Loop) -> Readers:
+    """Return all agents of a run as readers, as they are at the start."""
+    if loop.succession is None:
+        return all_readers(len(loop.order), loop.leaders)
+    return Readers(jnp.arange(len(loop.order), dtype=jnp.int32), jnp.asarray(loop.succession.first))
 
 
 def begin_network(
     loop: Loop, world: WorldState, sent: Float[jax.Array, "N s"], forward: int
 ) -> WorldState:
     """Return the world with a network before the first message, for a feed-forward (forward,)."""
-    channel, readers = loop.channel, _all(loop)
+    channel, readers = loop.channel, first_readers(loop)
     assert channel is not None
     links, s = len(loop.exchange.receivers), sent.shape[1]
-    mail = no_mail(
-        readers, links, sent, packet_size(channel, s, forward, len(loop.model.input_names))
-    )
+    heirs = loop.succession is not None
+    size = packet_size(channel, s, forward, len(loop.model.input_names), heirs)
+    mail = no_mail(readers, links, sent, size, heirs)
     posts = channel.begin(Letters(sent, readers.number, mail.packet), links)
     return world._replace(in_flight=posts, mail=mail)
 
@@ -59,9 +71,54 @@ def read_messages(
     channel = loop.channel
     assert channel is not None
     mail = take(channel, exchange, now.step, now.world.in_flight, now.world.mail)
+    mail = mail._replace(packet=led_by_heirs(loop, now.step, mail.packet, loop.motion.dt))
     ages = Ages(*(age_of(now.step, x, loop.motion.dt) for x in (mail.stamp, mail.packet.stamp)))
-    t = now.step.astype(sent.dtype) * loop.motion.dt
-    return understand(loop, exchange, _all(loop), t, mail, ages, sent, difference), mail
+    t, readers = now.step.astype(sent.dtype) * loop.motion.dt, readers_of(loop, mail.packet)
+    return understand(loop, exchange, readers, t, mail, ages, sent, difference), mail
+
+
+def led_by_heirs(loop: Cast, step: jax.Array, packet: Packets, dt: Array | float) -> Packets:
+    """Return the packets after those heirs took the lead that hear of no leader; dt in s."""
+    if loop.succession is None:
+        return packet
+    number = jnp.arange(len(packet.leader), dtype=jnp.int32)
+    waited = jnp.minimum(age_of(step, packet.stamp, dt), step * dt - since_at(loop, step))
+    silent = loop.succession.silent(number, packet.leader, waited)
+    here = present_at(loop, step)
+    silent = silent if here is None else silent & here
+    return taken_over(packet, silent, number, step)
+
+
+def readers_of(loop: Loop, packet: Packets) -> Readers:
+    """Return all agents as readers, of which those lead that say so."""
+    if loop.succession is None:
+        return all_readers(len(loop.order), loop.leaders)
+    number = jnp.arange(len(packet.leader), dtype=jnp.int32)
+    return Readers(number, packet.leader == number)
+
+
+def heard_at_once(
+    loop: Loop, now: Moment, packet: Packets, said: Float[jax.Array, "L k"]
+) -> Packets:
+    """Return the packets of an ideal network, in which all hear leaders in the same step.
+
+    Args:
+        loop: with heirs.
+        now: the moment.
+        packet: of all agents.
+        said: what leaders and heirs would say if they led.
+    """
+    agents, number = len(loop.order), jnp.asarray(loop.leaders)
+    here = present_at(loop, now.step)
+    here = jnp.ones(agents, bool) if here is None else here
+    leads = readers_of(loop, packet).leads & here
+    stamp = jnp.full(len(number), now.step, jnp.int32)
+    assert packet.epoch is not None
+    own = Packets(packet.leader[number], stamp, said, packet.epoch[number])
+    each = jax.tree.map(lambda part: jnp.repeat(part, agents, axis=0), own)
+    receivers = jnp.tile(jnp.arange(agents), len(number))
+    new = jnp.repeat(leads[number], agents) & here[receivers]
+    return newest(packet, each, new, receivers)
 
 
 def age_of(
@@ -86,6 +143,8 @@ def take(channel: Channel, exchange: Exchange, step: jax.Array, posts: Posts, ma
 def newest(own: Packets, others: Packets, new: jax.Array, receivers: jax.Array) -> Packets:
     """Return the packet of each agent: of the leader with the lowest number, the newest one.
 
+    Of several epochs the highest counts.
+
     Args:
         own: of the agents.
         others: (K, ...) that messages contain.
@@ -93,11 +152,17 @@ def newest(own: Packets, others: Packets, new: jax.Array, receivers: jax.Array) 
         receivers: (K,) of the messages.
     """
     count = len(own.stamp)
-    valid = new & (others.stamp != NEVER)
+    valid, epoch, current = new & (others.stamp != NEVER), own.epoch, own.leader
+    if others.epoch is not None and epoch is not None:
+        epochs = jnp.where(valid, others.epoch, 0)
+        epoch = jnp.maximum(epoch, jax.ops.segment_max(epochs, receivers, count))
+        valid &= others.epoch == epoch[receivers]
+        # Whoever led in an earlier epoch does so no more.
+        current = jnp.where(own.epoch == epoch, current, NOBODY)
     leaders = jnp.where(valid, others.leader, NOBODY)
-    leader = jnp.minimum(own.leader, jax.ops.segment_min(leaders, receivers, count))
+    leader = jnp.minimum(current, jax.ops.segment_min(leaders, receivers, count))
     of_it = valid & (leaders == leader[receivers])
-    last = jnp.where(own.leader == leader, own.stamp, NEVER)
+    last = jnp.where(current == leader, own.stamp, NEVER)
     stamp = jax.ops.segment_max(jnp.where(of_it, others.stamp, NEVER), receivers, count)
     stamp = jnp.maximum(last, stamp)
     latest = of_it & (others.stamp == stamp[receivers])
@@ -105,7 +170,7 @@ def newest(own: Packets, others: Packets, new: jax.Array, receivers: jax.Array) 
     place = jax.ops.segment_max(places, receivers, count)
     better = (place >= 0) & (stamp > last)
     content = jnp.where(better[:, None], others.content[place], own.content)
-    return Packets(leader, stamp, content)
+    return Packets(leader, stamp, content, epoch)
 
 
 def send_messages(
@@ -135,13 +200,12 @@ def send_messages(
     channel, numbers = loop.channel, loop.leaders
     assert channel is not None
     t = now.step.astype(sent.dtype) * loop.motion.dt
-    offsets = jnp.asarray(loop.offsets, sent.dtype)
-    own = now.states[numbers], offsets[numbers], now.leader_memory
+    own = now.states[numbers], offsets_at(loop, loop.leader, t, numbers)[0], now.leader_memory
     rows = *own, sent[numbers], forward, inputs
     content = jax.vmap(lambda *row: content_of(loop, t, *row))(*rows)
     content = jnp.zeros_like(mail.packet.content).at[numbers].set(content)
     letters, sends = write(
-        channel, _all(loop), now.step, mail, knowledge, sent, difference, content
+        channel, readers_of(loop, mail.packet), now.step, mail, knowledge, sent, difference, content
     )
     carried = links_with(exchange, sends)
     links = exchange.receivers, exchange.senders

@@ -4,6 +4,7 @@ A mean over stored frames would depend on how many are stored, and its first fra
 much as all the steps after it.
 """
 
+import dataclasses
 from types import ModuleType
 from typing import NamedTuple, TypeAlias, TypeVar, final
 
@@ -211,6 +212,7 @@ class Meter(eqx.Module):
         limited: jax.Array,
         chatter: jax.Array,
         reference: State | None,
+        goals: States | None = None,
     ) -> Sums:
         """Return the sums of one step.
 
@@ -221,8 +223,9 @@ class Meter(eqx.Module):
             limited: (N,) the agents whose inputs a limit changed.
             chatter: (N,) the agents with an input that went from one limit to the opposite one.
             reference: (n,) the state that the leaders follow at its beginning, or None.
+            goals: (N, n) the offsets at its beginning; None for constant ones.
         """
-        offsets = jnp.asarray(self.offsets, states.dtype)
+        offsets = jnp.asarray(self.offsets, states.dtype) if goals is None else goals
         y = states - offsets
         steady = step >= jnp.asarray(self.first_steady)
 
@@ -230,14 +233,15 @@ class Meter(eqx.Module):
             return self.of_agent(step, steady, x, offset, leader, u)
 
         rows = jax.vmap(one)(states, offsets, y[self.nearest], inputs)
-        tracking, outputs = self._tracking(steady, states[self.leaders], reference)
+        led = states[self.leaders], offsets[self.leaders]
+        tracking, outputs = self._tracking(steady, led, reference)
         return Sums(
             steps=jnp.stack([jnp.asarray(True), steady]).astype(jnp.int32),
             errors=rows.errors.T,
             tracking=tracking,
             outputs=outputs,
             effort=rows.effort,
-            spacing=self.spacing(states),
+            spacing=self.spacing(states, goals),
             limited=limited.astype(jnp.int32),
             unsettled=rows.unsettled.astype(jnp.int32),
             inside=rows.inside.astype(jnp.int32),
@@ -246,14 +250,40 @@ class Meter(eqx.Module):
             avoidance=jnp.zeros((len(states), self.slices), states.dtype),
         )
 
+    def following(self, nearest: jax.Array) -> "Meter":
+        """Return a meter of errors relative to these leaders (N,)."""
+        return dataclasses.replace(self, nearest=nearest)
+
+    def of_present(self, read: Sums, here: Bool[jax.Array, " N"]) -> Sums:
+        """Return the sums of a step without the agents, leaders and edges that are absent."""
+        nothing, leads = self.zero_sums(), here[self.leaders]
+        masks = dict.fromkeys(("effort", "limited", "unsettled", "chatter"), here)
+        masks |= dict.fromkeys(("inside", "separation", "avoidance"), here[:, None])
+        masks |= {"errors": here[None], "tracking": leads[None], "outputs": leads[:, None]}
+        masks["spacing"] = here[self.edges].all(axis=1)
+        return read._replace(
+            **{
+                name: jnp.where(mask, getattr(read, name), getattr(nothing, name))
+                for name, mask in masks.items()
+            }
+        )
+
     def of_slice(
-        self, step: jax.Array, states: States, active: Float[jax.Array, " N"]
+        self,
+        step: jax.Array,
+        states: States,
+        active: Float[jax.Array, " N"],
+        here: Bool[jax.Array, " N"] | None = None,
     ) -> dict[str, jax.Array]:
-        """Return the terms `separation` and `avoidance` of a step, where agents keep apart."""
+        """Return the terms `separation` and `avoidance` of a step, where agents keep apart.
+
+        They are of the agents that are present, (N,), if not all are.
+        """
         nothing, at = self.zero_sums(), step // jnp.asarray(self.per_slice)
         places = states[:, np.array(self.measured)] * jnp.asarray(self.scales[None], states.dtype)
         squares = ((places[:, None] - places[None]) ** 2).sum(axis=2)
         others = jnp.where(jnp.eye(len(states), dtype=bool), jnp.inf, squares)
+        others = others if here is None else jnp.where(here[None], others, jnp.inf)
         return {
             "separation": nothing.separation.at[:, at].set(jnp.sqrt(others.min(axis=1))),
             "avoidance": nothing.avoidance.at[:, at].set(active),
@@ -306,23 +336,22 @@ class Meter(eqx.Module):
         return jnp.sum(part * part)
 
     def _tracking(
-        self, steady: jax.Array, states: jax.Array, reference: jax.Array | None
+        self, steady: jax.Array, led: tuple[jax.Array, jax.Array], reference: jax.Array | None
     ) -> tuple[jax.Array, jax.Array]:
         """Return the squared deviations of the leaders (2, L), and of their outputs (L, q)."""
-        leaders, q, dtype = len(self.leaders), len(self.model.output_names), states.dtype
+        leaders, q, dtype = len(self.leaders), len(self.model.output_names), led[0].dtype
         if reference is None:
             return jnp.zeros((2, leaders), dtype), jnp.zeros((leaders, q), dtype)
-        offsets = jnp.asarray(self.offsets, dtype)[self.leaders]
-        off, outputs = jax.vmap(lambda x, o: self.of_leader(steady, x, o, reference))(
-            states, offsets
-        )
+        off, outputs = jax.vmap(lambda x, o: self.of_leader(steady, x, o, reference))(*led)
         return off.T, outputs
 
-    def spacing(self, states: States) -> Float[jax.Array, " E"]:
-        """Return the squared errors of the distances along the edges, (E,)."""
+    def spacing(self, states: States, goals: States | None = None) -> Float[jax.Array, " E"]:
+        """Return the squared errors of the distances along the edges, (E,), for offsets (N, n)."""
         i, j = self.edges.T
-        square = jax.vmap(self._length)(states[i] - states[j])
-        return spacing_error(square, jnp.asarray(self.spacings, states.dtype))
+        square, desired = jax.vmap(self._length)(states[i] - states[j]), self.spacings
+        if goals is not None:
+            desired = jnp.sqrt(jax.vmap(self._length)(goals[i] - goals[j]))
+        return spacing_error(square, jnp.asarray(desired, states.dtype))
 
 
 def spacing_error(square: jax.Array, desired: jax.Array) -> jax.Array:

@@ -16,8 +16,7 @@ from echelon.agents.network.near import Near
 from echelon.core.types import Array, States
 from echelon.laws.law import Law, Memory
 from echelon.simulation.step.knowledge import Knowledge, Mail
-from echelon.simulation.step.loop import Loop, Moment
-from echelon.simulation.step.messages import all_readers
+from echelon.simulation.step.loop import Loop, Moment, present_at
 
 
 class Sightings(NamedTuple):
@@ -46,13 +45,18 @@ def begin_sightings(loop: Loop, now: Moment) -> Sightings | None:
 
 
 def look_around(
-    loop: Loop, now: Moment, knowledge: Knowledge | None, mail: Mail | None
+    loop: Loop,
+    now: Moment,
+    leads: Bool[jax.Array, " N"],
+    knowledge: Knowledge | None,
+    mail: Mail | None,
 ) -> tuple[Near | None, Sightings | None]:
     """Return what each agent knows of all others, rows (N, N - 1, ..), and the messages after it.
 
     Args:
         loop: of the run.
         now: the moment, as agents measure it.
+        leads: who leads.
         knowledge: of the agents; None in the ideal network.
         mail: likewise.
     """
@@ -60,15 +64,16 @@ def look_around(
         return None, None
     hulls, agents = all_hulls(loop, now), len(loop.order)
     receivers, senders = _links(agents)
-    leads = all_readers(agents, loop.leaders).leads
-    points, known, seen = hulls[senders], jnp.ones(len(senders), bool), None
+    here = present_at(loop, now.step)
+    here = jnp.ones(agents, bool) if here is None else here
+    points, known, seen = hulls[senders], here[senders], None
     if knowledge is not None and mail is not None:
         t = now.step.astype(hulls.dtype) * loop.motion.dt
         rows = hulls, knowledge.leader
         hulls = jax.vmap(lambda hull, leader: less_expected(loop, t, hull, leader))(*rows)
-        sends = leads | (mail.packet.stamp != NEVER)
+        sends = here & (leads | (mail.packet.stamp != NEVER))
         seen = _exchanged(loop, now, hulls, sends[senders], (receivers, senders))
-        points, known = seen.points, seen.stamp != NEVER
+        points, known = seen.points, known & (seen.stamp != NEVER)
     near = Near(hulls[receivers] - points, leads[senders], known)
     return jax.tree.map(lambda part: part.reshape(agents, agents - 1, *part.shape[1:]), near), seen
 

@@ -1,11 +1,12 @@
 """The order of a step: agents send, receive, act and move; and many steps one after the other."""
 
 import operator
+from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from echelon.agents.network.exchange import Difference
 from echelon.agents.network.near import Near
@@ -13,8 +14,28 @@ from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act, limit_sides
-from echelon.simulation.step.loop import Loop, Moment, WorldState, exchange_at
-from echelon.simulation.step.messages import begin_network, read_messages, send_messages
+from echelon.simulation.step.knowledge import no_packets
+from echelon.simulation.step.loop import (
+    Loop,
+    Moment,
+    WorldState,
+    all_offsets,
+    exchange_at,
+    goals_at,
+    nearest_at,
+    offsets_at,
+    present_at,
+    time_of,
+)
+from echelon.simulation.step.messages import (
+    begin_network,
+    first_readers,
+    heard_at_once,
+    led_by_heirs,
+    read_messages,
+    readers_of,
+    send_messages,
+)
 from echelon.simulation.step.meter import Sums, reference_at
 from echelon.simulation.step.motion import MotionState
 from echelon.simulation.step.nearby import begin_sightings, look_around
@@ -27,10 +48,12 @@ def begin(loop: Loop, states: States) -> Moment:
     def remember(law: Law, agents: Array) -> Memory:
         return jax.vmap(lambda x: law.begin(loop.model, x))(jnp.asarray(states)[agents])
 
+    # Heirs, and a leader that may follow one of them, have the memory of followers.
+    lead = loop.leader if loop.succession is None else loop.follower
     moment = Moment(
         step=jnp.zeros((), jnp.int32),
         states=jnp.asarray(states),
-        leader_memory=remember(loop.leader, loop.leaders),
+        leader_memory=remember(lead, loop.leaders),
         follower_memory=remember(loop.follower, loop.followers),
         cut=jnp.zeros((len(states), len(loop.model.input_names)), jnp.int8),
     )
@@ -48,6 +71,11 @@ def begin(loop: Loop, states: States) -> Moment:
         size = _feedforward_size(loop, moment)
         world = begin_network(loop, world, _sent(loop, moment)[0], size)
         world = world._replace(seen=begin_sightings(loop, moment))
+    elif loop.succession is not None:
+        content = jnp.zeros((len(states), _feedforward_size(loop, moment)), moment.states.dtype)
+        world = world._replace(led=no_packets(first_readers(loop), content, True))
+    if loop.presence is not None and loop.presence.returns:
+        world = world._replace(starts=moment.states)
     return moment._replace(world=world)
 
 
@@ -70,6 +98,7 @@ class Control(NamedTuple):
 def control(loop: Loop, now: Moment) -> Control:
     """Return what all agents do from a moment on."""
     now = _measured(loop, now)
+    here = present_at(loop, now.step)
     sent, difference = _sent(loop, now)
     exchange = exchange_at(loop.exchange, loop.switches, now.step)
     knowledge = mail = None
@@ -79,26 +108,52 @@ def control(loop: Loop, now: Moment) -> Control:
     else:
         knowledge, mail = read_messages(loop, exchange, now, sent, difference)
         z = knowledge.disagreement
-    near, seen = look_around(loop, now, knowledge, mail)
-    led = _lead(loop, now, z)
+    dt, led = loop.motion.dt, now.world.led
+    packet = mail.packet if mail is not None else led_by_heirs(loop, now.step, led, dt)
+    leads = readers_of(loop, packet).leads
+    near, seen = look_around(loop, now, leads, knowledge, mail)
+    said, led = (_lead(loop, now, z),) * 2
+    world = now.world
     if loop.levels is not None:
         followed = _by_depth(loop, now, led, z)
     else:
-        broadcast = led.message[loop.sender]
-        forward = broadcast if knowledge is None else knowledge.feedforward[loop.followers]
-        rows = loop.followers, forward, now.follower_memory
+        if knowledge is not None:
+            forward = knowledge.feedforward
+        elif loop.succession is None:
+            forward = led.message
+        else:
+            packet = heard_at_once(loop, now, packet, led.message)
+            world, forward = world._replace(led=packet), packet.content
+        direct = knowledge is None and loop.succession is None
+        sender = loop.sender if direct else loop.followers
+        rows = loop.followers, forward[sender], now.follower_memory
         followed = _act_all(loop, now, z, loop.follower, *rows, near=near)
-    world = now.world
+        if loop.succession is not None:
+            rows = loop.leaders, forward[loop.leaders], now.leader_memory
+            follows = _act_all(loop, now, z, loop.follower, *rows, near=near)
+            led = _chosen(leads[loop.leaders], led, follows)
     if knowledge is not None and mail is not None:
-        said = led.message, led.input
-        world = send_messages(loop, exchange, now, mail, knowledge, sent, difference, *said)
+        rows = sent, difference, said.message, said.input
+        world = send_messages(loop, exchange, now, mail, knowledge, *rows)
         world = world._replace(seen=seen)
     u = jnp.concatenate([led.input, followed.input])[loop.order]
+    u = u if here is None else jnp.where(here[:, None], u, 0.0)
     if loop.sensors is not None and loop.sensors.estimator is not None:
         world = world._replace(estimates=jax.vmap(loop.sensors.estimator.act)(world.estimates, u))
     desired = jnp.concatenate([led.desired, followed.desired])[loop.order]
     limited, cut = limit_sides(u, desired)
+    if here is not None:
+        limited, cut = (jnp.where(here[:, None], part, 0) for part in (limited, cut))
     return Control(u, limited.any(axis=1), cut.astype(jnp.int8), led.memory, followed.memory, world)
+
+
+def _chosen(first: Bool[jax.Array, " L"], one: Action, other: Action) -> Action:
+    """Return what some agents do as in one of two actions, and all others as in the other one."""
+
+    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(first.reshape(-1, *[1] * (jnp.ndim(a) - 1)), a, b)
+
+    return jax.tree.map(pick, one, other)
 
 
 def _measured(loop: Loop, now: Moment) -> Moment:
@@ -135,9 +190,8 @@ def _act_all(
     near: Near | None = None,
 ) -> Action:
     """Return what some agents do, with what they are sent (K, k), remember and know of others."""
-    x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
-    # From the step number, since a sum of many dt would gather rounding.
-    t = now.step.astype(x.dtype) * loop.motion.dt
+    x, t = now.states, time_of(loop, now)
+    offsets, rates = offsets_at(loop, law, t, agents)
 
     # One time for all; of everything else, an agent sees its own row and no other.
     def one(
@@ -148,12 +202,13 @@ def _act_all(
         memory: Memory,
         row: PyTree,
         near: Near | None,
+        rate: State | None,
     ) -> Action:
-        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near)
+        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near, rate)
         return act(loop.with_motion(row), law, view, memory, leads)
 
     rows, near = jax.tree.map(lambda leaf: leaf[agents], (loop.motion.rows, near))
-    return jax.vmap(one)(x[agents], offsets[agents], z[agents], forward, memory, rows, near)
+    return jax.vmap(one)(x[agents], offsets, z[agents], forward, memory, rows, near, rates)
 
 
 def _by_depth(loop: Loop, now: Moment, led: Action, z: Float[jax.Array, "N s"]) -> Action:
@@ -204,7 +259,7 @@ def signals(
 
 def _sent(loop: Loop, now: Moment) -> tuple[Float[jax.Array, "N s"], Difference]:
     """Return what all agents send to their neighbours, and how far two such values are apart."""
-    offsets = jnp.asarray(loop.offsets, now.states.dtype)
+    offsets = all_offsets(loop, time_of(loop, now))
     sent = signals(loop, now, offsets)
     if sent is not None:
         return sent, operator.sub
@@ -216,7 +271,49 @@ def _sent(loop: Loop, now: Moment) -> tuple[Float[jax.Array, "N s"], Difference]
 
 def step(loop: Loop, now: Moment) -> Moment:
     """Return the moment one dt later."""
+    now = _with_arrivals(loop, now)
     return _move(loop, now, control(loop, now))
+
+
+def _with_arrivals(loop: Loop, now: Moment) -> Moment:
+    """Return the moment with agents that return in this step where they began, without memory."""
+    here, before = present_at(loop, now.step), present_at(loop, now.step - 1)
+    if here is None or before is None or now.world.starts is None:
+        return now
+    new = here & ~before & (now.step > 0)
+
+    def begun(now: Moment) -> Moment:
+        start = begin(loop, now.world.starts)
+        return _where(loop, new, start, now)
+
+    return jax.lax.cond(new.any(), begun, lambda now: now, now)
+
+
+def _where(loop: Loop, chosen: Bool[jax.Array, " N"], one: Moment, other: Moment) -> Moment:
+    """Return a moment in which some agents are as in one moment, and all others as in another."""
+
+    def some(agents: Array | slice) -> Callable[[jax.Array, jax.Array], jax.Array]:
+        def pick(a: jax.Array, b: jax.Array) -> jax.Array:
+            mask = chosen[agents]
+            return jnp.where(mask.reshape(-1, *[1] * (jnp.ndim(a) - 1)), a, b)
+
+        return pick
+
+    def of_all(part: Callable[[Moment], PyTree]) -> PyTree:
+        return jax.tree.map(some(slice(None)), part(one), part(other))
+
+    return other._replace(
+        states=of_all(lambda moment: moment.states),
+        cut=of_all(lambda moment: moment.cut),
+        leader_memory=jax.tree.map(some(loop.leaders), one.leader_memory, other.leader_memory),
+        follower_memory=jax.tree.map(
+            some(loop.followers), one.follower_memory, other.follower_memory
+        ),
+        world=other.world._replace(
+            motion=of_all(lambda moment: moment.world.motion),
+            estimates=of_all(lambda moment: moment.world.estimates),
+        ),
+    )
 
 
 def _move(loop: Loop, now: Moment, acted: Control) -> Moment:
@@ -226,7 +323,14 @@ def _move(loop: Loop, now: Moment, acted: Control) -> Moment:
     states, own = loop.motion.advance(now.states, acted.inputs, now.step, own)
     world = world if world.motion is None else world._replace(motion=own)
     memories = acted.leader_memory, acted.follower_memory
-    return Moment(now.step + 1, states, *memories, acted.cut, world)
+    after = Moment(now.step + 1, states, *memories, acted.cut, world)
+    here = present_at(loop, now.step)
+    # Who is absent stays as it is.
+    return (
+        after
+        if here is None
+        else _where(loop, here, after, now._replace(step=after.step, world=world))
+    )
 
 
 def measured_step(
@@ -236,15 +340,20 @@ def measured_step(
 
     `reference` (S, n) is what the leaders follow from the step `first` on.
     """
+    now = _with_arrivals(loop, now)
     acted = control(loop, now)
     followed = reference_at(reference, now.step - first, now.states)
     chatter = (acted.cut * now.cut < 0).any(axis=1)
-    moment = now.step, now.states, acted.inputs
-    read = loop.meter.read(*moment, acted.limited, chatter, followed)
+    moment, here = (now.step, now.states, acted.inputs), present_at(loop, now.step)
+    meter = loop.meter if here is None else loop.meter.following(nearest_at(loop, now.step))
+    read = meter.read(*moment, acted.limited, chatter, followed, goals_at(loop, now))
     active = loop.follower.active(acted.follower_memory)
     if active is not None:
         every = jnp.zeros(len(now.states), active.dtype).at[loop.followers].set(active)
-        read = read._replace(**loop.meter.of_slice(now.step, now.states, every))
+        if loop.succession is not None:
+            every = every.at[loop.leaders].set(loop.follower.active(acted.leader_memory))
+        read = read._replace(**meter.of_slice(now.step, now.states, every, here))
+    read = read if here is None else meter.of_present(read, here)
     return _move(loop, now, acted), read
 
 
@@ -270,7 +379,8 @@ def advance(
         carry: tuple[Moment, Sums], count: jax.Array
     ) -> tuple[tuple[Moment, Sums], tuple[States, Inputs]]:
         # The first step computes these inputs again, but after the last frame there is none.
-        stored = (carry[0].states, control(loop, carry[0]).inputs)
+        now = _with_arrivals(loop, carry[0])
+        stored = (now.states, control(loop, now).inputs)
         return jax.lax.fori_loop(0, count, one, carry), stored
 
     (now, sums), stored = jax.lax.scan(frame, (now, loop.meter.zero_sums()), counts)

@@ -13,6 +13,7 @@ import numpy as np
 from echelon.core.errors import GainError
 from echelon.core.memoize import memoize
 from echelon.core.types import Array
+from echelon.core.words import amount
 
 Number: TypeAlias = float | Fraction
 
@@ -202,6 +203,8 @@ def _check_shapes(vertices: Array, error: Array, B: Array, P: Array) -> None:
     }
     for name, (got, expected) in shapes.items():
         if got != expected or name == "B" and len(got) != 2:
-            raise GainError(f"`{name}` has shape {got}, and must fit the {n} states of `P`.")
+            raise GainError(
+                f"`{name}` has shape {got}, and must fit the {amount(n, 'state')} of `P`."
+            )
     if not len(vertices):
         raise GainError("`vertices` is empty, and must hold at least one matrix.")

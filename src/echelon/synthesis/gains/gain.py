@@ -29,6 +29,7 @@ from echelon.core.linear import check_definite
 from echelon.core.numerics import precision
 from echelon.core.trace import shared_traces
 from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.words import amount
 from echelon.synthesis.certificates.certificate import Certificate, RegionCertificate, certify
 
 Region: TypeAlias = Callable[[float, Spectrum], RegionCertificate | None]
@@ -88,7 +89,8 @@ class Gain(eqx.Module):
         B = linearize(model).B
         if self.P.shape[0] != B.shape[0] or self.R.shape[0] != B.shape[1]:
             raise GainError(
-                f"the gain is of {self.P.shape[0]} states and {self.R.shape[0]} inputs, and "
+                f"the gain is of {amount(len(self.P), 'state')} and "
+                f"{amount(len(self.R), 'input')}, and "
                 f"`{type(model).__name__}` has {B.shape[0]} and {B.shape[1]}."
             )
         scale = np.asarray(model.input_scale, np.float64)

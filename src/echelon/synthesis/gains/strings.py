@@ -6,6 +6,7 @@ from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import GainError
+from echelon.core.words import amount
 from echelon.synthesis.certificates.margins import ClosedLoop, string_gain
 from echelon.synthesis.gains.gain import Gain
 
@@ -39,6 +40,6 @@ def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, 
     worst = int(growth.argmax())
     return (
         f"{feedforward}, each agent of a branch amplifies a push by up to "
-        f"||T|| = {max(gains):.3g}, and the {depth[worst]} agents up from agent {worst} by up to "
-        f"{growth[worst]:.3g}; a stronger coupling brings ||T|| nearer to 1.",
+        f"||T|| = {max(gains):.3g}, and the {amount(depth[worst], 'agent')} up from agent {worst} "
+        f"by up to {growth[worst]:.3g}; a stronger coupling brings ||T|| nearer to 1.",
     )

@@ -182,12 +182,13 @@ class Chart {
     let [low, high] = [Infinity, -Infinity];
     const take = (y) => Number.isFinite(y) && ((low = Math.min(low, y)), (high = Math.max(high, y)));
     const [start, end] = this.shown();
-    for (const line of this.lines) if (!line.bound) for (let k = start; k < end; k++) take(line.values[k]);
+    for (const line of this.lines) if (!line.bound && !line.strip) for (let k = start; k < end; k++) take(line.values[k]);
     for (const mark of this.marks) take(this.log ? Math.log10(mark.value) : mark.value);
+    if (this.zero) take(0);
     if (!(low <= high)) return this.log ? [-1, 0] : [0, 1];
     if (this.log) return high - low > 2 ? [low - 0.15, high + 0.25] : [Math.floor(low - 0.05), Math.ceil(high + 0.05)];
     const margin = 0.06 * (high - low) || 0.1 * Math.abs(high) || 1;
-    return [low - margin, high + margin];
+    return [this.zero ? 0 : low - margin, high + margin];
   }
 
   draw() {
@@ -206,7 +207,8 @@ class Chart {
     pen.rect(MARGIN.left, MARGIN.top - 2, w - MARGIN.left - MARGIN.right, h - MARGIN.top - MARGIN.bottom + 4);
     pen.clip();
     this.drawMarks(pen, w);
-    for (const line of this.lines) this.drawLine(pen, line);
+    this.drawMoments(pen, w, h);
+    for (const line of this.lines) line.strip ? this.drawStrip(pen, line, h) : this.drawLine(pen, line);
     this.nameMarks(pen, w);
     pen.restore();
     if (this.now !== undefined) this.point(this.now);
@@ -245,6 +247,22 @@ class Chart {
     }
   }
 
+  // Events, as vertical lines with their words.
+  drawMoments(pen, w, h) {
+    this.moments.forEach(([time, words], k) => {
+      const x = Math.round(this.x(time)) + 0.5;
+      Object.assign(pen, { strokeStyle: themeColour("--axis"), fillStyle: themeColour("--faint"), lineWidth: 1, textBaseline: "top" });
+      pen.beginPath();
+      pen.moveTo(x, MARGIN.top);
+      pen.lineTo(x, h - MARGIN.bottom);
+      pen.stroke();
+      // Inside of the chart, and close events in two rows.
+      const left = x + pen.measureText(words).width > w - MARGIN.right;
+      pen.textAlign = left ? "right" : "left";
+      pen.fillText(words, x + (left ? -3 : 3), MARGIN.top + 12 * (k % 2));
+    });
+  }
+
   // After the curves, which would cross the names.
   nameMarks(pen, w) {
     for (const mark of this.marks) {
@@ -271,6 +289,20 @@ class Chart {
     }
     pen.stroke();
     pen.setLineDash([]);
+  }
+
+  // A number as steps along the bottom, whose largest is a quarter as high as the chart.
+  drawStrip(pen, line, h) {
+    const [start, end] = this.shown(), base = h - MARGIN.bottom, tall = 0.25 * (base - MARGIN.top);
+    const most = line.values.reduce((a, b) => Math.max(a, b || 0), 1);
+    pen.beginPath();
+    pen.moveTo(this.x(this.times[start]), base);
+    for (let k = start; k < end; k++)
+      for (const at of [k, k + 1]) pen.lineTo(this.x(this.times[Math.min(at, end - 1)]), base - (tall * (line.values[k] || 0)) / most);
+    pen.lineTo(this.x(this.times[end - 1]), base);
+    Object.assign(pen, { fillStyle: this.colour(line), globalAlpha: 0.35 });
+    pen.fill();
+    pen.globalAlpha = 1;
   }
 
   // Moves the cursor to a time, and shows the values there.

@@ -42,17 +42,23 @@ function showHeader(run, part, title) {
   if (run.thrust) add(make("i"), ""), key.lastChild.append("motor thrust 0", make("i", { class: "thrust" }), "limit");
   if (run.agents > run.leaders.length || run.referenced) add(make("i", { class: "ring" }), run.referenced ? "goal, and reference of a leader" : "goal");
   if (run.heard.some((who) => who === 1 || who === 2)) add(make("i", { class: run.agents > 200 ? "taper" : "arrow" }), "from sender to receiver");
+  if (run.ellipsoid?.kept) add(make("i", { class: "ellipsoid" }), "ellipsoid: amber below the kept distance, red where two overlap");
   key.append(make("span", {}, run.drawn));
 }
 
 // Shows which agents were closest to each other so far, beside the size of the vehicles.
-function showClosest(element, closest, { radius }) {
+function showClosest(element, closest, { ellipsoid }) {
   element.hidden = !closest;
   if (!closest) return;
-  const [time, distance, i, j] = closest, touch = radius && distance < 2 * radius;
+  const [time, distance, i, j] = closest, touch = ellipsoid && distance < ellipsoid.touching;
   element.classList.toggle("touch", Boolean(touch));
-  const size = radius ? ` (vehicles touch below ${brief(2 * radius)} m)` : "";
-  element.textContent = `${touch ? "overlap: " : ""}smallest distance so far ${brief(distance)} m, agents ${i} and ${j} at ${time.toFixed(2)} s${size}`;
+  const scaled = ellipsoid?.kept, size = ellipsoid ? ` (${scaled ? "ellipsoids" : "vehicles"} touch below ${brief(ellipsoid.touching)} m)` : "";
+  element.textContent = `${touch ? "overlap: " : ""}smallest ${scaled ? "scaled " : ""}distance so far ${brief(distance)} m, agents ${i} and ${j} at ${time.toFixed(2)} s${size}`;
+}
+
+// Shows the newest event.
+function showMoment(part, moment) {
+  part.querySelector(".moment").textContent = moment ? `${moment[0].toFixed(2)} s: ${moment[1]}` : "";
 }
 
 function setDark(dark) {
@@ -65,6 +71,8 @@ class ViewControls {
     Object.assign(this, { views, show, target: null, box: make("div", { class: "toggles" }) });
     for (const name of ["links", "goals", "trails"]) this.toggle(name, (on) => views.forEach((view) => (view.shared[name].value = on ? opacities(view.run)[name] : 0)));
     if (views.some((view) => view.labels.all.length)) this.toggle("names", (on) => views.forEach((view) => (view.labels.visible = on)));
+    const sized = views.flatMap((view) => view.ellipsoids ?? []);
+    if (sized.length) this.toggle("ellipsoids", (on) => sized.forEach((each) => (each.shown.value = on ? 1 : 0)), sized[0].shown.value > 0);
     this.makeFollow();
     const home = make("button", { title: "show all (h)" }, "show all");
     home.addEventListener("click", () => this.home());
@@ -114,8 +122,8 @@ class ViewControls {
     this.show();
   }
 
-  toggle(name, action) {
-    const button = make("button", { class: "toggle", "aria-pressed": "true" }, name);
+  toggle(name, action, begin = true) {
+    const button = make("button", { class: "toggle", "aria-pressed": begin }, name);
     button.addEventListener("click", () => {
       const on = button.getAttribute("aria-pressed") !== "true";
       button.setAttribute("aria-pressed", on);

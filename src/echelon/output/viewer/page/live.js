@@ -50,9 +50,10 @@ class Live {
     // V is a square of errors. In a stream, whose pictures are finite, NaN stands for what does not exist.
     const { run } = this, line = (name, colour) => ({ name, colour, values: [], none: "\u2013 none", floor: name === "V" ? FLOOR ** 2 : FLOOR });
     const charts = [{ title: "formation error", unit: run.unit, log: true, lines: [line("worst", 1), line("median", 0), ...(run.referenced ? [line("leader", "leader")] : [])], marks: [{ value: 0.01, name: run.unit ? "1 cm" : "0.01" }] }];
+    if (run.near) charts.push({ ...run.near, lines: [line("any two", "leader"), ...(run.ellipsoid.kept ? [{ ...line("active rows", 1), strip: true }] : [])] });
     if (run.limited) charts.push({ title: run.loads ? "motors" : "inputs", unit: "% of limit", log: false, lines: [line("largest", 1), line("smallest", 0)], marks: [{ value: 100, name: "limit", below: true }, { value: 0, name: "limit" }] });
     if (run.lyapunov) charts.splice(1, 0, { title: "Lyapunov function V", unit: "", log: true, lines: [line("V", 0)], marks: [] });
-    this.charts = charts.map((chart) => new Chart($("#side"), { ...chart, times: [] }, this.window));
+    this.charts = charts.map((chart) => new Chart($("#side"), { ...chart, moments: [], times: [] }, this.window));
   }
 
   take(block) {
@@ -64,8 +65,8 @@ class Live {
 
   fill(time, numbers) {
     const { run, moment } = this, { agents, axes, turns, loads } = run;
-    const [worst, median, off, most, least, lyapunov, factor, wind, ...closest] = numbers.subarray(0, 12);
-    let at = 12;
+    const [worst, median, off, most, least, lyapunov, factor, wind, near, active, ...closest] = numbers.subarray(0, 14);
+    let at = 14;
     at = this.places(numbers, at, axes, moment.position, time);
     at = this.places(numbers, at, axes, moment.goal, time);
     for (let i = 0; i < agents; i++, at += turns)
@@ -76,11 +77,12 @@ class Live {
     if (this.pictures++ && time < moment.time) this.view.trail.clear();
     this.view.trail.push(moment.position, time);
     moment.time = time;
-    this.numbers = { worst, median, off, lyapunov, factor, wind, closest };
+    this.numbers = { worst, median, off, lyapunov, factor, wind, near, active, closest };
     showClosest($(".closest"), Number.isNaN(closest[0]) ? null : closest, run);
     // A logarithm has no 0, and values below the floor are rounding errors.
     const log = (value, floor = FLOOR) => (value <= floor ? -Infinity : Math.log10(value));
-    this.chart(time, [[log(worst), log(median), log(off)], ...(run.lyapunov ? [[log(lyapunov, FLOOR ** 2)]] : []), [100 * most, 100 * least]]);
+    const rows = [[log(worst), log(median), log(off)], [log(lyapunov, FLOOR ** 2)], [near, active], [100 * most, 100 * least]];
+    this.chart(time, rows.filter((_, k) => [true, run.lyapunov, run.near, run.limited][k]));
     this.clock.innerHTML = `<b>${time.toFixed(1)}</b> s${factor < 0.95 ? ` \u00b7 ${factor.toFixed(2)} \u00d7 real time` : ""}`;
     this.show();
   }
@@ -143,8 +145,19 @@ class Live {
     const cut = new Set(state.cut.map(([i, j]) => `${i} ${j}`));
     this.run.edges.forEach(([i, j], edge) => this.view.cutLink(edge, cut.has(`${i} ${j}`)));
     this.state = state;
+    this.showMoments(state);
     this.paused = state.paused;
     this.pauseButton.replaceChildren(icon(this.paused ? "play" : "pause"));
+  }
+
+  // Shows who leads, and the events.
+  showMoments({ moments, nearest }) {
+    this.moments = moments;
+    this.charts.forEach((chart, place) => (chart.moments = moments.map(([time, words]) => [time, place ? "" : words])));
+    showMoment($("main"), moments.at(-1));
+    if (nearest.join() === this.nearest) return;
+    this.nearest = nearest.join();
+    this.view.setLeaders(nearest);
   }
 
   // ---- requests ----
@@ -195,7 +208,8 @@ class Live {
     };
     this.panel.append(make("div", { class: "buttons" },
       button("kick", "push the selected agent, else the first follower (k)", () => this.kick()),
-      button("lose", "cut all links of the selected agent, else of the first follower", () => this.lose()),
+      button("lose agent", "the selected agent is lost, else the last follower", () => this.lose()),
+      button("join", "the selected agent joins again, else the one lost last", () => this.join()),
       button("reset", "restart with the present controls", () => this.ask("reset")),
       button("save as scenario", "download a scenario file that repeats this session", () => this.save())));
     this.panel.append(make("p", { class: "hint" }, "click a link to cut or restore it, or an agent to select it"));
@@ -237,7 +251,18 @@ class Live {
   }
 
   lose() {
-    this.ask("lose", this.view.selected >= 0 ? this.view.selected : this.firstFollower);
+    const { selected } = this.view, present = [...Array(this.run.agents).keys()].filter((i) => !this.absent(i));
+    this.ask("lose", selected >= 0 ? selected : present.filter((i) => !this.run.leaders.includes(i)).at(-1) ?? present[0]);
+  }
+
+  absent(agent) {
+    return Number.isNaN(this.moment.position[3 * agent + 1]);
+  }
+
+  join() {
+    const { selected } = this.view, absent = [...Array(this.run.agents).keys()].filter((i) => this.absent(i));
+    if (selected >= 0 || absent.length) this.ask("join", selected >= 0 ? selected : absent.at(-1));
+    else this.showFault("Nobody is lost who could join; press `lose agent` first.");
   }
 
   kick() {

@@ -22,7 +22,9 @@ class Pane {
   show(frame) {
     const { run } = this, moment = run.at(frame);
     this.view.show(moment);
-    showClosest(this.closest, run.closest[upper(run.closest.map(([time]) => time), moment.time) - 1], run);
+    const last = (rows) => rows[upper(rows.map(([time]) => time), moment.time) - 1];
+    showClosest(this.closest, last(run.closest), run);
+    showMoment(this.part, last(run.moments));
     for (const chart of this.charts) chart.point(moment.time);
     return moment;
   }
@@ -103,7 +105,8 @@ class Player {
     this.button.addEventListener("click", () => this.play(!this.playing));
     this.scrub.addEventListener("input", () => (this.play(false), this.seek(Number(this.scrub.value))));
     speed.addEventListener("change", () => (this.speed = Number(speed.value)));
-    $("footer").append(this.button, this.clock, this.scrub, speed, this.views.box);
+    const marks = run.moments.map(([time, words]) => make("i", { class: "mark", title: words, style: `left: calc(8px + ${run.frameOf(time) / last} * (100% - 16px))` }));
+    $("footer").append(this.button, this.clock, make("span", { class: "track" }, this.scrub, ...marks), speed, this.views.box);
   }
 
   listen() {
@@ -159,8 +162,9 @@ class Player {
 function readCharts(run) {
   if (!run.series) return [];
   const curve = (c) => Array.from({ length: run.series.frames }, (_, k) => valueOf(run.series, c, k, 0));
-  return run.charts.map((chart) => ({
+  return run.charts.map((chart, place) => ({
     ...chart,
+    moments: place ? run.moments.map(([time]) => [time, ""]) : run.moments,
     times: run.chartTimes,
     lines: chart.lines.map((line) => ({ ...line, values: line.ends ? run.chartTimes.map((t) => line.ends[0] + line.ends[1] * t) : curve(line.series) })),
   }));

@@ -56,12 +56,18 @@ class Moment {
 
   // The goal of a follower is its offset from its nearest leader, that of a leader from the reference.
   setGoals(run) {
-    const { position: p, goal, reference } = this, { nearest, offsets } = run;
+    const { position: p, goal, reference } = this, { offsets, schedule } = run;
+    const nearest = schedule?.nearest?.[rowAt(schedule, this.time)] ?? run.nearest;
     for (let i = 0; i < run.agents; i++)
       for (let k = 0, to = nearest[i]; k < 3; k++)
         goal[3 * i + k] = to === i && run.referenced ? reference[k] + offsets[3 * i + k] : p[3 * to + k] + offsets[3 * i + k] - offsets[3 * to + k];
     if (run.space.kind === "time") for (let i = 0; i < run.agents; i++) goal[3 * i] = p[3 * i];
   }
+}
+
+// Which row of a schedule holds at a time.
+function rowAt({ starts, period }, time) {
+  return Math.max(0, upper(starts, (period ? (time + 1e-9) % period : time + 1e-9)) - 1);
 }
 
 class Replay {
@@ -110,6 +116,7 @@ class Replay {
       for (let c = 0, wide = this.motors.low.length / this.agents; c < this.motors.low.length; c++)
         now.motors[4 * Math.floor(c / wide) + (c % wide)] = valueOf(this.motors, c, k, part);
     if (this.shades) now.shades = this.shades.low.map((_, edge) => valueOf(this.shades, edge, k, 0));
+    if (this.moving) this.fill(this.offsets, this.moving, k, part, now.time);
     now.setGoals(this);
     return now;
   }

@@ -11,6 +11,7 @@ class View {
   constructor(element, run) {
     this.element = element;
     this.run = run;
+    this.first = new Set(run.leaders);
     this.flat = run.space.kind !== "space";
     this.software = isSoftware();
     this.renderer = new THREE.WebGLRenderer({ antialias: !this.software, alpha: true, powerPreference: "high-performance" });
@@ -74,6 +75,7 @@ class View {
     this.halo = this.add(halo(this.flat), this.material(VEHICLE), 3);
     this.makeLinks(lines);
     this.makeTrails(lines);
+    if (run.ellipsoid && run.agents <= 200 && ["space", "plane"].includes(run.space.kind)) this.ellipsoids = new Ellipsoids(this, lines);
     if (run.referenced) this.path = new Path(this, lines);
   }
 
@@ -148,11 +150,19 @@ class View {
   switchLinks(time) {
     const { schedule, edges } = this.run;
     if (!schedule) return;
-    const { starts, rows, period } = schedule;
-    const row = rows[Math.max(0, upper(starts, period ? (time + 1e-9) % period : time) - 1)];
-    if (row === this.row) return;
-    this.row = row;
+    const row = rowAt(schedule, time);
+    if (row === this.stretch) return;
+    this.stretch = row;
+    this.row = schedule.rows[row];
     edges.forEach((_, edge) => this.markLink(edge));
+    if (schedule.nearest) this.setLeaders(schedule.nearest[row]);
+  }
+
+  // Another agent may lead once the leader is lost.
+  setLeaders(nearest) {
+    this.run.leaders = [...new Set(nearest)];
+    this.setTheme();
+    this.labels.rename();
   }
 
   // The agents from which an agent receives now.
@@ -290,7 +300,8 @@ class View {
     const leads = new Set(run.leaders), many = run.agents > 200;
     let place = 0;
     for (let i = 0; i < run.agents; i++) {
-      const colour = leads.has(i) ? leader : rgb(PALETTE[many ? 0 : place++ % PALETTE.length]);
+      const colour = leads.has(i) ? leader : rgb(PALETTE[many ? 0 : place % PALETTE.length]);
+      place += this.first.has(i) ? 0 : 1;
       state.set([...colour, run.size * (many && leads.has(i) ? 1.25 : 1)], 4 * this.texel(i, 3));
     }
     this.draw();
@@ -301,12 +312,12 @@ class View {
   }
 
   show(moment) {
-    const { state, run } = this, { position: p, turn: q, motors: m, goal: g } = moment;
+    const { state, run } = this, { position: p, turn: q, motors: m, goal: g } = moment, near = this.ellipsoids?.marks(p);
     for (let i = 0; i < run.agents; i++) {
       let at = 4 * this.texel(i, 0);
       const exists = Number.isFinite(p[3 * i] + p[3 * i + 1] + p[3 * i + 2]);
       for (let k = 0; k < 3; k++) state[at + k] = exists ? p[3 * i + k] : 0;
-      state[at + 3] = !exists ? -1 : i === this.selected ? 1 : 0;
+      state[at + 3] = !exists ? -1 : (near?.[i] ?? 0) + (i === this.selected ? 1 : 0);
       for (let k = 0; k < 4; k++) (state[at + 4 + k] = q[4 * i + k]), (state[at + 8 + k] = m[4 * i + k]);
       at += 16;
       state[at] = g[3 * i], state[at + 1] = g[3 * i + 1], state[at + 2] = g[3 * i + 2];

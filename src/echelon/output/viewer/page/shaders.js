@@ -1,5 +1,5 @@
 // Shaders. The state of all agents is one texture with five texels per agent:
-// 0 place and mark (1 selected, -1 without a finite place), 1 attitude, 2 motors, 3 colour and size, 4 goal and its visibility.
+// 0 place and mark (1 selected, and 2 nearer to another than hulls keep or 4 overlapping; -1 without a finite place), 1 attitude, 2 motors, 3 colour and size, 4 goal and its visibility.
 
 const COLUMNS = 64, TEXELS = 5;
 
@@ -61,7 +61,7 @@ void main() {
     }
     if (kind > 7.5) shade *= 0.55;
     shade *= light;
-    if (place.w > 0.5) shade = mix(shade, vec3(1.0), 0.18);
+    if (mod(place.w, 2.0) > 0.5) shade = mix(shade, vec3(1.0), 0.18);
   } else if (kind < 5.5) {
     p = vec3(place.xy + p.xy, floor_);
     shade = shadow;
@@ -69,11 +69,30 @@ void main() {
     p = goal.xyz + p * goals * goal.w;
     shade = goalColour;
   } else {
-    p = place.xyz + p * place.w;
+    p = place.xyz + p;
   }
   gl_Position = place.w < -0.5 ? vec4(2.0, 2.0, 2.0, 1.0) : projectionMatrix * modelViewMatrix * vec4(p, 1.0);
 }`,
   fragmentShader: `in vec3 shade; out vec4 colour; void main() { colour = vec4(shade, 1.0); }`,
+};
+
+// The space about an agent: seen at its edge, and amber or red where another is too near.
+const ELLIPSOID = {
+  vertexShader: `${FETCH}
+in float agent;
+out vec4 shade;
+uniform vec3 radii, cutColour, goalColour;
+uniform float ellipsoids;
+void main() {
+  vec4 place = texel(agent, 0), eye = modelViewMatrix * vec4(place.xyz + position * radii, 1.0);
+  vec3 look = projectionMatrix[3][3] > 0.5 ? vec3(0.0, 0.0, 1.0) : -normalize(eye.xyz);
+  float edge = 1.0 - abs(dot(normalize(normalMatrix * (position / radii)), look));
+  vec3 colour = place.w > 3.5 ? cutColour : place.w > 1.5 ? goalColour : texel(agent, 3).rgb;
+  shade = vec4(colour, (place.w > 1.5 ? 0.3 : 0.06) + 0.4 * edge * edge);
+  bool hidden = place.w < -0.5 || (ellipsoids < 0.5 && place.w < 1.5);
+  gl_Position = hidden ? vec4(2.0, 2.0, 2.0, 1.0) : projectionMatrix * eye;
+}`,
+  fragmentShader: `in vec4 shade; out vec4 colour; void main() { colour = shade; }`,
 };
 
 // A line of a width in pixels between two points: four corners, moved on the screen.

@@ -112,6 +112,13 @@ function swarm(shape, agents, space) {
   return repeated(body, agents);
 }
 
+// An ellipsoid about each agent, whose radii the shader gives it.
+function ellipsoids(agents) {
+  const body = new Body();
+  body.ball(0, 1, agents > 60 ? 4 : 10);
+  return repeated(body, agents);
+}
+
 // A ring around the selected agent.
 function halo(flat) {
   const body = new Body();

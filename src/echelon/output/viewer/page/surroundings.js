@@ -106,6 +106,31 @@ class Path {
   }
 }
 
+// The ellipsoids about agents, of which those too near to each other are always drawn.
+class Ellipsoids {
+  constructor(view, lines) {
+    const { run, shared } = view, { radii, kept } = run.ellipsoid;
+    this.run = run;
+    shared.radii = { value: [0, 1, 2].map((k) => radii[k] ?? 0.01) };
+    this.shown = shared.ellipsoids = { value: kept ? 1 : 0 };
+    view.add(ellipsoids(run.agents), view.material(ELLIPSOID, lines), 4);
+  }
+
+  // Of each agent 2 if another is nearer than the limit, 4 if their ellipsoids overlap, else 0.
+  marks(p) {
+    const { agents } = this.run, { radii, touching, limit } = this.run.ellipsoid;
+    const marks = new Uint8Array(agents), scale = [0, 1, 2].map((k) => touching / 2 / (radii[k] ?? Infinity));
+    for (let i = 0; i < agents; i++)
+      for (let j = 0; j < i; j++) {
+        const far = Math.hypot(...scale.map((s, k) => s * (p[3 * i + k] - p[3 * j + k])));
+        // Places are rounded in the page.
+        const mark = far < touching ? 4 : far < limit - 1e-4 ? 2 : 0;
+        for (const agent of [i, j]) marks[agent] = Math.max(marks[agent], mark);
+      }
+    return marks;
+  }
+}
+
 // Tells how many agents are outside of the picture, with a way to show them.
 class Away {
   constructor(view) {
@@ -271,17 +296,25 @@ class Backdrop {
 // Names of all agents, or of the leaders of a large swarm.
 class Labels {
   constructor(view) {
-    const { run } = view, leads = new Set(run.leaders);
+    const { run } = view;
     this.view = view;
     this.visible = true;
     const named = run.agents <= 12 ? [...Array(run.agents).keys()] : run.agents <= 60 ? run.leaders.slice(0, 12) : [];
     this.all = named.map((agent) => {
       const label = document.createElement("span");
-      label.className = leads.has(agent) ? "label leader" : "label";
-      label.textContent = leads.has(agent) ? (run.leaders.length > 1 ? `leader ${agent}` : "leader") : agent;
       view.element.append(label);
       return [agent, label];
     });
+    this.rename();
+  }
+
+  rename() {
+    const { leaders } = this.view.run;
+    for (const [agent, label] of this.all) {
+      const leads = leaders.includes(agent);
+      label.className = leads ? "label leader" : "label";
+      label.textContent = leads ? (leaders.length > 1 ? `leader ${agent}` : "leader") : agent;
+    }
   }
 
   place() {

@@ -1,4 +1,4 @@
-"""`echelon law` writes a law that runs without echelon, or says why it does not."""
+"""`echelon export` writes a law that runs without echelon, or says why it does not."""
 
 import hashlib
 import json
@@ -11,6 +11,9 @@ import pytest
 
 import echelon as ech
 from echelon.output.archive.law_folder import law_files
+from echelon.simulation.codegen import is_installed
+
+NATIVE = is_installed()
 
 ALONE = """
 import law
@@ -23,10 +26,11 @@ print(u)
 
 def test_the_files_state_whom_an_agent_hears_and_run_without_echelon(tmp_path, echelon):
     out = tmp_path / "law"
-    command = ("law", "integrators", "--set", "simulation.dt=0.01", "--agent", 1)
+    command = ("export", "integrators", "--set", "simulation.dt=0.01", "--agent", 1)
     code, said, errors = echelon(*command, "--out", out)
     assert code == 0 and not errors and "law.py" in said
-    assert sorted(file.name for file in out.iterdir()) == ["law.c", "law.h", "law.json", "law.py"]
+    names = [*NATIVE * ["law.o"], "law.c", "law.h", "law.json", "law.py"]
+    assert sorted(file.name for file in out.iterdir()) == sorted(names)
     stated = json.loads((out / "law.json").read_text("utf-8"))
     parts, settings = ech.build(ech.load_scenario("integrators", ["simulation.dt=0.01"]))
     agent = ech.Agent(parts, 1, 0.01)
@@ -53,16 +57,16 @@ def test_the_files_state_whom_an_agent_hears_and_run_without_echelon(tmp_path, e
 
 
 def test_what_cannot_be_exported_is_refused_in_one_sentence(tmp_path, echelon):
-    code, _, errors = echelon("law", "integrators", "--agent", 99, "--out", tmp_path / "law")
+    code, _, errors = echelon("export", "integrators", "--agent", 99, "--out", tmp_path / "law")
     assert code == 2 and "agent 99 is not in this graph" in errors and errors.count("\n") == 1
     assert not (tmp_path / "law").exists()
-    code, _, errors = echelon("law", "paper-radio", "--agent", 1, "--out", tmp_path / "law")
+    code, _, errors = echelon("export", "crossing", "--agent", 1, "--out", tmp_path / "law")
     assert code == 2 and errors == (
-        "echelon: the law of agent 1 cannot be exported: there is no code for a network that is "
-        "not ideal.\n"
+        "echelon: the law of agent 1 cannot be exported: there is no code for agents that keep "
+        "away from each other.\n"
     )
     (tmp_path / "mine").write_text("")
-    code, _, errors = echelon("law", "integrators", "--agent", 1, "--out", tmp_path)
+    code, _, errors = echelon("export", "integrators", "--agent", 1, "--out", tmp_path)
     assert code == 2 and "is not empty" in errors
 
 
@@ -77,6 +81,20 @@ def test_a_law_without_scalar_operations_is_refused_with_its_line():
     model, graph = ech.models.Pendulum(), ech.Graph.path(2)
     drive = ech.Laws(ech.laws.TrimInput(), Bends())
     parts = ech.Parts(model, graph, ech.Formation(np.zeros((2, 2))), drive)
-    line = r"there is no code for `erf_inv` in .*test_law_command\.py, line \d+\.$"
+    line = r"there is no code for `erf_inv` in .*test_export_command\.py, line \d+\.$"
     with pytest.raises(ech.errors.OutputError, match=line):
         law_files(parts, ech.Settings(horizon=1.0, dt=0.01), 1, "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("--to", "law"), "`--to law` needs `--agent`, the number of an agent."),
+        (("--agent", 1, "--to", "csv"), "`--agent` is of a law, and `--to` is `csv`; leave out"),
+        (("--set", "seed=1"), "`--set` is of a scenario, and a run is written as it is"),
+        ((), "`integrators` does not exist; give the folder of a run, or its `run.nc`."),
+    ],
+)
+def test_a_run_and_a_law_are_not_confused(echelon, arguments, sentence):
+    code, _, errors = echelon("export", "integrators", *arguments)
+    assert code == 2 and sentence in errors and errors.count("\n") == 1

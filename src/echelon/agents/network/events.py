@@ -1,0 +1,263 @@
+"""What happens during a run: agents are lost or join, links are cut, and heirs take the lead.
+
+All of it is stated before the run, so that a graph with events is one that switches.
+"""
+
+import dataclasses
+import math
+import numbers
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, TypeAlias, final
+
+import numpy as np
+
+from echelon.agents.network.edges import name_agents
+from echelon.agents.network.matrices import GraphMatrices
+from echelon.agents.network.reach import nearest_leaders, unreached
+from echelon.agents.network.switching import Schedule
+from echelon.core.errors import GraphError
+from echelon.core.types import Array
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Lose:
+    """An agent falls silent, and its body is gone.
+
+    Args:
+        agent: its number.
+        at: time, s.
+    """
+
+    agent: int
+    at: float
+
+    def __str__(self) -> str:
+        """Return what happens, in words."""
+        return f"agent {self.agent} is lost"
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Join:
+    """An agent joins in its initial state; before, it is neither heard nor anywhere.
+
+    Args:
+        agent: its number.
+        at: time, s.
+    """
+
+    agent: int
+    at: float
+
+    def __str__(self) -> str:
+        """Return what happens, in words."""
+        return f"agent {self.agent} joins"
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Cut:
+    """A link carries nothing, either way.
+
+    Args:
+        link: the two agents.
+        at: time, s.
+        duration: s; None for ever.
+    """
+
+    link: tuple[int, int]
+    at: float
+    duration: float | None = None
+
+    @property
+    def end(self) -> float:
+        """When the link is restored, s."""
+        return math.inf if self.duration is None else self.at + self.duration
+
+    def __str__(self) -> str:
+        """Return what happens, in words."""
+        i, j = self.link
+        span = "for ever" if self.duration is None else f"for {self.duration:g} s"
+        return f"the link between agents {i} and {j} is cut {span}"
+
+
+Event: TypeAlias = Lose | Join | Cut
+
+
+def agents_of(event: Event) -> tuple[int, ...]:
+    """Return the agents that an event is about."""
+    return tuple(event.link) if isinstance(event, Cut) else (event.agent,)
+
+
+def check_heirs(graph: GraphMatrices, heirs: Sequence[int]) -> None:
+    """Check who may lead after the leader of a graph.
+
+    Raises:
+        GraphError: one is no agent, leads already or is named twice, or there are several leaders.
+    """
+    for k, heir in enumerate(heirs):
+        if not _is_agent(heir, graph.agents):
+            last = graph.agents - 1
+            raise GraphError(f"heir {heir} is no agent; agents are numbered from 0 to {last}.")
+        if heir in graph.leaders:
+            raise GraphError(f"heir {heir} is the leader itself; name followers.")
+        if heir in heirs[:k]:
+            raise GraphError(f"heir {heir} is named twice.")
+    if heirs and len(graph.leaders) > 1:
+        raise GraphError(f"got heirs of {len(graph.leaders)} leaders, and there must be one.")
+
+
+class EventFault(NamedTuple):
+    """What is wrong with the event of a number, in words."""
+
+    event: int
+    text: str
+
+
+def event_faults(
+    graph: GraphMatrices, events: Sequence[Event], heirs: Sequence[int], horizon: float = math.inf
+) -> Iterator[EventFault]:
+    """Yield what is wrong with each event; of those alone in order, whom they cut off.
+
+    Args:
+        graph: without events.
+        events: in any order.
+        heirs: who takes the lead when the leader is lost, the first that is present.
+        horizon: of the run, s.
+    """
+    faults = [*_alone(graph, events, horizon)]
+    faults = faults or [*_in_order(graph, events, heirs)]
+    yield from faults or _cut_off(graph, events, heirs)
+
+
+def _alone(graph: GraphMatrices, events: Sequence[Event], horizon: float) -> Iterator[EventFault]:
+    """Yield wrong times, agents and links."""
+    pairs = {frozenset(edge) for edge in graph.edges.tolist()}
+    for k, event in enumerate(events):
+        span = event.duration if isinstance(event, Cut) else None
+        strange = [x for x in agents_of(event) if not _is_agent(x, graph.agents)]
+        if not (_is_time(event.at) and (span is None or _is_time(span))):
+            yield EventFault(k, f"{event} at {event.at} s, and times must be positive and finite")
+        elif event.at >= horizon:
+            yield EventFault(k, f"{event} at {event.at:g} s, and the run ends at {horizon:g} s")
+        elif strange:
+            last = graph.agents - 1
+            yield EventFault(k, f"{event}, and agents are numbered from 0 to {last}")
+        elif isinstance(event, Cut) and frozenset(event.link) not in pairs:
+            yield EventFault(k, f"{event}, and the graph has no such link")
+
+
+def _is_time(value: object) -> bool:
+    return isinstance(value, numbers.Real) and 0.0 < float(value) < math.inf
+
+
+def _is_agent(value: object, agents: int) -> bool:
+    return isinstance(value, numbers.Integral) and 0 <= int(value) < agents
+
+
+def _in_order(
+    graph: GraphMatrices, events: Sequence[Event], heirs: Sequence[int]
+) -> Iterator[EventFault]:
+    """Yield who is lost or joins where that is not possible."""
+    absent = {x for event in events for x in agents_of(event) if _joins_first(x, events)}
+    if graph.schedule is not None and graph.schedule.period is not None and events:
+        yield EventFault(0, "a graph with a `period` takes no events")
+        return
+    for k in _by_time(events):
+        event = events[k]
+        if isinstance(event, Cut):
+            continue
+        if isinstance(event, Lose) == (event.agent in absent):
+            already = "absent" if isinstance(event, Lose) else "present"
+            yield EventFault(k, f"{event} at {event.at:g} s, when it is {already} already")
+            return
+        leads = event.agent in graph.leaders
+        if leads and len(graph.leaders) > 1:
+            yield EventFault(k, f"{event}, and one of several leaders cannot be lost, nor join")
+            return
+        if leads and isinstance(event, Join) and _joins_first(event.agent, events):
+            yield EventFault(k, f"{event}, and nobody leads before")
+            return
+        absent ^= {event.agent}
+        if {*graph.leaders} <= absent and {*heirs} <= absent:
+            remedy = "keep one of them" if heirs else "name `heirs` in `leadership`"
+            yield EventFault(k, f"{event}, and nobody leads afterwards; {remedy}")
+            return
+
+
+def _by_time(events: Sequence[Event]) -> list[int]:
+    return sorted(range(len(events)), key=lambda k: events[k].at)
+
+
+def _joins_first(agent: int, events: Sequence[Event]) -> bool:
+    """Tell whether an agent is absent until it joins."""
+    own = [events[k] for k in _by_time(events) if agents_of(events[k]) == (agent,)]
+    return bool(own) and isinstance(own[0], Join)
+
+
+def _cut_off(
+    graph: GraphMatrices, events: Sequence[Event], heirs: Sequence[int]
+) -> Iterator[EventFault]:
+    """Yield the event that cuts somebody off until the end."""
+    order, cause = _by_time(events), None
+    for count in range(len(order), 0, -1):
+        so_far = [events[k] for k in order[:count]]
+        schedule = schedule_of(graph, so_far, heirs)
+        lost = unreached(graph, schedule, len(schedule.starts) - 1)
+        if not len(lost):
+            break
+        cause = order[count - 1], name_agents(lost)
+    if cause is not None:
+        k, who = cause
+        after = f"from {events[k].at:g} s on"
+        yield EventFault(k, f"{events[k]}, and {who} no path to the leader {after}")
+
+
+def schedule_of(
+    graph: GraphMatrices, events: Sequence[Event], heirs: Sequence[int] = ()
+) -> Schedule:
+    """Return when which links of a graph hold, who is present, and whom each agent follows."""
+    base = graph.schedule or Schedule(np.zeros(1), graph.weights[None], None)
+    ends = [event.end for event in events if isinstance(event, Cut)]
+    times = [*base.starts.tolist(), *(event.at for event in events), *ends]
+    starts = np.unique([at for at in times if at < math.inf])
+    weights = base.weights[[base.row(at) for at in starts.tolist()]].copy()
+    for event in events:
+        if isinstance(event, Cut):
+            between = np.isin(graph.edges, event.link).all(axis=1)
+            weights[np.ix_((starts >= event.at) & (starts < event.end), between)] = 0.0
+    if all(isinstance(event, Cut) for event in events):
+        return Schedule(starts, weights, None)
+    present = _present(starts, graph.agents, events)
+    weights[~present[:, graph.edges].all(axis=2)] = 0.0
+    nearest = np.tile(nearest_leaders(graph), (len(starts), 1))
+    if len(graph.leaders) == 1:
+        nearest[:] = _acting(present, graph.leaders[0], heirs)[:, None]
+    for array in (starts, weights, present, nearest):
+        array.setflags(write=False)
+    return Schedule(starts, weights, None, present, nearest)
+
+
+def _present(starts: Array, agents: int, events: Sequence[Event]) -> Array:
+    """Return who is present from each start on, (S, N)."""
+    present = np.ones((len(starts), agents), bool)
+    for k in _by_time(events):
+        event = events[k]
+        if isinstance(event, Cut):
+            continue
+        if _joins_first(event.agent, events[: k + 1]) and isinstance(event, Join):
+            present[starts < event.at, event.agent] = False
+        present[starts >= event.at, event.agent] = isinstance(event, Join)
+    return present
+
+
+def _acting(present: Array, leader: int, heirs: Sequence[int]) -> Array:
+    """Return who leads in each stretch, (S,): who did, or else the first heir that is present."""
+    acting = list[int]()
+    for here in present:
+        # One that returns follows whoever leads by then.
+        last = acting[-1] if acting else leader
+        left = [agent for agent in (last, *heirs) if here[agent]]
+        acting.append(left[0] if left else last)
+    return np.array(acting)

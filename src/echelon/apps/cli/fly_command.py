@@ -1,0 +1,112 @@
+"""`echelon fly`: the processes of a flight, each by itself; this one only prepares them."""
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from echelon.apps.cli import options
+from echelon.apps.cli.status import STATUS
+from echelon.core.errors import FlightError
+from echelon.flight.links.link import check_scheme
+from echelon.flight.mission import FACTS
+from echelon.flight.wire import read_key, require_key
+from echelon.output.archive.folder import check_empty
+
+_SCENARIO = "The name of a bundled scenario, a YAML file, or a folder that `--out` wrote."
+_Number = Annotated[int | None, typer.Option(help="Fly this agent.")]
+_All = Annotated[bool, typer.Option("--all", help="Fly all agents, with simulated vehicles.")]
+_Ground = Annotated[bool, typer.Option("--ground", help="Serve the ground station's page.")]
+_Dry = Annotated[
+    bool, typer.Option("--dry-run", help="Check everything, and send nothing to others.")
+]
+_Link = Annotated[str, typer.Option(help="Link to the vehicle: udp, cflib://... or px4://...")]
+_Key = Annotated[Path | None, typer.Option(help="The key file of the formation.")]
+_Listen = Annotated[
+    str | None, typer.Option(help="ADDRESS:PORT to hear others at, as a multicast group.")
+]
+_Interface = Annotated[
+    str | None, typer.Option(help="Own address on the network of a multicast group.")
+]
+_Seconds = Annotated[
+    float | None, typer.Option(help="Length of the flight, s (default: the horizon).")
+]
+_Speed = Annotated[
+    float | None, typer.Option(help="Below 1, simulated vehicles are slower than real ones.")
+]
+_Out = Annotated[
+    Path | None, typer.Option("--out", help="Prepare the flight in this folder, and end.")
+]
+
+
+def fly(
+    scenario: Annotated[str, typer.Argument(help=_SCENARIO)],
+    agent: _Number = None,
+    every: _All = False,
+    ground: _Ground = False,
+    dry_run: _Dry = False,
+    link: _Link = "udp",
+    key: _Key = None,
+    listen: _Listen = None,
+    interface: _Interface = None,
+    seconds: _Seconds = None,
+    speed: _Speed = None,
+    set_: options.SetOption = None,
+    out: _Out = None,
+) -> None:
+    """Fly a scenario: a process for each agent, which needs neither JAX nor NumPy."""
+    _check(agent, every, ground, key, link, out)
+    folder = Path(scenario)
+    if not (folder / FACTS).is_file():
+        folder = _prepare(scenario, set_ or [], out)
+    if out is not None:
+        print(f"- Written to {folder}; `echelon fly {folder} --all` flies it.")
+        return
+    given = {
+        **{"--agent": agent, "--link": link, "--key": key, "--listen": listen},
+        **{"--interface": interface, "--seconds": seconds, "--speed": speed},
+    }
+    words = [str(word) for pair in given.items() if pair[1] is not None for word in pair]
+    flags = {"--all": every, "--ground": ground, "--dry-run": dry_run}
+    words += [flag for flag, is_set in flags.items() if is_set]
+    STATUS.pause()
+    sys.stdout.flush()
+    # In place of this process, which holds JAX.
+    os.execv(sys.executable, [sys.executable, "-m", "echelon.flight", str(folder), *words])
+
+
+def _check(
+    agent: int | None, every: bool, ground: bool, key: Path | None, link: str, out: Path | None
+) -> None:
+    """Check what can be, before the laws are written, which takes long.
+
+    Raises:
+        FlightError: options do not fit each other, or the key cannot be used.
+    """
+    tasks = [agent is not None, every, ground, out is not None]
+    if sum(tasks) != 1:
+        raise FlightError("give one of `--agent` with a number, `--all`, `--ground` and `--out`.")
+    check_scheme(link)
+    if agent is not None or ground:
+        read_key(require_key(key))
+
+
+def _prepare(scenario: str, changes: list[str], out: Path | None) -> Path:
+    """Write the folder of a flight, and return it."""
+    from echelon.experiments.scenario.scenario import load_scenario
+
+    loaded = load_scenario(scenario, changes)
+    if out is not None:
+        check_empty(out)
+    STATUS.begin(f"writing the laws of {loaded.name}")
+    from echelon.experiments.scenario.build import build
+    from echelon.experiments.scenario.self_contained import content_of_files
+    from echelon.output.archive.flight_folder import flight_files, save_flight
+
+    files = flight_files(*build(loaded), content_of_files(loaded))
+    folder = Path(tempfile.mkdtemp(prefix="echelon-fly-")) if out is None else out
+    save_flight(files, folder)
+    return folder

@@ -1,0 +1,1 @@
+"""Flight: one process per agent, with its exported law; it needs the standard library alone."""

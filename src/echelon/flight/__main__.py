@@ -1,0 +1,188 @@
+"""`python -m echelon.flight FOLDER`: one process of a flight that `echelon fly` has prepared."""
+
+import argparse
+import contextlib
+import math
+import signal
+import sys
+import time
+from pathlib import Path
+
+from echelon.core.errors import EchelonError, FlightError
+from echelon.flight.agent_process import AgentProcess, Crew
+from echelon.flight.air import LOOPBACK, PORT, Address, Air, ports_of, read_address
+from echelon.flight.links.link import Link, open_link
+from echelon.flight.mission import Mission
+from echelon.flight.plan_clock import PlanClock
+from echelon.flight.supervisor import Fault
+from echelon.flight.wire import GROUND, require_key, wire_of
+
+_READY = 5.0  # s, in which a vehicle says its state
+
+
+def main() -> None:
+    """Run one process; an error is one sentence and exit code 2."""
+    options = _options()
+    try:
+        code = _run(Mission(options.folder), options)
+    except EchelonError as error:
+        print(f"echelon: {error}", file=sys.stderr)
+        code = error.exit_code
+    except KeyboardInterrupt:
+        code = 130
+    raise SystemExit(code)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser("python -m echelon.flight", description=__doc__)
+    say = parser.add_argument
+    say("folder", type=Path, help="a folder that `echelon fly --out` wrote")
+    say("--agent", type=int, help="fly this agent")
+    say("--all", action="store_true", help="fly all, with simulated vehicles")
+    say("--ground", action="store_true", help="serve the page of the ground station")
+    say("--dry-run", action="store_true", help="check everything, and send nothing to others")
+    say("--link", default="udp", help="to the vehicle: udp, cflib://.. or px4://..")
+    say("--key", type=Path, help="the key file of the formation")
+    say("--listen", help="address and port to hear others at")
+    say("--to", help="addresses and ports of others, separated by commas")
+    say("--interface", default=LOOPBACK, help="own address on the network of a multicast group")
+    say("--seconds", type=float, help="length of the flight (default: the scenario's horizon)")
+    say("--speed", type=float, default=1.0, help="below 1, simulated vehicles are slower")
+    say("--port", type=int, default=PORT, help="of agent 0 on this machine")
+    say("--vehicles", action="store_true", help=argparse.SUPPRESS)
+    say("--weather", nargs=3, type=float, help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def _run(mission: Mission, options: argparse.Namespace) -> int:
+    if (
+        not 0.0 < options.speed <= 1.0
+        or options.speed != 1.0
+        and not options.link.startswith("udp")
+    ):
+        raise FlightError(
+            f"`--speed` is {options.speed:g}, and must be above 0 and at most 1; 1 if real."
+        )
+    if options.seconds is not None and not options.seconds > 0.0:
+        raise FlightError(f"`--seconds` is {options.seconds:g}, and must be above 0.")
+    # Imported where they are used: an agent's process stays small.
+    if options.vehicles:
+        from echelon.flight.vehicles import Vehicles, simulated
+
+        Vehicles(mission, simulated(mission), options.speed, options.port).run()
+    if options.weather:
+        return _bridge(mission, options)
+    if options.all:
+        return _fly_all(mission, options)
+    if options.ground:
+        return _watch(mission, options)
+    if options.agent is None:
+        raise FlightError("give `--agent` with a number, `--all` or `--ground`.")
+    return _fly(mission, options)
+
+
+def _bridge(mission: Mission, options: argparse.Namespace) -> int:
+    from echelon.flight.bridge import Weather, carry
+
+    ports = ports_of(mission.agents, options.port)
+    listen = LOOPBACK, options.port + mission.agents + 1
+    carry(listen, ports, Weather(*options.weather), options.speed)
+    return 0
+
+
+def _ways(
+    mission: Mission, number: int, options: argparse.Namespace
+) -> tuple[Address, list[Address]]:
+    """Return where a process listens, and where it sends to: on this machine unless told."""
+    ports = ports_of(mission.agents, options.port)
+    own = ports[min(number, mission.agents)]
+    listen = read_address(options.listen, "--listen") if options.listen else own
+    if options.to is None:
+        return listen, [listen] if options.listen else [port for port in ports if port != own]
+    return listen, [read_address(text, "--to") for text in options.to.split(",")]
+
+
+def _fly(mission: Mission, options: argparse.Namespace) -> int:
+    """Fly one agent."""
+    law, facts = mission.law(options.agent)
+    wire = wire_of(mission.facts, options.agent, require_key(options.key))
+    listen, to = _ways(mission, options.agent, options)
+    air, link = Air(listen, to, options.interface), open_link(options.link, facts)
+    if options.dry_run:
+        _wait_for_state(link)
+        print(f"agent {options.agent}: all checks passed; nothing was sent to other agents.")
+        return 0
+    seconds = mission.facts["horizon"] if options.seconds is None else options.seconds
+    crew = Crew(law, facts, mission.facts, link, air, wire, PlanClock(options.speed))
+    fault = AgentProcess(crew, seconds).run()
+    return 0 if fault in (Fault.END, Fault.SIGNAL) else 1
+
+
+def _wait_for_state(link: Link) -> None:
+    """Wait until the vehicle says its state.
+
+    Raises:
+        FlightError: it does not.
+    """
+    deadline = time.monotonic() + _READY
+    while time.monotonic() < deadline:
+        reading = link.read(0.1)
+        if reading is not None and all(map(math.isfinite, reading.x)):
+            link.close()
+            return
+    raise FlightError(f"the vehicle says no state within {_READY:g} s.")
+
+
+def _watch(mission: Mission, options: argparse.Namespace) -> int:
+    """Serve the page of the ground station until Ctrl-C."""
+    from echelon.flight.ground import Ground, page_of
+    from echelon.output.viewer.serve import serve, serving
+
+    listen, to = _ways(mission, GROUND, options)
+    wire = wire_of(mission.facts, GROUND, require_key(options.key))
+    ground = Ground(Air(listen, to, options.interface), wire, mission.agents)
+    with serving(serve(page_of(ground))) as address:
+        print(f"echelon: ground station at {address}. Ctrl-C quits.", file=sys.stderr, flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            while True:
+                time.sleep(1.0)
+    return 0
+
+
+def _fly_all(mission: Mission, options: argparse.Namespace) -> int:
+    """Fly all agents with simulated vehicles, and print their errors."""
+    from echelon.flight.ground import page_of
+    from echelon.flight.together import Together, flying
+    from echelon.output.viewer.serve import serve, serving
+
+    seconds = mission.facts["horizon"] if options.seconds is None else options.seconds
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for k in range(mission.agents):
+        mission.law(k)
+    together = Together(mission, seconds, options.speed, options.port)
+    if options.dry_run:
+        print("All checks passed; nothing was started.")
+        return 0
+    with serving(serve(page_of(together.ground))) as address, flying(together):
+        print(f"The ground station is at {address}.")
+        for k in range(mission.agents):
+            ready, size = together.ready[k], together.memory(k)
+            print(f"- agent {k}: ready after {ready:.2f} s, {size:.0f} MB", flush=True)
+        print(f"All are ready; the plan takes {seconds:g} s.", flush=True)
+        while together.time() < seconds:
+            time.sleep(0.05)
+        errors, faults = together.errors(), together.ground.faults
+    since = max(0.0, seconds - 4.0)
+    for k in set(range(mission.agents)) - {mission.facts["leader"]}:
+        worst = 1e3 * errors.worst(k, since)
+        print(f"- agent {k}: {worst:.1f} mm from its place at most, in the last 4 s")
+    early = [k for k, fault in faults.items() if fault not in (Fault.NONE, Fault.END)]
+    if early:
+        print(f"{len(early)} agents descended before the end.")
+    if errors.late or Fault.STALE in faults.values():
+        print("This machine did not keep up with the vehicles; with `--speed 0.2` it may.")
+    return int(bool(early))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,245 @@
+"""The process of one agent: its loop from states and letters to inputs and letters."""
+
+import math
+import os
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Mapping
+from types import ModuleType
+from typing import Any, Final, NamedTuple, final
+
+from echelon.core.errors import FlightError
+from echelon.flight.air import Air
+from echelon.flight.links.link import Link, Reading
+from echelon.flight.pilot import Pilot
+from echelon.flight.plan_clock import PlanClock
+from echelon.flight.supervisor import Fault, Fence, Supervisor
+from echelon.flight.wire import GROUND, Drop, Kind, Letter, Opened, Report, Wire
+
+_REPORTS: Final = 0.1  # s between two
+_LONGEST: Final = 20.0  # s of a descent
+_REST: Final = 0.05  # m/s
+_TOLD: Final = (Drop.VERSION, Drop.FORMATION, Drop.SIGNATURE, Drop.CLOCK)
+"""Reasons that somebody on the ground can remove."""
+
+
+class Crew(NamedTuple):
+    """What one agent's process uses: its law, its vehicle, and the others.
+
+    Attributes:
+        law: the module law.py.
+        facts: the content of law.json.
+        flight: the content of flight.json.
+        link: to the vehicle.
+        air: to the others.
+        wire: that signs for the agent.
+        clock: of the plan.
+    """
+
+    law: ModuleType
+    facts: Mapping[str, Any]
+    flight: Mapping[str, Any]
+    link: Link
+    air: Air
+    wire: Wire
+    clock: PlanClock
+
+
+@final
+class AgentProcess:
+    """Flies one vehicle.
+
+    Args:
+        crew: what it uses.
+        seconds: of the plan, after which it descends.
+    """
+
+    def __init__(self, crew: Crew, seconds: float = math.inf) -> None:
+        """Wait for a state and for the start."""
+        flight = crew.flight
+        self._crew, self._seconds, self._dt = crew, seconds, flight["dt"]
+        self._supervisor = Supervisor(flight, Fence(**flight["fence"]))
+        hold = 2.0 * crew.facts["network"]["forget"]
+        self._pilot = Pilot(crew.law, crew.facts, flight["leadership"], hold)
+        self._reading: Reading | None = None
+        self._began, self._ticked, self._fell = time.monotonic(), -math.inf, math.inf
+        self._sent, self._reported, self._signals = -math.inf, -math.inf, 0
+        self._moved = self._began
+        self._said = set[str]()
+        self._ticks, self._longest = deque[float](maxlen=100_000), 0.0
+
+    def run(self) -> Fault:
+        """Fly until the vehicle is down again, or until a signal where it never flew."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._interrupt)
+        while not self._over():
+            self._round()
+        self._report(time.monotonic())
+        self._crew.link.close()
+        self._say(f"{self._supervisor.sentence}; {self._summary()}")
+        return self._supervisor.fault
+
+    def _interrupt(self, number: int, frame: object) -> None:
+        self._signals += 1
+
+    def _over(self) -> bool:
+        """Tell whether nothing is left to do."""
+        if self._signals:
+            self._supervisor.trip(Fault.SIGNAL)
+        if self._supervisor.fault is Fault.NONE:
+            return False
+        now = time.monotonic()
+        self._fell = min(self._fell, now)
+        rests = now - self._moved > 1.0 / self._crew.clock.speed
+        late = now - self._fell > _LONGEST / self._crew.clock.speed
+        # The first signal lets a vehicle descend that flew; another one ends the process at once.
+        again = self._signals > (self._supervisor.fault is Fault.SIGNAL)
+        return again or self._ticked < 0.0 or rests or late
+
+    def _round(self) -> None:
+        """Do what is to be done when a state arrives, or none for a while."""
+        reading = self._read()
+        now = time.monotonic()
+        for datagram in self._crew.air.receive():
+            self._hear(datagram, now)
+        if reading is not None and all(map(math.isfinite, reading.x)):
+            self._reading = reading
+            speed = math.hypot(*(reading.x[k] for k in self._crew.flight["velocity"]))
+            self._moved = now if speed > _REST else self._moved
+            self._tick(reading)
+        if self._ticked >= 0.0 and self._reading is not None:
+            self._supervisor.look((now - self._reading.time) * self._crew.clock.speed)
+        if self._supervisor.fault is not Fault.NONE:
+            self._descend()
+        if now > self._reported + _REPORTS:
+            self._report(now)
+
+    def _read(self) -> Reading | None:
+        try:
+            return self._crew.link.read(0.5 * self._dt / self._crew.clock.speed)
+        except FlightError as error:
+            self._fail(error)
+            return None
+
+    def _fail(self, error: FlightError) -> None:
+        self._supervisor.trip(Fault.LINK)
+        self._say(str(error).rstrip("."))
+        time.sleep(0.5 * self._dt)
+
+    # ---- flying ----------------------------------------------------------------------------------
+
+    def _tick(self, reading: Reading) -> None:
+        """Let the law act on a state, if one of its periods has passed."""
+        t, supervisor = self._crew.clock.at(reading.time), self._supervisor
+        if t is None or t < 0.0 or t < self._ticked + 0.75 * self._dt:
+            return
+        supervisor.judge(reading, t)
+        if t > self._seconds:
+            supervisor.trip(Fault.END)
+        self._ticked = t
+        if supervisor.fault is not Fault.NONE:
+            return
+        # Of this thread alone: how long others on the machine took is seen in the states' ages.
+        began, wall = time.thread_time(), time.perf_counter()
+        ticked = self._pilot.tick(t, reading.x)
+        self._ticks.append(time.perf_counter() - wall)
+        self._longest = max(self._longest, self._ticks[-1])
+        supervisor.spend((time.thread_time() - began) * self._crew.clock.speed)
+        supervisor.check(ticked.u, ticked.valid)
+        if supervisor.fault is Fault.NONE:
+            self._act(ticked.u, ticked.letter, t)
+
+    def _act(self, u: list[float], letter: Letter | None, t: float) -> None:
+        try:
+            self._crew.link.send(u)
+        except FlightError as error:
+            self._fail(error)
+        # At the network's rate, whatever the ticks that were skipped.
+        due = math.floor(t / self._crew.facts["network"]["period"] + 1e-6)
+        if letter is not None and due > self._sent:
+            self._sent = due
+            self._crew.air.send(self._crew.wire.letter(letter))
+        if abs(self._supervisor.step - self._dt) > 0.1 * self._dt:
+            self._say(f"states do not come every {self._dt:g} s, the period of the law", "period")
+
+    def _descend(self) -> None:
+        self._say(f"{self._supervisor.sentence}: levels and descends", "fault")
+        try:
+            if self._ticked >= 0.0:
+                self._crew.link.level_descend()
+        except FlightError as error:
+            self._fail(error)
+
+    # ---- others ----------------------------------------------------------------------------------
+
+    def _hear(self, datagram: bytes, now: float) -> None:
+        wire, clock = self._crew.wire, self._crew.clock
+        opened = wire.open(datagram, clock.now, time.time())
+        if isinstance(opened, Drop):
+            # Before the start nobody's letters have a time.
+            if opened in _TOLD and (opened is not Drop.CLOCK or clock.started):
+                self._say(f"a datagram of {_name(wire.suspects.get(opened))} {opened.value}")
+            return
+        if opened.sender == wire.number:
+            self._meet(opened, now)
+        elif isinstance(opened.body, Letter):
+            why = self._pilot.box.receive(opened.body, clock.now or 0.0)
+            if why is not None:
+                wire.drop(why, datagram)
+        elif opened.kind is Kind.START and isinstance(opened.body, float):
+            clock.start(opened.body)
+        elif opened.kind is Kind.STOP:
+            self._supervisor.trip(Fault.STOP)
+
+    def _meet(self, opened: Opened, now: float) -> None:
+        """Judge a datagram with the agent's own number."""
+        # What a process before this one sent may still be on its way.
+        if opened.boot != self._crew.wire.boot and now > self._began + 2.0:
+            self._supervisor.trip(Fault.TWIN, opened.sender)
+
+    def _report(self, now: float) -> None:
+        self._reported = now
+        supervisor, clock, flight = self._supervisor, self._crew.clock, self._crew.flight
+        reading, t = self._reading, clock.at(now)
+        place = [] if reading is None else [reading.x[k] for k in flight["position"]]
+        x, y, z = (place + [math.nan] * 3)[:3]
+        battery = None if reading is None else reading.battery
+        report = Report(
+            mode=2 if supervisor.fault is not Fault.NONE else int(self._ticked >= 0.0),
+            fault=list(Fault).index(supervisor.fault),
+            amount=supervisor.amount,
+            time=math.nan if t is None else t,
+            x=x,
+            y=y,
+            z=z,
+            heard=max(self._pilot.box.ages(t or 0.0), default=0.0),
+            tick=self._longest,
+            step=supervisor.step,
+            battery=math.nan if battery is None else battery,
+            dropped=self._crew.wire.counts,
+        )
+        self._longest = 0.0
+        self._crew.air.send(self._crew.wire.report(time.time(), report))
+
+    def _say(self, sentence: str, key: str | None = None) -> None:
+        """Print a sentence once."""
+        if (key or sentence) not in self._said:
+            self._said.add(key or sentence)
+            print(f"agent {self._crew.wire.number}: {sentence}.", file=sys.stderr, flush=True)
+
+    def _summary(self) -> str:
+        if not self._ticks:
+            return "it never flew"
+        ticks = sorted(self._ticks)
+        middle, late = ticks[len(ticks) // 2], ticks[99 * len(ticks) // 100]
+        used = os.times()
+        return (
+            f"{len(ticks)} ticks, median {1e3 * middle:.2f} ms, 99th percentile "
+            f"{1e3 * late:.2f} ms, {used.user + used.system:.2f} s of a processor"
+        )
+
+
+def _name(sender: int | None) -> str:
+    return "the ground" if sender == GROUND else f"agent {sender}"

@@ -1,0 +1,160 @@
+"""The ground station: hears every agent, starts the plan, says stop, and serves a page."""
+
+import json
+import math
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, final
+
+from echelon.flight.air import Air
+from echelon.flight.supervisor import Fault
+from echelon.flight.wire import Drop, Report, Wire
+from echelon.output.viewer.serve import Handler
+
+_AGAIN: Final = 0.2
+"""s between two commands that repeat: who restarts, or missed one, gets the next."""
+_SILENT: Final = 1.0
+"""s without a report, after which an agent counts as lost."""
+_MODES: Final = ("ready", "flies", "descends")
+
+
+@final
+class Ground:
+    """What the ground station knows and says, by a thread of its own until `close`.
+
+    Args:
+        air: to the agents.
+        wire: that signs for the ground.
+        agents: how many there are.
+        watch: called with the number of an agent and each of its reports.
+    """
+
+    def __init__(
+        self,
+        air: Air,
+        wire: Wire,
+        agents: int,
+        watch: Callable[[int, Report], None] = lambda number, report: None,
+    ) -> None:
+        """Listen."""
+        self._air, self._wire, self._agents, self._watch = air, wire, agents, watch
+        self._reports = dict[int, tuple[float, Report]]()
+        self._start: float | None = None
+        self._stopped, self._said, self._closed = False, -math.inf, False
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def start(self, at: float) -> None:
+        """Let the plan start at a time, s since 1970, once."""
+        self._start = self._start or at
+
+    def stop(self) -> None:
+        """Let everybody level and descend."""
+        self._stopped, self._said = True, -math.inf
+
+    def close(self) -> None:
+        """End."""
+        self._closed = True
+        self._thread.join()
+        self._air.close()
+
+    def report(self, number: int) -> Report | None:
+        """Return the last report of an agent that is alive; None of one that is silent."""
+        heard, report = self._reports.get(number, (-math.inf, None))
+        return report if time.monotonic() - heard < _SILENT else None
+
+    @property
+    def faults(self) -> dict[int, Fault]:
+        """The fault of each agent that was ever heard."""
+        return {k: _fault(report) for k, (_, report) in self._reports.items()}
+
+    @property
+    def ready(self) -> bool:
+        """Whether all agents are alive, know their states, and have no fault."""
+        reports = [self.report(k) for k in range(self._agents)]
+        return all(x is not None and math.isfinite(x.x) and x.mode < 2 for x in reports)
+
+    def _run(self) -> None:
+        while not self._closed:
+            for datagram in self._air.receive():
+                opened = self._wire.open(datagram, None, time.time())
+                if not isinstance(opened, Drop) and isinstance(opened.body, Report):
+                    self._reports[opened.sender] = time.monotonic(), opened.body
+                    self._watch(opened.sender, opened.body)
+            if time.monotonic() > self._said + _AGAIN:
+                self._said = time.monotonic()
+                if self._start is not None and not self._stopped:
+                    self._air.send(self._wire.start(time.time(), self._start))
+                if self._stopped:
+                    self._air.send(self._wire.stop(time.time()))
+            time.sleep(0.01)
+
+    def state(self) -> dict[str, Any]:
+        """Return what the page shows."""
+        return {
+            "started": self._start is not None,
+            "stopped": self._stopped,
+            "agents": [self._row(k) for k in range(self._agents)],
+            "dropped": [f"a datagram {why.value}: {n}" for why, n in self._dropped().items()],
+        }
+
+    def _dropped(self) -> dict[Drop, int]:
+        # Letters are none of the ground's business: it has no time of the plan.
+        return {why: n for why, n in self._wire.dropped.items() if why is not Drop.CLOCK}
+
+    def _row(self, number: int) -> dict[str, Any]:
+        heard, report = self._reports.get(number, (None, None))
+        if heard is None or report is None:
+            return {"agent": number, "mode": "not heard yet"}
+        silent = time.monotonic() - heard
+        fault = _fault(report)
+        counts = zip(Drop, report.dropped, strict=True)
+        return {
+            "agent": number,
+            "mode": _MODES[min(report.mode, 2)] if silent < _SILENT else "silent",
+            "why": "" if fault is Fault.NONE else fault.sentence(report.amount),
+            "silent": round(silent, 1),
+            "time": _number(report.time, 2),
+            "place": [_number(x, 2) for x in (report.x, report.y, report.z)],
+            "heard": _number(report.heard, 3),
+            "tick": _number(1e3 * report.tick, 2),
+            "battery": _number(report.battery, 2),
+            "dropped": [f"{n} {why.value}" for why, n in counts if n],
+        }
+
+
+def _fault(report: Report) -> Fault:
+    return list(Fault)[report.fault] if report.fault < len(Fault) else Fault.NONE
+
+
+def _number(value: float, digits: int) -> float | None:
+    """Return a number that JSON has; None for others."""
+    return round(value, digits) if math.isfinite(value) else None
+
+
+def page_of(ground: Ground) -> type[Handler]:
+    """Return the handler of the page of a ground station."""
+
+    class Page(Handler):
+        page = Path(__file__).with_name("ground.html").read_bytes()
+
+        def do_GET(self) -> None:
+            """Send the page, or what it shows."""
+            if self.path != "/state":
+                super().do_GET()
+            elif self.allowed():
+                self.send(json.dumps(ground.state()).encode(), "application/json")
+
+        def do_POST(self) -> None:
+            """Start the plan, or stop everybody."""
+            if not self.allowed():
+                return
+            actions = {"/start": lambda: ground.start(time.time() + 2.0), "/stop": ground.stop}
+            action = actions.get(self.path)
+            if action is not None:
+                action()
+            self.send(b"\n", "text/plain", 404 if action is None else 200)
+
+    return Page

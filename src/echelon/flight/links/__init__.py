@@ -1,0 +1,1 @@
+"""Links from an agent's process to its vehicle, one file a kind; `link` is the interface."""

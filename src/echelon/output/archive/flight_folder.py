@@ -1,0 +1,209 @@
+"""The folder of a flight: flight.json, the law of each agent, and its simulated vehicles."""
+
+import json
+import math
+import py_compile
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.heading_symmetry import heading_index
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.channel import Network
+from echelon.core.errors import FlightError, OutputError
+from echelon.core.files import write_atomic
+from echelon.core.numerics import precision
+from echelon.core.types import Array, JsonObject
+from echelon.core.words import MessageContent
+from echelon.guarantees.promises.promise import promise
+from echelon.output.archive.folder import write_errors
+from echelon.output.archive.law_folder import python_law
+from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.onboard.python_text import python_text
+from echelon.simulation.onboard.vehicle_function import motions_of, move_function
+from echelon.simulation.scalars import Unsupported
+from echelon.simulation.step.settings import Settings
+
+_SUBSTEPS = 2
+"""Of a simulated vehicle in a period of the law; an input acts from the next one on."""
+_MARGIN, _FASTER = 1.5, 4.0
+"""m and m/s, by which a fence is beyond the starts and the plan."""
+_SINKING = -0.5  # m/s
+
+
+def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, str | bytes]:
+    """Return the files of a flight by name.
+
+    Args:
+        parts: of the formation; what they say of plants, wind and sensors is of simulated vehicles.
+        settings: of the run.
+        formation: a text that is equal for all agents of the formation alone.
+
+    Raises:
+        FlightError: messages are not those that fly.
+        OutputError: a law or a vehicle has no scalar operations.
+        EchelonError: the parts do not fit each other.
+    """
+    network = _network(parts)
+    agents = parts.graph.agents
+    files, guaranteed = dict[str, str | bytes](), promise(parts, settings).sentence()
+    for k in range(agents):
+        law = python_law(parts.replace(leadership=None), settings, k, formation, guaranteed)
+        files |= {f"law-{k}/{name}": text for name, text in law.items()}
+    facts = json.loads(files["law-0/law.json"])
+    vehicles = _vehicles(parts, settings)
+    described = {
+        "formation": facts["formation"],
+        "agents": agents,
+        "dt": settings.dt,
+        "horizon": settings.horizon,
+        "sizes": [len(facts["signal"]), facts["network"]["content"]],
+        "leader": min(parts.graph.leaders),
+        "leadership": _leadership(parts),
+        "weather": {"delay": network.delay, "jitter": network.jitter, "loss": network.loss},
+        **_places(parts.model),
+        "fence": _fence(parts, settings),
+        "offsets": parts.formation.offsets[:, list(parts.model.position_indices())].tolist(),
+        "vehicles": vehicles[0],
+    }
+    return {**files, **vehicles[1], "flight.json": json.dumps(described, indent=2) + "\n"}
+
+
+def _leadership(parts: Parts) -> JsonObject | None:
+    """Return who takes the lead after the leader; None for nobody."""
+    rule = parts.leadership
+    return None if rule is None else {"heirs": list(rule.heirs), "timeout": rule.timeout}
+
+
+def _network(parts: Parts) -> Network:
+    """Return the network of parts that can fly."""
+    network = parts.world.network
+    if network is None or network.messages is not MessageContent.DEVIATION:
+        got = "no `network`" if network is None else "`network.messages` `state`"
+        raise FlightError(
+            f"the scenario has {got}, and agents in processes of their own need messages of "
+            "deviations; use `--set network.messages=deviation --set network.rate=50`."
+        )
+    if not isinstance(parts.drive, Laws):
+        raise FlightError("the agents of the scenario are under no laws, and only laws can fly.")
+    if parts.graph.schedule is not None:
+        raise FlightError("the graph of the scenario switches, which no flight does yet.")
+    if network.bursts.share:
+        raise FlightError("`network.bursts` has no counterpart in a flight; use `network.loss`.")
+    if parts.world.sensing is not None and parts.world.sensing.delay:
+        raise FlightError("`sensing.delay` has no counterpart in a flight; leave it out.")
+    return network
+
+
+def _places(model: ControlAffine) -> JsonObject:
+    """Return which states a supervisor looks at."""
+    names = model.state_names
+    velocity = model.state_groups.get("velocity", ())
+    tilt = ("roll", "pitch") if {"roll", "pitch"} <= {*names} else ()
+    return {
+        "position": list(model.position_indices()),
+        "velocity": [names.index(name) for name in velocity],
+        "tilt": [names.index(name) for name in tilt],
+    }
+
+
+def _fence(parts: Parts, settings: Settings) -> JsonObject:
+    """Return a box about the starts and the plan, and a speed."""
+    prepared = prepare(parts, settings)
+    drive, model = prepared.parts.drive, parts.model
+    assert isinstance(drive, Laws)
+    places = list(model.position_indices())
+    corners, fastest = [prepared.problem.states[:, places]], 0.0
+    times = np.linspace(0.0, settings.horizon, 400)
+    with precision("float64"):
+        plan = drive.leader.reference_states(model, jnp.asarray(times))
+    if plan is not None:
+        path = np.asarray(plan)[:, places]
+        offsets = parts.formation.offsets[:, places]
+        corners += [path + offset for offset in offsets]
+        steps = np.diff(path, axis=0) / np.diff(times)[:, None]
+        fastest = float(np.linalg.norm(steps, axis=1).max(initial=0.0))
+    points = np.vstack(corners)
+    return {
+        "low": _rounded(points.min(axis=0) - _MARGIN),
+        "high": _rounded(points.max(axis=0) + _MARGIN),
+        "speed": round(fastest + _FASTER, 2),
+    }
+
+
+def _rounded(values: Array) -> list[float]:
+    return [round(float(value), 3) for value in values]
+
+
+def _vehicles(parts: Parts, settings: Settings) -> tuple[JsonObject, dict[str, str]]:
+    """Return the simulated vehicles: their numbers, and the files of their motions."""
+    prepared, model = prepare(parts, settings), parts.model
+    motion, agents = prepared.problem.motion, parts.graph.agents
+    about = "The motion of a simulated vehicle in a part of a control step."
+    try:
+        texts = [
+            python_text([move_function(each)], about, {})
+            for each in motions_of(motion, agents, _SUBSTEPS)
+        ]
+    except Unsupported as error:
+        raise OutputError(f"the vehicles have no code for {error}.") from None
+    names = [f"vehicle-{texts.index(text)}.py" for text in texts]
+    trim_x, trim_u = (list(map(float, part)) for part in motion.plant.trim)
+    lags = motion.motors is not None and motion.motors.lag is not None
+    wind, disturbance, sensing = motion.wind, parts.world.disturbance, parts.world.sensing
+    zeros = [0.0] * len(trim_x)
+    time = disturbance and (disturbance.time or disturbance.hold)
+    facts = {
+        "starts": np.asarray(prepared.problem.states).tolist(),
+        "files": names,
+        "substeps": _SUBSTEPS,
+        "trim": trim_u,
+        "rest": trim_x,
+        **_autopilot(model, trim_x),
+        "memory": trim_u if lags else [],
+        "constant": zeros if wind is None else np.asarray(wind.constant).tolist(),
+        "rms": zeros if wind is None or wind.rms is None else np.asarray(wind.rms).tolist(),
+        "fade": math.exp(-settings.dt / _SUBSTEPS / time) if time else 0.0,
+        "noise": zeros if sensing is None else model.per_state(sensing.noise).tolist(),
+        "seed": settings.seed,
+    }
+    return facts, dict(zip(names, texts, strict=True))
+
+
+def _autopilot(model: ControlAffine, rest: list[float]) -> JsonObject:
+    """Return how a simulated autopilot levels and sinks, by the model's own damping."""
+    names, places = model.state_names, list(model.position_indices())
+    velocity = [names.index(name) for name in model.state_groups.get("velocity", ())]
+    feedback = np.zeros((len(model.input_names), len(names)))
+    height = names.index("z") if "z" in model.position else None
+    sinking = list(rest)
+    if model.damping is not None and height is not None and len(velocity) == len(places):
+        feedback = np.asarray(model.input_scale) @ np.asarray(model.damping, float)
+        climbing = velocity[places.index(height)]
+        # It knows neither its place nor its heading, and levels without them.
+        feedback[:, [k for k in velocity if k != climbing]] = 0.0
+        sinking[climbing] = _SINKING
+    return {
+        "levelling": feedback.tolist(),
+        "sinking": sinking,
+        "height": height,
+        "place": [*places, *([] if model.heading is None else [heading_index(model)])],
+    }
+
+
+def save_flight(files: dict[str, str | bytes], folder: Path) -> None:
+    """Write the files into a folder that is new or empty.
+
+    Raises:
+        OutputError: they cannot be written.
+    """
+    with write_errors(folder):
+        for name, content in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(folder / name, content)
+            if name.endswith(".py"):
+                # An agent's process then needs half the time and memory to begin.
+                py_compile.compile(str(folder / name))

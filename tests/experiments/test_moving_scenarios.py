@@ -1,0 +1,104 @@
+"""Scenarios with formations that change with time: their keys, files and faults."""
+
+import copy
+
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon.core.errors import ScenarioError
+
+BASE = {
+    "name": "moves",
+    "model": {"name": "double-integrator"},
+    "graph": {"edges": [[0, 1], [0, 2]]},
+    "formation": {"name": "wedge"},
+    "leader": {"law": "stopping-point"},
+    "follower": {"law": "stopping-point"},
+    "simulation": {"horizon": 10.0, "dt": 0.01},
+}
+WAVE = """
+import jax.numpy as jnp
+import echelon.agents.network.formation_motion as m
+
+class Wave(m.OffsetMotion):
+    size: float = 0.1
+
+    def __call__(self, place, t):
+        return place + self.size * jnp.sin(t)
+"""
+
+
+def built(*motion, **more):
+    scenario = copy.deepcopy(BASE)
+    scenario["formation"] |= {"motion": list(motion), **more.pop("formation", {})}
+    return ech.build(scenario | more).parts.formation
+
+
+def test_motions_of_a_scenario_are_those_of_its_formation():
+    line = {"name": "line", "spacing": 2.0}
+    reshape = {"reshape": line, "at": 2.0, "over": 3.0, "assign": "nearest"}
+    formation = built({"rotate": 0.5}, {"scale": 0.4, "rate": 0.7}, reshape)
+    assert [type(m).__name__ for m in formation.motion.motions] == ["Rotate", "Scale"]
+    assert (formation.motion.begins, formation.motion.spans) == ([2.0], [3.0])
+    assert {*formation.motion.places[:, 1, 0]} == {0.0, -2.0, -4.0}
+    assert built().motion is None
+
+
+def test_a_first_assignment_is_by_the_starts():
+    places = built().offsets
+    starts = {1: places[2].tolist(), 2: places[1].tolist()}
+    formation = built(formation={"assign": "nearest"}, initial={"states": starts})
+    assert np.array_equal(formation.offsets[[1, 2]], places[[2, 1]])
+
+
+def test_a_motion_of_a_file_takes_its_parameters(tmp_path):
+    (tmp_path / "wave.py").write_text(WAVE)
+    text = "name: w\nmodel: {name: double-integrator}\ngraph: {edges: [[0, 1]]}\n"
+    text += "formation: {motion: [{python: wave.py:Wave, parameters: {size: 0.3}}]}\n"
+    text += "simulation: {horizon: 1.0, dt: 0.01}\n"
+    (tmp_path / "w.yaml").write_text(text)
+    formation = ech.build(tmp_path / "w.yaml").parts.formation
+    assert formation.offsets_at([2.0])[0, 1, :2] == pytest.approx(0.3 * np.sin(2.0))
+
+
+LINE = {"name": "line"}
+
+
+@pytest.mark.parametrize(
+    ("motion", "message"),
+    [
+        ([{}], "got none, allowed is one of"),
+        ([{"rotate": 1.0, "scale": 0.1}], "got `rotate` and `scale`, allowed is one of"),
+        ([{"scale": 0.1}], "`scale` needs the key `rate`"),
+        ([{"rotate": 0.1, "at": 1.0}], "got `at`, which `rotate` does not take"),
+        ([{"reshape": LINE, "at": 1.0}], "`reshape` needs the key `over`"),
+        ([{"reshape": LINE, "at": 1.0, "over": 0.0}], "over"),
+        (
+            [{"reshape": LINE, "at": 10.0, "over": 1.0}],
+            "at 10 s, allowed is a time before",
+        ),
+        (
+            [{"reshape": LINE, "at": 1.0, "over": 3.0}, {"reshape": LINE, "at": 2.0, "over": 1.0}],
+            "the reshape at 2 s begins before that at 1 s ends, at 4 s",
+        ),
+        (
+            [{"reshape": {"offsets": {9: [1.0, 0.0]}}, "at": 1.0, "over": 3.0}],
+            "an offset is given for agent 9, and agents are numbered from 0 to 2",
+        ),
+        (
+            [{"reshape": {"name": "line", "columns": 2}, "at": 1.0, "over": 3.0}],
+            "got `columns`, which the shape `line` does not take",
+        ),
+    ],
+)
+def test_faults_of_motions_are_a_sentence_with_their_place(motion, message):
+    with pytest.raises(ScenarioError) as error:
+        built(*motion)
+    assert message in str(error.value) and "formation" in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_an_assignment_without_starts_is_refused():
+    with pytest.raises(ScenarioError, match="`assign: nearest` needs `initial.states`"):
+        built(formation={"assign": "nearest"})

@@ -1,0 +1,207 @@
+"""One agent's process, with a vehicle and others that this test plays."""
+
+import math
+import socket
+import time
+
+import pytest
+
+from echelon.core.errors import FlightError
+from echelon.flight.agent_process import AgentProcess, Crew
+from echelon.flight.air import LOOPBACK, Air
+from echelon.flight.links.link import Link, Reading
+from echelon.flight.plan_clock import PlanClock
+from echelon.flight.supervisor import Fault
+from echelon.flight.wire import GROUND, Drop, Letter, Packet, Wire
+
+DT, KEY = 0.01, b"k" * 32
+FLIGHT = {
+    **{"dt": DT, "leadership": None},
+    "position": [0],
+    "velocity": [1],
+    "tilt": [],
+    "fence": {"low": [-5.0], "high": [5.0], "speed": 10.0},
+}
+NETWORK = {"period": 0.02, "forget": 0.5, "forget_hops": 5.0, "agents": 2, "leaders": [0]}
+FACTS = {
+    **{"agent": 1, "leads": False, "hears": [0], "weights": [1.0]},
+    **{"signal": ["x"], "message": ["v"], "network": {**NETWORK, "uses": "all"}},
+}
+
+
+class Law:
+    """A law that returns its disagreement, or what a test wants."""
+
+    u = 0.0
+
+    def begin(self, x):
+        return []
+
+    def difference(self, x, memory, place):
+        return [x[0] - place[0]]
+
+    def expected(self, t, content, age):
+        return [t], [1.0], True
+
+    def tick(self, t, x, z, forward, memory):
+        return [self.u - z[0]], [], [x[0]], [0.0], math.isfinite(self.u)
+
+
+class Fake(Link):
+    """A vehicle that reads as this test says."""
+
+    def __init__(self):
+        self.x, self.sent, self.sinks, self.fails, self.age = [0.0, 1.0], [], 0, False, 0.0
+        self.battery = None
+
+    def read(self, wait):
+        time.sleep(DT / 2)
+        if self.fails:
+            raise FlightError("the link is gone.")
+        return Reading(time.monotonic() - self.age, self.x, self.battery)
+
+    def send(self, u):
+        self.sent.append(u)
+
+    def level_descend(self):
+        self.sinks += 1
+
+    def close(self):
+        pass
+
+
+class Scene:
+    """An agent's process, its vehicle, and the socket of all others."""
+
+    def __init__(self, monkeypatch):
+        monkeypatch.setattr("signal.signal", lambda *_: None)
+        ways = []
+        for _ in range(2):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.bind((LOOPBACK, 0))
+                ways.append(probe.getsockname())
+        self.air, self.law, self.link = Air(ways[0], [ways[1]]), Law(), Fake()
+        air = Air(ways[1], [ways[0]])
+        crew = Crew(self.law, FACTS, FLIGHT, self.link, air, self.wire(1), PlanClock())
+        self.process = AgentProcess(crew)
+        self.crew, self.ground, self.leader = crew, self.wire(GROUND), self.wire(0)
+
+    def wire(self, number, key=KEY, formation="ab" * 32):
+        return Wire(key, formation, number, 2, (1, 1), time.time_ns() // 1_000_000)
+
+    def start(self):
+        self.air.send(self.ground.start(time.time(), time.time() - 1.0))
+        self.rounds(10)
+
+    def rounds(self, count):
+        for _ in range(count):
+            self.process._round()
+
+    @property
+    def fault(self):
+        return self.process._supervisor.fault
+
+
+@pytest.fixture
+def scene(monkeypatch):
+    return Scene(monkeypatch)
+
+
+def test_nothing_is_sent_before_the_start(scene):
+    scene.rounds(5)
+    assert not scene.link.sent and scene.fault is Fault.NONE
+    scene.start()
+    assert scene.link.sent and scene.fault is Fault.NONE
+
+
+def test_letters_are_heard_and_answered(scene):
+    scene.start()
+    t = scene.crew.clock.now
+    packet = Packet(0, t, (0.0,))
+    scene.air.send(scene.leader.letter(Letter(0, t, 0, (0.0,), packet)))
+    scene.rounds(20)
+    # The leader is expected at t, and the vehicle is at 0.
+    assert scene.link.sent[-1][0] == pytest.approx(t, abs=1.0)
+    wire = scene.wire(0)
+    letters = [wire.open(each, scene.crew.clock.now, time.time()) for each in scene.air.receive()]
+    bodies = [x.body for x in letters if not isinstance(x, Drop) and isinstance(x.body, Letter)]
+    assert bodies and bodies[-1].packet == packet and bodies[-1].hops == 1
+    # At the network's rate: every other state.
+    assert len(bodies) <= 0.6 * len(scene.link.sent) + 2
+
+
+FAULTS = {
+    Fault.FENCE: lambda scene: setattr(scene.link, "x", [6.0, 0.0]),
+    Fault.SPEED: lambda scene: setattr(scene.link, "x", [0.0, 11.0]),
+    Fault.BATTERY: lambda scene: setattr(scene.link, "battery", 0.1),
+    Fault.LINK: lambda scene: setattr(scene.link, "fails", True),
+    Fault.INPUT: lambda scene: setattr(scene.law, "u", math.nan),
+    Fault.STALE: lambda scene: setattr(scene.link, "age", 0.2),
+    Fault.STOP: lambda scene: scene.air.send(scene.leader.stop(time.time())),
+    Fault.SIGNAL: lambda scene: scene.process._interrupt(15, None),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_lets_the_vehicle_descend_and_stay_so(fault, scene, capsys):
+    scene.start()
+    sent = len(scene.link.sent)
+    FAULTS[fault](scene)
+    for _ in range(4):
+        scene.process._over()
+        scene.rounds(1)
+    assert scene.fault is fault
+    scene.link.fails, scene.link.x, scene.law.u, scene.link.age = False, [0.0, 1.0], 0.0, 0.0
+    before, sinks = len(scene.link.sent), scene.link.sinks
+    scene.rounds(5)
+    assert len(scene.link.sent) == before <= sent + 2 and scene.link.sinks == sinks + 5
+    said = capsys.readouterr().err
+    assert said.count("levels and descends.") == 1 and said.startswith("agent 1: ")
+
+
+def test_a_process_with_the_same_number_ends_the_flight(scene):
+    scene.start()
+    twin = scene.wire(1)
+    scene.process._began -= 3.0
+    time.sleep(0.01)
+    t = scene.crew.clock.now
+    scene.air.send(scene.wire(1).letter(Letter(1, t, 0, (0.0,), Packet(0, t, (0.0,)))))
+    scene.rounds(2)
+    assert scene.fault is Fault.TWIN and twin.number == 1
+    assert scene.process._supervisor.sentence == "two agents have the number 1"
+
+
+MISTAKES = {
+    "a datagram of agent 0 is signed with another key.": {"key": b"other" * 8},
+    "a datagram of agent 0 is of another formation.": {"formation": "cd" * 32},
+}
+
+
+@pytest.mark.parametrize("sentence", MISTAKES)
+def test_mistakes_on_the_ground_are_told_once(sentence, scene, capsys):
+    scene.start()
+    t, other = scene.crew.clock.now, scene.wire(0, **MISTAKES[sentence])
+    for _ in range(3):
+        scene.air.send(other.letter(Letter(0, t, 0, (0.0,), Packet(0, t, (0.0,)))))
+        scene.rounds(1)
+    said = capsys.readouterr().err.splitlines()
+    assert said.count(f"agent 1: {sentence}") == 1 and scene.fault is Fault.NONE
+
+
+def test_a_clock_that_is_off_is_told(scene, capsys):
+    scene.air.send(scene.ground.start(time.time() + 1.5, time.time()))
+    scene.start()
+    scene.air.send(scene.leader.letter(Letter(0, scene.crew.clock.now + 1.5, 0, (0.0,), None)))
+    scene.rounds(2)
+    assert (
+        "a datagram of agent 0 is stamped more than 1 s beside this clock."
+        in capsys.readouterr().err
+    )
+
+
+def test_the_first_start_counts(scene):
+    scene.start()
+    before = scene.crew.clock.now
+    scene.air.send(scene.ground.start(time.time(), time.time() + 100.0))
+    scene.rounds(2)
+    assert scene.crew.clock.now >= before

@@ -1,0 +1,73 @@
+"""Sockets: unicast and multicast on this machine alone."""
+
+import socket
+import time
+
+import pytest
+
+from echelon.core.errors import FlightError
+from echelon.flight.air import LOOPBACK, Air, read_address
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((LOOPBACK, 0))
+        return probe.getsockname()[1]
+
+
+def heard(air):
+    """What arrives within a second, until something does."""
+    for _ in range(100):
+        if datagrams := list(air.receive()):
+            return datagrams
+        time.sleep(0.01)
+    return []
+
+
+def test_a_datagram_reaches_the_others_and_not_its_sender():
+    ways = [(LOOPBACK, free_port()) for _ in range(3)]
+    airs = [Air(way, ways) for way in ways]
+    airs[0].send(b"hello")
+    assert [heard(air) for air in airs[1:]] == [[b"hello"], [b"hello"]]
+    assert not list(airs[0].receive())
+    for air in airs:
+        air.close()
+
+
+def test_a_group_is_heard_on_the_loopback_interface_alone():
+    way = "239.255.71.9", free_port()
+    first, second = (Air(way, [way]) for _ in range(2))
+    assert first._socket.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 0
+    first.send(b"to all")
+    assert heard(second) == [b"to all"]
+    first.close()
+    second.close()
+
+
+def test_a_port_in_use_is_one_sentence():
+    way = LOOPBACK, free_port()
+    first = Air(way, [])
+    with pytest.raises(FlightError, match=r"is in use; another agent of that number may run\.$"):
+        Air(way, [])
+    first.close()
+    with pytest.raises(FlightError, match=r"203\.0\.113\.1:\d+ cannot be used \(.*\)\.$"):
+        Air(("203.0.113.1", way[1]), [])
+
+
+def test_a_flood_ends_each_time():
+    way = LOOPBACK, free_port()
+    air, source = Air(way, []), Air((LOOPBACK, free_port()), [way])
+    for _ in range(1_000):
+        source.send(b"x")
+    assert len(list(air.receive())) <= 200
+    air.close()
+    source.close()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "47100", "host:1", "1.2.3.4", "1.2.3.4:0", "1.2.3.4:70000", "1.2.3:5"]
+)
+def test_addresses_are_checked(text):
+    with pytest.raises(FlightError, match="must be an IPv4 address and a port such as"):
+        read_address(text, "--to")
+    assert read_address("239.255.71.1:47100", "--to") == ("239.255.71.1", 47100)

@@ -1,0 +1,259 @@
+"""Formations in real time over unmodified cflib and pymavlink, against vehicles that are none.
+
+They need the extras `crazyflie` and `px4`. Over real radios and vehicles nothing was tried.
+"""
+
+import contextlib
+import importlib
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_vehicles import MELLINGER
+
+import echelon as ech
+from echelon.agents.models import CrazyflieAttitude
+from echelon.flight.air import Air, ports_of
+from echelon.flight.ground import Ground
+from echelon.flight.links.cflib_link import CflibLink
+from echelon.flight.mission import Mission
+from echelon.flight.together import make_key
+from echelon.flight.wire import GROUND, wire_of
+from echelon.output.archive.flight_folder import flight_files, save_flight
+from echelon.output.archive.law_folder import law_files
+
+pytestmark = pytest.mark.study
+
+TESTS = Path(__file__).parents[1]
+GRAPH = ech.Graph([(0, 1), (1, 2), (1, 3)])
+OFFSETS = {1: (0.6, 0.0, 0.0), 2: (0.6, 0.5, 0.0), 3: (0.6, -0.5, 0.0)}
+PATH = ech.references.Circle(center=(0.0, 0.0, 1.0), radius=0.6, rate=0.8)
+DT, SETTLED, SECONDS = 0.01, 10.0, 18.0
+SPEED = float(os.environ.get("FLIGHT_SPEED", "1"))  # below 1 on a machine that others use
+
+
+def extra(library, name):
+    """A library that the study needs."""
+    try:
+        return importlib.import_module(library)
+    except ImportError:
+        pytest.fail(f"this study needs `pip install 'echelon-formation[{name}]'`.", pytrace=False)
+
+
+def consensus(model):
+    gain = ech.synthesize(model, GRAPH, ech.gains.Riccati())
+    return ech.Laws(ech.laws.Tracking(PATH), ech.laws.Consensus(gain, feedforward="relay"))
+
+
+def stopping(_):
+    return ech.Laws(ech.laws.StoppingLeader(reference=PATH), ech.laws.StoppingPoint())
+
+
+def formation(model, laws=consensus, network=None):
+    """Four of a model, behind a leader on a circle."""
+    places = ech.Formation.from_offsets(model, GRAPH, OFFSETS)
+    return ech.Parts(model, GRAPH, places, laws(model), world=ech.World(network=network))
+
+
+def facts(model, agent):
+    """What a link needs of law.json."""
+    inputs = dict(zip(model.input_names, model.input_units, strict=True))
+    states = dict(zip(model.state_names, model.state_units, strict=True))
+    trim = dict(zip(model.input_names, model.trim[1], strict=True))
+    return {"agent": agent, "dt": DT, "states": states, "inputs": inputs, "trim": trim}
+
+
+@contextlib.contextmanager
+def served(script, **settings):
+    """A process of tests/ that serves vehicles while the block runs."""
+    command = [sys.executable, TESTS / script, json.dumps({"speed": SPEED} | settings)]
+    with subprocess.Popen(command, stdin=-1, stdout=-1, text=True) as process:
+        assert process.stdout.readline() == "ready\n"
+        try:
+            yield
+        finally:
+            process.stdin.close()
+            assert process.wait(10) == 0
+
+
+class Flown:
+    """One agent: its exported law, its link, its state and its memory."""
+
+    def __init__(self, parts, agent, link):
+        files = law_files(parts, ech.Settings(horizon=SECONDS, dt=DT), agent, "")
+        self.facts, self.law, self.link = json.loads(files["law.json"]), {}, link
+        exec(files["law.py"], self.law)
+        self.x = link.read(5.0).x
+        self.memory = self.law["begin"](self.x)
+
+    def hello(self):
+        if (reading := self.link.read(0.0)) is not None:
+            self.x = reading.x
+        return self.law["signal"](self.x, self.memory)
+
+    def act(self, t, signals, forward):
+        """Take a step; returns what the agent feeds forward."""
+        hears, weights = self.facts["hears"], self.facts["weights"]
+        gaps = [self.law["difference"](self.x, self.memory, signals[k]) for k in hears]
+        z = [sum(w * gap[n] for w, gap in zip(weights, gaps, strict=True)) for n in range(12)]
+        u, self.memory, _, message, valid = self.law["tick"](t, self.x, z, forward, self.memory)
+        assert valid
+        self.link.send(u)
+        return message
+
+
+def fly(parts, links):
+    """Fly a formation in real time, all in this thread; returns when it began."""
+    agents = [Flown(parts, k, link) for k, link in enumerate(links)]
+    begin = time.monotonic()
+    for step in range(int(SECONDS / DT)):
+        time.sleep(max(0.0, begin + step * DT / SPEED - time.monotonic()))
+        signals, t = [agent.hello() for agent in agents], (time.monotonic() - begin) * SPEED
+        forward = agents[0].act(t, signals, [math.nan] * 4)
+        for agent in agents[1:]:
+            agent.act(t, signals, forward)
+    return begin
+
+
+def fly_processes(folder, model, laws, links, port):
+    """Fly a formation by `echelon fly`, a process an agent; returns when the plan began."""
+    parts = formation(model, laws, ech.Network(rate=50.0))
+    save_flight(flight_files(parts, ech.Settings(horizon=SECONDS, dt=DT), "four"), folder)
+    mission, key, ports = Mission(folder), folder / "key", ports_of(4, port)
+    make_key(key)
+    ground = Ground(Air(ports[4], ports[:4]), wire_of(mission.facts, GROUND, key), 4)
+    command = [sys.executable, "-m", "echelon.flight", folder, "--key", key, "--port", str(port)]
+    command += ["--speed", str(SPEED)]
+    flying = [
+        subprocess.Popen([*command, "--agent", str(k), "--link", link])
+        for k, link in enumerate(links)
+    ]
+    try:
+        until = time.monotonic() + 30.0
+        while not ground.ready:
+            assert time.monotonic() < until and all(one.poll() is None for one in flying)
+            time.sleep(0.05)
+        begin = time.monotonic() + 0.5
+        ground.start(time.time() + 0.5)
+        # At the end of the plan they descend, and end by themselves.
+        assert [one.wait(SECONDS / SPEED + 30.0) for one in flying] == [0] * 4
+    finally:
+        for one in flying:
+            one.kill()
+    return begin
+
+
+def errors(file, begin):
+    """The largest distances (m) from the goals beside the leader, and of it from its path."""
+    flown = np.load(file)
+    t = (flown["times"] - begin) * SPEED
+    within = (t > SETTLED) & (t < SECONDS - 0.1)
+    places, t = flown["places"][within], t[within]
+    wanted = np.stack([0.6 * np.cos(0.8 * t), 0.6 * np.sin(0.8 * t), np.ones_like(t)], 1)
+    apart = [places[:, k] - places[:, 0] - np.array(OFFSETS[k]) for k in OFFSETS]
+    beside = max(np.linalg.norm(gap, axis=1).max() for gap in apart)
+    return beside, np.linalg.norm(places[:, 0] - wanted, axis=1).max()
+
+
+def say(capsys, name, beside, leader):
+    with capsys.disabled():
+        print(f"\n{name}: followers at most {1e3 * beside:.1f} mm from their places beside the")
+        print(f"leader, and the leader {1e3 * leader:.1f} mm from its path")
+
+
+def starts():
+    goals = np.array([(0.0, 0.0, 0.0), *OFFSETS.values()]) + [0.6, 0.0, 1.0]
+    return (goals + np.random.default_rng(3).uniform(-0.2, 0.2, (4, 3))).tolist()
+
+
+VEHICLES = {
+    "as identified": (CrazyflieAttitude(), {}),
+    "firmware's gains, motors of 30 ms": (
+        CrazyflieAttitude.named("firmware"),
+        {"mass": 0.029, "gain": 1.0, "lag": 0.03, "response": MELLINGER},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_a_swarm_of_cflib_flies_a_formation(tmp_path, name, capsys):
+    crtp, swarm = extra("cflib.crtp", "crazyflie"), extra("cflib.crazyflie.swarm", "crazyflie")
+    crtp.CLASSES or crtp.init_drivers()
+    model, vehicle = VEHICLES[name]
+    file = str(tmp_path / "flown.npz")
+    uris = [f"udp://127.0.0.1:{19850 + k}" for k in range(4)]
+    parts = formation(model)
+    with served("fake_crazyflie.py", port=19850, starts=starts(), file=file, **vehicle):
+        with swarm.Swarm(uris) as crazyflies:
+            crazyflies.parallel_safe(lambda each: each.wait_for_params())
+            each = [crazyflies._cfs[uri].cf for uri in uris]
+            links = [CflibLink("", facts(model, k), each[k]) for k in range(4)]
+            begin = fly(parts, links)
+    beside, leader = errors(file, begin)
+    say(capsys, name, beside, leader)
+    assert beside <= 0.015 and leader <= 0.05
+
+
+SCRIPTS = {
+    "cflib": ("cflib.crtp", "crazyflie", "fake_crazyflie.py", "cflib://udp://127.0.0.1:{}"),
+    "px4": ("pymavlink.mavutil", "px4", "fake_px4.py", "px4://udpin:127.0.0.1:{}"),
+}
+FLIGHTS = [
+    ("cflib", "as identified", consensus, 0.015),
+    ("cflib", "as identified", stopping, 0.015),
+    ("cflib", "firmware's gains, motors of 30 ms", stopping, 0.015),
+    ("px4", "as identified", consensus, 0.010),
+    # Its memory suffers from ticks that a shared processor misses.
+    ("px4", "as identified", stopping, 0.015),
+]
+
+
+@pytest.mark.parametrize(("name", "vehicle", "laws", "most"), FLIGHTS)
+def test_four_processes_fly_a_formation_and_land(tmp_path, name, vehicle, laws, most, capsys):
+    library, needed, script, address = SCRIPTS[name]
+    extra(library, needed)
+    file, (model, changes) = str(tmp_path / "flown.npz"), VEHICLES[vehicle]
+    port = 52100 + 20 * FLIGHTS.index((name, vehicle, laws, most))
+    with served(script, port=19860, starts=starts(), file=file, **changes):
+        links = [address.format(19860 + k) for k in range(4)]
+        begin = fly_processes(tmp_path / "flight", model, laws, links, port)
+    beside, leader = errors(file, begin)
+    say(capsys, f"four processes, {name}, {vehicle}, {laws.__name__}", beside, leader)
+    assert beside <= most and leader <= 0.05
+    assert np.load(file)["places"][-1, :, 2].max() < 0.06
+
+
+def test_a_crazyflie_whose_process_is_killed_levels_and_stops(tmp_path):
+    extra("cflib.crtp", "crazyflie")
+    file = str(tmp_path / "flown.npz")
+    start = [[0.6, 0.0, 1.0]]
+    with served("fake_crazyflie.py", port=19870, starts=start, file=file, speed=1.0):
+        code = [
+            "from test_autopilots_in_flight import *",
+            "link = CflibLink('udp://127.0.0.1:19870', facts(CrazyflieAttitude(), 0))",
+            "while True:",
+            "    link.send([0.2, 0.0, 0.0, 0.3206])",
+            "    print('flies', flush=True); time.sleep(0.01)",
+        ]
+        places = [TESTS, TESTS / "flight", *sys.path]
+        path = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, places))}
+        with subprocess.Popen(
+            [sys.executable, "-c", "\n".join(code)], stdout=-1, env=path
+        ) as process:
+            assert process.stdout.readline() == b"flies\n"
+            time.sleep(0.3)
+            process.kill()
+            killed = time.monotonic()
+        time.sleep(3.0)
+    flown = np.load(file)
+    t, places = flown["times"] - killed, flown["places"][:, 0]
+    speed = np.gradient(places[:, 1], t)
+    # Tilted until half a second after the last command, then level, then without motors.
+    level = speed[(t > 0.9) & (t < 1.5)]
+    assert np.ptp(level) < 0.05 and abs(level.mean()) > 0.3 and places[-1, 2] < 0.05

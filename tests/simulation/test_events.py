@@ -1,0 +1,230 @@
+"""Agents that are lost or join, links that are cut, and heirs that take the lead."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon.core.errors import EchelonError
+from echelon.guarantees.promises.event_lines import events_in_words
+
+Cut, Join, Lose = ech.network.Cut, ech.network.Join, ech.network.Lose
+CART = ech.models.DoubleIntegrator()
+RING = ech.Graph([(0, 1), (1, 2), (2, 3), (3, 0), (1, 3)])
+CIRCLE = ech.references.Circle(radius=2.0, rate=0.7)
+STOPPING = ech.Laws(ech.laws.StoppingLeader(reference=CIRCLE), ech.laws.StoppingPoint())
+PLACES = {1: [1.0, 0.0], 2: [2.0, 0.0], 3: [0.0, 1.0]}
+SETTINGS = ech.Settings(horizon=6.0, dt=0.02, seed=3)
+RADIO = ech.Network(rate=25.0, delay=0.02, loss=0.2)
+
+
+def _parts(graph=RING, drive=STOPPING, network=None, **more):
+    formation = ech.Formation.from_offsets(CART, graph, PLACES)
+    world = ech.World(network=network)
+    return ech.Parts(CART, graph, formation, drive, {"position": 0.5}, world=world, **more)
+
+
+@pytest.fixture(scope="module")
+def lost():
+    return ech.simulate(_parts(events=[Lose(3, 2.0), Join(2, 3.0)]), SETTINGS)
+
+
+def test_a_cut_link_is_a_graph_that_switches():
+    """To the bit, in both ways of stating it; native code steps it too."""
+    edges = RING.edges.tolist()
+    rest = [edge for edge in edges if edge != [1, 2]]
+    turns = ech.Graph.switching([(0.0, edges), (2.0, rest), (4.0, edges)])
+    drive = ech.Laws(STOPPING.leader, ech.laws.StoppingPoint(coupling=4.0))
+    stated, cut = (
+        ech.simulate(parts, SETTINGS._replace(engine="native"))
+        for parts in (_parts(turns, drive), _parts(drive=drive, events=[Cut((1, 2), 2.0, 2.0)]))
+    )
+    assert np.array_equal(stated.states, cut.states)
+    assert cut.engine == "native" and cut.presence is None
+
+
+def test_an_agent_is_there_until_it_is_lost_and_from_when_it_joins(lost):
+    steps = np.rint(lost.times / 0.02).astype(int)
+    assert np.array_equal(lost.presence[:, 3], steps < 100)
+    assert np.array_equal(lost.presence[:, 2], steps >= 150)
+    # It stays where it is, without inputs.
+    assert np.ptp(lost.states[steps >= 100, 3], axis=0).max() == 0.0
+    assert np.ptp(lost.states[steps <= 150, 2], axis=0).max() == 0.0
+    assert not lost.inputs[~lost.presence].any()
+    assert not lost.errors[~lost.presence].any()
+
+
+def test_those_who_remain_fly_as_in_a_graph_without_the_others(lost):
+    """Agents 0 and 1 alone between the two events, from the states at the first of them."""
+    edges = RING.edges.tolist()
+    fewer = [[edge for edge in edges if not absent & {*edge}] for absent in ({2}, {2, 3})]
+    graph = ech.Graph.switching([(0.0, fewer[0]), (2.0, fewer[1]), (3.0, edges)])
+    other = ech.simulate(_parts(graph), SETTINGS)
+    before = lost.times < 3.0 - 1e-9
+    gap = np.abs(other.states - lost.states)[before][:, [0, 1]]
+    assert gap.max() < 1e-12
+
+
+def test_numbers_are_of_the_steps_in_which_an_agent_is_there(lost):
+    numbers = {row.agent: row for row in ech.metrics(lost).followers}
+    frames = lost.presence[:-1]
+    for agent in (1, 2, 3):
+        own = lost.formation_errors[:-1, agent][frames[:, agent]]
+        assert numbers[agent].rmse == pytest.approx(np.sqrt(np.mean(own**2)), rel=1e-9)
+    assert numbers[3].steady_rmse is None
+
+
+def test_the_summary_states_each_event_and_what_followed(lost):
+    summary = ech.summary(lost)
+    assert [event["text"] for event in summary["events"]] == ["agent 3 is lost", "agent 2 joins"]
+    assert not any(event["guarantee"]["promised"] for event in summary["events"])
+    first, second = summary["event_outcomes"]
+    late = lost.formation_errors[lost.times >= 3.0 - 1e-9]
+    assert second["peak"] == pytest.approx(late.max())
+    assert second["restored"] is None or second["restored"] > 3.0
+    assert first["until"] == pytest.approx(2.98)
+    assert "Agent 2 joins at 3 s" in ech.report(lost)
+
+
+@pytest.mark.slow
+def test_an_agent_that_returns_begins_anew():
+    once = ech.simulate(_parts(events=[Lose(2, 2.0), Join(2, 3.0)]), SETTINGS)
+    at = int(round(3.0 / 0.02))
+    assert np.array_equal(once.states[at, 2], once.states[0, 2])
+    assert once.presence[:, 2].sum() == len(once.times) - 50
+    assert once.formation_errors[-1].max() < 0.02
+
+
+@pytest.mark.parametrize(
+    "network", [None, pytest.param(RADIO, marks=pytest.mark.slow)], ids=["ideal", "radio"]
+)
+def test_an_heir_leads_along_the_path(network):
+    parts = _parts(
+        network=network, events=[Lose(0, 3.0)], leadership=ech.Leadership((1, 2), timeout=0.3)
+    )
+    run = ech.simulate(parts, SETTINGS)
+    assert run.formation_errors[run.times > 3.0].max() < 1e-3
+    # The heir is where the leader's path and its own offset put it.
+    gap = run.states[-1, 1] - run.reference[-1] - run.offsets[1]
+    assert np.abs(gap).max() < 5e-3
+    assert (run.nearest_then[run.times >= 3.0] == 1).all()
+    agent, off = ech.summary(run)["event_outcomes"][0]["leader"]
+    assert agent == 1 and off < 0.3
+
+
+def test_losses_that_are_covered_are_guaranteed():
+    parts = _parts(events=[Lose(3, 2.0), Cut((1, 2), 3.0, 1.0)])
+    guarantee = ech.promise(parts, SETTINGS)
+    assert guarantee.promised and guarantee.rate is not None
+    stated = events_in_words(parts, guarantee)
+    assert [event["guarantee"]["kind"] for event in stated] == ["proof", "proof"]
+
+
+@pytest.mark.parametrize(
+    "events", [[Join(2, 3.0)], [Lose(0, 3.0)]], ids=["one that joins", "a leader that is lost"]
+)
+def test_what_is_not_covered_is_not_guaranteed(events):
+    parts = _parts(events=events, leadership=ech.Leadership((1,)))
+    assert not ech.promise(parts, SETTINGS).promised
+
+
+def test_heirs_over_a_radio_may_take_the_lead_at_any_time():
+    parts = _parts(network=RADIO, leadership=ech.Leadership((1,)))
+    assert not ech.promise(parts, SETTINGS).promised
+
+
+TREE = ech.Graph([(0, 1), (1, 2), (1, 3)])
+
+
+@pytest.mark.parametrize(
+    ("graph", "events", "words"),
+    [
+        (RING, [Lose(7, 2.0)], "agents are numbered from 0 to 3"),
+        (RING, [Lose(3, 9.0)], "the run ends at 6 s"),
+        (RING, [Lose(3, -1.0)], "times must be positive"),
+        (RING, [Lose(3, 2.0), Lose(3, 3.0)], "absent already"),
+        (RING, [Join(3, 2.0), Join(3, 3.0)], "present already"),
+        (RING, [Lose(0, 2.0)], "nobody leads afterwards"),
+        (RING, [Join(0, 2.0)], "nobody leads before"),
+        (RING, [Cut((0, 2), 2.0)], "no such link"),
+        (TREE, [Lose(1, 2.0)], "agents 2, 3 have no path"),
+        (TREE, [Cut((0, 1), 2.0, 1.0), Cut((1, 3), 3.0)], "agent 3 has no path"),
+    ],
+)
+def test_events_that_cannot_be_are_refused_in_a_sentence(graph, events, words):
+    with pytest.raises(EchelonError, match=words):
+        ech.simulate(_parts(graph, events=events), SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("heirs", "words"),
+    [((9,), "no agent"), ((0,), "leader itself"), ((1, 1), "twice"), ((), "empty")],
+)
+def test_heirs_that_cannot_be_are_refused(heirs, words):
+    with pytest.raises(EchelonError, match=words):
+        _parts(leadership=ech.Leadership(heirs))
+
+
+def test_heirs_that_cannot_wait_for_messages_are_refused():
+    parts = _parts(network=RADIO, leadership=ech.Leadership((1,), timeout=0.05))
+    with pytest.raises(EchelonError, match="at least two periods of the network"):
+        ech.simulate(parts, SETTINGS)
+
+
+def test_heirs_of_a_leader_without_a_plan_are_refused():
+    gain = ech.synthesize(CART, RING, ech.gains.Riccati())
+    passive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    with pytest.raises(EchelonError, match="no plan"):
+        ech.simulate(_parts(drive=passive, leadership=ech.Leadership((1,))), SETTINGS)
+
+
+def test_an_heir_of_a_leader_of_states_leads_too():
+    gain = ech.synthesize(CART, RING, ech.gains.Riccati())
+    drive = ech.Laws(ech.laws.Tracking(CIRCLE), ech.laws.Consensus(gain, feedforward="relay"))
+    parts = _parts(drive=drive, events=[Lose(0, 3.0)], leadership=ech.Leadership((1,)))
+    run = ech.simulate(parts, SETTINGS)
+    assert run.formation_errors[-1].max() < 0.05
+
+
+@pytest.mark.slow
+def test_a_run_with_events_is_stored_and_verified(tmp_path):
+    scenario = ech.load_scenario("paper-global").with_(simulation__horizon=2.0)
+    data = {
+        **scenario.data,
+        "events": [{"at": 1.0, "lose": 3}, {"at": 1.2, "cut": [1, 2], "for": 0.3}],
+    }
+    run = ech.run(ech.scenario_from_mapping(data))
+    folder = ech.save_run(run, tmp_path / "run", figures=False)
+    assert ech.verify(folder).verdict == "verified"
+    stored = ech.load(folder)
+    assert np.array_equal(stored.presence, run.presence)
+    assert ech.summary(stored)["event_outcomes"] == ech.summary(run)["event_outcomes"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("prediction", ["preview", "packet"])
+def test_single_agents_hand_the_lead_over_as_in_a_run(prediction):
+    """Each with a queue of its own; the leader stops at 1 s, and an heir of it at 2 s."""
+    dt, radio = 0.02, dataclasses.replace(RADIO, loss=0.0, prediction=prediction)
+    events = [Lose(0, 1.0), Lose(1, 2.0)]
+    parts = _parts(network=radio, events=events, leadership=ech.Leadership((1, 2), timeout=0.2))
+    run = ech.simulate(parts, ech.Settings(horizon=3.0, dt=dt, seed=3))
+    agents = [ech.Agent(parts, k, dt=dt) for k in range(4)]
+    states, under_way, leads = run.states[0].copy(), [], []
+    for k in range(150):
+        now = k * dt
+        for receiver, message in [x for x in under_way if x[1].time < now - 1e-9]:
+            agents[receiver].receive(message)
+        under_way = [x for x in under_way if x[1].time >= now - 1e-9]
+        inputs = np.zeros((4, 2))
+        for agent in agents:
+            if run.presence[k, agent.number]:
+                inputs[agent.number], message = agent.step(now, states[agent.number])
+                if message is not None and k % 2 == 0:
+                    near = [x for x in agents if agent.number in x.neighbours]
+                    under_way += [(x.number, message) for x in near if run.presence[k, x.number]]
+        assert inputs == pytest.approx(run.inputs[k], abs=1e-9)
+        states = run.states[k + 1]
+        leads.append([agent.leads for agent in agents])
+    assert np.array(leads)[-1].tolist() == [True, True, True, False]
