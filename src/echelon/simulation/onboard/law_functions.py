@@ -158,7 +158,7 @@ class _Traces:
             signal = () if type(self.law).signal is Law.signal else step.signal
             if not sends_packets:
                 return *results, _flat((x, signal, action))
-            content = content_of(loop, t, *own, step.signal, action.message, action.input)
+            content = content_of(loop, t, *own[:3], step.signal, action.message, action.input)
             return *results, content, _flat((x, signal, action, content))
 
         outputs = ("u", "memory", "signal", "message", *(("content",) if sends_packets else ()))
