@@ -377,7 +377,9 @@ def _strengths(run: StoppingRun) -> Array:
     """Return eigenvalues of the followers' Laplacian that stand for all, (K,)."""
     graph, reach = run.parts.graph, run.law.reach
     assert reach is not None
-    network = run.network  # what is heard over it is late, and an agent answers to its own deviation
+    network = (
+        run.network
+    )  # what is heard over it is late, and an agent answers to its own deviation
     alone = np.array([]) if network is None else network.sums
     if network is not None and network.ways is not None:
         return alone
