@@ -37,7 +37,7 @@ class Law:
     def begin(self, x):
         return []
 
-    def difference(self, x, memory, place):
+    def difference(self, t, x, memory, place):
         return [x[0] - place[0]]
 
     def expected(self, t, content, age):
@@ -205,3 +205,22 @@ def test_the_first_start_counts(scene):
     scene.air.send(scene.ground.start(time.time(), time.time() + 100.0))
     scene.rounds(2)
     assert scene.crew.clock.now >= before
+
+
+def test_states_that_come_unevenly_are_all_used(scene):
+    """States every period, each up to 4 ms late: the law counts its time by ticks."""
+    scene.start()
+    begin, before = time.monotonic(), len(scene.link.sent)
+    for k in range(200):
+        late = 0.004 * (k * 37 % 11) / 10
+        scene.process._tick(Reading(begin + k * DT + late, [0.0, 1.0]))
+    assert len(scene.link.sent) - before >= 199
+
+
+def test_states_that_come_too_often_are_skipped_and_missed_ones_are_not_made_up_for(scene):
+    scene.start()
+    begin, before = time.monotonic(), len(scene.link.sent)
+    for k in range(400):
+        if not 100 <= k < 200:
+            scene.process._tick(Reading(begin + k * DT / 2, [0.0, 1.0]))
+    assert 148 <= len(scene.link.sent) - before <= 152

@@ -65,6 +65,7 @@ class AgentProcess:
         self._pilot = Pilot(crew.law, crew.facts, flight["leadership"], hold)
         self._reading: Reading | None = None
         self._began, self._ticked, self._fell = time.monotonic(), -math.inf, math.inf
+        self._due = 0.0
         self._sent, self._reported, self._signals = -math.inf, -math.inf, 0
         self._moved = self._began
         self._said = set[str]()
@@ -133,8 +134,10 @@ class AgentProcess:
     def _tick(self, reading: Reading) -> None:
         """Let the law act on a state, if one of its periods has passed."""
         t, supervisor = self._crew.clock.at(reading.time), self._supervisor
-        if t is None or t < 0.0 or t < self._ticked + 0.75 * self._dt:
+        if t is None or t < max(0.0, self._due - 0.5 * self._dt):
             return
+        # A state that is late does not make the next one early: the law counts its time by ticks.
+        self._due = (self._due if t - self._due <= self._dt else t) + self._dt
         supervisor.judge(reading, t)
         if t > self._seconds:
             supervisor.trip(Fault.END)
@@ -209,6 +212,7 @@ class AgentProcess:
         report = Report(
             mode=2 if supervisor.fault is not Fault.NONE else int(self._ticked >= 0.0),
             fault=list(Fault).index(supervisor.fault),
+            leader=self._pilot.leader,
             amount=supervisor.amount,
             time=math.nan if t is None else t,
             x=x,

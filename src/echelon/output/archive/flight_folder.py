@@ -89,8 +89,17 @@ def _network(parts: Parts) -> Network:
         )
     if not isinstance(parts.drive, Laws):
         raise FlightError("the agents of the scenario are under no laws, and only laws can fly.")
+    if parts.events:
+        raise FlightError(
+            "`events` are of simulations; in a flight agents and links are lost by themselves. Use "
+            "`--set events=null`."
+        )
     if parts.graph.schedule is not None:
         raise FlightError("the graph of the scenario switches, which no flight does yet.")
+    if parts.formation.motion is not None:
+        raise FlightError(
+            "the formation changes with time, which no flight does yet; leave `motion` out."
+        )
     if network.bursts.share:
         raise FlightError("`network.bursts` has no counterpart in a flight; use `network.loss`.")
     if parts.world.sensing is not None and parts.world.sensing.delay:
