@@ -177,7 +177,7 @@ class Plain:
 
 
 def compare_late(agent, dt, steps, size=0.1):
-    """Let an agent and its exported law receive the same random messages and take the same steps."""
+    """Let an agent and its exported law take the same steps on the same random messages."""
     own, draws = agent.own_law, np.random.default_rng(1)
     plain = Plain(own, dt)
     trim = np.array(own.loop.model.trim[0], float)
