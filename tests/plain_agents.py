@@ -66,7 +66,7 @@ def compare(agent, runs, steps, dt, size=0.1, atol=1e-14):
         for number, run in enumerate(runs):
             before = memories[number]
             gaps = [run["difference"](time, x.tolist(), before, s.tolist()) for s in signals]
-            z = own.weights[row] @ np.reshape(gaps, (len(gaps), -1)) if gaps else np.zeros(len(own.signal_names))
+            z = own.weights[row] @ np.array(gaps) if gaps else np.zeros(len(own.signal_names))
             inputs = time, x.tolist(), z.tolist(), forward.tolist(), before
             *results, valid = run["tick"](*inputs)
             memories[number] = results[1]

@@ -110,7 +110,7 @@ def _scatter(
 def scatter_add(
     params: Params, x: np.ndarray, indices: np.ndarray, updates: np.ndarray
 ) -> np.ndarray | None:
-    """Return an array with entries of any kind added to windows of it; None where one is outside."""
+    """Return an array with entries of any kind added to windows of it; None if one is outside."""
     places, result = _scattered(params, x, indices, updates), x.copy()
     if places is not None:
         np.add.at(result, *places)
