@@ -134,9 +134,7 @@ class _Traces:
         )
 
     def _difference(self) -> LawFunction:
-        def gap(
-            t: jax.Array, x: jax.Array, flat: jax.Array, other: jax.Array
-        ) -> tuple[jax.Array]:
+        def gap(t: jax.Array, x: jax.Array, flat: jax.Array, other: jax.Array) -> tuple[jax.Array]:
             return (gap_of(self.loop, self.own.leads, self._state(t, x, flat), other),)
 
         return self._function(
