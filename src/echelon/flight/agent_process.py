@@ -21,6 +21,8 @@ from echelon.flight.wire import GROUND, Drop, Kind, Letter, Opened, Report, Wire
 _REPORTS: Final = 0.1  # s between two
 _LONGEST: Final = 20.0  # s of a descent
 _REST: Final = 0.05  # m/s
+_MADE_UP: Final = 5
+"""Ticks that are made up for at most; after a longer gap the law goes on from where it was."""
 _TOLD: Final = (Drop.VERSION, Drop.FORMATION, Drop.SIGNATURE, Drop.CLOCK)
 """Reasons that somebody on the ground can remove."""
 
@@ -136,8 +138,7 @@ class AgentProcess:
         t, supervisor = self._crew.clock.at(reading.time), self._supervisor
         if t is None or t < max(0.0, self._due - 0.5 * self._dt):
             return
-        # A state that is late does not make the next one early: the law counts its time by ticks.
-        self._due = (self._due if t - self._due <= self._dt else t) + self._dt
+        missed = self._missed(t)
         supervisor.judge(reading, t)
         if t > self._seconds:
             supervisor.trip(Fault.END)
@@ -146,13 +147,27 @@ class AgentProcess:
             return
         # Of this thread alone: how long others on the machine took is seen in the states' ages.
         began, wall = time.thread_time(), time.perf_counter()
+        for k in range(missed, 0, -1):
+            self._pilot.tick(t - k * self._dt, reading.x)
         ticked = self._pilot.tick(t, reading.x)
         self._ticks.append(time.perf_counter() - wall)
         self._longest = max(self._longest, self._ticks[-1])
-        supervisor.spend((time.thread_time() - began) * self._crew.clock.speed)
+        supervisor.spend((time.thread_time() - began) * self._crew.clock.speed / (1 + missed))
         supervisor.check(ticked.u, ticked.valid)
         if supervisor.fault is Fault.NONE:
             self._act(ticked.u, ticked.letter, t)
+
+    def _missed(self, t: float) -> int:
+        """Return how many ticks are made up for at a time (s), since the law counts its time by them.
+
+        A state that is up to a period late misses none, and does not make the next one early.
+        """
+        missed = max(0, int((t - self._due) / self._dt))
+        if missed > _MADE_UP:
+            self._due = t + self._dt
+            return 0
+        self._due += (1 + missed) * self._dt
+        return missed
 
     def _act(self, u: list[float], letter: Letter | None, t: float) -> None:
         try:
