@@ -158,7 +158,7 @@ class AgentProcess:
             self._act(ticked.u, ticked.letter, t)
 
     def _missed(self, t: float) -> int:
-        """Return how many ticks are made up for at a time (s), since the law counts its time by them.
+        """Return how many ticks are made up for at a time (s): the law counts its time by them.
 
         A state that is up to a period late misses none, and does not make the next one early.
         """
