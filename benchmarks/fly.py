@@ -19,7 +19,7 @@ CASES = {
     "lag": ("paper-radio", ["network.delay=0", "network.loss=0", "actuator.lag=0.03"], False),
     "radio": ("paper-radio", ["actuator.lag=0.03"], False),
     "everything": ("paper-everything", [], False),
-    "plain-everything": ("paper-everything", ["sensing.estimator=null"], False),
+    "plain-everything": ("paper-everything", ["sensing.estimator=none"], False),
     "kills": ("paper-radio", ["actuator.lag=0.03"], True),
     "heir": ("paper-radio", ["actuator.lag=0.03", "leadership={heirs: [1, 2]}"], False),
 }

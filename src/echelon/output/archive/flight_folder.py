@@ -16,7 +16,7 @@ from echelon.core.files import write_atomic
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import MessageContent
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guaranteed
 from echelon.output.archive.folder import write_errors
 from echelon.output.archive.law_folder import python_law
 from echelon.simulation.engine.law_drive import Laws
@@ -49,9 +49,9 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     """
     network = _network(parts)
     agents = parts.graph.agents
-    files, guaranteed = dict[str, str | bytes](), promise(parts, settings).sentence()
+    files, sentence = dict[str, str | bytes](), guaranteed(parts, settings)
     for k in range(agents):
-        law = python_law(parts.replace(leadership=None), settings, k, formation, guaranteed)
+        law = python_law(parts.replace(leadership=None), settings, k, formation, sentence)
         files |= {f"law-{k}/{name}": text for name, text in law.items()}
     facts = json.loads(files["law-0/law.json"])
     vehicles = _vehicles(parts, settings)
