@@ -30,7 +30,7 @@ def flown(name):
     return ech.build(ech.load_scenario(scenario, changes))
 
 
-def compare_both(name, number, steps):
+def compare_both(name, number, steps, atol=1e-14):
     parts, settings = flown(name)
     agent = ech.Agent(parts, number, settings.dt, settings.limits)
     if agent.own_law.loop.channel is not None:
@@ -38,7 +38,7 @@ def compare_both(name, number, steps):
         return
     law = as_python(law_functions(agent.own_law).values())
     # Through all of the run, in few steps.
-    compare(agent, [law], steps, settings.horizon / steps)
+    compare(agent, [law], steps, settings.horizon / steps, atol=atol)
 
 
 @pytest.mark.slow
@@ -64,4 +64,5 @@ def test_what_has_no_law_by_itself_is_refused(name):
 @pytest.mark.parametrize("number", [0, 2])
 @pytest.mark.parametrize("name", ["paper", "paper-far", "paper-radio", "reshape without safety"])
 def test_ten_thousand_steps_of_a_law_are_the_agents(name, number):
-    compare_both(name, number, 10_000)
+    # Offsets that change add five derivatives, whose terms are larger than their sum.
+    compare_both(name, number, 10_000, 3e-14 if name.startswith("reshape") else 1e-14)
