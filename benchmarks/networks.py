@@ -1,8 +1,8 @@
 """Measure what a network, and plants that are not ideal, leave of a formation's error.
 
 Run `python benchmarks/networks.py [SEEDS]` (some ten minutes on two cores for 8 seeds). Printed is
-the largest error of a follower in the last 4 of 15 s of the worst seed, in mm; of `paper-everything`
-the root mean square of the worst follower, its mean over the seeds and the worst one. The figures
+the largest error of a follower in the last 4 of 15 s of the worst seed, mm; of paper-everything
+the root mean square of the worst follower, its mean over the seeds and the worst seed. The figures
 stand on the page of networks.
 """
 
@@ -64,7 +64,7 @@ def largest(result: ech.Result) -> tuple[float, float]:
     errors, times = result.formation_errors.max(axis=1), result.times
     far = np.flatnonzero(errors > NEAR)
     arrived = times[min(far[-1] + 1, len(times) - 1)] if len(far) else 0.0
-    return 1e3 * errors[times >= times[-1] - WINDOW].max(), arrived
+    return 1e3 * float(errors[times >= times[-1] - WINDOW].max()), float(arrived)
 
 
 def main() -> None:
@@ -76,7 +76,7 @@ def main() -> None:
         print(f"{case}: {worst:.3g} mm, within 1 cm after {last:.2f} s", flush=True)
     for case, overrides in EVERYTHING.items():
         runs = (flown("paper-everything", *overrides, seed=seed) for seed in seeds)
-        values = [1e3 * ech.metrics(run).worst_steady for run in runs]
+        values = [1e3 * (ech.metrics(run).worst_steady or np.nan) for run in runs]
         print(f"everything, {case}: mean {np.mean(values):.3g}, worst {max(values):.3g} mm")
 
 

@@ -316,6 +316,8 @@ def test_a_message_is_used_as_it_was_when_it_came():
     whole = message._replace(packet=message.packet._replace(content=(1.0, -2.0)))
     buffer = np.array([1, -2])
     assert str(twin.receive(whole)) == "taken"
-    assert str(agent.receive(whole._replace(packet=whole.packet._replace(content=buffer)))) == "taken"
+    assert (
+        str(agent.receive(whole._replace(packet=whole.packet._replace(content=buffer)))) == "taken"
+    )
     buffer[:] = -(2**63)
     check_twins(agent, twin, x)

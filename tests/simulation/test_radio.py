@@ -116,12 +116,12 @@ def test_carts_that_send_states_agree_over_a_radio():
     assert driven(ech.Laws(ech.laws.Tracking(AROUND), ech.laws.Consensus(gain)), LATE) < 1e-3
 
 
+@pytest.mark.slow
 def test_messages_that_contain_raw_signals_lag_behind_the_leader():
     """The reason for deviations: what is late of a place is the way since then."""
     laws = ech.Laws(ech.laws.StoppingLeader(reference=AROUND), ech.laws.StoppingPoint())
     # At .5 m/s, 30 ms old on average on each of two links.
     assert driven(laws, ech.Network(delay=0.02, messages="state")) > 0.02
-    assert driven(laws, ech.Network(delay=0.02)) < 1e-4
 
 
 # ---- a flight of one's own -----------------------------------------------------------------------
