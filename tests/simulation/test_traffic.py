@@ -81,6 +81,12 @@ def test_a_network_without_losses_has_the_ages_of_its_rate_and_delay():
     assert found.sent == sum(len(range(0, STEPS - k, 4)) for k in first)
 
 
+def test_messages_in_use_are_those_of_neighbours_nearer_to_the_leader():
+    _, found = followed(ech.Network(rate=50.0, hears="leaderward"))
+    # The edge between 2 and 3, who are as far away as each other, and all edges outward are unused.
+    assert found.largest == pytest.approx(DT) == found.mean
+
+
 def test_every_message_is_lost_or_arrives_or_is_late_or_under_way():
     network = ech.Network(rate=25.0, delay=0.02, jitter=0.2, loss=0.3, forget=9.0)
     _, found = followed(network, directed=True)
