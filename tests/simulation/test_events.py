@@ -113,6 +113,19 @@ def test_an_heir_leads_along_the_path(network):
     assert agent == 1 and off < 0.3
 
 
+def test_an_heir_leads_at_its_place_in_a_formation_that_turns():
+    """Its place, and those of all others, are those of each time and not of the start."""
+    parts = _parts(events=[Lose(0, 3.0)], leadership=ech.Leadership((1, 2), timeout=0.3))
+    turning = parts.formation.moving(CART, RING, [ech.network.Rotate(0.8)])
+    run = ech.simulate(parts.replace(formation=turning), SETTINGS)
+    place = [np.cos(0.8 * 6.0), np.sin(0.8 * 6.0)]
+    assert run.states[-1, 1, :2] - run.reference[-1, :2] == pytest.approx(place, abs=5e-3)
+    [event] = ech.summary(run)["event_outcomes"]
+    assert event["restored"] == pytest.approx(3.0) and event["peak"] < 1e-3
+    agent, off = event["leader"]
+    assert agent == 1 and off < 0.3
+
+
 def test_losses_that_are_covered_are_guaranteed():
     parts = _parts(events=[Lose(3, 2.0), Cut((1, 2), 3.0, 1.0)])
     guarantee = ech.promise(parts, SETTINGS)
