@@ -6,7 +6,6 @@ import pytest
 
 import echelon as ech
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
-from echelon.apps.live.swarm import LiveLoop
 from echelon.core.errors import LawError, SimulationError
 from echelon.simulation.engine.gradient import gradient
 from echelon.simulation.engine.prepare import prepare
@@ -158,7 +157,6 @@ def test_what_knows_constant_offsets_alone_refuses_others():
             lambda: gradient(one, settings, lambda sums: sums.errors[0].sum(), ["P"]),
         ),
         ("the formation changes with time", lambda: ech.state_space(one)),
-        ("`echelon live` has knobs for its shape", lambda: LiveLoop(one, settings, None)),
     ):
         with pytest.raises(SimulationError, match=message):
             use()

@@ -67,6 +67,9 @@ class LiveSpec(BaseModel, **STRICT):
     scenario's."""
     shape: str | None = None
     """Shape of the formation, by a name of `formation`; `scenario` for the scenario's."""
+    reshape: str | None = None
+    """Shape to which the formation changes within 3 s, by a name of `formation`; `scenario` for the
+    scenario's."""
     size: Annotated[Positive | None, Unit("1")] = None
     """Size of the formation, relative to that of `formation`."""
     turn: Annotated[float | None, Unit("deg")] = None
