@@ -25,6 +25,7 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
         *_outcome(result, numbers),
         *_closest(result, numbers),
         *(outcome.sentence() for outcome in event_outcomes(result)),
+        *_waiting(result),
         *(cause.sentence() for cause in causes(result, numbers, guarantee)),
         *_world(result),
         *_guarantee(result, guarantee),
@@ -65,6 +66,21 @@ def _closest(result: Result, numbers: Metrics) -> Iterator[str]:
         yield numbers.closest.sentence(result.radius)
     kept = avoidance(result)
     yield from () if kept is None else (kept.sentence(),)
+
+
+def _waiting(result: Result) -> Iterator[str]:
+    """Yield for how long leaders waited that do."""
+    if result.late is None or not len(result.late):
+        return
+    late, end = float(result.late[-1]), result.times[-1]
+    if late < 0.5e-3:
+        yield "The leaders' plan waited for nobody."
+        return
+    since = result.times[np.flatnonzero(result.late < late - 1e-3)[-1:]]
+    yield (
+        f"The leaders' plan waited for stragglers until about {since.max(initial=0.0):.3g} s, and is "
+        f"{late:.3g} s late at {end:g} s."
+    )
 
 
 def _world(result: Result) -> Iterator[str]:

@@ -24,6 +24,7 @@ from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import leader_warnings, prepare_law
 from echelon.laws.safety import Safety
+from echelon.laws.stopping_point import StoppingLeader
 from echelon.laws.together import check_numbers, hulls_at, separations, too_near
 from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.native import is_installed
@@ -190,6 +191,11 @@ class Laws(Drive):
                 f"things than a leader under {name}, and could not take over; give both the same "
                 "kind of law, with the same `observer`."
             )
+
+    def check_patience(self) -> None:
+        """Check that the leader follows a path by stopping points."""
+        if not isinstance(self.leader, StoppingLeader) or self.leader.reference is None:
+            super().check_patience()
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of leaders and followers by their laws.
