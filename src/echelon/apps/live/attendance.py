@@ -69,7 +69,7 @@ def attendance(graph: Graph, events: Sequence[Event], leaderward: bool, dt: floa
 
 
 def room_for_events(parts: Parts, dt: float) -> Parts:
-    """Return parts whose loop has numbers for who is there, and for a reshape, where these can be."""
+    """Return parts whose loop has numbers for who is there and for a reshape, if these can be."""
     graph, model, formation = parts.graph.before, parts.model, parts.formation
     if model.position and formation.motion is None:
         still = Reshape(formation.offsets, 0.0, RESHAPE)

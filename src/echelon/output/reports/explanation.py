@@ -76,10 +76,10 @@ def _waiting(result: Result) -> Iterator[str]:
     if late < 0.5e-3:
         yield "The leaders' plan waited for nobody."
         return
-    since = result.times[np.flatnonzero(result.late < late - 1e-3)[-1:]]
+    until = result.times[np.flatnonzero(result.late < late - 1e-3)[-1:]].max(initial=0.0)
     yield (
-        f"The leaders' plan waited for stragglers until about {since.max(initial=0.0):.3g} s, and is "
-        f"{late:.3g} s late at {end:g} s."
+        f"The leaders' plan waited for stragglers until about {until:.3g} s, and is {late:.3g} s "
+        f"late at {end:g} s."
     )
 
 

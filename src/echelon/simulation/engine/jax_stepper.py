@@ -120,7 +120,9 @@ class JaxFormations(Stepper):
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; formations follow each other in what is returned."""
         now, frames, sums = _advance_all(self.loop, self.axes, now, counts, reference)
-        states, inputs = (part.reshape(len(part), -1, part.shape[3]) for part in on_host(frames[:2]))
+        states, inputs = (
+            part.reshape(len(part), -1, part.shape[3]) for part in on_host(frames[:2])
+        )
         return Chunk(now, states, inputs, on_host(sums))
 
 

@@ -7,11 +7,9 @@ its rate as ever.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Float
 
-from echelon.core.types import Array, Scalar
+from echelon.core.types import Array, PyTree, Scalar
 
 _FREE, _QUICK = 0.2, 0.2
 """Share of the distance up to which nobody waits, and s in which the pace follows."""
@@ -36,14 +34,14 @@ class Plan(NamedTuple):
             distance: at which the plan stands still.
             dt: the step, s.
         """
-        distance, dt = (jnp.asarray(x, away.dtype) for x in (distance, dt))
-        desired = jnp.clip((distance - away) / ((1.0 - _FREE) * distance), 0.0, 1.0)
-        pace = desired + (self.pace - desired) * jnp.exp(-dt / _QUICK)
-        return Plan(self.late + dt * (1.0 - self.pace), pace)
+        most, span = (jnp.asarray(x, away.dtype) for x in (distance, dt))
+        desired = jnp.clip((most - away) / ((1.0 - _FREE) * most), 0.0, 1.0)
+        pace = desired + (self.pace - desired) * jnp.exp(-span / _QUICK)
+        return Plan(self.late + span * (1.0 - self.pace), pace)
 
 
 class Followed(NamedTuple):
-    """What leaders that wait follow in T frames: how late, s, and their reference (T, n)."""
+    """What leaders that wait follow in T frames, in JAX or NumPy: how late (T,) s, and (T, n)."""
 
-    late: Float[Array, " T"]
-    reference: Float[Array, "T n"] | None
+    late: PyTree
+    reference: PyTree
