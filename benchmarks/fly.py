@@ -19,8 +19,11 @@ CASES = {
     "lag": ("paper-radio", ["network.delay=0", "network.loss=0", "actuator.lag=0.03"], False),
     "radio": ("paper-radio", ["actuator.lag=0.03"], False),
     "everything": ("paper-everything", [], False),
+    "plain-everything": ("paper-everything", ["sensing.estimator=none"], False),
     "kills": ("paper-radio", ["actuator.lag=0.03"], True),
+    "heir": ("paper-radio", ["actuator.lag=0.03", "leadership={heirs: [1, 2]}"], False),
 }
+"""Case -> scenario, changes, and whether each process is killed and started again."""
 HORIZON, DT, DEAD, APART = 15.0, 0.01, 0.5, 6.0
 
 
@@ -44,7 +47,7 @@ def fly(folder: Path, options: argparse.Namespace, kills: bool) -> None:
     own = [str(Path(__file__).resolve()), "--plant", str(folder)] if options.mujoco else []
     seconds = 2.0 + APART * mission.agents if kills else HORIZON
     together = Together(mission, seconds, options.speed, 47300, vehicles=own)
-    falls = list[float]()
+    falls, heir = list[float](), folder.name == "heir"
     with flying(together):
         ready = max(together.ready.values())
         memory = max(together.memory(k) for k in range(mission.agents))
@@ -54,10 +57,14 @@ def fly(folder: Path, options: argparse.Namespace, kills: bool) -> None:
             together.kill(k)
             wait(together, falls[-1] + DEAD)
             together.start_agent(k)
+        if heir:
+            hand_over(together)
+            # From now on its place is what the others' are measured from.
+            mission.facts["leader"] = 1
         wait(together, seconds - 0.1)
         errors = together.errors()
     print(f"  ready after {ready:.2f} s at most, {memory:.1f} MB at most; late {errors.late} times")
-    followers = [k for k in range(mission.agents) if k != mission.facts["leader"]]
+    followers = [k for k in range(heir, mission.agents) if k != mission.facts["leader"]]
     for k, fall in enumerate(falls):
         part = [row for t, row in zip(errors.times, errors.rows, strict=True) if fall <= t]
         far = max(row[j] for row in part[: round(APART / 0.011)] for j in followers)
@@ -70,6 +77,20 @@ def fly(folder: Path, options: argparse.Namespace, kills: bool) -> None:
     if not kills:
         worst = max(errors.worst(k, seconds - 4.0) for k in followers)
         print(f"  {1e3 * worst:.1f} mm at most in the last 4 s")
+
+
+def hand_over(together: Any) -> None:
+    """Kill the leader, and wait until an heir says that it leads."""
+    wait(together, 6.0)
+    fall = together.time()
+    together.kill(0)
+    while (report := together.ground.report(1)) is None or report.leader != 1:
+        if together.time() > fall + 3.0:
+            print("  nobody took the lead")
+            return
+        time.sleep(0.005)
+    # By its own clock, at the end of the tick in which it reported so.
+    print(f"  leader killed: agent 1 leads after {report.time - fall:.2f} s at most")
 
 
 def wait(together: Any, t: float) -> None:

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from fractions import Fraction
+from decimal import Decimal
 from typing import Any
 
 import equinox as eqx
@@ -157,7 +157,7 @@ def test_what_is_found_depends_on_every_bit_and_class():
 
 @pytest.mark.parametrize(
     "value",
-    [Own(), Own, lambda x: x, Fraction(1, 3), np.array([object()]), (1, {"a": [Own()]}), refused],
+    [Own(), Own, lambda x: x, Decimal(1), np.array([object()]), (1, {"a": [Own()]}), refused],
 )
 def test_nothing_is_kept_for_a_strangers_class(value, folder):
     assert place(value) is None

@@ -32,18 +32,19 @@ FACTS = {
 class Law:
     """A law that returns its disagreement, or what a test wants."""
 
-    u = 0.0
+    u, ticks = 0.0, 0
 
     def begin(self, x):
         return []
 
-    def difference(self, x, memory, place):
+    def difference(self, t, x, memory, place):
         return [x[0] - place[0]]
 
     def expected(self, t, content, age):
         return [t], [1.0], True
 
     def tick(self, t, x, z, forward, memory):
+        self.ticks += 1
         return [self.u - z[0]], [], [x[0]], [0.0], math.isfinite(self.u)
 
 
@@ -205,3 +206,32 @@ def test_the_first_start_counts(scene):
     scene.air.send(scene.ground.start(time.time(), time.time() + 100.0))
     scene.rounds(2)
     assert scene.crew.clock.now >= before
+
+
+def test_states_that_come_unevenly_are_all_used(scene):
+    """States every period, each up to 4 ms late: the law counts its time by ticks."""
+    scene.start()
+    begin, before = time.monotonic(), len(scene.link.sent)
+    for k in range(200):
+        late = 0.004 * (k * 37 % 11) / 10
+        scene.process._tick(Reading(begin + k * DT + late, [0.0, 1.0]))
+    assert len(scene.link.sent) - before >= 199
+
+
+def count_ticks(scene, times):
+    """How often the law acts on states of times after the start, in periods."""
+    scene.start()
+    begin, before = time.monotonic(), scene.law.ticks
+    for k in times:
+        scene.process._tick(Reading(begin + k * DT, [0.0, 1.0]))
+    return scene.law.ticks - before
+
+
+def test_the_law_counts_its_time_by_ticks(scene):
+    """States that come too often are skipped, and a few that were missed are made up for."""
+    often = [k / 2 for k in range(100)]
+    assert abs(count_ticks(scene, [*often, *(50 + 2 * k for k in range(25))]) - 99) <= 2
+
+
+def test_a_long_gap_is_not_made_up_for(scene):
+    assert abs(count_ticks(scene, [*range(50), *range(150, 200)]) - 100) <= 2

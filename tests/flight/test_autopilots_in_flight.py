@@ -92,15 +92,15 @@ class Flown:
         self.x = link.read(5.0).x
         self.memory = self.law["begin"](self.x)
 
-    def hello(self):
+    def hello(self, t):
         if (reading := self.link.read(0.0)) is not None:
             self.x = reading.x
-        return self.law["signal"](self.x, self.memory)
+        return self.law["signal"](t, self.x, self.memory)
 
     def act(self, t, signals, forward):
         """Take a step; returns what the agent feeds forward."""
         hears, weights = self.facts["hears"], self.facts["weights"]
-        gaps = [self.law["difference"](self.x, self.memory, signals[k]) for k in hears]
+        gaps = [self.law["difference"](t, self.x, self.memory, signals[k]) for k in hears]
         z = [sum(w * gap[n] for w, gap in zip(weights, gaps, strict=True)) for n in range(12)]
         u, self.memory, _, message, valid = self.law["tick"](t, self.x, z, forward, self.memory)
         assert valid
@@ -114,7 +114,8 @@ def fly(parts, links):
     begin = time.monotonic()
     for step in range(int(SECONDS / DT)):
         time.sleep(max(0.0, begin + step * DT / SPEED - time.monotonic()))
-        signals, t = [agent.hello() for agent in agents], (time.monotonic() - begin) * SPEED
+        t = (time.monotonic() - begin) * SPEED
+        signals = [agent.hello(t) for agent in agents]
         forward = agents[0].act(t, signals, [math.nan] * 4)
         for agent in agents[1:]:
             agent.act(t, signals, forward)

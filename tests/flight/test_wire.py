@@ -38,9 +38,9 @@ def test_commands_and_reports_are_read_without_a_plan():
     assert agent.open(ground.start(WALL, WALL + 2.0), None, WALL).body == WALL + 2.0
     assert agent.open(ground.stop(WALL), None, WALL).kind is Kind.STOP
     counts = tuple(range(len(Drop)))
-    report = Report(1, 2, 0.5, 3.0, 1.0, 2.0, 3.0, 0.25, 0.5, 0.01, math.nan, counts)
+    report = Report(1, 2, 0, 0.5, 3.0, 1.0, 2.0, 3.0, 0.25, 0.5, 0.01, math.nan, counts)
     read = ground.open(agent.report(WALL, report), None, WALL).body
-    assert read[:2] == report[:2] and read.dropped == counts and math.isnan(read.battery)
+    assert read[:3] == report[:3] and read.dropped == counts and math.isnan(read.battery)
 
 
 def test_the_layout_is_the_one_that_is_documented():

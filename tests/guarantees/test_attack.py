@@ -53,7 +53,7 @@ def test_a_plant_with_its_loop_closed_is_the_plant_under_that_input():
 
 @pytest.mark.parametrize(
     ("every", "least"),
-    [(3, 8), pytest.param(1, 20, marks=pytest.mark.slow)],
+    [(3, 8), pytest.param(1, 20, marks=pytest.mark.study)],
     ids=["a third", "all"],
 )
 def test_no_promise_for_random_systems_is_false(every, least):

@@ -407,9 +407,9 @@ def test_within_the_margin_late_messages_of_any_age_are_borne_both_ways():
 
 @pytest.mark.slow
 def test_beyond_the_margin_a_run_swings_and_is_warned_of():
+    world = {"sensing": Sensing(delay=0.01)}
+    most = said(parts_of(world=world)).hypotheses[Hypothesis.OWN_STATE].number
     for more in (-1, 2):
-        world = {"sensing": Sensing(delay=0.01)}
-        most = said(parts_of(world=world)).hypotheses[Hypothesis.OWN_STATE].number
         late = {"sensing": Sensing(delay=most + more * DT)}
         parts = parts_of(world=late, speed=np.inf)
         guarantee = said(parts)

@@ -17,7 +17,7 @@ def test_nothing_false_is_guaranteed_of_a_few(family):
     assert [finding.false for finding in findings if finding.false] == []
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("family", FAMILIES)
 def test_nothing_false_is_guaranteed_of_many(family):
     findings = [judge(family, 6, number) for number in range(3)]

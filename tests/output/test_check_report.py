@@ -9,12 +9,17 @@ from echelon.experiments.scenario.scenario import bundled_scenarios
 from echelon.output.reports.check_report import HEIGHT, WIDTH, check_report, grouped
 
 QUICK = ("paper", "integrators")
+# Those with the most lines and the longest; the others are a study.
+LONG = ("paper-everything", "crossing", "paper-far")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in bundled_scenarios()],
-)
+def marked(name):
+    """A scenario, as a study where others say as much."""
+    mark = pytest.mark.slow if name in LONG else pytest.mark.study
+    return name if name in QUICK else pytest.param(name, marks=mark)
+
+
+@pytest.mark.parametrize("name", map(marked, bundled_scenarios()))
 def test_a_check_of_a_bundled_scenario_fits_a_terminal(name):
     found = ech.check(*ech.build(ech.load_scenario(name)))
     text = check_report(found)

@@ -2,7 +2,6 @@
 
 import math
 
-import jax
 import numpy as np
 import pytest
 
@@ -85,6 +84,8 @@ def spoiled(message):
         for k in range(len(values)):
             wrong = np.where(np.arange(len(values)) == k, bad, values)
             yield message._replace(signal=(names, wrong)), "not-finite"
+    # The least whole number has no absolute value of its own kind.
+    yield message._replace(signal=(names, [-(2**63)] * len(values))), "not-finite"
     forward = message.feedforward
     yield message._replace(feedforward=(forward[0], forward[1] * math.nan)), "not-finite"
     yield message._replace(signal=(names, values[:-1])), "wrong-size"
@@ -251,12 +252,7 @@ def test_agents_over_a_plain_queue_fly_as_simulated(law, network):
         inputs, messages = zip(*(a.step(k * dt, x[a.number]) for a in agents), strict=True)
         if k % 4 == 0:
             queue += [(k + delay, message) for message in messages if message is not None]
-        x = x + dt * np.array([plant(POINTS, *row) for row in zip(x, inputs, strict=True)])
-
-
-def plant(model, x, u):
-    with jax.enable_x64(True):
-        return np.asarray(model.velocity(jax.numpy.asarray(x), jax.numpy.asarray(u)))
+        x = x + dt * np.concatenate([x[:, 2:], inputs], axis=1)
 
 
 def test_an_agent_on_a_network_whose_jitter_is_longer_than_its_delay_has_one():
@@ -298,6 +294,10 @@ def test_late_damaged_and_forged_messages_change_nothing():
         (message._replace(time=0.02, hops="text"), "no-message"),
     ):
         assert str(agent.receive(bad)) == word, bad
+    check_twins(agent, twin, x)
+
+
+def check_twins(agent, twin, x):
     for k in range(1, 4):
         for mine, theirs in zip(agent.step(0.02 * k, x), twin.step(0.02 * k, x), strict=True):
             assert (
@@ -305,3 +305,19 @@ def test_late_damaged_and_forged_messages_change_nothing():
                 if isinstance(mine, np.ndarray)
                 else (mine.time == theirs.time and np.array_equal(mine.signal[1], theirs.signal[1]))
             )
+
+
+def test_a_message_is_used_as_it_was_when_it_came():
+    """Whoever reads messages into one buffer may overwrite it, and may send whole numbers."""
+    parts = late_parts("stopping-point", delay=0.05)
+    leader, agent, twin = (ech.Agent(parts, k, 0.01) for k in (0, 1, 1))
+    x = np.array([0.3, 0.1, 0.0, 0.2])
+    _, message = leader.step(0.0, x)
+    whole = message._replace(packet=message.packet._replace(content=(1.0, -2.0)))
+    buffer = np.array([1, -2])
+    assert str(twin.receive(whole)) == "taken"
+    assert (
+        str(agent.receive(whole._replace(packet=whole.packet._replace(content=buffer)))) == "taken"
+    )
+    buffer[:] = -(2**63)
+    check_twins(agent, twin, x)

@@ -319,10 +319,12 @@ def test_a_leader_without_a_plan_is_carried_on_by_the_model():
 
 
 def test_states_are_not_predicted_by_a_plan_of_stopping_points():
-    parts, settings = ech.build(ech.load_scenario("paper-global", ["simulation.horizon=0.05"]))
-    followers = ech.build(ech.load_scenario("paper"))[0].drive.follower
-    mixed = parts.replace(drive=ech.Laws(parts.drive.leader, followers))
+    cart, graph = ech.models.DoubleIntegrator(dimension=1), ech.Graph.path(3)
+    gain = ech.synthesize(cart, graph, ech.gains.Riccati())
+    drive = ech.Laws(ech.laws.StoppingLeader(), ech.laws.Consensus(gain))
+    line = ech.Formation.from_offsets(cart, graph, {1: [1.0], 2: [2.0]})
+    mixed, short = ech.Parts(cart, graph, line, drive), ech.Settings(horizon=0.05, dt=0.01)
     radio = ech.Network(prediction="packet")
     with pytest.raises(SimulationError, match="`Consensus` do not send what the plan .* `packet`"):
-        ech.simulate(mixed.replace(world=ech.World(network=ech.Network())), settings)
-    assert ech.simulate(mixed.replace(world=ech.World(network=radio)), settings).outcome.reached
+        ech.simulate(mixed.replace(world=ech.World(network=ech.Network())), short)
+    assert ech.simulate(mixed.replace(world=ech.World(network=radio)), short).outcome.reached

@@ -8,16 +8,17 @@ import shutil
 import struct
 import subprocess
 
-import jax
 import numpy as np
 import pytest
+from plain_agents import as_python, compare
 
 import echelon as ech
 from echelon.simulation.codegen import is_installed
+from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.onboard.c_text import c_text, header_text
 from echelon.simulation.onboard.law_functions import LawFunction, law_functions
 from echelon.simulation.onboard.llvm_text import object_file
-from echelon.simulation.onboard.python_text import python_text
+from echelon.simulation.onboard.vehicle_function import move_function
 from echelon.simulation.scalars import ScalarGraph, Unsupported
 from echelon.simulation.scalars.scalar_graph import OPERATIONS
 
@@ -26,12 +27,6 @@ FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wdouble-promotion", "-We
 
 
 # ---- three ways to run the text ------------------------------------------------------------------
-
-
-def as_python(functions, folder):
-    scope = {}
-    exec(python_text(functions, "A law.", {}), scope)
-    return {f.name: scope[f.name] for f in functions}
 
 
 def as_read_c(functions, folder, bits=64):
@@ -136,8 +131,7 @@ def with_outputs(function, call, array):
             valid = call(*both.values())
         results = [list(map(float, both[name])) for name in function.outputs]
         if function.valid is None:
-            [results] = results
-            return results
+            return results[0] if len(results) == 1 else results
         return *results, bool(valid)
 
     return run
@@ -231,46 +225,11 @@ def agent(request):
 
 
 def test_a_law_by_itself_steps_as_the_agent_does(agent, tmp_path):
-    functions, own = law_functions(agent.own_law).values(), agent.own_law
-    runs = {way: way(functions, tmp_path) for way in WAYS}
-    trim, draws = np.array(own.loop.model.trim[0]), np.random.default_rng(0)
-    memory = {way: run["begin"](trim.tolist()) for way, run in runs.items()}
-    for k in range(300):
-        x = trim + 0.1 * draws.normal(size=len(trim)) * (k > 0)
-        signals, forward = receive(agent, draws)
-        time = k * own.loop.motion.dt
-        u, message = agent.step(time, x)
-        leaves = [np.ravel(leaf) for leaf in jax.tree.leaves(agent._memory)]
-        flat = np.concatenate([np.zeros(0), *leaves])
-        expected = u, flat, message.signal.values, message.feedforward.values
-        for way, run in runs.items():
-            before = memory[way]
-            gaps = [run["difference"](x.tolist(), before, s.tolist()) for s in signals]
-            z = (own.weights[0] @ np.array(gaps)).tolist()
-            inputs = time, x.tolist(), z, forward.tolist(), before
-            *results, valid = run["tick"](*inputs)
-            memory[way] = results[1]
-            assert valid and run["signal"](x.tolist(), before) == results[2]
-            for got, value in zip(results, expected, strict=True):
-                size = max(1.0, np.abs(value).max(initial=0.0))
-                np.testing.assert_allclose(got, value, rtol=0, atol=1e-14 * size)
+    functions = law_functions(agent.own_law).values()
+    runs = [way(functions, tmp_path) for way in WAYS]
+    memories = compare(agent, runs, 300, agent.own_law.loop.motion.dt)
     # Python and C agree to the bit.
-    assert all(numbers == memory[as_python] for numbers in memory.values())
-
-
-def receive(agent, draws):
-    """Send an agent random signals, and a feed-forward, and return both."""
-    own = agent.own_law
-    names, forward_names = own.signal_names, own.forward_names
-    signals = [0.3 * draws.normal(size=len(names)) for _ in own.neighbours]
-    forward = 0.1 * draws.normal(size=len(forward_names))
-    sent = ech.Message(own.source, (names, np.zeros(len(names))), (forward_names, forward))
-    if own.source is not None:
-        assert str(agent.receive(sent)) == "taken"
-    for sender, signal in zip(own.neighbours, signals, strict=True):
-        feed = (forward_names, forward) if sender == own.source else None
-        assert str(agent.receive(ech.Message(sender, (names, signal), feed))) == "taken"
-    return signals, forward
+    assert all(memory == memories[0] for memory in memories)
 
 
 def test_what_is_not_finite_is_not_valid(agent, tmp_path):
@@ -351,6 +310,50 @@ def test_single_precision_compiles_and_is_numpys_own_to_the_bit(agent, tmp_path)
         x = (np.array(trim) + 0.1 * draws.normal(size=len(trim))).astype(np.float32)
         inputs = np.float32(0.01 * k), x, *rows, memory
         assert compiled["tick"](*inputs) == rounded["tick"](*inputs)
+
+
+def fly(agents, bits, moves, starts, steps, folder):
+    """Places (T, N, 3) of vehicles in double precision under laws in a precision."""
+    laws = []
+    for agent in agents:
+        own = folder / f"{bits}-{agent.number}"
+        own.mkdir()
+        laws.append(as_compiled_c(law_functions(agent.own_law, bits).values(), own, bits))
+    owns, x = [agent.own_law for agent in agents], [list(map(float, start)) for start in starts]
+    memories = [law["begin"](state) for law, state in zip(laws, x, strict=True)]
+    places = []
+    for k in range(steps):
+        t, forward = k * owns[0].loop.motion.dt, [math.nan] * len(owns[0].forward_names)
+        rows = [*zip(laws, x, memories, strict=True)]
+        signals = [law["signal"](t, state, memory) for law, state, memory in rows]
+        for i, (law, state, memory) in enumerate(rows):
+            gaps = [law["difference"](t, state, memory, signals[j]) for j in owns[i].neighbours]
+            z = [0.0] * len(signals[i])
+            for weight, gap in zip(owns[i].weights[0], gaps, strict=True):
+                z = [a + weight * b for a, b in zip(z, gap, strict=True)]
+            u, memories[i], _, message, valid = law["tick"](t, state, z, forward, memory)
+            assert valid
+            # Of the leader, which is the first one, and acts before the others.
+            forward = message if i == 0 else forward
+            x[i], _ = moves(state, u, [], [0.0] * len(state))
+        places.append([state[:3] for state in x])
+    return np.array(places)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(COMPILER is None, reason="no C compiler")
+def test_a_flight_in_single_precision_is_that_in_double_to_ten_micrometres(tmp_path):
+    parts, settings = ech.build(ech.load_scenario("paper-global", OBSERVED))
+    agents = [ech.Agent(parts, k, settings.dt) for k in range(4)]
+    problem = prepare(parts, settings).problem
+    move = as_compiled_c([move_function(problem.motion)], tmp_path)["move"]
+    flights = [
+        fly(agents, bits, move, problem.states, round(10.0 / settings.dt), tmp_path)
+        for bits in (64, 32)
+    ]
+    apart = np.linalg.norm(flights[0] - flights[1], axis=2).max()
+    print(f"single precision is {1e6 * apart:.2f} micrometres from double")
+    assert 0.0 < apart <= 1e-5
 
 
 # ---- machine code of a microcontroller -----------------------------------------------------------

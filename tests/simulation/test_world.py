@@ -25,10 +25,13 @@ def motion(world, dt, **more):
 def pushed(world, dt, steps, command, **more):
     """The state of a point at rest after steps under one command."""
     with jax.enable_x64(True):
-        moves = motion(world, dt, **more)
-        x, own = jnp.zeros((1, 2 * N)), moves.begin(jnp.zeros((1, 2 * N)))
-        for k in range(steps):
-            x, own = moves.advance(x, jnp.asarray([command]), jnp.asarray(k), own)
+        moves, rest = motion(world, dt, **more), jnp.zeros((1, 2 * N))
+
+        def step(now, k):
+            return moves.advance(now[0], jnp.asarray([command]), k, now[1]), None
+
+        run = jax.jit(lambda now: jax.lax.scan(step, now, jnp.arange(steps))[0])
+        x, own = run((rest, moves.begin(rest)))
     return np.asarray(x[0]), own
 
 

@@ -11,6 +11,7 @@ import functools
 import hashlib
 import sys
 from collections.abc import Hashable, Sequence
+from fractions import Fraction
 from types import FunctionType
 from typing import Any, Final, final
 
@@ -19,7 +20,7 @@ from echelon.core.reads import is_installed, reads
 _LARGE: Final = 4096
 """Arrays of at least this many bytes are hashed in place and not copied."""
 _TRUSTED: Final = {"echelon", "builtins", "numpy", "jax", "jaxlib", "equinox", "scipy"}
-_PLAIN: Final = (bool, int, float, complex, str, bytes, type(None))
+_PLAIN: Final = (bool, int, float, complex, str, bytes, Fraction, type(None))
 
 
 def digest(value: object) -> bytes | None:

@@ -20,7 +20,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
 from echelon.core.identity import process_key
 from echelon.core.memoize import BoundedCache
-from echelon.core.numeric_rules import MOVES, NUMERIC, Params, Rule
+from echelon.core.numeric_rules import MOVES, NUMERIC, Params, Rule, scatter_add
 from echelon.core.numerics import precision
 from echelon.core.types import PyTree
 
@@ -254,8 +254,13 @@ def _place(
 def _add(
     equation: JaxprEqn, operands: Sequence[np.ndarray], constant: Callable[[float], Entry]
 ) -> np.ndarray:
-    """Return the result of a primitive that adds entries, by what it does to unit vectors."""
+    """Return the result of a primitive that adds entries: each of a sum of entries with weights."""
     pool, places = _label_entries(operands)
+    if equation.primitive.name != "cumsum":
+        terms = [_alone(a) if a.dtype == float else a for a in places]
+        sums = scatter_add(equation.params, *terms)
+        if sums is not None:
+            return map_entries(lambda term: _sum_of(pool, term, constant), sums)
 
     def result(unit: jax.Array) -> jax.Array:
         data = [unit[a.astype(int)] if a.dtype == float else jnp.asarray(a) for a in places]
@@ -269,6 +274,19 @@ def _add(
             lambda w, p=entry: constant(w) * p if w else constant(0.0), weight
         )
     return total
+
+
+def _alone(places: np.ndarray) -> np.ndarray:
+    """Return each place as a tuple of one, which adding joins."""
+    entries = np.empty(places.size, object)
+    entries[:] = [(int(place),) for place in places.flat]
+    return entries.reshape(places.shape)
+
+
+def _sum_of(
+    pool: Sequence[Entry], places: tuple[int, ...], constant: Callable[[float], Entry]
+) -> Entry:
+    return functools.reduce(operator.add, (constant(1.0) * pool[k] for k in places), constant(0.0))
 
 
 def _label_entries(operands: Sequence[np.ndarray]) -> tuple[list[Entry], list[np.ndarray]]:

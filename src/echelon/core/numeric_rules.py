@@ -97,6 +97,30 @@ def _scatter(
     params: Params, x: np.ndarray, indices: np.ndarray, updates: np.ndarray
 ) -> np.ndarray | None:
     """Return an array with windows of it replaced."""
+    result = x.copy()
+    if params["update_jaxpr"] is not None:
+        return None
+    places = _scattered(params, x, indices, updates)
+    if places is None:
+        return None
+    result[places[0]] = places[1]
+    return result
+
+
+def scatter_add(
+    params: Params, x: np.ndarray, indices: np.ndarray, updates: np.ndarray
+) -> np.ndarray | None:
+    """Return an array with entries of any kind added to windows of it; None if one is outside."""
+    places, result = _scattered(params, x, indices, updates), x.copy()
+    if places is not None:
+        np.add.at(result, *places)
+    return None if places is None else result
+
+
+def _scattered(
+    params: Params, x: np.ndarray, indices: np.ndarray, updates: np.ndarray
+) -> tuple[tuple[np.ndarray, ...], np.ndarray] | None:
+    """Return the places that windows cover and the updates, alike in shape; None if outside."""
     numbers, before = params["dimension_numbers"], indices.ndim - 1
     alone = sorted((*numbers.inserted_window_dims, *numbers.operand_batching_dims))
     windows = numbers.update_window_dims
@@ -106,11 +130,7 @@ def _scatter(
     places, outside = _window(
         x.shape, indices, updates.shape[before:], numbers.scatter_dims_to_operand_dims, batches
     )
-    if params["update_jaxpr"] is not None or outside:
-        return None
-    result = x.copy()
-    result[tuple(places)] = updates
-    return result
+    return None if outside else (tuple(np.broadcast_arrays(*places)), updates)
 
 
 def _pad(params: Params, x: np.ndarray, value: np.ndarray) -> np.ndarray | None:

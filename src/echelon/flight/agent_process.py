@@ -21,6 +21,8 @@ from echelon.flight.wire import GROUND, Drop, Kind, Letter, Opened, Report, Wire
 _REPORTS: Final = 0.1  # s between two
 _LONGEST: Final = 20.0  # s of a descent
 _REST: Final = 0.05  # m/s
+_MADE_UP: Final = 5
+"""Ticks that are made up for at most; after a longer gap the law goes on from where it was."""
 _TOLD: Final = (Drop.VERSION, Drop.FORMATION, Drop.SIGNATURE, Drop.CLOCK)
 """Reasons that somebody on the ground can remove."""
 
@@ -65,6 +67,7 @@ class AgentProcess:
         self._pilot = Pilot(crew.law, crew.facts, flight["leadership"], hold)
         self._reading: Reading | None = None
         self._began, self._ticked, self._fell = time.monotonic(), -math.inf, math.inf
+        self._due = 0.0
         self._sent, self._reported, self._signals = -math.inf, -math.inf, 0
         self._moved = self._began
         self._said = set[str]()
@@ -133,8 +136,9 @@ class AgentProcess:
     def _tick(self, reading: Reading) -> None:
         """Let the law act on a state, if one of its periods has passed."""
         t, supervisor = self._crew.clock.at(reading.time), self._supervisor
-        if t is None or t < 0.0 or t < self._ticked + 0.75 * self._dt:
+        if t is None or t < max(0.0, self._due - 0.5 * self._dt):
             return
+        missed = self._missed(t)
         supervisor.judge(reading, t)
         if t > self._seconds:
             supervisor.trip(Fault.END)
@@ -143,13 +147,27 @@ class AgentProcess:
             return
         # Of this thread alone: how long others on the machine took is seen in the states' ages.
         began, wall = time.thread_time(), time.perf_counter()
+        for k in range(missed, 0, -1):
+            self._pilot.tick(t - k * self._dt, reading.x)
         ticked = self._pilot.tick(t, reading.x)
         self._ticks.append(time.perf_counter() - wall)
         self._longest = max(self._longest, self._ticks[-1])
-        supervisor.spend((time.thread_time() - began) * self._crew.clock.speed)
+        supervisor.spend((time.thread_time() - began) * self._crew.clock.speed / (1 + missed))
         supervisor.check(ticked.u, ticked.valid)
         if supervisor.fault is Fault.NONE:
             self._act(ticked.u, ticked.letter, t)
+
+    def _missed(self, t: float) -> int:
+        """Return how many ticks are made up for at a time (s): the law counts its time by them.
+
+        A state that is up to a period late misses none, and does not make the next one early.
+        """
+        missed = max(0, int((t - self._due) / self._dt))
+        if missed > _MADE_UP:
+            self._due = t + self._dt
+            return 0
+        self._due += (1 + missed) * self._dt
+        return missed
 
     def _act(self, u: list[float], letter: Letter | None, t: float) -> None:
         try:
@@ -209,6 +227,7 @@ class AgentProcess:
         report = Report(
             mode=2 if supervisor.fault is not Fault.NONE else int(self._ticked >= 0.0),
             fault=list(Fault).index(supervisor.fault),
+            leader=self._pilot.leader,
             amount=supervisor.amount,
             time=math.nan if t is None else t,
             x=x,

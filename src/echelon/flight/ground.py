@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final, final
 
 from echelon.flight.air import Air
+from echelon.flight.letterbox import NOBODY
 from echelon.flight.supervisor import Fault
 from echelon.flight.wire import Drop, Report, Wire
 from echelon.output.viewer.serve import Handler
@@ -116,12 +117,13 @@ class Ground:
             "mode": _MODES[min(report.mode, 2)] if silent < _SILENT else "silent",
             "why": "" if fault is Fault.NONE else fault.sentence(report.amount),
             "silent": round(silent, 1),
+            "leader": None if report.leader == NOBODY else report.leader,
             "time": _number(report.time, 2),
             "place": [_number(x, 2) for x in (report.x, report.y, report.z)],
             "heard": _number(report.heard, 3),
             "tick": _number(1e3 * report.tick, 2),
             "battery": _number(report.battery, 2),
-            "dropped": [f"{n} {why.value}" for why, n in counts if n],
+            "dropped": [f"{n} × {why.value}" for why, n in counts if n],
         }
 
 

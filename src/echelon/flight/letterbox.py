@@ -10,7 +10,8 @@ from typing import Final, final
 from echelon.flight.wire import Drop, Letter, Packet
 
 NOBODY: Final = 0xFFFF
-"""Hops of an agent that no leader reaches, as letters have them."""
+"""Hops of an agent that no leader reaches, and the leader of one that knows none, as datagrams have
+them."""
 _AHEAD: Final = 0.05
 """s; by so much a letter may be ahead of the receiver."""
 

@@ -81,7 +81,7 @@ class Pilot:
         leader, forward = self._expected(t, x, memory)
         ages = self.box.ages(t)
         hops = self._hops(ages)
-        z = self._disagreement(x, memory, leader, ages, hops)
+        z = self._disagreement(t, x, memory, leader, ages, hops)
         if not self._in_lead and min(ages, default=0.0) > self._hold:
             z, forward = [0.0] * len(z), [0.0] * len(forward)
         u, after, _, _, *content, valid = self._law.tick(t, x, z, forward, memory)
@@ -92,9 +92,15 @@ class Pilot:
         return self._last
 
     @property
+    def leader(self) -> int:
+        """Whom it follows: its own number if it leads, `NOBODY` before it has heard of a leader."""
+        nobody = self._number if self.leads else NOBODY
+        return nobody if self.box.packet is None else self.box.packet.leader
+
+    @property
     def _in_lead(self) -> bool:
         """Whether it leads, from the beginning or as an heir."""
-        return self.leads or self.box.packet is not None and self.box.packet.leader == self._number
+        return self.leads or self.leader == self._number
 
     def _inherit(self, t: float) -> None:
         """Take the lead by the plan, if it is an heir that has heard of no leader for long."""
@@ -113,7 +119,7 @@ class Pilot:
         """Return the leader's signal as expected, and its feed-forward; None if it is not known."""
         silence, packet = [0.0] * len(self._facts["message"]), self.box.packet
         if packet is None:
-            return (self._law.signal(x, memory) if self.leads else None), silence
+            return (self._law.signal(t, x, memory) if self.leads else None), silence
         content, age = list(packet.content), max(0.0, t - packet.time)
         if hasattr(self._law, "pace"):
             rounds, duration = self._law.pace(age)
@@ -134,6 +140,7 @@ class Pilot:
 
     def _disagreement(
         self,
+        t: float,
         x: list[float],
         memory: list[float],
         leader: list[float] | None,
@@ -152,15 +159,15 @@ class Pilot:
             near = letter is not None and letter.hops < hops and (fresh or letter.hops == 0)
             if near or not self._leaderward:
                 place = [a + b for a, b in zip(leader, away, strict=True)]
-                terms.append((weight, self._law.difference(x, memory, place)))
+                terms.append((weight, self._law.difference(t, x, memory, place)))
         if self._in_lead and not self.leads:
             # An heir follows the plan alone.
-            terms = [(sum(self._facts["weights"]), self._law.difference(x, memory, leader))]
+            terms = [(sum(self._facts["weights"]), self._law.difference(t, x, memory, leader))]
         if not self._leaderward:
             return _weighted(terms, nothing)
         total = sum(weight for weight, _ in terms)
         if not total > 0.0:
-            return self._law.difference(x, memory, leader)
+            return self._law.difference(t, x, memory, leader)
         return [value / total for value in _weighted(terms, nothing)]
 
     def _letter(
@@ -179,7 +186,7 @@ class Pilot:
         if packet is None or leader is None:
             return None
         own = packet.leader == self._number
-        away = self._law.difference(x, memory, leader)
+        away = self._law.difference(t, x, memory, leader)
         value = [0.0] * len(away) if own else away
         return Letter(self._number, t, hops, tuple(value), packet)
 

@@ -97,6 +97,7 @@ class Report(NamedTuple):
     Attributes:
         mode: 0 waits, 1 flies, 2 descends.
         fault: the number of its fault.
+        leader: whose packet it follows; its own number if it leads, 0xFFFF before any.
         amount: that belongs to the fault.
         time: of the plan, s; NaN before there is one.
         x, y, z: position, m.
@@ -109,6 +110,7 @@ class Report(NamedTuple):
 
     mode: int
     fault: int
+    leader: int
     amount: float
     time: float
     x: float
@@ -132,7 +134,7 @@ class Opened(NamedTuple):
 
 
 _FIELDS: Final = len(Report._fields) - 1
-_REPORT: Final = struct.Struct(f"<BBdd{_FIELDS - 4}f{len(Drop)}I")
+_REPORT: Final = struct.Struct(f"<BBHdd{_FIELDS - 5}f{len(Drop)}I")
 _START: Final = struct.Struct("<d")
 
 

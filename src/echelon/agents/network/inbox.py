@@ -238,9 +238,9 @@ class Stamps:
         if max(times) > self.clock + _AHEAD:  # pyright: ignore - numbers, as just checked
             return Received.AHEAD
         if packet is not None:
-            fault = self._fault(packet)
-            if fault is not None:
-                return fault
+            packet = self._read(packet)
+            if isinstance(packet, Received):
+                return packet
             if self._wins(packet):
                 self.packet = packet
         # A late message may yet bring a newer packet, by another way.
@@ -250,15 +250,17 @@ class Stamps:
         self.hops[place] = min(max(int(message.hops), 0), _FAR)
         return None
 
-    def _fault(self, packet: Packet) -> Received | None:
-        """Return why a packet is not used; None if it is."""
+    def _read(self, packet: Packet) -> Packet | Received:
+        """Return a packet with floats of its own, or why it is not used."""
         whole = all(isinstance(x, numbers.Integral) for x in (packet.leader, packet.epoch))
         # Where nobody hands the lead over, a packet of a later epoch would win for ever.
         fine = whole and packet.leader in self._leaders and 0 <= packet.epoch <= self._last_epoch
         if not fine:
             return Received.NO_MESSAGE
         values = read_values((tuple(map(str, range(self._size))), packet.content))
-        return values if isinstance(values, Received) else None
+        if isinstance(values, Received):
+            return values
+        return packet._replace(time=float(packet.time), content=tuple(values.values()))
 
     def _wins(self, packet: Packet) -> bool:
         """Tell whether a packet is of a later epoch, a leader with a lower number, or newer."""
@@ -297,6 +299,8 @@ def read_values(part: object) -> dict[str, float] | Received:
     names = [*map(str, part[0])]
     if values.shape != (len(names),) or len({*names}) != len(names):
         return Received.WRONG_SIZE
+    # As floats: the least whole number of 64 bits has no absolute value of its own kind.
+    values = values.astype(float)
     if not (np.abs(values) <= LARGEST).all():
         return Received.NOT_FINITE
     return dict(zip(names, values.tolist(), strict=True))

@@ -14,6 +14,7 @@ from weakref import WeakKeyDictionary
 
 from echelon.core.errors import EchelonError
 from echelon.core.identity import foreign_key
+from echelon.core.memoize import load_or_compute
 from echelon.core.numerics import precision
 from echelon.core.statement import Cause, Hypothesis, Statement
 from echelon.core.trace import shared_traces
@@ -284,6 +285,21 @@ def promise(parts: Parts, settings: Settings) -> Promise:
     """
     stored = _stored(parts).get(settings)
     return stored or _computed(prepare(parts, settings), parts, settings)
+
+
+def guaranteed(parts: Parts, settings: Settings) -> str:
+    """Return the sentence of `promise`, from the disk cache if another process computed it.
+
+    Raises:
+        EchelonError: as `promise`.
+    """
+    # All fields of the parts, but for two that are no plain values: by what they are made of.
+    fields = [getattr(parts, field.name) for field in dataclasses.fields(parts)]
+    formation, graph = parts.formation, parts.graph.before
+    plain = [x for x in fields if not isinstance(x, type(formation) | type(graph))]
+    links = graph.edges, graph.weights, graph.agents, graph.leaders, graph.directed, graph.schedule
+    rest = formation.offsets, formation.motion, links, settings
+    return load_or_compute(lambda: promise(parts, settings).sentence(), __name__, plain, rest)
 
 
 def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) -> Promises:

@@ -16,7 +16,7 @@ from echelon.core.files import write_atomic
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import MessageContent
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guaranteed
 from echelon.output.archive.folder import write_errors
 from echelon.output.archive.law_folder import python_law
 from echelon.simulation.engine.law_drive import Laws
@@ -49,9 +49,9 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     """
     network = _network(parts)
     agents = parts.graph.agents
-    files, guaranteed = dict[str, str | bytes](), promise(parts, settings).sentence()
+    files, sentence = dict[str, str | bytes](), guaranteed(parts, settings)
     for k in range(agents):
-        law = python_law(parts.replace(leadership=None), settings, k, formation, guaranteed)
+        law = python_law(parts.replace(leadership=None), settings, k, formation, sentence)
         files |= {f"law-{k}/{name}": text for name, text in law.items()}
     facts = json.loads(files["law-0/law.json"])
     vehicles = _vehicles(parts, settings)
@@ -89,8 +89,17 @@ def _network(parts: Parts) -> Network:
         )
     if not isinstance(parts.drive, Laws):
         raise FlightError("the agents of the scenario are under no laws, and only laws can fly.")
+    if parts.events:
+        raise FlightError(
+            "`events` are of simulations; in a flight agents and links are lost by themselves. Use "
+            "`--set events=null`."
+        )
     if parts.graph.schedule is not None:
         raise FlightError("the graph of the scenario switches, which no flight does yet.")
+    if parts.formation.motion is not None:
+        raise FlightError(
+            "the formation changes with time, which no flight does yet; leave `motion` out."
+        )
     if network.bursts.share:
         raise FlightError("`network.bursts` has no counterpart in a flight; use `network.loss`.")
     if parts.world.sensing is not None and parts.world.sensing.delay:

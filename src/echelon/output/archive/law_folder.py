@@ -9,7 +9,7 @@ from echelon import __version__
 from echelon.core.errors import OutputError
 from echelon.core.files import write_atomic
 from echelon.core.types import JsonObject
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guaranteed
 from echelon.output.archive.folder import write_errors
 from echelon.simulation.engine.agent import Agent
 from echelon.simulation.engine.own_step import OwnLaw
@@ -56,18 +56,18 @@ def law_files(
     }
     image = object_file(single.values())
     files |= {} if image is None else {"law.o": image}
-    guaranteed = promise(parts, settings).sentence()
-    return {**files, "law.json": _facts(own, double, constants, guaranteed, files)}
+    sentence = guaranteed(parts, settings)
+    return {**files, "law.json": _facts(own, double, constants, sentence, files)}
 
 
 def python_law(
-    parts: Parts, settings: Settings, agent: int, formation: str, guaranteed: str
+    parts: Parts, settings: Settings, agent: int, formation: str, sentence: str
 ) -> dict[str, str | bytes]:
     """Return law.py and law.json of one agent, as `law_files`, with the sentence of `promise`."""
     own, functions = _traced(parts, settings, agent)
     about, constants = _head(settings, agent, formation)
     files: dict[str, str | bytes] = {"law.py": python_text(functions.values(), about, constants)}
-    return {**files, "law.json": _facts(own, functions, constants, guaranteed, files)}
+    return {**files, "law.json": _facts(own, functions, constants, sentence, files)}
 
 
 def _traced(parts: Parts, settings: Settings, agent: int) -> tuple[OwnLaw, dict[str, LawFunction]]:
@@ -91,7 +91,7 @@ def _facts(
     own: OwnLaw,
     functions: Mapping[str, LawFunction],
     constants: Mapping[str, float | str],
-    guaranteed: str,
+    sentence: str,
     files: Mapping[str, str | bytes],
 ) -> str:
     """Return law.json."""
@@ -102,7 +102,7 @@ def _facts(
         **_description(own, functions),
         "dt": dt,
         "network": network_facts(own, dt, functions),
-        "guaranteed": guaranteed,
+        "guaranteed": sentence,
         "excluded": [*_EXCLUDES, _CURRENT if own.loop.channel is None else _LATE],
         "echelon": __version__,
         "sha256": {name: _digest(content) for name, content in files.items()},

@@ -175,9 +175,8 @@ class Agent:
     @property
     def own_law(self) -> OwnLaw:
         """Its law, and whom it hears."""
-        offset, heard = self._loop.offsets[self.number], (self.neighbours, self._weights)
-        rest = self._source, self._schedule
-        return OwnLaw(self._loop, self.leads, offset, *heard, *self._names, *rest)
+        own, heard = (self.leads, self.number), (self.neighbours, self._weights)
+        return OwnLaw(self._loop, *own, *heard, *self._names, self._source, self._schedule)
 
     @property
     def _sizes(self) -> tuple[int, int, int]:

@@ -90,7 +90,7 @@ class OwnLaw(NamedTuple):
     Attributes:
         loop: of its formation.
         leads: whether it is a leader.
-        offset: of its goal (n,).
+        number: of the agent.
         neighbours: the numbers of those that it hears.
         weights: of their signals (rows, K); a graph that switches has several rows.
         signal_names, forward_names: of what it sends.
@@ -100,7 +100,7 @@ class OwnLaw(NamedTuple):
 
     loop: Loop
     leads: bool
-    offset: Array
+    number: int
     neighbours: tuple[int, ...]
     weights: Array
     signal_names: tuple[str, ...]

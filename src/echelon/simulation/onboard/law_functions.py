@@ -23,6 +23,7 @@ from echelon.simulation.engine.own_step import (
     OwnState,
     begin_alone,
     gap_of,
+    offset_alone,
     signal_of,
     step_with,
 )
@@ -108,8 +109,9 @@ class _Traces:
         if sensors is not None and sensors.estimator is not None:
             yield from self._estimation(sensors.estimator)
 
-    def _state(self, x: jax.Array, flat: jax.Array) -> OwnState:
-        return OwnState(x, jnp.asarray(self.own.offset), unflatten(self.law.init(), flat))
+    def _state(self, t: jax.Array, x: jax.Array, flat: jax.Array) -> OwnState:
+        offset, rate = offset_alone(self.loop, self.law, t, jnp.asarray(self.own.number))
+        return OwnState(x, offset, unflatten(self.law.init(), flat), rate)
 
     # ---- in any network ----
 
@@ -125,22 +127,22 @@ class _Traces:
     def _signal(self) -> LawFunction:
         return self._function(
             "signal",
-            "the agent's signal, before it acts",
-            lambda x, flat: (signal_of(self.loop, self.law, self._state(x, flat)),),
+            "the agent's signal at t (s), before it acts",
+            lambda t, x, flat: (signal_of(self.loop, self.law, self._state(t, x, flat)),),
             ("signal",),
-            {"x": self.n, "memory": self.memory},
+            {"t": None, "x": self.n, "memory": self.memory},
         )
 
     def _difference(self) -> LawFunction:
-        def gap(x: jax.Array, flat: jax.Array, other: jax.Array) -> tuple[jax.Array]:
-            return (gap_of(self.loop, self.own.leads, self._state(x, flat), other),)
+        def gap(t: jax.Array, x: jax.Array, flat: jax.Array, other: jax.Array) -> tuple[jax.Array]:
+            return (gap_of(self.loop, self.own.leads, self._state(t, x, flat), other),)
 
         return self._function(
             "difference",
-            "the difference of the own signal from another one, 0 where that is NaN",
+            "the difference of the own signal at t (s) from another one, 0 where that is NaN",
             gap,
             ("gap",),
-            {"x": self.n, "memory": self.memory, "received": self.s},
+            {"t": None, "x": self.n, "memory": self.memory, "received": self.s},
         )
 
     def _tick(self, gap: int) -> LawFunction:
@@ -150,7 +152,7 @@ class _Traces:
         def tick(
             t: jax.Array, x: jax.Array, z: jax.Array, forward: jax.Array, flat: jax.Array
         ) -> tuple[jax.Array, ...]:
-            own = self._state(x, flat)
+            own = self._state(t, x, flat)
             step = step_with(loop, leads, t, own, z, forward, None)
             action = step.action
             results = action.input, _flat(action.memory), step.signal, action.message
@@ -158,7 +160,7 @@ class _Traces:
             signal = () if type(self.law).signal is Law.signal else step.signal
             if not sends_packets:
                 return *results, _flat((x, signal, action))
-            content = content_of(loop, t, *own, step.signal, action.message, action.input)
+            content = content_of(loop, t, *own[:3], step.signal, action.message, action.input)
             return *results, content, _flat((x, signal, action, content))
 
         outputs = ("u", "memory", "signal", "message", *(("content",) if sends_packets else ()))
