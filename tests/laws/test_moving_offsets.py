@@ -82,6 +82,9 @@ def test_states_lag_behind_and_the_run_warns():
     assert 0.01 < late_error(one, 6.0) < 0.5
     [sentence] = (x for x in prepare(one, ech.Settings(1.0, 0.005)).warnings if "lags" in x)
     assert "`Consensus`" in sentence and "`stopping-point`" in sentence
+    result = ech.simulate(one, ech.Settings(6.0, 0.005))
+    largest = result.formation_errors[result.times > 4.8 - 1e-9].max()
+    assert f"observed {largest:.3g} m at most from 4.8 s on" in ech.report(result)
 
 
 def test_agents_alone_do_what_simulate_does():

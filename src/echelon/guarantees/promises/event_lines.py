@@ -65,9 +65,11 @@ def _leads(graph: Graph, event: Event) -> bool:
 
 def events_in_words(parts: Parts, guarantee: Promise) -> list[JsonObject]:
     """Return each event of a run, by time, and what is guaranteed through it, ready for JSON."""
+    prefix = guarantee.prefix
     return [
-        {**as_mapping(event), "guarantee": _through(parts.graph, event, guarantee)}
+        {**as_mapping(event), "guarantee": _through(parts.graph, event, holding)}
         for event in parts.graph.events
+        for holding in (prefix.promise if prefix and event.at < prefix.at else guarantee,)
     ]
 
 

@@ -26,6 +26,7 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
         *_closest(result, numbers),
         *(outcome.sentence() for outcome in event_outcomes(result)),
         *_waiting(result),
+        *_lag(result),
         *(cause.sentence() for cause in causes(result, numbers, guarantee)),
         *_world(result),
         *_guarantee(result, guarantee),
@@ -80,6 +81,19 @@ def _waiting(result: Result) -> Iterator[str]:
     yield (
         f"The leaders' plan waited for stragglers until about {until:.3g} s, and is {late:.3g} s "
         f"late at {end:g} s."
+    )
+
+
+def _lag(result: Result) -> Iterator[str]:
+    """Yield by how much followers lag behind places that change with time, under laws that do."""
+    late = np.flatnonzero(result.times >= result.settings.horizon - result.settings.window)
+    if result.formation.motion is None or not result.drive.lags or not len(late):
+        return
+    largest = float(result.goal_distances(late)[:, list(result.graph.followers)].max())
+    yield (
+        f"Followers lag behind places that change with time: observed {largest:.3g} "
+        f"{result.unit} at most from {result.times[late[0]]:.4g} s on; under `stopping-point` they "
+        "do not."
     )
 
 

@@ -142,6 +142,11 @@ class Laws(Drive):
             )
         self.follower.check_late(graph, dt)
 
+    @property
+    def lags(self) -> bool:
+        """Whether followers lag behind offsets that change with time."""
+        return type(self.follower).goal_offset is Law.goal_offset
+
     def check_motion(self, formation: Formation, graph: Graph) -> tuple[str, ...]:
         """Return that a law of states lags behind, and which reshapes lead agents together.
 
@@ -155,7 +160,7 @@ class Laws(Drive):
                 "`safety` keeps agents apart that move relative to the leader, whose own offset "
                 "must be constant; leave out its new offset."
             )
-        if type(self.follower).goal_offset is not Law.goal_offset:
+        if not self.lags:
             return ()
         return (
             f"the law `{type(self.follower).__name__}` uses the position and the velocity of "

@@ -228,6 +228,11 @@ class Drive(eqx.Module):
         return None
 
     @property
+    def lags(self) -> bool:
+        """Whether followers lag behind offsets that change with time."""
+        return False
+
+    @property
     def trimmed(self) -> bool:
         """Whether the trim input is applied."""
         return True
