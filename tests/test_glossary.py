@@ -74,8 +74,9 @@ def test_the_page_of_keys_is_what_the_schema_makes():
 def numbers_of(what):
     """Whether a number that is no count may stand in a value of the schema."""
     if isinstance(what, dict):
-        inner = (value for key, value in what.items() if key not in ("default", "enum"))
-        return what.get("type") == "number" or any(map(numbers_of, inner))
+        # A choice may be called `number`.
+        parts = [part for name, part in what.items() if name not in ("default", "enum")]
+        return any(map(numbers_of, parts))
     return any(map(numbers_of, what)) if isinstance(what, list) else what == "number"
 
 
@@ -83,8 +84,7 @@ def test_every_number_of_a_scenario_has_a_unit_and_every_key_a_sentence():
     schema = json_schema()
     for name, part in (*schema["$defs"].items(), ("file", schema)):
         for key, what in part["properties"].items():
-            # Numbers without a unit, and those whose class of the user's defines it.
-            free = {("GraphSpec", "edges"), ("MotionSpec", "parameters")}
-            if name not in ("file", "UserClass") and (name, key) not in free:
+            others = ("GraphSpec", "edges"), ("MotionSpec", "parameters")
+            if name not in ("file", "UserClass") and (name, key) not in others:
                 assert "unit" in what or not numbers_of(what), (name, key)
             assert "description" in what or "$ref" in repr(what), (name, key)

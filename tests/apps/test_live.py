@@ -167,6 +167,29 @@ def test_who_is_lost_or_joins_live_does_so_as_in_a_run(session):
     assert session.swarm.here.all() and not session.knobs.events
 
 
+def test_a_reshape_live_is_that_of_a_run(session):
+    """And a formation that moves in the scenario does so live."""
+    before = shown(session, 2)
+    session.ask({"name": "reshape", "value": "line"})
+    fault = session.ask({"name": "reshape", "value": "star"})["fault"]
+    assert fault.startswith("there is no shape `star` here")
+    during = shown(session, 4)
+    own = session.panel.scenario_at(session.knobs)
+    assert own.formation.motion[0].at == pytest.approx(0.08)
+    whole = ech.run(own.with_(simulation__horizon=0.24))
+    np.testing.assert_allclose(np.concatenate([before, during]), whole.states[1:], atol=1e-12)
+    live = LiveLoop(*build(own), Panel(own, build(own)).live)
+    np.testing.assert_allclose(flown(live, 6), whole.states[1:], atol=1e-12)
+    assert "lasts until 3.08 s" in session.ask({"name": "reshape", "value": "wedge"})["fault"]
+    assert session.state()["moments"] == [(0.08, "the shape becomes `line`")]
+    shown(session, 72)
+    assert session.knobs.shape == "line" and session.knobs.reshaping is None
+    picture = session.swarm.advance()
+    np.testing.assert_array_equal(picture.offsets, session.panel.live.offsets(session.knobs))
+    session.ask({"name": "reset"})
+    session.settle()
+
+
 def test_a_leader_that_has_lost_all_others_goes_on_alone(session):
     for agent in (3, 2, 1):
         session.ask({"name": "lose", "value": agent})

@@ -6,7 +6,6 @@ import pytest
 
 import echelon as ech
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
-from echelon.apps.live.swarm import LiveLoop
 from echelon.core.errors import LawError, SimulationError
 from echelon.simulation.engine.gradient import gradient
 from echelon.simulation.engine.prepare import prepare
@@ -83,6 +82,9 @@ def test_states_lag_behind_and_the_run_warns():
     assert 0.01 < late_error(one, 6.0) < 0.5
     [sentence] = (x for x in prepare(one, ech.Settings(1.0, 0.005)).warnings if "lags" in x)
     assert "`Consensus`" in sentence and "`stopping-point`" in sentence
+    result = ech.simulate(one, ech.Settings(6.0, 0.005))
+    largest = result.formation_errors[result.times > 4.8 - 1e-9].max()
+    assert f"observed {largest:.3g} m at most from 4.8 s on" in ech.report(result)
 
 
 def test_agents_alone_do_what_simulate_does():
@@ -158,7 +160,6 @@ def test_what_knows_constant_offsets_alone_refuses_others():
             lambda: gradient(one, settings, lambda sums: sums.errors[0].sum(), ["P"]),
         ),
         ("the formation changes with time", lambda: ech.state_space(one)),
-        ("`echelon live` has knobs for its shape", lambda: LiveLoop(one, settings, None)),
     ):
         with pytest.raises(SimulationError, match=message):
             use()

@@ -78,7 +78,8 @@ def test_numbers_are_of_the_steps_in_which_an_agent_is_there(lost):
 def test_the_summary_states_each_event_and_what_followed(lost):
     summary = ech.summary(lost)
     assert [event["text"] for event in summary["events"]] == ["agent 3 is lost", "agent 2 joins"]
-    assert not any(event["guarantee"]["promised"] for event in summary["events"])
+    # What is guaranteed holds until the first event that nothing covers.
+    assert [event["guarantee"]["promised"] for event in summary["events"]] == [True, False]
     first, second = summary["event_outcomes"]
     late = lost.formation_errors[lost.times >= 3.0 - 1e-9]
     assert second["peak"] == pytest.approx(late.max())
@@ -113,6 +114,19 @@ def test_an_heir_leads_along_the_path(network):
     assert agent == 1 and off < 0.3
 
 
+def test_an_heir_leads_at_its_place_in_a_formation_that_turns():
+    """Its place, and those of all others, are those of each time and not of the start."""
+    parts = _parts(events=[Lose(0, 3.0)], leadership=ech.Leadership((1, 2), timeout=0.3))
+    turning = parts.formation.moving(CART, RING, [ech.network.Rotate(0.8)])
+    run = ech.simulate(parts.replace(formation=turning), SETTINGS)
+    place = [np.cos(0.8 * 6.0), np.sin(0.8 * 6.0)]
+    assert run.states[-1, 1, :2] - run.reference[-1, :2] == pytest.approx(place, abs=5e-3)
+    [event] = ech.summary(run)["event_outcomes"]
+    assert event["restored"] == pytest.approx(3.0) and event["peak"] < 1e-3
+    agent, off = event["leader"]
+    assert agent == 1 and off < 0.3
+
+
 def test_losses_that_are_covered_are_guaranteed():
     parts = _parts(events=[Lose(3, 2.0), Cut((1, 2), 3.0, 1.0)])
     guarantee = ech.promise(parts, SETTINGS)
@@ -127,6 +141,20 @@ def test_losses_that_are_covered_are_guaranteed():
 def test_what_is_not_covered_is_not_guaranteed(events):
     parts = _parts(events=events, leadership=ech.Leadership((1,)))
     assert not ech.promise(parts, SETTINGS).promised
+
+
+def test_until_a_leader_is_lost_the_guarantee_is_that_without_the_loss():
+    parts = _parts(events=[Cut((1, 2), 1.0, 0.5), Lose(0, 3.01)], leadership=ech.Leadership((1,)))
+    guarantee = ech.promise(parts, SETTINGS)
+    without = ech.promise(
+        parts.replace(events=[Cut((1, 2), 1.0, 0.5)]), SETTINGS._replace(horizon=3.0)
+    )
+    assert guarantee.prefix.promise.sentence() == without.sentence()
+    assert "from 3.01 s on" in guarantee.sentence() and "Until 3.01 s: " in guarantee.sentence()
+    assert guarantee.as_mapping()["prefix"]["promise"]["promised"]
+    # At its first step nothing comes before it.
+    at_once = _parts(events=[Lose(0, 0.01)], leadership=ech.Leadership((1,)))
+    assert ech.promise(at_once, SETTINGS).prefix is None
 
 
 def test_heirs_over_a_radio_may_take_the_lead_at_any_time():

@@ -342,15 +342,21 @@ class StoppingLeader(FlatLaw):
             # An heir that was held back when it took the lead gives way to nobody now.
             memory = memory._replace(active=0.0 * memory.half)
         away = self.deviation(model, view.t, view.x, view.offset, memory)
-        rate = self._rate(model, view.t, away, view.period)
+        rate = self._rate(model, view.t, away, view.period, view.pace)
         return self.ready.obey(model, view.x, rate, memory, view.period, view.offset_rate)
 
     def _rate(
-        self, model: ControlAffine, t: Scalar, away: jax.Array, period: Scalar | float
+        self,
+        model: ControlAffine,
+        t: Scalar,
+        away: jax.Array,
+        period: Scalar | float,
+        pace: Scalar | None = None,
     ) -> jax.Array:
         """Return zeta' (m,) that the leader commands at a deviation (m,) from its path."""
-        path = self.path(model, t)
-        return self.ready.stop(path[1:]) - self.bounded(self.strength(period) * away)
+        ahead = self.ready.stop(self.path(model, t)[1:])
+        ahead = ahead if pace is None else pace * ahead
+        return ahead - self.bounded(self.strength(period) * away)
 
     @property
     def plans(self) -> bool:

@@ -223,6 +223,13 @@ class Graph(GraphMatrices):
         graph.schedule = schedule_of(before, events, heirs) if events else before.schedule
         return graph
 
+    def until(self, at: float) -> "Graph":
+        """Return the graph with the events before a time (s) alone."""
+        graph, schedule = copy.copy(self), self.schedule and self.schedule.until(at)
+        graph.events = tuple(event for event in self.events if event.at < at)
+        graph.schedule, graph._spectrum = schedule or self.before.schedule, None
+        return graph
+
     def _triples(self) -> list[list[float]]:
         return np.column_stack([self.edges, self.weights]).tolist()
 

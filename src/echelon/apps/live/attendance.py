@@ -1,4 +1,4 @@
-"""Agents that are lost or join while a live loop runs."""
+"""Agents that are lost or join while a live loop runs, and formations that take another shape."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from echelon.agents.network.events import Event, Join, Lose, agents_of
+from echelon.agents.network.formation_motion import Reshape
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, JsonObject
@@ -16,6 +17,10 @@ from echelon.simulation.step.loop import Loop, Presence
 
 KINDS = {"lose": Lose, "join": Join}
 """What may happen to an agent, by the name of the request."""
+ROOMY = (*KINDS, "reshape")
+"""Requests that need a loop with room for them."""
+RESHAPE = 3.0
+"""s, over which agents move to the places of another shape."""
 _STRETCHES = (-2, -1, -1)
 """Of a graph with events a live loop has the last two stretches, in three rows."""
 
@@ -64,14 +69,13 @@ def attendance(graph: Graph, events: Sequence[Event], leaderward: bool, dt: floa
 
 
 def room_for_events(parts: Parts, dt: float) -> Parts:
-    """Return parts whose loop has numbers for who is there.
-
-    Raises:
-        SimulationError: the graph switches.
-    """
-    graph = parts.graph.before
+    """Return parts whose loop has numbers for who is there and for a reshape, if these can be."""
+    graph, model, formation = parts.graph.before, parts.model, parts.formation
+    if model.position and formation.motion is None:
+        still = Reshape(formation.offsets, 0.0, RESHAPE)
+        parts = parts.replace(formation=formation.moving(model, graph, [still]))
     if graph.schedule is not None:
-        raise SimulationError("agents of a graph that switches cannot be lost or join.")
+        return parts
     agent = graph.followers[-1]
     return parts.replace(events=(Lose(agent, dt), Join(agent, 2.0 * dt)))
 
@@ -87,6 +91,8 @@ def happened(
     """
     if type(agent) is not int or not 0 <= agent < graph.agents:
         raise SimulationError(f"`{name}` got `{agent}`, and must be the number of an agent.")
+    if graph.before.schedule is not None:
+        raise SimulationError("agents of a graph that switches cannot be lost or join.")
     own = [each for each in events if agents_of(each) == (agent,)]
     if name == "join" and not (own and isinstance(own[-1], Lose)):
         raise SimulationError(f"agent {agent} cannot join, since it is there.")
@@ -99,6 +105,13 @@ def as_entries(events: Sequence[Event]) -> list[JsonObject]:
     """Return losses and arrivals as a scenario states them."""
     pairs = ((each, agents_of(each)[0]) for each in events)
     return [{"at": each.at, type(each).__name__.lower(): agent} for each, agent in pairs]
+
+
+def moments_of(events: Sequence[Event], changes: Sequence[JsonObject]) -> list[tuple[float, str]]:
+    """Return when who was lost or joined, and the shape changed, in words, by time."""
+    moments = [(event.at, str(event)) for event in events]
+    shapes = [(each["at"], each["reshape"]) for each in changes if "reshape" in each]
+    return sorted([*moments, *((at, f"the shape becomes `{name}`") for at, name in shapes)])
 
 
 def as_changes(entries: Sequence[JsonObject]) -> list[JsonObject]:

@@ -11,7 +11,9 @@ from jaxtyping import Float
 from echelon.agents.models.linearization import linearize
 from echelon.agents.network.channel import Network
 from echelon.agents.network.events import Event
+from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.network.graph import Graph
+from echelon.apps.live.attendance import RESHAPE
 from echelon.apps.live.choices import shapes_of
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
@@ -22,6 +24,18 @@ from echelon.guarantees.promises.closed_loop import LinearLoop, loop_of
 from echelon.simulation.engine.law_drive import Laws
 from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.riccati import Riccati
+
+
+class Reshaping(NamedTuple):
+    """A change of the shape that is under way: the shape before, by its name, and since when, s."""
+
+    before: str | None
+    at: float
+
+    @property
+    def end(self) -> float:
+        """When all agents have their new places, s."""
+        return self.at + RESHAPE
 
 
 class Knobs(NamedTuple):
@@ -44,6 +58,7 @@ class Knobs(NamedTuple):
         method: of the gain; None for the scenario's own.
         shape: of the formation; None for the scenario's own.
         events: agents that were lost and joined, by time.
+        reshaping: how the formation comes to its shape; None where it has it.
     """
 
     coupling: float | None
@@ -62,6 +77,17 @@ class Knobs(NamedTuple):
     method: str | None = None
     shape: str | None = None
     events: tuple[Event, ...] = ()
+    reshaping: Reshaping | None = None
+
+    @property
+    def roomy(self) -> bool:
+        """Whether the loop needs room for events."""
+        return bool(self.events or self.reshaping)
+
+    @property
+    def before(self) -> "Knobs":
+        """The positions with the shape that the formation comes from."""
+        return self if self.reshaping is None else self._replace(shape=self.reshaping.before)
 
 
 @final
@@ -79,7 +105,8 @@ class LiveParts:
         model = self.parts.model
         self.start = _start(experiment)
         self.axes = list(model.position_indices())
-        self.shapes = shapes_of(self.parts)
+        moves = self.parts.formation.motion is not None
+        self.shapes = {} if moves else shapes_of(self.parts)
         # The state that the wind acts on; None of agents without a position.
         self.wind_state = self.axes[0] if self.axes else None
         if "velocity" in model.state_groups:
@@ -142,6 +169,22 @@ class LiveParts:
             places[:, :2] = places[:, :2] @ np.array([[c, s], [-s, c]])
         offsets[:, self.axes] = center + places
         return offsets
+
+    def motion(self, knobs: Knobs, room: FormationMotion | None) -> FormationMotion | None:
+        """Return how offsets change with time: the scenario's own, or to the shape of the knobs.
+
+        Args:
+            knobs: with the reshape that is under way, if any.
+            room: a motion with room for one; None where a loop has none.
+        """
+        own = self.parts.formation.motion
+        if own is not None or room is None:
+            return own
+        ends = [self.offsets(each)[:, self.axes] for each in (knobs.before, knobs)]
+        center = ends[0][self.parts.graph.leaders[0]]
+        begin = 0.0 if knobs.reshaping is None else knobs.reshaping.at
+        rows = np.stack(ends, axis=1) - center, center, np.array([begin])
+        return eqx.tree_at(lambda motion: (motion.places, motion.center, motion.begins), room, rows)
 
     def wind(self, knobs: Knobs) -> Float[Array, " n"]:
         """Return the constant wind of the scenario and the knob."""

@@ -39,7 +39,7 @@ class LoopsByLaw:
             if usable in self.ready:
                 return self.ready[usable]
         check_choice("law", law, self.first.laws)
-        what = "losses and arrivals" if eventful else f"the law `{law}`"
+        what = "room for events" if eventful else f"the law `{law}`"
         self.send({"note": f"Compiling {what}; the loop continues meanwhile."})
         try:
             panel = self._panel(law)

@@ -5,9 +5,11 @@ from typing import Any, final
 
 import numpy as np
 
-from echelon.apps.live.attendance import KINDS, as_entries, happened
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.formation_motion import Reshape
+from echelon.apps.live.attendance import KINDS, RESHAPE, as_entries, happened
 from echelon.apps.live.choices import AS_GIVEN
-from echelon.apps.live.knobs import Knobs, LiveParts
+from echelon.apps.live.knobs import Knobs, LiveParts, Reshaping
 from echelon.apps.live.sliders import SLIDERS
 from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.types import JsonObject
@@ -93,6 +95,8 @@ class Panel:
             at = max(at, self.experiment.settings.dt)
             events = happened(self.live.parts.graph, knobs.events, name, value, at)
             return knobs._replace(events=events)
+        if name == "reshape":
+            return self._reshaped(knobs, value, at)
         if name in self.options:
             return self._choose(knobs, name, value)
         if name not in self.ranges:
@@ -121,11 +125,33 @@ class Panel:
             check_choice(name, value, self.options[name])
         changed = knobs._replace(**{name: choice})
         if name == "shape":
-            return changed
+            return changed._replace(reshaping=None)
         # Each method chooses the coupling of its own gain.
         gain = None if choice is None else self.live.unweighted_gain(changed)
         coupling = self.start.coupling if gain is None else round(gain.coupling, 9)
         return changed._replace(weight=1.0, coupling=coupling)
+
+    def _reshaped(self, knobs: Knobs, value: Any, at: float) -> Knobs:
+        """Return the knobs of a formation that begins to take another shape at a time (s).
+
+        Raises:
+            SimulationError: there is no such shape, or a reshape is under way.
+            LawError: with `safety`, a leader or an heir would move beside its path.
+        """
+        check_choice("shape", value, (AS_GIVEN, *self.options["shape"]))
+        under_way = knobs.reshaping
+        if under_way is not None and at < under_way.end:
+            raise SimulationError(
+                f"got `reshape` at {at:.4g} s, and the reshape before it lasts until "
+                f"{under_way.end:.4g} s; wait for its end."
+            )
+        shape = None if value == AS_GIVEN else str(value)
+        after = knobs._replace(shape=shape, reshaping=Reshaping(knobs.shape, at))
+        live, graph = self.live, self.live.parts.graph
+        change = Reshape(live.offsets(after), at, RESHAPE)
+        moving = Formation(live.offsets(after.before)).moving(live.parts.model, graph, [change])
+        live.parts.drive.check_motion(moving, graph)
+        return after
 
     def edge(self, pair: Any) -> int:
         """Return the index of the edge between two agents.
@@ -157,8 +183,10 @@ class Panel:
             data["graph"] = self._graph(knobs)
         if knobs.events:
             data["events"] = as_entries(knobs.events)
+        if knobs.roomy:
             # A scenario's events are before its end.
-            end = knobs.events[-1].at + data["simulation"]["horizon"]
+            last = max(each.at for each in (*knobs.events[-1:], knobs.reshaping) if each)
+            end = last + data["simulation"]["horizon"]
             data["simulation"] = data["simulation"] | {"horizon": end}
         return scenario_from_mapping(data, self.scenario.folder)
 

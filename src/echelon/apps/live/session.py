@@ -5,12 +5,12 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, final
 
 import numpy as np
 from jaxtyping import Float
 
-from echelon.apps.live.attendance import KINDS
+from echelon.apps.live.attendance import ROOMY, moments_of
 from echelon.apps.live.guarantee_status import GuaranteeStatus, lost
 from echelon.apps.live.header import foreseen_of
 from echelon.apps.live.knobs import Knobs
@@ -31,9 +31,6 @@ from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.plots.space import space_of
 from echelon.output.viewer.replay import heard_by
 from echelon.simulation.engine.closest_pair import ClosestPair
-
-if TYPE_CHECKING:
-    from echelon.experiments.scenario.event_sections import LiveSpec
 
 _PICTURE, _MESSAGE = 0, 1
 _EMPTY = struct.pack("<I", _MESSAGE) + b"{}"
@@ -59,7 +56,8 @@ class Session:
         self.space, self.bounds = space_of(self.run), self.run.bounds
         self.pending: list[Callable[[], None]] = []
         self.events: list[JsonObject] = []
-        self.future = sorted(map(_as_event, scenario.live), key=lambda event: event["at"])
+        future = (spec.model_dump(exclude_none=True) for spec in scenario.live)
+        self.future = sorted(future, key=lambda event: event["at"])
         self.picture, self.number, self.messages = b"", 0, list[bytes]()
         self.changed, self.lost, self.factor = threading.Condition(), False, 1.0
         self.closest: ClosestPair | None = None
@@ -87,7 +85,7 @@ class Session:
                     elif name not in ("at", "law"):
                         start = panel.start._replace(events=happened)
                         happened = panel.change(start, name, value, event["at"]).events
-                if happened:
+                if happened or "reshape" in event:
                     self.loops.prepare(panel.law, True)
             except EchelonError as error:
                 message = _without_place(error)
@@ -139,6 +137,9 @@ class Session:
         with self.changed:
             pending, self.pending = self.pending, []
         now = self.swarm.steps * self.swarm.settings.dt
+        under_way = self.knobs.reshaping
+        if under_way is not None and under_way.end <= now:
+            pending.insert(0, lambda: self._set(self.knobs._replace(reshaping=None)))
         while self.future and self.future[0]["at"] <= now + 1e-9:
             event = self.future.pop(0)
             pending.append(lambda event=event: self.apply(event))
@@ -248,7 +249,7 @@ class Session:
         cut = [graph.edges[k].tolist() for k in sorted(self.knobs.cut)]
         chosen = {"law": self.panel.law, "method": self.knobs.method, "shape": self.knobs.shape}
         state = {"knobs": knobs, "chosen": chosen, "cut": cut, "paused": self.paused}
-        moments = [[event.at, str(event)] for event in self.knobs.events]
+        moments = moments_of(self.knobs.events, self.events)
         return {**state, "moments": moments, "nearest": self.swarm.nearest.tolist()}
 
     def _panel_message(self) -> JsonObject:
@@ -272,13 +273,13 @@ class Session:
             return {}
         try:
             if name == "law":
-                event = {name: self.loops.prepare(str(value), bool(self.knobs.events))[0].law}
+                event = {name: self.loops.prepare(str(value), self.knobs.roomy)[0].law}
             else:
                 event = self._event(str(name), value)
-                if name in KINDS:
+                if name in ROOMY:
                     self.loops.prepare(self.panel.law, True)
         except (ScenarioError, GraphError, LawError, SimulationError) as error:
-            if name not in ("law", *KINDS):
+            if name not in ("law", *ROOMY):
                 raise
             # A valid request, but it is not possible for these agents.
             return {"fault": _without_place(error)}
@@ -334,16 +335,20 @@ class Session:
                 knobs = self._switch_law(str(value), knobs)
             elif name != "at":
                 knobs = self.panel.change(knobs, name, value, now)
-                if name in KINDS:
+                if name in ROOMY:
                     self._make_room()
         # After the changes, so that a refused event is not saved.
         self.events.append({"at": now, **{k: v for k, v in event.items() if k != "at"}})
         if knobs != self.knobs:
-            self.knobs = knobs
-            self.status.begin()
-            self.swarm.apply(knobs)
-            self.promiser.ask(self.panel, knobs)
-            self.send(self.state())
+            self._set(knobs)
+
+    def _set(self, knobs: Knobs) -> None:
+        """Set all knobs, and compute what is guaranteed from now on."""
+        self.knobs = knobs
+        self.status.begin()
+        self.swarm.apply(knobs)
+        self.promiser.ask(self.panel, knobs)
+        self.send(self.state())
 
     def _make_room(self) -> None:
         """Continue from here in the loop in which agents can be lost and join."""
@@ -356,12 +361,12 @@ class Session:
     def _switch_law(self, law: str, knobs: Knobs) -> Knobs:
         """Continue from here under another law, with its initial memory."""
         before = self.swarm
-        self.panel, self.swarm = self.loops.prepare(law, bool(knobs.events))
+        self.panel, self.swarm = self.loops.prepare(law, knobs.roomy)
         self.swarm.states, self.swarm.first = before.states, before.first
         self.swarm.proceed(np.asarray(before.now.states, float), before.steps)
         self.status.begin()
         self.send(self._panel_message())
-        names = {"shape", "cut", "events", *self.panel.ranges} - {"coupling"}
+        names = {"shape", "cut", "events", "reshaping", *self.panel.ranges} - {"coupling"}
         return self.panel.start._replace(**{name: getattr(knobs, name) for name in names})
 
     def _pause(self, paused: bool) -> None:
@@ -371,7 +376,7 @@ class Session:
     def _reset(self) -> None:
         """Restart from the initial states, with the knobs as they are."""
         # At the start nobody has been lost.
-        self.knobs = self.knobs._replace(events=())
+        self.knobs = self.knobs._replace(events=(), reshaping=None)
         self.swarm.apply(self.knobs)
         self.swarm.restart()
         self.status.restart()
@@ -387,11 +392,6 @@ class Session:
             self.events.append({"at": 0.0, "cut": graph.edges[edge].tolist()})
         self.send({"reset": True, "note": "", **self.state()})
         self.show(self.swarm.advance(still=True))
-
-
-def _as_event(spec: "LiveSpec") -> JsonObject:
-    """Return an event of a scenario as one that was recorded."""
-    return {name: value for name, value in spec.model_dump().items() if value is not None}
 
 
 def _without_place(error: EchelonError) -> str:

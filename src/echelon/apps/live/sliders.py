@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from echelon.apps.live.attendance import RESHAPE
 from echelon.apps.live.knobs import Knobs, LiveParts
 from echelon.core.types import JsonObject
 from echelon.synthesis.gains.fixed import FixedGain
@@ -77,6 +78,8 @@ def _write_feedforward(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
 
 
 def _size_range(live: LiveParts) -> Range | None:
+    if live.parts.formation.motion is not None:
+        return None
     apart = bool(live.axes) and live.parts.formation.offsets[:, live.axes].any()
     return Range(0.3, 3.0, True) if live.shapes or apart else None
 
@@ -87,10 +90,16 @@ def _turn_range(live: LiveParts) -> Range | None:
 
 
 def _write_formation(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
-    if (knobs.size, knobs.turn, knobs.shape) != (1.0, 0.0, None):
+    def places(knobs: Knobs) -> JsonObject:
         offsets = live.offsets(knobs)
         agents = np.flatnonzero(offsets.any(axis=1))
-        data["formation"] = {"offsets": {i: offsets[i, live.axes].tolist() for i in agents}}
+        return {"offsets": {i: offsets[i, live.axes].tolist() for i in agents}}
+
+    if knobs.reshaping is not None:
+        change = {"reshape": places(knobs), "at": knobs.reshaping.at, "over": RESHAPE}
+        data["formation"] = {**places(knobs.before), "motion": [change]}
+    elif (knobs.size, knobs.turn, knobs.shape) != (1.0, 0.0, None):
+        data["formation"] = places(knobs)
 
 
 def _wind_range(live: LiveParts) -> Range | None:

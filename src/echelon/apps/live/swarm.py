@@ -13,13 +13,14 @@ from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import NEVER, Channel
+from echelon.agents.network.formation import Formation
 from echelon.agents.network.hearing import edges_of
 from echelon.agents.world.disturbance import Disturbance
 from echelon.apps.live.attendance import attendance, room_for_events
 from echelon.apps.live.knobs import Knobs, LiveParts
 from echelon.apps.live.live_stepper import choose_stepper
 from echelon.core.compiled import cached_jit
-from echelon.core.errors import GraphError, SimulationError
+from echelon.core.errors import GraphError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, PyTree
 from echelon.experiments.results.lyapunov import fixed_metric, potential
@@ -74,7 +75,8 @@ class LiveLoop:
         parts: of a scenario.
         settings: of it.
         panel: the numbers that its knobs set.
-        eventful: whether agents can be lost and join, which no native code steps.
+        eventful: whether agents can be lost and join, and the formation can take other shapes,
+            which no native code steps.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
@@ -84,11 +86,6 @@ class LiveLoop:
         self, parts: Parts, settings: Settings, panel: LiveParts, eventful: bool = False
     ) -> None:
         """Prepare the loop and its stepper."""
-        if parts.formation.motion is not None:
-            raise SimulationError(
-                "got a formation that changes, and `echelon live` has knobs for its shape; "
-                "remove `formation.motion`, or use `echelon run`."
-            )
         disturbance = parts.world.disturbance or Disturbance()
         world = dataclasses.replace(parts.world, disturbance=disturbance)
         parts = room_for_events(parts, settings.dt) if eventful else parts
@@ -239,6 +236,8 @@ class LiveLoop:
             (self.offsets, weights, self.panel.wind(knobs)),
         )
         self.loop = self._in_world(eqx.tree_at(self._adjustable, loop, self._numbers(knobs)), knobs)
+        moving = self.panel.motion(knobs, self.loop.moving)
+        self.loop = dataclasses.replace(self.loop, moving=moving)
 
     def _count(self, knobs: Knobs) -> None:
         """Let those be there who are after the events of the knobs."""
@@ -284,7 +283,8 @@ class LiveLoop:
     def _potential(self, knobs: Knobs) -> Callable[[Array], Array] | None:
         """Return the function that computes V; None without a P or for a disconnected graph."""
         P, gain = fixed_metric(self.parts), self.panel.gain(knobs)
-        if P is None or knobs.events:
+        moves = self.panel.parts.formation.motion is not None
+        if P is None or knobs.roomy or moves:
             return None
         P = P if gain is None else gain.P
         key = knobs.cut, knobs.method, knobs.weight
@@ -315,19 +315,22 @@ class LiveLoop:
         with precision(self.precision):
             chunk = self.stepper.advance(self.now, counts, reference)
         self.now, states, inputs = chunk.now, chunk.states[-1], chunk.inputs[-1]
-        y, here = states - self.offsets, self.here
+        time = self.steps * self.settings.dt
+        offsets = Formation(self.offsets, self.loop.moving).offsets_at([time])[0]
+        y, here = states - offsets, self.here
         with np.errstate(over="ignore", invalid="ignore"):
             deviation = (y - y[self.nearest])[:, self.measured]
             errors = np.linalg.norm(deviation, axis=1) * (1.0 if here is None else here)
         valid = np.isfinite(inputs).all(axis=1) & (np.abs(states) < _FAR).all(axis=1)
         # Which agent it is nobody knows.
         valid &= not np.any(chunk.inexact)
-        time = self.steps * self.settings.dt
         V = float(self.potential(y[None])[0]) if valid.all() and self.potential else np.nan
         desired = None if reference is None else reference[counts[0]]
+        if chunk.followed is not None and chunk.followed.reference is not None:
+            desired = chunk.followed.reference[-1]
         beyond = np.logical_not(valid)
         shades = self._shades(int(counts[0]))
-        rows = time, states, inputs, errors, self.offsets, desired, V, beyond, shades
+        rows = time, states, inputs, errors, offsets, desired, V, beyond, shades
         return Picture(*rows, self._apart(), here)
 
     def _shades(self, steps: int) -> Float[Array, " E"]:

@@ -108,7 +108,8 @@ def _new_leader(result: Result, frames: Int[np.ndarray, " F"]) -> tuple[int, flo
     old, new = (int(result.nearest_then[k, 0]) for k in (frames[0] - 1, frames[0]))
     if old == new:
         return None
-    off = result.states[frames, new] - result.reference[frames] - result.offsets[new]
+    own = result.offsets_in(frames)[..., new, :]
+    off = result.states[frames, new] - result.reference[frames] - own
     return new, float(np.linalg.norm(off[:, list(result.measured)], axis=1).max())
 
 

@@ -38,13 +38,16 @@ class EventSpec(BaseModel, **either("lose", "cut", "join")):
 
 @final
 class LeadershipSpec(BaseModel, **STRICT):
-    """Who takes the lead when nobody hears of the leader any more."""
+    """Who takes the lead when nobody hears of the leader any more, and whether leaders wait."""
 
-    heirs: Agents = Field(min_length=1)
+    heirs: Agents = ()
     """Numbers of followers, in the order in which they take over."""
     timeout: Annotated[Positive, Unit("s")] = 0.3
     """Time without news of a leader after which the first heir takes the lead, s; the second does
     after twice that, and so on."""
+    waits: Annotated[Positive | None, Unit("m")] = None
+    """Distance of a follower from its place at which the leaders' plan stands still until it is
+    nearer, m; by default never."""
 
 
 @final
@@ -67,6 +70,9 @@ class LiveSpec(BaseModel, **STRICT):
     scenario's."""
     shape: str | None = None
     """Shape of the formation, by a name of `formation`; `scenario` for the scenario's."""
+    reshape: str | None = None
+    """Shape to which the formation changes within 3 s, by a name of `formation`; `scenario` for the
+    scenario's."""
     size: Annotated[Positive | None, Unit("1")] = None
     """Size of the formation, relative to that of `formation`."""
     turn: Annotated[float | None, Unit("deg")] = None

@@ -69,7 +69,7 @@ def leaders_of(parts: Parts, states: Array) -> Leaders:
     law = getattr(drive, "leader", None)
     answer = drive.reacts or law is not None and law.metric(model) is not None
     return Leaders(
-        starts=(states - parts.formation.offsets)[leads],
+        starts=(states - parts.formation.offsets_at([0.0])[0])[leads],
         rest=isinstance(law, TrimInput),
         alike=all_alike(drive, model),
         answer=answer,

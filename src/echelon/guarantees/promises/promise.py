@@ -8,6 +8,7 @@ feed-forward, limits and starts that run; what a gain claims of itself is only c
 import abc
 import dataclasses
 import importlib
+import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeAlias
 from weakref import WeakKeyDictionary
@@ -92,6 +93,8 @@ class Promise(abc.ABC):
         certified: the set of starts that the region certifies; None without one.
         domain: the region's domain in words; empty without one.
         complete: whether nothing was left out to save time.
+        prefix: what is guaranteed until the first event that is not covered; None without one, or
+            if nothing is.
     """
 
     loop: LinearLoop
@@ -102,6 +105,7 @@ class Promise(abc.ABC):
     certified: CertifiedSet | None = None
     domain: str = ""
     complete: bool = True
+    prefix: "Prefix | None" = None
 
     # ---- what each kind of guarantee implements ----
 
@@ -236,7 +240,12 @@ class Promise(abc.ABC):
         """Return all that stands against a guarantee, and what would help."""
         against = (line for line in self.hypotheses.values() if line.fails and line.reason)
         remedies = "; ".join(dict.fromkeys(x.remedy for x in against))
-        return f"Nothing is guaranteed: {'; '.join(self.reasons)}. What would help: {remedies}."
+        until = "" if self.prefix is None else f" {self.prefix.sentence()}"
+        which = "" if self.prefix is None else f" from {self.prefix.at:g} s on"
+        text = (
+            f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. What would help: {remedies}."
+        )
+        return text + until
 
     def as_mapping(self) -> dict[str, Any]:
         """Return it ready for JSON; what does not exist is None."""
@@ -257,7 +266,21 @@ class Promise(abc.ABC):
             "certified_set": None if certified is None else certified.as_mapping(),
             "anywhere": self.anywhere(),
             "hypotheses": [line.as_mapping() for line in self.hypotheses.values()],
+            "prefix": None
+            if self.prefix is None
+            else {"at": self.prefix.at, "promise": self.prefix.promise.as_mapping()},
         }
+
+
+class Prefix(NamedTuple):
+    """What is guaranteed until a time (s), at which something happens that nothing covers."""
+
+    at: float
+    promise: "Promise"
+
+    def sentence(self) -> str:
+        """Return it in a sentence."""
+        return f"Until {self.at:g} s: {self.promise.sentence()}"
 
 
 Promises: TypeAlias = Iterator[Promise | EchelonError]
@@ -324,10 +347,28 @@ def _computed(prepared: Prepared, parts: Parts, settings: Settings, brief: bool 
     """Return what is guaranteed of parts, and store it if nothing was left out."""
     with precision("float64"):
         computed = prover_of(prepared.parts.drive).of(prepared, settings, brief)
+    if not brief:
+        computed = dataclasses.replace(computed, prefix=_prefix_of(computed, parts, settings))
     # A result holds the prepared parts, and asks again.
     for key in (parts, prepared.parts) if computed.complete else ():
         _stored(key)[settings] = computed
     return computed
+
+
+def _prefix_of(computed: Promise, parts: Parts, settings: Settings) -> Prefix | None:
+    """Return what is guaranteed until the first event that is not covered; None for nothing."""
+    line = computed.hypotheses.get(Hypothesis.EVENTS)
+    if line is None or not line.fails or line.number is None:
+        return None
+    steps = math.floor(line.number / settings.dt + 1e-9)
+    if not steps:
+        return None
+    graph = parts.graph.until(line.number)
+    first = promise(
+        parts.replace(graph=graph, events=graph.events),
+        settings._replace(horizon=steps * settings.dt, steady_window=None),
+    )
+    return Prefix(line.number, first) if first.promised else None
 
 
 def _stored(parts: Parts) -> dict[Settings, Promise]:

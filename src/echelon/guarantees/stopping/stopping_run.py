@@ -260,12 +260,8 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     text += ", and the leaders' own coupling" * run.apart
     text = f"the slowest of the roots, {text}; far away the `speed` limits it"
     text += ", and not while agents hold each other back" * (run.law.safety is not None)
-    changed = _changed(run)
-    yield (
-        changed
-        if changed is not None
-        else holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, -run.rate, f"{-run.rate:.3g} 1/s")
-    )
+    rate = -run.rate, f"{-run.rate:.3g} 1/s"
+    yield _changed(run) or holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, *rate)
     text = "the law is linear in flat coordinates everywhere"
     yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)
     yield _step_line(run)

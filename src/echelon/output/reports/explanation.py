@@ -25,6 +25,8 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
         *_outcome(result, numbers),
         *_closest(result, numbers),
         *(outcome.sentence() for outcome in event_outcomes(result)),
+        *_waiting(result),
+        *_lag(result),
         *(cause.sentence() for cause in causes(result, numbers, guarantee)),
         *_world(result),
         *_guarantee(result, guarantee),
@@ -65,6 +67,34 @@ def _closest(result: Result, numbers: Metrics) -> Iterator[str]:
         yield numbers.closest.sentence(result.radius)
     kept = avoidance(result)
     yield from () if kept is None else (kept.sentence(),)
+
+
+def _waiting(result: Result) -> Iterator[str]:
+    """Yield for how long leaders waited that do."""
+    if result.late is None or not len(result.late):
+        return
+    late, end = float(result.late[-1]), result.times[-1]
+    if late < 0.5e-3:
+        yield "The leaders' plan waited for nobody."
+        return
+    until = result.times[np.flatnonzero(result.late < late - 1e-3)[-1:]].max(initial=0.0)
+    yield (
+        f"The leaders' plan waited for stragglers until about {until:.3g} s, and is {late:.3g} s "
+        f"late at {end:g} s."
+    )
+
+
+def _lag(result: Result) -> Iterator[str]:
+    """Yield by how much followers lag behind places that change with time, under laws that do."""
+    late = np.flatnonzero(result.times >= result.settings.horizon - result.settings.window)
+    if result.formation.motion is None or not result.drive.lags or not len(late):
+        return
+    largest = float(result.goal_distances(late)[:, list(result.graph.followers)].max())
+    yield (
+        f"Followers lag behind places that change with time: observed {largest:.3g} "
+        f"{result.unit} at most from {result.times[late[0]]:.4g} s on; under `stopping-point` they "
+        "do not."
+    )
 
 
 def _world(result: Result) -> Iterator[str]:

@@ -53,7 +53,10 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
             `settings.engine` is `native`, and native code is unavailable.
     """
     if parts.formation.motion is not None:
-        raise SimulationError("got a formation that changes, but derivatives are of constant ones.")
+        raise SimulationError(
+            "got a formation that changes, but derivatives are of constant ones; leave out `motion` "
+            "to tune, and give it to the runs afterwards."
+        )
     if parts.world.network is not None:
         raise SimulationError("got a network, but derivatives are of messages that are never late.")
     if parts.drive.safety is not None:

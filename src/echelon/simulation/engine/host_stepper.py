@@ -156,7 +156,7 @@ class HostStepper(Stepper):
         chunk.step += count
         chunk.sums = chunk.sums.plus(sums)
         if store:
-            for stored, frame in zip((chunk.states, chunk.inputs), frames, strict=True):
+            for stored, frame in zip((chunk.states, chunk.inputs), frames[:2], strict=True):
                 stored.append(np.asarray(frame[0], np.float64))
 
 

@@ -16,7 +16,7 @@ from echelon.simulation.native.varying import is_number
 from echelon.simulation.step.drive import Chunk, Stepper
 from echelon.simulation.step.loop import Loop, Moment, WorldState
 from echelon.simulation.step.meter import Sums, on_host
-from echelon.simulation.step.sequence import advance, begin
+from echelon.simulation.step.sequence import Frames, advance, begin
 
 _AGENT_STEPS, _FEWEST = 100_000, 4
 """Steps of one agent each in a chunk, and the fewest of all agents.
@@ -79,9 +79,9 @@ class JaxStepper(Stepper):
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; a divergence is noticed afterwards."""
         step = advance if self.mesh is None else partial(advance_parted, self.mesh)
-        now, (states, inputs), sums = step(self.loop, now, counts, reference, now.step)
-        states, inputs, sums = on_host((states, inputs, sums))
-        return Chunk(now, states, inputs, sums.split(1))
+        now, frames, sums = step(self.loop, now, counts, reference, now.step)
+        (states, inputs, followed), sums = on_host((frames, sums))
+        return Chunk(now, states, inputs, sums.split(1), followed=followed)
 
 
 # ---- many formations -----------------------------------------------------------------------------
@@ -120,7 +120,9 @@ class JaxFormations(Stepper):
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; formations follow each other in what is returned."""
         now, frames, sums = _advance_all(self.loop, self.axes, now, counts, reference)
-        states, inputs = (part.reshape(len(part), -1, part.shape[3]) for part in on_host(frames))
+        states, inputs = (
+            part.reshape(len(part), -1, part.shape[3]) for part in on_host(frames[:2])
+        )
         return Chunk(now, states, inputs, on_host(sums))
 
 
@@ -136,7 +138,7 @@ def _begin_all(loop: Loop, axes: PyTree, states: jax.Array) -> Moment:
 @cached_jit
 def _advance_all(
     loop: Loop, axes: PyTree, now: Moment, counts: Array, reference: Array | None
-) -> tuple[Moment, tuple[jax.Array, jax.Array], Sums]:
+) -> tuple[Moment, Frames, Sums]:
     in_axes = (axes, _ALL, None, None, None)
     return eqx.filter_vmap(advance, in_axes=in_axes, out_axes=(_ALL, 1, 0))(
         loop, now, counts, reference, now.step

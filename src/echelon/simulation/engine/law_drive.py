@@ -24,6 +24,7 @@ from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import leader_warnings, prepare_law
 from echelon.laws.safety import Safety
+from echelon.laws.stopping_point import StoppingLeader
 from echelon.laws.together import check_numbers, hulls_at, separations, too_near
 from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.native import is_installed
@@ -141,6 +142,11 @@ class Laws(Drive):
             )
         self.follower.check_late(graph, dt)
 
+    @property
+    def lags(self) -> bool:
+        """Whether followers lag behind offsets that change with time."""
+        return type(self.follower).goal_offset is Law.goal_offset
+
     def check_motion(self, formation: Formation, graph: Graph) -> tuple[str, ...]:
         """Return that a law of states lags behind, and which reshapes lead agents together.
 
@@ -154,7 +160,7 @@ class Laws(Drive):
                 "`safety` keeps agents apart that move relative to the leader, whose own offset "
                 "must be constant; leave out its new offset."
             )
-        if type(self.follower).goal_offset is not Law.goal_offset:
+        if not self.lags:
             return ()
         return (
             f"the law `{type(self.follower).__name__}` uses the position and the velocity of "
@@ -190,6 +196,11 @@ class Laws(Drive):
                 f"things than a leader under {name}, and could not take over; give both the same "
                 "kind of law, with the same `observer`."
             )
+
+    def check_patience(self) -> None:
+        """Check that the leader follows a path by stopping points."""
+        if not isinstance(self.leader, StoppingLeader) or self.leader.reference is None:
+            super().check_patience()
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of leaders and followers by their laws.

@@ -13,6 +13,8 @@ from echelon.simulation.engine.grid import ChunkGrid
 from echelon.simulation.step.drive import Chunk, Problem, numbers
 from echelon.simulation.step.meter import ALWAYS, Meter, Sums, on_host, outside
 
+_BY_FRAME = ("times", "states", "inputs", "reference", "late")
+"""What a stretch has of each frame."""
 _VERBS = {Outcome.INTERRUPTED: "interrupted", Outcome.STOPPED: "ended from outside"}
 
 
@@ -30,6 +32,7 @@ class Stretch(NamedTuple):
         moment: the numbers of the moment at its end.
         stopped: why no further step can be taken, in words; None where one can.
         seconds: of computing, since the run began.
+        late: (T,) how late the plan is that leaders follow, s; None where it does not wait.
     """
 
     first: int
@@ -42,6 +45,7 @@ class Stretch(NamedTuple):
     moment: tuple[Array, ...]
     stopped: str | None
     seconds: float
+    late: Array | None = None
 
     @property
     def finite(self) -> bool:
@@ -50,16 +54,13 @@ class Stretch(NamedTuple):
 
     def rows(self, rows: Array | slice) -> "Stretch":
         """Return some of its frames."""
-        reference = None if self.reference is None else self.reference[rows]
-        states, inputs = self.states[rows], self.inputs[rows]
-        return self._replace(
-            times=self.times[rows], states=states, inputs=inputs, reference=reference
-        )
+        names = [name for name in _BY_FRAME if getattr(self, name) is not None]
+        return self._replace(**{name: getattr(self, name)[rows] for name in names})
 
     def record(self, outcome: Outcome, message: str) -> "Record":
         """Return the stretch as the record of a run with this outcome."""
         frames = self.times, self.states, self.inputs, self.reference
-        return Record(*frames, self.sums, outcome, message, self.seconds)
+        return Record(*frames, self.sums, outcome, message, self.seconds, self.late)
 
 
 class Record(NamedTuple):
@@ -74,6 +75,7 @@ class Record(NamedTuple):
         outcome: how it ended.
         message: the same with time and agent.
         seconds: of computing.
+        late: (T,) how late the plan is that leaders follow, s; None where it does not wait.
     """
 
     times: Array
@@ -84,6 +86,7 @@ class Record(NamedTuple):
     outcome: Outcome
     message: str
     seconds: float
+    late: Array | None = None
 
 
 @final
@@ -141,6 +144,10 @@ class Recorder:
         self._finite &= finite.all(axis=0)
         self.frames += int(frames.sum())
         alone = len(self.problems) == 1
+        late, rows = None, None if reference is None else reference[points - first]
+        if chunk.followed is not None:
+            late, rows = chunk.followed
+            late = late[stored]
         if self.stretches:
             # Only the last one's are read, and those of all stretches would fill the memory.
             self.stretches[-1] = self.stretches[-1]._replace(moment=(), sums=self.sums)
@@ -151,11 +158,12 @@ class Recorder:
                 self.problems[0].settings.dt * points[stored],
                 chunk.states[stored],
                 chunk.inputs[stored],
-                None if reference is None else reference[points - first][stored],
+                None if rows is None else rows[stored],
                 self.sums.of(0) if alone else self.sums,
                 numbers(chunk.now) if alone else (),
                 chunk.stopped,
                 seconds,
+                late,
             )
         )
 
@@ -272,15 +280,11 @@ def join(stretches: Sequence[Stretch]) -> Stretch | None:
     """Return stretches that follow each other as one; None where there is none."""
     if len(stretches) < 2:
         return stretches[0] if stretches else None
-    times, states, inputs = (
-        np.concatenate([getattr(stretch, name) for stretch in stretches])
-        for name in ("times", "states", "inputs")
-    )
-    references = [part.reference for part in stretches if part.reference is not None]
-    reference = np.concatenate(references) if references else None
-    return stretches[-1]._replace(
-        first=stretches[0].first, times=times, states=states, inputs=inputs, reference=reference
-    )
+    rows = dict[str, Array | None]()
+    for name in _BY_FRAME:
+        parts = [getattr(stretch, name) for stretch in stretches]
+        rows[name] = None if any(part is None for part in parts) else np.concatenate(parts)
+    return stretches[-1]._replace(first=stretches[0].first, **rows)
 
 
 def _finite(stretch: Stretch) -> Bool[np.ndarray, "T N"]:

@@ -53,6 +53,8 @@ class Loop(eqx.Module):
         sensors: of the agents' own states; None for exact ones.
         share: of the feed-forward that followers use; None for all of it.
         moving: how the offsets change with time; None for constant ones.
+        patience: the distance of a follower from its place at which the leaders' plan stands still,
+            m; None where it never waits.
     """
 
     model: ControlAffine
@@ -75,6 +77,7 @@ class Loop(eqx.Module):
     sensors: Sensors | None = None
     share: Array | None = None
     moving: FormationMotion | None = None
+    patience: Array | None = None
 
     def with_motion(self, row: PyTree) -> "Loop":
         """Return the loop of one agent whose plant has the parameters of a row; None for no row."""
@@ -225,6 +228,7 @@ class WorldState(NamedTuple):
         starts: (N, n) the initial states, where agents are lost and join again.
         led: what each agent last received of its leader, as `Packets`, in the ideal network with
             heirs.
+        plan: where leaders that wait are on their plan, as `Plan`.
     """
 
     in_flight: PyTree = None
@@ -235,6 +239,7 @@ class WorldState(NamedTuple):
     estimates: PyTree = None
     starts: PyTree = None
     led: PyTree = None
+    plan: PyTree = None
 
 
 class Moment(NamedTuple):
@@ -264,6 +269,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
     followers = np.array([k for k in graph.followers if k not in graph.heirs], int)
     by_depth = follower.feedforward is Feedforward.PARENT
     nearest = np.array(graph.nearest_leader())
+    waits = None if problem.leadership is None else problem.leadership.waits
     return Loop(
         model=problem.model,
         motion=problem.motion,
@@ -286,6 +292,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         channel=problem.channel,
         sensors=problem.sensors,
         moving=problem.formation.motion,
+        patience=None if waits is None else np.asarray(float(waits)),
     )
 
 
@@ -313,3 +320,17 @@ def time_of(loop: Loop, now: Moment) -> jax.Array:
     """Return the time (s) of a moment."""
     # From the step number, since a sum of many dt would gather rounding.
     return now.step.astype(now.states.dtype) * loop.motion.dt
+
+
+def measured(loop: Loop, now: Moment) -> Moment:
+    """Return the moment as the agents measure it: they know nothing of their true states."""
+    if loop.sensors is None:
+        return now
+    states, last = loop.sensors.read(now.world.measured, now.states, now.step)
+    world, estimator = now.world._replace(measured=last), loop.sensors.estimator
+    if estimator is not None:
+        states, estimates = jax.vmap(
+            lambda before, y: estimator.measure(loop.model, before, y, now.step == 0)
+        )(world.estimates, states)
+        world = world._replace(estimates=estimates)
+    return now._replace(states=states, world=world)

@@ -22,6 +22,7 @@ from echelon.simulation.step.loop import (
     all_offsets,
     exchange_at,
     goals_at,
+    measured,
     nearest_at,
     offsets_at,
     present_at,
@@ -39,6 +40,8 @@ from echelon.simulation.step.messages import (
 from echelon.simulation.step.meter import Sums, reference_at
 from echelon.simulation.step.motion import MotionState
 from echelon.simulation.step.nearby import begin_sightings, look_around
+from echelon.simulation.step.patience import followed_at, next_plan, plan_time
+from echelon.simulation.step.plan import Followed, Plan
 
 
 @cached_jit
@@ -76,6 +79,8 @@ def begin(loop: Loop, states: States) -> Moment:
         world = world._replace(led=no_packets(first_readers(loop), content, True))
     if loop.presence is not None and loop.presence.returns:
         world = world._replace(starts=moment.states)
+    if loop.patience is not None:
+        world = world._replace(plan=Plan.begin(moment.states.dtype))
     return moment._replace(world=world)
 
 
@@ -97,7 +102,7 @@ class Control(NamedTuple):
 
 def control(loop: Loop, now: Moment) -> Control:
     """Return what all agents do from a moment on."""
-    now = _measured(loop, now)
+    now = measured(loop, now)
     here = present_at(loop, now.step)
     sent, difference = _sent(loop, now)
     exchange = exchange_at(loop.exchange, loop.switches, now.step)
@@ -136,6 +141,7 @@ def control(loop: Loop, now: Moment) -> Control:
         rows = sent, difference, said.message, said.input
         world = send_messages(loop, exchange, now, mail, knowledge, *rows)
         world = world._replace(seen=seen)
+    world = world._replace(plan=next_plan(loop, now))
     u = jnp.concatenate([led.input, followed.input])[loop.order]
     u = u if here is None else jnp.where(here[:, None], u, 0.0)
     if loop.sensors is not None and loop.sensors.estimator is not None:
@@ -154,20 +160,6 @@ def _chosen(first: Bool[jax.Array, " L"], one: Action, other: Action) -> Action:
         return jnp.where(first.reshape(-1, *[1] * (jnp.ndim(a) - 1)), a, b)
 
     return jax.tree.map(pick, one, other)
-
-
-def _measured(loop: Loop, now: Moment) -> Moment:
-    """Return the moment as the agents measure it: they know nothing of their true states."""
-    if loop.sensors is None:
-        return now
-    states, last = loop.sensors.read(now.world.measured, now.states, now.step)
-    world, estimator = now.world._replace(measured=last), loop.sensors.estimator
-    if estimator is not None:
-        states, estimates = jax.vmap(
-            lambda before, y: estimator.measure(loop.model, before, y, now.step == 0)
-        )(world.estimates, states)
-        world = world._replace(estimates=estimates)
-    return now._replace(states=states, world=world)
 
 
 def _lead(loop: Loop, now: Moment, z: Float[jax.Array, "N s"]) -> Action:
@@ -192,6 +184,7 @@ def _act_all(
     """Return what some agents do, with what they are sent (K, k), remember and know of others."""
     x, t = now.states, time_of(loop, now)
     offsets, rates = offsets_at(loop, law, t, agents)
+    t, pace = plan_time(now, t) if leads else (t, None)
 
     # One time for all; of everything else, an agent sees its own row and no other.
     def one(
@@ -204,7 +197,7 @@ def _act_all(
         near: Near | None,
         rate: State | None,
     ) -> Action:
-        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near, rate)
+        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near, rate, pace)
         return act(loop.with_motion(row), law, view, memory, leads)
 
     rows, near = jax.tree.map(lambda leaf: leaf[agents], (loop.motion.rows, near))
@@ -343,6 +336,8 @@ def measured_step(
     now = _with_arrivals(loop, now)
     acted = control(loop, now)
     followed = reference_at(reference, now.step - first, now.states)
+    if followed is not None and now.world.plan is not None:
+        followed = followed_at(loop, now).reference
     chatter = (acted.cut * now.cut < 0).any(axis=1)
     moment, here = (now.step, now.states, acted.inputs), present_at(loop, now.step)
     meter = loop.meter if here is None else loop.meter.following(nearest_at(loop, now.step))
@@ -357,8 +352,8 @@ def measured_step(
     return _move(loop, now, acted), read
 
 
-Frames: TypeAlias = tuple[Float[jax.Array, "T N n"], Float[jax.Array, "T N m"]]
-"""States and inputs at T times."""
+Frames: TypeAlias = tuple[Float[jax.Array, "T N n"], Float[jax.Array, "T N m"], Followed | None]
+"""States and inputs at T times, and what leaders follow that wait."""
 
 
 @cached_jit
@@ -377,10 +372,11 @@ def advance(
 
     def frame(
         carry: tuple[Moment, Sums], count: jax.Array
-    ) -> tuple[tuple[Moment, Sums], tuple[States, Inputs]]:
+    ) -> tuple[tuple[Moment, Sums], tuple[States, Inputs, Followed | None]]:
         # The first step computes these inputs again, but after the last frame there is none.
         now = _with_arrivals(loop, carry[0])
-        stored = (now.states, control(loop, now).inputs)
+        followed = None if now.world.plan is None else followed_at(loop, now)
+        stored = (now.states, control(loop, now).inputs, followed)
         return jax.lax.fori_loop(0, count, one, carry), stored
 
     (now, sums), stored = jax.lax.scan(frame, (now, loop.meter.zero_sums()), counts)

@@ -194,6 +194,7 @@ class Live {
       this.controls[slider.name] = control;
       this.panel.append(control.element);
     }
+    this.shapes = choices.shape;
     const words = { law: "law", method: "gain method", shape: "shape" };
     const rows = Object.entries(choices).filter(([, names]) => names.length > 1);
     this.panel.append(make("div", { class: "choices" }, ...rows.map(([name, names]) => this.makeChoice(name, words[name], names))));
@@ -210,6 +211,7 @@ class Live {
       button("kick", "push the selected agent, else the first follower (k)", () => this.kick()),
       button("lose agent", "the selected agent is lost, else the last follower", () => this.lose()),
       button("join", "the selected agent joins again, else the one lost last", () => this.join()),
+      ...(this.shapes.length > 1 ? [button("reshape", "agents move to the next shape within 3 s", () => this.reshape())] : []),
       button("reset", "restart with the present controls", () => this.ask("reset")),
       button("save as scenario", "download a scenario file that repeats this session", () => this.save())));
     this.panel.append(make("p", { class: "hint" }, "click a link to cut or restore it, or an agent to select it"));
@@ -263,6 +265,11 @@ class Live {
     const { selected } = this.view, absent = [...Array(this.run.agents).keys()].filter((i) => this.absent(i));
     if (selected >= 0 || absent.length) this.ask("join", selected >= 0 ? selected : absent.at(-1));
     else this.showFault("Nobody is lost who could join; press `lose agent` first.");
+  }
+
+  reshape() {
+    const present = this.state?.chosen.shape ?? "scenario", names = this.shapes;
+    this.ask("reshape", names[(names.indexOf(present) + 1) % names.length]);
   }
 
   kick() {
