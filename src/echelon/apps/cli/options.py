@@ -82,7 +82,7 @@ def _name_key(option: str, words: list[str], command: str) -> None:
     from echelon.experiments.scenario.key_paths import places_of
     from echelon.experiments.scenario.scenario import Scenario
 
-    places = places_of(option.lstrip("-").replace("-", "_"), Scenario)
+    places = places_of((option.lstrip("-").replace("-", "_"),), Scenario)
     if not places:
         return
     text = " ".join(words).partition(option)[2]
