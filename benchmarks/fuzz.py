@@ -118,6 +118,88 @@ BASES: list[dict[str, Any]] = [
         "simulation": {"horizon": 0.2, "dt": 0.02},
     },
 ]
+CHANGING: list[dict[str, Any]] = [
+    {
+        "name": "dance",
+        "model": {"name": "double-integrator", "parameters": {"dimension": 3}},
+        "graph": {"edges": [[0, 1], [1, 2], [0, 3]], "leaders": [0]},
+        "formation": {
+            "name": "wedge",
+            "spacing": 1.5,
+            "motion": [
+                {"rotate": 0.4},
+                {"scale": 0.2, "rate": 0.5},
+                {
+                    "reshape": {"name": "line", "spacing": 1.5},
+                    "at": 0.04,
+                    "over": 0.1,
+                    "assign": "nearest",
+                },
+            ],
+        },
+        "reference": {"name": "circle", "radius": 1.0, "rate": 0.5},
+        "leader": {"law": "stopping-point"},
+        "follower": {"law": "stopping-point", "speed": 1.0},
+        "safety": {
+            "radii": [0.1, 0.1, 0.3],
+            "gain": 3.0,
+            "swirl": 0.4,
+            "margin": 0.03,
+            "reach": 6.0,
+        },
+        "simulation": {"horizon": 0.2, "dt": 0.02},
+    },
+    {
+        "name": "places",
+        "model": {"name": "double-integrator"},
+        "graph": {"name": "path", "agents": 4},
+        "formation": {
+            "name": "circle",
+            "spacing": 1.0,
+            "assign": "nearest",
+            "motion": [
+                {"reshape": {"offsets": {1: [1, 0], 2: [2, 0], 3: [3, 0]}}, "at": 0.1, "over": 0.2},
+                {"reshape": {"name": "grid", "columns": 2}, "at": 0.4, "over": 0.5},
+            ],
+        },
+        "follower": {"gain": {"method": "riccati"}},
+        "initial": {"states": {1: [0.5, 0, 0, 0], 2: [1, 1, 0, 0], 3: [0, 1, 0, 0.1]}},
+        "simulation": {"horizon": 0.6, "dt": 0.02},
+    },
+    {
+        "name": "losses",
+        "model": {"name": "double-integrator", "parameters": {"dimension": 2}},
+        "graph": {"edges": [[0, 1], [1, 2], [2, 3], [0, 3]], "leaders": [0]},
+        "formation": {"offsets": {1: [1.0, 0.0], 2: [2.0, 0.0], 3: [1.0, 1.0]}},
+        "reference": {"name": "circle", "radius": 1.0, "rate": 0.5},
+        "leader": {"law": "stopping-point"},
+        "follower": {"law": "stopping-point", "rate": 3.0},
+        "events": [
+            {"at": 0.06, "lose": 0},
+            {"at": 0.1, "cut": [2, 3], "for": 0.04},
+            {"at": 0.12, "lose": 3},
+            {"at": 0.16, "join": 3},
+        ],
+        "leadership": {"heirs": [1, 2], "timeout": 0.06},
+        "network": {"rate": 50.0, "delay": 0.02, "loss": 0.1},
+        "initial": {"spread": {"position": 0.5}},
+        "simulation": {"horizon": 0.2, "dt": 0.02},
+    },
+    {
+        "name": "crazyflies",
+        "model": {"name": "quadrotor", "parameters": "crazyflie"},
+        "graph": {"edges": [[0, 1], [0, 2], [1, 2]], "leaders": [0]},
+        "formation": {"name": "triangle", "motion": [{"rotate": 0.3}]},
+        "reference": {"name": "circle", "radius": 1.0, "rate": 0.5},
+        "leader": {"law": "stopping-point"},
+        "follower": {"law": "stopping-point"},
+        "safety": {"gain": 2.0, "reach": 8.0},
+        "events": [{"at": 0.1, "cut": [1, 2]}, {"at": 0.12, "lose": 2}],
+        "simulation": {"horizon": 0.2, "dt": 0.02},
+    },
+]
+"""With collision avoidance, formations that change, and events."""
+BASES += CHANGING
 
 ODD: list[Any] = [
     None,
@@ -161,6 +243,10 @@ SIZED += ["simulation.store_every", "disturbance.hold", "report.steady_window", 
 SIZED += ["formation.spacing", "reference.rate", "follower.gain.coupling", "graph.edges.1.2"]
 SIZED += ["network.delay", "network.jitter", "network.forget", "network.rate", "sensing.delay"]
 SIZED += ["actuator.lag", "safety.reach", "follower.rate", "follower.coupling", "graph.period"]
+SIZED += ["safety.gain", "safety.margin", "safety.swirl", "events.0.at"]
+SIZED += ["formation.motion.0.rotate"]
+SIZED += ["formation.motion.1.rate", "formation.motion.2.at", "formation.motion.2.over"]
+SIZED += ["events.0.lose", "events.1.for", "leadership.timeout", "leadership.heirs.0"]
 NUMBERS = [0, 1, 2, 3, 0.1, 1e-8, 1e-300, 1e16, 1e155, 1.7e308]
 MARKS = [b"{", b"]", b": ", b"\n", b"&a ", b"*a", b"\xff", b"- ", b"!!x "]
 WORDS = ["dt", "horizon", "gain", "name", "python", "file", "set", "0", "x", "position", "é", "*"]
@@ -259,10 +345,10 @@ def _rows(value: Any) -> list[Any]:
     return value if isinstance(value, list) else []
 
 
-def scenario(rng: random.Random) -> Any:
+def scenario(rng: random.Random, bases: Sequence[Any] = BASES) -> Any:
     """Return a scenario with up to three things spoiled, as plain data."""
     while True:
-        data = rng.choice(BASES)
+        data = rng.choice(bases)
         for _ in range(rng.choice([0, 1, 1, 1, 2, 3])):
             data = spoil(rng, data) if places(data) else data
         if harmless(data):
@@ -339,6 +425,7 @@ def options(rng: random.Random, verb: str) -> list[str]:
         "check": [["--json"]],
         "design": [["--json"], ["--method", "riccati"], ["--method", "x"], ["--out", "no/g.json"]],
         "verify": [["--json"]],
+        "export": [["--out", "e"], ["--out", "s.yaml"], ["--force"], ["--set", "seed=4"]],
     }.get(verb, [])
     found = [option for option in some if rng.random() < 0.4]
     if rng.random() < 0.1:
@@ -346,9 +433,11 @@ def options(rng: random.Random, verb: str) -> list[str]:
     return [word for option in found for word in option]
 
 
-def flown(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
+def flown(
+    rng: random.Random, gain: bytes, run: dict[str, bytes], bases: Sequence[Any] = BASES
+) -> Case:
     """Draw a scenario file under a verb."""
-    data = scenario(rng)
+    data = scenario(rng, bases)
     text = as_yaml(data)
     if rng.random() < 0.2:
         text = torn(rng, text)
@@ -358,12 +447,39 @@ def flown(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
     return Case([verb, "s.yaml", *quick, *options(rng, verb)], {"s.yaml": text})
 
 
-def overridden(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
+def overridden(
+    rng: random.Random, gain: bytes, run: dict[str, bytes], bases: Sequence[Any] = BASES
+) -> Case:
     """Draw a sound scenario under `--set`."""
-    data = rng.choice(BASES)
+    data = rng.choice(bases)
     sets = [["--set", setting(rng, data)] for _ in range(rng.randint(1, 3))]
     words = [word for pair in sets for word in pair]
     return Case(["check", "s.yaml", *words], {"s.yaml": as_yaml(data)})
+
+
+def changing(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
+    """Draw a scenario file that changes while it runs, or a sound one under `--set`."""
+    return rng.choice([flown, overridden])(rng, gain, run, CHANGING)
+
+
+def exported(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
+    """Draw a scenario whose laws are written for other programs, or a run that is."""
+    sound = [data for data in BASES if data["follower"].get("law") == "stopping-point"]
+    data = scenario(rng, sound)
+    files = {"s.yaml": as_yaml(data), "g.json": gain}
+    if rng.random() < 0.2:
+        files |= {f"out/{name}": text for name, text in run.items()}
+        form = rng.choice(["csv", "npz", "mat", "nc", "json", "html", "law", "x", ""])
+        words = ["export", rng.choice(["out", "out/run.nc", "s.yaml", "no"]), "--to", form]
+        return Case([*words, *options(rng, "export")], files)
+    agent = str(rng.choice([0, 1, 2, 3, -1, 4, 10**23, "x"]))
+    if rng.random() < 0.4:
+        return Case(["export", "s.yaml", "--agent", agent, *options(rng, "export")], files)
+    # Without `--out` a flight begins, in a process in place of this one, where nothing is wrong.
+    out = ["--out", rng.choice(["f", "f", "f", "s.yaml", "."])]
+    more = [["--agent", agent, "--key", "g.json"], ["--ground", "--key", "no"], ["--link", "x"]]
+    more += [["--agent", agent], [], ["--ground", "--all"]]
+    return Case(["fly", "s.yaml", *(out if rng.random() < 0.8 else rng.choice(more))], files)
 
 
 def gained(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
@@ -396,7 +512,8 @@ def reopened(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
 
 def typed(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
     """Draw a command line of words."""
-    verbs = ["run", "check", "design", "compare", "verify", "list", "schema", "fly", "", "--help"]
+    verbs = ["run", "check", "design", "compare", "verify", "list", "schema", "fly", "export"]
+    verbs += ["", "--help"]
     verb = rng.choice(verbs)
     names = ["s.yaml", "nowhere.yaml", ".", "", "g.json", "pape", "é", "\udcff", "-", "--", "/"]
     words = [rng.choice(names) for _ in range(rng.randint(0, 2))]
@@ -426,6 +543,8 @@ KINDS: dict[str, Callable[..., Case]] = {
     "folders of runs": reopened,
     "command lines": typed,
     "sizes": sized,
+    "changes": changing,
+    "laws": exported,
 }
 
 

@@ -30,3 +30,15 @@ def test_a_disturbance_that_outlasts_every_run_is_one_draw():
     winds = [ech.Disturbance(rms={"x": 1.0}, hold=hold) for hold in (1.0, 1e308)]
     short, long = (run(horizon=0.5, disturbance=wind) for wind in winds)
     assert np.array_equal(short.states, long.states)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda: ech.simulate(3, ech.Settings(1.0, 0.1)),
+        lambda: ech.Agent(3, 0),
+    ],
+)
+def test_what_are_no_parts_is_refused_by_its_kind(use):
+    with pytest.raises(SimulationError, match="^`parts` is a `int`, and must be a `Parts`.$"):
+        use()

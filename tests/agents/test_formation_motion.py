@@ -170,3 +170,18 @@ def test_what_cannot_move_is_refused(model, changes, message):
 
 def test_a_sixth_power_has_five_derivatives():
     assert WEDGE.moving(MODEL, GRAPH, [Kinked(6)]).motion is not None
+
+
+@pytest.mark.parametrize("size", [1e-250, 1.0, 1e250])
+def test_places_of_any_size_are_assigned_and_their_meetings_are_known(size):
+    before = size * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 3.0]])
+    after = size * np.array([[0.0, 0.0], [0.0, 3.5], [1.0, 0.5]])
+    assert nearest_places((0,), before, after).tolist() == [0, 2, 1]
+    model, graph = DoubleIntegrator(2), Graph.star(3)
+    to = np.zeros((3, 4))
+    to[:, :2] = after
+    formation = Formation(np.pad(before, ((0, 0), (0, 2))))
+    moving = formation.moving(model, graph, [Reshape(to, 1.0, 2.0)])
+    [(begin, i, j, apart)] = moving.motion.meetings()
+    # Agents 1 and 2 cross: (1 - s, 3.5 s) and (s, 3 - 2.5 s) are nearest at s = 1/2.
+    assert (begin, i, j) == (1.0, 1, 2) and apart == pytest.approx(0.0, abs=1e-12 * size)

@@ -240,7 +240,7 @@ FALSE = {
     ),
     "limits that do not say what is delivered": (
         limits(matrix=((1.0,), (2.0,)), low=(-1.0, -1.0), high=(1.0, 1.0)),
-        "`input_limits` of `Tank` has 2 rows for 1 inputs, which does not define the input that "
+        "`input_limits` of `Tank` has 2 rows for 1 input, which does not define the input that "
         "is delivered beyond the limits; add the method `limit`.",
     ),
     "limits that nothing keeps to": (

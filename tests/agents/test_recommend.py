@@ -152,8 +152,8 @@ def test_what_does_not_shorten_is_not_recommended():
 
 def test_more_than_there_is_cannot_be_had():
     graph = ech.Graph.complete(4)
-    with pytest.raises(ech.EchelonError, match="from 0 to 2 of the 3 followers"):
+    with pytest.raises(ech.EchelonError, match="from 0 to 2, so that a follower remains"):
         ech.network.recommend_leaders(graph, 3)
-    with pytest.raises(ech.EchelonError, match="from 0 to 0 pairs are not linked yet"):
+    with pytest.raises(ech.EchelonError, match="from 0 to 0, the pairs that are not linked yet"):
         ech.network.recommend_edges(graph)
     assert ech.network.recommend_leaders(graph, 0) == () == ech.network.recommend_edges(graph, 0)

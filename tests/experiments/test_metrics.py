@@ -199,6 +199,16 @@ def test_the_closest_pair_is_who_was_closest_and_when(agents):
     assert told["vehicle_radius"] == pytest.approx(0.07)
 
 
+def test_agents_whose_only_state_is_a_place_have_a_closest_pair():
+    model = ech.models.SingleIntegrator(dimension=1)
+    states = np.array([[[0.0], [3.0], [5.0]], [[0.0], [3.0], [3.5]]])
+    found = made_up(states, model, ech.Graph.path(3)).approaches()
+    assert [(pair.agents, pair.distance, pair.time) for pair in found] == [
+        ((1, 2), 2.0, 0.0),
+        ((1, 2), 0.5, 1.0),
+    ]
+
+
 def test_agents_in_one_place_and_frames_without_numbers_have_a_closest_pair_too():
     model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(12)
     states = np.zeros((3, 12, 2))

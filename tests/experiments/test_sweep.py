@@ -199,16 +199,19 @@ class Bends(ech.laws.Law):
         return -self.gain * heard, memory
 
 
-def test_runs_without_native_code_are_stepped_side_by_side_and_say_why(monkeypatch):
+WIND = ech.World(disturbance=ech.Disturbance(rms={"position": 0.3}, hold=0.05))
+
+
+@pytest.mark.parametrize(("gains", "world"), [((1.0, 0.5), WIND), ((1.0,), ech.World())])
+def test_runs_without_native_code_are_stepped_side_by_side_and_say_why(monkeypatch, gains, world):
     for room in (law_drive, batch):
         monkeypatch.setattr(room, "is_long", lambda *_: True)
     model, graph = ech.models.SingleIntegrator(dimension=2), ech.Graph.path(3)
-    wind = ech.World(disturbance=ech.Disturbance(rms={"position": 0.3}, hold=0.05))
     chosen, runs = ech.Settings(horizon=0.5, dt=0.01, store_every=10), []
-    for gain in (1.0, 0.5):
+    for gain in gains:
         drive = ech.Laws(ech.laws.TrimInput(), Bends(gain))
         formation = ech.Formation.line(model, graph)
-        parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0}, world=wind)
+        parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0}, world=world)
         runs += [(parts, chosen._replace(seed=k)) for k in (3, 4)]
     alone = [ech.simulate(*run) for run in runs]
     monkeypatch.setattr(batch, "simulate", None)

@@ -162,8 +162,8 @@ def test_a_drift_that_expands_its_metric_is_refused_at_the_corners(files, said):
     # Nor is it promised to contract, even where it does.
     told = edited(files["plain"], "certificate.region.theorem", "A5")
     told = edited(told, "certificate.region.kind", "vertices")
-    assert "rate at 1 vertices, 1/s" in said(edited(told, "certificate.region.rate", 0.5))
-    assert "rate at 1 vertices, 1/s" not in said(edited(told, "certificate.region.rate", 0.0))
+    assert "rate at 1 vertex, 1/s" in said(edited(told, "certificate.region.rate", 0.5))
+    assert "rate at 1 vertex, 1/s" not in said(edited(told, "certificate.region.rate", 0.0))
 
 
 def test_the_set_of_a_drift_shrinks_where_inputs_act_unlike(said, tmp_path):
@@ -307,9 +307,9 @@ def test_a_rate_that_rounding_leaves_open_is_refused(files, said):
         "error": [[0, 0], [0, 0]],
     }
     STUDY.abscissa_put_right(told)
-    assert {"rate at 1 vertices, 1/s", "rate at 260 states, 1/s"} <= set(said(told))
+    assert {"rate at 1 vertex, 1/s", "rate at 260 states, 1/s"} <= set(said(told))
     told["certificate"]["region"] |= {"theorem": "A5", "rate": 0.0, "strength": 0.0}
-    assert {"rate at 1 vertices, 1/s", "rate at 260 states, 1/s"} <= set(said(told))
+    assert {"rate at 1 vertex, 1/s", "rate at 260 states, 1/s"} <= set(said(told))
 
 
 def test_the_sign_of_a_mode_that_rounding_leaves_open_is_refused(said, tmp_path):

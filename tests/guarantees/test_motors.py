@@ -11,7 +11,7 @@ import pytest
 import scipy.linalg
 
 import echelon as ech
-from echelon.core.enclosure.over_time import enclose_derivatives
+from echelon.core.enclosure.taylor import enclose_derivatives
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis

@@ -164,3 +164,9 @@ def test_a_moving_run_is_not_accepted_under_the_promise_of_constant_offsets():
     assert "refused" in verdicts
     own = json.loads(json.dumps(check(*moving).as_mapping()))
     assert {x.verdict for x in compare_claims(own, moving, "moves")} == {"recomputed"}
+
+
+def test_rates_beyond_all_numbers_are_refused_in_words():
+    formation = parts([Rotate(1e200)]).formation
+    with pytest.raises(ech.EchelonError, match="may be beyond 1e\\+300.$"):
+        offset_sizes(formation.motion)

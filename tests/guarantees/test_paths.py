@@ -9,7 +9,7 @@ import pytest
 
 import echelon as ech
 from echelon.agents.models.chains import chains_of
-from echelon.core.enclosure.over_time import enclose_derivatives
+from echelon.core.enclosure.taylor import enclose_derivatives
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
 from echelon.guarantees.promises.promise import promise

@@ -310,3 +310,9 @@ def test_what_cannot_be_kept_apart_is_refused_with_one_sentence(change, sentence
     with pytest.raises(EchelonError, match=sentence) as refusal:
         ech.simulate(change(), settings)
     assert str(refusal.value).count(". ") == 0
+
+
+def test_a_reach_for_any_speed_is_known_without_a_warning():
+    safety = ech.Safety(radii=(0.1,) * 3)
+    speeds = np.array([3e155, 4e155])
+    assert safety.needed_reach(speeds, np.ones(2)) == pytest.approx(2.5e155)

@@ -296,8 +296,6 @@ def test_a_table_that_does_not_fit_is_refused_with_its_size(run, monkeypatch):
 @pytest.mark.parametrize("kind", exporting._WRITERS)
 def test_a_run_is_exported_by_the_ending_of_its_file(run, tmp_path, kind):
     file = tmp_path / f"run.{kind}"
-    if kind == "parquet":
-        pytest.importorskip("pyarrow")
     assert ech.export(run[0], file) == file
     with pytest.raises(ech.errors.OutputError, match="exists; choose another"):
         ech.export(run[0], file)

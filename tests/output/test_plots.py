@@ -432,7 +432,7 @@ law = ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.Riccati()))
 drive = ech.Laws(ech.laws.TrimInput(), law)
 parts = ech.Parts(model, graph, ech.Formation.line(model, graph), drive)
 result = ech.simulate(parts, ech.Settings(horizon=0.1, dt=0.05))
-assert len(ech.save_figures(result, Path({str(tmp_path)!r}))) == 10
+assert len(ech.save_figures(result, Path({str(tmp_path)!r}))) == 8
 assert "matplotlib.pyplot" not in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)

@@ -36,6 +36,15 @@ def test_an_agent_that_leaves_its_chart_is_named_with_the_time(start, first, sto
     assert ech.summary(run)["outcome"] == {"name": "left_chart", "message": run.message}
 
 
+def test_a_run_whose_agents_all_leave_their_chart_has_left_it():
+    model, graph, rest = ech.models.Quadrotor(), ech.Graph.path(2), ech.laws.TrimInput()
+    still = ech.Formation(np.zeros((2, 12)))
+    states = np.zeros((2, 12))
+    states[:, 7] = 1.94
+    parts = ech.Parts(model, graph, still, ech.Laws(rest, rest), initial=states)
+    assert ech.simulate(parts, ech.Settings(0.05, 0.01)).outcome is Outcome.LEFT_CHART
+
+
 def test_inside_of_its_chart_a_run_completes():
     assert spinning((0.5, 0.1)).outcome is Outcome.COMPLETED
 

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
+from echelon.agents.models.model import wrap_angles
 from echelon.simulation import codegen as kernels
 from echelon.simulation.codegen import block_copy
 from echelon.simulation.engine.batch import Batch
@@ -499,6 +500,33 @@ def test_a_difference_with_sines_has_native_code_and_large_angles_are_left_to_ja
     check_alike(parts, run_settings(), (5, 40, 0))
     _, stepper = stepped(parts, run_settings(), (5, 40, 0), "native")
     assert bool(stepper.warnings) == left
+
+
+class Compass(ech.ControlAffine):
+    """An angle with the shorter difference."""
+
+    state_names, input_names = ("angle",), ("rate",)
+
+    def drift(self, x):
+        return 0.0 * x
+
+    def input_map(self, x):
+        return jnp.ones((1, 1), x.dtype)
+
+    def difference(self, x, y):
+        return wrap_angles(x - y, 0)
+
+
+@pytest.mark.parametrize("size", [0.01, 3.0])
+def test_differences_of_angles_are_the_shorter_ones_wherever_neighbours_stand(size):
+    # In a ring in any order agents are read as whole vectors, by plain differences if they can be.
+    order = np.random.default_rng(1).permutation(120)
+    model, graph = Compass(), ech.Graph(np.stack([order, np.roll(order, 1)], axis=1))
+    gain = ech.synthesize(model, graph, ech.gains.FixedGain([[1.0]], coupling=0.3))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    start = size * np.random.default_rng(0).normal(size=(120, 1))
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((120, 1))), drive, initial=start)
+    check_alike(parts, run_settings(), (5, 40, 0))
 
 
 @pytest.mark.parametrize("store_every", [1, 7, 1000])

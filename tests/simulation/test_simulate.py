@@ -21,6 +21,7 @@ from oracles import (
 from runs import simulate
 from scipy.integrate import solve_ivp
 
+import echelon as ech
 from echelon.agents.models import (
     ControlAffine,
     DoubleIntegrator,
@@ -39,6 +40,7 @@ from echelon.core.errors import Outcome
 from echelon.experiments.results.metrics import metrics
 from echelon.laws import Agreement, Consensus, Tracking, TrimInput
 from echelon.simulation.engine import jax_stepper
+from echelon.simulation.step.drive import Stopped
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains import FixedGain, Riccati
 from echelon.synthesis.gains.gain import synthesize
@@ -669,6 +671,19 @@ def test_an_interrupt_keeps_what_was_computed():
     assert run.reference.shape == (len(run.times), 4) and len(run.inputs) == len(run.times)
     last = run.times[-1]
     assert run.message == f"The run was interrupted at t = {last:.6g} s; what was computed is kept."
+
+
+def test_who_keeps_a_run_may_end_it_with_a_reason():
+    def refuse(stretch):
+        raise Stopped("its folder is full,")
+
+    laws, still = ech.Laws(TrimInput(), Agreement()), Formation(np.zeros((2, 2)))
+    parts = ech.Parts(SingleIntegrator(), Graph.path(2), still, laws, initial={"position": 1.0})
+    run = ech.simulate(parts, Settings(horizon=1.0, dt=0.1), keep=refuse)
+    assert run.message == (
+        "The run was stopped, since its folder is full, at t = 1 s; what was computed is kept."
+    )
+    assert run.outcome is Outcome.INTERRUPTED and len(run.times) == 11
 
 
 def test_an_interrupt_before_the_first_frame_leaves_an_empty_run(monkeypatch):

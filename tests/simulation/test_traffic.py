@@ -81,6 +81,15 @@ def test_a_network_without_losses_has_the_ages_of_its_rate_and_delay():
     assert found.sent == sum(len(range(0, STEPS - k, 4)) for k in first)
 
 
+def test_messages_in_use_are_those_of_neighbours_nearer_to_the_leader():
+    network = ech.Network(rate=50.0, delay=0.02, jitter=0.06, hears="leaderward", seed=1)
+    _, found = followed(network)
+    # Of the edges 0-1, 1-2 and 1-3, outward; 2 and 3 are as far away as each other.
+    used, every = found.ages[:-1, [0, 1, 3], 1], found.ages[:-1]
+    assert found.mean == pytest.approx(np.nanmean(used), rel=1e-12)
+    assert abs(found.mean - np.nanmean(every)) > 1e-5
+
+
 def test_every_message_is_lost_or_arrives_or_is_late_or_under_way():
     network = ech.Network(rate=25.0, delay=0.02, jitter=0.2, loss=0.3, forget=9.0)
     _, found = followed(network, directed=True)

@@ -119,7 +119,7 @@ class Safety:
 
     def needed_reach(self, speeds: Float[Array, " d"], scales: Float[Array, " d"]) -> float:
         """Return the distance beyond which no row can act, for agents of some speeds, m/s."""
-        return self.distance + 2.0 * float(np.linalg.norm(scales * speeds)) / self.gain
+        return self.distance + 2.0 * math.hypot(*(scales * speeds).tolist()) / self.gain
 
     def filtered(
         self,

@@ -20,9 +20,10 @@ _COMMON_NAMES = {
     "simulation.horizon": "duration time end t_end final_time",
     "simulation.dt": "step timestep time_step",
     "initial": "start starts initial_states x0",
-    "graph": "topology edges links",
+    "graph": "topology",
+    "graph.edges": "links",
     "graph.agents": "agents",
-    "formation": "shape spacing",
+    "formation.name": "shape",
     "reference": "path trajectory waypoints",
     "follower.law": "controller control law",
     "follower.gain": "gains gain_method",
@@ -55,24 +56,27 @@ def key_paths(section: type[BaseModel], before: str = "") -> Iterator[tuple[str,
             yield from key_paths(inner, f"{before}{key}.")
 
 
-def places_of(key: object, scenario: type[BaseModel]) -> list[str]:
-    """Return the paths of the keys that a name may mean, the likeliest first."""
+def places_of(wrong: tuple[str | int, ...], scenario: type[BaseModel]) -> list[str]:
+    """Return the paths of the keys that an unknown one may mean, the likeliest first."""
+    key, section = wrong[-1], [str(part) for part in wrong[:-1] if isinstance(part, str)]
+    around = {".".join(section[: k + 1]) for k in range(len(section))}
     paths = [path for path, _, _ in key_paths(scenario)]
     common = [path for path, names in _COMMON_NAMES.items() if str(key) in names.split()]
     same = [path for path in paths if key in (path, path.rpartition(".")[2])]
-    return list(dict.fromkeys([*common, *sorted(same, key=lambda path: path.count("."))]))
+    places = dict.fromkeys([*common, *sorted(same, key=lambda path: path.count("."))])
+    return [path for path in places if path not in around]
 
 
-def meant(key: object, allowed: list[str], scenario: type[BaseModel]) -> str:
+def meant(wrong: tuple[str | int, ...], allowed: list[str], scenario: type[BaseModel]) -> str:
     """Return ` (did you mean ...?)` with what an unknown key may mean; empty if nothing is close.
 
     Args:
-        key: that its section does not have.
+        wrong: the path of the key that its section does not have.
         allowed: the keys that the section has.
         scenario: the class of the whole file.
     """
-    places = places_of(key, scenario)
+    places = places_of(wrong, scenario)
     if not places:
-        return did_you_mean(key, allowed)
+        return did_you_mean(wrong[-1], allowed)
     first, *others = (f"`{path}`" for path in places[:3])
     return f" (did you mean {' or '.join([', '.join([first, *others[:-1]]), *others[-1:]])}?)"

@@ -151,10 +151,8 @@ def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
         return path, "got nothing, this key is required."
     if kind in ("extra_forbidden", "invalid_key"):
         keys = _keys(path[:-1])
-        return (
-            path,
-            f"got an unknown key, allowed {is_or_are(keys)}{meant(path[-1], keys, Scenario)}.",
-        )
+        hint = meant(path, keys, Scenario)
+        return path, f"got an unknown key, allowed {is_or_are(keys)}{hint}."
     got = context.get("got", error["input"])
     allowed = _ALLOWED[kind].format(**context) if kind in _ALLOWED else error["msg"]
     close = did_you_mean(got, context.get("names", "").split()) or _like_key(path)

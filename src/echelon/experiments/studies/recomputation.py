@@ -140,7 +140,7 @@ def _led_by(parts: Parts, gain: Gain) -> Parts:
     assert isinstance(drive, Laws)
     leader = drive.leader
     leader = eqx.tree_at(lambda law: law.gain, leader, gain, is_leaf=lambda part: part is None)
-    return parts.replace(drive=Laws(leader, drive.follower))
+    return parts.replace(drive=Laws(leader, drive.follower).prepare(parts.model, parts.graph))
 
 
 def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:

@@ -13,7 +13,7 @@ from echelon.agents.network.graph import Graph
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 from echelon.guarantees.messages.late_agreement import LateRate, late_rates, longest_ways
-from echelon.guarantees.messages.message_ages import MessageAges, ages_of
+from echelon.guarantees.messages.message_ages import AgeLimits, ages_of
 
 _ONE_WAY = (
     "With one-way edges, or `follower.hears: leaderward`, messages of any age would cost a delay "
@@ -75,7 +75,7 @@ class LateMessages(NamedTuple):
         leaderward: whether neighbours with fewer hops alone are heard.
     """
 
-    ages: MessageAges
+    ages: AgeLimits
     rate: float
     ways: Array | None
     weights: Array

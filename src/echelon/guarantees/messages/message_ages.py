@@ -18,7 +18,7 @@ _GRID = 2.0**-23
 """Of the draws, which are floats of 24 bits: so much more is lost at most."""
 
 
-class MessageAges(NamedTuple):
+class AgeLimits(NamedTuple):
     """Ages in control steps, of messages while they are in use; an input is held for one more.
 
     Attributes:
@@ -59,7 +59,7 @@ class MessageAges(NamedTuple):
         return self.arrived is not None and self.arrived <= self.hop_life
 
 
-def ages_of(channel: Channel, dt: float, steps: int, links: int, hops: int) -> MessageAges:
+def ages_of(channel: Channel, dt: float, steps: int, links: int, hops: int) -> AgeLimits:
     """Return the ages on a number of links in a run of so many steps (dt in s)."""
     every, delay, jitter = (int(x) for x in (channel.every, channel.delay, channel.jitter))
     lost = losses_in_a_row(channel, links, -(-steps // every))
@@ -71,7 +71,7 @@ def ages_of(channel: Channel, dt: float, steps: int, links: int, hops: int) -> M
     ends = channel.loss < 1.0 and step[1, 1] < 1.0
     again = float((starts[0] @ np.linalg.inv(rest)).sum()) if ends else steps / every
     mean = dt * (delay + 0.5 * jitter + 0.5 * (every - 1) + every * again)
-    return MessageAges(lost, arrived, int(channel.forget) + 1, hops, dt, mean)
+    return AgeLimits(lost, arrived, int(channel.forget) + 1, hops, dt, mean)
 
 
 def losses_in_a_row(channel: Channel, links: int, messages: int) -> int | None:

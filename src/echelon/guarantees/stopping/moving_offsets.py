@@ -28,6 +28,8 @@ from echelon.guarantees.stopping.chain_response import largest_between
 
 Sizes: TypeAlias = tuple[tuple[Fraction, ...], ...]
 """[order][coordinate]; under a rotation, of the first two together."""
+_LARGEST = Fraction(10**300)
+"""Of a size: products with it are to be floats."""
 _ROUNDED = Fraction(1) + Fraction(1, 10**12)
 
 
@@ -52,6 +54,8 @@ def offset_sizes(motion: FormationMotion) -> Sizes:
         sizes[-1] = sizes[-1] or [Fraction(0)] * len(lengths)
     for change in motion.motions:
         sizes = _after(change, sizes)
+    if max(map(max, sizes)) > _LARGEST:
+        raise GainError(f"derivatives of the offsets may be beyond {float(_LARGEST):g}.")
     return tuple(map(tuple, sizes))
 
 

@@ -12,7 +12,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import COORDINATES, Reference
 from echelon.core.enclosure.interval import Interval, point
-from echelon.core.enclosure.over_time import enclose_finely
+from echelon.core.enclosure.taylor import enclose_finely
 from echelon.core.memoize import memoize
 from echelon.core.rational import float_below, root_bounds
 from echelon.laws.stopping_point import StoppingLeader

@@ -82,12 +82,9 @@ class StoppingRun(NamedTuple):
     @property
     def rate(self) -> float:
         """The slowest mode of the formation, 1/s, as a positive number."""
-        modes = [self.agreement]
-        if max(self.law.ready.chains.degrees) > 1:
-            modes.append(self.law.slowest_root)
-        if self.apart:
-            modes.append(float(self.leader.strength(self.settings.dt)))
-        return min(modes)
+        root = [self.law.slowest_root] if max(self.law.ready.chains.degrees) > 1 else []
+        leaders = [float(self.leader.strength(self.settings.dt))] if self.apart else []
+        return min(self.agreement, *root, *leaders)
 
     @property
     def network(self) -> LateMessages | None:
@@ -376,9 +373,11 @@ def _strengths(run: StoppingRun) -> Array:
     """Return eigenvalues of the followers' Laplacian that stand for all, (K,)."""
     graph, reach = run.parts.graph, run.law.reach
     assert reach is not None
-    # Over a network what is heard is late, and an agent answers to its own deviation.
-    alone = np.array([]) if run.network is None else run.network.sums
-    if run.network is not None and run.network.ways is not None:
+    network = (
+        run.network
+    )  # what is heard over it is late, and an agent answers to its own deviation
+    alone = np.array([]) if network is None else network.sums
+    if network is not None and network.ways is not None:
         return alone
     if run.law.leaderward or graph.directed or graph.schedule is not None:
         return np.append(alone, agreement_modes(graph, run.law))

@@ -54,8 +54,8 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
     """
     if parts.formation.motion is not None:
         raise SimulationError(
-            "got a formation that changes, but derivatives are of constant ones; leave out `motion` "
-            "to tune, and give it to the runs afterwards."
+            "got a formation that changes, but derivatives are of constant ones; leave out "
+            "`motion` to tune, and give it to the runs afterwards."
         )
     if parts.world.network is not None:
         raise SimulationError("got a network, but derivatives are of messages that are never late.")

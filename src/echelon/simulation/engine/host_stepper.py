@@ -126,7 +126,6 @@ class HostStepper(Stepper):
             self._query_pilot(chunk)
             # Up to the next frame or the next plan, whichever is first.
             self._take(chunk, min(end, (chunk.step // self.hold + 1) * self.hold) - chunk.step)
-            # Solvers fail on states that are not finite, which must not count as their failures.
             if not np.isfinite(np.asarray(chunk.now.states)).all():
                 return
 
@@ -136,7 +135,11 @@ class HostStepper(Stepper):
             return
         # Solvers work in float64, and so are the states that they start from.
         states = chunk.now.states
-        desired = jnp.asarray(self.pilot(chunk.step, np.asarray(states, np.float64)))
+        start = np.asarray(states, np.float64)
+        if not np.isfinite(start).all():
+            # Solvers fail on such states, which must not count as their failures.
+            return
+        desired = jnp.asarray(self.pilot(chunk.step, start))
         desired = desired.astype(states.dtype)
         self._queried = chunk.step
         chunk.now = chunk.now._replace(

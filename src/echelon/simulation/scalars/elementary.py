@@ -7,7 +7,7 @@ approximates it. Tests measure the error of each, in units in the last place.
 import math
 from fractions import Fraction
 
-from echelon.simulation.scalars.polynomials import (
+from echelon.simulation.scalars.approximations import (
     EPS,
     LN2,
     PI,

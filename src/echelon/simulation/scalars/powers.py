@@ -2,6 +2,7 @@
 
 import math
 
+from echelon.simulation.scalars.approximations import LN2, TINY, parts_of
 from echelon.simulation.scalars.elementary import (
     choose,
     exp,
@@ -12,7 +13,6 @@ from echelon.simulation.scalars.elementary import (
     signed,
     size,
 )
-from echelon.simulation.scalars.polynomials import LN2, TINY, parts_of
 from echelon.simulation.scalars.scalar_graph import Node
 
 
