@@ -181,7 +181,7 @@ def test_a_reshape_live_is_that_of_a_run(session):
     live = LiveLoop(*build(own), Panel(own, build(own)).live)
     np.testing.assert_allclose(flown(live, 6), whole.states[1:], atol=1e-12)
     assert "lasts until 3.08 s" in session.ask({"name": "reshape", "value": "wedge"})["fault"]
-    assert session.state()["moments"] == [(0.08, "the shape becomes `line`")]
+    assert session.state()["moments"] == [(0.08, "the shape becomes line")]
     shown(session, 72)
     assert session.knobs.shape == "line" and session.knobs.reshaping is None
     picture = session.swarm.advance()

@@ -111,7 +111,7 @@ def moments_of(events: Sequence[Event], changes: Sequence[JsonObject]) -> list[t
     """Return when who was lost or joined, and the shape changed, in words, by time."""
     moments = [(event.at, str(event)) for event in events]
     shapes = [(each["at"], each["reshape"]) for each in changes if "reshape" in each]
-    return sorted([*moments, *((at, f"the shape becomes `{name}`") for at, name in shapes)])
+    return sorted([*moments, *((at, f"the shape becomes {name}") for at, name in shapes)])
 
 
 def as_changes(entries: Sequence[JsonObject]) -> list[JsonObject]:
