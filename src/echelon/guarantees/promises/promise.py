@@ -266,9 +266,7 @@ class Promise(abc.ABC):
             "certified_set": None if certified is None else certified.as_mapping(),
             "anywhere": self.anywhere(),
             "hypotheses": [line.as_mapping() for line in self.hypotheses.values()],
-            "prefix": None
-            if self.prefix is None
-            else {"at": self.prefix.at, "promise": self.prefix.promise.as_mapping()},
+            **({} if self.prefix is None else {"prefix": self.prefix.as_mapping()}),
         }
 
 
@@ -277,6 +275,10 @@ class Prefix(NamedTuple):
 
     at: float
     promise: "Promise"
+
+    def as_mapping(self) -> dict[str, Any]:
+        """Return it ready for JSON."""
+        return {"at": self.at, "promise": self.promise.as_mapping()}
 
     def sentence(self) -> str:
         """Return it in a sentence."""

@@ -84,7 +84,7 @@ class StoppingRun(NamedTuple):
         """The slowest mode of the formation, 1/s, as a positive number."""
         root = [self.law.slowest_root] if max(self.law.ready.chains.degrees) > 1 else []
         leaders = [float(self.leader.strength(self.settings.dt))] if self.apart else []
-        return min(self.agreement, *root, *leaders)
+        return min([self.agreement, *root, *leaders])
 
     @property
     def network(self) -> LateMessages | None:
