@@ -126,9 +126,26 @@ class Follower:
 
     def native(self) -> Run:
         """Return it as native code."""
-        bodies = Body(stores=self.stores), Body()
-        read = (0, 0, False, False, False, (), 0, 0.0)
-        plan = Plan(self.bits, self.lanes, False, False, self.rows, 0, *bodies, *read)
+        plan = Plan(
+            bits=self.bits,
+            lanes=self.lanes,
+            batched=False,
+            row_major=False,
+            rows=self.rows,
+            width=0,
+            first=Body(stores=self.stores),
+            others=Body(),
+            message_start=0,
+            message_size=0,
+            one_source=False,
+            one_leader=False,
+            weighted=False,
+            edges=(),
+            apart=False,
+            exception_row=0,
+            table=0,
+            dt=0.0,
+        )
         code = Code(program(plan))
 
         def run(rows: np.ndarray, steps: int) -> None:
