@@ -136,6 +136,55 @@ def test_losses_that_are_covered_are_guaranteed():
 
 
 @pytest.mark.parametrize(
+    ("world", "ignored"),
+    [
+        (ech.World(network=RADIO), "messages are late or lost"),
+        (ech.World(actuator=ech.Actuator(lag=0.03)), "the actuators lag or have levels"),
+        (
+            ech.World(sensing=ech.Sensing(noise={"position": 0.001})),
+            "agents measure their states late or with noise",
+        ),
+    ],
+    ids=["radio", "lag", "noise"],
+)
+def test_an_event_is_not_covered_by_a_guarantee_that_ignores_how_messages_and_agents_are(
+    world, ignored
+):
+    """As before the event: what the guarantee of the run leaves out, that of an event does too."""
+    parts = _parts(events=[Lose(3, 2.0), Cut((1, 2), 3.0, 1.0)]).replace(world=world)
+    guarantee = ech.promise(parts, SETTINGS)
+    assert ignored in guarantee.sentence()
+    for event in events_in_words(parts, guarantee):
+        stated = event["guarantee"]
+        assert not stated["promised"] and stated["kind"] is None
+        assert stated["sentence"].startswith("The guarantee would ")
+        assert stated["sentence"].endswith(f" The guarantee ignores that {ignored}.")
+
+
+@pytest.mark.parametrize(
+    "event", [Lose(3, 2.01), Cut((1, 2), 2.01), Cut((1, 2), 2.01, 1.003)], ids=str
+)
+def test_an_event_between_two_steps_is_guaranteed_as_at_the_later_one(event):
+    later = dataclasses.replace(event, at=2.02)
+    if isinstance(event, Cut) and event.duration is not None:
+        later = dataclasses.replace(later, duration=1.0)
+    between, on = (ech.promise(_parts(events=[each]), SETTINGS) for each in (event, later))
+    assert on.promised and between.sentence() == on.sentence()
+    assert between.rate == on.rate
+
+
+def test_who_is_there_in_steps_is_who_is_there_in_a_run():
+    parts, dt = _parts(events=[Lose(3, 1.013), Join(3, 2.0), Lose(2, 3.009)]), SETTINGS.dt
+    stepped = parts.graph.in_steps(dt)
+    assert stepped.schedule.starts == pytest.approx([0.0, 1.02, 2.0, 3.02])
+    times = dt * np.arange(300)
+    rows = [graph.schedule.present[graph.schedule.rows(times)] for graph in (parts.graph, stepped)]
+    assert np.array_equal(*rows)
+    # Put into parts again, it is the same graph: no event is added to it twice.
+    assert parts.replace(graph=stepped).graph is stepped
+
+
+@pytest.mark.parametrize(
     "events", [[Join(2, 3.0)], [Lose(0, 3.0)]], ids=["one that joins", "a leader that is lost"]
 )
 def test_what_is_not_covered_is_not_guaranteed(events):

@@ -309,10 +309,12 @@ class Graph(GraphMatrices):
         starts, rows = schedule.starts, self.schedule.weights
         if len(starts) == len(rows) and np.allclose(starts, self.schedule.starts, 0.0, 1e-9 * dt):
             return self
-        graph = Graph.__new__(Graph)
-        graph.directed = self.directed
-        heavy = schedule.weights.max(axis=0)
-        graph._set(self.edges, heavy, self.agents, self.leaders, schedule)
+        # Its events are in the schedule already, and so are who is there and who leads.
+        graph = copy.copy(self)
+        graph.weights, graph.schedule = schedule.weights.max(axis=0), schedule
+        graph.weights.setflags(write=False)
+        graph._spectrum = None
+        check_reached(graph)
         return graph
 
     def spectrum(self) -> Spectrum:

@@ -24,7 +24,7 @@ def check_reached(graph: GraphMatrices) -> None:
         raise GraphError(_cut_off(graph, lost))
     schedule = graph.schedule
     if schedule is not None and schedule.period is None:
-        lost = lost_along(graph, schedule.weights[-1])
+        lost = unreached(graph, schedule, -1)
         if len(lost):
             raise GraphError(
                 f"the graph leaves agents behind: {name_agents(lost)} no path to a leader "

@@ -93,7 +93,9 @@ class Schedule(NamedTuple):
         steps, rows = self.switches(dt, (periods - 0.5) * (self.period or 0.0))
         # What begins at the end belongs to the next period.
         steps, rows = steps[steps < span], rows[steps < span]
-        return Schedule(steps * dt, self.weights[rows], None if span == np.inf else span * dt)
+        here = (None if part is None else part[rows] for part in (self.present, self.nearest))
+        period = None if span == np.inf else span * dt
+        return Schedule(steps * dt, self.weights[rows], period, *here)
 
     def spans(self) -> Iterator[str]:
         """Yield the time span of each row, in words."""

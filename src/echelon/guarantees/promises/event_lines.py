@@ -11,8 +11,8 @@ from echelon.core.words import Kind
 from echelon.guarantees.promises.promise import Promise
 from echelon.simulation.engine.parts import Parts
 
-_SEVERED = "The guarantee covers it, as that of a graph that switches"
-_BEREFT = "The guarantee holds for all others, who do not hear it any more"
+_SEVERED = "cover", "it, as that of a graph that switches"
+_BEREFT = "hold", "for all others, who do not hear it any more"
 _REMEDY = "remove the event to see what is guaranteed without it"
 
 
@@ -90,5 +90,10 @@ def _through(graph: Graph, event: Event, guarantee: Promise) -> JsonObject:
     if why or not guarantee.promised:
         text = f"Nothing is guaranteed through it: {why}." if why else "Nothing is guaranteed."
         return {"promised": False, "kind": None, "sentence": text}
-    text = _SEVERED if isinstance(event, Cut) else _BEREFT
-    return {"promised": True, "kind": str(guarantee.kind), "sentence": f"{text}."}
+    verb, what = _SEVERED if isinstance(event, Cut) else _BEREFT
+    if guarantee.without:
+        # It is of another flight, and covers nothing of this one.
+        text = f"The guarantee would {verb} {what}. {guarantee.ignored()}"
+        return {"promised": False, "kind": None, "sentence": text}
+    text = f"The guarantee {verb}s {what}."
+    return {"promised": True, "kind": str(guarantee.kind), "sentence": text}

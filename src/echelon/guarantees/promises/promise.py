@@ -231,10 +231,14 @@ class Promise(abc.ABC):
         """Return what is guaranteed, in sentences, and no more than that."""
         text = self.guarantee() if self.promised else self._against()
         if self.promised and self.without:
-            text += f" The guarantee ignores that {self.without}."
+            text += f" {self.ignored()}"
         noted = (self.hypotheses.get(name) for name in _NOTED)
         notes = (f" Note: {x.explanation}." for x in noted if x and x.fails and not x.reason)
         return text + "".join(notes)
+
+    def ignored(self) -> str:
+        """Return what the guarantee leaves out of what acts, in a sentence; empty for nothing."""
+        return f"The guarantee ignores that {self.without}." if self.without else ""
 
     def _against(self) -> str:
         """Return all that stands against a guarantee, and what would help."""
