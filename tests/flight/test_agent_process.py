@@ -12,11 +12,11 @@ from echelon.flight.air import LOOPBACK, Air
 from echelon.flight.links.link import Link, Reading
 from echelon.flight.plan_clock import PlanClock
 from echelon.flight.supervisor import Fault
-from echelon.flight.wire import GROUND, Drop, Letter, Packet, Wire
+from echelon.flight.wire import GROUND, Drop, Kind, Letter, Packet, Wire
 
 DT, KEY = 0.01, b"k" * 32
 FLIGHT = {
-    **{"dt": DT, "leadership": None},
+    **{"dt": DT, "leadership": None, "weather": {"delay": 0.02, "jitter": 0.03, "loss": 0.0}},
     "position": [0],
     "velocity": [1],
     "tilt": [],
@@ -157,6 +157,8 @@ def test_each_fault_lets_the_vehicle_descend_and_stay_so(fault, scene, capsys):
     scene.rounds(5)
     assert len(scene.link.sent) == before <= sent + 2 and scene.link.sinks == sinks + 5
     said = capsys.readouterr().err
+    # The page has it in the report; what the link says is a note.
+    assert notes(scene) == ({"the link is gone"} if fault is Fault.LINK else set())
     assert said.count("levels and descends.") == 1 and said.startswith("agent 1: ")
 
 
@@ -189,15 +191,54 @@ def test_mistakes_on_the_ground_are_told_once(sentence, scene, capsys):
     assert said.count(f"agent 1: {sentence}") == 1 and scene.fault is Fault.NONE
 
 
-def test_a_clock_that_is_off_is_told(scene, capsys):
-    scene.air.send(scene.ground.start(time.time() + 1.5, time.time()))
+def notes(scene):
+    """What the process says to the ground, meanwhile."""
+    wire = scene.wire(GROUND)
+    opened = [wire.open(each, None, time.time()) for each in scene.air.receive()]
+    return {x.body for x in opened if not isinstance(x, Drop) and x.kind is Kind.NOTE}
+
+
+CLOCKS = {
+    "is stamped more than 1 s beside this clock": (-1.5, 1.5),
+    "names the start by a clock that is more than 0.1 s beside this one": (-0.4, -0.2, 0.15, 0.9),
+}
+
+
+@pytest.mark.parametrize("why", CLOCKS)
+def test_a_clock_that_is_off_keeps_a_vehicle_on_the_ground(why, scene, capsys):
+    for off in CLOCKS[why]:
+        for _ in range(3):
+            now = time.time() + off
+            scene.air.send(scene.ground.start(now, now))
+            scene.rounds(1)
+    scene.process._report(time.monotonic())
+    sentence = f"a datagram of the ground {why}"
+    assert capsys.readouterr().err == f"agent 1: {sentence}.\n"
+    assert not scene.link.sent and notes(scene) == {sentence}
     scene.start()
-    scene.air.send(scene.leader.letter(Letter(0, scene.crew.clock.now + 1.5, 0, (0.0,), None)))
+    assert scene.link.sent
+
+
+def test_a_neighbour_whose_clock_is_ahead_is_told(scene, capsys):
+    scene.start()
+    for off, why in ((1.5, "is stamped more than 1 s beside"), (0.2, "is stamped ahead of")):
+        t = scene.crew.clock.now + off
+        scene.air.send(scene.leader.letter(Letter(0, t, 0, (0.0,), Packet(0, t, (0.0,)))))
+        scene.rounds(2)
+        assert f"agent 1: a datagram of agent 0 {why} this clock.\n" in capsys.readouterr().err
+    # One that is late is none of them, and nobody is told.
+    t = scene.crew.clock.now - 0.5
+    scene.air.send(scene.leader.letter(Letter(0, t, 0, (0.0,), Packet(0, t, (0.0,)))))
     scene.rounds(2)
-    assert (
-        "a datagram of agent 0 is stamped more than 1 s beside this clock."
-        in capsys.readouterr().err
-    )
+    assert not capsys.readouterr().err
+
+
+def test_a_process_of_the_same_number_that_could_not_begin_changes_nothing(scene):
+    scene.start()
+    scene.process._began -= 3.0
+    scene.air.send(scene.wire(1).note(time.time(), "the address is in use"))
+    scene.rounds(2)
+    assert scene.fault is Fault.NONE
 
 
 def test_the_first_start_counts(scene):

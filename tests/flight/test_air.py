@@ -6,7 +6,7 @@ import time
 import pytest
 
 from echelon.core.errors import FlightError
-from echelon.flight.air import LOOPBACK, Air, read_address
+from echelon.flight.air import LOOPBACK, Air, bound, read_address, tell_once
 
 
 def free_port():
@@ -47,11 +47,26 @@ def test_a_group_is_heard_on_the_loopback_interface_alone():
 def test_a_port_in_use_is_one_sentence():
     way = LOOPBACK, free_port()
     first = Air(way, [])
-    with pytest.raises(FlightError, match=r"is in use; another agent of that number may run\.$"):
-        Air(way, [])
+    used = r"is in use; a process with the same number, or another flight, may run here\.$"
+    for listen in (lambda: Air(way, []), lambda: bound(way[1])):
+        with pytest.raises(FlightError, match=used):
+            listen()
     first.close()
     with pytest.raises(FlightError, match=r"203\.0\.113\.1:\d+ cannot be used \(.*\)\.$"):
         Air(("203.0.113.1", way[1]), [])
+
+
+def test_who_has_no_port_is_heard_too():
+    for host in (LOOPBACK, "239.255.71.9"):
+        way = host, free_port()
+        air = Air(way, [])
+        tell_once(b"no port", [way])
+        assert heard(air) == [b"no port"]
+        tell_once(b"old", [way])
+        time.sleep(0.02)
+        air.skip()
+        assert not list(air.receive())
+        air.close()
 
 
 def test_a_flood_ends_each_time():

@@ -51,11 +51,13 @@ def test_the_page_shows_agents_and_stops_all_of_them(browser, size):
             for number, said in ((0, report(0)), (1, report(0, Fault.FENCE, 0.5))):
                 agents.send(wire(number).report(time.time(), said))
             agents.send(wire(0, b"other" * 8).stop(time.time()))
+            agents.send(wire(2).note(time.time(), "the address is in use"))
             until(lambda: "12 × is not newer" in page.inner_text("table"))
             text = page.inner_text("body")
             assert "the plan, and leads" in text and "agent 0" in text and "not heard yet" in text
             assert "descends: the vehicle is 0.50 m outside its fence" in text
-            assert "Dropped here: a datagram is signed with another key: 1." in text
+            assert "Dropped here: a datagram of agent 0 is signed with another key: 1." in text
+            assert "not heard yet. the address is in use" in text
             assert "1, -0.25, ?" in text and "50 %" in text
             # Nothing has to be scrolled sideways, and the stop is always in sight.
             assert page.evaluate("document.documentElement.scrollWidth") <= width

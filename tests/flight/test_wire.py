@@ -37,6 +37,10 @@ def test_commands_and_reports_are_read_without_a_plan():
     ground, agent = wire(GROUND), wire(2)
     assert agent.open(ground.start(WALL, WALL + 2.0), None, WALL).body == WALL + 2.0
     assert agent.open(ground.stop(WALL), None, WALL).kind is Kind.STOP
+    assert agent.open(wire(1).letter(letter()), None, WALL) is Drop.EARLY
+    for sentence in ("the key is another one", "é" * 200, ""):
+        opened = ground.open(agent.note(WALL, sentence), None, WALL)
+        assert (opened.kind, opened.body) == (Kind.NOTE, sentence[:120])
     counts = tuple(range(len(Drop)))
     report = Report(1, 2, 0, 0.5, 3.0, 1.0, 2.0, 3.0, 0.25, 0.5, 0.01, math.nan, counts)
     read = ground.open(agent.report(WALL, report), None, WALL).body

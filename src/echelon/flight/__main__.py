@@ -10,7 +10,7 @@ from pathlib import Path
 
 from echelon.core.errors import EchelonError, FlightError
 from echelon.flight.agent_process import AgentProcess, Crew
-from echelon.flight.air import LOOPBACK, PORT, Address, Air, ports_of, read_address
+from echelon.flight.air import LOOPBACK, PORT, Address, Air, ports_of, read_address, tell_once
 from echelon.flight.links.link import Link, open_link
 from echelon.flight.mission import Mission
 from echelon.flight.plan_clock import PlanClock
@@ -85,8 +85,7 @@ def _bridge(mission: Mission, options: argparse.Namespace) -> int:
     from echelon.flight.bridge import Weather, carry
 
     ports = ports_of(mission.agents, options.port)
-    listen = LOOPBACK, options.port + mission.agents + 1
-    carry(listen, ports, Weather(*options.weather), options.speed)
+    carry(options.port + mission.agents + 1, ports, Weather(*options.weather), options.speed)
     return 0
 
 
@@ -104,10 +103,17 @@ def _ways(
 
 def _fly(mission: Mission, options: argparse.Namespace) -> int:
     """Fly one agent."""
-    law, facts = mission.law(options.agent)
     wire = wire_of(mission.facts, options.agent, require_key(options.key))
     listen, to = _ways(mission, options.agent, options)
-    air, link = Air(listen, to, options.interface), open_link(options.link, facts)
+    try:
+        law, facts = mission.law(options.agent)
+        air, link = Air(listen, to, options.interface), open_link(options.link, facts)
+    except EchelonError as error:
+        if not options.dry_run:
+            tell_once(wire.note(time.time(), str(error).rstrip(".")), to, options.interface)
+        raise
+    # The start may have been said often while the link was opened.
+    air.skip()
     if options.dry_run:
         _wait_for_state(link)
         print(f"agent {options.agent}: all checks passed; nothing was sent to other agents.")

@@ -16,14 +16,16 @@ from echelon.flight.links.link import Link, Reading
 from echelon.flight.pilot import Pilot
 from echelon.flight.plan_clock import PlanClock
 from echelon.flight.supervisor import Fault, Fence, Supervisor
-from echelon.flight.wire import GROUND, Drop, Kind, Letter, Opened, Report, Wire
+from echelon.flight.wire import Drop, Kind, Letter, Opened, Report, Wire, name_of, sender_of
 
 _REPORTS: Final = 0.1  # s between two
 _LONGEST: Final = 20.0  # s of a descent
 _REST: Final = 0.05  # m/s
+_CLOCK: Final = 0.1
+"""s, by which the clock that names the start may be beside this one, without a network's delay."""
 _MADE_UP: Final = 5
 """Ticks that are made up for at most; after a longer gap the law goes on from where it was."""
-_TOLD: Final = (Drop.VERSION, Drop.FORMATION, Drop.SIGNATURE, Drop.CLOCK)
+_TOLD: Final = (Drop.VERSION, Drop.FORMATION, Drop.SIGNATURE, Drop.CLOCK, Drop.AHEAD, Drop.START)
 """Reasons that somebody on the ground can remove."""
 
 
@@ -70,7 +72,7 @@ class AgentProcess:
         self._due = 0.0
         self._sent, self._reported, self._signals = -math.inf, -math.inf, 0
         self._moved = self._began
-        self._said = set[str]()
+        self._said, self._notes = set[str](), deque[str](maxlen=10)
         self._ticks, self._longest = deque[float](maxlen=100_000), 0.0
 
     def run(self) -> Fault:
@@ -195,21 +197,37 @@ class AgentProcess:
     def _hear(self, datagram: bytes, now: float) -> None:
         wire, clock = self._crew.wire, self._crew.clock
         opened = wire.open(datagram, clock.now, time.time())
-        if isinstance(opened, Drop):
-            # Before the start nobody's letters have a time.
-            if opened in _TOLD and (opened is not Drop.CLOCK or clock.started):
-                self._say(f"a datagram of {_name(wire.suspects.get(opened))} {opened.value}")
+        why = opened if isinstance(opened, Drop) else self._use(opened, now)
+        if why is None:
             return
-        if opened.sender == wire.number:
+        if not isinstance(opened, Drop):
+            wire.drop(why, datagram)
+        # A process that was held up finds one or two of them old.
+        if why in _TOLD and (why is not Drop.START or wire.dropped[why] > 2):
+            self._say(f"a datagram of {name_of(sender_of(datagram))} {why.value}")
+
+    def _use(self, opened: Opened, now: float) -> Drop | None:
+        """Use what a datagram says, or return why it is not used."""
+        if opened.kind is Kind.NOTE:
+            return None
+        if opened.sender == self._crew.wire.number:
             self._meet(opened, now)
         elif isinstance(opened.body, Letter):
-            why = self._pilot.box.receive(opened.body, clock.now or 0.0)
-            if why is not None:
-                wire.drop(why, datagram)
+            return self._pilot.box.receive(opened.body, self._crew.clock.now or 0.0)
         elif opened.kind is Kind.START and isinstance(opened.body, float):
-            clock.start(opened.body)
+            return self._take_start(opened.body, time.time() - opened.stamp)
         elif opened.kind is Kind.STOP:
             self._supervisor.trip(Fault.STOP)
+        return None
+
+    def _take_start(self, at: float, late: float) -> Drop | None:
+        """Let the plan start at a time (s since 1970) of a clock that is not beside this one."""
+        clock, weather = self._crew.clock, self._crew.flight["weather"]
+        if not clock.started:
+            if not -_CLOCK < late < _CLOCK + (weather["delay"] + weather["jitter"]) / clock.speed:
+                return Drop.START
+            clock.start(at)
+        return None
 
     def _meet(self, opened: Opened, now: float) -> None:
         """Judge a datagram with the agent's own number."""
@@ -241,12 +259,18 @@ class AgentProcess:
         )
         self._longest = 0.0
         self._crew.air.send(self._crew.wire.report(time.time(), report))
+        if self._notes:
+            # One after the other, again and again: some are lost.
+            self._notes.rotate()
+            self._crew.air.send(self._crew.wire.note(time.time(), self._notes[0]))
 
     def _say(self, sentence: str, key: str | None = None) -> None:
         """Print a sentence once."""
         if (key or sentence) not in self._said:
             self._said.add(key or sentence)
             print(f"agent {self._crew.wire.number}: {sentence}.", file=sys.stderr, flush=True)
+            if key != "fault":
+                self._notes.append(sentence)
 
     def _summary(self) -> str:
         if not self._ticks:
@@ -258,7 +282,3 @@ class AgentProcess:
             f"{len(ticks)} ticks, median {1e3 * middle:.2f} ms, 99th percentile "
             f"{1e3 * late:.2f} ms, {used.user + used.system:.2f} s of a processor"
         )
-
-
-def _name(sender: int | None) -> str:
-    return "the ground" if sender == GROUND else f"agent {sender}"

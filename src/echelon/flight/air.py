@@ -64,10 +64,7 @@ class Air:
             self._open(listen, interface)
         except OSError as error:
             self._socket.close()
-            used = error.errno == errno.EADDRINUSE
-            why = "is in use; another agent of that number may run" if used else "cannot be used"
-            detail = "" if used else f" ({(error.strerror or '').lower()})"
-            raise FlightError(f"the address {listen[0]}:{listen[1]} {why}{detail}.") from None
+            raise _refusal(listen, error) from None
 
     def _open(self, listen: Address, interface: str) -> None:
         if not _is_group(listen):
@@ -77,14 +74,8 @@ class Air:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._socket.bind(listen)
         own = socket.inet_aton(interface)
-        alone = ipaddress.IPv4Address(interface).is_loopback
-        options = {
-            socket.IP_ADD_MEMBERSHIP: socket.inet_aton(listen[0]) + own,
-            socket.IP_MULTICAST_IF: own,
-            socket.IP_MULTICAST_TTL: 0 if alone else 1,
-            socket.IP_MULTICAST_LOOP: 1,
-        }
-        for option, value in options.items():
+        member = {socket.IP_ADD_MEMBERSHIP: socket.inet_aton(listen[0]) + own}
+        for option, value in (member | _to_group(interface)).items():
             self._socket.setsockopt(socket.IPPROTO_IP, option, value)
 
     def send(self, datagram: bytes) -> None:
@@ -100,6 +91,11 @@ class Air:
             for _ in range(_MOST):
                 yield self._socket.recv(_LONGEST)
 
+    def skip(self) -> None:
+        """Skip what arrived while nobody listened."""
+        while any(True for _ in self.receive()):
+            pass
+
     def fileno(self) -> int:
         """Return what `select` waits for."""
         return self._socket.fileno()
@@ -111,3 +107,44 @@ class Air:
 
 def _is_group(address: Address) -> bool:
     return ipaddress.IPv4Address(address[0]).is_multicast
+
+
+def _to_group(interface: str) -> dict[int, bytes | int]:
+    """Return the options of a socket that sends to a group by an interface."""
+    alone = ipaddress.IPv4Address(interface).is_loopback
+    return {
+        socket.IP_MULTICAST_IF: socket.inet_aton(interface),
+        socket.IP_MULTICAST_TTL: 0 if alone else 1,
+        socket.IP_MULTICAST_LOOP: 1,
+    }
+
+
+def tell_once(datagram: bytes, to: Sequence[Address], interface: str = LOOPBACK) -> None:
+    """Send a datagram from no port of the flight, as a process does that cannot begin."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out, contextlib.suppress(OSError):
+        for option, value in _to_group(interface).items():
+            out.setsockopt(socket.IPPROTO_IP, option, value)
+        for address in to:
+            out.sendto(datagram, address)
+
+
+def bound(port: int) -> socket.socket:
+    """Return a socket at a port of this machine.
+
+    Raises:
+        FlightError: it is in use.
+    """
+    result = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        result.bind((LOOPBACK, port))
+    except OSError as error:
+        result.close()
+        raise _refusal((LOOPBACK, port), error) from None
+    return result
+
+
+def _refusal(address: Address, error: OSError) -> FlightError:
+    why = f"cannot be used ({(error.strerror or '').lower()})"
+    if error.errno == errno.EADDRINUSE:
+        why = "is in use; a process with the same number, or another flight, may run here"
+    return FlightError(f"the address {address[0]}:{address[1]} {why}.")

@@ -4,12 +4,11 @@ import heapq
 import itertools
 import random
 import select
-import socket
 import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from echelon.flight.air import Address
+from echelon.flight.air import Address, bound
 from echelon.flight.wire import sender_of
 
 
@@ -22,19 +21,18 @@ class Weather(NamedTuple):
     seed: int = 0
 
 
-def carry(listen: Address, to: Sequence[Address], weather: Weather, speed: float = 1.0) -> None:
+def carry(port: int, to: Sequence[Address], weather: Weather, speed: float = 1.0) -> None:
     """Carry datagrams to all but their sender until the process ends.
 
     Args:
-        listen: where agents send to.
+        port: of this machine, where agents send to.
         to: where agent k listens, and last the ground station.
         weather: what happens on the way.
         speed: seconds of the plan in one of this machine.
     """
     draws, order = random.Random(weather.seed), itertools.count()
     queue = list[tuple[float, int, bytes, Address]]()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as air:
-        air.bind(listen)
+    with bound(port) as air:
         while True:
             wait = max(0.0, queue[0][0] - time.monotonic()) if queue else None
             if select.select([air], [], [], wait)[0]:

@@ -11,13 +11,15 @@ from typing import Any, Final, final
 from echelon.flight.air import Air
 from echelon.flight.letterbox import NOBODY
 from echelon.flight.supervisor import Fault
-from echelon.flight.wire import Drop, Report, Wire
+from echelon.flight.wire import GROUND, Drop, Opened, Report, Wire, is_letter, name_of
 from echelon.output.viewer.serve import Handler
 
 _AGAIN: Final = 0.2
 """s between two commands that repeat: who restarts, or missed one, gets the next."""
 _SILENT: Final = 1.0
 """s without a report, after which an agent counts as lost."""
+_NOTES: Final = 5
+"""Of an agent that are shown at most: the last ones."""
 _MODES: Final = ("ready", "flies", "descends")
 
 
@@ -41,7 +43,8 @@ class Ground:
     ) -> None:
         """Listen."""
         self._air, self._wire, self._agents, self._watch = air, wire, agents, watch
-        self._reports = dict[int, tuple[float, Report]]()
+        self._reports, self._boots = dict[int, tuple[float, Report]](), dict[int, int]()
+        self._notes: dict[int, dict[str, int]] = {k: {} for k in range(agents)}
         self._start: float | None = None
         self._stopped, self._said, self._closed = False, -math.inf, False
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -80,10 +83,12 @@ class Ground:
     def _run(self) -> None:
         while not self._closed:
             for datagram in self._air.receive():
+                # The ground has no time of the plan, by which letters are stamped.
+                if is_letter(datagram):
+                    continue
                 opened = self._wire.open(datagram, None, time.time())
-                if not isinstance(opened, Drop) and isinstance(opened.body, Report):
-                    self._reports[opened.sender] = time.monotonic(), opened.body
-                    self._watch(opened.sender, opened.body)
+                if not isinstance(opened, Drop):
+                    self._hear(opened)
             if time.monotonic() > self._said + _AGAIN:
                 self._said = time.monotonic()
                 if self._start is not None and not self._stopped:
@@ -92,23 +97,43 @@ class Ground:
                     self._air.send(self._wire.stop(time.time()))
             time.sleep(0.01)
 
+    def _hear(self, opened: Opened) -> None:
+        """Remember a report or a note."""
+        sender = opened.sender
+        if isinstance(opened.body, str):
+            notes = self._notes.get(sender, {})
+            if notes.get(opened.body) != opened.boot:
+                notes.pop(opened.body, None)
+            notes[opened.body] = opened.boot
+        elif isinstance(opened.body, Report):
+            self._boots[sender] = opened.boot
+            self._reports[sender] = time.monotonic(), opened.body
+            self._watch(sender, opened.body)
+
     def state(self) -> dict[str, Any]:
         """Return what the page shows."""
         return {
             "started": self._start is not None,
             "stopped": self._stopped,
             "agents": [self._row(k) for k in range(self._agents)],
-            "dropped": [f"a datagram {why.value}: {n}" for why, n in self._dropped().items()],
+            "dropped": [self._dropped(why, n) for why, n in [*self._wire.dropped.items()]],
         }
 
-    def _dropped(self) -> dict[Drop, int]:
-        # Letters are none of the ground's business: it has no time of the plan.
-        return {why: n for why, n in self._wire.dropped.items() if why is not Drop.CLOCK}
+    def _dropped(self, why: Drop, count: int) -> str:
+        who = self._wire.suspects.get(why)
+        named = who in self._notes or who == GROUND
+        return f"a datagram {f'of {name_of(who)} ' if named else ''}{why.value}: {count}"
+
+    def _noted(self, number: int) -> list[str]:
+        """Return the last notes of an agent since its process began, and of others that tried."""
+        since = self._boots.get(number, 0)
+        notes = [text for text, boot in [*self._notes[number].items()] if boot >= since]
+        return notes[-_NOTES:]
 
     def _row(self, number: int) -> dict[str, Any]:
         heard, report = self._reports.get(number, (None, None))
         if heard is None or report is None:
-            return {"agent": number, "mode": "not heard yet"}
+            return {"agent": number, "mode": "not heard yet", "notes": self._noted(number)}
         silent = time.monotonic() - heard
         fault = _fault(report)
         counts = zip(Drop, report.dropped, strict=True)
@@ -116,6 +141,7 @@ class Ground:
             "agent": number,
             "mode": _MODES[min(report.mode, 2)] if silent < _SILENT else "silent",
             "why": "" if fault is Fault.NONE else fault.sentence(report.amount),
+            "notes": self._noted(number),
             "silent": round(silent, 1),
             "leader": None if report.leader == NOBODY else report.leader,
             "time": _number(report.time, 2),

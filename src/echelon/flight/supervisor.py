@@ -90,8 +90,8 @@ class Supervisor:
 
     @property
     def step(self) -> float:
-        """The median time (s) between states; the law's before there are some."""
-        return sorted(self._steps)[len(self._steps) // 2] if self._steps else self._dt
+        """The median time (s) between states; the law's before there are enough."""
+        return sorted(self._steps)[_STEPS // 2] if len(self._steps) == _STEPS else self._dt
 
     def look(self, age: float) -> None:
         """Judge the age (s) of the newest state."""
@@ -121,7 +121,7 @@ class Supervisor:
         if time > self._before:
             self._steps.append(time - self._before)
         self._before = time
-        if len(self._steps) == _STEPS and self.step >= 2.0 * self._dt:
+        if self.step >= 2.0 * self._dt:
             self.trip(Fault.PERIOD, self.step)
 
     def spend(self, seconds: float) -> None:

@@ -7,12 +7,12 @@ levels it, as real ones do; after that, or where it is asked to, it descends.
 import math
 import random
 import select
-import socket
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, TextIO, TypeAlias, final
 
+from echelon.flight.air import bound
 from echelon.flight.links.udp import DESCEND, HEAD, INPUT
 from echelon.flight.mission import Mission, load_module
 
@@ -118,9 +118,8 @@ class Vehicles:
         self._input = struct.Struct(f"<{len(facts['trim'])}d")
         self._state = struct.Struct(f"<{2 + len(facts['rest'])}d")
         self._position = mission.facts["position"]
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket = bound(port)
         self._socket.setblocking(False)
-        self._socket.bind(("127.0.0.1", port))
         self._log: TextIO = (mission.folder / "positions.csv").open("w", encoding="utf-8")
         self._logged, self.let_go = -math.inf, 0
 

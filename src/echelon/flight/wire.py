@@ -39,6 +39,7 @@ class Kind(enum.IntEnum):
     START = 2
     STOP = 3
     REPORT = 4
+    NOTE = 5
 
 
 class Drop(enum.Enum):
@@ -55,6 +56,8 @@ class Drop(enum.Enum):
     SENDER = "has a sender that is not heard"
     AHEAD = "is stamped ahead of this clock"
     PACKET = "has no packet of a leader"
+    EARLY = "came before the start"
+    START = "names the start by a clock that is more than 0.1 s beside this one"
 
 
 class Packet(NamedTuple):
@@ -130,12 +133,13 @@ class Opened(NamedTuple):
     sender: int
     boot: int
     stamp: float
-    body: Letter | Report | float | None
+    body: "Letter | Report | float | str | None"
 
 
 _FIELDS: Final = len(Report._fields) - 1
 _REPORT: Final = struct.Struct(f"<BBHdd{_FIELDS - 5}f{len(Drop)}I")
 _START: Final = struct.Struct("<d")
+_NOTE: Final = struct.Struct("<240s")
 
 
 def require_key(file: Path | None) -> Path:
@@ -204,7 +208,8 @@ class Wire:
         self.number, self.boot, self._agents, self._count = number, boot, agents, 0
         self._letter = struct.Struct(f"<HHB{sizes[0]}dHd{sizes[1]}d")
         self._sizes = sizes
-        bodies = {Kind.LETTER: self._letter, Kind.START: _START, Kind.REPORT: _REPORT}
+        bodies = {Kind.START: _START, Kind.REPORT: _REPORT, Kind.NOTE: _NOTE}
+        bodies[Kind.LETTER] = self._letter
         around = _HEAD.size + _SIGNATURE
         self._lengths = {kind: around + body.size for kind, body in bodies.items()}
         self._lengths[Kind.STOP] = around
@@ -236,6 +241,10 @@ class Wire:
     def report(self, wall: float, report: Report) -> bytes:
         """Return the datagram of a report."""
         return self._sign(Kind.REPORT, wall, _REPORT.pack(*report[:-1], *report.dropped))
+
+    def note(self, wall: float, sentence: str) -> bytes:
+        """Return the datagram of a sentence to the ground, of which 240 bytes are sent."""
+        return self._sign(Kind.NOTE, wall, _NOTE.pack(sentence.encode()))
 
     def _sign(self, kind: Kind, stamp: float, body: bytes) -> bytes:
         self._count += 1
@@ -292,8 +301,10 @@ class Wire:
         if isinstance(body, Drop):
             return body
         clock = plan if kind == Kind.LETTER else wall
+        if clock is None:
+            return Drop.EARLY
         # A process whose clock was once far ahead would be believed for ever by its boot.
-        if clock is None or abs(stamp - clock) > APART or boot > 1e3 * (wall + APART):
+        if abs(stamp - clock) > APART or boot > 1e3 * (wall + APART):
             return Drop.CLOCK
         newest = self._newest.get((sender, Kind(kind)), (0, 0))
         if (boot, count) <= newest:
@@ -303,7 +314,7 @@ class Wire:
 
     def _body(
         self, kind: Kind, sender: int, stamp: float, text: bytes
-    ) -> Drop | Letter | Report | float | None:
+    ) -> Drop | Letter | Report | float | str | None:
         if not math.isfinite(stamp):
             return Drop.NOT_FINITE
         if kind is Kind.STOP:
@@ -311,6 +322,8 @@ class Wire:
         if kind is Kind.START:
             [at] = _START.unpack(text)
             return at if math.isfinite(at) else Drop.NOT_FINITE
+        if kind is Kind.NOTE:
+            return text.rstrip(b"\0").decode(errors="ignore")
         if kind is Kind.REPORT:
             numbers = _REPORT.unpack(text)
             return Report(*numbers[:_FIELDS], dropped=numbers[_FIELDS:])
@@ -331,6 +344,16 @@ class Wire:
 def sender_of(datagram: bytes) -> int | None:
     """Return who sent a datagram, as it says itself."""
     return _HEAD.unpack_from(datagram)[3] if len(datagram) >= _HEAD.size else None
+
+
+def is_letter(datagram: bytes) -> bool:
+    """Tell whether a datagram is a letter between agents, as it says itself."""
+    return datagram[1:2] == bytes([Kind.LETTER])
+
+
+def name_of(sender: int | None) -> str:
+    """Return the name of a sender in sentences."""
+    return "the ground" if sender == GROUND else f"agent {sender}"
 
 
 def _largest(numbers: Iterable[float]) -> float:

@@ -1,0 +1,78 @@
+"""The ground station, beside agents that this test plays."""
+
+import math
+import time
+
+import pytest
+
+from echelon.flight.air import LOOPBACK, Air, ports_of
+from echelon.flight.ground import Ground
+from echelon.flight.wire import GROUND, Drop, Letter, Report, Wire
+
+KEY, BOOT = b"k" * 32, time.time_ns() // 1_000_000
+REPORT = Report(1, 0, 0, 0.0, math.nan, 0.0, 0.0, 1.0, 0.0, 2e-4, 0.01, math.nan, (0,) * len(Drop))
+
+
+def wire(number, key=KEY, boot=BOOT):
+    return Wire(key, "ab" * 32, number, 2, (1, 1), boot)
+
+
+@pytest.fixture
+def scene():
+    """The ground station, and the socket of all others."""
+    port = 48300
+    ground = Ground(Air((LOOPBACK, port), []), wire(GROUND), 2)
+    agents = Air((LOOPBACK, port + 1), ports_of(0, port))
+    yield ground, agents
+    ground.close()
+    agents.close()
+
+
+def shown(ground, holds):
+    """What the page shows, once it holds."""
+    for _ in range(200):
+        if holds(state := ground.state()):
+            return state
+        time.sleep(0.01)
+    raise AssertionError(ground.state())
+
+
+def test_notes_of_a_process_that_ended_vanish(scene):
+    ground, agents = scene
+    agents.send(wire(1, boot=BOOT - 10).note(time.time(), "the address is in use"))
+    state = shown(ground, lambda state: state["agents"][1]["notes"])
+    assert state["agents"][1] == {
+        **{"agent": 1, "mode": "not heard yet"},
+        "notes": ["the address is in use"],
+    }
+    flies = wire(1)
+    agents.send(flies.report(time.time(), REPORT))
+    shown(ground, lambda state: state["agents"][1]["mode"] == "flies")
+    assert ground.state()["agents"][1]["notes"] == []
+    for text in ("its own", "its own", *"abcde"):
+        agents.send(flies.note(time.time(), text))
+    shown(ground, lambda state: state["agents"][1]["notes"] == [*"abcde"])
+    # Another one that did not begin takes the place of nobody.
+    agents.send(wire(1, boot=BOOT + 10).note(time.time(), "the address is in use"))
+    state = shown(ground, lambda state: "the address is in use" in state["agents"][1]["notes"])
+    agents.send(flies.report(time.time(), REPORT._replace(mode=2)))
+    shown(ground, lambda state: state["agents"][1]["mode"] == "descends")
+
+
+MISTAKES = {
+    "a datagram of agent 1 is signed with another key: 1": lambda now: wire(1, b"other" * 8).report(
+        now, REPORT
+    ),
+    "a datagram of agent 1 is stamped more than 1 s beside this clock: 1": lambda now: wire(
+        1
+    ).report(now + 1.2, REPORT),
+    "a datagram has another length than any datagram of this formation: 1": lambda now: b"x" * 99,
+}
+
+
+@pytest.mark.parametrize("sentence", MISTAKES)
+def test_whose_datagrams_are_dropped_is_shown(sentence, scene):
+    ground, agents = scene
+    agents.send(wire(0).letter(Letter(0, 99.0, 0, (0.0,), None)))
+    agents.send(MISTAKES[sentence](time.time()))
+    assert shown(ground, lambda state: state["dropped"])["dropped"] == [sentence]
