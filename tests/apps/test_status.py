@@ -152,3 +152,13 @@ def test_a_terminal_shows_that_the_program_loads(monkeypatch):
 )
 def test_a_time_is_said_in_words(seconds, text):
     assert status.duration(seconds) == text
+
+
+def test_native_code_that_there_is_not_is_refused_before_a_run_begins(here, echelon, monkeypatch):
+    begun = []
+    monkeypatch.setattr(STATUS, "begin", lambda text, log=True: begun.append(text))
+    native = ["--set", "network={rate: 20, prediction: packet}"]
+    native += ["--set", "simulation.engine=native"]
+    code, _, err = echelon("run", "integrators", *native, "--out", "o")
+    assert code == 2 and "no native code for a network that is not ideal" in err
+    assert begun == ["preparing integrators"] and not (here / "o").exists()

@@ -1,5 +1,6 @@
 """The inner loop with which the paper's Assumption 5 holds."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
@@ -131,3 +132,27 @@ def test_an_agent_without_symmetric_states_is_refused():
         ech.synthesize(
             ech.models.DoubleIntegrator(2), graph, ech.gains.InnerLoop(symmetry_weight=-1.0)
         )
+
+
+class Drifter(ech.ControlAffine):
+    """A body in a fluid, whose parameters have the name of an attribute of all models."""
+
+    damping: float | tuple[float, float] = 0.3
+    state_names = ("x", "y", "vx", "vy")
+    input_names = ("fx", "fy")
+
+    def drift(self, x):
+        return jnp.concatenate([x[2:], -jnp.asarray(self.damping) * x[2:]])
+
+    def input_map(self, x):
+        return jnp.concatenate([jnp.zeros((2, 2)), jnp.eye(2)])
+
+
+@pytest.mark.parametrize("damping", [0.3, (0.3, 0.2)])
+def test_a_parameter_called_damping_is_no_inner_loop(damping):
+    model = Drifter(damping)
+    gain = ech.synthesize(model, ech.Graph.path(3), ech.gains.InnerLoop())
+    A, _ = closed(model, gain)
+    assert gain.inner.shape == (2, 4) and not gain.inner[:, :2].any()
+    # More damping than the water has: the loop of the Riccati equation, not the parameter.
+    assert np.linalg.eigvals(A[2:, 2:]).real.max() < -0.5

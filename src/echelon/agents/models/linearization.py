@@ -110,6 +110,17 @@ def linearize(model: ControlAffine) -> Linearization:
     return Linearization(_freeze(trim.drift_slope + trim_slopes(model).sum(0)), _freeze(B))
 
 
+def own_damping(model: ControlAffine) -> Array | None:
+    """Return the feedback K (m, n) that a model declares as its `damping`; None if it has none.
+
+    Of any other shape, `damping` is a parameter of the model, such as a coefficient of drag.
+    """
+    shape = len(model.input_names), len(model.state_names)
+    if model.damping is None or np.shape(model.damping) != shape:
+        return None
+    return np.asarray(model.damping, float)
+
+
 @memoize
 def trim_slopes(model: ControlAffine) -> Array:
     """Return u*_k dg_k/dx at the trim, (m, n, n), read-only: the term of each trim input in A."""

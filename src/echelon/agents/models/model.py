@@ -160,7 +160,9 @@ class ControlAffine(eqx.Module):
     """Diagonals of the default Riccati weights (Q, R), R on normalized inputs; all ones."""
 
     damping: ClassVar[Rows | None] = None
-    """Feedback K (m, n) of an inner loop v = -K (x - x*) that does not use symmetric states."""
+    """Feedback K (m, n) of an inner loop v = -K (x - x*) that does not use symmetric states.
+
+    Of another shape it is a parameter of a model of yours, which has no such loop."""
 
     symmetry_weights: ClassVar[tuple[float, ...] | None] = None
     """Weights of the symmetric states in the P that goes with `damping`, one each."""

@@ -79,7 +79,7 @@ class EchelonCommand(TyperCommand):
 def _name_key(option: str, words: list[str], command: str) -> None:
     """Raise an error with `--set KEY=VALUE` for an option that is a key of the scenario."""
     # Not above: pydantic takes long to load.
-    from echelon.experiments.scenario.key_paths import places_of
+    from echelon.experiments.scenario.key_paths import places_of, sections_among
     from echelon.experiments.scenario.scenario import Scenario
 
     places = places_of((option.lstrip("-").replace("-", "_"),), Scenario)
@@ -88,7 +88,9 @@ def _name_key(option: str, words: list[str], command: str) -> None:
     text = " ".join(words).partition(option)[2]
     value = text[1:].split()[:1]
     shown = value[0] if value and not value[0].startswith("--") else "VALUE"
-    keys = " or ".join(f"`--set {place}={shown}`" for place in places[:2])
+    keyed = set[str]() if shown.startswith("{") else sections_among(places, Scenario)
+    inner = dict.fromkeys(keyed, ".KEY")
+    keys = " or ".join(f"`--set {place}{inner.get(place, '')}={shown}`" for place in places[:2])
     raise ScenarioError(
         f"`{option}` is no option of `{command}`; use {keys}, which changes that key of the "
         "scenario."

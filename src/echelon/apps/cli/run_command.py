@@ -79,9 +79,11 @@ def _new_run(
     from echelon.experiments.scenario.build import build
     from echelon.output.archive.chunks import Chunks
     from echelon.output.archive.folder import claim_folder
+    from echelon.simulation.engine.prepare import check_engine
 
     # Parts before the folder: a bad scenario must leave no empty folder behind.
     experiment = build(scenario, to_run=True)
+    check_engine(*experiment)
     job = Job("run", Chunks(claim_folder(scenario.name, out, force)))
     with job.cleanup():
         job.chunks.begin(scenario)

@@ -1,6 +1,6 @@
 """All keys of a scenario file by their paths, and what a key that does not exist may mean."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import get_args
 
 from pydantic import BaseModel
@@ -57,14 +57,28 @@ def key_paths(section: type[BaseModel], before: str = "") -> Iterator[tuple[str,
 
 
 def places_of(wrong: tuple[str | int, ...], scenario: type[BaseModel]) -> list[str]:
-    """Return the paths of the keys that an unknown one may mean, the likeliest first."""
+    """Return the paths of the keys that an unknown one may mean, the likeliest first.
+
+    Where a key that takes a value has that name, sections of the same name are left out.
+    """
     key, section = wrong[-1], [str(part) for part in wrong[:-1] if isinstance(part, str)]
     around = {".".join(section[: k + 1]) for k in range(len(section))}
     paths = [path for path, _, _ in key_paths(scenario)]
     common = [path for path, names in _COMMON_NAMES.items() if str(key) in names.split()]
     same = [path for path in paths if key in (path, path.rpartition(".")[2])]
     places = dict.fromkeys([*common, *sorted(same, key=lambda path: path.count("."))])
-    return [path for path in places if path not in around]
+    keyed = sections_among(places, scenario)
+    valued = {path.rpartition(".")[2] for path in places if path not in keyed}
+    return [
+        path
+        for path in places
+        if path not in around and not (path in keyed and path.rpartition(".")[2] in valued)
+    ]
+
+
+def sections_among(places: Iterable[str], scenario: type[BaseModel]) -> set[str]:
+    """Return which of these keys have keys of their own."""
+    return {*places} & {path.rpartition(".")[0] for path, _, _ in key_paths(scenario)}
 
 
 def meant(wrong: tuple[str | int, ...], allowed: list[str], scenario: type[BaseModel]) -> str:

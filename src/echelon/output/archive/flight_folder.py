@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.heading_symmetry import heading_index
+from echelon.agents.models.linearization import own_damping
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Network
 from echelon.core.errors import FlightError, OutputError
@@ -189,8 +190,9 @@ def _autopilot(model: ControlAffine, rest: list[float]) -> JsonObject:
     feedback = np.zeros((len(model.input_names), len(names)))
     height = names.index("z") if "z" in model.position else None
     sinking = list(rest)
-    if model.damping is not None and height is not None and len(velocity) == len(places):
-        feedback = np.asarray(model.input_scale) @ np.asarray(model.damping, float)
+    damping = own_damping(model)
+    if damping is not None and height is not None and len(velocity) == len(places):
+        feedback = np.asarray(model.input_scale) @ damping
         climbing = velocity[places.index(height)]
         # It knows neither its place nor its heading, and levels without them.
         feedback[:, [k for k in velocity if k != climbing]] = 0.0

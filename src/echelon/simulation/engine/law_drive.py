@@ -28,6 +28,7 @@ from echelon.laws.stopping_point import StoppingLeader
 from echelon.laws.together import check_numbers, hulls_at, separations, too_near
 from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.native import is_installed
+from echelon.simulation.native.agent_step import BlockRows
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.drive import Drive, Information, Problem, Stepper
@@ -234,6 +235,16 @@ class Laws(Drive):
                 if near is not None:
                     yield place, near.agent, f"it is too near to {near.text}"
 
+    def check_engine(self, problem: Problem) -> None:
+        """Check that native code, if it is requested, can step what the agents know and do.
+
+        Raises:
+            SimulationError: it cannot.
+        """
+        if problem.settings.engine == "native":
+            loop = assemble(problem, self.leader, self.follower)
+            choose_engine(problem.settings, 0, lambda: BlockRows.of(loop), _no_rows)
+
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws, and about references that leaders cannot follow."""
         warnings = self.leader.warnings(model, graph) + self.follower.warnings(model, graph)
@@ -280,6 +291,11 @@ class Laws(Drive):
         return choose_engine(
             settings, len(states), native, lambda why: JaxStepper(loop, states, why, devices)
         )
+
+
+def _no_rows(_: str) -> BlockRows | None:
+    """Return nothing, in place of what native code needs."""
+    return None
 
 
 _WORTH = 100_000

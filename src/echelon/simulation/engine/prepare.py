@@ -138,6 +138,18 @@ def check_given(parts: Parts, settings: Settings) -> None:
     settings.check()
 
 
+def check_engine(parts: Parts, settings: Settings) -> None:
+    """Check, before anything is compiled, that the engine which is requested can step the agents.
+
+    Raises:
+        EchelonError: it cannot, or a part is malformed or does not fit the others.
+    """
+    if settings.engine == "native":
+        prepared = prepare(parts, settings)
+        with precision("float64"):
+            prepared.parts.drive.check_engine(prepared.problem)
+
+
 def check_memory(model: ControlAffine, agents: int, settings: Settings) -> None:
     """Check that memory suffices for what a run of so many agents stores.
 

@@ -292,6 +292,13 @@ class Drive(eqx.Module):
             LawError: an agent starts where its law has no meaning.
         """
 
+    def check_engine(self, problem: Problem) -> None:
+        """Check, before anything is compiled, that the engine which is requested can step this.
+
+        Raises:
+            SimulationError: it cannot.
+        """
+
     def start(self, model: ControlAffine) -> State:
         """Return the state (n,) in which leaders begin, the trim unless replaced."""
         # By way of NumPy, so that a trim of whole numbers becomes one of floats.

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from echelon.agents.models.linearization import Linearization
+from echelon.agents.models.linearization import Linearization, own_damping
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import GainError, listing
@@ -65,8 +65,9 @@ class InnerLoop(Method):
     def _feedback(self, model: ControlAffine, linear: Linearization, fixed: list[int]) -> Array:
         """Return K (m, n), zero in the columns of the symmetric states."""
         # A Riccati equation ignores actuator limits; the damping of a model respects them.
-        if self.Q is None and self.R is None and model.damping is not None:
-            return np.asarray(model.damping, float)
+        declared = own_damping(model) if self.Q is None and self.R is None else None
+        if declared is not None:
+            return declared
         free = _others(model, fixed)
         Q, R = weights_of(model, self.Q, self.R)
         A, B = linear.A[np.ix_(free, free)], linear.B[free]
