@@ -206,6 +206,50 @@ def test_until_a_leader_is_lost_the_guarantee_is_that_without_the_loss():
     assert ech.promise(at_once, SETTINGS).prefix is None
 
 
+def test_events_between_two_steps_are_those_of_the_step_after_them():
+    between, on = (
+        ech.promise(_parts(events=[Cut((1, 2), 1.0 + more, 1.0), Lose(3, 3.0 + more)]), SETTINGS)
+        for more in (-0.007, 0.0)
+    )
+    assert between.promised and between.sentence() == on.sentence()
+
+
+def test_who_hears_nearer_neighbours_alone_may_be_left_behind_by_an_event():
+    """Agent 2 of a ring of five hears agent 1 alone, which is lost, or hears the leader no more."""
+    ring, ward = ech.Graph.ring(5), ech.laws.StoppingPoint(hears="leaderward")
+    drive = ech.Laws(STOPPING.leader, ward)
+    for event in (Lose(1, 0.2), Cut((0, 1), 0.2)):
+        guarantee = ech.promise(_parts(ring, drive, events=[event]), SETTINGS)
+        assert not guarantee.promised and guarantee.rate is None
+        assert "no path to the leader along neighbours that are nearer" in guarantee.sentence()
+        # Truly: whoever hears nobody stays off.
+        run = ech.simulate(_parts(ring, drive, events=[event]), SETTINGS)
+        assert run.formation_errors[-1].max() > 0.1
+        assert ech.promise(_parts(ring, events=[event]), SETTINGS).promised
+
+
+def test_a_link_that_no_step_has_makes_nobody_nearer():
+    """For 3 ms agent 3 is the leader's neighbour, and so hears nobody who is not."""
+    line = [(0, 1), (1, 2), (2, 3)]
+    turns = [(0.0, line), (1.011, [*line, (0, 3)]), (1.014, line)]
+    graph, ward = ech.Graph.switching(turns, period=2.0), ech.laws.StoppingPoint(hears="leaderward")
+    parts = _parts(graph, ech.Laws(STOPPING.leader, ward))
+    assert not ech.promise(parts, SETTINGS).promised
+    assert ech.simulate(parts, SETTINGS).formation_errors[-1, 3] > 0.1
+
+
+def test_what_is_guaranteed_until_an_event_is_of_links_that_come_back():
+    """The link is cut when the leader is lost: without the loss it would be restored."""
+    line = ech.Graph.path(4)
+    cut, heirs = Cut((0, 1), 1.0, 3.0), ech.Leadership((1,))
+    guarantee = ech.promise(_parts(line, events=[cut, Lose(0, 2.0)], leadership=heirs), SETTINGS)
+    until = guarantee.prefix.promise
+    assert until.rate == ech.promise(_parts(line, events=[cut]), SETTINGS).rate > 1.0
+    # Where somebody is away whose messages others need, nothing is.
+    away = _parts(line, events=[Join(2, 2.0)])
+    assert ech.promise(away, SETTINGS).prefix is None
+
+
 def test_heirs_over_a_radio_may_take_the_lead_at_any_time():
     parts = _parts(network=RADIO, leadership=ech.Leadership((1,)))
     assert not ech.promise(parts, SETTINGS).promised

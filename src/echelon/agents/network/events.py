@@ -215,9 +215,15 @@ def _cut_off(
 
 
 def schedule_of(
-    graph: GraphMatrices, events: Sequence[Event], heirs: Sequence[int] = ()
+    graph: GraphMatrices,
+    events: Sequence[Event],
+    heirs: Sequence[int] = (),
+    absent: Sequence[int] = (),
 ) -> Schedule:
-    """Return when which links of a graph hold, who is present, and whom each agent follows."""
+    """Return when which links of a graph hold, who is present, and whom each agent follows.
+
+    Who is `absent` is so until the end, whatever happens.
+    """
     base = graph.schedule or Schedule(np.zeros(1), graph.weights[None], None)
     ends = [event.end for event in events if isinstance(event, Cut)]
     times = [*base.starts.tolist(), *(event.at for event in events), *ends]
@@ -227,9 +233,10 @@ def schedule_of(
         if isinstance(event, Cut):
             between = np.isin(graph.edges, event.link).all(axis=1)
             weights[np.ix_((starts >= event.at) & (starts < event.end), between)] = 0.0
-    if all(isinstance(event, Cut) for event in events):
+    if all(isinstance(event, Cut) for event in events) and not absent:
         return Schedule(starts, weights, None)
     present = _present(starts, graph.agents, events)
+    present[:, list(absent)] = False
     weights[~present[:, graph.edges].all(axis=2)] = 0.0
     nearest = np.tile(nearest_leaders(graph), (len(starts), 1))
     if len(graph.leaders) == 1:

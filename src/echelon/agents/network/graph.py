@@ -218,16 +218,18 @@ class Graph(GraphMatrices):
         for fault in event_faults(before, events, heirs):
             raise GraphError(f"{fault.text}.")
         graph, events = copy.copy(before), tuple(sorted(events, key=lambda event: event.at))
-        graph.heirs, graph.before, graph._spectrum = heirs, before, None
-        graph.events = events
+        graph.events, graph.heirs, graph.before, graph._spectrum = events, heirs, before, None
         graph.schedule = schedule_of(before, events, heirs) if events else before.schedule
         return graph
 
     def until(self, at: float) -> "Graph":
-        """Return the graph with the events before a time (s) alone."""
-        graph, schedule = copy.copy(self), self.schedule and self.schedule.until(at)
-        graph.events = tuple(event for event in self.events if event.at < at)
-        graph.schedule, graph._spectrum = schedule or self.before.schedule, None
+        """Return the graph with the events before a time (s) alone: nobody joins afterwards."""
+        graph, before, presence = copy.copy(self), self.before, self.presence
+        events = tuple(event for event in self.events if event.at < at)
+        absent = [] if presence is None else np.flatnonzero(~presence[0]).tolist()
+        graph.events, graph.schedule, graph._spectrum = events, before.schedule, None
+        if events or absent:
+            graph.schedule = schedule_of(before, events, self.heirs, absent)
         return graph
 
     def _triples(self) -> list[list[float]]:
@@ -306,14 +308,12 @@ class Graph(GraphMatrices):
         schedule = self.schedule.in_steps(dt)
         if schedule is None:
             return None
-        starts, rows = schedule.starts, self.schedule.weights
-        if len(starts) == len(rows) and np.allclose(starts, self.schedule.starts, 0.0, 1e-9 * dt):
+        old, new = self.schedule.starts, schedule.starts
+        if len(old) == len(new) and np.allclose(old, new, 0.0, 1e-9 * dt):
             return self
-        # Its events are in the schedule already, and so are who is there and who leads.
+        # Its weights stay: by them it is known who is nearer to a leader, whatever steps leave out.
         graph = copy.copy(self)
-        graph.weights, graph.schedule = schedule.weights.max(axis=0), schedule
-        graph.weights.setflags(write=False)
-        graph._spectrum = None
+        graph.schedule, graph._spectrum = schedule, None
         check_reached(graph)
         return graph
 

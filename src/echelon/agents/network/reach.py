@@ -19,10 +19,10 @@ def check_reached(graph: GraphMatrices) -> None:
     Raises:
         GraphError: they do not.
     """
-    lost = lost_along(graph, graph.weights)
+    schedule = graph.schedule
+    lost = lost_along(graph, graph.weights if schedule is None else schedule.weights.max(axis=0))
     if len(lost):
         raise GraphError(_cut_off(graph, lost))
-    schedule = graph.schedule
     if schedule is not None and schedule.period is None:
         lost = unreached(graph, schedule, -1)
         if len(lost):

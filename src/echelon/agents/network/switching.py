@@ -64,16 +64,6 @@ class Schedule(NamedTuple):
         last = np.append(np.diff(steps) > 0, True)
         return steps[last], rows[last]
 
-    def until(self, at: float) -> "Schedule | None":
-        """Return the rows that begin before a time (s); None of one row in which all are there."""
-        count = int(np.searchsorted(self.starts, at - _ROUNDED))
-        if count == 1 and (self.present is None or self.present[0].all()):
-            return None
-        parts = self.weights, self.present, self.nearest
-        weights, present, nearest = (None if part is None else part[:count] for part in parts)
-        assert weights is not None
-        return Schedule(self.starts[:count], weights, None, present, nearest)
-
     def in_steps(self, dt: float) -> "Schedule | None":
         """Return the schedule as it runs in steps of dt (s), to which switches are rounded up.
 

@@ -28,6 +28,7 @@ from echelon.guarantees.stopping.flat_starts import flat_starts
 from echelon.guarantees.stopping.flat_states import flat_states_of
 from echelon.guarantees.stopping.moving_offsets import size_beside
 from echelon.guarantees.stopping.path_bounds import pieces_of
+from echelon.guarantees.stopping.switching_line import switching_line
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
 from echelon.simulation.engine.law_drive import Laws
@@ -216,7 +217,8 @@ def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> Stopping
     assert isinstance(drive.leader, StoppingLeader)
     flat = flat_starts(parts, drive.follower, states)
     graph, left_out = _in_steps(parts.graph, settings.dt)
-    parts = parts if graph is parts.graph else parts.replace(graph=graph)
+    if graph is not parts.graph:
+        parts = parts.replace(graph=graph, events=graph.events)
     run = StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
     run, leaderward = run._replace(left_out=left_out), drive.follower.leaderward
     speed = min(map(run.law.speed_of, range(len(run.law.ready.chains.outputs))))
@@ -266,7 +268,7 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)
     yield _step_line(run)
     if run.parts.graph.schedule is not None:
-        yield _switching_line(run)
+        yield switching_line(run.parts.graph, run.law.leaderward, run.left_out, run.rate)
     yield unneeded(Hypothesis.CLAIMS, _PROOF, "there is no gain")
 
 
@@ -280,23 +282,6 @@ def _changed(run: StoppingRun) -> Statement | None:
     remedy = "use the bundled law, or name a `prover` of your own"
     name, kind = Hypothesis.DISAGREEMENT_DECAY, Kind.PROOF
     return fails(name, kind, text, remedy=remedy, reason=text)
-
-
-def _switching_line(run: StoppingRun) -> Statement:
-    """Say along which edges the leader reaches everybody: checked when the graph was made."""
-    schedule = run.parts.graph.schedule
-    assert schedule is not None
-    if run.left_out:
-        remedy = "switch at multiples of `simulation.dt`"
-        name, reason = Hypothesis.SWITCHING, run.left_out
-        return fails(name, _PROOF, run.left_out, remedy=remedy, reason=reason)
-    text = f"the leader reaches every agent along the edges from {schedule.starts[-1]:g} s on"
-    if schedule.period is not None:
-        text = (
-            f"the leader reaches every agent along the edges of any {schedule.period:g} s together"
-        )
-    text += ", and zeta' is received whatever edges are present"
-    return holds(Hypothesis.SWITCHING, _PROOF, text, run.rate)
 
 
 def _offsets_line(run: StoppingRun) -> Statement:
