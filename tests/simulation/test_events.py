@@ -206,14 +206,6 @@ def test_until_a_leader_is_lost_the_guarantee_is_that_without_the_loss():
     assert ech.promise(at_once, SETTINGS).prefix is None
 
 
-def test_events_between_two_steps_are_those_of_the_step_after_them():
-    between, on = (
-        ech.promise(_parts(events=[Cut((1, 2), 1.0 + more, 1.0), Lose(3, 3.0 + more)]), SETTINGS)
-        for more in (-0.007, 0.0)
-    )
-    assert between.promised and between.sentence() == on.sentence()
-
-
 def test_who_hears_nearer_neighbours_alone_may_be_left_behind_by_an_event():
     """Agent 2 of a ring of five hears agent 1 alone, which is lost, or hears the leader no more."""
     ring, ward = ech.Graph.ring(5), ech.laws.StoppingPoint(hears="leaderward")
@@ -245,6 +237,9 @@ def test_what_is_guaranteed_until_an_event_is_of_links_that_come_back():
     guarantee = ech.promise(_parts(line, events=[cut, Lose(0, 2.0)], leadership=heirs), SETTINGS)
     until = guarantee.prefix.promise
     assert until.rate == ech.promise(_parts(line, events=[cut]), SETTINGS).rate > 1.0
+    # Between two steps as well, where somebody is away for good.
+    later = [Cut((0, 1), 1.003, 3.0), Join(3, 2.0)]
+    assert ech.promise(_parts(line, events=later), SETTINGS).prefix.promise.rate > 1.0
     # Where somebody is away whose messages others need, nothing is.
     away = _parts(line, events=[Join(2, 2.0)])
     assert ech.promise(away, SETTINGS).prefix is None

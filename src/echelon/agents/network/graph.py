@@ -311,8 +311,7 @@ class Graph(GraphMatrices):
         old, new = self.schedule.starts, schedule.starts
         if len(old) == len(new) and np.allclose(old, new, 0.0, 1e-9 * dt):
             return self
-        # Its weights stay: by them it is known who is nearer to a leader, whatever steps leave out.
-        graph = copy.copy(self)
+        graph = copy.copy(self)  # by whose weights agents are nearer to a leader than others
         graph.schedule, graph._spectrum = schedule, None
         check_reached(graph)
         return graph

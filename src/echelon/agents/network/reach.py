@@ -20,10 +20,11 @@ def check_reached(graph: GraphMatrices) -> None:
         GraphError: they do not.
     """
     schedule = graph.schedule
-    lost = lost_along(graph, graph.weights if schedule is None else schedule.weights.max(axis=0))
+    periodic = schedule is not None and schedule.period is not None
+    lost = lost_along(graph, schedule.weights.max(axis=0) if periodic else graph.weights)
     if len(lost):
         raise GraphError(_cut_off(graph, lost))
-    if schedule is not None and schedule.period is None:
+    if schedule is not None and not periodic:
         lost = unreached(graph, schedule, -1)
         if len(lost):
             raise GraphError(
