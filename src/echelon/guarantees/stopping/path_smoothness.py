@@ -58,7 +58,7 @@ def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: 
             return part(t)[picked]
 
         list(enclose_finely(path, (Fraction(begin), Fraction(until)), 0))
-        _compare(path, order, begin, until)
+        compare_derivatives(path, order, begin, until)
         begin = until
 
 
@@ -82,7 +82,9 @@ def _check_joints(reference: Reference, order: int) -> None:
         )
 
 
-def _compare(path: Callable[[jax.Array], jax.Array], order: int, begin: float, end: float) -> None:
+def compare_derivatives(
+    path: Callable[[jax.Array], jax.Array], order: int, begin: float, end: float
+) -> None:
     """Check handwritten derivatives in a path, which the law uses, at a few times.
 
     Raises:

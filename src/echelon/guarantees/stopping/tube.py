@@ -20,6 +20,7 @@ from echelon.guarantees.stopping.flat_everywhere import bounds_of
 from echelon.guarantees.stopping.flat_states import flat_states_of
 from echelon.guarantees.stopping.motor_load import MotorLoad, motor_load_of
 from echelon.guarantees.stopping.moving_offsets import offsets_mapping
+from echelon.guarantees.stopping.offset_smoothness import offset_fault
 from echelon.guarantees.stopping.path_smoothness import path_fault
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 
@@ -121,6 +122,11 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     if fault:
         remedy = "choose a smooth path: sines of time need no remainder, and `waypoints` pass "
         return _nothing(fault, f"{remedy}smoothly through the entries of a table")
+    motion = run.parts.formation.motion
+    fault = offset_fault(motion, max(chains.degrees), run.settings.horizon)
+    if fault:
+        remedy = "write the motion without branches, remainders and jumps"
+        return _nothing(fault, "use a shorter chain" if "reshape" in fault else remedy)
     try:
         chain = run.chain(longest)
         gains = tuple(float(chain.gain(k)) for k in range(max(1, len(chain.powers) + 1)))
@@ -142,7 +148,6 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     lines = [inner, *(_by(known.kind, model, line) for line in _set_lines(run, borders))]
     if any(line.fails for line in lines):
         return None, lines
-    motion = run.parts.formation.motion
     tube = Tube(
         run.rate,
         gains,

@@ -1,0 +1,97 @@
+"""A motion of the formation has the derivatives that T5 asks of it, or nothing is guaranteed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate
+from echelon.guarantees.stopping.offset_smoothness import offset_fault
+
+CART = ech.models.DoubleIntegrator()
+GRAPH = ech.Graph.path(3)
+LAWS = ech.Laws(ech.laws.StoppingLeader(), ech.laws.StoppingPoint())
+MOVED = np.array([[0, 0, 0, 0], [0.5, 1, 0, 0], [1, 2, 0, 0.0]])
+
+
+class Late(OffsetMotion):
+    """A jump after all samples."""
+
+    def __call__(self, place, t):
+        return place + jnp.where(t > 61.0, place, 0.0)
+
+
+class Place(OffsetMotion):
+    """A jump where an agent is far out, which the place of the samples is not."""
+
+    def __call__(self, place, t):
+        return jnp.where(place > 1.5, place + 0.5, place)
+
+
+class Small(OffsetMotion):
+    """A kink that is small beside the rest."""
+
+    def __call__(self, place, t):
+        return place.at[0].add(1e-4 * jnp.abs(t - 13.1) + 2.0 * jnp.sin(t))
+
+
+class Hidden(OffsetMotion):
+    """A part without derivatives."""
+
+    def __call__(self, place, t):
+        return place.at[0].add(10.0 * jnp.sin(t) + 1e-3 * jnp.sin(jax.lax.stop_gradient(t)))
+
+
+class Smooth(OffsetMotion):
+    """A wave that is larger where an agent is far out."""
+
+    def __call__(self, place, t):
+        return place.at[1].add(0.2 * place[0] * jnp.sin(t))
+
+
+def guaranteed(*changes, model=CART, horizon=20.0, places=((1.0, 0.0), (2.0, 1.0))):
+    formation = ech.Formation.from_offsets(model, GRAPH, dict(enumerate(places, 1)))
+    formation = formation.moving(model, GRAPH, changes)
+    parts = ech.Parts(model, GRAPH, formation, LAWS)
+    return parts, ech.promise(parts, ech.Settings(horizon=horizon, dt=0.01))
+
+
+@pytest.mark.parametrize(
+    ("changes", "horizon"),
+    [
+        ((Late(),), 70.0),
+        ((Rotate(0.5), Place()), 20.0),
+        ((Reshape(MOVED, 1.1, 2.3), Place()), 20.0),
+        ((Small(),), 20.0),
+        ((Hidden(),), 20.0),
+    ],
+    ids=["after all samples", "on its way round", "on its way", "small", "without derivatives"],
+)
+def test_a_motion_that_is_not_shown_smooth_is_not_guaranteed(changes, horizon):
+    _, value = guaranteed(*changes, horizon=horizon)
+    assert not value.promised
+    name = type(changes[-1]).__name__
+    assert f"the motion `{name}` is not known to have 2 bounded derivatives" in value.sentence()
+
+
+def test_of_a_motion_that_jumps_nothing_was_true():
+    """Errors jump with it."""
+    parts, _ = guaranteed(Rotate(0.5), Place())
+    run = ech.simulate(parts, ech.Settings(horizon=10.0, dt=0.01))
+    assert run.formation_errors[run.times > 4.0].max() > 0.4
+
+
+def test_a_smooth_motion_between_reshapes_is_guaranteed():
+    _, value = guaranteed(Reshape(MOVED, 1.1, 2.3), Rotate(0.3), Smooth())
+    assert value.promised and value.rate > 1.0
+    # Until the jump nothing keeps it from that.
+    _, before = guaranteed(Late(), horizon=60.0)
+    assert before.promised
+
+
+def test_a_reshape_has_no_derivatives_for_longer_chains():
+    parts, _ = guaranteed(Reshape(MOVED, 1.1, 2.3))
+    assert offset_fault(parts.formation.motion, 6, 20.0) == ""
+    fault = offset_fault(parts.formation.motion, 7, 20.0)
+    assert fault == "a reshape has 5 continuous derivatives, and 6 are needed"
