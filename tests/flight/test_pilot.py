@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
+from echelon.agents.network.formation_motion import Rotate
 from echelon.agents.network.inbox import Packet as SimulatedPacket
 from echelon.flight.letterbox import NOBODY
 from echelon.flight.pilot import Pilot
@@ -18,7 +19,7 @@ from echelon.simulation.onboard.python_text import python_text
 CARTS, DT = ech.models.DoubleIntegrator(), 0.01
 
 
-def parts_of(law, sensing=None, **network):
+def parts_of(law, sensing=None, changes=(), **network):
     graph = ech.Graph([(0, 1), (1, 2), (1, 3)])
     offsets = {1: (1.0, 0.0), 2: (1.0, 0.8), 3: (1.0, -0.8)}
     circle = ech.references.Circle(rate=0.5)
@@ -29,6 +30,8 @@ def parts_of(law, sensing=None, **network):
         leader = ech.laws.StoppingLeader(reference=circle)
         drive = ech.Laws(leader, ech.laws.StoppingPoint())
     places = ech.Formation.from_offsets(CARTS, graph, offsets)
+    if changes:
+        places = places.moving(CARTS, graph, changes)
     world = ech.World(network=ech.Network(rate=25.0, **network), sensing=sensing)
     return ech.Parts(CARTS, graph, places, drive, world=world)
 
@@ -40,6 +43,7 @@ def pilot_of(agent, **options):
     exec(python_text(functions.values(), "A law.", {}), vars(law))
     facts = {
         "agent": agent.number,
+        "dt": DT,
         "leads": own.leads,
         "hears": list(own.neighbours),
         "weights": own.weights[0].tolist(),
@@ -72,6 +76,7 @@ CASES = {
     "leaderward": ("stopping-point", 1, {"hears": "leaderward"}),
     "carried": ("consensus", 1, {"prediction": "packet", "hears": "leaderward"}),
     "estimated": ("stopping-point", 1, {"sensing": NOISE}),
+    "turning": ("stopping-point", 2, {"changes": [Rotate(0.5)]}),
 }
 
 
@@ -105,8 +110,9 @@ def test_a_pilot_is_the_agent(case):
     assert sent > 100
 
 
-def test_who_hears_nobody_flies_by_the_plan_and_then_holds():
-    agent = ech.Agent(parts_of("stopping-point"), 1, DT)
+@pytest.mark.parametrize("changes", [[], [Rotate(0.8)]])
+def test_who_hears_nobody_flies_by_the_plan_and_then_holds(changes):
+    agent = ech.Agent(parts_of("stopping-point", changes=changes), 1, DT)
     pilot, facts = pilot_of(agent, hold=1.0)
     draws, x = np.random.default_rng(0), [1.0, 0.0, 0.0, 0.0]
     letter = draw(draws, facts, 0, 0.0)

@@ -8,6 +8,7 @@ import urllib.request
 import pytest
 
 import echelon as ech
+from echelon.agents.network.formation_motion import Rotate
 from echelon.core.errors import FlightError
 from echelon.flight.ground import page_of
 from echelon.flight.mission import Mission
@@ -23,6 +24,7 @@ CARTS, DT, SPEED, SECONDS = ech.models.DoubleIntegrator(), 0.02, 0.25, 8.0
 def mission(tmp_path_factory):
     graph = ech.Graph([(0, 1), (1, 2)], directed=True)
     places = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.0), 2: (1.0, 0.8)})
+    places = places.moving(CARTS, graph, [Rotate(0.4)])
     circle = ech.references.Circle(rate=0.5)
     leader = ech.laws.StoppingLeader(reference=circle)
     drive = ech.Laws(leader, ech.laws.StoppingPoint())

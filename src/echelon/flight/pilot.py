@@ -83,13 +83,21 @@ class Pilot:
         hops = self._hops(ages)
         z = self._disagreement(t, x, memory, leader, ages, hops)
         if not self._in_lead and min(ages, default=0.0) > self._hold:
-            z, forward = [0.0] * len(z), [0.0] * len(forward)
+            z, forward = [0.0] * len(z), self._stillness(t, x, memory, len(forward))
         u, after, _, _, *content, valid = self._law.tick(t, x, z, forward, memory)
         if not valid:
             return self._last._replace(valid=False) if self._last else Ticked(u, None, False)
         letter = self._letter(t, x, memory, leader, hops, content)
         self._memory, self._last = after, Ticked(u, letter, True)
         return self._last
+
+    def _stillness(self, t: float, x: list[float], memory: list[float], size: int) -> list[float]:
+        """Return the feed-forward of one who holds its place, though its offset may move."""
+        still, dt = [0.0] * size, self._facts["dt"]
+        if self._network["moves"]:
+            before, after = (self._law.signal(at, x, memory) for at in (t - dt, t + dt))
+            still[: len(before)] = [(b - a) / (2 * dt) for a, b in zip(before, after, strict=True)]
+        return still
 
     @property
     def leader(self) -> int:

@@ -7,9 +7,9 @@ import secrets
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final, final
+from typing import Any, Final, final
 
 from echelon.core.errors import FlightError
 from echelon.flight.air import LOOPBACK, Air, ports_of
@@ -193,20 +193,32 @@ class Errors:
 def read_errors(mission: Mission, begins: float, speed: float) -> Errors:
     """Return the errors in positions.csv, of a plan that began at a monotonic time (s)."""
     facts = mission.facts
-    offsets, d = facts["offsets"], len(facts["position"])
+    d = len(facts["position"])
     leader = facts["leader"]
     times, rows, late = list[float](), list[list[float]](), 0
     for line in (mission.folder / "positions.csv").read_text("utf-8").splitlines():
         moment, gone, *flat = map(float, line.split(","))
         places = [flat[d * k : d * k + d] for k in range(mission.agents)]
+        times.append((moment - begins) * speed)
+        offsets = offsets_at(facts["offsets"], times[-1])
         goals = [
             [x + b - a for x, a, b in zip(places[leader], offsets[leader], own, strict=True)]
             for own in offsets
         ]
-        times.append((moment - begins) * speed)
         rows.append([math.dist(x, goal) for x, goal in zip(places, goals, strict=True)])
         late = int(gone)
     return Errors(times, rows, late)
+
+
+def offsets_at(facts: Mapping[str, Any], t: float) -> list[list[float]]:
+    """Return where agents belong relative to each other (N, d) at a time of the plan (s)."""
+    rows, index = facts["rows"], max(0.0, t) / facts["every"]
+    k = min(int(index), len(rows) - 1)
+    share, after = index - k, rows[min(k + 1, len(rows) - 1)]
+    return [
+        [a + share * (b - a) for a, b in zip(own, then, strict=True)]
+        for own, then in zip(rows[k], after, strict=True)
+    ]
 
 
 def make_key(file: Path) -> None:
@@ -221,7 +233,7 @@ def flying(together: Together) -> Iterator[None]:
     """Start all processes, wait until all are ready, start the plan, and end all at last."""
     try:
         together.start_world()
-        for k in range(len(together._mission.facts["offsets"])):
+        for k in range(together._mission.agents):
             together.start_agent(k)
         together.wait_until_ready()
         together.start()

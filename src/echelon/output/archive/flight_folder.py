@@ -32,6 +32,7 @@ _SUBSTEPS = 2
 """Of a simulated vehicle in a period of the law; an input acts from the next one on."""
 _MARGIN, _FASTER = 1.5, 4.0
 """m and m/s, by which a fence is beyond the starts and the plan."""
+_EVERY = 0.02  # s between offsets of a formation that moves
 _SINKING = -0.5  # m/s
 
 
@@ -67,7 +68,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         "weather": {"delay": network.delay, "jitter": network.jitter, "loss": network.loss},
         **_places(parts.model),
         "fence": _fence(parts, settings),
-        "offsets": parts.formation.offsets[:, list(parts.model.position_indices())].tolist(),
+        "offsets": _offsets(parts, settings),
         "vehicles": vehicles[0],
     }
     return {**files, **vehicles[1], "flight.json": json.dumps(described, indent=2) + "\n"}
@@ -97,10 +98,6 @@ def _network(parts: Parts) -> Network:
         )
     if parts.graph.schedule is not None:
         raise FlightError("the graph of the scenario switches, which no flight does yet.")
-    if parts.formation.motion is not None:
-        raise FlightError(
-            "the formation changes with time, which no flight does yet; leave `motion` out."
-        )
     if network.bursts.share:
         raise FlightError("`network.bursts` has no counterpart in a flight; use `network.loss`.")
     if parts.world.sensing is not None and parts.world.sensing.delay:
@@ -120,6 +117,15 @@ def _places(model: ControlAffine) -> JsonObject:
     }
 
 
+def _offsets(parts: Parts, settings: Settings) -> JsonObject:
+    """Return where agents belong relative to each other, m, every so often (s)."""
+    moves = parts.formation.motion is not None
+    count = 1 + math.ceil(settings.horizon / _EVERY) if moves else 1
+    places = parts.formation.offsets_at(_EVERY * np.arange(count))
+    rows = places[:, :, list(parts.model.position_indices())]
+    return {"every": _EVERY, "rows": np.round(rows, 7).tolist()}
+
+
 def _fence(parts: Parts, settings: Settings) -> JsonObject:
     """Return a box about the starts and the plan, and a speed."""
     prepared = prepare(parts, settings)
@@ -132,10 +138,10 @@ def _fence(parts: Parts, settings: Settings) -> JsonObject:
         plan = drive.leader.reference_states(model, jnp.asarray(times))
     if plan is not None:
         path = np.asarray(plan)[:, places]
-        offsets = parts.formation.offsets[:, places]
-        corners += [path + offset for offset in offsets]
-        steps = np.diff(path, axis=0) / np.diff(times)[:, None]
-        fastest = float(np.linalg.norm(steps, axis=1).max(initial=0.0))
+        goals = path[:, None] + parts.formation.offsets_at(times)[:, :, places]
+        corners += list(goals)
+        steps = np.diff(goals, axis=0) / np.diff(times)[:, None, None]
+        fastest = float(np.linalg.norm(steps, axis=2).max(initial=0.0))
     points = np.vstack(corners)
     return {
         "low": _rounded(points.min(axis=0) - _MARGIN),

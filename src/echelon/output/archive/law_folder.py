@@ -10,6 +10,7 @@ from echelon.core.errors import OutputError
 from echelon.core.files import write_atomic
 from echelon.core.types import JsonObject
 from echelon.guarantees.promises.promise import guaranteed
+from echelon.laws.law import Law
 from echelon.output.archive.folder import write_errors
 from echelon.simulation.engine.agent import Agent
 from echelon.simulation.engine.own_step import OwnLaw
@@ -167,6 +168,7 @@ def network_facts(
         "agents": len(loop.order),
         "leaders": loop.leaders.tolist(),
         "content": size,
+        "moves": loop.moving is not None and type(own.law).goal_offset is not Law.goal_offset,
     }
 
 
