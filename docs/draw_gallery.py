@@ -36,6 +36,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "figures": {"avoidance": "near"},
         "video": ("crossing", 1.0),
     },
+    "reshape": {"set": ("reference.amplitude=[1.0, 1.6]",), "video": ("reshape", 2.5)},
     "leader-lost": {"figures": {"trajectories": "heir"}, "video": ("heir", 1.5)},
     "paper-far": {"set": ("simulation.horizon=20",), "figures": {"trajectories": "far"}},
     "flock.yaml": {
@@ -100,8 +101,8 @@ def draw_run(scene: str, folder: Path, out: Path, quick: bool) -> None:
     changes = (*told.get("set", ()), *(short if quick else ()))
     source = folder / scene if scene.endswith(".yaml") else scene
     run = recording_of(ech.run(ech.load_scenario(source, changes)))
-    drawn = ech.figures(run, tuple(told["figures"]))
-    save({told["figures"][name]: figure for name, figure in drawn.items()}, out)
+    names = told.get("figures", {})
+    save({names[name]: figure for name, figure in ech.figures(run, tuple(names)).items()}, out)
     if "video" in told:
         name, speed = told["video"]
         save_video(run, out / f"{name}.gif", 100.0 if quick else speed)

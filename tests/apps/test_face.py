@@ -17,6 +17,7 @@ import echelon as ech
 from echelon.apps.cli.explain_command import _names_and_keys
 from echelon.core.errors import MissingExtraError, OutputError
 from echelon.experiments.results.avoidance import Ellipsoid
+from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.recording import FORMAT, read_recording
 from echelon.experiments.scenario.registry import families
@@ -227,6 +228,37 @@ def test_the_camera_holds_the_whole_box_and_shows_near_things_larger(run):
     up = np.array([0.0, 0.0, 0.1])
     tall = np.linalg.norm(camera.project(corners + up)[0] - pixels, axis=1)
     assert tall[depth.argmin()] > tall[depth.argmax()]
+
+
+def test_the_camera_comes_as_near_as_places_and_their_shadows_fit(run):
+    space = space_of(run)
+    places = video.scene_places(run, space)
+    camera, box = camera_for(space, 600, 500, 10, places), camera_for(space, 600, 500, 10)
+    middle = places.reshape(-1, 3).mean(axis=0)
+    assert camera.project(middle)[1] < box.project(middle)[1]
+    below = places * (1.0, 1.0, 0.0) + (0.0, 0.0, space.low[2])
+    pixels, depth = camera.project(np.concatenate([places, below]))
+    assert (depth > 0).all()
+    assert (pixels > (10, 0)).all() and (pixels < (610, 500)).all()
+
+
+def test_an_heir_is_drawn_as_the_leader_that_it_is():
+    cart, graph = ech.models.DoubleIntegrator(), ech.Graph([(0, 1), (1, 2)])
+    laws = ech.Laws(
+        ech.laws.StoppingLeader(reference=ech.references.Circle(radius=2.0, rate=0.7)),
+        ech.laws.StoppingPoint(),
+    )
+    places = ech.Formation.from_offsets(cart, graph, {1: [1.0, 0.0], 2: [2.0, 0.0]})
+    parts = ech.Parts(
+        cart, graph, places, laws, {"position": 0.5},
+        events=[ech.network.Lose(0, 1.0)], leadership=ech.Leadership((1,)),
+    )  # fmt: skip
+    run = recording_of(ech.simulate(parts, ech.Settings(horizon=2.0, dt=0.02)))
+    film = video._Film(run, (960, 540), run.times[[0, -1]])
+    for time, leads in ((0.5, [False, False]), (1.5, [True, False])):
+        film.moving.show(time, *film.between(time))
+        black = (film.moving.bodies == film.moving.black).all(axis=1)
+        assert black[1:].tolist() == leads
 
 
 def test_rotations_are_those_of_roll_pitch_and_yaw():

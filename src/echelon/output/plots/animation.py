@@ -7,6 +7,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.experiments.results.recording import Recording
+from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import pen_of
 from echelon.output.plots.camera import Camera
 from echelon.output.plots.space import Space, body_width
@@ -49,6 +50,7 @@ class MovingScene(abc.ABC):
         self.colours: Any = to_rgba_array(
             [pen_of(run, agent)["color"] for agent in range(run.agents)]
         )
+        self.bodies, self.black = self.colours, to_rgba_array(draw.LEADER)
         self.size = body_width(run, space)
         every = [run.offsets] if run.moving is None else run.moving
         self.offsets = np.stack([scene_offsets(rows, space) for rows in every])
@@ -81,6 +83,9 @@ class MovingScene(abc.ABC):
         nearest = self.run.nearest
         if schedule is not None and schedule.nearest is not None:
             nearest = schedule.nearest[schedule.row(time)]
+        # An heir is drawn as the leader that it is.
+        leads = nearest == np.arange(len(nearest))
+        self.bodies = np.where(leads[:, None], self.black, self.colours)
         goals = np.where(np.isfinite(now), now[nearest] + offsets - offsets[nearest], np.nan)
         if self.space.kind == "time":
             goals[:, 0] = now[:, 0]
@@ -145,7 +150,7 @@ class _Vehicles(MovingScene):
         if self.space.shape != "quadrotor" or angles is None:
             discs = project(now[:, None] + 0.3 * self.size * self._facing())[0]
             self.rotors.set_verts(list(discs[order]))
-            self.rotors.set_facecolor(self.colours[order])
+            self.rotors.set_facecolor(self.bodies[order])
             return
         self._quadrotors(now, angles, order)
 
@@ -167,7 +172,7 @@ class _Vehicles(MovingScene):
         w = self.ring[:, :1] * self.camera.axes[0] + self.ring[:, 1:2] * self.camera.axes[1]
         outline = squares * w / np.sqrt((squares * w * w).sum(axis=1, keepdims=True))
         self.shells.set_verts(list(self.camera.project(now[:, None] + outline)[0]))
-        edges = np.where(near[:, None] > 0.0, _NEAR[near.astype(int)], self.colours)
+        edges = np.where(near[:, None] > 0.0, _NEAR[near.astype(int)], self.bodies)
         faces: Any = edges.copy()
         faces[:, 3] = np.where(near > 0.0, 0.35, 0.1)
         self.shells.set_edgecolor(edges)
@@ -179,7 +184,7 @@ class _Vehicles(MovingScene):
         placed = now[:, None] + hubs @ turns.swapaxes(1, 2)
         arms = project(placed.reshape(-1, 2, 2, 3))[0]
         self.arms.set_segments(list(arms[order].reshape(-1, 2, 2)))
-        pens: Any = np.repeat(self.colours[order], 4, axis=0)
+        pens: Any = np.repeat(self.bodies[order], 4, axis=0)
         self.arms.set_color(pens[::2])
         discs = (hubs[:, None] + 0.23 * size * self.ring) @ turns[:, None].swapaxes(2, 3)
         discs = project(now[:, None, None] + discs)[0]

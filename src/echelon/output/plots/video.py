@@ -159,7 +159,7 @@ class _Film:
         self.run, self.space = run, space_of(run)
         self.places = scene_places(run, self.space)
         self.size, tall = size, _WIDTH * size[1] / size[0]
-        self.camera = camera_for(self.space, _SCENE, round(tall), 0)
+        self.camera = camera_for(self.space, _SCENE, round(tall), 0, self.places)
         inches = _WIDTH / _UNITS, tall / _UNITS
         self.figure = Figure(inches, dpi=size[0] / inches[0], facecolor=_PAPER)
         self.canvas: FigureCanvasAgg = FigureCanvasAgg(self.figure)
@@ -217,6 +217,7 @@ def scene_places(run: Recording, space: Space) -> Array:
 def draw_floor(ax: "Axes", camera: Camera, space: Space) -> None:
     """Draw a grid under the agents, with its step as a text."""
     from matplotlib.collections import LineCollection
+    from matplotlib.patches import Rectangle
 
     low, high, stretch = space.low, space.high, (*space.stretch, 1.0)
     lines, steps = [], []
@@ -230,7 +231,12 @@ def draw_floor(ax: "Axes", camera: Camera, space: Space) -> None:
             line = ends.copy()
             line[:, k] = value * step * stretch[k]
             lines.append(camera.project(line)[0])
-    ax.add_collection(LineCollection(lines, colors=_GRID, linewidths=0.9))
+    floor = ax.add_collection(LineCollection(lines, colors=_GRID, linewidths=0.9))
+    # Its corners may be outside of the scene, of which the curves are beside.
+    left, bottom = camera.middle - (0.5 * _SCENE, camera.middle[1])
+    floor.set_clip_path(
+        Rectangle((left, bottom), _SCENE, 2.0 * camera.middle[1], transform=ax.transData)
+    )
     names = " and ".join(dict.fromkeys(steps))
     words = (
         f"grid {names}"
