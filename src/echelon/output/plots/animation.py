@@ -50,7 +50,8 @@ class MovingScene(abc.ABC):
         self.colours: Any = to_rgba_array(
             [pen_of(run, agent)["color"] for agent in range(run.agents)]
         )
-        self.bodies, self.black = self.colours, to_rgba_array(draw.LEADER)
+        self.black: Any = to_rgba_array(draw.LEADER)
+        self.bodies: Any = self.colours
         self.size = body_width(run, space)
         every = [run.offsets] if run.moving is None else run.moving
         self.offsets = np.stack([scene_offsets(rows, space) for rows in every])
@@ -172,7 +173,7 @@ class _Vehicles(MovingScene):
         w = self.ring[:, :1] * self.camera.axes[0] + self.ring[:, 1:2] * self.camera.axes[1]
         outline = squares * w / np.sqrt((squares * w * w).sum(axis=1, keepdims=True))
         self.shells.set_verts(list(self.camera.project(now[:, None] + outline)[0]))
-        edges = np.where(near[:, None] > 0.0, _NEAR[near.astype(int)], self.bodies)
+        edges: Any = np.where(near[:, None] > 0.0, _NEAR[near.astype(int)], self.bodies)
         faces: Any = edges.copy()
         faces[:, 3] = np.where(near > 0.0, 0.35, 0.1)
         self.shells.set_edgecolor(edges)
