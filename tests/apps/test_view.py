@@ -446,6 +446,9 @@ def test_two_runs_have_one_clock_one_scale_and_one_camera(browser, run, tmp_path
         assert targets[0] == pytest.approx(targets[1])
         page.keyboard.press("n")
         assert page.locator(".card").count() == 2 and page.locator(".card").last.is_visible()
+    with opened(browser, path.as_uri(), 390, 844) as page:
+        cut = "(names) => names.map((name) => name.scrollWidth > name.clientWidth)"
+        assert page.locator("main h1").evaluate_all(cut) == [False, False]
 
 
 def test_a_phone_shows_scene_and_controls_on_one_screen_with_room_for_fingers(browser, file):

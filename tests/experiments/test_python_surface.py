@@ -64,6 +64,7 @@ def adjacency(graph):
     [
         ([[0, 1]], {}, r"has shape \(1, 2\), and must be a square matrix"),
         ("edges", {}, r"must be a square matrix"),
+        ([[0, 1], [1]], {}, r"must be a square matrix .* with rows of one length"),
         ([[0, 1], [0, 0]], {"directed": False}, "is not symmetric"),
         ([[0, -1], [-1, 0]], {}, "weight"),
         ([[0, np.nan], [np.nan, 0]], {}, "weight"),

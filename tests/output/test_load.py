@@ -144,6 +144,24 @@ def test_its_repr_is_one_line(run):
     assert repr(recording_of(ech.load(run[1]))) == "Recording('integrators', 4 agents, 6 frames)"
 
 
+def test_a_file_by_itself_is_summarized_saved_and_verified(run, here):
+    """Its `summary.json` is lost, and with it how long the run took."""
+    alone = ech.load(copied(run[1]))
+    assert ech.summary(alone)["wall_time_s"] is None
+    again = ech.load(ech.save_run(alone, "again", figures=False))
+    assert np.isnan(again.wall_time) and ech.verify(alone).holds
+
+
+def test_python_is_answered_in_its_own_words(run, here):
+    ech.save_run(run[0], "o", figures=False)
+    ech.export(run[0], "o.csv")
+    for write in (lambda: ech.save_run(run[0], "o"), lambda: ech.export(run[0], "o.csv")):
+        with pytest.raises(ech.errors.OutputError, match="choose another, or `force=True` to repl"):
+            write()
+    with pytest.raises(ech.errors.OutputError, match="`place` is 3, and must be the folder of"):
+        ech.load(3)
+
+
 def test_the_names_of_before_lead_to_the_same_with_a_warning(run):
     for name in (ech.load_run, ech.open_run):
         with pytest.warns(DeprecationWarning, match="is now `load`"):

@@ -380,7 +380,9 @@ def test_an_inner_loop_makes_assumption_5_hold():
 def test_a_broken_offset_and_a_missing_relay_are_named():
     lines, found = verdicts("paper", "formation.offsets.1=[1,0,0,0,0,0,0.2,0,0,0,0,0]")
     assert lines["offsets are symmetries"].verdict is Verdict.FAILS and not found.promised
-    assert lines["offsets are symmetries"].text.startswith("agent 1: it changes the drift")
+    assert lines["offsets are symmetries"].text.startswith(
+        "the offset of agent 1: it changes the drift"
+    )
     lines, found = verdicts("paper", "follower.feedforward=none")
     assert lines["leader's motion is matched"].verdict is Verdict.FAILS
     assert "once the leader's input rests" in found.promise.sentence()

@@ -188,7 +188,10 @@ def edges_of_matrix(
     try:
         weights = np.asarray(matrix, np.float64)
     except (TypeError, ValueError):
-        weights = np.zeros(0)
+        raise GraphError(
+            "the adjacency matrix must be a square matrix of numbers (agents, agents), with rows "
+            "of one length."
+        ) from None
     if weights.ndim != 2 or len(weights) != len(weights.T):
         raise GraphError(
             f"the adjacency matrix has shape {np.shape(weights)}, and must be a square matrix of "

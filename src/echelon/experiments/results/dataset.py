@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -297,7 +298,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
         "steady_window_s": numbers.steady_window,
         "warnings": list(result.warnings),
         "engine": result.engine,
-        "wall_time_s": result.wall_time,
+        "wall_time_s": result.wall_time if math.isfinite(result.wall_time) else None,
         "versions": {
             key[8:]: text for key, text in result.provenance.items() if key.startswith("version_")
         },

@@ -57,7 +57,7 @@ def _result(
 ) -> Result:
     attributes, arrays = data.attributes, data.arrays()
     sums = {name: arrays[SUM + name] for name in Sums._fields if SUM + name in arrays}
-    solver = attributes.get("solver")
+    solver, seconds = attributes.get("solver"), summary.get("wall_time_s")
     settings = _settings(attributes)
     return Result(
         times=arrays["time"],
@@ -68,7 +68,7 @@ def _result(
         message=attributes["message"],
         warnings=tuple(attributes["warnings"].splitlines()),
         settings=settings,
-        wall_time=float(summary.get("wall_time_s", float("nan"))),
+        wall_time=float("nan") if seconds is None else float(seconds),
         sums=Later(partial(_sums, file, sums)),
         parts=Later(partial(parts, attributes, settings)),
         work=None if solver is None else SolverStats(**json.loads(solver)),

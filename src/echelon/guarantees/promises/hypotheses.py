@@ -182,7 +182,7 @@ def _symmetric(case: Case) -> Statement:
         return holds(name, kind, f"f and g are invariant under them{where}", 0, "0 broken")
     agent, why = next(iter(broken.items()))
     text, remedy = (
-        f"agent {agent}: {why}{where}",
+        f"the offset of agent {agent}: {why}{where}",
         "offset only states that f and g do not use",
     )
     count, reason = len(broken), "an offset is no symmetry of the dynamics"

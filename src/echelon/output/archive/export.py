@@ -82,13 +82,13 @@ def export(run: "Result", path: "PathLike", force: bool = False) -> Path:
             cannot be written.
         MissingExtraError: pyarrow, of Parquet, or the page's three.js is not installed.
     """
-    from echelon.output.archive.folder import claim_file, write_errors
+    from echelon.output.archive.folder import IN_PYTHON, claim_file, write_errors
 
     file = Path(path)
     if not file.suffix:
         raise OutputError(f"`{file.name}` has no ending, such as `.csv`, to choose the format.")
     content = content_of(file.suffix.lower().removeprefix("."), f"`{file.name}` ends in")
-    claim_file(file, force)
+    claim_file(file, force, how=IN_PYTHON)
     with write_errors(file):
         write_atomic(file, content(run))
     return file

@@ -21,20 +21,27 @@ _SWEEP = ("sweep.nc", FRAMES, "scenario.yaml", "sweep.txt", "figures", INPUTS, B
 _MARKS = {SUMMARY: _RUN, CHUNKS: _RUN, "comparison.json": _COMPARISON}
 _MARKS |= {"sweep.nc": _SWEEP, BATCHES: _SWEEP}
 """The name that shows which command wrote a folder, and the files that `--force` then removes."""
+FORCE, IN_PYTHON = "`--force`", "`force=True`"
+"""What replaces files that exist, for the command line and in Python."""
 _FILES = {CHUNKS: _RUN, RUNS: _COMPARISON, BATCHES: _SWEEP}
 
 
-def claim_folder(name: str, out: Path | None, force: bool, by: str = CHUNKS) -> Path:
+def claim_folder(
+    name: str, out: Path | None, force: bool, by: str = CHUNKS, how: str = FORCE
+) -> Path:
     """Return the folder for a run, created and empty of earlier runs.
 
     Without `out` it is `runs/<name>-<time>`, numbered where two runs start in the same second. It
-    is claimed by creating the folder `by` in it, which only one of two runs can.
+    is claimed by creating the folder `by` in it, which only one of two runs can. `how` is what
+    replaces an earlier run, in words.
 
     Raises:
         OutputError: `out` holds something and `force` was not given, or it cannot be written.
     """
     with write_errors(Path(RUNS) if out is None else out):
-        folder = _new_folder(Path(RUNS), name) if out is None else _named_folder(out, force, by)
+        folder = (
+            _new_folder(Path(RUNS), name) if out is None else _named_folder(out, force, by, how)
+        )
         try:
             (folder / by).mkdir()
         except FileExistsError:
@@ -120,7 +127,11 @@ def when_written(folder: Path) -> float:
 
 
 def claim_file(
-    file: Path, force: bool, inputs: Sequence[Path] = (), endings: Sequence[str] = ()
+    file: Path,
+    force: bool,
+    inputs: Sequence[Path] = (),
+    endings: Sequence[str] = (),
+    how: str = FORCE,
 ) -> None:
     """Check that a file can be written without the loss of another.
 
@@ -139,7 +150,7 @@ def claim_file(
         raise OutputError(f"`{file}` is an input of this command; choose another file.")
     # A pipe or a device holds nothing that could be lost.
     if file.is_file() and not force:
-        raise OutputError(f"the file `{file}` exists; choose another, or `--force` to replace it.")
+        raise OutputError(f"the file `{file}` exists; choose another, or {how} to replace it.")
     if not file.resolve().parent.is_dir():
         raise OutputError(f"`{file.parent}` is not a folder; create it first to write `{file}`.")
 
@@ -208,7 +219,7 @@ def _new_folder(parent: Path, name: str) -> Path:
     raise OutputError(f"999 runs of `{name}` started in the same second; wait a second.")
 
 
-def _named_folder(out: Path, force: bool, by: str) -> Path:
+def _named_folder(out: Path, force: bool, by: str, how: str) -> Path:
     if out.exists():
         _check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -217,7 +228,7 @@ def _named_folder(out: Path, force: bool, by: str) -> Path:
     if present and not force:
         raise OutputError(
             f"the folder `{out}` is not empty (it holds `{present[0]}`); choose another, "
-            "or `--force` to replace an earlier run."
+            f"or {how} to replace an earlier run."
         )
     # Permission bits do not show a full disk, so a file is written.
     probe = out / ".writable"

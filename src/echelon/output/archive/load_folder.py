@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import warnings
 from functools import partial
 from pathlib import Path
@@ -46,6 +47,10 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
             when `parts` are first read, if there is no scenario or it was changed since the run.
         ScenarioError: the scenario of a killed run cannot be read.
     """
+    if not isinstance(place, str | os.PathLike):
+        raise OutputError(
+            f"`place` is {place!r}, and must be the folder of a run, or its `{DATA}`."
+        )
     path = check_exists(Path(place))
     if path.is_file():
         return _stored(path, parts)

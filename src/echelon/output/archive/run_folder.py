@@ -9,7 +9,14 @@ from echelon.experiments.results.dataset import labelled, run_file, summary
 from echelon.experiments.results.recording import recording
 from echelon.experiments.scenario.scenario import SCENARIO_FILE
 from echelon.output.archive.chunks import Chunks
-from echelon.output.archive.folder import DATA, GAIN, SUMMARY, claim_folder, write_errors
+from echelon.output.archive.folder import (
+    DATA,
+    GAIN,
+    IN_PYTHON,
+    SUMMARY,
+    claim_folder,
+    write_errors,
+)
 from echelon.output.reports.run_report import report
 from echelon.simulation.engine.result import Result
 from echelon.synthesis.gains.gain_file import save_gain
@@ -30,7 +37,7 @@ def save_run(
         OutputError: the folder holds something, or cannot be written.
     """
     name = result.provenance.get("scenario") or type(result.model).__name__
-    place = claim_folder(name, None if folder is None else Path(folder), force)
+    place = claim_folder(name, None if folder is None else Path(folder), force, how=IN_PYTHON)
     # A run from Python has no scenario file.
     if "scenario_text" in result.provenance:
         with write_errors(place):
