@@ -105,9 +105,9 @@ class Crazyflie:
         command, block = data[0], data[1] if len(data) > 1 else 0
         if command in (6, 7):
             entries = [struct.unpack_from("<BH", data, k) for k in range(2, len(data) - 2, 3)]
-            self.blocks.setdefault(block, [0.0, now, []])[2].extend(entries)
+            self.blocks.setdefault(block, [0.0, -math.inf, []])[2].extend(entries)
         elif command == 3:
-            self.blocks[block][:2] = data[2] / 100.0, now
+            self.blocks[block][:2] = data[2] / 100.0, -math.inf
         elif command in (2, 4):
             self.blocks.pop(block, None)
         elif command == 5:
@@ -190,7 +190,7 @@ def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=No
         state = vehicles.p, vehicles.v, vehicles.q, vehicles.w
         rows.append([begun + steps * real, *vehicles.p.ravel()])
         for k, each in enumerate(crazyflies):
-            for packet in each.logged(*(part[k] for part in state), now):
+            for packet in each.logged(*(part[k] for part in state), speed * now):
                 if peers[k]:
                     sockets[k].sendto(packet, peers[k])
     flown = np.array(rows)

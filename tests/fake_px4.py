@@ -118,7 +118,7 @@ def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=No
             steps += 1
         rows.append([begun + steps * real, *vehicles.p.ravel()])
         for k, px4 in enumerate(each):
-            px4.send(now, vehicles.p[k], vehicles.v[k], vehicles.q[k], vehicles.w[k])
+            px4.send(speed * now, vehicles.p[k], vehicles.v[k], vehicles.q[k], vehicles.w[k])
     flown = np.array(rows)
     np.savez(file, times=flown[:, 0], places=flown[:, 1:].reshape(len(flown), -1, 3))
 

@@ -210,8 +210,7 @@ FLIGHTS = [
     ("cflib", "as identified", stopping, 0.015),
     ("cflib", "firmware's gains, motors of 30 ms", stopping, 0.015),
     ("px4", "as identified", consensus, 0.010),
-    # Its memory suffers from ticks that a shared processor misses.
-    ("px4", "as identified", stopping, 0.015),
+    ("px4", "as identified", stopping, 0.010),
 ]
 
 

@@ -55,13 +55,11 @@ def _options() -> argparse.Namespace:
 
 
 def _run(mission: Mission, options: argparse.Namespace) -> int:
-    if (
-        not 0.0 < options.speed <= 1.0
-        or options.speed != 1.0
-        and not options.link.startswith("udp")
-    ):
+    here = options.link.startswith("udp") or f":{LOOPBACK}:" in options.link.replace("/", ":")
+    if not (0.0 < options.speed < 1.0 and here or options.speed == 1.0):
         raise FlightError(
-            f"`--speed` is {options.speed:g}, and must be above 0 and at most 1; 1 if real."
+            f"`--speed` is {options.speed:g}, and must be above 0 and at most 1; 1 where "
+            "the vehicle is not on this machine."
         )
     if options.seconds is not None and not options.seconds > 0.0:
         raise FlightError(f"`--seconds` is {options.seconds:g}, and must be above 0.")

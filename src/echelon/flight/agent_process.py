@@ -268,7 +268,9 @@ class AgentProcess:
         """Print a sentence once."""
         if (key or sentence) not in self._said:
             self._said.add(key or sentence)
-            print(f"agent {self._crew.wire.number}: {sentence}.", file=sys.stderr, flush=True)
+            # At once, since several processes write to one terminal.
+            sys.stderr.write(f"agent {self._crew.wire.number}: {sentence}.\n")
+            sys.stderr.flush()
             if key != "fault":
                 self._notes.append(sentence)
 
