@@ -105,9 +105,9 @@ class Crazyflie:
         command, block = data[0], data[1] if len(data) > 1 else 0
         if command in (6, 7):
             entries = [struct.unpack_from("<BH", data, k) for k in range(2, len(data) - 2, 3)]
-            self.blocks.setdefault(block, [0.0, -math.inf, []])[2].extend(entries)
+            self.blocks.setdefault(block, [0.0, now, []])[2].extend(entries)
         elif command == 3:
-            self.blocks[block][:2] = data[2] / 100.0, -math.inf
+            self.blocks[block][:2] = data[2] / 100.0, now
         elif command in (2, 4):
             self.blocks.pop(block, None)
         elif command == 5:
@@ -181,10 +181,10 @@ def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=No
         for end in ends:
             k = sockets.index(end)
             packet, peers[k] = end.recvfrom(64)
-            for answer in crazyflies[k].answer(packet, now):
+            for answer in crazyflies[k].answer(packet, speed * now):
                 end.sendto(answer, peers[k])
         while begun + steps * real <= now:
-            vehicles.command = np.array([each.acting(now) for each in crazyflies])
+            vehicles.command = np.array([each.acting(speed * now) for each in crazyflies])
             vehicles.step(dt)
             steps += 1
         state = vehicles.p, vehicles.v, vehicles.q, vehicles.w

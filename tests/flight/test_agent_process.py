@@ -22,9 +22,16 @@ FLIGHT = {
     "tilt": [],
     "fence": {"low": [-5.0], "high": [5.0], "speed": 10.0},
 }
-NETWORK = {"period": 0.02, "forget": 0.5, "forget_hops": 5.0, "agents": 2, "leaders": [0]}
+NETWORK = {
+    "moves": False,
+    "period": 0.02,
+    "forget": 0.5,
+    "forget_hops": 5.0,
+    "agents": 2,
+    "leaders": [0],
+}
 FACTS = {
-    **{"agent": 1, "leads": False, "hears": [0], "weights": [1.0]},
+    **{"agent": 1, "dt": DT, "leads": False, "hears": [0], "weights": [1.0]},
     **{"signal": ["x"], "message": ["v"], "network": {**NETWORK, "uses": "all"}},
 }
 
