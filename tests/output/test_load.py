@@ -152,6 +152,14 @@ def test_a_file_by_itself_is_summarized_saved_and_verified(run, here):
     assert np.isnan(again.wall_time) and ech.verify(alone).holds
 
 
+def test_a_table_that_memory_does_not_hold_is_refused_before_errors_are_computed(run):
+    shape = 10**9, *run[0].states.shape[1:]
+    huge = {name: np.broadcast_to(0.0, shape) for name in ("states", "inputs")}
+    large = dataclasses.replace(run[0], times=np.broadcast_to(0.0, shape[:1]), **huge)
+    with pytest.raises(ech.errors.OutputError, match="the table is too large: .* with `every`"):
+        ech.table(large)
+
+
 def test_python_is_answered_in_its_own_words(run, here):
     ech.save_run(run[0], "o", figures=False)
     ech.export(run[0], "o.csv")

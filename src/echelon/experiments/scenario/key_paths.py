@@ -89,6 +89,9 @@ def meant(wrong: tuple[str | int, ...], allowed: list[str], scenario: type[BaseM
         allowed: the keys that the section has.
         scenario: the class of the whole file.
     """
+    before, colon, value = str(wrong[-1]).partition(":")
+    if colon and value and before in allowed:
+        return f" (did you mean `{before}: {value}`, with a space?)"
     places = places_of(wrong, scenario)
     if not places:
         return did_you_mean(wrong[-1], allowed)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from echelon.core.errors import MissingExtraError, OutputError, check_name
+from echelon.core.errors import MissingExtraError, OutputError, check_kind, check_name
 from echelon.core.files import write_atomic
 from echelon.core.limits import excess_rows
 
@@ -38,14 +38,19 @@ def table(run: "Result | Recording", every: int = 1) -> "pd.DataFrame":
     import pandas as pd
 
     from echelon.experiments.results.dataset import recording_of
+    from echelon.experiments.results.recording import Recording
+    from echelon.simulation.engine.result import Result
 
+    if not isinstance(run, Recording):
+        check_kind("result", run, Result)
     if not isinstance(every, int | np.integer) or every < 1:
         raise OutputError(f"`every` is {every}, and must be a whole number from 1 on.")
-    run = recording_of(run)
-    frames, agents = len(run.times[::every]), run.agents
-    excess = excess_rows(frames * agents, 4 + len(run.state_names) + len(run.input_names))
+    # Before errors are computed, which take as much memory as the states.
+    frames, (_, agents, n) = len(run.times[::every]), run.states.shape
+    excess = excess_rows(frames * agents, 4 + n + run.inputs.shape[2])
     if excess is not None:
         raise OutputError(f"the table is too large: {excess}; take fewer frames with `every`.")
+    run = recording_of(run)
     states, inputs = run.states[::every], run.inputs[::every]
     columns: JsonObject = {
         "time": np.repeat(run.times[::every], agents),
