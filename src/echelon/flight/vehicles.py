@@ -40,7 +40,7 @@ class Vehicle:
 
     def __init__(self, facts: Mapping[str, Any], number: int, move: Move) -> None:
         """Stand at its start."""
-        self._facts, self._move = facts, move
+        self._facts, self._move, self._trim = facts, move, facts["trim"][number]
         self.x: list[float] = list(facts["starts"][number])
         self.u: list[float] | None = None
         self.heard, self.descends, self.address = -math.inf, False, None
@@ -84,7 +84,7 @@ class Vehicle:
         gaps = [x - y for x, y in zip(self.x, goal, strict=True)]
         return [
             u - sum(k * gap for k, gap in zip(row, gaps, strict=True))
-            for u, row in zip(facts["trim"], facts["levelling"], strict=True)
+            for u, row in zip(self._trim, facts["levelling"], strict=True)
         ]
 
     def _land(self) -> None:
@@ -115,7 +115,7 @@ class Vehicles:
         self.all = [Vehicle(facts, k, move) for k, move in enumerate(moves)]
         self._speed, self._substeps = speed, facts["substeps"]
         self._dt = mission.facts["dt"]
-        self._input = struct.Struct(f"<{len(facts['trim'])}d")
+        self._input = struct.Struct(f"<{len(facts['trim'][0])}d")
         self._state = struct.Struct(f"<{2 + len(facts['rest'])}d")
         self._position = mission.facts["position"]
         self._socket = bound(port)

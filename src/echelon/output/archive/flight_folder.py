@@ -159,11 +159,11 @@ def _vehicles(parts: Parts, settings: Settings) -> tuple[JsonObject, dict[str, s
     prepared, model = prepare(parts, settings), parts.model
     motion, agents = prepared.problem.motion, parts.graph.agents
     about = "The motion of a simulated vehicle in a part of a control step."
+    with precision("float64"):
+        own = motions_of(motion, agents, _SUBSTEPS)
+        hover = [[float(u) for u in each.plant.trim[1]] for each in own]
     try:
-        texts = [
-            python_text([move_function(each)], about, {})
-            for each in motions_of(motion, agents, _SUBSTEPS)
-        ]
+        texts = [python_text([move_function(each)], about, {}) for each in own]
     except Unsupported as error:
         raise OutputError(f"the vehicles have no code for {error}.") from None
     names = [f"vehicle-{texts.index(text)}.py" for text in texts]
@@ -176,7 +176,8 @@ def _vehicles(parts: Parts, settings: Settings) -> tuple[JsonObject, dict[str, s
         "starts": np.asarray(prepared.problem.states).tolist(),
         "files": names,
         "substeps": _SUBSTEPS,
-        "trim": trim_u,
+        # As autopilots do, which find the thrust of hovering by themselves.
+        "trim": hover,
         "rest": trim_x,
         **_autopilot(model, trim_x),
         "memory": trim_u if lags else [],
