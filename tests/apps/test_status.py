@@ -123,6 +123,13 @@ def test_a_log_has_plain_lines_and_not_many(monkeypatch):
     assert text.splitlines()[2] == "echelon: simulating: 1 of 100 steps, 1 s left ..."
 
 
+def test_the_time_that_is_left_is_shown_once_it_is_known(monkeypatch):
+    monkeypatch.setattr(status, "_DRAWN", 0.0)
+    counted = [lambda k=k: STATUS.count(k, 3000, "steps") for k in (0, 1, 29, 30)]
+    text = shown(Terminal(), monkeypatch, lambda: STATUS.begin("comparing"), *counted)
+    assert "29 of 3000 steps ..." in text and "30 of 3000 steps, 1 s left ..." in text
+
+
 def test_what_is_for_programs_has_no_lines_in_a_log(monkeypatch):
     assert shown(io.StringIO(), monkeypatch, lambda: STATUS.begin("x", log=False)) == ""
     assert "echelon: x" in shown(Terminal(), monkeypatch, lambda: STATUS.begin("x", log=False))

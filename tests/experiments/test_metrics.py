@@ -219,6 +219,13 @@ def test_agents_in_one_place_and_frames_without_numbers_have_a_closest_pair_too(
     assert result.radius is None and not metrics(result).closest.touch(None)
 
 
+@pytest.mark.filterwarnings("error")
+def test_the_distance_of_agents_whose_squares_are_beyond_floats_is_known():
+    states = np.array([[[0.0, 0.0], [3e200, 4e200], [3e300, 0.0]]])
+    model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(3)
+    assert made_up(states, model, graph).closest_pair().distance == pytest.approx(5e200)
+
+
 @pytest.mark.parametrize(("apart", "touch"), [(0.1399, True), (0.1401, False)])
 def test_a_report_warns_of_agents_closer_than_two_radii(apart, touch):
     model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(2)

@@ -20,6 +20,8 @@ _DRAWN, _PLAIN = 0.1, 5.0
 """Seconds between two changes by counting: of a terminal's line, and between plain lines."""
 _SILENT = 15.0
 """Seconds after which plain output shows that uncounted work continues."""
+_FORESEEN, _LATE = 0.01, 30.0
+"""The share of the work, or the seconds, after which the time that the rest takes is known."""
 _ERASE = "\r\x1b[K"
 
 
@@ -98,7 +100,10 @@ class Status:
                 self._first = (now, done)
             left = ""
             if 0 <= before < done:
-                left = f", {duration((total - done) * (now - begun) / (done - before))} left"
+                seconds = (total - done) * (now - begun) / (done - before)
+                # Before that, most of the time was taken by what is compiled once.
+                foreseen = done - before >= _FORESEEN * total or now - begun >= _LATE
+                left = f", {duration(seconds)} left" if foreseen else ""
             self._counted = f": {int(done)} of {total} {unit}{left if done < total else ''}"
             self._write(_DRAWN if self._terminal else _PLAIN)
 

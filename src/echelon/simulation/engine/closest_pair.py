@@ -25,12 +25,14 @@ class ClosestPair(NamedTuple):
         from scipy.spatial import KDTree
 
         # Of places whose squares are beyond floats a tree knows no distances.
-        scaled = np.ldexp(places, -max(0, int(np.frexp(np.abs(places).max())[1])))
+        exponent = max(0, int(np.frexp(np.abs(places).max())[1]))
+        scaled = np.ldexp(places, -exponent)
         away, near = map(np.asarray, KDTree(scaled).query(scaled, k=2))
         first = int(away[:, 1].argmin())
         # Agents in one place come in any order.
         other = next(int(agent) for agent in near[first] if agent != first)
-        distance = float(np.linalg.norm(places[first] - places[other]))
+        with np.errstate(over="ignore"):
+            distance = float(np.ldexp(np.linalg.norm(scaled[first] - scaled[other]), exponent))
         return cls(distance, (min(first, other), max(first, other)), time)
 
     def touch(self, radius: float | None) -> bool:
