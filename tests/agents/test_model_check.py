@@ -261,6 +261,35 @@ FALSE = {
         {"input_names": 1},
         "`input_names` of `Tank` is 1, and must be a tuple of names.",
     ),
+    "a number for a position": (
+        {"position": 0.5},
+        "`position` of `Tank` is 0.5, and must be a tuple of states' names; a parameter needs "
+        "another name.",
+    ),
+    "a text for a position": (
+        {"position": "level"},
+        "`position` of `Tank` is 'level', and must be a tuple of states' names; a parameter needs "
+        "another name.",
+    ),
+    "a number for groups": (
+        {"state_groups": 2.0},
+        "`state_groups` of `Tank` is 2.0, and must be a mapping of names to tuples of states' "
+        "names; a parameter needs another name.",
+    ),
+    "a number for a chart": (
+        {"chart": 0.1},
+        "`chart` of `Tank` is 0.1, and must be a mapping of states' names to bounds; a parameter "
+        "needs another name.",
+    ),
+    "a number for units": (
+        {"input_units": 3.0},
+        "`input_units` of `Tank` is 3.0, and must be a tuple of units; a parameter needs "
+        "another name.",
+    ),
+    "a number for a difference": (
+        {"difference": 1.0},
+        "`difference` of `Tank` is 1.0, and must be a method; a parameter needs another name.",
+    ),
     "limits that are no limits": (
         {"input_limits": (0.0, 1.0)},
         "`input_limits` of `Tank` is (0.0, 1.0), and must be a `Limits`.",

@@ -156,3 +156,11 @@ def test_a_parameter_called_damping_is_no_inner_loop(damping):
     assert gain.inner.shape == (2, 4) and not gain.inner[:, :2].any()
     # More damping than the water has: the loop of the Riccati equation, not the parameter.
     assert np.linalg.eigvals(A[2:, 2:]).real.max() < -0.5
+
+
+def test_a_weight_of_one_input_may_be_a_plain_number():
+    class Cart(ech.models.DoubleIntegrator):
+        symmetry_inputs: float = 3.0
+
+    gain = ech.synthesize(Cart(dimension=1), ech.Graph.path(3), ech.gains.InnerLoop())
+    np.testing.assert_array_equal(gain.R, [[3.0]])

@@ -1,6 +1,7 @@
 """The checks of a model, run once for each model in `synthesize` and `simulate`."""
 
 import numbers
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
@@ -87,6 +88,27 @@ def _check_derived(model: ControlAffine, name: str) -> None:
             )
 
 
+_KINDS = (
+    ("state_units", (tuple, list), "a tuple of units"),
+    ("input_units", (tuple, list), "a tuple of units"),
+    ("position", (tuple, list), "a tuple of states' names"),
+    ("state_groups", Mapping, "a mapping of names to tuples of states' names"),
+    ("chart", Mapping, "a mapping of states' names to bounds"),
+    ("difference", Callable, "a method"),
+)
+
+
+def _check_kinds(model: ControlAffine, name: str) -> None:
+    """Check what models declare, whose names a parameter may have by accident."""
+    for what, kind, text in _KINDS:
+        value = getattr(model, what)
+        if not isinstance(value, kind):
+            raise ModelError(
+                f"`{what}` of `{name}` is {value!r}, and must be {text}; a parameter needs another "
+                "name."
+            )
+
+
 def _check_words(model: ControlAffine, name: str) -> None:
     """Check that the names of states and inputs are tuples of text, and not empty."""
     for what, names in (("state_names", model.state_names), ("input_names", model.input_names)):
@@ -108,6 +130,7 @@ def _check_words(model: ControlAffine, name: str) -> None:
 def _check_names(model: ControlAffine, name: str) -> None:
     """Check the names, and that groups, position and units refer to states that exist."""
     _check_words(model, name)
+    _check_kinds(model, name)
     states = model.state_names
     if len(set(states)) < len(states):
         raise ModelError(f"`state_names` of `{name}` repeats a name: {listing(states)}.")
@@ -136,6 +159,8 @@ def _check_constants(model: ControlAffine, name: str) -> tuple[np.ndarray, np.nd
     x, u = _pair(name, "trim", model.trim, n, m)
     _pair(name, "weights", model.weights, n, m)
     scale = _numbers(name, "input_scale", model.input_scale, (m, m))
+    if model.symmetry_inputs is not None:
+        _numbers(name, "symmetry_inputs", model.symmetry_inputs, (m,))
     # At a condition number near 1/eps = 4.5e15 no digit of the inverse is right.
     if np.linalg.cond(scale) > 1e15:
         raise ModelError(f"`input_scale` of `{name}` is singular, and must be invertible.")

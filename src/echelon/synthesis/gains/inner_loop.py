@@ -59,7 +59,9 @@ class InnerLoop(Method):
         P = _monotone(model, linear.with_inner(K).A, fixed, self._weights(model, len(fixed)))
         # P A + A'P <= 0 without any feedback, so it holds with every coupling: rho is 0. It holds
         # with any R too, which limits how fast an input responds where the agent is tilted.
-        R = np.diag(model.symmetry_inputs or np.ones(len(model.input_names)))
+        declared = model.symmetry_inputs
+        inputs = np.ones(len(model.input_names)) if declared is None else declared
+        R = np.diag(np.atleast_1d(np.asarray(inputs, float)))
         return Feedback(P, R, rho=0.0, inner=K)
 
     def _feedback(self, model: ControlAffine, linear: Linearization, fixed: list[int]) -> Array:
