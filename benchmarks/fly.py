@@ -15,15 +15,16 @@ import time
 from pathlib import Path
 from typing import Any
 
+FAST = [
+    f"{role}.{key}"
+    for role in ("leader", "follower")
+    for key in ("roots=[5, 5.5, 6]", "observer={push: 24, scale: 2}")
+]
 CASES = {
     "lag": ("paper-radio", ["network.delay=0", "network.loss=0", "actuator.lag=0.03"], False),
     "radio": ("paper-radio", ["actuator.lag=0.03"], False),
     "everything": ("paper-everything", [], False),
-    "fast-everything": (
-        "paper-everything",
-        ["leader.roots=[6, 6.5, 7]", "follower.roots=[6, 6.5, 7]"],
-        False,
-    ),
+    "fast-everything": ("paper-everything", FAST, False),
     "plain-everything": ("paper-everything", ["sensing.estimator=none"], False),
     "kills": ("paper-radio", ["actuator.lag=0.03"], True),
     "heir": ("paper-radio", ["actuator.lag=0.03", "leadership={heirs: [1, 2]}"], False),
