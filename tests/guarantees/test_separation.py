@@ -8,7 +8,7 @@ import pytest
 
 import echelon as ech
 from echelon.core.statement import Hypothesis
-from echelon.core.words import Kind, Theorem
+from echelon.core.words import Kind, Theorem, at_least, at_most
 from echelon.guarantees.promises.promise import promise
 from echelon.guarantees.stopping import separation
 from echelon.guarantees.stopping.flat_states import FlatStates
@@ -69,6 +69,31 @@ def test_in_a_world_that_is_not_ideal_distances_are_observed(world):
     assert value.hypotheses[Hypothesis.SEPARATION].fails
     assert "In this world distances are observed, not proved." in value.sentence()
     assert "converge to zero" not in value.sentence()
+
+
+def test_numbers_in_a_sentence_state_no_more_than_is_guaranteed():
+    """Radii are rounded down, and times up."""
+    _, value = guaranteed(ech.Safety(radii=(0.123456, 0.123456, 0.3), margin=0.0))
+    assert "radii of 0.1234 x 0.1234 m" in value.sentence()
+    slow = ech.laws.StoppingPoint(rate=0.12, coupling=0.12, speed=100.0)
+    drive = ech.Laws(ech.laws.StoppingLeader(rate=0.12), slow)
+    parts = guaranteed()[0].replace(drive=drive)
+    value = promise(parts, SETTINGS)
+    shown = float(value.sentence().split("within 1 cm after ")[1].split(" s")[0])
+    assert 10.0 < value.tube.arrival <= shown <= value.tube.arrival + 1.0
+    assert (at_least(4.2700000000000005, 3), at_most(0.375, 4)) == ("4.27", "0.375")
+
+
+def test_metres_are_of_positions_in_metres():
+    class Far(ech.models.DoubleIntegrator):
+        state_units = ("km", "km", "km/s", "km/s")
+
+    parts, value = guaranteed(None)
+    assert value.tube.arrival is not None
+    far = parts.replace(model=Far())
+    assert promise(far, SETTINGS).promised and promise(far, SETTINGS).tube.arrival is None
+    with pytest.raises(ech.EchelonError, match="needs the position in m"):
+        promise(guaranteed()[0].replace(model=Far()), SETTINGS)
 
 
 def stored(value):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model import ControlAffine, in_metres
 from echelon.agents.network.near import Near
 from echelon.core.errors import LawError, listing
 from echelon.core.types import Array
@@ -97,13 +97,15 @@ class Safety:
 
         Raises:
             LawError: the model has no position in x, y and z, or no radius, or its outputs with the
-                names of the position are other values, as seen at samples.
+                names of the position are other values, as seen at samples, or are not in m.
         """
         name, odd = type(model).__name__, [x for x in model.position if x not in AXES]
         if not model.position or odd:
             what = f"the position {listing(model.position)}" if odd else "no `position`"
             raise LawError(f"`safety` needs a position in x, y or z, and `{name}` has {what}.")
         _check_position(model)
+        if not in_metres(model):
+            raise LawError(f"`safety` needs the position in m, and `{name}` has another unit.")
         if self.radii is not None:
             return self
         radius = model.radius

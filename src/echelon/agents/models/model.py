@@ -377,3 +377,9 @@ def _inverse(rows: Rows, G: jax.Array) -> jax.Array:
     if any(isinstance(x, Tracer) for row in rows for x in row):
         return jnp.linalg.inv(G)
     return jnp.asarray(np.linalg.inv(np.asarray(rows)), G.dtype)
+
+
+def in_metres(model: ControlAffine) -> bool:
+    """Tell whether no coordinate of the position has another unit than m."""
+    units = dict(zip(model.state_names, model.state_units, strict=True))
+    return all(units[name] in ("", "m") for name in model.position)

@@ -11,7 +11,7 @@ import scipy.sparse.linalg as spla
 from echelon.agents.network.channel import Network
 from echelon.agents.network.graph import Graph
 from echelon.core.types import Array, JsonObject
-from echelon.core.words import MessageContent, NeighbourChoice, Prediction
+from echelon.core.words import MessageContent, NeighbourChoice, Prediction, at_least
 from echelon.guarantees.messages.late_agreement import LateRate, late_rates, longest_ways
 from echelon.guarantees.messages.message_ages import AgeLimits, ages_of
 
@@ -148,7 +148,7 @@ class LateMessages(NamedTuple):
         late = 0.0 if self.ways is None else float(self.ways.max() - 1) * self.age
         text += f"; messages then cost a delay of {late:.3g} s at most" * bool(late)
         if arrival is not None:
-            text += f", and from these starts all stay within 1 cm after {arrival:.3g} s"
+            text += f", and from these starts all stay within 1 cm after {at_least(arrival, 3)} s"
         # Without ages agreement is at least as fast as c / max w.
         slow = self.ways is None and 2.0 * self.rate < self.coupling / self.spread
         return f"{text}. {_ONE_WAY}" if slow else text

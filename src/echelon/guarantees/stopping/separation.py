@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.types import Array
-from echelon.core.words import Kind, Theorem
+from echelon.core.words import Kind, Theorem, at_most
 from echelon.guarantees.stopping.flat_states import flat_states_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 from echelon.guarantees.stopping.tube import Tube
@@ -67,7 +67,7 @@ class Separation(NamedTuple):
 
     def sentence(self) -> str:
         """Return what is guaranteed."""
-        radii = " x ".join(f"{self.safety.size[AXES.index(x)]:.4g}" for x in self.axes)
+        radii = " x ".join(at_most(self.safety.size[AXES.index(x)], 4) for x in self.axes)
         text = f"{self.kind.value}: ellipsoids about the agents with radii of {radii} m never "
         text += f"overlap from these starts, for any number of agents and any graph, if {_EXACT} "
         text += "(T10), and each agent stays in its tube (T5). The inputs are held "

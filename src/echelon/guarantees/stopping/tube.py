@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model import ControlAffine, in_metres
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import JsonObject
-from echelon.core.words import Feedforward, Kind, Theorem, amount
+from echelon.core.words import Feedforward, Kind, Theorem, amount, at_least
 from echelon.guarantees.messages.late_messages import LateMessages
 from echelon.guarantees.stopping.arrival import arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
@@ -80,7 +80,7 @@ class Tube(NamedTuple):
         if self.network is not None:
             text += f"{self.network.faster()}. {self.network.sentence(self.arrival)}"
         elif self.arrival is not None:
-            text += f"; from these starts all stay within 1 cm after {self.arrival:.3g} s"
+            text += f"; from these starts all stay within 1 cm after {at_least(self.arrival, 3)} s"
         return f"{text}." if self.motor_load is None else f"{text}. {self.motor_load.sentence()}"
 
     def _received(self) -> str:
@@ -290,8 +290,10 @@ def _angle(border: Border) -> str:
 
 
 def _positions(run: StoppingRun) -> tuple[int, ...]:
-    """Return which outputs are the position; none where a part of it is no output."""
+    """Return which outputs are the position; none where a part of it is no output, or not in m."""
     chains, position = run.law.ready.chains, run.parts.model.position
+    if not in_metres(run.parts.model):
+        return ()
     if not set(position) <= {*flat_states_of(run.parts.model, chains).outputs}:
         return ()
     return tuple(map(chains.outputs.index, position))
