@@ -88,6 +88,12 @@ def test_the_summary_states_each_event_and_what_followed(lost):
     assert "Agent 2 joins at 3 s" in ech.report(lost)
 
 
+def test_a_run_at_whose_end_no_follower_is_left_says_so():
+    events = [Lose(agent, 0.1 + 0.1 * agent) for agent in (1, 2, 3)]
+    run = ech.simulate(_parts(events=events), SETTINGS._replace(horizon=1.0))
+    assert "No follower is there at the end." in ech.report(run)
+
+
 @pytest.mark.slow
 def test_an_agent_that_returns_begins_anew():
     once = ech.simulate(_parts(events=[Lose(2, 2.0), Join(2, 3.0)]), SETTINGS)

@@ -51,7 +51,9 @@ def _outcome(result: Result, numbers: Metrics) -> Iterator[str]:
     times = [follower.settling_time for follower in numbers.followers if here[follower.agent]]
     settled = [time for time in times if time is not None]
     count, late = len(times), len(times) - len(settled)
-    if not late:
+    if not count:
+        yield "No follower is there at the end."
+    elif not late:
         who = "The follower stays" if count == 1 else f"All {count} followers{there} stay"
         goals = "its goal" if count == 1 else "their goals"
         yield f"{who} within 0.01{unit} of {goals} from {max(settled):.3g} s on."
