@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import h5py
 import numpy as np
 import pytest
 
@@ -322,6 +323,10 @@ def test_a_run_with_events_is_stored_and_verified(tmp_path):
     stored = ech.load(folder)
     assert np.array_equal(stored.presence, run.presence)
     assert ech.summary(stored)["event_outcomes"] == ech.summary(run)["event_outcomes"]
+    # Who is there, and where places are, follows from the scenario.
+    with h5py.File(folder / "run.nc", "r+") as file:
+        file["presence"][-1, 3] = 1
+    assert ech.verify(folder).verdict == "refused"
 
 
 @pytest.mark.slow

@@ -15,8 +15,9 @@ import numpy as np
 from echelon.core.errors import GainError
 from echelon.core.types import JsonObject
 from echelon.experiments.results.dataset import OBSERVED, leader_gain_of, statement
+from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.labelled_parts import labelled_parts
-from echelon.experiments.results.recording import FORMAT, recording_with_data
+from echelon.experiments.results.recording import FORMAT, Recording, recording_with_data
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.self_contained import without_folders
@@ -159,12 +160,31 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
     fixed = labelled_parts(prepare(parts, settings).parts, settings)
     stated = {**run.attributes, **data.arrays()}
     older = stated["format"] != FORMAT
+    yield from _compare_frames(run, data, experiment, name)
+    yield from compare_values(f"{name}: scenario", run.attributes.get("scenario"), scenario.name)
     for key, part in {**fixed.attributes, **fixed.arrays()}.items():
         # A file of an earlier format states less.
         if older and (key == "format" or key not in stated):
             continue
         theirs, ours = (np.asarray(each).tolist() for each in (stated.get(key), part))
         yield from compare_values(f"{name}: parts.{key}", theirs, ours)
+
+
+def _compare_frames(
+    run: Recording, data: Labelled, experiment: Experiment, name: str
+) -> Iterator[Finding]:
+    """Compare the times of the frames, who is there at each, and offsets that change with time."""
+    (parts, settings), stored = experiment, data.arrays()
+    steps = np.minimum(np.arange(len(run.states)) * settings.store_every, settings.steps)
+    times, schedule = steps * settings.dt, parts.graph.schedule
+    given = {"time": times}
+    if schedule is not None and schedule.present is not None:
+        given["presence"] = schedule.present[schedule.rows(times)].astype(np.int8)
+    if parts.formation.motion is not None:
+        given["moving_offset"] = parts.formation.offsets_at(times)
+    for key, value in given.items():
+        theirs = np.asarray(stored.get(key)).tolist()
+        yield from compare_values(f"{name}: {key}", theirs, value.tolist())
 
 
 def _as_json(value: JsonObject) -> JsonObject:
