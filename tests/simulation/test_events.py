@@ -260,6 +260,12 @@ def test_heirs_over_a_radio_may_take_the_lead_at_any_time():
 TREE = ech.Graph([(0, 1), (1, 2), (1, 3)])
 
 
+def test_nothing_is_stated_until_an_event_that_brings_back_who_was_cut_off():
+    """Without the arrival of agent 1 agents 2 and 3 would have no path to the leader for ever."""
+    guarantee = ech.promise(_parts(TREE, events=[Lose(1, 2.0), Join(1, 3.0)]), SETTINGS)
+    assert not guarantee.promised and guarantee.prefix is None
+
+
 @pytest.mark.parametrize(
     ("graph", "events", "words"),
     [

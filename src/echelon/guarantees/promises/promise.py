@@ -370,10 +370,12 @@ def _prefix_of(computed: Promise, parts: Parts, settings: Settings) -> Prefix | 
     if not steps:
         return None
     graph = parts.graph.until(line.number)
-    first = promise(
-        parts.replace(graph=graph, events=graph.events),
-        settings._replace(horizon=steps * settings.dt, steady_window=None),
-    )
+    until = settings._replace(horizon=steps * settings.dt, steady_window=None)
+    try:
+        first = promise(parts.replace(graph=graph, events=graph.events), until)
+    except EchelonError:
+        # Without what happens later somebody has no path to a leader for ever.
+        return None
     return Prefix(line.number, first) if first.promised else None
 
 
