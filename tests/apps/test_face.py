@@ -355,6 +355,45 @@ def test_every_word_of_a_message_is_explained():
         assert explain_term(word, _names_and_keys()), word
 
 
+PHRASES = {
+    "active rows": "pairs",
+    "coupling edge": "above which every mode",
+    "eigenvalue": "lambda_max",
+    "fastest": "largest magnitude",
+    "feed-forward": "leader's input",
+    "formation error": "goal",
+    "gust": "pushes agents",
+    "heir": "take over",
+    "input range": "beyond the trim input",
+    "lambda_min": "followers agree",
+    "local guarantee": "sufficiently close",
+    "lyapunov function": "squares of all deviations",
+    "metric": "P",
+    "observed": "not a proof",
+    "rank": "observability",
+    "row sum": "zero",
+    "scaled distance": "keep apart",
+    "seconds": "computing time",
+    "slowest mode": "largest real part",
+    "steady window": "last seconds",
+    "trim": "x* and input u*",
+    "worst F": "largest error",
+}
+"""Terms of messages and tables, in the words of those who ask, and what an answer says."""
+
+
+@pytest.mark.parametrize(("term", "says"), PHRASES.items())
+def test_a_term_is_explained_in_the_words_of_who_asks(term, says):
+    assert says in " ".join(explain_term(term, _names_and_keys()).values())
+
+
+def test_the_term_itself_comes_before_keys_and_only_whole_words_match():
+    terms = _names_and_keys()
+    assert next(iter(explain_term("coupling", terms))) == "coupling"
+    assert "saturated" not in explain_term("rate", terms)
+    assert "geometric" not in explain_term("metric", terms)
+
+
 def test_messages_use_no_word_of_the_field_that_is_not_tried_here():
     """What the messages say of radios, wind and collisions stands in the list above."""
     text = (Path(__file__).parents[1] / "sentences.txt").read_text("utf-8").lower()

@@ -14,6 +14,8 @@ _PLACES: Final = (
     Path(__file__).resolve().parents[4] / "docs" / "glossary.md",
 )
 _LINK: Final = re.compile(r"\[([^\]]*)\]\([^)]*\)")
+_BOLD: Final = re.compile(r"\*\*(.+?)\*\*")
+_SLANTED: Final = re.compile(r"(?<![\w*])\*(\w[^*]*)\*")
 
 
 def glossary(more: Mapping[str, str]) -> dict[str, str]:
@@ -26,12 +28,15 @@ def glossary(more: Mapping[str, str]) -> dict[str, str]:
     if file is None:
         raise OutputError("this copy of echelon has no `docs/glossary.md`; install echelon again.")
     terms: dict[str, str] = {}
+    others: dict[str, str] = {}
     for block in re.split(r"^- (?=\*\*)", file.read_text("utf-8"), flags=re.MULTILINE)[1:]:
         # A term ends where its paragraph does, before a heading or another list.
-        name, _, text = block.split("\n\n")[0].partition("**: ")
-        plain = _LINK.sub(r"\1", " ".join(text.split()))
-        terms[name.strip("* ").replace("**", "")] = plain.replace("*", "")
-    return {**_numbers(), **more, **terms}
+        names, _, text = " ".join(block.split("\n\n")[0].split()).partition("**: ")
+        first, *more_names = (name.strip("* ") for name in names.split("**, **"))
+        terms[first] = _SLANTED.sub(r"\1", _BOLD.sub(r"\1", _LINK.sub(r"\1", text)))
+        others |= dict.fromkeys([*more_names, *_BOLD.findall(text)], terms[first])
+    # The definition of a term comes before the keys of its name.
+    return {**others, **terms, **_numbers(), **more, **others, **terms}
 
 
 def _numbers() -> dict[str, str]:
@@ -48,17 +53,43 @@ def explain_term(term: str, more: Mapping[str, str]) -> dict[str, str]:
     Raises:
         OutputError: there is none.
     """
-    terms, key = glossary(more), term.strip().lower()
-    # A key alone is not all that its last name may mean, as `margin` of `safety` is not.
-    exact = key in map(str.lower, terms)
-    matches = {
-        name: text
-        for name, text in terms.items()
-        if (key in (name.lower(), name.split(".")[-1]) if exact else key and key in name.lower())
-    }
+    terms, key = glossary(more), _plain(term)
+    matches = _named(key, terms) or _containing(key, terms)
+    if not matches and all(found := [_named(word, terms) for word in key.split()]):
+        matches = {name: text for each in found for name, text in each.items()}
     if not matches:
-        close = did_you_mean(key, [name.lower() for name in terms])
+        close = did_you_mean(term.strip().lower(), [name.lower() for name in terms])
         raise OutputError(
             f"the glossary has no term `{term}`{close}; `echelon explain` lists all terms."
         )
     return matches
+
+
+def _plain(term: str) -> str:
+    """Return the words of a term, without the signs between them."""
+    return " ".join(re.findall(r"[^\s_.,-]+", term.lower()))
+
+
+def _named(key: str, terms: Mapping[str, str]) -> dict[str, str]:
+    """Return the terms of this name with the keys that end in it; none without such a term."""
+    joined = key.replace(" ", "")
+    names = {name: _plain(name).replace(" ", "") for name in terms}
+    # A key alone is not all that its last name may mean, as `margin` of `safety` is not.
+    if joined not in names.values():
+        return {}
+    ends = {name: name.lower().split(".")[-1].replace("_", "") for name in terms}
+    return {name: terms[name] for name in terms if joined in (names[name], ends[name])}
+
+
+def _containing(key: str, terms: Mapping[str, str]) -> dict[str, str]:
+    """Return the terms in which words begin as those of a key, or a key's last name is it."""
+    start = re.compile(rf"(?<!\w){re.escape(key)}") if key else None
+    return {
+        name: text
+        for name, text in terms.items()
+        if start
+        and (
+            start.search(_plain(name))
+            or key.replace(" ", "") == name.lower().split(".")[-1].replace("_", "")
+        )
+    }
