@@ -284,8 +284,8 @@ def main() -> None:
         "random starts; it too is rounding, of states of a few metres in float64.",
         "## The inner loop",
         "Gain `inner-loop`, coupling 3 and step 5 ms for every length, starts within 1 m, 0.3 rad "
-        "(seed 0), leader on a figure eight. The rate decreases like the smallest eigenvalue of the "
-        "graph, 1/N^2 on a line; a graph with short paths to a leader shortens it.",
+        "(seed 0), leader on a figure eight. The rate decreases like the smallest eigenvalue of "
+        "the graph, 1/N^2 on a line; a graph with short paths to a leader shortens it.",
         table(inner_loops()),
         "## What fails, and by how much",
         table(what_fails(seeds)),
