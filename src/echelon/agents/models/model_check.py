@@ -1,7 +1,7 @@
 """The checks of a model, run once for each model in `synthesize` and `simulate`."""
 
 import numbers
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -94,8 +94,8 @@ _KINDS = (
     ("position", (tuple, list), "a tuple of states' names"),
     ("state_groups", Mapping, "a mapping of names to tuples of states' names"),
     ("chart", Mapping, "a mapping of states' names to bounds"),
-    ("difference", Callable, "a method"),
 )
+_NOT_DECLARED = "`{}` of `{}` is {!r}, and must be {}; a parameter needs another name."
 
 
 def _check_kinds(model: ControlAffine, name: str) -> None:
@@ -103,10 +103,9 @@ def _check_kinds(model: ControlAffine, name: str) -> None:
     for what, kind, text in _KINDS:
         value = getattr(model, what)
         if not isinstance(value, kind):
-            raise ModelError(
-                f"`{what}` of `{name}` is {value!r}, and must be {text}; a parameter needs another "
-                "name."
-            )
+            raise ModelError(_NOT_DECLARED.format(what, name, value, text))
+    if not callable(model.difference):
+        raise ModelError(_NOT_DECLARED.format("difference", name, model.difference, "a method"))
 
 
 def _check_words(model: ControlAffine, name: str) -> None:

@@ -20,8 +20,10 @@ def check_reached(graph: GraphMatrices) -> None:
         GraphError: they do not.
     """
     schedule = graph.schedule
-    periodic = schedule is not None and schedule.period is not None
-    lost = lost_along(graph, schedule.weights.max(axis=0) if periodic else graph.weights)
+    weights, periodic = graph.weights, False
+    if schedule is not None and schedule.period is not None:
+        weights, periodic = schedule.weights.max(axis=0), True
+    lost = lost_along(graph, weights)
     if len(lost):
         raise GraphError(_cut_off(graph, lost))
     if schedule is not None and not periodic:

@@ -177,12 +177,12 @@ def _compare_frames(
     (parts, settings), stored = experiment, data.arrays()
     steps = np.minimum(np.arange(len(run.states)) * settings.store_every, settings.steps)
     times, schedule = steps * settings.dt, parts.graph.schedule
-    given = {"time": times}
+    frames: dict[str, np.ndarray] = {"time": times}
     if schedule is not None and schedule.present is not None:
-        given["presence"] = schedule.present[schedule.rows(times)].astype(np.int8)
+        frames["presence"] = schedule.present[schedule.rows(times)].astype(np.int8)
     if parts.formation.motion is not None:
-        given["moving_offset"] = parts.formation.offsets_at(times)
-    for key, value in given.items():
+        frames["moving_offset"] = parts.formation.offsets_at(times)
+    for key, value in frames.items():
         theirs = np.asarray(stored.get(key)).tolist()
         yield from compare_values(f"{name}: {key}", theirs, value.tolist())
 

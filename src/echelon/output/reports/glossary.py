@@ -55,8 +55,9 @@ def explain_term(term: str, more: Mapping[str, str]) -> dict[str, str]:
     """
     terms, key = glossary(more), _plain(term)
     matches = _named(key, terms) or _containing(key, terms)
-    if not matches and all(found := [_named(word, terms) for word in key.split()]):
-        matches = {name: text for each in found for name, text in each.items()}
+    by_word = [_named(word, terms) for word in key.split()]
+    if not matches and all(by_word):
+        matches = {name: text for terms_of in by_word for name, text in terms_of.items()}
     if not matches:
         close = did_you_mean(term.strip().lower(), [name.lower() for name in terms])
         raise OutputError(
