@@ -1,5 +1,7 @@
 """A motion of the formation has the derivatives that T5 asks of it, or nothing is guaranteed."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,6 +52,17 @@ class Smooth(OffsetMotion):
         return place.at[1].add(0.2 * place[0] * jnp.sin(t))
 
 
+_JUMPS = False
+
+
+class Told(OffsetMotion):
+    """A wave, or what a global says."""
+
+    def __call__(self, place, t):
+        wave = place.at[0].add(0.1 * jnp.sin(t))
+        return jnp.where(t > 5.0, wave + place, wave) if _JUMPS else wave
+
+
 def guaranteed(*changes, model=CART, horizon=20.0, places=((1.0, 0.0), (2.0, 1.0))):
     formation = ech.Formation.from_offsets(model, GRAPH, dict(enumerate(places, 1)))
     formation = formation.moving(model, GRAPH, changes)
@@ -80,6 +93,13 @@ def test_of_a_motion_that_jumps_nothing_was_true():
     parts, _ = guaranteed(Rotate(0.5), Place())
     run = ech.simulate(parts, ech.Settings(horizon=10.0, dt=0.01))
     assert run.formation_errors[run.times > 4.0].max() > 0.4
+
+
+def test_what_a_motion_reads_is_asked_again(monkeypatch):
+    parts, value = guaranteed(Told())
+    assert value.promised
+    monkeypatch.setattr(sys.modules[__name__], "_JUMPS", True)
+    assert not ech.promise(parts, ech.Settings(horizon=20.0, dt=0.01)).promised
 
 
 def test_a_smooth_motion_between_reshapes_is_guaranteed():

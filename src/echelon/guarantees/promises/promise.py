@@ -381,4 +381,6 @@ def _prefix_of(computed: Promise, parts: Parts, settings: Settings) -> Prefix | 
 
 def _stored(parts: Parts) -> dict[Settings, Promise]:
     """Return the guarantees of parts by settings, of what their code reads now."""
-    return _cache.setdefault(parts, {}).setdefault(foreign_key(parts), {})
+    # A formation is no dataclass, whose parts would be found.
+    reads = foreign_key((parts, parts.formation.motion))
+    return _cache.setdefault(parts, {}).setdefault(reads, {})
