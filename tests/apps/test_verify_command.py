@@ -182,6 +182,8 @@ FORGED = {
     "a scenario twice": ("tube", in_text("scenario.yaml", "agents: 4", "agents: 4, agents: 4"), 2),
     "another start": ("alone", in_text("scenario.yaml", "position: 1.0", "position: 2.0"), 1),
     "a start in the data": ("alone", moved("states"), 1),
+    "a time in the data": ("alone", moved("time"), 2),
+    "a time of inputs in the data": ("alone", moved("inputs/time"), 2),
     "a weight in the data": ("alone", moved("graph/edge_weight"), 1),
     "an offset in the data": ("gain", moved("offset"), 1),
     "a P in the data": ("gain", moved("gain/P"), 1),

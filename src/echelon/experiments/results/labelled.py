@@ -105,6 +105,7 @@ def read_labelled(file: Path) -> Labelled:
 
     Raises:
         OSError: the file cannot be read; a damaged one may also raise other errors.
+        ValueError: a coordinate, of which each group has a copy, is not the same in all.
     """
     import h5netcdf
 
@@ -117,7 +118,10 @@ def read_labelled(file: Path) -> Labelled:
                 is_label = name in labels or variable.dimensions == (name,)
                 place = result.coordinates if is_label else result.variables
                 attributes = {k: v for k, v in variable.attrs.items() if k not in _OF_FORMAT}
-                place[name] = (variable.dimensions, _values(variable[...]), attributes)
+                values = _values(variable[...])
+                if name in place and values.tolist() != _whole(name, place[name])[1].tolist():
+                    raise ValueError(f"its groups have different values of `{name}`")
+                place[name] = (variable.dimensions, values, attributes)
         result.attributes.update((k, _plain(v)) for k, v in stored.attrs.items())
     result.attributes.pop("coordinates", None)
     return result
