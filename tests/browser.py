@@ -22,8 +22,10 @@ os.environ.setdefault("PLAYWRIGHT_NODEJS_PATH", str(NODE))
 
 
 def executable():
-    """Chromium on the PATH, or else Playwright's own, or else None."""
-    found = next(filter(None, map(shutil.which, NAMES)), None)
+    """Chromium on the PATH or of the system, or else Playwright's own, or else None."""
+    # The system's folders may have been left out of the PATH, as `.ci/run` does.
+    folders = os.pathsep.join((os.environ.get("PATH", ""), os.defpath))
+    found = next(filter(None, (shutil.which(name, path=folders) for name in NAMES)), None)
     if found is None:
         with sync_playwright() as playwright:
             own = playwright.chromium.executable_path
