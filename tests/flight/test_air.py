@@ -4,15 +4,10 @@ import socket
 import time
 
 import pytest
+from processes import free_port
 
 from echelon.core.errors import FlightError
 from echelon.flight.air import LOOPBACK, Air, bound, read_address, tell_once
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind((LOOPBACK, 0))
-        return probe.getsockname()[1]
 
 
 def heard(air):

@@ -4,6 +4,7 @@ import math
 import time
 
 import pytest
+from processes import free_port
 
 from echelon.flight.air import LOOPBACK, Air, ports_of
 from echelon.flight.ground import Ground
@@ -20,9 +21,9 @@ def wire(number, key=KEY, boot=BOOT):
 @pytest.fixture
 def scene():
     """The ground station, and the socket of all others."""
-    port = 48300
+    port = free_port()
     ground = Ground(Air((LOOPBACK, port), []), wire(GROUND), 2)
-    agents = Air((LOOPBACK, port + 1), ports_of(0, port))
+    agents = Air((LOOPBACK, free_port()), ports_of(0, port))
     yield ground, agents
     ground.close()
     agents.close()

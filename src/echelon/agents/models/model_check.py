@@ -142,10 +142,9 @@ def _check_names(model: ControlAffine, name: str) -> None:
                     f"`{where}` of `{name}` names `{member}`, which is no state; the states are "
                     f"{listing(states)}{did_you_mean(member, states)}."
                 )
-    for where, units, names in (
-        ("state_units", model.state_units, states),
-        ("input_units", model.input_units, model.input_names),
-    ):
+    pairs = ("state_units", states), ("input_units", model.input_names)
+    for where, names in pairs:
+        units = getattr(model, where)
         if len(units) != len(names):
             raise ModelError(
                 f"`{where}` of `{name}` has {len(units)} entries, and must have {len(names)}."

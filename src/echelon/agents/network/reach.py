@@ -20,13 +20,13 @@ def check_reached(graph: GraphMatrices) -> None:
         GraphError: they do not.
     """
     schedule = graph.schedule
-    weights, periodic = graph.weights, False
-    if schedule is not None and schedule.period is not None:
-        weights, periodic = schedule.weights.max(axis=0), True
-    lost = lost_along(graph, weights)
+    periodic = schedule is not None and schedule.period is not None
+    lost = lost_along(
+        graph, schedule.weights.max(axis=0) if schedule and periodic else graph.weights
+    )
     if len(lost):
         raise GraphError(_cut_off(graph, lost))
-    if schedule is not None and not periodic:
+    if schedule and not periodic:
         lost = unreached(graph, schedule, -1)
         if len(lost):
             raise GraphError(
