@@ -46,8 +46,8 @@ def prepare(case: str, folder: Path) -> None:
 
 def fly(folder: Path, options: argparse.Namespace, kills: bool) -> None:
     """Fly, and print what was measured."""
+    from echelon.flight.local_flight import Together, flying
     from echelon.flight.mission import Mission
-    from echelon.flight.together import Together, flying
 
     mission = Mission(folder)
     own = [str(Path(__file__).resolve()), "--plant", str(folder)] if options.mujoco else []

@@ -44,7 +44,7 @@ TESTS = {
     "laws": ["laws", "feedforward", "inner_loop", "sentences", "paper", "attack", "prepared"],
     "laws/safety.py": ["safety"],
     "laws/nearest_point.py": ["safety"],
-    "laws/together.py": ["safety"],
+    "laws/safety_check.py": ["safety"],
     "laws/lqr.py": ["lqr", "prepared"],
     "simulation/step": ["simulate", "feedforward", "disturbance", "metrics"],
     "simulation/engine": ["simulate", "metrics", "plans", "agent", "gradient", "native", "traffic"],

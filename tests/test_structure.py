@@ -11,6 +11,7 @@ import statistics
 import subprocess
 import sys
 import tomllib
+from collections import Counter
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -201,6 +202,17 @@ def test_folders_are_layers_and_packages():
 @pytest.mark.parametrize("module", PATHS)
 def test_files_are_short(module):
     assert len(PATHS[module].read_text("utf-8").splitlines()) <= 400
+
+
+def test_the_names_of_files_and_classes_are_unique():
+    stems = Counter(path.stem for path in FILES if not path.stem.startswith("__"))
+    classes = Counter(
+        node.name
+        for module in PATHS
+        for node in ast.walk(tree(module))
+        if isinstance(node, ast.ClassDef)
+    )
+    assert [name for names in (stems, classes) for name in names if names[name] > 1] == []
 
 
 def test_functions_are_short():

@@ -153,6 +153,7 @@ def test_the_grid_visits_each_step_once_and_stores_each_frame_once(steps, every,
 # ---- a real process is killed, and its run goes on ----
 
 
+@pytest.mark.slow
 def test_a_killed_run_opens_as_stopped_and_goes_on_to_the_same_bits(here, echelon):
     with started(EAGER, "run", "mine.yaml", *LONG, "--no-figures", "--out", "o") as process:
         wait_for(process, lambda: len(list(here.glob("o/chunks/*.npz"))) > 3)

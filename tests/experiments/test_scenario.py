@@ -22,7 +22,7 @@ from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, Le
 from echelon.experiments.scenario.named_class import accepted, resolve
 from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.experiments.scenario.scenario import (
-    Fault,
+    ScenarioFault,
     bundled_scenarios,
     json_schema,
     key_meanings,
@@ -353,8 +353,8 @@ def test_the_error_carries_its_faults(load):
     with pytest.raises(ScenarioError) as caught:
         load(seed="seed: -1", name="name: 3")
     assert caught.value.faults == (
-        Fault("s.yaml:1", "name", f"got `3`, allowed is {FOLDER_NAME}."),
-        Fault("s.yaml:11", "seed", "got `-1`, allowed is a number of at least 0."),
+        ScenarioFault("s.yaml:1", "name", f"got `3`, allowed is {FOLDER_NAME}."),
+        ScenarioFault("s.yaml:11", "seed", "got `-1`, allowed is a number of at least 0."),
     )
     assert str(caught.value) == "\n".join(map(str, caught.value.faults))
     assert caught.value.exit_code == 2

@@ -12,7 +12,7 @@ from echelon.flight.air import LOOPBACK, Air
 from echelon.flight.links.link import Link, Reading
 from echelon.flight.plan_clock import PlanClock
 from echelon.flight.supervisor import Fault
-from echelon.flight.wire import GROUND, Drop, Kind, Letter, Packet, Wire
+from echelon.flight.wire import GROUND, DatagramKind, Drop, Letter, Packet, Wire
 
 DT, KEY = 0.01, b"k" * 32
 FLIGHT = {
@@ -202,7 +202,7 @@ def notes(scene):
     """What the process says to the ground, meanwhile."""
     wire = scene.wire(GROUND)
     opened = [wire.open(each, None, time.time()) for each in scene.air.receive()]
-    return {x.body for x in opened if not isinstance(x, Drop) and x.kind is Kind.NOTE}
+    return {x.body for x in opened if not isinstance(x, Drop) and x.kind is DatagramKind.NOTE}
 
 
 CLOCKS = {

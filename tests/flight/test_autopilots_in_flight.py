@@ -22,8 +22,8 @@ from echelon.agents.models import CrazyflieAttitude
 from echelon.flight.air import Air, ports_of
 from echelon.flight.ground import Ground
 from echelon.flight.links.cflib_link import CflibLink
+from echelon.flight.local_flight import make_key
 from echelon.flight.mission import Mission
-from echelon.flight.together import make_key
 from echelon.flight.wire import GROUND, wire_of
 from echelon.output.archive.flight_folder import flight_files, save_flight
 from echelon.output.archive.law_folder import law_files

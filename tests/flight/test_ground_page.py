@@ -10,7 +10,7 @@ from browser import chromium, until
 from echelon.flight.air import LOOPBACK, Air
 from echelon.flight.ground import Ground, page_of
 from echelon.flight.supervisor import Fault
-from echelon.flight.wire import GROUND, Drop, Kind, Opened, Report, Wire
+from echelon.flight.wire import GROUND, DatagramKind, Drop, Opened, Report, Wire
 from echelon.output.viewer.serve import serve, serving
 
 SIZES = {"desktop": (1280, 720), "phone": (390, 844)}
@@ -35,6 +35,19 @@ def report(leader, fault=Fault.NONE, amount=0.0):
     return Report(mode, number, leader, amount, *rest, dropped)
 
 
+SHOWN = (
+    "the plan, and leads",
+    "agent 0",
+    "descends: the vehicle is 0.50 m outside its fence",
+    "Dropped here: a datagram of agent 0 is signed with another key: 1.",
+    "not heard yet. the address is in use",
+    "12 × is not newer than the last one of its sender",
+    "1, -0.25, ?",
+    "50 %",
+)
+"""Of the page, once all has arrived."""
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_the_page_shows_agents_and_stops_all_of_them(browser, size):
     ways = []
@@ -52,13 +65,7 @@ def test_the_page_shows_agents_and_stops_all_of_them(browser, size):
                 agents.send(wire(number).report(time.time(), said))
             agents.send(wire(0, b"other" * 8).stop(time.time()))
             agents.send(wire(2).note(time.time(), "the address is in use"))
-            until(lambda: "12 × is not newer" in page.inner_text("table"))
-            text = page.inner_text("body")
-            assert "the plan, and leads" in text and "agent 0" in text and "not heard yet" in text
-            assert "descends: the vehicle is 0.50 m outside its fence" in text
-            assert "Dropped here: a datagram of agent 0 is signed with another key: 1." in text
-            assert "not heard yet. the address is in use" in text
-            assert "1, -0.25, ?" in text and "50 %" in text
+            until(lambda: all(part in page.inner_text("body") for part in SHOWN))
             # Nothing has to be scrolled sideways, and the stop is always in sight.
             assert page.evaluate("document.documentElement.scrollWidth") <= width
             page.evaluate("window.scrollTo(0, 1e6)")
@@ -70,7 +77,7 @@ def test_the_page_shows_agents_and_stops_all_of_them(browser, size):
             for datagram in agents.receive():
                 opened = receiver.open(datagram, None, time.time())
                 kinds += [opened.kind] * isinstance(opened, Opened)
-            assert Kind.STOP in kinds and page.is_disabled("#start")
+            assert DatagramKind.STOP in kinds and page.is_disabled("#start")
             page.context.set_offline(True)
             until(lambda: "can stop nobody" in page.inner_text("#note"))
     finally:

@@ -6,9 +6,9 @@ import random
 import numpy as np
 
 from echelon.agents.network.inbox import Inbox, Message, NamedValues, Received, Stamps
-from echelon.agents.network.inbox import Packet as SimulatedPacket
+from echelon.core.packet import Packet
 from echelon.flight.letterbox import Letterbox
-from echelon.flight.wire import Drop, Letter, Packet
+from echelon.flight.wire import Drop, Letter
 
 HEARS, LEADERS, NAMES = (0, 1, 3), (0, 1), ("x", "y")
 SAME = {
@@ -31,9 +31,8 @@ def draw(draws, clock):
 
 
 def as_message(letter):
-    packet = None if letter.packet is None else SimulatedPacket(*letter.packet)
     values = NamedValues(NAMES, np.array(letter.value))
-    return Message(letter.sender, values, None, letter.time, letter.hops, packet)
+    return Message(letter.sender, values, None, letter.time, letter.hops, letter.packet)
 
 
 def test_both_take_and_keep_the_same():

@@ -8,10 +8,10 @@ import pytest
 
 import echelon as ech
 from echelon.agents.network.formation_motion import Rotate
-from echelon.agents.network.inbox import Packet as SimulatedPacket
+from echelon.core.packet import Packet
 from echelon.flight.letterbox import NOBODY
 from echelon.flight.pilot import Pilot
-from echelon.flight.wire import Letter, Packet
+from echelon.flight.wire import Letter
 from echelon.output.archive.law_folder import network_facts
 from echelon.simulation.onboard.law_functions import law_functions
 from echelon.simulation.onboard.python_text import python_text
@@ -65,8 +65,8 @@ def draw(draws, facts, sender, t):
 
 def as_message(letter, names):
     hops = 2**30 if letter.hops == NOBODY else letter.hops
-    packet = SimulatedPacket(*letter.packet)
-    return ech.Message(letter.sender, (names, letter.value), None, letter.time, hops, packet)
+    value = names, letter.value
+    return ech.Message(letter.sender, value, None, letter.time, hops, letter.packet)
 
 
 NOISE = ech.Sensing(noise={"position": 0.05}, estimator="constant-gain")

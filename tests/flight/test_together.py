@@ -11,8 +11,8 @@ import echelon as ech
 from echelon.agents.network.formation_motion import Rotate
 from echelon.core.errors import FlightError
 from echelon.flight.ground import page_of
+from echelon.flight.local_flight import Together, flying
 from echelon.flight.mission import Mission
-from echelon.flight.together import Together, flying
 from echelon.output.archive.flight_folder import flight_files, save_flight
 from echelon.output.viewer.serve import serve, serving
 

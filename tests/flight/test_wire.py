@@ -9,7 +9,7 @@ import struct
 import pytest
 
 from echelon.core.errors import FlightError
-from echelon.flight.wire import GROUND, Drop, Kind, Letter, Packet, Report, Wire, read_key
+from echelon.flight.wire import GROUND, DatagramKind, Drop, Letter, Packet, Report, Wire, read_key
 
 KEY, FORMATION, AGENTS, SIZES = b"k" * 32, "ab" * 32, 4, (4, 4)
 NOW, WALL, BOOT = 3.0, 1.8e9, 1_800_000_000_000
@@ -36,11 +36,11 @@ def test_a_letter_is_read_as_it_was_written():
 def test_commands_and_reports_are_read_without_a_plan():
     ground, agent = wire(GROUND), wire(2)
     assert agent.open(ground.start(WALL, WALL + 2.0), None, WALL).body == WALL + 2.0
-    assert agent.open(ground.stop(WALL), None, WALL).kind is Kind.STOP
+    assert agent.open(ground.stop(WALL), None, WALL).kind is DatagramKind.STOP
     assert agent.open(wire(1).letter(letter()), None, WALL) is Drop.EARLY
     for sentence in ("the key is another one", "é" * 200, ""):
         opened = ground.open(agent.note(WALL, sentence), None, WALL)
-        assert (opened.kind, opened.body) == (Kind.NOTE, sentence[:120])
+        assert (opened.kind, opened.body) == (DatagramKind.NOTE, sentence[:120])
     counts = tuple(range(len(Drop)))
     report = Report(1, 2, 0, 0.5, 3.0, 1.0, 2.0, 3.0, 0.25, 0.5, 0.01, math.nan, counts)
     read = ground.open(agent.report(WALL, report), None, WALL).body
@@ -57,7 +57,7 @@ def test_the_layout_is_the_one_that_is_documented():
     assert len(datagram) == 32 + 79 + 16
 
 
-def signed(body, kind=Kind.LETTER, number=1, stamp=NOW, count=1, boot=BOOT, version=1):
+def signed(body, kind=DatagramKind.LETTER, number=1, stamp=NOW, count=1, boot=BOOT, version=1):
     """A datagram of somebody who has the key and knows the format."""
     head = struct.pack("<BB8sHQId", version, kind, b"\xab" * 8, number, boot, count, stamp)
     return head + body + hmac.digest(KEY, head + body, "sha256")[:16]
@@ -69,7 +69,14 @@ def body_of(value=(0.0,) * 4, content=(0.0,) * 4, said=NOW, has=1):
 
 GOOD = signed(body_of())
 BAD = {
-    Drop.LENGTH: [b"", b"x", GOOD[:-1], GOOD + b"\0", signed(b""), signed(body_of(), Kind.START)],
+    Drop.LENGTH: [
+        b"",
+        b"x",
+        GOOD[:-1],
+        GOOD + b"\0",
+        signed(b""),
+        signed(body_of(), DatagramKind.START),
+    ],
     Drop.VERSION: [signed(body_of(), version=2)],
     Drop.FORMATION: [wire(formation="cd" * 32).letter(letter())],
     Drop.SIGNATURE: [
@@ -117,7 +124,7 @@ def test_replays_are_old_and_a_restarted_process_is_not():
 def test_only_the_ground_starts_a_plan():
     agent = wire(2)
     assert agent.open(wire(1).start(WALL, WALL), None, WALL) is Drop.SENDER
-    assert agent.open(wire(1).stop(WALL), None, WALL).kind is Kind.STOP
+    assert agent.open(wire(1).stop(WALL), None, WALL).kind is DatagramKind.STOP
 
 
 def attack(count, seed):

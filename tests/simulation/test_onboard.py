@@ -13,7 +13,6 @@ import pytest
 from plain_agents import as_python, compare
 
 import echelon as ech
-from echelon.simulation.codegen import is_installed
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.onboard.c_text import c_text, header_text
 from echelon.simulation.onboard.law_functions import LawFunction, law_functions
@@ -22,7 +21,8 @@ from echelon.simulation.onboard.vehicle_function import move_function
 from echelon.simulation.scalars import ScalarGraph, Unsupported
 from echelon.simulation.scalars.scalar_graph import OPERATIONS
 
-COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang") or "cc"
+"""Of the studies; the other tests read the text of C, which needs none."""
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wdouble-promotion", "-Werror")
 
 
@@ -137,7 +137,13 @@ def with_outputs(function, call, array):
     return run
 
 
-WAYS = [as_python, as_read_c, *([as_compiled_c] if COMPILER else [])]
+WAYS = [as_python, as_read_c]
+COMPILED = pytest.mark.study  # which has a C compiler, and fails without
+each_way = pytest.mark.parametrize("way", [*WAYS, pytest.param(as_compiled_c, marks=COMPILED)])
+all_ways = pytest.mark.parametrize(
+    "ways",
+    [pytest.param(WAYS, id="read"), pytest.param([*WAYS, as_compiled_c], id="all", marks=COMPILED)],
+)
 
 
 # ---- each operation ------------------------------------------------------------------------------
@@ -172,7 +178,7 @@ def operations(values):
     return LawFunction("each", "all of them", {"x": 3}, {op: [n] for op, n in results.items()})
 
 
-@pytest.mark.parametrize("way", WAYS)
+@each_way
 def test_each_operation_is_the_graphs_own_to_the_bit(way, tmp_path):
     plain = [op for op in OPERATIONS if op not in DOMAINS]
     for domain, ops in [(SPECIAL, plain), *((d, [op]) for op, d in DOMAINS.items())]:
@@ -224,27 +230,27 @@ def agent(request):
     return ech.Agent(parts, number, settings.dt, settings.limits)
 
 
-def test_a_law_by_itself_steps_as_the_agent_does(agent, tmp_path):
+@all_ways
+def test_a_law_by_itself_steps_as_the_agent_does(agent, ways, tmp_path):
     functions = law_functions(agent.own_law).values()
-    runs = [way(functions, tmp_path) for way in WAYS]
+    runs = [way(functions, tmp_path) for way in ways]
     memories = compare(agent, runs, 300, agent.own_law.loop.motion.dt)
     # Python and C agree to the bit.
     assert all(memory == memories[0] for memory in memories)
 
 
-def test_what_is_not_finite_is_not_valid(agent, tmp_path):
+@each_way
+def test_what_is_not_finite_is_not_valid(agent, way, tmp_path):
     own, functions = agent.own_law, law_functions(agent.own_law).values()
     trim = list(map(float, own.loop.model.trim[0]))
     sizes = {f.name: f.inputs for f in functions}["tick"]
-    for way in WAYS:
-        run = way(functions, tmp_path)
-        memory = run["begin"](trim)
-        zeros = {name: [0.0] * size for name, size in sizes.items() if size is not None}
-        rest = zeros | {"x": trim, "memory": memory}
-        assert run["tick"](0.0, *rest.values())[-1]
-        for bad in (math.nan, math.inf, -math.inf):
-            wrong = rest | {"x": [*trim[:2], bad, *trim[3:]]}
-            assert not run["tick"](0.0, *wrong.values())[-1], (way, bad)
+    run = way(functions, tmp_path)
+    zeros = {name: [0.0] * size for name, size in sizes.items() if size is not None}
+    rest = zeros | {"x": trim, "memory": run["begin"](trim)}
+    assert run["tick"](0.0, *rest.values())[-1]
+    for bad in (math.nan, math.inf, -math.inf):
+        wrong = rest | {"x": [*trim[:2], bad, *trim[3:]]}
+        assert not run["tick"](0.0, *wrong.values())[-1], bad
 
 
 # ---- what has no code ----------------------------------------------------------------------------
@@ -294,7 +300,7 @@ def test_single_precision_is_that_of_its_own_trace(agent, tmp_path):
         memory = results[1]
 
 
-@pytest.mark.skipif(COMPILER is None, reason="no C compiler")
+@COMPILED
 def test_single_precision_compiles_and_is_numpys_own_to_the_bit(agent, tmp_path):
     own, draws = agent.own_law, np.random.default_rng(3)
     single = law_functions(own, 32).values()
@@ -340,8 +346,7 @@ def fly(agents, bits, moves, starts, steps, folder):
     return np.array(places)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(COMPILER is None, reason="no C compiler")
+@COMPILED
 def test_a_flight_in_single_precision_is_that_in_double_to_ten_micrometres(tmp_path):
     parts, settings = ech.build(ech.load_scenario("paper-global", OBSERVED))
     agents = [ech.Agent(parts, k, settings.dt) for k in range(4)]
@@ -363,7 +368,6 @@ LARGEST = {"consensus": 4000, "stopping-point": 7000, "its-leader": 9000}
 """Bytes of a tick."""
 
 
-@pytest.mark.skipif(not is_installed(), reason="no llvmlite")
 def test_machine_code_of_a_microcontroller_is_small_and_calls_nothing(agent, request):
     single = law_functions(agent.own_law, 32)
     image = object_file(single.values())

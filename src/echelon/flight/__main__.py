@@ -156,7 +156,7 @@ def _watch(mission: Mission, options: argparse.Namespace) -> int:
 def _fly_all(mission: Mission, options: argparse.Namespace) -> int:
     """Fly all agents with simulated vehicles, and print their errors."""
     from echelon.flight.ground import page_of
-    from echelon.flight.together import Together, flying
+    from echelon.flight.local_flight import Together, flying
     from echelon.output.viewer.serve import serve, serving
 
     seconds = mission.facts["horizon"] if options.seconds is None else options.seconds

@@ -16,7 +16,7 @@ from echelon.flight.links.link import Link, Reading
 from echelon.flight.pilot import Pilot
 from echelon.flight.plan_clock import PlanClock
 from echelon.flight.supervisor import Fault, Fence, Supervisor
-from echelon.flight.wire import Drop, Kind, Letter, Opened, Report, Wire, name_of, sender_of
+from echelon.flight.wire import DatagramKind, Drop, Letter, Opened, Report, Wire, name_of, sender_of
 
 _REPORTS: Final = 0.1  # s between two
 _LONGEST: Final = 20.0  # s of a descent
@@ -208,15 +208,15 @@ class AgentProcess:
 
     def _use(self, opened: Opened, now: float) -> Drop | None:
         """Use what a datagram says, or return why it is not used."""
-        if opened.kind is Kind.NOTE:
+        if opened.kind is DatagramKind.NOTE:
             return None
         if opened.sender == self._crew.wire.number:
             self._meet(opened, now)
         elif isinstance(opened.body, Letter):
             return self._pilot.box.receive(opened.body, self._crew.clock.now or 0.0)
-        elif opened.kind is Kind.START and isinstance(opened.body, float):
+        elif opened.kind is DatagramKind.START and isinstance(opened.body, float):
             return self._take_start(opened.body, time.time() - opened.stamp)
-        elif opened.kind is Kind.STOP:
+        elif opened.kind is DatagramKind.STOP:
             self._supervisor.trip(Fault.STOP)
         return None
 

@@ -7,7 +7,8 @@ import math
 from collections.abc import Collection, Sequence
 from typing import Final, final
 
-from echelon.flight.wire import Drop, Letter, Packet
+from echelon.core.packet import Packet
+from echelon.flight.wire import Drop, Letter
 
 NOBODY: Final = 0xFFFF
 """Hops of an agent that no leader reaches, and the leader of one that knows none, as datagrams have
@@ -68,13 +69,9 @@ class Letterbox:
         """Tell whether a packet is of a later epoch, a leader with a lower number, or newer."""
         if self._own is not None and packet.leader >= self._own and not packet.epoch:
             return False
-        return self.packet is None or _rank(packet) > _rank(self.packet)
+        return self.packet is None or packet.rank > self.packet.rank
 
     def ages(self, clock: float) -> list[float]:
         """Return how old the newest letter of each neighbour is, s; infinite for none."""
         letters = self.letters.values()
         return [math.inf if x is None else max(0.0, clock - x.time) for x in letters]
-
-
-def _rank(packet: Packet) -> tuple[int, int, float]:
-    return packet.epoch, -packet.leader, packet.time

@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple, final
 
+from echelon.core.packet import Packet
 from echelon.flight.letterbox import NOBODY, Letterbox
-from echelon.flight.wire import Letter, Packet
+from echelon.flight.wire import Letter
 
 
 class Ticked(NamedTuple):

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, final
 
 from echelon.core.errors import FlightError
+from echelon.core.packet import Packet
 
 VERSION: Final = 1
 GROUND: Final = 0xFFFF
@@ -32,7 +33,7 @@ _HEAD: Final = struct.Struct("<BB8sHQId")
 _SIGNATURE: Final = 16
 
 
-class Kind(enum.IntEnum):
+class DatagramKind(enum.IntEnum):
     """What a datagram is."""
 
     LETTER = 1
@@ -58,22 +59,6 @@ class Drop(enum.Enum):
     PACKET = "has no packet of a leader"
     EARLY = "came before the start"
     START = "names the start by a clock that is more than 0.1 s beside this one"
-
-
-class Packet(NamedTuple):
-    """What a leader last said of itself, as in the simulated channel.
-
-    Attributes:
-        leader: its number.
-        time: of the plan, s.
-        content: (p,).
-        epoch: how often the leadership was handed over.
-    """
-
-    leader: int
-    time: float
-    content: tuple[float, ...]
-    epoch: int = 0
 
 
 class Letter(NamedTuple):
@@ -129,7 +114,7 @@ class Report(NamedTuple):
 class Opened(NamedTuple):
     """A datagram that is used: its kind, who sent it since when, its stamp (s), and its body."""
 
-    kind: Kind
+    kind: DatagramKind
     sender: int
     boot: int
     stamp: float
@@ -208,12 +193,16 @@ class Wire:
         self.number, self.boot, self._agents, self._count = number, boot, agents, 0
         self._letter = struct.Struct(f"<HHB{sizes[0]}dHd{sizes[1]}d")
         self._sizes = sizes
-        bodies = {Kind.START: _START, Kind.REPORT: _REPORT, Kind.NOTE: _NOTE}
-        bodies[Kind.LETTER] = self._letter
+        bodies = {
+            DatagramKind.LETTER: self._letter,
+            DatagramKind.START: _START,
+            DatagramKind.REPORT: _REPORT,
+            DatagramKind.NOTE: _NOTE,
+        }
         around = _HEAD.size + _SIGNATURE
         self._lengths = {kind: around + body.size for kind, body in bodies.items()}
-        self._lengths[Kind.STOP] = around
-        self._newest = dict[tuple[int, Kind], tuple[int, int]]()
+        self._lengths[DatagramKind.STOP] = around
+        self._newest = dict[tuple[int, DatagramKind], tuple[int, int]]()
         self.dropped, self.suspects = Counter[Drop](), dict[Drop, int]()
         if max(self._lengths.values()) > LONGEST:
             raise FlightError(
@@ -228,25 +217,27 @@ class Wire:
         packet = letter.packet or Packet(0, 0.0, (0.0,) * self._sizes[1])
         head = packet.epoch, letter.hops, letter.packet is not None
         rest = packet.leader, packet.time, *packet.content
-        return self._sign(Kind.LETTER, letter.time, self._letter.pack(*head, *letter.value, *rest))
+        return self._sign(
+            DatagramKind.LETTER, letter.time, self._letter.pack(*head, *letter.value, *rest)
+        )
 
     def start(self, wall: float, at: float) -> bytes:
         """Return the command that the plan starts at a time, both in s since 1970."""
-        return self._sign(Kind.START, wall, _START.pack(at))
+        return self._sign(DatagramKind.START, wall, _START.pack(at))
 
     def stop(self, wall: float) -> bytes:
         """Return the command that everybody levels and descends."""
-        return self._sign(Kind.STOP, wall, b"")
+        return self._sign(DatagramKind.STOP, wall, b"")
 
     def report(self, wall: float, report: Report) -> bytes:
         """Return the datagram of a report."""
-        return self._sign(Kind.REPORT, wall, _REPORT.pack(*report[:-1], *report.dropped))
+        return self._sign(DatagramKind.REPORT, wall, _REPORT.pack(*report[:-1], *report.dropped))
 
     def note(self, wall: float, sentence: str) -> bytes:
         """Return the datagram of a sentence to the ground, of which 240 bytes are sent."""
-        return self._sign(Kind.NOTE, wall, _NOTE.pack(sentence.encode()))
+        return self._sign(DatagramKind.NOTE, wall, _NOTE.pack(sentence.encode()))
 
-    def _sign(self, kind: Kind, stamp: float, body: bytes) -> bytes:
+    def _sign(self, kind: DatagramKind, stamp: float, body: bytes) -> bytes:
         self._count += 1
         who = VERSION, kind, self._formation, self.number, self.boot, self._count
         text = _HEAD.pack(*who, stamp) + body
@@ -294,37 +285,37 @@ class Wire:
             return Drop.SIGNATURE
         # From here on it was written by somebody who has the key.
         # Only the ground starts a plan, and it has no letters; anybody says stop.
-        ground = sender == GROUND and kind in (Kind.START, Kind.STOP)
-        if not (ground or sender < self._agents and kind != Kind.START):
+        ground = sender == GROUND and kind in (DatagramKind.START, DatagramKind.STOP)
+        if not (ground or sender < self._agents and kind != DatagramKind.START):
             return Drop.SENDER
-        body = self._body(Kind(kind), sender, stamp, text[_HEAD.size :])
+        body = self._body(DatagramKind(kind), sender, stamp, text[_HEAD.size :])
         if isinstance(body, Drop):
             return body
-        clock = plan if kind == Kind.LETTER else wall
+        clock = plan if kind == DatagramKind.LETTER else wall
         if clock is None:
             return Drop.EARLY
         # A process whose clock was once far ahead would be believed for ever by its boot.
         if abs(stamp - clock) > APART or boot > 1e3 * (wall + APART):
             return Drop.CLOCK
-        newest = self._newest.get((sender, Kind(kind)), (0, 0))
+        newest = self._newest.get((sender, DatagramKind(kind)), (0, 0))
         if (boot, count) <= newest:
             return Drop.OLD
-        self._newest[sender, Kind(kind)] = boot, count
-        return Opened(Kind(kind), sender, boot, stamp, body)
+        self._newest[sender, DatagramKind(kind)] = boot, count
+        return Opened(DatagramKind(kind), sender, boot, stamp, body)
 
     def _body(
-        self, kind: Kind, sender: int, stamp: float, text: bytes
+        self, kind: DatagramKind, sender: int, stamp: float, text: bytes
     ) -> Drop | Letter | Report | float | str | None:
         if not math.isfinite(stamp):
             return Drop.NOT_FINITE
-        if kind is Kind.STOP:
+        if kind is DatagramKind.STOP:
             return None
-        if kind is Kind.START:
+        if kind is DatagramKind.START:
             [at] = _START.unpack(text)
             return at if math.isfinite(at) else Drop.NOT_FINITE
-        if kind is Kind.NOTE:
+        if kind is DatagramKind.NOTE:
             return text.rstrip(b"\0").decode(errors="ignore")
-        if kind is Kind.REPORT:
+        if kind is DatagramKind.REPORT:
             numbers = _REPORT.unpack(text)
             return Report(*numbers[:_FIELDS], dropped=numbers[_FIELDS:])
         return self._read_letter(sender, stamp, text)
@@ -348,7 +339,7 @@ def sender_of(datagram: bytes) -> int | None:
 
 def is_letter(datagram: bytes) -> bool:
     """Tell whether a datagram is a letter between agents, as it says itself."""
-    return datagram[1:2] == bytes([Kind.LETTER])
+    return datagram[1:2] == bytes([DatagramKind.LETTER])
 
 
 def name_of(sender: int | None) -> str:

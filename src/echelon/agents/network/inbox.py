@@ -7,6 +7,7 @@ from typing import NamedTuple, final
 import numpy as np
 from jaxtyping import Float
 
+from echelon.core.packet import Packet
 from echelon.core.types import Array
 from echelon.core.words import Word
 
@@ -31,22 +32,6 @@ class NamedValues(NamedTuple):
 
     names: tuple[str, ...]
     values: Array
-
-
-class Packet(NamedTuple):
-    """What a leader last said of itself, passed on unchanged.
-
-    Attributes:
-        leader: its number.
-        time: when it said so, s.
-        content: its deviation from its plan, or what else the prediction needs (p,).
-        epoch: how often heirs took the lead over.
-    """
-
-    leader: int
-    time: float
-    content: tuple[float, ...]
-    epoch: int = 0
 
 
 class Message(NamedTuple):
@@ -269,10 +254,7 @@ class Stamps:
                 return False
             # One of several leaders stays one.
             self._own = None if self._last_epoch else self._own
-        if self.packet is None:
-            return True
-        rank = [(x.epoch, -x.leader, x.time) for x in (packet, self.packet)]
-        return rank[0] > rank[1]
+        return self.packet is None or packet.rank > self.packet.rank
 
 
 _FAR = 2**30

@@ -25,7 +25,7 @@ from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, PyTree
 from echelon.experiments.results.lyapunov import fixed_metric, potential
 from echelon.laws.law import Law
-from echelon.laws.together import separations
+from echelon.laws.safety_check import separations
 from echelon.output.viewer.replay import link_shades
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts

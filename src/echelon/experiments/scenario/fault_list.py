@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from typing import TypeVar, cast, final
 
 from echelon.core.errors import EchelonError, MissingExtraError
-from echelon.experiments.scenario.scenario import Fault, Scenario, refuse
+from echelon.experiments.scenario.scenario import Scenario, ScenarioFault, refuse
 from echelon.experiments.scenario.yaml import joined
 
 _Part = TypeVar("_Part")
@@ -17,7 +17,7 @@ class FaultList:
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        self.faults: list[Fault] = []
+        self.faults: list[ScenarioFault] = []
 
     @contextlib.contextmanager
     def at(self, *path: str | int) -> Iterator[None]:
@@ -29,7 +29,8 @@ class FaultList:
         except EchelonError as error:
             # Of a part that is checked key by key, and then whole, each fault once.
             if str(error) not in {fault.message for fault in self.faults}:
-                self.faults.append(Fault(self.scenario.place(*path), joined(path), str(error)))
+                place = self.scenario.place(*path)
+                self.faults.append(ScenarioFault(place, joined(path), str(error)))
 
     def part(self, make: Callable[[], _Part], *path: str | int) -> _Part:
         """Return a part; in place of one with a fault None, until `settle` raises the fault."""

@@ -21,8 +21,8 @@ from echelon.experiments.scenario.override import settle_overrides
 from echelon.experiments.scenario.values import STRICT, FolderName, Seed
 from echelon.experiments.scenario.yaml import (
     Document,
-    Fault,
     KeyPath,
+    ScenarioFault,
     apply_overrides,
     dump_yaml,
     inline_yaml,
@@ -183,14 +183,14 @@ def _with_defaults(data: Mapping[Any, Any]) -> dict[Any, Any]:
     return filled
 
 
-def _by_line(fault: Fault) -> tuple[bool, int]:
+def _by_line(fault: ScenarioFault) -> tuple[bool, int]:
     """Return a sort key: the line, with faults of the command line last."""
     line = fault.place.rpartition(":")[2]
     overridden = fault.place.startswith("--set ")
     return overridden, int(line) if line.isdigit() and not overridden else 0
 
 
-def refuse(faults: Iterable[Fault]) -> NoReturn:
+def refuse(faults: Iterable[ScenarioFault]) -> NoReturn:
     """Raise all faults as one error, a line each in the order of the file.
 
     Raises:
@@ -206,7 +206,7 @@ def _scenario(document: Document, text: str, file: Path) -> Scenario:
     data = {} if document.data is None else document.data
     if not isinstance(data, dict):
         text = f"got {quoted(data)}, allowed is a mapping with the keys {listing(_keys(()))}."
-        refuse([Fault(document.place(()), "", text)])
+        refuse([ScenarioFault(document.place(()), "", text)])
     document = document._replace(data=data)
     scenario, errors = None, list[ErrorDetails]()
     try:
@@ -217,7 +217,7 @@ def _scenario(document: Document, text: str, file: Path) -> Scenario:
     sentences: dict[KeyPath, str] = {}
     for path, sentence in (*cross_faults(document), *map(_describe, errors)):
         sentences.setdefault(path, sentence)
-    faults = [Fault(document.place(path), joined(path), s) for path, s in sentences.items()]
+    faults = [ScenarioFault(document.place(path), joined(path), s) for path, s in sentences.items()]
     if scenario is None or faults or document.faults:
         refuse([*document.faults, *faults])
     scenario._document, scenario._text, scenario._file = document, text, file
@@ -260,7 +260,7 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
 
     Raises:
         ScenarioError: There is no such scenario, or it has faults: one line for each of them; the
-            error's `faults` are the same as `Fault` records.
+            error's `faults` are the same as `ScenarioFault` records.
     """
     file, name = _locate(source)
     try:

@@ -25,7 +25,7 @@ KeyPath = tuple[str | int, ...]
 Where = Callable[[int], str]
 
 
-class Fault(NamedTuple):
+class ScenarioFault(NamedTuple):
     """One fault of a scenario: its place, its key (joined by dots), and a sentence."""
 
     place: str
@@ -47,7 +47,7 @@ class Document(NamedTuple):
 
     data: Any
     places: dict[KeyPath, str]
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[ScenarioFault, ...] = ()
     overrides: tuple[tuple[KeyPath, str], ...] = ()
 
     def place(self, path: KeyPath) -> str:
@@ -85,7 +85,7 @@ class _Reading:
         self.where, self.most = where, len(text) + _ALIASED
         self.yaml = YAML(typ="safe", pure=True)
         self.places: dict[KeyPath, str] = {}
-        self.faults: list[Fault] = []
+        self.faults: list[ScenarioFault] = []
 
     def line(self, node: Node) -> str:
         return self.where(node.start_mark.line + 1)
@@ -139,7 +139,7 @@ class _Reading:
         return key if type(key) is int else str(node.value)
 
     def add_fault(self, node: Node, path: KeyPath, message: str) -> None:
-        self.faults.append(Fault(self.line(node), joined(path), message))
+        self.faults.append(ScenarioFault(self.line(node), joined(path), message))
 
 
 def _reason(error: Exception, text: str) -> tuple[int, str]:
@@ -176,7 +176,7 @@ def read_yaml(text: str, file: str) -> Document:
     """Read one YAML 1.2 document; `file` is the name in places.
 
     Mappings become dicts with keys of text or int, sequences lists. A repeated key, a tag, or a key
-    that is a list or a mapping becomes a `Fault`.
+    that is a list or a mapping becomes a `ScenarioFault`.
 
     Raises:
         ScenarioError: The text is not YAML; one sentence, `file:line: ...`.

@@ -17,7 +17,7 @@ from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.law_sections import GainSpec
 from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
-from echelon.experiments.scenario.yaml import Fault
+from echelon.experiments.scenario.yaml import ScenarioFault
 from echelon.experiments.studies.speedup import speedup
 from echelon.guarantees.promises.promise import LawDesign, Promise, promise, prover_of
 from echelon.laws.consensus import Consensus
@@ -145,7 +145,7 @@ def _built(scenario: Scenario) -> Experiment:
     try:
         return build(scenario)
     except ScenarioError as error:
-        faults: tuple[Fault, ...] = getattr(error, "faults", ())
+        faults: tuple[ScenarioFault, ...] = getattr(error, "faults", ())
         spec = scenario.follower.gain
         # A missing file is a mistake, while a method that fails is a design with its reason.
         if spec.file or spec.python or {fault.field for fault in faults} != {"follower.gain"}:

@@ -56,7 +56,7 @@ def _check(motion: FormationMotion, order: int, horizon: float) -> None:
         compare_derivatives(piece, order, piece.begin, piece.end)
 
 
-class _Piece(NamedTuple):
+class _Stretch(NamedTuple):
     """The offsets from a time until another one (s), between which at most one reshape goes on."""
 
     motion: FormationMotion
@@ -79,9 +79,9 @@ class _Piece(NamedTuple):
         return places.ravel()
 
 
-def _pieces(motion: FormationMotion, rows: Array, horizon: float) -> Iterator[_Piece]:
+def _pieces(motion: FormationMotion, rows: Array, horizon: float) -> Iterator[_Stretch]:
     """Yield the pieces of a motion between the ends of its reshapes, until a horizon (s)."""
     ends = {*motion.begins.tolist(), *(motion.begins + motion.spans).tolist()}
     times = [0.0, *sorted(end for end in ends if 0.0 < end < horizon), horizon]
     for begin, end in zip(times, times[1:], strict=False):
-        yield _Piece(motion, rows, begin, end)
+        yield _Stretch(motion, rows, begin, end)

@@ -12,7 +12,7 @@ from echelon.guarantees.stopping.flat_states import flat_states_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 from echelon.guarantees.stopping.tube import Tube
 from echelon.laws.safety import AXES, Safety
-from echelon.laws.together import hulls_at, separations
+from echelon.laws.safety_check import hulls_at, separations
 
 _EXACT = (
     "the model is exact, time is continuous, no input is at a limit and all is known at the same "

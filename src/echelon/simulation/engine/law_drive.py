@@ -24,8 +24,8 @@ from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import leader_warnings, prepare_law
 from echelon.laws.safety import Safety
+from echelon.laws.safety_check import check_numbers, hulls_at, separations, too_near
 from echelon.laws.stopping_point import StoppingLeader
-from echelon.laws.together import check_numbers, hulls_at, separations, too_near
 from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.native import is_installed
 from echelon.simulation.native.agent_step import BlockRows

@@ -26,7 +26,7 @@ from echelon.laws.safety import Safety
 from echelon.simulation.step.leadership import Leadership
 from echelon.simulation.step.meter import Meter, Sums
 from echelon.simulation.step.motion import Motion
-from echelon.simulation.step.plan import Followed
+from echelon.simulation.step.plan_phase import Followed
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats
 

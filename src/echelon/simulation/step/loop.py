@@ -228,7 +228,7 @@ class WorldState(NamedTuple):
         starts: (N, n) the initial states, where agents are lost and join again.
         led: what each agent last received of its leader, as `Packets`, in the ideal network with
             heirs.
-        plan: where leaders that wait are on their plan, as `Plan`.
+        plan: where leaders that wait are on their plan, as `PlanPhase`.
     """
 
     in_flight: PyTree = None

@@ -6,10 +6,10 @@ import numpy as np
 
 from echelon.core.types import Scalar
 from echelon.simulation.step.loop import Loop, Moment, goals_at, nearest_at, present_at, time_of
-from echelon.simulation.step.plan import Followed, Plan
+from echelon.simulation.step.plan_phase import Followed, PlanPhase
 
 
-def next_plan(loop: Loop, now: Moment) -> Plan | None:
+def next_plan(loop: Loop, now: Moment) -> PlanPhase | None:
     """Return the plan of leaders after a step; None where they do not wait."""
     if loop.patience is None:
         return None

@@ -41,7 +41,7 @@ from echelon.simulation.step.meter import Sums, reference_at
 from echelon.simulation.step.motion import MotionState
 from echelon.simulation.step.nearby import begin_sightings, look_around
 from echelon.simulation.step.patience import followed_at, next_plan, plan_time
-from echelon.simulation.step.plan import Followed, Plan
+from echelon.simulation.step.plan_phase import Followed, PlanPhase
 
 
 @cached_jit
@@ -80,7 +80,7 @@ def begin(loop: Loop, states: States) -> Moment:
     if loop.presence is not None and loop.presence.returns:
         world = world._replace(starts=moment.states)
     if loop.patience is not None:
-        world = world._replace(plan=Plan.begin(moment.states.dtype))
+        world = world._replace(plan=PlanPhase.begin(moment.states.dtype))
     return moment._replace(world=world)
 
 

@@ -15,18 +15,18 @@ _FREE, _QUICK = 0.2, 0.2
 """Share of the distance up to which nobody waits, and s in which the pace follows."""
 
 
-class Plan(NamedTuple):
+class PlanPhase(NamedTuple):
     """Where leaders are on their plan: how late it is, s, and its pace, s per s."""
 
     late: Scalar
     pace: Scalar
 
     @classmethod
-    def begin(cls, dtype: jnp.dtype) -> "Plan":
+    def begin(cls, dtype: jnp.dtype) -> "PlanPhase":
         """Return the plan at the start."""
         return cls(jnp.zeros((), dtype), jnp.ones((), dtype))
 
-    def after(self, away: Scalar, distance: Array, dt: Array | float) -> "Plan":
+    def after(self, away: Scalar, distance: Array, dt: Array | float) -> "PlanPhase":
         """Return the plan a step later.
 
         Args:
@@ -37,7 +37,7 @@ class Plan(NamedTuple):
         most, span = (jnp.asarray(x, away.dtype) for x in (distance, dt))
         desired = jnp.clip((most - away) / ((1.0 - _FREE) * most), 0.0, 1.0)
         pace = desired + (self.pace - desired) * jnp.exp(-span / _QUICK)
-        return Plan(self.late + span * (1.0 - self.pace), pace)
+        return PlanPhase(self.late + span * (1.0 - self.pace), pace)
 
 
 class Followed(NamedTuple):
