@@ -165,8 +165,10 @@ def test_a_killed_run_opens_as_stopped_and_goes_on_to_the_same_bits(here, echelo
     assert result.outcome is ech.Outcome.STOPPED and 3 < len(result.times) < 401
     assert result.message.startswith("The run was ended from outside at t = ")
     assert result.sums.steps[0] > 750 and result.provenance["scenario"] == "mine"
-    code, out, _ = echelon("run", "--resume", "o", "--no-figures")
+    # Without figures, as it began.
+    code, out, _ = echelon("run", "--resume", "o")
     assert code == 0 and "1000 s" in out and not (here / "o" / "chunks").exists()
+    assert not (here / "o" / "figures").exists()
     # A run's folder is a scenario: it repeats the run to the bit.
     assert echelon("run", "o", "--no-figures", "--out", "again")[0] == 0
     assert_same(here / "o", here / "again")

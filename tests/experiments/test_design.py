@@ -137,6 +137,8 @@ def test_the_table_and_its_sentence_are_whole(echelon):
     code, out, _ = echelon("design", "mine.yaml")
     assert code == 0 and "dt up to" in out and "certified" in out and "delay" in out
     assert "- inner-loop: `Pendulum` has no symmetric state" in out
+    tables = out.partition("(1)")[0]
+    assert max(map(len, tables.splitlines())) <= 80
     sentence = out.splitlines()[-1]
     assert sentence.startswith("Recommended: ") and sentence.endswith("is short enough.")
 

@@ -241,6 +241,8 @@ def test_rounding_is_no_forgery_and_a_third_digit_is():
         (2e-9, 1e-9, False),
         (10**299, 1.0, False),
         ([1.0, 2e-16], [1.0, 0.0], True),
+        ([np.inf, 1.0], [np.inf, 1.0], True),
+        ([np.inf, 1.0], [np.inf, 2.0], False),
         ([[1.0], [2.0, 3.0]], [[1.0], [2.0]], False),
         ([1.0], 1.0, False),
         ([], [], True),

@@ -189,6 +189,20 @@ def test_states_beyond_the_range_of_the_sines_go_on_by_jax():
 # ---- what has no native code ----
 
 
+@pytest.mark.parametrize("command", [["sweep", "--over", "seed=0..2"], ["compare"], ["run"]])
+def test_native_code_over_a_network_is_refused_before_anything_is_made(echelon, here, command):
+    name, *more = command
+    native = [
+        "--set",
+        "simulation.engine=native",
+        "--set",
+        "network={rate: 50, prediction: packet}",
+    ]
+    code, out, err = echelon(name, "integrators", *more, *native, "--out", "o")
+    assert (code, out) == (2, "") and not (here / "o").exists()
+    assert "no native code for a network that is not ideal" in err and "simulating" not in err
+
+
 class Bends(ech.laws.Law):
     """Feeds back what it hears, and uses what has no native code."""
 

@@ -18,7 +18,7 @@ from runs import OWN_PENDULUM
 import echelon as ech
 from echelon.experiments.results.dataset import recording_of, run_file
 from echelon.experiments.scenario.build import build
-from echelon.experiments.studies.recomputation import recompute
+from echelon.experiments.studies.recomputation import experiment_of, recompute
 from echelon.output.archive import export as exporting
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.report_page import report_page
@@ -290,7 +290,8 @@ def test_a_file_of_format_3_is_read_but_for_its_sums(here):
     with pytest.raises(ech.errors.OutputError, match="has no sums over all steps"):
         ech.report(result)
     data = here / "old" / "run.nc"
-    claims = list(recompute(integrators(), None, data=data))
+    experiment, _ = experiment_of(integrators(), None, None)
+    claims = list(recompute(experiment, integrators(), None, data))
     assert len(claims) > 20 and {claim.verdict for claim in claims} == {"recomputed"}
 
 

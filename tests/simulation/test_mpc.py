@@ -43,6 +43,15 @@ def regulator(Q, R, dt):
     return A - B @ K, K
 
 
+@pytest.mark.parametrize("simulate_drive", [simulate_mpc, simulate_plans])
+def test_native_code_is_refused_before_a_solver_plans(simulate_drive, monkeypatch):
+    for drive in (ech.optimal.Plans, ech.optimal.RecedingHorizon):
+        monkeypatch.setattr(drive, "stepper", lambda *_: pytest.fail("it planned"))
+    refused = "^`engine` is `native`, and must be `auto` or `jax` where a solver drives agents"
+    with pytest.raises(ech.errors.SimulationError, match=refused):
+        simulate_drive(CART, PAIR, APART, horizon=0.2, dt=0.1, engine="native")
+
+
 # ---- linear theory ----
 
 

@@ -18,6 +18,14 @@ def _check_port(port: int | None) -> int | None:
 
 BrowserOption = Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")]
 FiguresOption = Annotated[bool, typer.Option("--figures/--no-figures", help="Draw the figures.")]
+ResumedFiguresOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--figures/--no-figures",
+        help="Draw the figures (default: yes; with --resume, as when the run began).",
+        show_default=False,
+    ),
+]
 FolderOption = Annotated[
     Path | None,
     typer.Option("--out", help="Output folder (default: a new folder in runs/)."),

@@ -33,7 +33,7 @@ def run(
     out: options.FolderOption = None,
     resume: options.ResumeOption = None,
     force: options.ForceOption = False,
-    figures: options.FiguresOption = True,
+    figures: options.ResumedFiguresOption = None,
     view: Annotated[
         bool, typer.Option("--view", help="Show the run in the browser while it is computed.")
     ] = False,
@@ -49,9 +49,12 @@ def run(
     from echelon.output.archive.folder import writing
 
     if resume is None:
-        specification, experiment, job = _new_run(str(scenario), set_ or [], out, force, as_json)
+        figures = figures is not False
+        new = str(scenario), set_ or [], out, force, as_json, figures
+        specification, experiment, job = _new_run(*new)
     else:
         specification, experiment, job = _unfinished_run(resume)
+        figures = job.chunks.figures if figures is None else figures
     with contextlib.ExitStack() as stack:
         stack.enter_context(job.cleanup())
         watched = stack.enter_context(watching(specification, experiment)) if view else None
@@ -69,7 +72,7 @@ def run(
 
 
 def _new_run(
-    name: str, changes: Sequence[str], out: Path | None, force: bool, quiet: bool
+    name: str, changes: Sequence[str], out: Path | None, force: bool, quiet: bool, figures: bool
 ) -> "tuple[Scenario, Experiment, Job]":
     """Return the scenario, its parts, and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
@@ -79,14 +82,12 @@ def _new_run(
     from echelon.experiments.scenario.build import build
     from echelon.output.archive.chunks import Chunks
     from echelon.output.archive.folder import claim_folder
-    from echelon.simulation.engine.prepare import check_engine
 
     # Parts before the folder: a bad scenario must leave no empty folder behind.
     experiment = build(scenario, to_run=True)
-    check_engine(*experiment)
     job = Job("run", Chunks(claim_folder(scenario.name, out, force)))
     with job.cleanup():
-        job.chunks.begin(scenario)
+        job.chunks.begin(scenario, figures=figures)
         foretell(experiment, quiet)
     return scenario, experiment, job
 

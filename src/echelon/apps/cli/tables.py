@@ -57,6 +57,12 @@ _DESIGN: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "promise": ("", lambda design: design.promise.as_mapping()),
 }
 """The numbers of a design, each with its column, if it has one, and its computation."""
+_PARTS = (
+    ("coupling", "edge", "slowest_mode", "fastest_mode", "seconds"),
+    ("longest_step", "condition", "gain_margin", "delay_margin"),
+    ("rate", "kind", "theorem", "radius"),
+)
+"""The columns of each of the tables of designs, which so fit into 80 columns."""
 
 
 def design_row(design: "Design") -> "JsonObject":
@@ -89,23 +95,27 @@ _FOOTNOTES = (
 
 
 def print_designs(rows: "list[JsonObject]", sentence: str) -> None:
-    """Print the methods as a table, the reasons of those without a gain, and a recommendation."""
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    columns = {key: title for key, (title, _) in _DESIGN.items() if title}
-    for key, title in columns.items():
-        table.add_column(title, justify="left" if key == "method" else "right")
-    for row in rows:
-        table.add_row(*(_cell(row.get(key)) for key in columns))
+    """Print the methods as tables, the reasons of those without a gain, and a recommendation."""
     out = console()
-    out.print(table)
+    for part in _PARTS:
+        out.print(_design_table(rows, ("method", *part)))
     notes = [*_FOOTNOTES] if any(row.get("coupling") for row in rows) else []
     for row in rows:
         notes += [f"- {row['method']}: {row[key]}" for key in ("reason", "advice") if row.get(key)]
     for text in (*notes, sentence):
         out.print(text, highlight=False, markup=False, soft_wrap=not out.is_terminal)
+
+
+def _design_table(rows: "list[JsonObject]", keys: Iterable[str]) -> "Table":
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for key in keys:
+        table.add_column(_DESIGN[key][0], justify="left" if key == "method" else "right")
+    for row in rows:
+        table.add_row(*(_cell(row.get(key)) for key in keys))
+    return table
 
 
 def _cell(value: object) -> str:

@@ -27,9 +27,16 @@ def verify(
         str | None,
         typer.Option(help="The scenario or run with classes of your own; their code is executed."),
     ] = None,
+    repeat: Annotated[
+        bool,
+        typer.Option(
+            "--repeat/--no-repeat",
+            help="Compute the run again too; without it, what the run observed is not checked.",
+        ),
+    ] = True,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a gain by independent code, and compute a run's guarantee again from its scenario.
+    """Check a gain by independent code, and compute a run and its guarantee again.
 
     Exit code 0 if all claims hold, 1 if one does not, 5 if one could not be checked.
     """
@@ -41,11 +48,11 @@ def verify(
     from echelon.experiments.scenario.scenario import load_scenario
     from echelon.output.archive.verify_folder import check_files
 
-    def begin() -> None:
-        STATUS.begin("computing the guarantee again, which takes up to a minute", log=False)
+    def begin(what: str) -> None:
+        STATUS.begin(what, log=False)
 
     trusted = None if scenario is None else load_scenario(scenario)
-    verification, obstacle = check_files(files, trusted, begin)
+    verification, obstacle = check_files(files, trusted, repeat, begin)
     from echelon.apps.cli.verify_report import as_mapping, print_verification
 
     if as_json:

@@ -228,11 +228,16 @@ def run_file(result: Result, data: Labelled | None = None) -> bytes:
         result: the run.
         data: its labelled arrays, computed if None.
     """
+    return with_sums(result, data).netcdf(group_of)
+
+
+def with_sums(result: Result, data: Labelled | None = None) -> Labelled:
+    """Return the labelled arrays of `run.nc`, with the sums over all steps."""
     data = labelled(result) if data is None else data
     sums = {
         SUM + name: _numbered(SUM + name, total) for name, total in result.sums._asdict().items()
     }
-    return data._replace(variables=data.variables | sums).netcdf(group_of)
+    return data._replace(variables=data.variables | sums)
 
 
 def _numbered(name: str, values: Array) -> tuple[tuple[str, ...], Array]:

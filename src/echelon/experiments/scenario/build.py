@@ -48,7 +48,7 @@ from echelon.laws.safety import Safety
 from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.engine.prepare import check_memory
+from echelon.simulation.engine.prepare import check_engine, check_memory
 from echelon.simulation.engine.record import Stretch
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import Keep, Progress, simulate
@@ -69,11 +69,12 @@ def build(scenario: ScenarioLike, to_run: bool = False) -> Experiment:
 
     Args:
         scenario: a scenario, its name, its file, the folder of a run, or a mapping of its keys.
-        to_run: also check that a run of it would fit in memory and has no `live` events, which
-            `echelon run` cannot repeat.
+        to_run: also check that a run of it would fit in memory, that its engine can step it, and
+            that it has no `live` events, which `echelon run` cannot repeat.
 
     Raises:
         ScenarioError: one line for each part that cannot be built, with its place in the file.
+        EchelonError: the engine cannot step a run of it.
     """
     scenario = as_scenario(scenario)
     faults = FaultList(scenario)
@@ -89,6 +90,8 @@ def build(scenario: ScenarioLike, to_run: bool = False) -> Experiment:
             # And before a gain is computed, which takes long for many agents.
             _check_run(scenario, faults, model, graph, settings)
         parts = _parts(scenario, faults, model, graph, reference)
+    if to_run:
+        check_engine(parts, settings)
     return Experiment(parts, settings)
 
 

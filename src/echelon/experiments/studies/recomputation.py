@@ -26,7 +26,7 @@ from echelon.experiments.studies.check import check
 from echelon.experiments.studies.design import with_gain
 from echelon.guarantees.promises.promise import promise
 from echelon.guarantees.verifier.findings import Finding, decide
-from echelon.guarantees.verifier.stored_values import compare_values
+from echelon.guarantees.verifier.stored_values import Digits, compare_values
 from echelon.guarantees.verifier.strict_json import parse_json, read_json
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.initial import initial_states
@@ -36,35 +36,52 @@ from echelon.simulation.engine.prepare import prepare
 from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.gain_file import gain_as_mapping, load_gain
 
-_SOLVED = 1e-3
+SOLVED = Digits(1e-3)
 """Relative. On another machine a semidefinite program ends at another P, 1e-4 apart."""
 
 
-def recompute(
-    scenario: Scenario, claims: Path | None, gain: Path | None = None, data: Path | None = None
-) -> Iterator[Finding]:
-    """Yield a finding for each value that a run's files state and its scenario gives.
+def experiment_of(
+    scenario: Scenario, claims: Path | None, gain: Path | None
+) -> tuple[Experiment, list[Finding]]:
+    """Return the parts of a run with the gains that its files state, and what is compared of them.
 
     Args:
         scenario: of the run. Code that it names is executed.
         claims: the run's `summary.json`, or the output of `check --json`.
         gain: the run's gain file; the guarantee is then that of the gain in it.
-        data: the run's `run.nc`, of which the guarantee, the scenario and the starts are compared.
 
     Raises:
         EchelonError: the scenario cannot be built, or a file cannot be read.
     """
     # As for a run: what is too large to have been run is refused.
-    experiment = build(scenario, to_run=True)
+    experiment, findings = build(scenario, to_run=True), list[Finding]()
     if gain is not None:
-        yield from compare_gain(gain, experiment)
+        findings += compare_gain(gain, experiment)
         with contextlib.suppress(GainError):
             experiment = with_gain_of(experiment, gain)
     if claims is not None:
-        stored = read_json(claims)
-        experiment, findings = with_leader_gain(experiment, stored.get("leader_gain"))
-        yield from findings
-        yield from compare_claims(stored, experiment, scenario.name)
+        stored = read_json(claims).get("leader_gain")
+        experiment, more = with_leader_gain(experiment, stored)
+        findings += more
+    return experiment, findings
+
+
+def recompute(
+    experiment: Experiment, scenario: Scenario, claims: Path | None, data: Path | None = None
+) -> Iterator[Finding]:
+    """Yield a finding for each value that a run's files state and its scenario gives.
+
+    Args:
+        experiment: of the run, as `experiment_of` returns it.
+        scenario: of the run.
+        claims: the run's `summary.json`, or the output of `check --json`.
+        data: the run's `run.nc`, of which the guarantee, the scenario and the starts are compared.
+
+    Raises:
+        EchelonError: a file cannot be read.
+    """
+    if claims is not None:
+        yield from compare_claims(read_json(claims), experiment, scenario.name)
     if data is not None:
         yield from _compare_data(data, scenario, experiment)
 
@@ -96,7 +113,7 @@ def compare_gain(file: Path, experiment: Experiment) -> Iterator[Finding]:
     assert parts.drive.gain is not None
     value = _as_json(gain_as_mapping(parts.drive.gain, parts.model, parts.graph))
     for key in ("method", "coupling", "P", "R", "inner"):
-        yield from compare_values(f"{file.name}: {key}", stored[key], value[key], _SOLVED)
+        yield from compare_values(f"{file.name}: {key}", stored[key], value[key], SOLVED)
     yield from compare_values(f"{file.name}: graph", stored["graph"], value["graph"])
     # The name of a class may change with the version, and the verifier has evaluated it.
     stored, value = ({**each["model"], "class": ""} for each in (stored, value))
@@ -126,7 +143,7 @@ def with_leader_gain(experiment: Experiment, stored: object) -> tuple[Experiment
         return experiment, []
     numbers = {"P": gain.P.tolist(), "R": gain.R.tolist()}
     theirs = {name: stored[name] for name in numbers}
-    findings = list(compare_values("leader_gain", theirs, numbers, _SOLVED))
+    findings = list(compare_values("leader_gain", theirs, numbers, SOLVED))
     with contextlib.suppress(GainError):
         if not any(each.verdict == "refused" for each in findings):
             P, R = (np.array(theirs[name], float) for name in numbers)

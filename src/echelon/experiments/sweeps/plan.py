@@ -48,6 +48,7 @@ class Sweep:
     Raises:
         ScenarioError: there are too many runs, or a value makes a scenario with faults; or states
             are stored, and a value changes the agents, states or times of a run.
+        SimulationError: the engine cannot step the first run.
     """
 
     def __init__(
@@ -127,8 +128,11 @@ class Sweep:
     def first_built(self) -> "Experiment":
         """The parts and settings of the first case."""
         from echelon.experiments.scenario.build import build
+        from echelon.simulation.engine.prepare import check_engine
 
-        return build(self.case((0,) * len(self.axes)))
+        first = build(self.case((0,) * len(self.axes)))
+        check_engine(*first)
+        return first
 
     @cached_property
     def frames(self) -> "FrameShape | None":

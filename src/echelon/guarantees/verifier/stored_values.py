@@ -6,6 +6,7 @@ rounding agree with each other. Words agree letter by letter.
 
 import re
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,17 +14,27 @@ from echelon.core.types import Array
 from echelon.core.words import amount
 from echelon.guarantees.verifier.findings import Finding
 
-SAME = 1e-6
-"""Relative difference allowed; eigenvalues and solutions of Riccati equations differ by less."""
-_NOISE = 1e-12
-"""Numbers below it, or in a matrix below this fraction of its largest, are rounding."""
+
+class Digits(NamedTuple):
+    """How far numbers of two machines may be apart.
+
+    Attributes:
+        same: relative difference; eigenvalues and solutions of Riccati equations differ by less.
+        noise: numbers below it, or in a matrix below this fraction of its largest, are rounding.
+    """
+
+    same: float = 1e-6
+    noise: float = 1e-12
+
+
+_USUAL = Digits()
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _SHOWN = 60
 """Letters of a text that a finding shows from where it differs."""
 
 
 def compare_values(
-    claim: str, stored: object, value: object, same: float = SAME
+    claim: str, stored: object, value: object, digits: Digits = _USUAL
 ) -> Iterator[Finding]:
     """Yield a finding for each number, matrix or text of a stored value.
 
@@ -31,7 +42,7 @@ def compare_values(
         claim: the name of the value.
         stored: plain data of a file.
         value: the same, computed again.
-        same: the relative difference of numbers that is allowed.
+        digits: to which numbers must agree.
     """
     arrays = _array(stored), _array(value)
     if isinstance(stored, dict) and isinstance(value, dict):
@@ -43,24 +54,47 @@ def compare_values(
                 # In ASCII, so that a letter that looks like another one is seen.
                 yield _differs(ascii(name)[1:-1], _shown(stored[key]), "", "it is unknown")
             else:
-                yield from compare_values(name, stored[key], value[key], same)
+                yield from compare_values(name, stored[key], value[key], digits)
     elif arrays[0] is not None and arrays[1] is not None:
-        yield _finding(claim, stored, value, _agree(arrays[0], arrays[1], same))
+        yield _finding(claim, stored, value, _agree(arrays[0], arrays[1], digits))
     elif isinstance(stored, list) and isinstance(value, list) and len(stored) == len(value):
         for k, pair in enumerate(zip(stored, value, strict=True)):
-            yield from compare_values(f"{claim}.{k}", *pair, same)
+            yield from compare_values(f"{claim}.{k}", *pair, digits)
     else:
-        yield _compare_leaf(claim, stored, value, same)
+        yield _compare_leaf(claim, stored, value, digits)
 
 
-def _compare_leaf(claim: str, stored: object, value: object, same: float) -> Finding:
+def compare_arrays(
+    claim: str, stored: Array | None, value: Array, digits: Digits = _USUAL
+) -> Finding:
+    """Return the finding for an array of numbers or words; NaN agrees with NaN."""
+    if stored is None:
+        return _differs(claim, "", _described(value), "it is missing")
+    shown, same = (claim, _described(stored), _described(value)), stored.shape == value.shape
+    if not (same and value.dtype.kind in "iufb" and stored.dtype.kind in "iufb"):
+        fine = same and bool(np.array_equal(stored, value))
+    else:
+        gaps = np.isnan(np.asarray(value, float))
+        theirs, ours = (np.where(gaps, 0.0, x) for x in (stored, value))
+        fine = bool((gaps == np.isnan(np.asarray(stored, float))).all())
+        fine = fine and (not value.size or _agree(theirs, ours, digits))
+    if not fine:
+        return _differs(*shown, "")
+    return Finding(*shown, "recomputed", "", True)
+
+
+def _described(array: Array) -> str:
+    return f"{' x '.join(map(str, array.shape)) or 1} {'number' if array.size == 1 else 'numbers'}"
+
+
+def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> Finding:
     if isinstance(stored, str) and isinstance(value, str):
         fine, at = _same_text(stored, value), _first_difference(stored, value)
         shown = [ascii(text[at : at + _SHOWN])[1:-1] for text in (stored, value)]
         reason = f"from letter {at} on `{shown[0]}` is stored, and computed is `{shown[1]}`"
         return _finding(claim, stored, value, fine, reason)
     if _is_number(stored) and _is_number(value):
-        fine = _agree(np.array(stored, float), np.array(value, float), same)
+        fine = _agree(np.array(stored, float), np.array(value, float), digits)
         return _finding(claim, stored, value, fine)
     # `True == 1` in Python, so types are compared too.
     return _finding(claim, stored, value, type(stored) is type(value) and stored == value)
@@ -108,15 +142,17 @@ def _array(value: object) -> Array | None:
         return None
 
 
-def _agree(stored: Array, value: Array, same: float) -> bool:
+def _agree(stored: Array, value: Array, digits: Digits) -> bool:
     if stored.shape != value.shape:
         return False
     size = np.maximum(np.abs(stored), np.abs(value))
-    noise = _NOISE * max(1.0, float(np.abs(value).max())) if value.ndim else _NOISE
+    # Of finite numbers alone, or beside an infinite bound every number would be rounding.
+    largest = float(np.abs(np.where(np.isfinite(value), value, 0.0)).max()) if value.ndim else 1.0
+    least = digits.noise * max(1.0, largest)
     with np.errstate(invalid="ignore"):
-        near = np.abs(stored - value) <= same * np.where(np.isfinite(size), size, 0.0)
+        near = np.abs(stored - value) <= digits.same * np.where(np.isfinite(size), size, 0.0)
     # Infinite bounds are equal, and have no difference.
-    return bool((near | (stored == value) | (size <= noise)).all())
+    return bool((near | (stored == value) | (size <= least)).all())
 
 
 def _same_text(stored: str, value: str) -> bool:
@@ -126,7 +162,7 @@ def _same_text(stored: str, value: str) -> bool:
     if _NUMBER.split(stored) != _NUMBER.split(value):
         return False
     pairs = zip(_NUMBER.findall(stored), _NUMBER.findall(value), strict=True)
-    return all(a == b or max(abs(float(a)), abs(float(b))) <= _NOISE for a, b in pairs)
+    return all(a == b or max(abs(float(a)), abs(float(b))) <= _USUAL.noise for a, b in pairs)
 
 
 def _first_difference(a: str, b: str) -> int:

@@ -53,10 +53,16 @@ class Chunks:
         """Whether a stretch is stored."""
         return any(self.place.glob("*.npz"))
 
-    def begin(self, scenario: Scenario, more: Mapping[str, str] = MappingProxyType({})) -> None:
+    def begin(
+        self,
+        scenario: Scenario,
+        more: Mapping[str, str] = MappingProxyType({}),
+        figures: bool = True,
+    ) -> None:
         """Write the scenario and all files that it names, before anything is computed.
 
-        `more` are further inputs, as texts by the name of their file.
+        `more` are further inputs, as texts by the name of their file; `figures` is whether figures
+        are to be drawn.
 
         Raises:
             OutputError: a file cannot be written.
@@ -70,7 +76,7 @@ class Chunks:
                 (self.folder / INPUTS).mkdir(exist_ok=True)
                 write_atomic(self.folder / INPUTS / name, content)
             write_atomic(self.folder / SCENARIO_FILE, text)
-            begun = {"inputs": self._digest(), "versions": versions()}
+            begun = {"inputs": self._digest(), "versions": versions(), "figures": figures}
             write_atomic(self.place / _BEGUN, json.dumps(begun) + "\n")
 
     def check(self) -> None:
@@ -79,12 +85,7 @@ class Chunks:
         Raises:
             OutputError: they are not, so that its numbers could differ.
         """
-        try:
-            begun = json.loads((self.place / _BEGUN).read_text("utf-8"))
-        except _DAMAGED as error:
-            raise OutputError(
-                f"`{self.folder}` holds no unfinished run; give the folder of one."
-            ) from error
+        begun = self._begun()
         if begun["inputs"] != self._digest():
             raise OutputError(
                 f"the scenario in `{self.folder}` was changed since the run began, so it cannot be "
@@ -99,6 +100,20 @@ class Chunks:
                     f"installed, which may round differently; `echelon run {self.folder}` starts a "
                     "new run."
                 )
+
+    @property
+    def figures(self) -> bool:
+        """Whether figures are to be drawn, as was asked when the run began."""
+        return bool(self._begun().get("figures", True))
+
+    def _begun(self) -> JsonObject:
+        """Return what was written when the run began."""
+        try:
+            return json.loads((self.place / _BEGUN).read_text("utf-8"))
+        except _DAMAGED as error:
+            raise OutputError(
+                f"`{self.folder}` holds no unfinished run; give the folder of one."
+            ) from error
 
     def _digest(self) -> str:
         """Return a digest of the scenario and of every file that it names."""

@@ -14,12 +14,13 @@ from echelon.experiments.scenario.scenario import (
     load_scenario,
 )
 from echelon.experiments.scenario.self_contained import files_of, names_code, without_folders
-from echelon.experiments.studies.recomputation import recompute
+from echelon.experiments.studies.recomputation import experiment_of, recompute
 from echelon.guarantees.verifier import verify as verifier
 from echelon.guarantees.verifier.findings import Finding, unchecked
 from echelon.guarantees.verifier.verify import PROMISE, Verification, judge
 from echelon.output.archive.folder import DATA, SUMMARY
 from echelon.output.archive.open_folder import ClaimFiles, claim_files
+from echelon.output.archive.repetition import OBSERVATIONS, compare_run
 from echelon.output.archive.run_folder import save_run
 from echelon.simulation.engine.result import Result
 
@@ -32,8 +33,9 @@ def verify(
     run: "Result | PathLike",
     model: ControlAffine | None = None,
     scenario: ScenarioLike | None = None,
+    repeat: bool = True,
 ) -> Verification:
-    """Check a gain by independent code, and compute a run's guarantee again from its scenario.
+    """Check a gain by independent code, and compute a run and its guarantee again.
 
     Args:
         run: a gain file, the output of `check --json`, the folder of a run, or a result, whose
@@ -42,6 +44,8 @@ def verify(
             equations are not checked and the verdict is `incomplete`.
         scenario: of a folder whose scenario names classes of your own, which are executed; a
             result's own is executed.
+        repeat: whether to simulate the scenario again. Without it, what the run observed is not
+            checked and the verdict is `incomplete`.
 
     Raises:
         GainError: a file is neither, or a part is missing or unknown.
@@ -52,34 +56,58 @@ def verify(
         with TemporaryDirectory() as place:
             folder = save_run(run, Path(place) / "run", figures=False)
             own = folder if "scenario_text" in run.provenance else None
-            return verify(folder, model, own)
+            return verify(folder, model, own, repeat)
     if Path(run).is_file() and scenario is None:
         return verifier.verify(run, model)
     trusted = None if scenario is None else as_scenario(scenario)
-    return check_files(claim_files(run), trusted)[0]
+    return check_files(claim_files(run), trusted, repeat)[0]
 
 
 def check_files(
-    files: ClaimFiles, trusted: Scenario | None, begin: Callable[[], None] = lambda: None
+    files: ClaimFiles,
+    trusted: Scenario | None,
+    repeat: bool,
+    begin: Callable[[str], None] = lambda what: None,
 ) -> tuple[Verification, str]:
     """Return what holds of files with claims, and what is against their scenario, if anything.
 
     Args:
         files: of a run, or a gain file.
         trusted: the scenario whose code may be executed.
-        begin: called before the guarantee is computed again, which may take a minute.
+        repeat: whether to simulate the scenario again.
+        begin: called with what is begun that may take a minute or longer.
     """
     source, obstacle = _source(files, trusted)
     findings, note = _independent(files, trusted)
     computed = list[Finding]()
     # A gain file by itself is no run.
     if source is not None and (files.claims is not None or files.data is not None):
-        begin()
-        computed = list(recompute(source, files.claims, files.gain, files.data))
+        computed = [*_computed(files, source, repeat, begin)]
     still_open = [*_still_open(findings, computed, obstacle)]
     if files.claims is not None and files.claims.name == SUMMARY and files.data is None:
         still_open.append(unchecked(DATA, "", "it is missing"))
     return judge([*still_open, *computed], note), obstacle
+
+
+def _computed(
+    files: ClaimFiles, source: Scenario, repeat: bool, begin: Callable[[str], None]
+) -> Iterator[Finding]:
+    """Yield what is computed again from a scenario: the guarantee, and then the run."""
+    begin("computing the guarantee again, which takes up to a minute")
+    experiment, findings = experiment_of(source, files.claims, files.gain)
+    yield from findings
+    for each in recompute(experiment, source, files.claims, files.data):
+        findings.append(each)
+        yield each
+    if files.data is None:
+        return
+    if not repeat:
+        yield unchecked(OBSERVATIONS, "", "the run was not computed again")
+    elif any(each.verdict == "refused" for each in findings):
+        yield unchecked(OBSERVATIONS, "", "the scenario is not that of the run")
+    else:
+        begin("computing the run again")
+        yield from compare_run(files, source, experiment)
 
 
 def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | None, str]:

@@ -97,6 +97,8 @@ def simulate(
     began = time.perf_counter()
     prepared = prepare(parts, settings, to_store=True)
     with precision("float64"):
+        # Before a solver plans, which may take minutes.
+        prepared.parts.drive.check_engine(prepared.problem)
         # Plans and solvers need float64, also in a float32 run.
         stepper = prepared.parts.drive.stepper(prepared.problem)
     _check_devices(settings, stepper)

@@ -298,6 +298,10 @@ class Drive(eqx.Module):
         Raises:
             SimulationError: it cannot.
         """
+        if problem.settings.engine == "native":
+            raise SimulationError(
+                "`engine` is `native`, and must be `auto` or `jax` where a solver drives agents."
+            )
 
     def start(self, model: ControlAffine) -> State:
         """Return the state (n,) in which leaders begin, the trim unless replaced."""
