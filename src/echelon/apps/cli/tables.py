@@ -5,6 +5,8 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from echelon.core.digits import about, at_least, at_most
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -57,6 +59,16 @@ _DESIGN: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "promise": ("", lambda design: design.promise.as_mapping()),
 }
 """The numbers of a design, each with its column, if it has one, and its computation."""
+_SAFE: dict[str, tuple[Callable[[float], str], ...]] = {
+    "edge": (at_least,),
+    "slowest_mode": (at_least,),
+    "longest_step": (at_most,),
+    "gain_margin": (at_least, at_most),
+    "delay_margin": (at_most,),
+    "rate": (at_most,),
+    "radius": (at_most,),
+}
+"""Towards where numbers that are guaranteed are rounded."""
 
 
 def design_row(design: "Design") -> "JsonObject":
@@ -98,7 +110,7 @@ def print_designs(rows: "list[JsonObject]", sentence: str) -> None:
     for key, title in columns.items():
         table.add_column(title, justify="left" if key == "method" else "right")
     for row in rows:
-        table.add_row(*(_cell(row.get(key)) for key in columns))
+        table.add_row(*(_cell(row.get(key), _SAFE.get(key, (about, about))) for key in columns))
     out = console()
     out.print(table)
     notes = [*_FOOTNOTES] if any(row.get("coupling") for row in rows) else []
@@ -108,11 +120,12 @@ def print_designs(rows: "list[JsonObject]", sentence: str) -> None:
         out.print(text, highlight=False, markup=False, soft_wrap=not out.is_terminal)
 
 
-def _cell(value: object) -> str:
+def _cell(value: object, towards: tuple[Callable[[float], str], ...]) -> str:
     if isinstance(value, float):
-        return f"{value:.3g}"
+        return towards[0](value)
     if isinstance(value, list):
-        return " - ".join("inf" if part is None else f"{part:.3g}" for part in value)
+        ends = zip(towards, value, strict=True)
+        return " - ".join("inf" if part is None else text(part) for text, part in ends)
     return "-" if value is None else str(value)
 
 
