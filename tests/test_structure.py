@@ -261,6 +261,14 @@ def module_of_entry(entry: registry.Entry) -> str:
     return resolve(entry).__module__.removeprefix("echelon.")
 
 
+def test_numbers_of_guarantees_are_rounded_by_the_three_functions_for_it():
+    """`core/digits.py` has them; a format such as `:.3g` may state more than is known."""
+    for module, path in PATHS.items():
+        of_guarantees = module.startswith(("guarantees.", "experiments.studies."))
+        if of_guarantees and module != "experiments.studies.doctor":
+            assert not re.findall(r":\.\d[efg]\}", path.read_text("utf-8")), module
+
+
 def test_importing_echelon_loads_nothing_heavy():
     assert loaded_after("import echelon") == set()
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import echelon as ech
 from echelon.agents.network.topology import _Large
+from echelon.core.digits import at_least
 from echelon.experiments.studies.speedup import speedup, time_constant
 
 
@@ -136,9 +137,9 @@ def test_what_is_told_is_what_the_changed_graph_has():
         assert told == pytest.approx(-1.0 / again, rel=1e-9) and told < 0.5 * found.now
     (i, j), (k, m) = found.edges
     assert found.sentence() == (
-        f"The slowest disagreement decays with a time constant of {found.now:.3g} s; "
-        f"{found.with_leaders:.3g} s with the further leader {found.leaders[0]}; "
-        f"{found.with_edges:.3g} s with the further edges {i}-{j}, {k}-{m}."
+        f"The slowest disagreement decays with a time constant of {at_least(found.now)} s; "
+        f"{at_least(found.with_leaders)} s with the further leader {found.leaders[0]}; "
+        f"{at_least(found.with_edges)} s with the further edges {i}-{j}, {k}-{m}."
     )
 
 

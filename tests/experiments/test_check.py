@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
+from echelon.core.digits import at_most
 from echelon.core.linear import longest_step
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
@@ -168,10 +169,12 @@ def test_the_region_is_told_and_the_promise_says_it(robust):
     assert lines["region of the gain"].verdict is Verdict.HOLDS
     assert lines["region of the gain"].kind is region.kind is Kind.VERTICES
     assert lines["region of the gain"].number == region.rate
-    assert lines["region of the gain"].number_text == f"{region.rate:.3g} 1/s"
+    assert lines["region of the gain"].number_text == f"{at_most(region.rate)} 1/s"
     assert found.promised and "corners of a hull" in found.sentence()
-    assert f"{region.rate:.3g} 1/s or faster" in found.sentence() and "(T1)" in found.sentence()
-    assert f"<= {region.radius:.3g}^2" in found.sentence()
+    assert (
+        f"{at_most(region.rate)} 1/s or faster" in found.sentence() and "(T1)" in found.sentence()
+    )
+    assert f"<= {at_most(region.radius)}^2" in found.sentence()
     assert (found.theorem, found.kind, found.rate) == (Theorem.T1, Kind.VERTICES, region.rate)
 
 

@@ -11,6 +11,7 @@ import scipy.linalg
 import echelon as ech
 from echelon.agents.models.chains import chains_of
 from echelon.agents.models.model import FlatBound, FlatChains, Flattened
+from echelon.core.digits import at_most
 from echelon.core.errors import EchelonError
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem
@@ -92,7 +93,7 @@ def test_a_unicycle_is_promised_while_it_drives(tmp_path):
     # A chord of the leader's speed is 60 degrees; its path is enclosed a little below 1.4 m/s.
     assert 1.36 < border["path"] <= 1.4 and "a speed above 0" in found.sentence()
     chord = 2.0 * np.degrees(np.arcsin(found.tube.steepest / 2.8))
-    assert 57.0 < chord < 60.0 and f"{chord:.3g} deg to either side" in found.sentence()
+    assert 57.0 < chord < 60.0 and f"{at_most(chord)} deg to either side" in found.sentence()
     file = tmp_path / "summary.json"
     file.write_text(json.dumps({"promise": found.as_mapping()}))
     assert verify(file).verdict == "incomplete"

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import echelon as ech
+from echelon.core.digits import at_least, at_most
 from echelon.core.statement import Hypothesis
-from echelon.core.words import Kind, Theorem, at_least, at_most
+from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.promise import promise
 from echelon.guarantees.stopping import separation
 from echelon.guarantees.stopping.flat_states import FlatStates

@@ -3,7 +3,6 @@
 Nothing here needs JAX, so scenarios can be checked without it. Code compares members, never names.
 """
 
-import decimal
 import enum
 from typing import Self
 
@@ -13,22 +12,6 @@ from echelon.core.errors import SimulationError, check_name
 def amount(count: int, noun: str, nouns: str = "") -> str:
     """Return a count with its noun, such as `1 agent`; `nouns` is an irregular plural."""
     return f"{count} {noun if count == 1 else nouns or noun + 's'}"
-
-
-def at_most(x: float, digits: int) -> str:
-    """Return a number with so many digits, rounded down: what is stated is not more than it."""
-    return _towards(x, digits, decimal.ROUND_FLOOR)
-
-
-def at_least(x: float, digits: int) -> str:
-    """Return a number with so many digits, rounded up: what is stated is not less than it."""
-    return _towards(x, digits, decimal.ROUND_CEILING)
-
-
-def _towards(x: float, digits: int, rounding: str) -> str:
-    # Its shortest digits first: what is behind them is rounding.
-    number = decimal.Decimal(f"{x:.12g}")
-    return f"{decimal.Context(digits, rounding).create_decimal(number):g}"
 
 
 class Word(enum.Enum):

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.core.compiled import cached_jit
+from echelon.core.digits import at_least, at_most
 from echelon.core.errors import LawError
 from echelon.core.types import Array, States
 from echelon.laws.flat_law import FlatLaw
@@ -47,7 +48,7 @@ def check_numbers(
     if law.safety.gain * period > 1.0 + _ROUNDING:
         raise LawError(
             f"`gain` of `safety` is {law.safety.gain:g} 1/s, and must be at most one over the "
-            f"step, {1.0 / period:g} 1/s."
+            f"step, {at_most(1.0 / period, 6)} 1/s."
         )
     _check_space(law.safety, law, model, offsets)
 
@@ -60,8 +61,8 @@ def _check_space(
     least = safety.needed_reach(np.array([law.speed_of(k) for k in law.places(model)]), scales)
     if safety.reach < least:
         raise LawError(
-            f"`reach` of `safety` is {safety.reach:g} m, and must be at least {least:.4g} m, so "
-            "that agents at their `speed` regard each other in time."
+            f"`reach` of `safety` is {safety.reach:g} m, and must be at least "
+            f"{at_least(least, 4)} m, so that agents at their `speed` regard each other in time."
         )
     goals = offsets[:, list(model.position_indices())] * scales
     near = too_near(safety, _lengths(goals[:, None] - goals))
@@ -85,8 +86,9 @@ def too_near(safety: Safety, apart: Float[Array, "N N"]) -> TooNear | None:
     k = int(apart[i, j].argmin()) if len(i) else 0
     if not len(i) or apart[i[k], j[k]] >= safety.distance - _ROUNDING:
         return None
-    text = f"agent {j[k]}, {apart[i[k], j[k]]:.4g} m as `safety` measures it, and at least "
-    return TooNear(int(i[k]), f"{text}{safety.distance:.4g} m are allowed")
+    near = at_most(float(apart[i[k], j[k]]), 4)
+    text = f"agent {j[k]}, {near} m as `safety` measures it, and at least "
+    return TooNear(int(i[k]), f"{text}{at_least(safety.distance, 4)} m are allowed")
 
 
 def hulls_at(

@@ -5,6 +5,8 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from echelon.core.digits import about, at_least, at_most
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -63,6 +65,16 @@ _PARTS = (
     ("rate", "kind", "theorem", "radius"),
 )
 """The columns of each of the tables of designs, which so fit into 80 columns."""
+_SAFE: dict[str, tuple[Callable[[float], str], ...]] = {
+    "edge": (at_least,),
+    "slowest_mode": (at_least,),
+    "longest_step": (at_most,),
+    "gain_margin": (at_least, at_most),
+    "delay_margin": (at_most,),
+    "rate": (at_most,),
+    "radius": (at_most,),
+}
+"""Towards where numbers that are guaranteed are rounded."""
 
 
 def design_row(design: "Design") -> "JsonObject":
@@ -114,15 +126,16 @@ def _design_table(rows: "list[JsonObject]", keys: Iterable[str]) -> "Table":
     for key in keys:
         table.add_column(_DESIGN[key][0], justify="left" if key == "method" else "right")
     for row in rows:
-        table.add_row(*(_cell(row.get(key)) for key in keys))
+        table.add_row(*(_cell(row.get(key), _SAFE.get(key, (about, about))) for key in keys))
     return table
 
 
-def _cell(value: object) -> str:
+def _cell(value: object, towards: tuple[Callable[[float], str], ...]) -> str:
     if isinstance(value, float):
-        return f"{value:.3g}"
+        return towards[0](value)
     if isinstance(value, list):
-        return " - ".join("inf" if part is None else f"{part:.3g}" for part in value)
+        ends = zip(towards, value, strict=True)
+        return " - ".join("inf" if part is None else text(part) for text, part in ends)
     return "-" if value is None else str(value)
 
 

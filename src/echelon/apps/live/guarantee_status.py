@@ -14,6 +14,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.apps.live.swarm import Picture
+from echelon.core.digits import at_least, at_most
 from echelon.core.types import JsonObject
 from echelon.experiments.results.avoidance import ROUNDING
 from echelon.simulation.step.meter import SETTLED, outside
@@ -141,8 +142,8 @@ class GuaranteeStatus:
         if kept is None or self.near >= kept - ROUNDING:
             return ""
         return (
-            f"The hulls of two agents are {self.near:.3g} m apart, scaled, as after a kick; from "
-            f"{kept:.3g} m on it is guaranteed again that agents stay apart."
+            f"The hulls of two agents are {at_most(self.near)} m apart, scaled, as after a kick; "
+            f"from {at_least(kept)} m on it is guaranteed again that agents stay apart."
         )
 
     def _current(self) -> JsonObject:

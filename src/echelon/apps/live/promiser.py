@@ -7,6 +7,7 @@ from typing import Final, NamedTuple, final
 
 from echelon.apps.live.knobs import Knobs
 from echelon.apps.live.panel import Panel
+from echelon.core.digits import at_least
 from echelon.core.errors import EchelonError, GraphError
 from echelon.core.rational import bisect
 from echelon.core.types import JsonObject
@@ -148,6 +149,7 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
     badge["apart"] = ((stated["anywhere"] or {}).get("separation") or {}).get("distance")
     badge["causes"] = [cause.sentence() for cause in guarantee.causes]
     badge["edge"], badge["end"] = guarantee.edge, _end(panel, knobs, guarantee.edge)
+    badge["above"] = None if guarantee.edge is None else at_least(guarantee.edge)
     badge["rate"], certified = guarantee.rate, guarantee.certified
     badge["anywhere"] = certified is not None and certified.radius == float("inf")
     # Shown where the guarantee does not cover the state.
@@ -199,7 +201,8 @@ def first_look(panel: Panel, knobs: Knobs) -> JsonObject:
         return pending_badge() | {"state": "lost", "short": growth}
     if loop is None:
         return pending_badge()
-    return pending_badge(f"slowest mode {-loop.held_rate(settings):.3g} 1/s; guarantee \u2026")
+    slowest = at_least(-loop.held_rate(settings))
+    return pending_badge(f"slowest mode {slowest} 1/s; guarantee \u2026")
 
 
 def _growth(loop: LinearLoop | None, settings: Settings) -> str:

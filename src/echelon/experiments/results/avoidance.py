@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from echelon.core.digits import about, at_most
 from echelon.core.types import Array
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import steps_per_slice
@@ -80,13 +81,13 @@ class Avoidance(NamedTuple):
 
     def sentence(self) -> str:
         """Return them in a sentence."""
-        text = f"Smallest scaled distance: {self.least:.4g} m; agents touch at "
-        text += f"{self.ellipsoid.touching:.4g} m, and their hulls keep "
-        text += f"{self.ellipsoid.limit:.4g} m. "
+        text = f"Smallest scaled distance: {about(self.least, 4)} m; agents touch at "
+        text += f"{about(self.ellipsoid.touching, 4)} m, and their hulls keep "
+        text += f"{at_most(self.ellipsoid.limit, 4)} m. "
         if self.last is None:
             return f"{text}No agent was held back."
-        first = self.times[np.flatnonzero(self.active)[0]]
-        return f"{text}Agents held each other back between {first:.3g} s and {self.last:.3g} s."
+        first, last = (about(float(t)) for t in self.times[np.flatnonzero(self.active)][[0, -1]])
+        return f"{text}Agents held each other back between {first} s and {last} s."
 
 
 def avoidance(result: Result) -> Avoidance | None:

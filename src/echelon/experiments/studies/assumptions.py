@@ -11,6 +11,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import who_hears_whom
 from echelon.agents.references.demand import ReferenceDemand, infeasible, reference_demand, too_fast
+from echelon.core.digits import about, at_least, at_most
 from echelon.core.linear import eigenvalue_text
 from echelon.core.statement import Hypothesis, Statement, Topic, fails, holds, unneeded, vacuous
 from echelon.core.words import Kind, Verdict, amount
@@ -47,20 +48,20 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     followers, leaders = len(graph.followers), len(graph.leaders)
     roles = f"{amount(leaders, 'leader')}, {amount(followers, 'follower')}"
     yield holds(Topic.PARENTS, _PROOF, who_hears_whom(graph), leaders, roles)
-    extremes = f"lambda_min {low:.6g}, lambda_max {high:.6g}"
+    extremes = f"lambda_min {at_most(low, 6)}, lambda_max {at_least(high, 6)}"
     yield holds(Topic.GROUNDED, _PROOF, "for the grounded Laplacian", low, extremes)
     if other:
         text = "no eigenvalue of any L has a smaller real part"
-        yield fails(Topic.POSITIVE, _PROOF, text, low, f"{low:.6g}", remedy=remedy)
+        yield fails(Topic.POSITIVE, _PROOF, text, low, at_most(low, 6), remedy=remedy)
     else:
-        yield holds(Topic.POSITIVE, _PROOF, "grounded Laplacian", low, f"{low:.6g}")
+        yield holds(Topic.POSITIVE, _PROOF, "grounded Laplacian", low, at_most(low, 6))
     yield unneeded(Topic.SCHUR, _PROOF, "the LMI is not used")
     # A follower linked to a leader has the weight of that edge on its diagonal but not the leader's
     # column, so its row sums to that weight.
     rows = float(np.abs(graph.grounded_laplacian().sum(axis=1)).max())
     text = "true for rows that sum to zero; the grounded Laplacian's do not"
     remedy = "nothing here uses it: Lemma 1 suffices"
-    yield fails(Topic.EDGES, _PROOF, text, rows, f"row sum {rows:.3g}", remedy=remedy)
+    yield fails(Topic.EDGES, _PROOF, text, rows, f"row sum {about(rows)}", remedy=remedy)
 
 
 def _other_graph(graph: Graph) -> str:
@@ -105,10 +106,10 @@ def _leader_line(promise: Promise) -> Statement:
         return vacuous(name, _LINEAR, _NOT_SMOOTH)
     # NaN counts as not damped.
     if slow < -ZERO:
-        return holds(name, _LINEAR, "at the trim", slow, f"{slow:.3g} 1/s")
+        return holds(name, _LINEAR, "at the trim", slow, f"{at_least(slow)} 1/s")
     text = "the tracking error is not damped at the trim"
     remedy = "give `leader.gain` another method"
-    return fails(name, _LINEAR, text, slow, f"{slow:.3g} 1/s", remedy=remedy)
+    return fails(name, _LINEAR, text, slow, f"{at_least(slow)} 1/s", remedy=remedy)
 
 
 def _reference_line(model: ControlAffine, demand: ReferenceDemand, settings: Settings) -> Statement:
@@ -116,8 +117,8 @@ def _reference_line(model: ControlAffine, demand: ReferenceDemand, settings: Set
     limited = settings.limits and model.input_limits is not None
     sizes = ((demand.speed, "m/s"), (demand.acceleration, "m/s^2"))
     # Smaller numbers are rounding of differences.
-    numbers = [f"{round(x, 5):.3g} {unit}" for x, unit in sizes if x is not None]
-    numbers += [f"{100.0 * demand.share:.3g} % of the input range"] if limited else []
+    numbers = [f"{at_least(round(x, 5))} {unit}" for x, unit in sizes if x is not None]
+    numbers += [f"{at_least(100.0 * demand.share)} % of the input range"] if limited else []
     number = demand.share, ", ".join(numbers)
     if not demand.feasible:
         text, remedy = infeasible(model, demand), "give knots that the model can follow"
@@ -140,7 +141,7 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     worst = float(np.linalg.eigvalsh(slope)[-1])
     # If the drift does not depend on a position, A e = 0 and e'(P A + A'P) e = 0: the largest
     # eigenvalue is then at least 0, which must pass despite rounding.
-    number = worst, f"{worst:.3g}"
+    number = worst, at_least(worst)
     if worst <= ZERO * max(1.0, float(np.abs(slope).max())):
         return holds(name, _LINEAR, "the drift does not expand P", *number)
     mode = obstacle(A[None])
@@ -174,7 +175,7 @@ def _printed_line(parts: Parts, promise: Promise) -> Statement:
     Y = -F @ D.T
     largest = float(np.linalg.eigvalsh(np.block([[0.0 * X, X], [X, 0.5 * (Y + Y.T)]]))[-1])
     text = "infeasible for every P > 0: its upper left block is zero"
-    number, remedy = (largest, f"eigenvalue {largest:.3g} > 0"), "use the finite condition"
+    number, remedy = (largest, f"eigenvalue {about(largest)} > 0"), "use the finite condition"
     return fails(Topic.LMI_AS_PRINTED, _PROOF, text, *number, remedy=remedy)
 
 
@@ -189,7 +190,7 @@ def _finite_line(parts: Parts, promise: Promise) -> Statement:
         return vacuous(name, _PROOF, text, 0.0, "0 <= 0")
     every = condition.agents == parts.graph.agents
     kind, largest = _PROOF if every else Kind.SAMPLES, condition.largest
-    number = largest, f"{largest:.3g}"
+    number = largest, at_least(largest)
     if condition.verdict is Verdict.FAILS:
         text = "goals of agents {} and {} drift apart in this P".format(*condition.pair)
         return fails(name, kind, text, *number, remedy="choose other offsets or P")

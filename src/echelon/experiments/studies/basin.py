@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
+from echelon.core.digits import about, at_most
 from echelon.core.errors import GainError, check_name
 from echelon.core.numerics import precision
 from echelon.core.types import Array
@@ -186,14 +187,14 @@ class Radii(NamedTuple):
         """Return both radii in a sentence."""
         certified = "none, since no set is certified"
         if self.certified is not None:
-            certified = "everywhere" if self.certified == np.inf else f"{self.certified:.3g}"
-        observed = f"{self.observed:.3g}"
+            certified = "everywhere" if self.certified == np.inf else at_most(self.certified)
+        observed = at_most(self.observed)
         if self.observed >= self.largest:
-            observed = f"all that was tried, up to {self.largest:.3g}"
+            observed = f"all that was tried, up to {at_most(self.largest)}"
         return (
             f"Radius r of sum_i delta_i'P delta_i <= r^2, leader at rest: certified {certified}; "
             f"observed {observed}, for starts in `{self.states[0]}` and `{self.states[1]}` alone, "
-            f"run for {self.horizon:.3g} s."
+            f"run for {about(self.horizon)} s."
         )
 
 

@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
+from echelon.core.digits import at_most
 from echelon.core.errors import EchelonError, GainError, ScenarioError, check_name
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
@@ -176,7 +177,7 @@ def because(best: Design, designs: tuple[Design, ...], dt: float) -> str:
     assert best.promise is not None
     step = f"The scenario's step of {dt:g} s is short enough."
     if best.step <= dt:
-        step = f"It needs a step below {best.step:.3g} s; the scenario's is {dt:g} s."
+        step = f"It needs a step below {at_most(best.step)} s; the scenario's is {dt:g} s."
     others = [d for d in designs if d.stable and d is not best]
     text = f"Recommended: {best.method}. {_advantage(best, others, dt)} {step}"
     # The step has been mentioned.
@@ -205,9 +206,9 @@ def _advantage(best: Design, others: list[Design], dt: float) -> str:
     region = best.promise.region
     if region is None:
         local = f"{number[0].upper()}{number[1:]} are only locally guaranteed"
-        return f"{local}; this one converges fastest ({rate:.3g} 1/s)."
+        return f"{local}; this one converges fastest ({at_most(rate)} 1/s)."
     same = 1 + sum([*d.merit(dt)[1:3]] == argument for d in rivals)
-    text = f"Of {number} it has the strongest guarantee: {rate:.3g} 1/s on its domain "
+    text = f"Of {number} it has the strongest guarantee: {at_most(rate)} 1/s on its domain "
     text += f"({region.kind}, {region.theorem})"
     return f"{text}." if same == 1 else f"{text}, the fastest of {same} with this argument."
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 
+from echelon.core.digits import at_most
 from echelon.core.errors import EchelonError
 from echelon.core.statement import Hypothesis
 from echelon.guarantees.promises.promise import promise
@@ -41,7 +42,7 @@ def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
         # With an integer fraction of the step, the horizon remains a whole number of steps.
         shorter = settings.dt / math.ceil(settings.dt / longest) if longest > 0.0 else settings.dt
         if promise(parts, settings._replace(dt=shorter)).promised:
-            yield f"simulation.dt={shorter:.6g}"
+            yield f"simulation.dt={at_most(shorter, 6)}"
     law = parts.drive.follower if isinstance(parts.drive, Laws) else None
     if not isinstance(law, Consensus):
         return

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
+from echelon.core.digits import at_least
 from echelon.core.statement import Statement, Topic, fails, holds
 from echelon.core.types import Array
 from echelon.core.words import Kind
@@ -26,7 +27,7 @@ def killing_line(parts: Parts, promise: Promise) -> Statement:
     domain = _box(parts.model) if claim is None else claim.domain
     where = f"within {_RADIUS:g} of the trim" if claim is None else "on the domain"
     residual, kind = killing_residual(parts.model, promise.loop.closed.P, domain)
-    number = residual, f"{residual:.3g} 1/s"
+    number = residual, f"{at_least(residual)} 1/s"
     if kind is Kind.PROOF:
         text = f"g is constant {where}: guarantees on a region are not local (T1)"
         return holds(Topic.KILLING, kind, text, *number)

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.linearization import trim_slopes
 from echelon.agents.models.model import ControlAffine
+from echelon.core.digits import about, at_least, at_most
 from echelon.core.statement import Hypothesis, Statement, Topic, fails, holds, unneeded, vacuous
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, amount
@@ -45,15 +46,16 @@ def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
         return
     stiffness = margins.stiffness(loop.closed)
     if stiffness > _STIFF:
-        text = f"the fastest mode is {stiffness:.2g} times the slowest, which is lost in rounding"
+        ratio = about(stiffness, 2)
+        text = f"the fastest mode is {ratio} times the slowest, which is lost in rounding"
         yield unneeded(Topic.MARGINS, _KIND, text, stiffness)
         return
     low, high = margins.gain_margin(loop.closed)
     text = "factors on the coupling, in continuous time"
-    yield holds(Topic.GAIN, _KIND, text, low, f"{low:.3g} to {high:.3g}")
+    yield holds(Topic.GAIN, _KIND, text, low, f"{at_least(low)} to {at_most(high)}")
     delay = delay_margin(loop.closed)
-    time = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
-    text = f"uniform delay of z, critical mode lambda = {delay.eigenvalue:.3g}; {loop.where}"
+    time = f"{at_most(1e3 * delay.delay)} ms" if np.isfinite(delay.delay) else "any"
+    text = f"uniform delay of z, critical mode lambda = {about(delay.eigenvalue)}; {loop.where}"
     yield holds(Topic.DELAY, _KIND, text, delay.delay, time)
     low, high = loop.certificate.lambda_min, loop.certificate.lambda_max
     best = delay_margin(loop.closed._replace(eigenvalues=np.array([low]))).delay
@@ -72,7 +74,7 @@ def _switching_lines(promise: Promise) -> Iterator[Statement]:
         low = edge / promise.loop.closed.coupling
         what = "factors on the coupling for which one P serves all graphs, however they switch, in "
         what += "continuous time"
-        yield holds(Topic.GAIN, _KIND, what, low, f"{low:.3g} to inf")
+        yield holds(Topic.GAIN, _KIND, what, low, f"{at_least(low)} to inf")
     text = "any coupling; " if anywhere else ""
     text += "delay margins are known for one graph only, not for switching graphs"
     yield unneeded(Topic.MARGINS, _KIND, text)
@@ -87,11 +89,11 @@ def _spread_line(low: float, high: float, delay: float, best: float) -> Statemen
     ratio = high / low
     if not ratio > _WIDE:
         text = f"at most {_WIDE}, so the fastest mode reduces the delay margin little"
-        return holds(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, f"{ratio:.3g}")
-    text = f"delay margin {1e3 * delay:.3g} ms; it would be {1e3 * best:.3g} ms if all eigenvalues "
-    text += f"of the graph were equal (their ratio is {ratio:.3g})"
+        return holds(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, about(ratio))
+    text = f"delay margin {at_most(1e3 * delay)} ms; it would be {at_most(1e3 * best)} ms if all "
+    text += f"eigenvalues of the graph were equal (their ratio is {about(ratio)})"
     remedy = "let agents send only away from the leader, by `graph.directed: true`"
-    return fails(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, f"{ratio:.3g}", remedy=remedy)
+    return fails(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, about(ratio), remedy=remedy)
 
 
 def _agreement_lines(agreement: AgreementModes) -> Iterator[Statement]:
@@ -103,8 +105,8 @@ def _agreement_lines(agreement: AgreementModes) -> Iterator[Statement]:
     c, values = agreement
     delays = (0.5 * np.pi - np.abs(np.angle(values))) / (c * np.abs(values))
     at, sizes = int(delays.argmin()), np.abs(values)
-    text = f"uniform delay of z, critical mode lambda = {values[at]:.3g}"
-    yield holds(Topic.DELAY, _KIND, text, float(delays[at]), f"{1e3 * delays[at]:.3g} ms")
+    text = f"uniform delay of z, critical mode lambda = {about(values[at])}"
+    yield holds(Topic.DELAY, _KIND, text, float(delays[at]), f"{at_most(1e3 * delays[at])} ms")
     best = 0.5 * np.pi / (c * float(np.real(values).min()))
     yield _spread_line(float(np.real(values).min()), float(sizes.max()), float(delays[at]), best)
 
@@ -115,7 +117,7 @@ def _scaling_line(model: ControlAffine, loop: LinearLoop) -> Statement:
     worst = margins.input_scaling(loop.closed, slopes=slopes).abscissa
     text = "each input 30 % weaker or stronger (checked only at these corners), as by a wrong mass "
     text += "or inertia"
-    number = worst, f"{worst:.3g} 1/s"
+    number = worst, f"{at_least(worst)} 1/s"
     if worst < 0.0:
         return holds(Topic.SCALING, _KIND, text, *number)
     remedy = "identify them better, or raise `coupling`"
@@ -149,7 +151,7 @@ def _disturbance_lines(model: ControlAffine, loop: LinearLoop) -> Iterator[State
     unit = f"{units.pop()} " if len(units) == 1 and "" not in units else ""
 
     def line(name: Topic, bounds: Float[Array, " n"], text: str) -> Statement:
-        sizes = ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in bounded)
+        sizes = ", ".join(f"{model.state_names[k]} {at_least(bounds[k])}" for k in bounded)
         worst, text = float(bounds[list(bounded)].max()), f"{unit}per {where}: {text}; {loop.where}"
         # Of an interval of eigenvalues, so many values are tried.
         kind = Kind.SAMPLES if loop.closed.between else _KIND
@@ -170,7 +172,7 @@ def _string_line(parts: Parts, loop: LinearLoop) -> Iterator[Statement]:
         return
     gain = margins.string_gain(loop.closed).gain
     depth = int(graph.depths().max())
-    number = gain**depth, f"{gain:.3g}, {gain**depth:.3g} over {amount(depth, 'link')}"
+    number = gain**depth, f"{at_least(gain)}, {at_least(gain**depth)} over {amount(depth, 'link')}"
     # On a directed graph a branch is such a chain under any feed-forward.
     if parts.drive.feedforward is Feedforward.PARENT or graph.directed:
         text = (

@@ -6,6 +6,7 @@ from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.topology import recommend_edges, recommend_leaders
+from echelon.core.digits import at_least
 from echelon.synthesis.certificates.certificate import certify
 from echelon.synthesis.gains.gain import Gain
 
@@ -27,15 +28,15 @@ class Speedup(NamedTuple):
 
     def sentence(self) -> str:
         """Return it as a sentence."""
-        parts = [f"The slowest disagreement decays with a time constant of {self.now:.3g} s"]
+        parts = [f"The slowest disagreement decays with a time constant of {at_least(self.now)} s"]
         if self.leaders:
             names = ", ".join(map(str, self.leaders))
             role = f"leader {names}" if len(self.leaders) == 1 else f"leaders {names}"
-            parts.append(f"{self.with_leaders:.3g} s with the further {role}")
+            parts.append(f"{at_least(self.with_leaders)} s with the further {role}")
         if self.edges:
             names = ", ".join(f"{i}-{j}" for i, j in self.edges)
             edges = "edge" if len(self.edges) == 1 else "edges"
-            parts.append(f"{self.with_edges:.3g} s with the further {edges} {names}")
+            parts.append(f"{at_least(self.with_edges)} s with the further {edges} {names}")
         return f"{'; '.join(parts)}."
 
 

@@ -15,6 +15,7 @@ from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.guide import Guide
 from echelon.agents.world.world import World
+from echelon.core.digits import about
 from echelon.core.errors import LawError, OutputError, SimulationError, check_kind
 from echelon.core.files import write_atomic
 from echelon.core.numerics import precision
@@ -152,7 +153,7 @@ def _linearized(loop: Loop, parts: Parts) -> StateSpace:
         agent, k = np.unravel_index(int(np.argmax(drift)), drift.shape)
         raise SimulationError(
             f"the closed loop is not at rest at the goals: `{model.state_names[k]}` of agent "
-            f"{agent} moves there by {drift.max():.3g} per second."
+            f"{agent} moves there by {about(drift.max())} per second."
         )
     (A, B), (C, D) = (
         jax.jit(jax.jacfwd(function, (0, 1)))(rest, motion) for function in (velocity, errors)

@@ -10,8 +10,9 @@ import scipy.sparse.linalg as spla
 
 from echelon.agents.network.channel import Network
 from echelon.agents.network.graph import Graph
+from echelon.core.digits import at_least, at_most
 from echelon.core.types import Array, JsonObject
-from echelon.core.words import MessageContent, NeighbourChoice, Prediction, at_least
+from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 from echelon.guarantees.messages.late_agreement import LateRate, late_rates, longest_ways
 from echelon.guarantees.messages.message_ages import AgeLimits, ages_of
 
@@ -129,12 +130,12 @@ class LateMessages(NamedTuple):
 
     def faster(self) -> str:
         """Return at what rate all but a few runs agree, as the end of a sentence."""
-        age = f"{1e3 * self.age:.3g} ms"
         if self.ways is None and not self.ages.lost:
-            return f", with messages of at most {age}"
+            return f", as no message in use is older than {at_least(1e3 * self.age)} ms"
         if self.quick is None:
             return ""
-        return f", and at {self.quick:.3g} 1/s while no message in use is older than {age}"
+        text = f", and at {at_most(self.quick)} 1/s while no message in use is older than "
+        return f"{text}{at_most(1e3 * self.age)} ms"
 
     def sentence(self, arrival: float | None) -> str:
         """Return what is guaranteed beside rates, in sentences; the arrival (s) where known."""
@@ -144,11 +145,11 @@ class LateMessages(NamedTuple):
             return f"{text}. A link may lose all messages of a run"
         few = f"In all but one run in a million no link loses more than {ages.lost} in a row, e"
         text += f". {few if ages.lost else 'E'}verybody has a packet"
-        text += " and knows its hops" * self.leaderward + f" after {ages.first_packet:.3g} s"
+        text += " and knows its hops" * self.leaderward + f" after {at_least(ages.first_packet)} s"
         late = 0.0 if self.ways is None else float(self.ways.max() - 1) * self.age
-        text += f"; messages then cost a delay of {late:.3g} s at most" * bool(late)
+        text += f"; messages then cost a delay of {at_least(late)} s at most" * bool(late)
         if arrival is not None:
-            text += f", and from these starts all stay within 1 cm after {at_least(arrival, 3)} s"
+            text += f", and from these starts all stay within 1 cm after {at_least(arrival)} s"
         # Without ages agreement is at least as fast as c / max w.
         slow = self.ways is None and 2.0 * self.rate < self.coupling / self.spread
         return f"{text}. {_ONE_WAY}" if slow else text
@@ -181,8 +182,10 @@ def late_messages_of(
     leaderward = network.hears is NeighbourChoice.LEADERWARD
     if leaderward and c * dt > 1.0 + 1e-12:
         # A mean has weights of sum 1, however small those of the graph are.
-        text = f"with `hears: leaderward` weights count as 1, and c dt = {c * dt:.3g} is above 1"
-        return Uncovered(text, f"lower `follower.coupling` to {1.0 / dt:.4g}", True)
+        text = (
+            f"with `hears: leaderward` weights count as 1, and c dt = {at_least(c * dt)} is above 1"
+        )
+        return Uncovered(text, f"lower `follower.coupling` to {at_most(1.0 / dt, 4)}", True)
     if leaderward and not ages.hops_last:
         return _UNSETTLED
     if leaderward:

@@ -7,6 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
+from echelon.core.digits import about, at_least
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.words import Kind, MessageContent, NeighbourChoice
@@ -31,9 +32,10 @@ class Bias(NamedTuple):
 
     def sentence(self) -> str:
         """Return it in words."""
+        age, speed, size = about(1e3 * self.age), about(self.speed), about(self.size)
         return (
-            f"messages contain states: at a mean age of {1e3 * self.age:.3g} ms and a mean speed "
-            f"of {self.speed:.3g} {self.unit}/s followers lag by {self.size:.3g} {self.unit}"
+            f"messages contain states: at a mean age of {age} ms and a mean speed of {speed} "
+            f"{self.unit}/s followers lag by {size} {self.unit}"
         )
 
 
@@ -74,7 +76,7 @@ def bias_line(parts: Parts, settings: Settings) -> Statement | None:
     if bias is None or bias.size < _MUCH:
         return _swinging_line(parts)
     remedy = "set `messages: deviation`"
-    number = bias.size, f"{1e3 * bias.size:.3g} mm"
+    number = bias.size, f"{about(1e3 * bias.size)} mm"
     return fails(Hypothesis.MESSAGES, Kind.LINEARIZATION, bias.sentence(), *number, remedy=remedy)
 
 
@@ -86,7 +88,7 @@ def _swinging_line(parts: Parts) -> Statement | None:
         return None
     text = "agents with motors that lag hear each other late and both ways, and may swing up"
     remedy = "set `graph.directed: true`, or use the law `stopping-point`"
-    shown = f"lag {1e3 * lag:.3g} ms"
+    shown = f"lag {about(1e3 * lag)} ms"
     return fails(Hypothesis.MESSAGES, Kind.LINEARIZATION, text, lag, shown, remedy=remedy)
 
 
@@ -100,16 +102,16 @@ def messages_line(
     if isinstance(late, Uncovered):
         bias = bias_of(parts, settings)
         text = late.text if bias is None else bias.sentence()
-        number = (None, "") if bias is None else (bias.size, f"{1e3 * bias.size:.3g} mm")
+        number = (None, "") if bias is None else (bias.size, f"{about(1e3 * bias.size)} mm")
         reason = text if late.lost else ""
         return fails(name, Kind.PROOF, text, *number, remedy=late.remedy, reason=reason)
     ages = late.ages
-    text = f"T9: no deviation in use is older than {1e3 * late.age:.3g} ms"
+    text = f"T9: no deviation in use is older than {at_least(1e3 * late.age)} ms"
     if ages.lost and ages.oldest < ages.forgotten:
         text += f", in all but one run in a million, with up to {ages.lost} losses in a row"
     elif ages.oldest == ages.forgotten:
         text += ", when it is forgotten"
     if late.off_plan is not None:
         text += f"; behind a leader that leaves its plan at {OFF_PLAN:g}/s in an output, followers "
-        text += f"end within {late.off_plan:.3g} of it"
-    return holds(name, Kind.PROOF, text, late.age, f"{1e3 * late.age:.3g} ms")
+        text += f"end within {at_least(late.off_plan)} of it"
+    return holds(name, Kind.PROOF, text, late.age, f"{at_least(1e3 * late.age)} ms")

@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 from echelon.agents.world.actuator import MotorArrays
 from echelon.agents.world.world import World
 from echelon.core.compiled import cached_jit
+from echelon.core.digits import about, at_most
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Estimation, Kind
@@ -71,16 +72,16 @@ def own_delay_line(case: OwnCase) -> Statement | None:
         text = "no margin is known of agents that hear each other with many sums of weights"
         return unneeded(name, kind, text)
     step = late_step(case.problem, case.law, lag)
-    text = f"own state {1e3 * delay * dt:.3g} ms late, " * bool(delay)
+    text = f"own state {about(1e3 * delay * dt)} ms late, " * bool(delay)
     estimated = world.sensing is not None and world.sensing.estimator is not Estimation.NONE
-    text += f"lag {1e3 * lag:.3g} ms, " * bool(lag) + "without the estimator, " * estimated
-    text += f"inputs held for {1e3 * dt:.3g} ms: "
+    text += f"lag {about(1e3 * lag)} ms, " * bool(lag) + "without the estimator, " * estimated
+    text += f"inputs held for {about(1e3 * dt)} ms: "
     if world.plant is not None or world.plants:
         text += "for agents as in the model, unlike these plants, "
     if step is None:
         return unneeded(name, kind, f"{text}the model has no linearization at its trim")
     most = longest_delay(case, step)
-    shown = "none" if most < 0 else f"{1e3 * most * dt:.3g} ms"
+    shown = "none" if most < 0 else f"{at_most(1e3 * most * dt)} ms"
     number = max(most, 0) * dt, shown
     if most >= delay and _decays(case, step, delay):
         text += f"the linearized loop decays with own states up to {shown} late"

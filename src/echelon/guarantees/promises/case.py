@@ -86,4 +86,7 @@ class Case(NamedTuple):
     def disturbed(self) -> str:
         """What acts that no promise covers, in words; empty without any."""
         acting = [text for text, acts in self.parts.world.differences.items() if acts]
-        return " and ".join(x for x in acting if not (self.over_network and x == LATE))
+        acting = [x for x in acting if not (self.over_network and x == LATE)]
+        # Far from 0 its numbers are centimetres apart, whatever a law does.
+        acting += ["numbers have single precision"] * (self.settings.precision == "float32")
+        return " and ".join(acting)

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from echelon.core.digits import about, at_least, at_most
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
@@ -74,14 +75,16 @@ def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> C
     j = int(np.argmin(radii))
     name, wide = model.state_names[j], margins[j]
     if radii[j] == 0.0:
-        text = f"the leader alone reaches {away[j]:.3g} in `{name}`, and the domain {wide:.3g}"
+        text = (
+            f"the leader alone reaches {about(away[j])} in `{name}`, and the domain {about(wide)}"
+        )
         return CertifiedSet(0.0, kind, text, "widen the domain, or slow the reference")
     # On a directed graph a sum with weights falls, which one agent's share may exceed so much.
     shrink = 1.0 / np.sqrt(parts.graph.spectrum().skew)
     if region.theorem is Theorem.A5 and not _constant(parts, region):
         shrink = np.sqrt(parts.graph.spectrum().proved / parts.graph.spectrum().high)
-    text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {wide:.3g}"
-    text += f" less {away[j]:.3g} of the leader" if away.any() else ", leader at the trim"
+    text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {at_most(wide)}"
+    text += f" less {at_least(away[j])} of the leader" if away.any() else ", leader at the trim"
     return CertifiedSet(float(shrink * radii[j]), kind, text)
 
 
@@ -103,7 +106,7 @@ def set_line(region: RegionCertificate | None, certified: CertifiedSet | None) -
     if certified is None:
         return unneeded(Hypothesis.SET, Kind.PROOF, _no_set(region))
     if certified.radius > 0.0:
-        number = certified.radius, f"radius {certified.radius:.3g}"
+        number = certified.radius, f"radius {at_most(certified.radius)}"
         return holds(Hypothesis.SET, certified.kind, certified.why, *number)
     return fails(
         Hypothesis.SET,
@@ -122,7 +125,7 @@ def starts_line(
     if certified is None:
         return unneeded(Hypothesis.STARTS, Kind.PROOF, _no_set(region))
     size = size_of(parts, states)
-    number = size, f"{size:.3g} of {certified.radius:.3g}"
+    number = size, f"{at_least(size)} of {at_most(certified.radius)}"
     if size <= certified.radius:
         text = "no follower leaves the domain from these starts"
         return holds(Hypothesis.STARTS, certified.kind, text, *number)

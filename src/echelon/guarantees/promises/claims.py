@@ -3,6 +3,7 @@
 import numpy as np
 
 from echelon.agents.models.linearization import at_trim
+from echelon.core.digits import about
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.words import Kind
 from echelon.guarantees.promises.closed_loop import LinearLoop, grounded_slowest
@@ -38,19 +39,17 @@ def _difference(
     """Return the first difference in words; empty without any."""
     claim, low = gain.certificate, parts.graph.spectrum().low
     if abs(claim.lambda_min - low) > _SAME * low:
-        return (
-            f"the gain was made for lambda_min {claim.lambda_min:.4g}, and this graph has {low:.4g}"
-        )
+        made = about(claim.lambda_min, 4)
+        return f"the gain was made for lambda_min {made}, and this graph has {about(low, 4)}"
     slowest = grounded_slowest(gain, loop.linear, parts.graph)
     fastest = float(np.abs(np.linalg.eigvals(loop.linear.A - loop.linear.B @ loop.gains[-1])).max())
     bends = at_trim(parts.model).bends.any()
     if not bends and abs(claim.abscissa - slowest) > _SAME * abs(slowest) + _ROUNDING * fastest:
-        return (
-            f"the gain says that its slowest mode is {claim.abscissa:.4g} 1/s, and this model at "
-            f"coupling {gain.coupling:.4g} has {slowest:.4g} 1/s"
-        )
+        text = f"the gain says that its slowest mode is {about(claim.abscissa, 4)} 1/s, and this "
+        text += f"model at coupling {about(gain.coupling, 4)} has {about(slowest, 4)} 1/s"
+        return text
     if claim.edge is not None and loop.certificate.edge is None:
-        text = f"the gain says that every mode decays from coupling {claim.edge:.4g} on"
+        text = f"the gain says that every mode decays from coupling {about(claim.edge, 4)} on"
         return f"{text}, and here its argument does not hold"
     ours, theirs = _rate(region), _rate(claim.region)
     return "" if ours == theirs else f"the gain says {theirs} on its domain, and here it is {ours}"
@@ -61,4 +60,4 @@ def _rate(region: RegionCertificate | None) -> str:
     if region is None:
         return "nothing"
     kind, theorem = region.kind, region.theorem
-    return f"{region.rate:.5g} 1/s ({kind}, {theorem})"
+    return f"{about(region.rate, 5)} 1/s ({kind}, {theorem})"

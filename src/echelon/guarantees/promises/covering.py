@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from echelon.core.digits import about
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.promise import Promise
@@ -30,10 +31,10 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
     limited = float(result.saturated.max())
     against, remedy = promise.without, "leave it out to see what it costs"
     if left is not None:
-        against = f"agent {left.agent} left the domain at {left.time:.4g} s (`{left.name}`)"
+        against = f"agent {left.agent} left the domain at {about(left.time, 4)} s (`{left.name}`)"
         remedy = "widen the `domain`, start nearer to the goals, or slow the reference"
     elif limited:
-        against = f"a limit acted on an agent in {100.0 * limited:.3g} % of the steps"
+        against = f"a limit acted on an agent in {about(100.0 * limited)} % of the steps"
         remedy = "start nearer to the goals, or slow the reference"
     if against:
         yield f"The {what} does not cover this run: {against}; {remedy}."

@@ -15,6 +15,7 @@ from echelon.agents.models.heading_symmetry import state_turn
 from echelon.agents.models.model import ControlAffine
 from echelon.core import linear
 from echelon.core.compiled import cached_jit
+from echelon.core.digits import about
 from echelon.core.linear import discretize, matrix_exponential, sampled_radius
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
@@ -324,4 +325,4 @@ def _culprit(parts: Parts, loop: LinearLoop, path: LeaderPath, frozen: FrozenLaw
     leader = _leader(parts, np.repeat(path.own_headings(parts)[k], n), slopes)
     growth = slopes.growth() if leader is None else np.maximum(slopes.growth(), leader.growth())
     j = int(growth.argmin())
-    return f"`{model.state_names[j]}` {path.states[k, j]:.3g} {model.state_units[j]}".rstrip()
+    return f"`{model.state_names[j]}` {about(path.states[k, j])} {model.state_units[j]}".rstrip()

@@ -12,6 +12,7 @@ from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import at_limits, is_limited, trim_shortfall
 from echelon.core.compiled import compiled_for_one_call
+from echelon.core.digits import about, at_least
 from echelon.core.errors import listing
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
@@ -57,7 +58,7 @@ def _trim_applied(case: Case) -> Statement:
     parts = case.parts
     there = np.zeros_like(parts.formation.offsets)
     size = float(np.abs(goal_drifts(parts.model, there, parts.drive)).max())
-    number = size, f"|f + g u*| {size:.2g}"
+    number = size, f"|f + g u*| {at_least(size, 2)}"
     if parts.drive.trimmed or not np.any(np.asarray(parts.model.trim[1], float)):
         text = "holds about the trim, since the law applies the trim input"
         return holds(Hypothesis.TRIM_APPLIED, Kind.PROOF, text, *number)
@@ -99,11 +100,12 @@ def _trim_within_limits(case: Case) -> Statement:
         text = "the actuators deliver the trim input with a margin on both sides"
         return holds(name, Kind.PROOF, text)
     units = dict(zip(model.input_names, model.input_units, strict=True))
-    cut = [f"{got:.4g} of {asked:.4g} {units[i]}".rstrip() for i, (got, asked) in short.items()]
+    sizes = ((about(got, 4), about(asked, 4), units[i]) for i, (got, asked) in short.items())
+    cut = [f"{got} of {asked} {unit}".rstrip() for got, asked, unit in sizes]
     text = "the actuators deliver " + ", ".join(f"`{i}` {part}" for i, part in zip(short, cut))
     worst = min(got / asked if asked else 0.0 for got, asked in short.values())
     remedy = "lighten the agents or strengthen their actuators"
-    number, reason = (worst, f"{100.0 * worst:.3g} %"), f"{text}, and cannot hold the trim"
+    number, reason = (worst, f"{about(100.0 * worst)} %"), f"{text}, and cannot hold the trim"
     return fails(name, Kind.PROOF, text, *number, remedy=remedy, reason=reason)
 
 
@@ -112,7 +114,8 @@ def _exact(case: Case) -> Statement:
     if not case.disturbed:
         text = "states are known exactly, and nothing disturbs the agents"
         return holds(Hypothesis.EXACT_STATES, Kind.PROOF, text)
-    text = f"{case.disturbed}; the guarantee ignores this, and bounds on its effect are below"
+    text = f"{case.disturbed}; the guarantee ignores this"
+    text += "" if case.parts.world.ideal else ", and bounds on its effect are below"
     return fails(
         Hypothesis.EXACT_STATES, Kind.PROOF, text, remedy="leave it out to see what it costs"
     )
@@ -128,7 +131,7 @@ def _agreement(case: Case) -> Statement:
     if leaders.meet:
         slow = case.loop.slowest if leaders.slowest is None else leaders.slowest
         text = "they start apart, and their own law brings them together"
-        return holds(name, _LINEAR, text, slow, f"{slow:.3g} 1/s")
+        return holds(name, _LINEAR, text, slow, f"{at_least(slow)} 1/s")
     if leaders.answer:
         text = "leaders that react to their neighbours are driven apart by them"
         return fails(name, _LINEAR, text, remedy="set `leader.reacts: false`", reason=text)
@@ -144,16 +147,16 @@ def _drifting(case: Case) -> Statement:
     away = apart(case.parts, case.settings, case.leaders.starts)
     first, unit = case.parts.graph.leaders[0], "m " if case.parts.model.position else ""
     text = (
-        f"leader {away.leader} starts {away.start:.3g} {unit}off the place that leader {first} "
-        f"gives it, is {away.end:.3g} {unit}off at {case.settings.horizon:g} s and "
-        f"{away.most:.3g} {unit}at most"
+        f"leader {away.leader} starts {about(away.start)} {unit}off the place that leader {first} "
+        f"gives it, is {about(away.end)} {unit}off at {case.settings.horizon:g} s and "
+        f"{at_least(away.most)} {unit}at most"
     )
     remedy = "start the leaders alike, or give them a reference to follow"
     reason = (
-        f"the leaders do not agree, but are {away.most:.3g} {unit}apart; followers of linear "
+        f"the leaders do not agree, but are {at_least(away.most)} {unit}apart; followers of linear "
         "agents then end in the leaders' convex hull"
     )
-    number = away.most, f"{away.most:.3g} {unit}apart"
+    number = away.most, f"{at_least(away.most)} {unit}apart"
     return fails(
         Hypothesis.LEADERS_AGREE, Kind.SAMPLES, text, *number, remedy=remedy, reason=reason
     )

@@ -9,6 +9,7 @@ from typing import cast, final
 import numpy as np
 
 from echelon.agents.models.linearization import at_trim
+from echelon.core.digits import at_most
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.types import Array
@@ -168,7 +169,7 @@ class MetricPromise(Promise):
     def _regional(self, region: RegionCertificate) -> str:
         """Return what the region adds, as strong as its own argument and no stronger."""
         certified, condition, theorem = self.certified, self.condition, region.theorem
-        by, what = self.kind.value, f"errors shrink at {region.rate:.3g} 1/s or faster"
+        by, what = self.kind.value, f"errors shrink at {at_most(region.rate)} 1/s or faster"
         what = "V does not increase" if theorem is Theorem.A5 else what
         if certified is None:
             text = f"small {what}{condition}, while the leader stays in {self.domain}"
@@ -178,7 +179,7 @@ class MetricPromise(Promise):
             text += f"certified to stay: {certified.why}; {certified.remedy}."
             return f"{by}: {what}{condition}, {text}"
         read = "" if certified.kind is self.kind else ", if the leader moves as in a run of its own"
-        start = f"any start with sum_i delta_i'P delta_i <= {certified.radius:.3g}^2"
+        start = f"any start with sum_i delta_i'P delta_i <= {at_most(certified.radius)}^2"
         start = "everywhere" if certified.radius == float("inf") else start
         return f"{by}: from {start}, {what}{condition}{read} ({theorem})."
 

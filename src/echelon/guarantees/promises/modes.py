@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from echelon.core.digits import about, at_least, at_most
 from echelon.core.linear import sampled_radius
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded, vacuous
 from echelon.core.words import Kind, Theorem, amount
@@ -15,9 +16,9 @@ from echelon.synthesis.certificates.margins import detectability
 
 _LINEAR = Kind.LINEARIZATION
 _GROWS = "with the input held over the step `dt` the disagreement grows"
-_IN_TURNS = "on one of the graphs errors are multiplied by {:.4g} a step in the norm of P"
-_ON_PATH = "spectral radius {:.4g} a step along the leader's path"
-_AT_STARTS = "spectral radius {:.4g} a step where agents start"
+_IN_TURNS = "on one of the graphs errors are multiplied by {} a step in the norm of P"
+_ON_PATH = "spectral radius {} a step along the leader's path"
+_AT_STARTS = "spectral radius {} a step where agents start"
 _NOT_STABLE = "the disagreement does not decay at the trim"
 _BENT = "the model is not differentiable at the trim and has no modes there"
 
@@ -51,7 +52,7 @@ def _bent(case: Case) -> Iterator[Statement]:
     else:
         text = "by the slopes on all sides of the trim, where the model is not differentiable"
         rate = -region.rate
-        yield holds(Hypothesis.DISAGREEMENT_DECAY, region.kind, text, rate, f"{rate:.3g} 1/s")
+        yield holds(Hypothesis.DISAGREEMENT_DECAY, region.kind, text, rate, f"{at_least(rate)} 1/s")
     yield _sampled_bend(case)
 
 
@@ -63,7 +64,7 @@ def _sampled_bend(case: Case) -> Statement:
         return vacuous(name, Kind.SAMPLES, _BENT, None, dt_text)
     A, dt = case.slopes[:, None], settings.dt
     radius = sampled_radius(A, loop.linear.B, loop.gains, dt, settings.integrator)
-    text = f"spectral radius {radius:.4g} a step, over the slopes of all sides of the trim"
+    text = f"spectral radius {at_least(radius, 4)} a step, over the slopes of all sides of the trim"
     if radius < 1.0:
         return holds(name, Kind.SAMPLES, text, radius, dt_text)
     text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
@@ -94,13 +95,15 @@ def _detectable(case: Case) -> Statement:
 def _coupled(case: Case) -> Statement:
     edge, c = case.loop.certificate.edge, case.loop.closed.coupling
     if edge is None:
-        return holds(Hypothesis.COUPLING, Kind.PROOF, "no edge is known", c, f"c {c:.4g}")
-    number = c, f"c {c:.4g}, edge {edge:.4g}"
+        return holds(Hypothesis.COUPLING, Kind.PROOF, "no edge is known", c, f"c {about(c, 4)}")
+    number = c, f"c {about(c, 4)}, edge {at_least(edge, 4)}"
     if c >= edge:
         text = "from the edge on every mode decays: near the trim, and of linear agents anywhere"
         return holds(Hypothesis.COUPLING, Kind.PROOF, text, *number)
-    text = f"coupling {c:.4g} is below the edge {edge:.4g} of what this gain guarantees"
-    remedy = f"raise `coupling` to {edge:.4g} or more"
+    text = (
+        f"coupling {about(c, 4)} is below the edge {at_least(edge, 4)} of what this gain guarantees"
+    )
+    remedy = f"raise `coupling` to {at_least(edge, 4)} or more"
     return fails(Hypothesis.COUPLING, Kind.PROOF, text, *number, remedy=remedy)
 
 
@@ -124,7 +127,7 @@ def _decaying(case: Case) -> Statement:
         text = "over the edges' weights, as parents' inputs are fed forward"
     elif len(loop.closed.eigenvalues) > loop.certificate.modes:
         text = f"at lambda_min and lambda_max; {'all' if loop.every else 'not all'} between decay"
-    number = loop.slowest, f"{loop.slowest:.3g} 1/s"
+    number = loop.slowest, f"{at_least(loop.slowest)} 1/s"
     if loop.every:
         return holds(name, _LINEAR, text, *number)
     remedy = "raise `coupling`, or let `echelon design` find a gain that decays"
@@ -149,11 +152,11 @@ def _taking_turns(case: Case) -> Statement:
             "sum_i delta_i'P delta_i increases on no graph, whenever they switch",
             max(0.0, common.rate),
         )
-        return holds(name, _LINEAR, text, rate, f"{rate:.3g} 1/s")
+        return holds(name, _LINEAR, text, rate, f"{at_most(rate)} 1/s")
     text = "no one P is known that serves all graphs of the schedule"
     remedy = "use the law `stopping-point`"
     if edge is not None and not c >= edge:
-        remedy = f"raise `coupling` to {edge:.4g} or more, or {remedy}"
+        remedy = f"raise `coupling` to {at_least(edge, 4)} or more, or {remedy}"
     return fails(name, _LINEAR, text, remedy=remedy, reason=text)
 
 
@@ -166,16 +169,16 @@ def _along(case: Case) -> Statement:
         text = "the leader rests at the trim, or follows no path of its own"
         return unneeded(name, Kind.SAMPLES, text)
     growth, states = frozen.growth(), len(frozen.times)
-    number = growth.rate, f"{growth.rate:.3g} 1/s"
+    number = growth.rate, f"{at_least(growth.rate)} 1/s"
     if not growth.lost:
         text = (
             f"small errors decay over {amount(states, 'state')} of it, each frozen until the next"
         )
         return holds(name, Kind.SAMPLES, text, *number)
-    grown = f"{np.exp(min(growth.most, 99.0)):.2g}-fold on a part of it"
-    grown = f"at {growth.rate:.3g} 1/s" if growth.rate >= 0.0 else grown
+    grown = f"{about(np.exp(min(growth.most, 99.0)), 2)}-fold on a part of it"
+    grown = f"at {about(growth.rate)} 1/s" if growth.rate >= 0.0 else grown
     text = f"along the leader's path the {growth.whose} errors grow {grown}, fastest at "
-    text += f"{growth.when:.3g} s, where {frozen.culprit} takes the law farthest from its trim"
+    text += f"{about(growth.when)} s, where {frozen.culprit} takes the law farthest from its trim"
     remedy = f"keep {frozen.culprit.partition(' ')[0]} nearer to the trim there"
     return fails(name, Kind.SAMPLES, text, *number, remedy=remedy, reason=text)
 
@@ -196,13 +199,13 @@ def sampling_line(case: Case) -> Statement:
     if printed and goals.any():
         text = "`printed` takes f + g u as the next state, which ignores the goals"
         return _step_line(case, np.inf, text, "use `simulation.integrator: rk4`")
-    where = f"spectral radius {{:.4g}} a step, {loop.where}"
+    where = f"spectral radius {{}} a step, {loop.where}"
     radii = {where: radius, _IN_TURNS: loop.growth(settings)}
     if case.frozen and not printed:
         radii |= zip((_ON_PATH, _AT_STARTS), case.frozen.radii(settings))
     where = next((x for x, one in radii.items() if not one < 1.0), where)
     remedy = "use `simulation.integrator: rk4`" if printed else ""
-    text = where.format(radii[where])
+    text = where.format(at_least(radii[where], 4))
     # At the starts it lasts a moment, and a guarantee is for starts near the goals.
     return _step_line(case, radii[where], text, remedy, "" if where == _AT_STARTS else _GROWS)
 
@@ -217,6 +220,6 @@ def _step_line(
         return holds(Hypothesis.SAMPLING, _LINEAR, text, *number)
     if not remedy:
         longest = longest_step(case.loop, case.frozen, case.settings)
-        remedy = f"shorten `simulation.dt` below {longest:.3g} s, or lower the gain"
+        remedy = f"shorten `simulation.dt` below {at_most(longest)} s, or lower the gain"
     text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
     return fails(Hypothesis.SAMPLING, _LINEAR, text, *number, remedy=remedy, reason=reason)

@@ -13,6 +13,7 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeAlias
 from weakref import WeakKeyDictionary
 
+from echelon.core.digits import at_most
 from echelon.core.errors import EchelonError
 from echelon.core.identity import foreign_key
 from echelon.core.memoize import load_or_compute
@@ -245,7 +246,7 @@ class Promise(abc.ABC):
         against = (line for line in self.hypotheses.values() if line.fails and line.reason)
         remedies = "; ".join(dict.fromkeys(x.remedy for x in against))
         until = "" if self.prefix is None else f" {self.prefix.sentence()}"
-        which = "" if self.prefix is None else f" from {self.prefix.at:g} s on"
+        which = "" if self.prefix is None else f" from {at_most(self.prefix.at, 6)} s on"
         text = (
             f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. What would help: {remedies}."
         )
@@ -286,7 +287,7 @@ class Prefix(NamedTuple):
 
     def sentence(self) -> str:
         """Return it in a sentence."""
-        return f"Until {self.at:g} s: {self.promise.sentence()}"
+        return f"Until {at_most(self.at, 6)} s: {self.promise.sentence()}"
 
 
 Promises: TypeAlias = Iterator[Promise | EchelonError]

@@ -14,6 +14,7 @@ import numpy as np
 from echelon.agents.models.linearization import at_trim, linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.straight_range import straight_range
+from echelon.core.digits import about, at_least, at_most
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
@@ -70,8 +71,8 @@ def region_of(parts: Parts, settings: Settings, leaders: Leaders) -> Region:
         text = "on this graph no sum of squares is known that decreases for all slopes"
         return Region(None, None, _lost(text, "make the links bidirectional"))
     if certificate is None:
-        strength = f"at coupling {gain.coupling:.4g}, 2 c lambda_min = {_strength(parts, gain):.4g}"
-        text = f"P does not contract on the domain {strength}"
+        text = f"P does not contract on the domain at coupling {about(gain.coupling, 4)}, "
+        text += f"2 c lambda_min = {about(_strength(parts, gain), 4)}"
         return Region(None, None, _lost(text, "raise `coupling`, or shrink the `domain`"))
     text, remedy = _withheld(parts, settings, leaders, gain, certificate)
     if text:
@@ -210,8 +211,8 @@ def _uncovered_input(
     if beyond[frame, k] <= _ROUNDED:
         return "", ""
     low, high, name = domain.input_lower[k], domain.input_upper[k], model.input_names[k]
-    text = f"the leader's own input reaches {v[frame, k]:.3g} in `{name}`, and the hull covers "
-    text += f"[{low:.3g}, {high:.3g}]"
+    text = f"the leader's own input reaches {about(v[frame, k])} in `{name}`, and the hull covers "
+    text += f"[{at_least(low)}, {at_most(high)}]"
     return text, f"name `{name}` in the `domain`, or slow the reference"
 
 
@@ -258,5 +259,5 @@ def _line(parts: Parts, certificate: RegionCertificate) -> Statement:
     text += f"; no more than {kind}, since {certificate.why}" if certificate.why else ""
     skew = parts.graph.spectrum().skew
     if skew > 1.0:
-        text += f"; their squares weighted as T7 has it, {skew:.3g} to 1 at most"
-    return holds(_NAME, kind, text, certificate.rate, f"{certificate.rate:.3g} 1/s")
+        text += f"; their squares weighted as T7 has it, {at_least(skew)} to 1 at most"
+    return holds(_NAME, kind, text, certificate.rate, f"{at_most(certificate.rate)} 1/s")

@@ -19,6 +19,7 @@ from echelon.agents.models.heading_symmetry import (
 )
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
+from echelon.core.digits import about, at_least, at_most
 from echelon.core.rational import bisect
 from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.types import Array
@@ -47,21 +48,22 @@ def turning(case: Case) -> Iterator[Statement]:
         return
     model, kind = case.parts.model, Kind.SAMPLES
     name, gap = heading_of(model).state, heading_gap(model)
-    text = f"f and g turn with `{name}`, up to {gap:.1g} at samples, so the law acts at any "
-    text += f"`{name}` as at the trim"
+    text = f"f and g turn with `{name}`, up to {at_least(gap, 1)} at samples, so the law acts at "
+    text += f"any `{name}` as at the trim"
     slowest = slowest_in_turns(case)
     if not slowest:
-        yield holds(_NAME, kind, text, gap, f"gap {gap:.1g}")
+        yield holds(_NAME, kind, text, gap, f"gap {at_least(gap, 1)}")
         return
     worst = max(slowest, key=lambda rate: slowest[rate])
-    number = slowest[worst], f"{slowest[worst]:.3g} 1/s at {worst:.3g} rad/s"
+    number = slowest[worst], f"{at_least(slowest[worst])} 1/s at {about(worst)} rad/s"
     if slowest[worst] < 0.0:
-        text += f"; in a steady turn of {worst:.3g} rad/s modes decay at {-slowest[worst]:.3g} 1/s"
+        rate = at_most(-slowest[worst])
+        text += f"; in a steady turn of {about(worst)} rad/s modes decay at {rate} 1/s"
         yield holds(_NAME, kind, text, *number)
         return
-    text = f"in a steady turn of {worst:.3g} rad/s, as on the leader's path, the disagreement "
+    text = f"in a steady turn of {about(worst)} rad/s, as on the leader's path, the disagreement "
     text += "does not decay"
-    remedy = f"turn no faster than {_fastest(case, worst):.3g} rad/s"
+    remedy = f"turn no faster than {at_most(_fastest(case, worst))} rad/s"
     yield fails(_NAME, kind, text, *number, remedy=remedy, reason=text)
 
 
@@ -69,7 +71,7 @@ def turns_in_words(case: Case) -> str:
     """Return what the heading of the leader may do besides; nothing where no law turns."""
     if not turns_with_heading(case):
         return ""
-    rates = [f"{rate:.3g}" for rate in slowest_in_turns(case)]
+    rates = [about(rate) for rate in slowest_in_turns(case)]
     steady = f" or to a steady turn at {' or '.join(rates)} rad/s" if rates else ""
     return f"{steady}, at any `{heading_of(case.parts.model).state}`"
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple, final
 
+from echelon.core.digits import about
 from echelon.core.errors import GainError
 
 _FINE = Fraction(1, 2**40)
@@ -51,8 +52,8 @@ class Chain(NamedTuple):
         powers = tuple(int(root / unit) for root in exact)
         if powers[-1] > _HIGHEST:
             raise GainError(
-                f"`roots` {list(map(float, exact))} are multiples of {float(unit):.3g} alone, and "
-                f"must be at most {_HIGHEST} times their common unit for a proof."
+                f"`roots` {list(map(float, exact))} are multiples of {about(float(unit))} alone, "
+                f"and must be at most {_HIGHEST} times their common unit for a proof."
             )
         return cls(powers, unit)
 

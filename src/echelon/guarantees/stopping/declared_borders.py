@@ -13,6 +13,7 @@ from echelon.agents.models.chains import Chains, derivatives_of, flatten
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.quadrotor import Quadrotor
 from echelon.core.compiled import compiled_for_one_call
+from echelon.core.digits import about
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
@@ -103,7 +104,8 @@ def airframe_fault(model: ControlAffine, chains: Chains, frame: Airframe) -> str
     if limits is None or np.shape(limits.matrix) != (4, 4):
         return f"{name} is of four motors, and `input_limits` are not of four rows"
     if {*limits.low} != {0.0} or {*limits.high} != {frame.motor_thrust}:
-        return f"{name} has motors of 0 to {frame.motor_thrust:.4g} N, `input_limits` have others"
+        most = about(frame.motor_thrust, 4)
+        return f"{name} has motors of 0 to {most} N, `input_limits` have others"
     draw, n = np.random.default_rng(0), len(model.state_names)
     x = np.asarray(model.trim[0], float) + draw.uniform(-_NEAR, _NEAR, (_ENDS, n))
     e, tops = draw.uniform(-_NEAR, _NEAR, (_ENDS, chains.size)), draw.normal(size=(_ENDS, 4))
@@ -116,7 +118,7 @@ def airframe_fault(model: ControlAffine, chains: Chains, frame: Airframe) -> str
     off = float(np.abs(mine - theirs).max())
     if off <= _SAME * (frame.motor_thrust + np.abs(mine).max()):
         return ""
-    return f"{name} is not of its motion: at a sample a motor's thrust is {off:.3g} N off"
+    return f"{name} is not of its motion: at a sample a motor's thrust is {about(off)} N off"
 
 
 @compiled_for_one_call

@@ -16,6 +16,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.flatness import follow_at
 from echelon.agents.references.reference import Reference
 from echelon.core.compiled import cached_jit
+from echelon.core.digits import about, at_least
 from echelon.core.statement import Hypothesis, Statement, fails
 from echelon.core.types import State
 from echelon.core.words import Kind
@@ -71,11 +72,13 @@ def _drifts(name: str, current: float, force: float, s: float, inner: bool) -> S
     """Say what a current, and a force by what it asks of agreement, do to a leader of speed s."""
     asked = abs(current + force)
     what = " and ".join(word for word, d in (("current", current), ("push", force)) if d)
-    text = f"a lasting {what} along `{name}` demands a speed of {asked:.3g} from agreement, the "
-    text += f"leader's is {s:.3g}, and it can drift away for ever"
+    text = (
+        f"a lasting {what} along `{name}` demands a speed of {at_least(asked)} from agreement, the "
+    )
+    text += f"leader's is {about(s)}, and it can drift away for ever"
     helps = "" if inner and abs(current) >= s else "set `observer: true`, or "
-    remedy = f"{helps}raise the leader's `speed` above {asked:.3g}"
-    return _fails(text, remedy, asked, f"{asked:.3g}")
+    remedy = f"{helps}raise the leader's `speed` above {at_least(asked)}"
+    return _fails(text, remedy, asked, f"{at_least(asked)}")
 
 
 def _fails(text: str, remedy: str, number: float | None = None, shown: str = "") -> Statement:

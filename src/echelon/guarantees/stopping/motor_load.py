@@ -11,6 +11,7 @@ from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.declarations import is_by_user, undeclared
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import is_limited
+from echelon.core.digits import at_least, at_most
 from echelon.core.enclosure.interval import Interval
 from echelon.core.memoize import memoize
 from echelon.core.rational import bisect, float_above, float_below, norm_above
@@ -64,11 +65,12 @@ class Alone(NamedTuple):
     def sentence(self) -> str:
         """Return the same in words."""
         rest = ", or level and at rest" if self.rest else ""
+        tilt, rate = at_most(math.degrees(self.tilt)), at_most(self.rate)
         return (
             "any place and heading behind a leader that is on its path but for its place, if one "
-            f"thing alone differs from the leader: a tilt of {math.degrees(self.tilt):.3g} deg at "
-            f"its velocity, or {self.sideways:.3g} m/s sideways, or {self.upward:.3g} m/s upward, "
-            f"or {self.rate:.3g} rad/s of roll and pitch when level{rest}"
+            f"thing alone differs from the leader: a tilt of {tilt} deg at its velocity, or "
+            f"{at_most(self.sideways)} m/s sideways, or {at_most(self.upward)} m/s upward, or "
+            f"{rate} rad/s of roll and pitch when level{rest}"
         )
 
 
@@ -92,9 +94,9 @@ class MotorLoad(NamedTuple):
 
     def sentence(self) -> str:
         """Return what is promised of motors."""
-        text = f"From these starts each motor's thrust stays between {self.least:.3g} and "
-        text += f"{self.largest:.3g} N (maximum {self.most:.4g} N), and the tilt is at most "
-        text += f"{math.degrees(self.tilt):.3g} deg"
+        text = f"From these starts each motor's thrust stays between {at_most(self.least)} and "
+        text += f"{at_least(self.largest, 4)} N (maximum {at_least(self.most, 4)} N), and the tilt "
+        text += f"is at most {at_least(math.degrees(self.tilt))} deg"
         more = "" if self.alone is None else f"; they suffice from {self.alone.sentence()}"
         return f"{text}{more}."
 
@@ -206,8 +208,8 @@ def _beyond(run: StoppingRun) -> str:
 def _thrust_text(motors: Motors) -> str:
     if motors.slope is None:
         return ""
-    tilt = math.degrees(float(motors.tilt))
-    return f"{float(motors.least):.3g} .. {float(motors.largest):.3g} N, {tilt:.3g} deg"
+    tilt = at_least(math.degrees(motors.tilt))
+    return f"{at_most(float(motors.least))} .. {at_least(float(motors.largest), 4)} N, {tilt} deg"
 
 
 # ---- the path ------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import numpy as np
 from echelon.agents.models.chains import Chains
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import COORDINATES, Reference
+from echelon.core.digits import about
 from echelon.core.enclosure.taylor import enclose_derivatives, enclose_finely
 from echelon.core.errors import GainError
 from echelon.core.memoize import memoize
@@ -99,5 +100,5 @@ def compare_derivatives(
             for x, value in zip(sum(rows, []), values, strict=True):
                 slack = Fraction(_SAME) * (1 + max(abs(x.lo), abs(x.hi)))
                 if not (np.isfinite(value) and x.lo - slack <= Fraction(value) <= x.hi + slack):
-                    when = f"at {t:.3g} s"
+                    when = f"at {about(t)} s"
                     raise GainError(f"a path has a derivative {when} that is not of its values")

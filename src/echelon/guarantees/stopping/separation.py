@@ -5,9 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from echelon.core.digits import at_least, at_most
 from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.types import Array
-from echelon.core.words import Kind, Theorem, at_most
+from echelon.core.words import Kind, Theorem
 from echelon.guarantees.stopping.flat_states import flat_states_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 from echelon.guarantees.stopping.tube import Tube
@@ -57,9 +58,9 @@ class Separation(NamedTuple):
     @property
     def line(self) -> Statement:
         """The line of a check."""
-        name, number = Hypothesis.SEPARATION, (self.least, f"{self.least:.3g} m at the start")
+        name, number = Hypothesis.SEPARATION, (self.least, f"{at_most(self.least)} m at the start")
         if self.ideal:
-            text = f"{self.safety.distance:.3g} m are kept, scaled, while {_EXACT} (T10)"
+            text = f"{at_most(self.safety.distance)} m are kept, scaled, while {_EXACT} (T10)"
             return holds(name, self.kind, text, *number)
         text = f"observed, not proved: T10 rests on it that {_EXACT}"
         remedy = "allow for the rest by `safety.margin`"
@@ -71,13 +72,13 @@ class Separation(NamedTuple):
         text = f"{self.kind.value}: ellipsoids about the agents with radii of {radii} m never "
         text += f"overlap from these starts, for any number of agents and any graph, if {_EXACT} "
         text += "(T10), and each agent stays in its tube (T5). The inputs are held "
-        text += f"for {self.step:.3g} s, which `safety.margin` has to allow for. "
+        text += f"for {at_least(self.step)} s, which `safety.margin` has to allow for. "
         text += "Convergence is not guaranteed "
         if self.tube.offsets is not None:
             text += "while offsets change, whose rates are within the `speed` too."
         else:
             text += "while agents hold each other back; without that, errors decay at "
-            text += f"{self.tube.rate:.3g} 1/s or faster eventually."
+            text += f"{at_most(self.tube.rate)} 1/s or faster eventually."
         if not self.ideal:
             text = f"In this world distances are observed, not proved. In the ideal one: {text}"
         motors = self.tube.motor_load

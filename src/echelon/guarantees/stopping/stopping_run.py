@@ -10,6 +10,7 @@ import scipy.linalg
 
 from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.network.graph import Graph
+from echelon.core.digits import about, at_least, at_most
 from echelon.core.enclosure.interval import point
 from echelon.core.errors import GraphError
 from echelon.core.linear import sampled_radius
@@ -255,14 +256,14 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     if run.network is not None:
         text = "everybody predicts zeta' by the leader's plan and the packet that it has of it"
     yield holds(Hypothesis.MATCHED_MOTION, _PROOF, text)
-    yield holds(Hypothesis.COUPLING, _PROOF, "any coupling suffices", c, f"c {c:.4g}, edge 0")
+    yield holds(Hypothesis.COUPLING, _PROOF, "any coupling suffices", c, f"c {about(c, 4)}, edge 0")
     text = "c lambda_min" if run.network is None else "the agreement over late messages"
     if run.parts.graph.schedule is not None:
         text = "the agreement over a period, or eventually"
     text += ", and the leaders' own coupling" * run.apart
     text = f"the slowest of the roots, {text}; far away the `speed` limits it"
     text += ", and not while agents hold each other back" * (run.law.safety is not None)
-    rate = -run.rate, f"{-run.rate:.3g} 1/s"
+    rate = -run.rate, f"{at_least(-run.rate)} 1/s"
     yield _changed(run) or holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, *rate)
     text = "the law is linear in flat coordinates everywhere"
     yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)
@@ -310,23 +311,23 @@ def _step_line(run: StoppingRun) -> Statement:
     """Return whether a held step keeps the largest stopping point from growing, c d_max dt <= 1."""
     name, dt, c = Hypothesis.SAMPLING, run.settings.dt, run.coupling
     share = c * run.heaviest * dt
-    radius, share_text = _radius(run), f"c d_max dt = {share:.3g}"
+    radius, share_text = _radius(run), f"c d_max dt = {at_least(share)}"
     own = float(run.leader.strength(dt)) * dt
     if own > 1.0 + 1e-12:
         # Its distance from its path would grow, on which the tube and the motors rest.
-        text = f"the step `dt` = {dt:g} s is too long for the leader: c dt = {own:.3g} is above 1"
-        remedy = f"lower `leader.coupling` to {1.0 / dt:.4g}"
+        text = f"the leader's step `dt` = {dt:g} s is too long: c dt = {at_least(own)} is above 1"
+        remedy = f"lower `leader.coupling` to {at_most(1.0 / dt, 4)}"
         return fails(name, Kind.LINEARIZATION, text, own, share_text, remedy=remedy, reason=text)
     if share <= 1.0 + 1e-12 and radius < 1.0:
-        text = f"Euler's step of zeta does not grow; spectral radius {radius:.4g} a step"
+        text = f"Euler's step of zeta does not grow; spectral radius {at_least(radius, 4)} a step"
         return holds(name, Kind.LINEARIZATION, text, share, share_text)
-    text = f"the step `dt` = {dt:g} s is too long: c d_max dt = {share:.3g} is above 1"
-    remedy = f"lower `coupling` to {1.0 / (run.heaviest * dt):.4g}, or shorten "
-    remedy += f"`simulation.dt` to {1.0 / (c * run.heaviest):.3g} s"
+    text = f"the step `dt` = {dt:g} s is too long: c d_max dt = {at_least(share)} is above 1"
+    remedy = f"lower `coupling` to {at_most(1.0 / (run.heaviest * dt), 4)}, or shorten "
+    remedy += f"`simulation.dt` to {at_most(1.0 / (c * run.heaviest))} s"
     if share <= 1.0:
         text = f"the step `dt` = {dt:g} s is too long for this coupling and these roots: spectral "
-        text, remedy = f"{text}radius {radius:.4g}", "lower `coupling` or `roots`, or shorten "
-        remedy += "`simulation.dt`"
+        text += f"radius {at_least(radius, 4)}"
+        remedy = "lower `coupling` or `roots`, or shorten `simulation.dt`"
     return fails(name, Kind.LINEARIZATION, text, share, share_text, remedy=remedy, reason=text)
 
 

@@ -5,6 +5,7 @@ import numpy as np
 from echelon.agents.network.edges import name_agents
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.reach import unreached
+from echelon.core.digits import at_least
 from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.words import Kind
 
@@ -21,10 +22,11 @@ def switching_line(graph: Graph, leaderward: bool, left_out: str, rate: float) -
         remedy = "set `hears: all`, or add links" if leaderward else "add links"
         remedy = "switch at multiples of `simulation.dt`" if left_out else remedy
         return fails(name, Kind.PROOF, against, remedy=remedy, reason=against)
-    text = f"the leader reaches every agent along the edges from {schedule.starts[-1]:g} s on"
+    since = at_least(schedule.starts[-1], 6)
+    text = f"the leader reaches every agent along the edges from {since} s on"
     if schedule.period is not None:
         text = "the leader reaches every agent along the edges of any "
-        text += f"{schedule.period:g} s together"
+        text += f"{at_least(schedule.period, 6)} s together"
     text += ", and zeta' is received whatever edges are present"
     return holds(name, Kind.PROOF, text, rate)
 

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine, in_metres
+from echelon.core.digits import about, at_least, at_most
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import JsonObject
-from echelon.core.words import Feedforward, Kind, Theorem, amount, at_least
+from echelon.core.words import Feedforward, Kind, Theorem, amount
 from echelon.guarantees.messages.late_messages import LateMessages
 from echelon.guarantees.stopping.arrival import arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
@@ -76,11 +77,11 @@ class Tube(NamedTuple):
         # Held inputs leave a rest where offsets go on changing.
         text += ". " if self.offsets is None else "; offsets may change as they do, and inputs of "
         text += "" if self.offsets is None else "continuous time follow them exactly. "
-        text += f"On {self.graphs[1]} they decay at {self.rate:.3g} 1/s or faster eventually"
+        text += f"On {self.graphs[1]} they decay at {at_most(self.rate)} 1/s or faster eventually"
         if self.network is not None:
             text += f"{self.network.faster()}. {self.network.sentence(self.arrival)}"
         elif self.arrival is not None:
-            text += f"; from these starts all stay within 1 cm after {at_least(self.arrival, 3)} s"
+            text += f"; from these starts all stay within 1 cm after {at_least(self.arrival)} s"
         return f"{text}." if self.motor_load is None else f"{text}. {self.motor_load.sentence()}"
 
     def _received(self) -> str:
@@ -91,7 +92,7 @@ class Tube(NamedTuple):
         text += "after it may be late, lost or out of order"
         if self.network.leaderward:
             ages = self.network.ages
-            text += f" while no link is silent for {ages.hop_life * ages.dt:.3g} s"
+            text += f" while no link is silent for {at_most(ages.hop_life * ages.dt)} s"
         return f"{text} (T9)"
 
     def as_mapping(self) -> dict[str, object]:
@@ -138,7 +139,7 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
         remedy = "use `rotate`, `scale` and `reshape`" if "motion" in text else remedy
         return _nothing(text, remedy)
     text = "T5: largest speed and derivatives of outputs per speed that agreement asks, for any "
-    number = gains[-1], ", ".join(f"{gain:.4g}" for gain in gains)
+    number = gains[-1], ", ".join(at_least(gain, 4) for gain in gains)
     inner = holds(Hypothesis.REGION, _PROOF, f"{text}size of the formation", *number)
     if borders is None:
         remedy = "state `flat_chains` and `flat_bounds` in the model"
@@ -225,12 +226,13 @@ def _set_lines(run: StoppingRun, borders: Sequence[Border]) -> Iterator[Statemen
         yield unneeded(Hypothesis.STARTS, _PROOF, "there is no set")
         return
     far, bound, where = float(nearest.left), nearest.bound, nearest.outputs
-    number = far, f"{far:.3g} left"
+    number = far, f"{at_most(far)} left"
     if nearest.left > 0:
-        text = f"{nearest.what()} stays {far:.3g} above {bound.above:.4g}, with {bound.within}"
+        text = f"{nearest.what()} stays {at_most(far)} above {at_most(bound.above, 4)}, with "
+        text += bound.within
         yield holds(Hypothesis.STARTS, _PROOF, text, *number)
         return
-    text = f"from these starts {nearest.what()} is not proved to stay above {bound.above:.4g}"
+    text = f"from these starts {nearest.what()} is not proved to stay above {about(bound.above, 4)}"
     remedy = f"start nearer to the leader's speed in {where}, start the leader on its path there, "
     remedy += f"or lower `speed` of {where}, of the leader and the followers"
     yield fails(Hypothesis.STARTS, _PROOF, text, *number, remedy=remedy, reason=text)
@@ -239,21 +241,22 @@ def _set_lines(run: StoppingRun, borders: Sequence[Border]) -> Iterator[Statemen
 def _set_line(run: StoppingRun, border: Border) -> Statement:
     """Say how far starts may be off behind a leader that keeps to its path."""
     bound, steepest = border.bound, border.steepest
-    number = steepest, f"{steepest:.3g} off"
+    number = steepest, f"{at_most(steepest)} off"
     if border.fastest > 0.0 and steepest > 0.0:
         text = f"any place, with {bound.within}, and {border.speeds} so far off {_whose([border])}"
         text = f"{text}, which keeps to its path in {border.outputs}"
         return holds(Hypothesis.SET, _PROOF, text, *number)
     if not border.fastest > 0.0:
-        text = f"on the leader's path {border.what()} comes to {border.path:.3g}, and the chart "
-        text, remedy = f"{text}ends at {bound.above:.3g}", "choose a path that keeps away from it"
+        text = f"on the leader's path {border.what()} comes to {about(border.path)}, and the chart "
+        text += f"ends at {about(bound.above)}"
+        remedy = "choose a path that keeps away from it"
     else:
         s = run.speed(run.law.ready.chains.outputs.index(bound.outputs[0]))
-        text = f"at a `speed` of {s:.3g} agreement alone may take {border.what()} to "
-        text = f"{text}{bound.above:.3g}, where the chart ends"
+        text = f"at a `speed` of {about(s)} agreement alone may take {border.what()} to "
+        text = f"{text}{about(bound.above)}, where the chart ends"
         # What one link may have of a speed against the leader.
         least = border.fastest / run.links
-        remedy = f"lower the `speed` of {border.outputs} below {least:.3g}"
+        remedy = f"lower the `speed` of {border.outputs} below {at_most(least)}"
         if run.network is not None:
             text += "; before their first packet agents stand still against the leader's path"
             remedy += ", or choose a slower path"
@@ -272,7 +275,7 @@ def _who(run: StoppingRun, borders: Sequence[Border]) -> str:
         # Of the leader's speed against its path no more is used than what these starts ask for.
         free = f"{free} of the followers, with {within}, their {speeds} as at these starts"
         return f"{free}, and the leader as at these starts"
-    off = " and ".join(f"{b.speeds} within {b.steepest:.3g}{_angle(b)}" for b in borders)
+    off = " and ".join(f"{b.speeds} within {at_most(b.steepest)}{_angle(b)}" for b in borders)
     return f"{free}, with {within}, and {off} of {_whose(borders)}, which keeps to its path there"
 
 
@@ -286,7 +289,7 @@ def _angle(border: Border) -> str:
     """Return by what angle a velocity of the leader's size may be off it, in words."""
     if math.isinf(border.turn):
         return ""
-    return f" (at its speed, {border.turn:.3g} deg to either side)"
+    return f" (at its speed, {at_most(border.turn)} deg to either side)"
 
 
 def _positions(run: StoppingRun) -> tuple[int, ...]:

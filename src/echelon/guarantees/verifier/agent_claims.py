@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
+from echelon.core.digits import at_least
 from echelon.core.types import Array
 from echelon.guarantees.verifier import enclosed
 from echelon.guarantees.verifier.agent_equations import Evaluated, NoModel, evaluate, model_of
@@ -81,7 +82,7 @@ def _check_trim(facts: Facts, model: ControlAffine) -> Iterator[Finding]:
         ("B at the trim", saved.B, at.maps[0]),
     ):
         gap, size = float(np.abs(stored - result).max()), float(np.abs(result).max())
-        yield decide(name, gap <= TIGHT * size, "", f"{gap:.3g} apart")
+        yield decide(name, gap <= TIGHT * size, "", f"{at_least(gap)} apart")
     gap = _quotients_off(saved, at, np.diagonal(displaced - saved.state, axis1=2, axis2=3))
     text = "relative to the quotients"
     yield decide("A at the trim, by difference quotients", gap <= _QUOTIENT, "", gap, text)
@@ -119,13 +120,13 @@ def _check_domain(facts: Facts, region: SavedRegion, model: ControlAffine) -> It
     if needs_constant(facts, region):
         gap = float(np.abs(result.maps - saved.model.B).max())
         fine = gap <= ROUNDING * float(np.abs(saved.model.B).max())
-        yield decide(f"g is constant ({region.theorem})", fine, "", f"{gap:.3g} apart", count)
+        yield decide(f"g is constant ({region.theorem})", fine, "", f"{at_least(gap)} apart", count)
     # Under T2 the hull contains pairs, since A and g vary together.
     both = [result.jacobians, weighted] if region.theorem == "T2" else [result.jacobians]
     if region.kind == "samples":
         gap = enclosed.farthest_from_all(region.hull, np.dstack(both)[: some.corners])
-        text = f"{some.corners} corners of the domain"
-        yield decide("samples include the corners", gap <= TIGHT, "", f"{gap:.3g} apart", text)
+        text, shown = f"{some.corners} corners of the domain", f"{at_least(gap)} apart"
+        yield decide("samples include the corners", gap <= TIGHT, "", shown, text)
     else:
         outside = enclosed.farthest_outside(region.hull, region.error, np.dstack(both))
         text = f"of {count}, relative to the ranges of the entries"

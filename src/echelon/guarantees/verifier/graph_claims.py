@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from echelon.core.digits import at_least
 from echelon.core.types import Array
 from echelon.guarantees.verifier import algebra
 from echelon.guarantees.verifier.findings import (
@@ -55,7 +56,7 @@ def check_spectrum(facts: Facts) -> Iterator[Finding]:
         yield unchecked(claim, float(stored[0]), text)
     else:
         gap = float(np.abs(result - stored).max())
-        yield decide(claim, gap <= TIGHT * high, "", f"{gap:.3g} apart", "grounded Laplacian")
+        yield decide(claim, gap <= TIGHT * high, "", f"{at_least(gap)} apart", "grounded Laplacian")
     text = "every follower has a path to a leader"
     yield decide("lambda_min is positive", facts.low > 0.0, value=facts.low, text=text)
     yield compare("lambda_min", saved.lambda_min, facts.low)
@@ -70,7 +71,7 @@ def _compare_complex(recomputed: Array, stored: Array, high: float) -> Finding:
     for value in recomputed:
         at = int(np.argmin(np.abs(np.array(left) - value)))
         gap = max(gap, abs(left.pop(at) - value))
-    return decide("graph spectrum", gap <= _LOOSE * high, "", f"{gap:.3g} apart", "arrows")
+    return decide("graph spectrum", gap <= _LOOSE * high, "", f"{at_least(gap)} apart", "arrows")
 
 
 def _is_graph(edges: Array, directed: bool) -> bool:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from echelon.core.digits import at_least
 from echelon.core.types import Array
 from echelon.guarantees.verifier import algebra
 from echelon.guarantees.verifier.findings import DECIDED, Facts, Finding, compare, decide, unchecked
@@ -25,7 +26,7 @@ def check_linearization(facts: Facts) -> Iterator[Finding]:
     yield decide("kind of the slowest mode", saved.kind == "linearization", saved.kind)
     result, slack = _slowest(facts, _checked_eigenvalues(facts))
     if saved.abscissa < 0.0 and slack > _MODE_DECIDED * abs(result):
-        text = f"undecided: the rounding is {slack:.2g}"
+        text = f"undecided: the rounding is {at_least(slack, 2)}"
         yield decide("slowest mode, 1/s", False, saved.abscissa, result, text)
     else:
         yield compare("slowest mode, 1/s", saved.abscissa, result, slack)

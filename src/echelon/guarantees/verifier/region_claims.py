@@ -6,6 +6,7 @@ from fractions import Fraction
 import numpy as np
 import scipy.linalg
 
+from echelon.core.digits import at_least
 from echelon.core.types import Array
 from echelon.core.words import amount
 from echelon.guarantees.verifier import algebra, exact_minors
@@ -124,7 +125,7 @@ def _check_rate(facts: Facts, region: SavedRegion) -> Iterator[Finding]:
         yield from _proof(facts, region)
         return
     if not decided:
-        text = f"undecided: the rounding is {slack:.2g}"
+        text = f"undecided: the rounding is {at_least(slack, 2)}"
         yield decide(claim, False, region.rate, result, text)
     elif region.theorem == "A5":
         fine = result >= region.rate - slack and region.rate == 0.0

@@ -11,6 +11,7 @@ from fractions import Fraction
 
 import numpy as np
 
+from echelon.core.digits import at_most
 from echelon.core.types import Array, JsonObject
 from echelon.guarantees.verifier.findings import Finding, compare, decide
 from echelon.guarantees.verifier.motor_claims import motor_findings
@@ -67,7 +68,7 @@ def _check_margin(border: JsonObject, roots: Sequence[Fraction], name: str) -> I
     worst = min(
         allowed - _fall(roots, order, sign * steep, float(border["speed"])) for sign in (-1.0, 1.0)
     )
-    shown, text = f"{worst:.4g} left", "margin from this start"
+    shown, text = f"{at_most(worst, 4)} left", "margin from this start"
     yield decide(f"steepest start of {name}", worst >= -1e-9, border["steepest"], shown, text)
 
 

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
+from echelon.core.digits import about
 from echelon.core.types import JsonObject, PathLike
 from echelon.guarantees.verifier import exact_minors
 from echelon.guarantees.verifier.agent_claims import MODEL as MODEL
@@ -140,7 +141,7 @@ def _no_decay_sentence(saved: SavedGain) -> str:
     """Return the sentence that is added for a correct file whose gain is not stabilizing."""
     if saved.abscissa < 0.0:
         return ""
-    return f" The gain guarantees no decay: the slowest mode is {saved.abscissa:.3g} 1/s."
+    return f" The gain guarantees no decay: the slowest mode is {about(saved.abscissa)} 1/s."
 
 
 def _check_definite(saved: SavedGain) -> Iterator[Finding]:

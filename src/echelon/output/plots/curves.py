@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from echelon.core.digits import at_most
 from echelon.core.types import Array
 from echelon.experiments.results.lyapunov import rises
 from echelon.experiments.results.metrics import SETTLED
@@ -144,7 +145,7 @@ def _slope(ax: "Axes", run: Recording, values: Array, times: float) -> None:
         line[1] = finite[first] * np.exp(-600.0)
     # Equal eigenvalues, as of a directed chain, give t^k e^(-rt): the slope holds in the end only.
     name = "guaranteed asymptotic slope" if _has_one_way_link(run) else "guaranteed slope"
-    text = f"{name}: \u2212{times * rate:.3g} 1/s"
+    text = f"{name}: \u2212{at_most(times * rate)} 1/s"
     draw.plot(ax, t, line, label=text, **_SLOPE)
 
 

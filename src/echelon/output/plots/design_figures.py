@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from echelon.core.digits import at_most
 from echelon.core.types import Array
 from echelon.experiments.results.recording import LoopPoles
 from echelon.experiments.studies.basin import (
@@ -132,10 +133,10 @@ def _legend(figure: "Figure", ax: "Axes", radii: Radii, run: Trial) -> None:
 
     certified = "no certified set"
     if radii.certified is not None:
-        certified = f"certified, r = {radii.certified:.3g}"
+        certified = f"certified, r = {at_most(radii.certified)}"
         certified = certified if radii.certified else "certified: empty"
         certified = "certified everywhere" if radii.certified == np.inf else certified
-    observed = f"observed: all tested starts converge, r = {radii.observed:.3g}"
+    observed = f"observed: all tested starts converge, r = {at_most(radii.observed)}"
     lost = f"error not below {100.0 * run.decay:.2g} % after {run.horizon:.3g} s"
     ink = _CERTIFIED if radii.certified else "none"
     border: dict[str, Any] = {"edgecolor": "0.7", "linewidth": 0.5}

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from echelon.agents.network.switching import Schedule
+from echelon.core.digits import at_least
 from echelon.core.types import Array
 from echelon.experiments.results.recording import LoopPoles, Recording
 from echelon.output.plots import style as draw
@@ -59,7 +60,7 @@ def _name_slowest(ax: "Axes", slowest: float) -> None:
     # Above the axes, on the side with more room.
     place = float(ax.transAxes.inverted().transform(ax.transData.transform((slowest, 0.0)))[0])
     look |= {"color": draw.COLOURS[1], "ha": "right" if place > 0.5 else "left"}
-    text = f"slowest: {slowest:.3g} 1/s".replace("-", "\u2212")
+    text = f"slowest: {at_least(slowest)} 1/s".replace("-", "\u2212")
     ax.annotate(text, (slowest, 1.0), (0, 2), **look, **near)
 
 

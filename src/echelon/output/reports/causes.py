@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from echelon.core.digits import at_least
 from echelon.core.errors import Outcome
 from echelon.core.statement import Cause, Hypothesis
 from echelon.experiments.results.agent_metrics import Metrics
@@ -65,7 +66,7 @@ def _slow(result: Result, guarantee: Promise) -> Iterator[Cause]:
         span = "1 m to 1 cm" if result.length_unit else "1 to 0.01"
         yield Cause(
             f"{'the slowest mode' if by_mode else 'the guaranteed rate'} takes "
-            f"{_SETTLES / rate:.3g} s from {span}, and the horizon is "
+            f"{at_least(_SETTLES / rate)} s from {span}, and the horizon is "
             f"{result.settings.horizon:g} s",
             "lengthen `simulation.horizon`, or let `echelon design` find a faster gain",
         )

@@ -4,6 +4,7 @@ import io
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
+from echelon.core.digits import at_most
 from echelon.core.errors import Outcome
 from echelon.core.types import JsonObject
 from echelon.core.words import amount
@@ -160,7 +161,7 @@ def _guaranteed(promise: Promise) -> str:
     if promise.rate is None:
         return "none"
     source = "" if promise.theorem is None else f" ({promise.kind}, {promise.theorem})"
-    return f"{promise.rate:.3g}{source}"
+    return f"{at_most(promise.rate)}{source}"
 
 
 def _remarks(row: ComparisonRow) -> Iterator[str]:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from echelon.agents.network.hearing import who_hears_whom
+from echelon.core.digits import at_least, at_most
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
 from echelon.core.words import amount
@@ -136,10 +137,10 @@ def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
     slowest, coupling = guarantee.slowest, guarantee.loop.closed.coupling
     if result.drive.gain is not None and slowest is not None:
         mode = "the slowest mode decays" if slowest < 0.0 else "a mode grows"
-        text = f"{mode} at {abs(slowest):.3g} 1/s (coupling {coupling:.4g})"
-        edge = guarantee.edge
-        bound = "" if edge is None else f" Couplings above {edge:.4g} are sufficient for stability."
-        yield f"Linearized at the trim, {text}.{bound}"
+        text = f"{mode} at {at_most(abs(slowest))} 1/s (coupling {coupling:.4g})"
+        if guarantee.edge is not None:
+            text += f". Couplings above {at_least(guarantee.edge, 4)} are sufficient for stability"
+        yield f"Linearized at the trim, {text}."
     yield from coverage(result, guarantee)
     if len(result.graph.leaders) > 1:
         yield f"Leaders: {who_hears_whom(result.graph)}; goals are relative to the nearest leader."

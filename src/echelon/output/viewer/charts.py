@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from echelon.core.digits import at_most
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.metrics import SETTLED
 from echelon.experiments.results.quantity import settling_bound
@@ -125,7 +126,7 @@ def _slope(run: Recording, begin: float, times: float) -> list[JsonObject]:
         return []
     slope = -times * rate / float(np.log(10.0))
     ends = [float(np.log10(begin)), slope]
-    name = f"guaranteed slope, \u2212{times * rate:.3g} 1/s"
+    name = f"guaranteed slope, \u2212{at_most(times * rate)} 1/s"
     return [
         {"name": name, "colour": "faint", "ends": ends, "dash": True, "mute": True, "bound": True}
     ]

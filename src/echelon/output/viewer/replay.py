@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from echelon.core.digits import at_most
 from echelon.core.errors import OutputError
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.recording import MessageAges, Recording
@@ -238,7 +239,7 @@ def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
         return _badge_of_distances(apart["ideal"], promise)
     rate, kind = promise["rate"], promise["kind"]
     source = promise["theorem"] or kind
-    short = f"guaranteed: {f'{rate:.3g} 1/s' if rate else 'V does not rise'}, {source}"
+    short = f"guaranteed: {f'{at_most(rate)} 1/s' if rate else 'V does not rise'}, {source}"
     whole = f"{promise['sentence']} {_rate_in_words(promise)}".rstrip()
     return {"state": "holds", "short": short, "whole": whole}
 
@@ -256,10 +257,10 @@ def _rate_in_words(promise: Mapping[str, Any]) -> str:
     if not rate or promise["theorem"]:
         return ""
     if slowest is None or abs(rate + slowest) <= 1e-6 * rate:
-        return f"The rate of {rate:.3g} 1/s is that of the slowest mode."
+        return f"The rate of {at_most(rate)} 1/s is that of the slowest mode."
     return (
-        f"The rate of {rate:.3g} 1/s holds for all graphs and turns of the scenario; the slowest "
-        f"mode alone decays at {-slowest:.3g} 1/s."
+        f"The rate of {at_most(rate)} 1/s holds for all graphs and turns of the scenario; the "
+        f"slowest mode alone decays at {at_most(-slowest)} 1/s."
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.straight_range import straight_range
+from echelon.core.digits import at_least, at_most
 from echelon.core.errors import GainError, did_you_mean, listing
 from echelon.core.types import Array
 
@@ -91,7 +92,7 @@ class Domain:
         lower = np.concatenate([self.lower, self.input_lower])
         upper = np.concatenate([self.upper, self.input_upper])
         named = [
-            f"{name} in [{low:.4g}, {high:.4g}]"
+            f"{name} in [{at_least(low, 4)}, {at_most(high, 4)}]"
             for name, low, high in zip(names, lower, upper, strict=True)
             if np.isfinite([low, high]).all() and low < high
         ]

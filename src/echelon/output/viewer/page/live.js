@@ -133,7 +133,7 @@ class Live {
     this.promise = badge;
     this.causes = badge.causes ?? [];
     const coupling = this.controls.coupling;
-    if (coupling && badge.edge) coupling.mark(badge.edge, badge.end);
+    if (coupling && badge.edge) coupling.mark(badge);
   }
 
   showNotes() {
@@ -334,14 +334,14 @@ class Slider {
   }
 
   // Marks from where on modes are guaranteed to decay, and from where on they grow in held steps.
-  mark(edge, end) {
+  mark({ edge, above, end }) {
     const put = (element, value, words) => {
       element.hidden = !value;
       if (!value) return;
       element.title = words;
       element.style.left = `calc(8px + ${this.partOf(value)} * (100% - 16px))`;
     };
-    put(this.edge, edge, `modes are guaranteed to decay above ${edge.toPrecision(3)}${end ? `, up to about ${end.toPrecision(3)}` : ""}`);
+    put(this.edge, edge, `modes are guaranteed to decay above ${above}${end ? `, up to about ${end.toPrecision(3)}` : ""}`);
     put(this.end, end, end && `errors grow in the steps of the loop from about ${end.toPrecision(3)} on`);
   }
 }

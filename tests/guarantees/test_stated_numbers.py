@@ -1,0 +1,237 @@
+"""No sentence states more than its number: each is read back and compared with the exact one."""
+
+import dataclasses
+import decimal
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import echelon as ech
+from echelon.core.statement import Hypothesis, Topic
+from echelon.core.words import Kind, Theorem, Verdict
+from echelon.experiments.studies.basin import Radii
+from echelon.experiments.studies.speedup import Speedup
+from echelon.guarantees.messages.late_agreement import LateRate
+from echelon.guarantees.messages.late_messages import LateMessages
+from echelon.guarantees.messages.message_ages import AgeLimits
+from echelon.guarantees.promises.certified_set import CertifiedSet, set_line
+from echelon.guarantees.promises.promise import Prefix
+from echelon.guarantees.stopping.motor_load import Alone, MotorLoad
+from echelon.guarantees.stopping.separation import Separation
+from echelon.guarantees.stopping.tube import Tube
+from echelon.output.viewer.replay import promise_badge
+from echelon.synthesis.certificates.domain import Domain
+
+BELOW, ABOVE = -1, 1
+"""What is stated may not be more than the number, or not less."""
+SIZES = st.floats(1e-3, 1e4)
+
+
+def known(x):
+    """A number with the digits that are not rounding of its computation."""
+    return decimal.Decimal(f"{x:.12g}")
+
+
+def assert_safe(text, number, side):
+    """A text states a number from its safe side, and no less than its digits have to."""
+    shown, exact = decimal.Decimal(text), known(number)
+    assert (shown - exact) * side >= 0
+    assert abs(shown - exact) <= abs(exact) * decimal.Decimal("0.01")
+
+
+def tube(rate=1.0, arrival=None, motors=None, network=None):
+    return Tube(rate, (1.0,), 1.0, 1.0, arrival, "", (), motors, network=network)
+
+
+def late(steps=3, dt=1.0, **changes):
+    """What T9 says of followers along one way, with messages lost."""
+    ages = AgeLimits(5, steps, 7, 1, dt, 0.1)
+    numbers = {"rate": 1.0, "ways": np.array([1, 3]), "rates": ()} | changes
+    rest = {"weights": np.ones(2), "sums": np.ones(1), "spread": 2.0, "coupling": 1.0}
+    return LateMessages(ages=ages, speed=1.0, **rest | numbers)
+
+
+def both_ways(rate):
+    return late(ways=None, rate=0.5 * rate, rates=(LateRate(rate, np.ones(2)),))
+
+
+def apart(**changes):
+    numbers = {"safety": ech.Safety(radii=(0.1, 0.1, 0.3)), "tube": tube(), "least": 1.0}
+    rest = {"pair": (0, 1), "gap": np.ones((1, 3)), "scales": np.ones(3), "speeds": np.ones(3)}
+    rest |= {"axes": ("x", "y"), "step": 0.01, "ideal": True, "kind": Kind.PROOF}
+    return Separation(**rest | numbers | changes)
+
+
+def motors(least=0.01, largest=0.1, most=0.2, tilt=0.1, alone=None):
+    return MotorLoad(least, largest, most, tilt, alone, {})
+
+
+def alone(**changes):
+    one = Alone(0.1, 1.0, 1.0, 1.0, False)._replace(**changes)
+    return motors(alone=one).sentence()
+
+
+def badge(rate, theorem="T1", slowest=None):
+    told = {"promised": True, "sentence": "", "rate": rate, "kind": "proof", "theorem": theorem}
+    return promise_badge(told | {"slowest_mode": -rate if slowest is None else slowest})
+
+
+def domain(bounds):
+    return Domain.about(ech.models.DoubleIntegrator(1), bounds).in_words(
+        ech.models.DoubleIntegrator(1)
+    )
+
+
+class Bare:
+    """A guarantee until an event."""
+
+    def sentence(self):
+        return ""
+
+
+KINDS = {
+    "rate of T5": (BELOW, r"decay at (\S+) 1/s", lambda x: tube(x).sentence()),
+    "arrival of T5": (ABOVE, r"1 cm after (\S+) s", lambda x: tube(arrival=x).sentence()),
+    "arrival of T9": (ABOVE, r"1 cm after (\S+) s", lambda x: late().sentence(x)),
+    "rate of T9": (BELOW, r"at (\S+) 1/s while", lambda x: both_ways(x).faster()),
+    "age of T9": (BELOW, r"older than (\S+) ms", lambda x: late(dt=x / 3e3, ways=None,
+        rates=(LateRate(2.0, np.ones(2)),)).faster()),
+    "packets": (ABOVE, r"has a packet after (\S+) s", lambda x: late(dt=x / 3.0).sentence(None)),
+    "delay": (ABOVE, r"a delay of (\S+) s", lambda x: late(dt=x / 6.0).sentence(None)),
+    "rate of T10": (BELOW, r"decay at (\S+) 1/s", lambda x: apart(tube=tube(x)).sentence()),
+    "radii": (BELOW, r"radii of (\S+) x", lambda x: apart(
+        safety=ech.Safety(radii=(x, x, x))).sentence()),
+    "distance": (BELOW, r"(\S+) m at the start", lambda x: apart(least=x).line.number_text),
+    "kept": (BELOW, r"(\S+) m are kept", lambda x: apart(
+        safety=ech.Safety(radii=(0.5 * x, 0.5 * x, x), margin=0.0)).line.text),
+    "thrust, least": (BELOW, r"between (\S+) and", lambda x: motors(least=x).sentence()),
+    "thrust, largest": (ABOVE, r"and (\S+) N", lambda x: motors(largest=x).sentence()),
+    "tilt": (ABOVE, r"is at most (\S+) deg", lambda x: motors(tilt=math.radians(x)).sentence()),
+    "start, tilt": (BELOW, r"a tilt of (\S+) deg", lambda x: alone(tilt=math.radians(x))),
+    "start, sideways": (BELOW, r"or (\S+) m/s sideways", lambda x: alone(sideways=x)),
+    "start, upward": (BELOW, r"or (\S+) m/s upward", lambda x: alone(upward=x)),
+    "start, rate": (BELOW, r"or (\S+) rad/s", lambda x: alone(rate=x)),
+    "set": (BELOW, r"radius (\S+)$", lambda x: set_line(
+        None, CertifiedSet(x, Kind.PROOF, "")).number_text),
+    "domain, upper end": (BELOW, r", (\S+)\]", lambda x: domain({"position": (-1.0, x)})),
+    "domain, lower end": (BELOW, r"\[-(\S+),", lambda x: domain({"position": (-x, 1.0)})),
+    "until an event": (BELOW, r"Until (\S+) s", lambda x: Prefix(x, Bare()).sentence()),
+    "certified radius": (BELOW, r"certified (\S+);", lambda x: Radii(
+        ("x", "y"), x, 1.0, 2.0, 1.0).sentence()),
+    "observed radius": (BELOW, r"observed (\S+),", lambda x: Radii(
+        ("x", "y"), 1.0, x, 2.0 * x, 1.0).sentence()),
+    "time constant": (ABOVE, r"constant of (\S+) s", lambda x: Speedup(
+        x, (), x, (), x).sentence()),
+    "badge": (BELOW, r": (\S+) 1/s", lambda x: badge(x)["short"]),
+    "badge, by linearization": (BELOW, r"rate of (\S+) 1/s", lambda x: badge(x, None)["whole"]),
+    "badge, slowest": (BELOW, r"decays at (\S+) 1/s", lambda x: badge(
+        0.5 * x, None, -x)["whole"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=40, deadline=None)
+@given(SIZES)
+def test_a_sentence_states_no_more_than_its_number(kind, x):
+    side, pattern, text = KINDS[kind]
+    [shown] = re.findall(pattern, text(x))
+    assert_safe(shown, x, side)
+
+
+@settings(max_examples=100, deadline=None)
+@given(SIZES, st.floats(1.0, 1.001))
+def test_a_thrust_that_suffices_is_not_stated_above_the_limit(x, more):
+    text = motors(largest=x, most=more * x).sentence()
+    [(largest, most)] = re.findall(r"and (\S+) N \(maximum (\S+) N", text)
+    assert float(largest) <= float(most)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(1e-3, 1e3), st.floats(1e-3, 1e3))
+def test_the_sentence_of_a_region_states_no_more(robust, rate, radius):
+    region = dataclasses.replace(robust.region, rate=rate)
+    text = dataclasses.replace(
+        robust, region=region, certified=CertifiedSet(radius, region.kind, "")
+    ).sentence()
+    assert_safe(re.findall(r"shrink at (\S+) 1/s", text)[0], rate, BELOW)
+    assert_safe(re.findall(r"<= (\S+)\^2", text)[0], radius, BELOW)
+
+
+ROBUST = {"gain": {"method": "robust-lqr", "domain": {"angle": 0.5}}}
+
+
+@pytest.fixture(scope="module")
+def robust():
+    """A guarantee of a pendulum on a domain."""
+    scenario = {"name": "mine", "model": {"name": "pendulum"}, "follower": ROBUST}
+    scenario |= {"graph": {"name": "path", "agents": 4}, "leader": {"law": "passive"}}
+    scenario |= {"simulation": {"horizon": 2.0, "dt": 0.01}}
+    found = ech.check(*ech.build(ech.scenario_from_mapping(scenario))).promise
+    assert found.theorem is Theorem.T1
+    return found
+
+
+# ---- the lines of a check ----
+
+LINES = {
+    Hypothesis.DISAGREEMENT_DECAY: (ABOVE, r"(\S+) 1/s", 1.0),
+    Hypothesis.ALONG_PATH: (ABOVE, r"(\S+) 1/s", 1.0),
+    Hypothesis.SWITCHING: (BELOW, r"(\S+) 1/s", 1.0),
+    Hypothesis.REGION: (BELOW, r"(\S+) 1/s", 1.0),
+    Hypothesis.SET: (BELOW, r"(?:radius )?(\S+)(?: off)?$", 1.0),
+    Hypothesis.STARTS: (BELOW, r"(\S+) left$", 1.0),
+    Hypothesis.SEPARATION: (BELOW, r"(\S+) m at", 1.0),
+    Hypothesis.LIMITS: (BELOW, r"(\S+) \.\.", 1.0),
+    Hypothesis.MESSAGES: (ABOVE, r"(\S+) ms", 1e3),
+    Hypothesis.OWN_STATE: (BELOW, r"(\S+) ms", 1e3),
+    Topic.LEADER_TRACKING: (ABOVE, r"(\S+) 1/s", 1.0),
+    Topic.GAIN: (ABOVE, r"^(\S+) to", 1.0),
+    Topic.DELAY: (BELOW, r"(\S+) ms", 1e3),
+    Topic.SCALING: (ABOVE, r"(\S+) 1/s", 1.0),
+    Topic.POSITIVE: (BELOW, r"(\S+)", 1.0),
+    Topic.STRING: (ABOVE, r", (\S+) over", 1.0),
+}
+"""On which side the number of a line that holds is stated, where, and its factor."""
+
+SCENARIOS = {
+    "integrators": (),
+    "van-der-pol": (),
+    "unicycle": (),
+    "crossing": (),
+    "paper-radio": (),
+    "leader-lost": (),
+    "paper-global": (),
+    "paper-windy": ("follower.feedforward=parent", "graph={edges: [[0, 1], [1, 2], [2, 3]]}"),
+}
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_no_line_of_a_check_states_more_than_its_number(name):
+    seen = 0
+    for line in ech.check(*ech.build(ech.load_scenario(name, SCENARIOS[name]))).lines:
+        side, pattern, scale = LINES.get(line.statement, (0, "", 1.0))
+        found = re.findall(pattern, line.number_text) if side else ()
+        if line.verdict is Verdict.HOLDS and found and math.isfinite(line.number):
+            assert_safe(found[0], scale * line.number, side)
+            seen += 1
+    assert seen
+
+
+def test_a_guarantee_in_single_precision_says_that_it_ignores_its_rounding():
+    """At 300 km numbers are 3 cm apart, and followers stay farther off than the guarantee says."""
+    circle = ech.references.Circle(center=(3e5, 0.0, 0.0))
+    laws = ech.Laws(ech.laws.StoppingLeader(reference=circle), ech.laws.StoppingPoint())
+    model, graph = ech.models.DoubleIntegrator(2), ech.Graph.path(3)
+    formation = ech.Formation.from_offsets(model, graph, {1: [1.0, 0.0], 2: [2.0, 0.0]})
+    parts = ech.Parts(model, graph, formation, laws, {"position": 0.5})
+    said = "The guarantee ignores that numbers have single precision."
+    for precision, left_out in (("float64", False), ("float32", True)):
+        chosen = ech.Settings(horizon=6.0, dt=0.01, precision=precision)
+        found, result = ech.promise(parts, chosen), ech.simulate(parts, chosen)
+        assert found.promised and (said in found.sentence()) is left_out
+        late = result.times >= found.tube.arrival
+        assert (result.formation_errors[late].max() > 0.02) == left_out
