@@ -102,3 +102,57 @@ def test_faults_of_motions_are_a_sentence_with_their_place(motion, message):
 def test_an_assignment_without_starts_is_refused():
     with pytest.raises(ScenarioError, match="`assign: nearest` needs `initial.states`"):
         built(formation={"assign": "nearest"})
+
+
+THROUGH = """
+name: through
+model: {name: double-integrator}
+graph: {edges: [[0, 1], [0, 2]]}
+formation:
+  offsets: {1: [1, 1], 2: [1, -1]}
+  motion: [{reshape: {offsets: {1: [1, -1], 2: [1, 1]}}, at: 0.0, over: 0.4}]
+leader: {law: stopping-point}
+follower: {law: stopping-point}
+simulation: {horizon: 0.5, dt: 0.01}
+"""
+MEET = (
+    "echelon: Warning: in the reshape at 0 s agents 1 and 2 come within 0 m of each other; add "
+    "`safety`, or choose other places.\n"
+)
+
+
+@pytest.mark.parametrize("command", ["run", "sweep", "live"])
+def test_a_reshape_through_itself_is_warned_of_before_it_runs(echelon, here, monkeypatch, command):
+    """Nothing can be simulated, so that what is printed was printed before."""
+    (here / "through.yaml").write_text(THROUGH)
+
+    def stop(*arguments):
+        raise ScenarioError("nothing runs here.")
+
+    monkeypatch.setattr("echelon.experiments.scenario.build.run", stop)
+    monkeypatch.setattr("echelon.experiments.sweeps.sweep.compute", stop)
+    monkeypatch.setattr("echelon.apps.cli.view_command.keep_serving", stop)
+    over = ["--over", "seed=0..1"] if command == "sweep" else []
+    code, out, err = echelon(command, "through.yaml", *over)
+    assert (code, out) == (2, "") and err.count(MEET) == 1 and err.endswith("nothing runs here.\n")
+    if command != "live":
+        assert MEET not in echelon(command, "through.yaml", *over, "--json")[2]
+    assert MEET not in echelon("--quiet", command, "through.yaml", *over)[2]
+
+
+def test_check_states_that_a_reshape_passes_through_itself(echelon, here):
+    (here / "through.yaml").write_text(THROUGH)
+    text = " ".join(echelon("check", "through.yaml")[1].split())
+    assert MEET.removeprefix("echelon: ").strip() in text
+    safe = ["--set", "safety={radii: [0.1, 0.1, 0.1]}"]
+    code, out, err = echelon("check", "through.yaml", *safe)
+    assert code == 0 and err == "" and "in the reshape" not in out
+
+
+def test_errors_of_held_inputs_from_starts_at_the_goals_are_no_growth(tmp_path):
+    (tmp_path / "through.yaml").write_text(THROUGH)
+    run = ech.simulate(*ech.build(tmp_path / "through.yaml"))
+    assert 0.0 < run.formation_errors[-1].max() < 1e-2
+    text = " ".join(ech.report(run).split())
+    assert "All 2 followers stay within 0.01 m of their goals from " in text
+    assert "grows" not in text and "Cause" not in text

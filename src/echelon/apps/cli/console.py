@@ -1,9 +1,11 @@
-"""Output shared by commands: the guarantee of a run, and the files written."""
+"""Output shared by commands: warnings and guarantee of a run, and the files written."""
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from echelon.apps.cli.status import STATUS
 from echelon.core.files import write_atomic
 from echelon.output.archive.folder import write_errors
 
@@ -12,14 +14,23 @@ if TYPE_CHECKING:
 
 
 def foretell(experiment: "Experiment", quiet: bool) -> None:
-    """Print the guarantee of a run on a terminal; anywhere, if nothing is guaranteed."""
-    if quiet:
+    """Print the warnings of a run, and its guarantee on a terminal or if nothing is guaranteed."""
+    if quiet or STATUS.silent:
         return
     from echelon.experiments.studies.forecast import forecast
     from echelon.guarantees.promises.promise import promise
+    from echelon.simulation.engine.prepare import prepare
 
+    warn(prepare(*experiment).warnings)
     if sys.stderr.isatty() or not promise(*experiment).promised:
         print(f"echelon: {forecast(*experiment)}", file=sys.stderr, flush=True)
+
+
+def warn(warnings: Iterable[str], quiet: bool = False) -> None:
+    """Print warnings before what they warn of is computed, each on a line of standard error."""
+    if not (quiet or STATUS.silent):
+        for text in warnings:
+            print(f"echelon: Warning: {text}", file=sys.stderr, flush=True)
 
 
 def print_folder(folder: Path) -> None:

@@ -29,6 +29,7 @@ def live(
     loaded = load_scenario(scenario, set_ or [])
     check_page()
     STATUS.begin(f"preparing {loaded.name} for the browser, which takes up to a minute")
+    from echelon.apps.cli.console import warn
     from echelon.apps.cli.view_command import keep_serving
     from echelon.apps.live.server import live as make_ready
     from echelon.apps.live.server import serve_live
@@ -39,6 +40,7 @@ def live(
     folder = Path(scenario) if loaded.folder == Path(scenario) else None
     run = recording_of(load(folder)) if folder is not None and when_written(folder) else None
     session, html = make_ready(loaded, run, STATUS.counter("parts"))
+    warn(session.swarm.warnings)
     server = serve_live(session, html, port)
     session.start()
     try:

@@ -76,6 +76,11 @@ class Status:
             self.pause()
             self._stream = None
 
+    @property
+    def silent(self) -> bool:
+        """Whether nothing is shown, as with `--quiet`."""
+        return self._stream is None
+
     def silence(self) -> None:
         """Show nothing more."""
         with self._lock:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from echelon.apps.cli import options
-from echelon.apps.cli.console import print_folder
+from echelon.apps.cli.console import print_folder, warn
 from echelon.apps.cli.job import Job, check_inputs
 from echelon.apps.cli.status import STATUS
 from echelon.apps.cli.stop import STOP, Ended
@@ -90,12 +90,15 @@ def _new_sweep(
     from echelon.experiments.sweeps.plan import Sweep
     from echelon.output.archive.folder import BATCHES, claim_folder
     from echelon.output.archive.sweep_folder import Batches
+    from echelon.simulation.engine.prepare import prepare
 
     plan = Sweep(scenario, axes, keep_states)
     batches = Batches(claim_folder(f"sweep-{scenario.name}", out, force, BATCHES))
     job = Job("sweep", batches.chunks)
     with job.cleanup():
         batches.begin(plan)
+        # Those of other cases are in the report, which counts them.
+        warn(prepare(*plan.first_built).warnings, quiet)
     return plan, batches, job
 
 

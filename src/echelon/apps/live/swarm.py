@@ -104,6 +104,7 @@ class LiveLoop:
         # The share of the feed-forward is a number of the loop, so that a knob can change it.
         self.loop: Loop = dataclasses.replace(loop, follower=law, share=np.asarray(1.0))
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
+        self.warnings = prepared.warnings
         self.eventful = eventful
         if loop.channel is not None:
             self.loop = dataclasses.replace(self.loop, channel=self._roomy(loop.channel))

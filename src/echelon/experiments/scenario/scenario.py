@@ -126,6 +126,7 @@ _ALLOWED = {
     "less_than": "is a number below {lt}",
     "less_than_equal": "is a number of at most {le:g}",
     "too_short": "is a list of at least {min_length} number",
+    "too_long": "is a list of {max_length} numbers",
 }
 
 

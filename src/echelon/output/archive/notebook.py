@@ -14,7 +14,7 @@ from echelon.experiments.results.run_numbers import AGENT_NUMBERS
 from echelon.guarantees.promises.promise import promise
 from echelon.output.plots.figure_files import html_image
 from echelon.output.plots.run_figures import figures
-from echelon.output.reports.causes import causes, grows
+from echelon.output.reports.causes import causes, ends_farther, grows
 from echelon.output.reports.run_report import labelled
 from echelon.output.viewer.replay import replay_page
 from echelon.simulation.engine.result import Result
@@ -59,9 +59,11 @@ def result_replay(result: Result) -> str:
 def _causes(result: Result) -> str:
     """Return the causes of growing errors as a list."""
     # A promise takes seconds to compute, so other runs do without.
-    if not len(result.times) or not grows(result):
+    if not len(result.times) or not ends_farther(result):
         return ""
     guarantee = promise(result.parts, result.settings)
+    if not grows(result, guarantee):
+        return ""
     sentences = (cause.sentence() for cause in causes(result, metrics(result), guarantee))
     items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences)
     return f"<ul>{items}</ul>" if items else ""

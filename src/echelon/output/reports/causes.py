@@ -24,7 +24,7 @@ def causes(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[Cau
     """Yield the causes of large errors, each with a remedy."""
     if len(result.times):
         settled = all(follower.settling_time is not None for follower in numbers.followers)
-        lost = grows(result)
+        lost = grows(result, guarantee)
         if lost or not settled:
             yield from guarantee.causes
         if lost:
@@ -138,7 +138,17 @@ def sizes(result: Result) -> tuple[float, float]:
     return first, last
 
 
-def grows(result: Result) -> bool:
+def grows(result: Result, guarantee: Promise) -> bool:
+    """Return whether a run diverged, or its errors grew beyond what a guarantee allows for.
+
+    Under one, errors that end below 1 cm are those of rounding and of inputs that are held.
+    """
+    if result.outcome is Outcome.DIVERGED or not guarantee.promised:
+        return ends_farther(result)
+    return ends_farther(result) and sizes(result)[1] >= SETTLED
+
+
+def ends_farther(result: Result) -> bool:
     """Return whether a run diverged, or ends farther from its goals than it began."""
     if result.outcome is Outcome.DIVERGED:
         return True

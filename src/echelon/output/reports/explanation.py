@@ -23,7 +23,7 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
     """Return the sentences of a report: outcome, causes, world, guarantee, Lyapunov function."""
     guarantee = promise(result.parts, result.settings)
     return (
-        *_outcome(result, numbers),
+        *_outcome(result, numbers, guarantee),
         *_closest(result, numbers),
         *(outcome.sentence() for outcome in event_outcomes(result)),
         *_waiting(result),
@@ -35,12 +35,12 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
     )
 
 
-def _outcome(result: Result, numbers: Metrics) -> Iterator[str]:
+def _outcome(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[str]:
     yield result.message
     if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
         return
     unit = f" {result.length_unit}".rstrip()
-    if grows(result):
+    if grows(result, guarantee):
         first, last = sizes(result)
         yield (
             f"The formation error grows: {first:.3g}{unit} at the start, "
