@@ -23,6 +23,7 @@ from echelon.guarantees.promises.promise import Prefix
 from echelon.guarantees.stopping.motor_load import Alone, MotorLoad
 from echelon.guarantees.stopping.separation import Separation
 from echelon.guarantees.stopping.tube import Tube
+from echelon.laws.trim_input import TrimInput
 from echelon.output.viewer.replay import promise_badge
 from echelon.synthesis.certificates.domain import Domain
 
@@ -235,3 +236,47 @@ def test_a_guarantee_in_single_precision_says_that_it_ignores_its_rounding():
         assert found.promised and (said in found.sentence()) is left_out
         late = result.times >= found.tube.arrival
         assert (result.formation_errors[late].max() > 0.02) == left_out
+
+
+class Feet(ech.models.DoubleIntegrator):
+    """Carts in feet."""
+
+    state_units = ("ft", "ft", "ft/s", "ft/s")
+
+
+class Mixed(ech.models.DoubleIntegrator):
+    """Carts with a coordinate in cm."""
+
+    state_units = ("m", "cm", "m/s", "cm/s")
+
+
+METRES = re.compile(r"\b(m|cm|mm|m/s|m/s\^2)\b(?! 2 c)")
+
+
+@pytest.mark.parametrize(("model", "unit"), [(Feet(), "ft"), (Mixed(), "1")])
+def test_nothing_is_stated_in_metres_of_positions_in_other_units(model, unit):
+    """Nor in the unit of one coordinate where the others have another one."""
+    graph = ech.Graph([(0, 1), (1, 2), (2, 3)], leaders=(0, 3))
+    formation = ech.Formation.from_offsets(model, graph, {1: [1, 0], 2: [2, 0], 3: [3, 0]})
+    circle = ech.references.Circle(center=(0.0, 0.0, 0.0))
+    for leader, follower, world in (
+        (ech.laws.StoppingLeader(reference=circle), ech.laws.StoppingPoint(), "state"),
+        (TrimInput(), ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.Riccati())), None),
+    ):
+        network = None if world is None else ech.Network(messages=world, delay=0.2)
+        parts = ech.Parts(
+            model,
+            graph,
+            formation,
+            ech.Laws(leader, follower),
+            {"position": 0.5},
+            start_error={"position": 0.1} if world is None else {},
+            world=ech.World(network=network),
+        )
+        chosen = ech.Settings(horizon=1.0, dt=0.01)
+        checked = ech.check(parts, chosen)
+        told = [checked.promise.sentence(), ech.report(ech.simulate(parts, chosen))]
+        told += [f"{line.number_text} {line.explanation}" for line in checked.lines]
+        assert [text for text in told if METRES.search(text)] == []
+        if world is not None:
+            assert f" {unit}/s" in " ".join(told)

@@ -65,7 +65,7 @@ def test_the_checker_loads_nothing_of_the_synthesis():
     assert "guarantees.verifier.exact_minors" in ours
     assert not ours & {"agents.models.linearization", "agents.models.model_check"}
     # `core.compiled` and `core.disk_cache` save what is computed; the verifier never uses them.
-    shared = {"core", "core.errors", "core.identity", "core.memoize", "core.limits"}
+    shared = {"core", "core.errors", "core.identity", "core.memoize", "core.limits", "core.digits"}
     shared |= {"core.compiled", "core.disk_cache", "core.numerics", "core.types", "core.words"}
     # A model traces its own functions once in a call, whoever calls them.
     shared |= {"core.trace", "core.reads"}

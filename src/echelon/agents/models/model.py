@@ -383,3 +383,11 @@ def in_metres(model: ControlAffine) -> bool:
     """Tell whether no coordinate of the position has another unit than m."""
     units = dict(zip(model.state_names, model.state_units, strict=True))
     return all(units[name] in ("", "m") for name in model.position)
+
+
+def position_unit(model: ControlAffine) -> str:
+    """Return the unit of distances: m where none is declared; empty without one for all axes."""
+    if in_metres(model):
+        return "m" if model.position else ""
+    units = {model.state_units[k] for k in model.position_indices()}
+    return units.pop() if len(units) == 1 else ""

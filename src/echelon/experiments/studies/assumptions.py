@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model import ControlAffine, position_unit
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import who_hears_whom
 from echelon.agents.references.demand import ReferenceDemand, infeasible, reference_demand, too_fast
@@ -115,7 +115,8 @@ def _leader_line(promise: Promise) -> Statement:
 def _reference_line(model: ControlAffine, demand: ReferenceDemand, settings: Settings) -> Statement:
     """Return the reference's speed and acceleration, and whether the input limits suffice."""
     limited = settings.limits and model.input_limits is not None
-    sizes = ((demand.speed, "m/s"), (demand.acceleration, "m/s^2"))
+    unit = position_unit(model) or "1"
+    sizes = ((demand.speed, f"{unit}/s"), (demand.acceleration, f"{unit}/s^2"))
     # Smaller numbers are rounding of differences.
     numbers = [f"{at_least(round(x, 5))} {unit}" for x, unit in sizes if x is not None]
     numbers += [f"{at_least(100.0 * demand.share)} % of the input range"] if limited else []

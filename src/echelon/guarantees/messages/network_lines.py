@@ -7,6 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
+from echelon.agents.models.model import position_unit
 from echelon.core.digits import about, at_least
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds
@@ -29,6 +30,12 @@ class Bias(NamedTuple):
     speed: float
     size: float
     unit: str
+
+    @property
+    def shown(self) -> str:
+        """The size with its unit."""
+        metres = self.unit == "m"
+        return f"{about(1e3 * self.size)} mm" if metres else f"{about(self.size)} {self.unit}"
 
     def sentence(self) -> str:
         """Return it in words."""
@@ -66,8 +73,8 @@ def bias_of(parts: Parts, settings: Settings) -> Bias | None:
     most = float(spla.splu(sp.csc_array(L)).solve(L.diagonal()).max())
     if network.hears is NeighbourChoice.LEADERWARD:
         most = float(graph.depths().max())
-    speed, [unit] = float(moved) / settings.horizon, {parts.model.state_units[position[0]]}
-    return Bias(age, speed, age * speed * most, unit or "1")
+    speed = float(moved) / settings.horizon
+    return Bias(age, speed, age * speed * most, position_unit(parts.model) or "1")
 
 
 def bias_line(parts: Parts, settings: Settings) -> Statement | None:
@@ -76,7 +83,7 @@ def bias_line(parts: Parts, settings: Settings) -> Statement | None:
     if bias is None or bias.size < _MUCH:
         return _swinging_line(parts)
     remedy = "set `messages: deviation`"
-    number = bias.size, f"{about(1e3 * bias.size)} mm"
+    number = bias.size, bias.shown
     return fails(Hypothesis.MESSAGES, Kind.LINEARIZATION, bias.sentence(), *number, remedy=remedy)
 
 
@@ -102,7 +109,7 @@ def messages_line(
     if isinstance(late, Uncovered):
         bias = bias_of(parts, settings)
         text = late.text if bias is None else bias.sentence()
-        number = (None, "") if bias is None else (bias.size, f"{about(1e3 * bias.size)} mm")
+        number = (None, "") if bias is None else (bias.size, bias.shown)
         reason = text if late.lost else ""
         return fails(name, Kind.PROOF, text, *number, remedy=late.remedy, reason=reason)
     ages = late.ages

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from echelon.agents.models.linearization import at_trim
-from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model import ControlAffine, position_unit
 from echelon.agents.models.model_check import at_limits, is_limited, trim_shortfall
 from echelon.core.compiled import compiled_for_one_call
 from echelon.core.digits import about, at_least
@@ -145,7 +145,7 @@ def _drifting(case: Case) -> Statement:
     the disagreement; the rows of -L_g^-1 L_FL are weights that add to one.
     """
     away = apart(case.parts, case.settings, case.leaders.starts)
-    first, unit = case.parts.graph.leaders[0], "m " if case.parts.model.position else ""
+    first, unit = case.parts.graph.leaders[0], f"{position_unit(case.parts.model)} ".lstrip()
     text = (
         f"leader {away.leader} starts {about(away.start)} {unit}off the place that leader {first} "
         f"gives it, is {about(away.end)} {unit}off at {case.settings.horizon:g} s and "

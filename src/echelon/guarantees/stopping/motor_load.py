@@ -9,7 +9,7 @@ import numpy as np
 
 from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.declarations import is_by_user, undeclared
-from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model import ControlAffine, in_metres
 from echelon.agents.models.model_check import is_limited
 from echelon.core.digits import at_least, at_most
 from echelon.core.enclosure.interval import Interval
@@ -199,6 +199,8 @@ def _beyond(run: StoppingRun) -> str:
     chains = run.law.ready.chains
     if not (run.settings.limits and is_limited(run.parts.model)):
         return "the inputs have no limits"
+    if not in_metres(run.parts.model):
+        return "motors are judged where positions are in m"
     if (chains.outputs, chains.degrees) != (_OUTPUTS, _DEGREES):
         return _UNKNOWN
     speeds = [*map(run.speed, range(4)), *map(run.own_speed, range(4))]

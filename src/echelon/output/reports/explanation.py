@@ -67,7 +67,7 @@ def _outcome(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[s
 def _closest(result: Result, numbers: Metrics) -> Iterator[str]:
     """Yield which agents came closest to each other, and whether vehicles would have touched."""
     if numbers.closest is not None and result.outcome is not Outcome.DIVERGED:
-        yield numbers.closest.sentence(result.radius)
+        yield numbers.closest.sentence(result.radius, result.length_unit)
     kept = avoidance(result)
     yield from () if kept is None else (kept.sentence(),)
 

@@ -39,16 +39,16 @@ class ClosestPair(NamedTuple):
         """Return whether agents of a radius (m) touched; None has no size."""
         return radius is not None and self.distance < 2.0 * radius
 
-    def sentence(self, radius: float | None) -> str:
+    def sentence(self, radius: float | None, unit: str = "m") -> str:
         """Return who was closest, how close and when, beside the size of agents of a radius (m)."""
-        one, other = self.agents
-        size = "" if radius is None else f"agents of radius {radius:.2g} m touch below"
-        if radius is not None and self.touch(radius):
+        (one, other), near = self.agents, f"{self.distance:.3g} {unit}".rstrip()
+        size = ""
+        if radius is not None:
+            sizes = (f"{x} {unit}".rstrip() for x in (f"{radius:.2g}", f"{2.0 * radius:.3g}"))
+            size = "; agents of radius {} touch below {}".format(*sizes)
+        if self.touch(radius):
             return (
-                f"Warning: agents {one} and {other} came within {self.distance:.3g} m at "
-                f"{self.time:.4g} s; {size} {2.0 * radius:.3g} m, and the simulation lets them "
-                "pass through each other."
+                f"Warning: agents {one} and {other} came within {near} at {self.time:.4g} s{size}, "
+                "and the simulation lets them pass through each other."
             )
-        text = f"Smallest distance: {self.distance:.3g} m, agents {one} and {other} at "
-        text += f"{self.time:.4g} s"
-        return f"{text}; {size} {2.0 * radius:.3g} m." if radius is not None else f"{text}."
+        return f"Smallest distance: {near}, agents {one} and {other} at {self.time:.4g} s{size}."

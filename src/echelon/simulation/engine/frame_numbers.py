@@ -47,6 +47,9 @@ class _Frames(Protocol):
     def position(self) -> tuple[int, ...]: ...
 
     @property
+    def state_units(self) -> Sequence[str]: ...
+
+    @property
     def measured(self) -> tuple[int, ...]: ...
 
     def offsets_in(self, frames: FrameChoice) -> Float[Array, "*F N n"]: ...
@@ -72,8 +75,9 @@ class FrameNumbers(abc.ABC):
 
     @property
     def length_unit(self: _Frames) -> str:
-        """The unit of errors: m for a position, nothing for abstract states."""
-        return "m" if self.position else ""
+        """The unit of errors: m for a position in m, nothing for other units and states."""
+        metres = all(self.state_units[k] in ("", "m") for k in self.position)
+        return "m" if self.position and metres else ""
 
     @property
     def errors(self: _Frames) -> Float[Array, "T N n"]:

@@ -156,6 +156,11 @@ class Result(FrameNumbers):
         return self.model.position_indices()
 
     @property
+    def state_units(self) -> tuple[str, ...]:
+        """The unit of each state."""
+        return tuple(self.model.state_units)
+
+    @property
     def radius(self) -> float | None:
         """The radius of an agent, m; None without a position or a size."""
         return self.model.radius if self.position else None
