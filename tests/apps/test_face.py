@@ -110,6 +110,20 @@ def test_a_row_is_of_an_agent_at_a_time(run):
     assert rows[rows.leader].agent.unique().tolist() == [0]
 
 
+def test_an_agent_that_is_absent_has_no_rows_and_an_heir_is_the_leader():
+    result = heir_after_a_loss()
+    rows = table(result)
+    assert rows[rows.time < 1.0].agent.unique().tolist() == [0, 1, 2]
+    late = rows[rows.time > 1.5]
+    assert late.agent.unique().tolist() == [1, 2]
+    assert late[late.leader].agent.unique().tolist() == [1]
+
+
+def test_a_run_has_the_poles_of_its_own_loop_or_none():
+    # Under `stopping-point` the loop of the promise has zeros where the law places roots.
+    assert recording_of(heir_after_a_loss()).modes is None
+
+
 def test_a_run_without_frames_is_exported_to_no_file(here, run):
     empty = {name: getattr(run, name)[:0] for name in ("times", "states", "inputs")}
     for kind in ("csv", "npz", "html"):
@@ -242,7 +256,8 @@ def test_the_camera_comes_as_near_as_places_and_their_shadows_fit(run):
     assert (pixels > (10, 0)).all() and (pixels < (610, 500)).all()
 
 
-def test_an_heir_is_drawn_as_the_leader_that_it_is():
+def heir_after_a_loss():
+    """Carts whose leader is lost after 1 s, and the first follower leads on."""
     cart, graph = ech.models.DoubleIntegrator(), ech.Graph([(0, 1), (1, 2)])
     laws = ech.Laws(
         ech.laws.StoppingLeader(reference=ech.references.Circle(radius=2.0, rate=0.7)),
@@ -253,7 +268,11 @@ def test_an_heir_is_drawn_as_the_leader_that_it_is():
         cart, graph, places, laws, {"position": 0.5},
         events=[ech.network.Lose(0, 1.0)], leadership=ech.Leadership((1,)),
     )  # fmt: skip
-    run = recording_of(ech.simulate(parts, ech.Settings(horizon=2.0, dt=0.02)))
+    return ech.simulate(parts, ech.Settings(horizon=2.0, dt=0.02))
+
+
+def test_an_heir_is_drawn_as_the_leader_that_it_is():
+    run = recording_of(heir_after_a_loss())
     film = video._Film(run, (960, 540), run.times[[0, -1]])
     for time, leads in ((0.5, [False, False]), (1.5, [True, False])):
         film.moving.show(time, *film.between(time))

@@ -397,7 +397,8 @@ def test_who_is_lost_vanishes_an_heir_leads_and_the_event_is_marked(browser, run
         goal = run.states[100, 1, :3] + run.offsets[2, :3] - run.offsets[1, :3]
         assert page.evaluate("echelon.goal(2)") == pytest.approx(goal, abs=1e-4)
         away = np.linalg.norm(run.states[100, 2, :3] - goal)
-        assert f"2 {away:#.3g}" in page.locator(".chart").first.inner_text().replace("\n", " ")
+        shown = page.locator(".chart").first.inner_text().replace("\n", " ")
+        assert f"2 {away:#.3g}" in shown and "1 \u2013 leads" in shown
         seek(page, 50)
         assert page.evaluate("echelon.run.leaders") == [0]
 

@@ -460,3 +460,20 @@ def test_lines_that_have_names_differ_in_grey_too():
         for j, other in enumerate(looks[:i]):
             apart = abs(shades[i] - shades[j]) > 0.06
             assert apart or one["linestyle"] != other["linestyle"], (i, j)
+
+
+def test_a_lost_leader_has_no_values_after_its_loss(long):
+    lost = dataclasses.replace(
+        long,
+        schedule=Schedule(
+            np.array([0.0, 5.0]),
+            np.ones((2, len(long.edges))),
+            None,
+            np.array([[True] * 4, [False, True, True, True]]),
+        ),
+    )
+    for name in ("tracking", "states"):
+        for ax in figures(lost, [name])[name].axes:
+            line = ax.get_lines()[0]
+            times, values = line.get_xdata(), line.get_ydata()
+            assert np.array_equal(np.isfinite(values), times < 5.0)

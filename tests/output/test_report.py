@@ -131,3 +131,33 @@ def test_wind_is_not_blamed_where_the_loop_grows_by_itself():
     ]
     assert "as expected under a disturbance" in told[0]
     assert "`dt` is too long for an input" in told[1] and "as expected" not in told[1]
+
+
+def cut_off(span):
+    """Return the causes in the report of carts in a line whose last one is cut off for a time."""
+    cart, graph = ech.models.DoubleIntegrator(), ech.Graph.path(4)
+    places = ech.Formation.from_offsets(cart, graph, {k: [float(k), 0.0] for k in (1, 2, 3)})
+    events = [ech.network.Cut((2, 3), at=0.5, duration=span)]
+    gain = ech.synthesize(cart, graph, ech.gains.Riccati())
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    parts = ech.Parts(cart, graph, places, laws, {"position": 0.5}, events=events)
+    result = ech.simulate(parts, ech.Settings(horizon=5.0, dt=0.01))
+    return [line for line in ech.report(result).split("- ") if line.startswith("Cause: ")]
+
+
+def test_an_agent_that_nobody_sent_anything_is_named_with_the_times():
+    first = " ".join(cut_off(4.0)[0].split())
+    assert first == (
+        "Cause: agent 3 received nothing from 0.5 s to 4.5 s, since no link led to it; give it "
+        "another link at that time, or use the law `stopping-point`, under which an agent alone "
+        "remains stable."
+    )
+
+
+def test_a_short_silence_without_harm_and_an_agent_that_is_heard_are_no_cause():
+    assert not any("received nothing" in cause for cause in cut_off(0.05))
+
+
+def test_a_mode_that_does_not_decay_is_a_cause_in_words():
+    told = cut_off(4.0)
+    assert any("not every mode decays, over " in " ".join(cause.split()) for cause in told)

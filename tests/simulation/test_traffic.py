@@ -9,7 +9,7 @@ from echelon.agents.network.channel import NEVER
 from echelon.agents.network.hearing import edges_of
 from echelon.core.numerics import precision
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.engine.traffic import traffic
+from echelon.simulation.engine.traffic import Traffic, traffic
 from echelon.simulation.step.loop import assemble
 from echelon.simulation.step.sequence import begin, step
 
@@ -129,3 +129,12 @@ def test_a_run_reports_its_messages():
     ideal = ech.simulate(parts_of(None), ech.Settings(horizon=1.0, dt=DT))
     assert ideal.traffic is None and ech.summary(ideal)["messages_sent"] is None
     assert "age" not in ech.dataset(ideal) and "Messages" not in ech.report(ideal)
+
+
+def test_messages_of_an_absent_sender_have_no_age():
+    ages = np.array([[[0.1, 0.2], [0.3, 0.4]], [[0.5, 0.6], [0.7, 0.8]]])
+    found = Traffic(ages, np.zeros((2, 2, 2), int), 0, 0, 0, 0.8, 0.4)
+    edges = np.array([[0, 1], [1, 2]])
+    here = np.array([[True, True, True], [False, True, True]])
+    expected = [[0.1, 0.3, 0.4], [np.nan, 0.7, 0.8]]
+    np.testing.assert_array_equal(found.of_agents(edges, 3, here), expected)

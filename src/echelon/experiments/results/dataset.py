@@ -149,7 +149,7 @@ def _messages(result: Result) -> Variables:
     if network is None or traffic is None:
         return {}
     link, seconds = ("time", "edge", "end"), {"units": "s"}
-    ages = traffic.of_agents(result.graph.edges, result.graph.agents)
+    ages = traffic.of_agents(result.graph.edges, result.graph.agents, result.presence)
     return {
         "age": (("time", "agent"), ages, seconds),
         "edge_age": (link, traffic.ages, seconds),
@@ -171,9 +171,12 @@ def _avoidance(result: Result) -> Variables:
 
 
 def _poles(result: Result) -> Variables:
-    """Return the poles of the linearized loop; nothing where laws have none."""
+    """Return the poles of the linearized loop; nothing where laws have none.
+
+    The law `stopping-point` closes chains by its roots, and only their agreement is in the loop.
+    """
     guarantee = promise(result.parts, result.settings)
-    if not guarantee.linear:
+    if not guarantee.linear or guarantee.agreement is not None:
         return {}
     poles, values = guarantee.loop.poles, guarantee.loop.eigenvalues
     imaginary = {"mode_eigenvalue_imaginary": ("mode", np.imag(values))}

@@ -6,7 +6,7 @@ All figures draw a recording, so that a stored run gives the same figures as the
 import dataclasses
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, final
 
@@ -233,9 +233,16 @@ class Recording(FrameNumbers):
     def loads(self) -> Float[np.ndarray, "T N k"] | None:
         """Loads of the inputs, NaN of absent agents; None where they have none."""
         loads = None if self.bounds is None else self.bounds.loads(self.inputs)
-        if loads is None or self.presence is None:
-            return loads
-        return np.where(self.presence[:, :, None], loads, np.nan)
+        return None if loads is None else self.while_present(loads, range(self.agents))
+
+    def while_present(
+        self, values: Float[np.ndarray, "T K *s"], agents: Sequence[int]
+    ) -> Float[np.ndarray, "T K *s"]:
+        """Return values of some agents over time, NaN while those are absent."""
+        if self.presence is None:
+            return values
+        here = self.presence[:, list(agents)]
+        return np.where(here.reshape(*here.shape, *[1] * (values.ndim - 2)), values, np.nan)
 
 
 def read_recording(file: Path) -> Recording:

@@ -126,10 +126,11 @@ def _decaying(case: Case) -> Statement:
     if case.fed_by_parents:
         text = "over the edges' weights, as parents' inputs are fed forward"
     elif len(loop.closed.eigenvalues) > loop.certificate.modes:
-        text = f"at lambda_min and lambda_max; {'all' if loop.every else 'not all'} between decay"
+        text = f"at lambda_min and lambda_max{'; all between decay' if loop.every else ''}"
     number = loop.slowest, f"{at_least(loop.slowest)} 1/s"
     if loop.every:
         return holds(name, _LINEAR, text, *number)
+    text = f"not every mode decays, {text}"
     remedy = "raise `coupling`, or let `echelon design` find a gain that decays"
     reason = "the disagreement does not decay"
     return fails(name, _LINEAR, text, *number, remedy=remedy, reason=reason)

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 
 def table(run: "Result | Recording", every: int = 1) -> "pd.DataFrame":
-    """Return one row per time and agent, with a column for each state and input.
+    """Return one row per time and agent that is there, with a column for each state and input.
 
-    The columns are `time` (s), `agent`, `leader` (whether it leads), the states and inputs by name
-    (an input that has the name of a state as `input_NAME`), and `formation_error`, the distance
-    from the goal. `attrs["units"]` has the unit of each column that has one.
+    The columns are `time` (s), `agent`, `leader` (whether it leads then), the states and inputs by
+    name (an input that has the name of a state as `input_NAME`), and `formation_error`, the
+    distance from the goal. `attrs["units"]` has the unit of each column that has one.
 
     Args:
         run: a result.
@@ -55,7 +55,7 @@ def table(run: "Result | Recording", every: int = 1) -> "pd.DataFrame":
     columns: JsonObject = {
         "time": np.repeat(run.times[::every], agents),
         "agent": np.tile(np.arange(agents), frames),
-        "leader": np.tile(np.isin(np.arange(agents), run.leaders), frames),
+        "leader": (run.nearest_then[::every] == np.arange(agents)).ravel(),
         **{name: states[:, :, k].ravel() for k, name in enumerate(run.state_names)},
     }
     units = {"time": "s", **dict(zip(run.state_names, run.state_units, strict=True))}
@@ -66,6 +66,9 @@ def table(run: "Result | Recording", every: int = 1) -> "pd.DataFrame":
     columns["formation_error"] = run.goal_distances(slice(None, None, every)).ravel()
     units["formation_error"] = run.length_unit
     frame = pd.DataFrame(columns)
+    # What is stored of an agent that is absent is where it was lost, and no motion.
+    if run.presence is not None:
+        frame = frame[run.presence[::every].ravel()].reset_index(drop=True)
     frame.attrs["units"] = {name: unit for name, unit in units.items() if unit}
     return frame
 

@@ -47,6 +47,7 @@ def tracking(run: Recording) -> "Figure | None":
     errors, names, units = run.tracking
     # Nobody can distinguish the lines of more leaders than have names.
     leaders = run.leaders if len(run.leaders) <= draw.NAMED else run.leaders[:1]
+    errors = run.while_present(errors[:, : len(leaders)], leaders)
     cut = [False]
 
     def show(ax: "Axes", frames: Array, unit: str) -> None:
@@ -213,10 +214,11 @@ def states_over_time(run: Recording, agents: Iterable[int]) -> "Figure":
     references = [reference_of(run, agent) for agent in agents]
     # With followers in the figure references would hide their lines.
     guides = references if set(agents) <= {*run.leaders} else []
+    shown = run.while_present(run.states[:, agents], agents)
     cut = [False]
 
     def show(ax: "Axes", frames: Array, k: int) -> None:
-        paths = run.states[:, agents, k, None]
+        paths = shown[:, :, k, None]
         anchors = [references[0][:, k, None]] if references[0] is not None else []
         values, over = draw.drop_runaways(paths, paths[0], *anchors)
         for name, guide in zip(["reference", *[None] * len(guides)], guides):

@@ -1,13 +1,16 @@
 """Causes of a poor run, each with a remedy."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from echelon.core.digits import at_least
 from echelon.core.errors import Outcome
 from echelon.core.statement import Cause, Hypothesis
+from echelon.core.words import amount
 from echelon.experiments.results.agent_metrics import Metrics
+from echelon.experiments.results.silences import silences
 from echelon.guarantees.promises.promise import Promise
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED
@@ -22,6 +25,8 @@ _CHATTERS = 20
 
 def causes(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[Cause]:
     """Yield the causes of large errors, each with a remedy."""
+    alone = _alone(result)
+    yield from () if alone is None else (alone.cause,)
     if len(result.times):
         settled = all(follower.settling_time is not None for follower in numbers.followers)
         lost = grows(result, guarantee)
@@ -39,7 +44,36 @@ def causes(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[Cau
             "that of the trim",
             "start closer to the trim, or slow the reference",
         )
-    yield from _chatter(result)
+    yield from _chatter(result, () if alone is None else alone.agents)
+
+
+class _Alone(NamedTuple):
+    """Followers whose errors did not shrink while no link led to them."""
+
+    agents: tuple[int, ...]
+    cause: Cause
+
+
+def _alone(result: Result) -> _Alone | None:
+    """Return which followers lost their way while nobody was linked to them; None without any."""
+    away = result.formation_errors
+    spans: dict[int, tuple[float, float]] = {}
+    for agent, start, end in silences(result):
+        frames = np.flatnonzero((result.times >= start) & (result.times <= end))
+        errors = away[frames, agent]
+        lost = len(frames) and not errors[-1] <= max(SETTLED, errors[0])
+        if lost and end - start > np.subtract(*spans.get(agent, (0.0, 0.0))[::-1]):
+            spans[agent] = start, end
+    if not spans:
+        return None
+    worst = max(spans, key=lambda agent: spans[agent][1] - spans[agent][0])
+    more = f"; so did {amount(len(spans) - 1, 'other agent')} at some time" * (len(spans) > 1)
+    start, end = spans[worst]
+    text = f"agent {worst} received nothing from {start:g} s to {end:g} s, since no link led to it"
+    remedy = "give it another link at that time"
+    if result.drive.gain is not None:
+        remedy += ", or use the law `stopping-point`, under which an agent alone remains stable"
+    return _Alone(tuple(spans), Cause(text + more, remedy))
 
 
 def beyond(saturated: float, guarantee: Promise) -> Iterator[Cause]:
@@ -118,9 +152,14 @@ def _falls(result: Result, steady: float) -> bool:
         return float(np.linalg.norm(away[..., list(result.measured)])) < 0.5 * steady
 
 
-def _chatter(result: Result) -> Iterator[Cause]:
-    """Yield that a step is so long that inputs alternate between their limits."""
+def _chatter(result: Result, alone: Sequence[int]) -> Iterator[Cause]:
+    """Yield that a step is so long that inputs alternate between their limits.
+
+    Inputs of agents that tumbled `alone` do so at any step.
+    """
     agent = int(result.chatter.argmax())
+    if agent in alone:
+        return
     if result.chatter[agent] > _CHATTERS:
         yield Cause(
             f"the inputs of agent {agent} jumped from one limit to the other "

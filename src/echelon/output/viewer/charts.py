@@ -83,10 +83,13 @@ def _frames(run: Recording) -> Array:
 def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
     errors, followers = run.formation_errors, list(run.followers)
     here = np.ones_like(errors, bool) if run.presence is None else run.presence
-    none = {} if run.presence is None else {"none": "\u2013 absent"}
+    # An agent that leads is its own goal, and has no error to show.
+    leads = run.nearest_then == np.arange(run.agents)
     if 0 < len(followers) <= NAMED:
+        shown = np.where(here & ~leads, errors, np.nan)
         lines = [
-            sheet.line(str(agent), np.where(here, errors, np.nan)[:, agent], place, True) | none
+            sheet.line(str(agent), shown[:, agent], place, True)
+            | _without(not here[:, agent].all(), bool(leads[:, agent].any()))
             for place, agent in enumerate(followers)
         ]
     else:
@@ -107,13 +110,20 @@ def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
     return _chart("formation error", run.length_unit, True, lines, marks)
 
 
+def _without(absent: bool, leads: bool) -> JsonObject:
+    """Return what a line shows where an agent has no value; nothing where it always has one."""
+    words = " or ".join(["absent"] * absent + ["leads"] * leads)
+    return {"none": f"\u2013 {words}"} if words else {}
+
+
 def _off_reference(run: Recording, reference: Float[Array, "T n"]) -> Float[Array, " T"]:
     """Return the largest distance of a leader from its place beside the reference."""
     leaders, measured = list(run.leaders), list(run.measured)
     if run.presence is not None:
         leads = (run.nearest_then == np.arange(run.agents)) & run.presence
         away = (run.states - run.offsets_in() - reference[:, None])[:, :, measured]
-        return np.where(leads, np.linalg.norm(away, axis=2), 0.0).max(axis=1)
+        largest = np.where(leads, np.linalg.norm(away, axis=2), 0.0).max(axis=1)
+        return np.where(leads.any(axis=1), largest, np.nan)
     away = run.states[:, leaders] - run.offsets_in()[..., leaders, :] - reference[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
         return np.linalg.norm(away[:, :, measured], axis=2).max(axis=1)

@@ -64,11 +64,17 @@ class Traffic(NamedTuple):
     largest: float
     mean: float
 
-    def of_agents(self, edges: Int[Array, "E 2"], agents: int) -> Float[Array, "T N"]:
-        """Return the age of the oldest message that each agent has of its neighbours, s."""
+    def of_agents(
+        self, edges: Int[Array, "E 2"], agents: int, presence: Bool[Array, "T N"] | None = None
+    ) -> Float[Array, "T N"]:
+        """Return the age of the oldest message that each agent has of its neighbours, s.
+
+        Neighbours that are absent do not count, and an agent that is absent has none.
+        """
         ages = np.full((agents, len(self.ages)), -np.inf)
+        both = True if presence is None else presence[:, edges].all(axis=2)
         for end in (0, 1):
-            known = np.nan_to_num(self.ages[:, :, end], nan=-np.inf)
+            known = np.nan_to_num(np.where(both, self.ages[:, :, end], np.nan), nan=-np.inf)
             np.maximum.at(ages, edges[:, end], known.T)
         return np.where(ages > -np.inf, ages, np.nan).T
 
