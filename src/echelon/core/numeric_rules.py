@@ -179,16 +179,11 @@ NUMERIC: dict[str, Callable[..., np.ndarray | None]] = {
     **{
         name: _numeric(full)
         for name, full in {
-            **{
-                "add": "add",
-                "add_any": "add",
-                "sub": "subtract",
-                "mul": "multiply",
-                "neg": "negative",
-            },
+            **{"add": "add", "sub": "subtract", "mul": "multiply", "neg": "negative"},
+            **{"add_any": "add", "not": "invert"},
             **{"lt": "less", "le": "less_equal", "gt": "greater", "ge": "greater_equal"},
             **{"eq": "equal", "ne": "not_equal", "max": "maximum", "min": "minimum"},
-            **{"and": "bitwise_and", "or": "bitwise_or", "not": "invert", "abs": "abs"},
+            **{"and": "bitwise_and", "or": "bitwise_or", "abs": "abs"},
         }.items()
     },
     "copy": lambda params, x: x,
