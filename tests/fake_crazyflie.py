@@ -3,7 +3,8 @@
     python fake_crazyflie.py '{"port": 19850, "starts": [[0, 0, 1]], "file": "flown.npz"}'
 
 serves one port for each vehicle in real time until its standard input ends, and then writes what
-was flown. `Crazyflie` holds the packets alone, without sockets, clocks and vehicles.
+was flown; a line `cut 0 1.5` there silences the first vehicle for 1.5 s. `Crazyflie` holds the
+packets alone, without sockets, clocks and vehicles.
 """
 
 import json
@@ -15,7 +16,7 @@ import sys
 import time
 
 import numpy as np
-from fake_vehicles import IDENTIFIED, Vehicles
+from fake_vehicles import IDENTIFIED, Radio, Recorder, Vehicles
 
 PROTOCOL = 12
 LOGS = [*((f"stateEstimateZ.{k}", 5, "h") for k in ("x", "y", "z", "vx", "vy", "vz")),
@@ -160,27 +161,36 @@ class Crazyflie:
         return due
 
 
-def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=None, speed=1.0):
+def serve(
+    port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=None, speed=1.0,
+    controller=None,
+):  # fmt: skip
     """Serve vehicles until the standard input ends; in slow motion with a speed below 1."""
-    vehicles = Vehicles(starts, mass, gain, lag, **(response or IDENTIFIED))
+    vehicles = Vehicles(starts, mass, gain, lag, controller=controller, **(response or IDENTIFIED))
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in starts]
     for k, end in enumerate(sockets):
         end.bind(("127.0.0.1", port + k))
         end.setblocking(False)
     crazyflies, peers = [Crazyflie() for _ in starts], [None] * len(starts)
-    rows, dt, real, begun, steps = [], 0.002, 0.002 / speed, time.monotonic(), 0
+    radio = Radio(len(starts))
+    flown, dt, real, begun, steps = Recorder(), 0.002, 0.002 / speed, time.monotonic(), 0
     print("ready", flush=True)
     while True:
         now = time.monotonic()
         ends, _, _ = select.select(
             [*sockets, sys.stdin], [], [], max(0.0, begun + steps * real - now)
         )
-        if sys.stdin in ends:
-            break
         now = time.monotonic()
+        if sys.stdin in ends:
+            if radio.ends(now):
+                break
+            ends.remove(sys.stdin)
         for end in ends:
             k = sockets.index(end)
-            packet, peers[k] = end.recvfrom(64)
+            packet, peer = end.recvfrom(64)
+            if not radio.open(k, now):
+                continue
+            peers[k] = peer
             for answer in crazyflies[k].answer(packet, speed * now):
                 end.sendto(answer, peers[k])
         while begun + steps * real <= now:
@@ -188,13 +198,12 @@ def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=No
             vehicles.step(dt)
             steps += 1
         state = vehicles.p, vehicles.v, vehicles.q, vehicles.w
-        rows.append([begun + steps * real, *vehicles.p.ravel()])
+        flown.add(begun + steps * real, vehicles)
         for k, each in enumerate(crazyflies):
             for packet in each.logged(*(part[k] for part in state), speed * now):
-                if peers[k]:
+                if peers[k] and radio.open(k, now):
                     sockets[k].sendto(packet, peers[k])
-    flown = np.array(rows)
-    np.savez(file, times=flown[:, 0], places=flown[:, 1:].reshape(len(flown), -1, 3))
+    flown.save(file)
 
 
 if __name__ == "__main__":

@@ -3,8 +3,9 @@
     python fake_px4.py '{"port": 14540, "starts": [[0, 0, 1]], "file": "flown.npz"}'
 
 sends to one port for each vehicle in real time until its standard input ends, and then writes what
-was flown. As PX4, it enters OFFBOARD only after setpoints at 2 Hz, obeys them there alone, and
-leaves it 1 s after the last one.
+was flown; a line `cut 0 1.5` there silences the first vehicle for 1.5 s. As PX4, it enters OFFBOARD
+only after setpoints at 2 Hz, obeys them there alone, and leaves it 1 s after the last one, when it
+levels.
 """
 
 import json
@@ -15,7 +16,7 @@ import sys
 import time
 
 import numpy as np
-from fake_vehicles import GRAVITY, IDENTIFIED, Vehicles
+from fake_vehicles import GRAVITY, IDENTIFIED, Radio, Recorder, Vehicles
 
 os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil  # noqa: E402
@@ -46,9 +47,9 @@ class Px4:
         self.came = [-np.inf] * 3
         self.period, self.logged, self.beat = 0.02, -np.inf, -np.inf
 
-    def receive(self, now):
+    def receive(self, now, heard):
         while (message := self.wire.recv_msg()) is not None:
-            kind = message.get_type()
+            kind = message.get_type() if heard else ""
             if kind == "SET_ATTITUDE_TARGET":
                 self.target(message, now)
             elif kind == "PARAM_REQUEST_READ" and message.param_id == "MPC_THR_HOVER":
@@ -75,6 +76,7 @@ class Px4:
     def acting(self, now, height):
         if self.mode == OFFBOARD and now - self.came[-1] > LOST:
             self.mode, self.beat = (4, 3), -np.inf
+            self.command = np.array([0.0, 0.0, 0.0, self.weight])
         if self.mode == LAND:
             self.command = np.array([0.0, 0.0, 0.0, 0.95 * self.weight * (height > 0.05)])
         return self.command
@@ -100,27 +102,29 @@ def serve(port, starts, file, mass=0.0319, gain=0.97605781, lag=0.0, response=No
     """Serve vehicles until the standard input ends; in slow motion with a speed below 1."""
     vehicles = Vehicles(starts, mass, gain, lag, **(response or IDENTIFIED))
     each = [Px4(port + k, mass * GRAVITY / gain) for k in range(len(starts))]
-    rows, dt, real, begun, steps = [], 0.002, 0.002 / speed, time.monotonic(), 0
+    radio = Radio(len(starts))
+    flown, dt, real, begun, steps = Recorder(), 0.002, 0.002 / speed, time.monotonic(), 0
     print("ready", flush=True)
     while True:
         wait = max(0.0, begun + steps * real - time.monotonic())
         ends, _, _ = select.select([*(px4.wire.fd for px4 in each), sys.stdin], [], [], wait)
-        if sys.stdin in ends:
-            break
         now = time.monotonic()
-        for px4 in each:
-            px4.receive(now)
+        if sys.stdin in ends and radio.ends(now):
+            break
+        for k, px4 in enumerate(each):
+            px4.receive(now, radio.open(k, now))
         while begun + steps * real <= now:
             vehicles.command = np.array(
                 [px4.acting(now, z) for px4, z in zip(each, vehicles.p[:, 2], strict=True)]
             )
             vehicles.step(dt)
             steps += 1
-        rows.append([begun + steps * real, *vehicles.p.ravel()])
+        flown.add(begun + steps * real, vehicles)
         for k, px4 in enumerate(each):
+            if not radio.open(k, now):
+                continue
             px4.send(speed * now, vehicles.p[k], vehicles.v[k], vehicles.q[k], vehicles.w[k])
-    flown = np.array(rows)
-    np.savez(file, times=flown[:, 0], places=flown[:, 1:].reshape(len(flown), -1, 3))
+    flown.save(file)
 
 
 if __name__ == "__main__":

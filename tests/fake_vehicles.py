@@ -1,5 +1,7 @@
 """Rigid bodies with four motors under an attitude controller, which stand in for real vehicles."""
 
+import sys
+
 import numpy as np
 
 ARM, INERTIA = 0.0325, np.array([16.571710e-6, 16.655602e-6, 29.261652e-6])
@@ -35,31 +37,71 @@ def angles(q):
     return np.stack([roll, pitch, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], 1)
 
 
+class Recorder:
+    """Times (s), places (N, 3) and tilts (N,) in degrees, of one step after the other."""
+
+    def __init__(self):
+        self.times, self.places, self.tilts = [], [], []
+
+    def add(self, now, vehicles):
+        self.times.append(now)
+        self.places.append(vehicles.p.copy())
+        upright = 1.0 - 2.0 * np.sum(vehicles.q[:, 1:3] ** 2, axis=1)
+        self.tilts.append(np.degrees(np.arccos(np.clip(upright, -1.0, 1.0))))
+
+    def save(self, file):
+        np.savez(file, times=self.times, places=self.places, tilts=self.tilts)
+
+
+class Radio:
+    """What reaches vehicles: a line `cut K SECONDS` on the standard input silences one."""
+
+    def __init__(self, count):
+        self.until = [-np.inf] * count
+
+    def open(self, k, now):
+        """Whether a vehicle is reached at a time (s)."""
+        return now >= self.until[k]
+
+    def ends(self, now):
+        """Whether the standard input, which has something to say, ended; a cut begins now (s)."""
+        words = sys.stdin.readline().split()
+        if words:
+            self.until[int(words[1])] = now + float(words[2])
+        return not words
+
+
 class Vehicles:
     """N of them. They are held at their starts until a first thrust is commanded.
 
     `command` (N, 4) is roll, pitch (rad), yaw rate (rad/s), thrust (N); it may be changed any time.
+    `controller` takes the vehicles and returns the forces (N, 4) that it asks of their motors, N;
+    without one an attitude controller of `response` does.
     """
 
-    def __init__(self, starts, mass, gain=1.0, lag=0.0, motor=0.12, **response):
+    def __init__(self, starts, mass, gain=1.0, lag=0.0, motor=0.12, controller=None, **response):
         count = len(starts)
         self.mass, self.gain, self.lag, self.motor, self.response = mass, gain, lag, motor, response
+        self.controller = controller or Vehicles.responding
         self.p, self.v, self.w = np.array(starts, float), np.zeros((count, 3)), np.zeros((count, 3))
         self.q = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
         self.command = np.zeros((count, 4))
         self.force = np.full((count, 4), mass * GRAVITY / 4)
         self.held = np.ones(count, bool)
 
-    def step(self, dt):
-        """Advance by dt (s)."""
+    def responding(self):
+        """The forces that answer the command by `response`."""
         zeta, at = angles(self.q), self.response
         turn = -at["damp"] * self.w
         turn[:, :2] += at["command"] * self.command[:, :2] - at["stiff"] * zeta[:, :2]
         turn[:, 2] = at["turn"] * (self.command[:, 2] - self.w[:, 2])
         torque = INERTIA * turn + cross(self.w, INERTIA * self.w)
+        return np.concatenate([self.gain * self.command[:, 3:], torque], 1) @ PULL
+
+    def step(self, dt):
+        """Advance by dt (s)."""
         on = self.command[:, 3:] > 0.0
-        asked = np.concatenate([self.gain * self.command[:, 3:], torque], 1) @ PULL
-        asked = np.where(on, np.clip(asked, 0.0, self.motor), 0.0)
+        asked = np.where(on, np.clip(self.controller(self), 0.0, self.motor), 0.0)
         share = 1.0 if self.lag == 0.0 else 1.0 - np.exp(-dt / self.lag)
         self.force += share * (asked - self.force)
         wrench = self.force @ MIX.T

@@ -38,6 +38,8 @@ CASES = {
     "a border": lambda x: jnp.pad(x, ((0, 1), (2, 0), (0, 0)), constant_values=3.0),
     "truths": lambda x: ((x > 0.0) & (jnp.abs(x) < 1.0) | ~(x < 0.5)).any(axis=(0, 2)),
     "all of them": lambda x: (x > -9.0).all(axis=1),
+    "a quotient": lambda x: jnp.stack([x / 3.0, 1.0 / (0.0 * x), x[0, 0, 0] / jnp.abs(x)]),
+    "powers": lambda x: jnp.stack([x**k for k in (-3, -1, 2, 3, 5, 8)]),
     "bits": lambda x: (jnp.arange(6) & 3) | ~jnp.arange(6),
 }
 
@@ -53,7 +55,9 @@ def test_numbers_are_those_of_jax_to_the_bit_without_jax(name, monkeypatch):
 
 
 OTHERS = {
-    "a quotient": lambda x: jnp.stack([x / 3.0, 1.0 / (0.0 * x), x[0, 0, 0] / jnp.abs(x)]),
+    "a quotient without digits": lambda x: x / 1e308 / 1e7,
+    "a power without digits": lambda x: (1e-80 * x) ** 4,
+    "a power of whole numbers": lambda x: jnp.arange(-3, 3) ** 3,
     "outside": lambda x: x[0].at[jnp.array([1, 9])].get(mode="fill"),
     "written outside": lambda x: x.at[jnp.array([1, 9])].set(2.0),
     "less": lambda x: jax.lax.pad(x, 0.0, ((-1, 0, 0), (0, 0, 1), (0, 0, 0))),

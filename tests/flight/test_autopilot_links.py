@@ -372,5 +372,5 @@ def test_offboard_is_asked_for_after_a_second_of_setpoints_until_it_is_there(px4
 def test_px4_that_does_not_tell_its_hover_thrust_is_refused(px4, monkeypatch):
     clock = iter(range(100))
     monkeypatch.setattr("time.monotonic", lambda: float(next(clock)))
-    with pytest.raises(FlightError, match="PX4 does not tell its parameter `MPC_THR_HOVER`"):
+    with pytest.raises(FlightError, match="PX4 does not send its parameter `MPC_THR_HOVER`"):
         px4()

@@ -76,10 +76,11 @@ def served(script, **settings):
     with subprocess.Popen(command, stdin=-1, stdout=-1, text=True) as process:
         assert process.stdout.readline() == "ready\n"
         try:
-            yield
+            yield process
         finally:
             process.stdin.close()
-            assert process.wait(10) == 0
+            # A test may have killed it.
+            assert process.wait(10) in (0, -9)
 
 
 class Flown:
@@ -101,7 +102,8 @@ class Flown:
         """Take a step; returns what the agent feeds forward."""
         hears, weights = self.facts["hears"], self.facts["weights"]
         gaps = [self.law["difference"](t, self.x, self.memory, signals[k]) for k in hears]
-        z = [sum(w * gap[n] for w, gap in zip(weights, gaps, strict=True)) for n in range(12)]
+        size = range(len(self.facts["signal"]))
+        z = [sum(w * gap[n] for w, gap in zip(weights, gaps, strict=True)) for n in size]
         u, self.memory, _, message, valid = self.law["tick"](t, self.x, z, forward, self.memory)
         assert valid
         self.link.send(u)
@@ -122,8 +124,12 @@ def fly(parts, links):
     return begin
 
 
-def fly_processes(folder, model, laws, links, port):
-    """Fly a formation by `echelon fly`, a process an agent; returns when the plan began."""
+@contextlib.contextmanager
+def started(folder, model, laws, links, port):
+    """Start a formation by `echelon fly`, a process an agent.
+
+    Yields the ground station, the processes, and when the plan began.
+    """
     parts = formation(model, laws, ech.Network(rate=50.0))
     save_flight(flight_files(parts, ech.Settings(horizon=SECONDS, dt=DT), "four"), folder)
     mission, key, ports = Mission(folder), folder / "key", ports_of(4, port)
@@ -132,7 +138,7 @@ def fly_processes(folder, model, laws, links, port):
     command = [sys.executable, "-m", "echelon.flight", folder, "--key", key, "--port", str(port)]
     command += ["--speed", str(SPEED)]
     flying = [
-        subprocess.Popen([*command, "--agent", str(k), "--link", link])
+        subprocess.Popen([*command, "--agent", str(k), "--link", link], stderr=-1, text=True)
         for k, link in enumerate(links)
     ]
     try:
@@ -140,13 +146,20 @@ def fly_processes(folder, model, laws, links, port):
         while not ground.ready:
             assert time.monotonic() < until and all(one.poll() is None for one in flying)
             time.sleep(0.05)
-        begin = time.monotonic() + 0.5
         ground.start(time.time() + 0.5)
-        # At the end of the plan they descend, and end by themselves.
-        assert [one.wait(SECONDS / SPEED + 30.0) for one in flying] == [0] * 4
+        yield ground, flying, time.monotonic() + 0.5
     finally:
         for one in flying:
             one.kill()
+            one.communicate()
+        ground.close()
+
+
+def fly_processes(*arguments):
+    """Fly a formation by `echelon fly` to its end; returns when the plan began."""
+    with started(*arguments) as (_, flying, begin):
+        # At the end of the plan they descend, and end by themselves.
+        assert [one.wait(SECONDS / SPEED + 30.0) for one in flying] == [0] * 4
     return begin
 
 
@@ -257,3 +270,50 @@ def test_a_crazyflie_whose_process_is_killed_levels_and_stops(tmp_path):
     # Tilted until half a second after the last command, then level, then without motors.
     level = speed[(t > 0.9) & (t < 1.5)]
     assert np.ptp(level) < 0.05 and abs(level.mean()) > 0.3 and places[-1, 2] < 0.05
+
+
+# A cut in s of the plan; 0: the vehicle's program is killed.
+BREAKS = [(name, cut) for name in SCRIPTS for cut in (1.0, 5.0, 0.0)]
+
+
+@pytest.mark.parametrize(("name", "cut"), BREAKS)
+def test_a_link_that_breaks_in_the_air(tmp_path, name, cut):
+    """Agent 2 descends level and says why, here and on the page; the others fly on."""
+    library, needed, script, address = SCRIPTS[name]
+    extra(library, needed)
+    number, file = BREAKS.index((name, cut)), str(tmp_path / "broken.npz")
+    port, model, at = 19900 + 10 * number, CrazyflieAttitude(), starts()
+    links = [address.format(port + k) for k in (0, 1, 5, 2)]
+    others = {"port": port, "starts": [at[0], at[1], at[3]], "file": str(tmp_path / "others.npz")}
+    own = served(script, port=port + 5, starts=[at[2]], file=file)
+    flight = started(tmp_path / "flight", model, consensus, links, 52400 + 10 * number)
+    with served(script, **others), own as broken, flight as (ground, flying, begin):
+        time.sleep(max(0.0, begin + 6.0 / SPEED - time.monotonic()))
+        since = time.monotonic()
+        if cut:
+            print(f"cut 0 {cut / SPEED}", file=broken.stdin, flush=True)
+        else:
+            broken.kill()
+        time.sleep(0.5 / SPEED)
+        row = ground.state()["agents"][2]
+        assert row["mode"] == "descends" and row["why"].startswith("the newest state is 0.1")
+        codes = [flying[k].wait((SECONDS + 30.0) / SPEED) for k in (2, 0, 1, 3)]
+        assert codes == [1, 0, 0, 0]
+        said = flying[2].communicate()[1]
+    assert said.count("more than 0.1 s; the vehicle levels and descends.") == 1
+    if cut:
+        check_landing(np.load(file), since, name, cut)
+
+
+def check_landing(flown, since, name, cut):
+    """Check that a vehicle whose link broke at a time (s) is soon level, and then on the ground."""
+    times = np.arange(0.0, 12.0, 0.05)
+    t = (flown["times"] - since) * SPEED
+    tilts, heights = (
+        np.interp(times, t, part) for part in (flown["tilts"][:, 0], flown["places"][:, 0, 2])
+    )
+    alone = {"cflib": 0.5, "px4": 1.0}[name]
+    assert tilts[times > alone + 0.7].max() < 0.5 and heights[-1] < 0.06
+    # After 2 s without commands a Crazyflie stops its motors, and falls.
+    falls = (name, cut) == ("cflib", 5.0)
+    assert (np.diff(heights).min() / 0.05 < -2.0) == falls

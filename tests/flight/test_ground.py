@@ -64,10 +64,8 @@ MISTAKES = {
     "a datagram of agent 1 is signed with another key: 1": lambda now: wire(1, b"other" * 8).report(
         now, REPORT
     ),
-    "a datagram of agent 1 is stamped more than 1 s beside this clock: 1": lambda now: wire(
-        1
-    ).report(now + 1.2, REPORT),
-    "a datagram has another length than any datagram of this formation: 1": lambda now: b"x" * 99,
+    f"a datagram of agent 1 {Drop.CLOCK.value}: 1": lambda now: wire(1).report(now + 1.2, REPORT),
+    "a datagram has a length that no datagram of this formation has: 1": lambda now: b"x" * 99,
 }
 
 

@@ -70,7 +70,7 @@ def test_the_page_shows_who_is_alive_and_its_button_stops_all(mission):
         urllib.request.urlopen(urllib.request.Request(f"{address}stop", b""))
         wait_until(together, 1.6)
         rows = json.load(urllib.request.urlopen(f"{address}state"))["agents"]
-        assert {row["why"] for row in rows} == {"somebody with the key said stop"}
+        assert {row["why"] for row in rows} == {"a signed stop command arrived"}
         assert "Ground station" in urllib.request.urlopen(address).read().decode()
 
 

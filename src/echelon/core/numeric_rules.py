@@ -144,18 +144,51 @@ def _numeric(name: str) -> Rule:
     return lambda params, *arrays: getattr(np, name)(*arrays)
 
 
+def _quotient(params: Params, x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
+    with np.errstate(all="ignore"):
+        return None if x.dtype.kind != "f" else _unless_tiny(x / y, x, y)
+
+
+def _integer_power(params: Params, x: np.ndarray) -> np.ndarray | None:
+    """Return a power by the products of JAX, in its order."""
+    if x.dtype.kind != "f" or params["y"] == 0:
+        return None
+    rest, square, power, parts = abs(params["y"]), x, None, [x]
+    with np.errstate(all="ignore"):
+        while rest:
+            if rest & 1:
+                power = square if power is None else power * square
+                parts.append(power)
+            rest >>= 1
+            square = square * square if rest else square
+            parts.append(square)
+        assert power is not None
+        result = power if params["y"] > 0 else np.ones((), x.dtype) / power
+    return _unless_tiny(result, *parts)
+
+
+def _unless_tiny(result: np.ndarray, *parts: np.ndarray) -> np.ndarray | None:
+    """Return a result, but None where a number has so few digits that JAX takes it for 0."""
+    least = np.finfo(result.dtype).tiny
+    tiny = any(((a != 0.0) & (np.abs(a) < least)).any() for a in (result, *parts))
+    return None if tiny else result
+
+
 NUMERIC: dict[str, Callable[..., np.ndarray | None]] = {
     **MOVES,
     **{
         name: _numeric(full)
         for name, full in {
             **{"add": "add", "sub": "subtract", "mul": "multiply", "neg": "negative"},
+            **{"add_any": "add", "not": "invert"},
             **{"lt": "less", "le": "less_equal", "gt": "greater", "ge": "greater_equal"},
             **{"eq": "equal", "ne": "not_equal", "max": "maximum", "min": "minimum"},
-            **{"and": "bitwise_and", "or": "bitwise_or", "not": "invert", "abs": "abs"},
+            **{"and": "bitwise_and", "or": "bitwise_or", "abs": "abs"},
         }.items()
     },
     "copy": lambda params, x: x,
+    "div": _quotient,
+    "integer_pow": _integer_power,
     "gather": _gather,
     "scatter": _scatter,
     "pad": _pad,

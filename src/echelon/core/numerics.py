@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+_N = TypeVar("_N", float, jax.Array)
 _R = TypeVar("_R")
 Precision: TypeAlias = Literal["float64", "float32"]
 Field: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
@@ -27,6 +28,17 @@ def inlined(function: Callable[..., _R]) -> Callable[..., _R]:
     """Return a function that JAX traces once for all its calls inside other traces."""
     # Under a name of its own, as JAX would hand out the first trace of one function again.
     return jax.jit(lambda *arguments: function(*arguments), inline=True)
+
+
+def lesser(a: float, b: _N) -> _N | jax.Array:
+    """Return the smaller of two numbers, of which the second may be traced."""
+    # JAX would compile a program for two plain numbers.
+    return jnp.minimum(a, b) if isinstance(b, jax.Array) else min(a, b)
+
+
+def greater(a: _N, b: float) -> _N | jax.Array:
+    """Return the larger of two numbers, of which the first may be traced."""
+    return jnp.maximum(a, b) if isinstance(a, jax.Array) else max(a, b)
 
 
 def rk4(field: Field, x: jax.Array, u: jax.Array, dt: float | jax.Array) -> jax.Array:

@@ -134,7 +134,7 @@ def _wait_for_state(link: Link) -> None:
         if reading is not None and all(map(math.isfinite, reading.x)):
             link.close()
             return
-    raise FlightError(f"the vehicle says no state within {_READY:g} s.")
+    raise FlightError(f"the vehicle sends no state within {_READY:g} s.")
 
 
 def _watch(mission: Mission, options: argparse.Namespace) -> int:

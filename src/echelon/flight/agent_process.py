@@ -71,7 +71,7 @@ class AgentProcess:
         self._began, self._ticked, self._fell = time.monotonic(), -math.inf, math.inf
         self._due = 0.0
         self._sent, self._reported, self._signals = -math.inf, -math.inf, 0
-        self._moved = self._began
+        self._moved = self._heard_at = self._began
         self._said, self._notes = set[str](), deque[str](maxlen=10)
         self._ticks, self._longest = deque[float](maxlen=100_000), 0.0
 
@@ -97,7 +97,8 @@ class AgentProcess:
             return False
         now = time.monotonic()
         self._fell = min(self._fell, now)
-        rests = now - self._moved > 1.0 / self._crew.clock.speed
+        # As far as its states say: one that is not heard may still fly.
+        rests = self._heard_at - self._moved > 1.0 / self._crew.clock.speed
         late = now - self._fell > _LONGEST / self._crew.clock.speed
         # The first signal lets a vehicle descend that flew; another one ends the process at once.
         again = self._signals > (self._supervisor.fault is Fault.SIGNAL)
@@ -110,7 +111,7 @@ class AgentProcess:
         for datagram in self._crew.air.receive():
             self._hear(datagram, now)
         if reading is not None and all(map(math.isfinite, reading.x)):
-            self._reading = reading
+            self._reading, self._heard_at = reading, now
             speed = math.hypot(*(reading.x[k] for k in self._crew.flight["velocity"]))
             self._moved = now if speed > _REST else self._moved
             self._tick(reading)
@@ -182,10 +183,11 @@ class AgentProcess:
             self._sent = due
             self._crew.air.send(self._crew.wire.letter(letter))
         if abs(self._supervisor.step - self._dt) > 0.1 * self._dt:
-            self._say(f"states do not come every {self._dt:g} s, the period of the law", "period")
+            step = f"{self._supervisor.step:.3g} s, and the law's period is {self._dt:g} s"
+            self._say(f"states arrive every {step}", "period")
 
     def _descend(self) -> None:
-        self._say(f"{self._supervisor.sentence}: levels and descends", "fault")
+        self._say(f"{self._supervisor.sentence}; the vehicle levels and descends", "fault")
         try:
             if self._ticked >= 0.0:
                 self._crew.link.level_descend()
@@ -234,6 +236,8 @@ class AgentProcess:
         # What a process before this one sent may still be on its way.
         if opened.boot != self._crew.wire.boot and now > self._began + 2.0:
             self._supervisor.trip(Fault.TWIN, opened.sender)
+            if self._supervisor.fault is not Fault.TWIN:
+                self._say(Fault.TWIN.sentence(opened.sender))
 
     def _report(self, now: float) -> None:
         self._reported = now

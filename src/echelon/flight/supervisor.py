@@ -30,13 +30,13 @@ class Fault(enum.Enum):
     FENCE = "the vehicle is {:.2f} m outside its fence"
     SPEED = "the vehicle moves at {:.2f} m/s, more than its fence allows"
     INPUT = "the law returned an input that is not finite"
-    OVERRUN = "the law takes {:.2g} of its period, more than half"
-    PERIOD = "states come every {:.3g} s, twice the law's period or more"
-    STOP = "somebody with the key said stop"
+    OVERRUN = "a step of the law takes {:.0%} of its period, more than half"
+    PERIOD = "states arrive every {:.3g} s, at least twice the law's period"
+    STOP = "a signed stop command arrived"
     TWIN = "two agents have the number {:.0f}"
     BATTERY = "{:.0%} of the battery is left, less than 15 %"
     LINK = "the link to the vehicle failed"
-    SIGNAL = "the process was told to end"
+    SIGNAL = "the process received a signal to end"
     END = "the flight is over"
 
     def sentence(self, amount: float) -> str:

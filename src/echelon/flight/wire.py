@@ -46,19 +46,19 @@ class DatagramKind(enum.IntEnum):
 class Drop(enum.Enum):
     """Why a datagram is not used."""
 
-    LENGTH = "has another length than any datagram of this formation"
-    VERSION = "has another version"
+    LENGTH = "has a length that no datagram of this formation has"
+    VERSION = "is of another version of the protocol"
     FORMATION = "is of another formation"
     SIGNATURE = "is signed with another key"
     NOT_FINITE = "has a number that is not finite"
-    TOO_LARGE = "has a deviation beyond 1e6"
-    CLOCK = "is stamped more than 1 s beside this clock"
-    OLD = "is not newer than the last one of its sender"
-    SENDER = "has a sender that is not heard"
-    AHEAD = "is stamped ahead of this clock"
+    TOO_LARGE = "has a deviation larger than 1e6"
+    CLOCK = "has a time stamp that differs from this clock by more than 1 s"
+    OLD = "is not newer than the last one from its sender"
+    SENDER = "is from a sender that this process does not listen to"
+    AHEAD = "has a time stamp ahead of this clock"
     PACKET = "has no packet of a leader"
     EARLY = "came before the start"
-    START = "names the start by a clock that is more than 0.1 s beside this one"
+    START = "gives the start by a clock that differs from this one by more than 0.1 s"
 
 
 class Letter(NamedTuple):

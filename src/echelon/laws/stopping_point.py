@@ -22,7 +22,7 @@ from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
 from echelon.core.errors import LawError, check_kind, listing
 from echelon.core.memoize import memoize
-from echelon.core.numerics import precision
+from echelon.core.numerics import greater, lesser, precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward, NeighbourChoice
 from echelon.laws.flat_law import (
@@ -211,11 +211,11 @@ class StoppingPoint(FlatLaw):
         assert self.reach is not None
         if self.coupling is not None:
             return self.coupling
-        period = jnp.maximum(period, _INSTANT)
+        period = greater(period, _INSTANT)
         # While the highest derivatives are held the inner loop goes on, and zeta moves farther than
         # Euler's step by half the sum of the roots times the period; twice that is kept free.
         most = 1.0 / (self.reach.heaviest * period * (1.0 + period * self.fastest))
-        return jnp.minimum(2.0 * self.slowest_root / self.reach.slowest, most)
+        return lesser(2.0 * self.slowest_root / self.reach.slowest, most)
 
     def update(
         self, model: ControlAffine, view: LocalView, memory: FlatMemory
@@ -332,7 +332,7 @@ class StoppingLeader(FlatLaw):
         """Return c where inputs are held for a period (s)."""
         if self.coupling is not None:
             return self.coupling
-        return jnp.minimum(2.0 * self.slowest_root, 1.0 / jnp.maximum(period, _INSTANT))
+        return lesser(2.0 * self.slowest_root, 1.0 / greater(period, _INSTANT))
 
     def update(
         self, model: ControlAffine, view: LocalView, memory: FlatMemory

@@ -1,6 +1,7 @@
 """The interface of a reference: a smooth path in space with a yaw, as functions of time."""
 
 import abc
+import functools
 from collections.abc import Callable, Sequence
 from typing import ClassVar, Protocol
 
@@ -15,7 +16,7 @@ from echelon.core.enclosure.hull import Box, value_hull
 from echelon.core.errors import GainError, LawError, ReferenceError, check_kind, listing
 from echelon.core.memoize import memoize
 from echelon.core.numerics import derivatives, precision
-from echelon.core.trace import check_array, check_function, checked_trace
+from echelon.core.trace import call_once_traced, check_array, check_function, checked_trace
 from echelon.core.types import Array, Input, Scalar, State
 
 COORDINATES = ("x", "y", "z", "yaw")
@@ -39,8 +40,8 @@ class Reference(Guide):
         Their shape is (order + 1, len(coordinates)).
         """
         # Selected before differentiating, so that unused coordinates cost no derivatives.
-        chosen = np.array([COORDINATES.index(name) for name in coordinates])
-        return derivatives(lambda s: self(s)[chosen], t, order)
+        chosen = tuple(COORDINATES.index(name) for name in coordinates)
+        return call_once_traced(functools.partial(_derivatives, self, chosen, order), t)
 
     def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return the state and the input by the model's flatness map."""
@@ -90,6 +91,10 @@ class Reference(Guide):
                 f"has {listing(COORDINATES)}."
             )
         _check_map(model)
+
+
+def _derivatives(path: Reference, chosen: tuple[int, ...], order: int, t: Scalar) -> jax.Array:
+    return derivatives(lambda s: path(s)[np.array(chosen)], t, order)
 
 
 def _heading_coordinate(model: ControlAffine) -> int | None:

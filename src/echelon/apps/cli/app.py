@@ -6,6 +6,7 @@ Heavy modules are imported inside each command, so that `--help` is quick.
 import contextlib
 import errno
 import functools
+import gc
 import logging
 import os
 import sys
@@ -79,6 +80,8 @@ def _main() -> None:
     # Matrices are small here: more threads of linear algebra wait for each other, and no digit may
     # depend on their number. NumPy reads this when it is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Traces are made of many objects that last: Python would look through all of them at each 700.
+    gc.set_threshold(20_000)
     folder = keep_compiled_code(os.environ)
     with disk_cache.use_folder(folder), outlive_readers(), STOP.listen():
         try:

@@ -136,7 +136,7 @@ class Px4Link(Link):
             value = self._next("PARAM_VALUE", 0.5)
             if value is not None and value.param_id == name.decode():
                 return float(value.param_value)
-        raise FlightError(f"PX4 does not tell its parameter `{name.decode()}`.")
+        raise FlightError(f"PX4 does not send its parameter `{name.decode()}`.")
 
 
 def _connected(address: str) -> Any:

@@ -8,6 +8,7 @@ from pathlib import Path
 from echelon import __version__
 from echelon.core.errors import OutputError
 from echelon.core.files import write_atomic
+from echelon.core.trace import shared_traces
 from echelon.core.types import JsonObject
 from echelon.guarantees.promises.promise import guaranteed
 from echelon.laws.law import Law
@@ -32,6 +33,7 @@ _CURRENT = "late or lost messages: the guarantee assumes that `z` is of the curr
 _LATE = "other networks than `network`"
 
 
+@shared_traces()
 def law_files(
     parts: Parts, settings: Settings, agent: int, formation: str
 ) -> dict[str, str | bytes]:

@@ -370,14 +370,14 @@ class Agent:
 def _names(loop: Loop, law: Law) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of what an agent sends: of its signal and of its feed-forward."""
     model, follower = loop.model, loop.follower
-    x, v = jnp.zeros(len(model.state_names)), jnp.zeros(len(model.input_names))
 
-    def sizes() -> tuple[jax.Array, jax.Array]:
-        own = OwnState(x, x, law.begin(model, x))
+    def sizes(x: State, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        own = OwnState(x, x, begin_alone(loop, law, x))
         forward = feedforward_of(follower, model, x, v, own.memory)
         return signal_of(loop, law, own), forward
 
-    signal, forward = jax.eval_shape(sizes)
+    x, v = np.zeros(len(model.state_names)), np.zeros(len(model.input_names))
+    signal, forward = jax.eval_shape(sizes, x, v)
     heading = ("heading",) * follower.turning
     return (
         _fitting(law.signal_names(model), signal.size),

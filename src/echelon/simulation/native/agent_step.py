@@ -118,11 +118,11 @@ def memory_size(law: Law) -> int:
     Raises:
         Unsupported: it is not made of numbers, such as a random key.
     """
-    leaves = jax.tree.leaves(law.init())
+    leaves = jax.tree.leaves(jax.eval_shape(law.init))
     for leaf in leaves:
-        if not jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating):
-            raise Unsupported(f"a memory of the type {jnp.asarray(leaf).dtype}")
-    return sum(np.size(leaf) for leaf in leaves)
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise Unsupported(f"a memory of the type {leaf.dtype}")
+    return sum(leaf.size for leaf in leaves)
 
 
 def unflatten(like: PyTree, flat: Array | jax.Array) -> PyTree:
