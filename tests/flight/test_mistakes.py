@@ -13,8 +13,8 @@ from processes import free_port
 import echelon as ech
 from echelon.flight.air import Air, bound, ports_of
 from echelon.flight.ground import Ground
+from echelon.flight.local_flight import make_key
 from echelon.flight.mission import Mission
-from echelon.flight.together import make_key
 from echelon.flight.wire import GROUND, wire_of
 from echelon.output.archive.flight_folder import flight_files, save_flight
 
