@@ -407,6 +407,37 @@ class Bends(ech.laws.Law):
         return jax.scipy.special.erfinv(view.disagreement)[:1] * 0.0, memory
 
 
+TABLE = np.linspace(-1.0, 1.0, 5)
+
+
+class Drawn(ech.models.ControlAffine):
+    """Reads a table of NumPy, converted to the precision of the run or as it is."""
+
+    state_names, input_names = ("x",), ("u",)
+    converted: bool = False
+
+    def drift(self, x):
+        table = jnp.asarray(TABLE) if self.converted else TABLE
+        return -jnp.interp(x, table, table)
+
+    def input_map(self, x):
+        return jnp.ones((1, 1))
+
+
+@pytest.mark.parametrize("converted", [False, True])
+def test_a_table_of_one_precision_is_explained(converted):
+    model, graph = Drawn(converted), ech.Graph.path(2)
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((2, 1))), drive, {"x": 0.5})
+    both = [run_settings(precision=name, engine="jax") for name in ("float64", "float32")]
+    ech.simulate(parts, both[0])
+    if converted:
+        assert ech.simulate(parts, both[1]).outcome is ech.Outcome.COMPLETED
+    else:
+        with pytest.raises(ech.errors.SimulationError, match=r"write `jnp.asarray\(array\)` there"):
+            ech.simulate(parts, both[1])
+
+
 def test_what_has_no_native_code_runs_by_jax_and_says_why():
     model, graph = ech.models.Pendulum(), ech.Graph.path(2)
     drive = ech.Laws(ech.laws.TrimInput(), Bends())

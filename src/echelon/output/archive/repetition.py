@@ -100,8 +100,8 @@ def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Find
     if files.claims is not None:
         names = [name for name in OBSERVED if name not in {*_COMPUTED, *stopped}]
         stored, value = read_json(files.claims), json.loads(json.dumps(summary(result)))
-        pair = ({k: x[k] for k in names if k in x} for x in (stored, value))
-        yield from compare_values("", *pair, digits)
+        theirs, ours = [{k: x[k] for k in names if k in x} for x in (stored, value)]
+        yield from compare_values("", theirs, ours, digits)
         yield from _compare_origin(stored, data)
     written = files.data.parent / _REPORT
     if written.is_file() and not stopped:
@@ -132,8 +132,8 @@ def _compare_dataset(
     skipped = {*_ATTRIBUTES, *stopped, *known.attributes}
     for key in {**values, **attributes}:
         if key not in skipped and not key.startswith("version_"):
-            pair = ({key: x[key]} if key in x else {} for x in (attributes, values))
-            yield from compare_values(f"{name}: observed", *pair, digits)
+            theirs, ours = [{key: x[key]} if key in x else {} for x in (attributes, values)]
+            yield from compare_values(f"{name}: observed", theirs, ours, digits)
 
 
 def _compare_report(file: Path, text: str) -> Finding:

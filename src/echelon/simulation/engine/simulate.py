@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias, final
 
 import jax
@@ -102,10 +102,27 @@ def simulate(
         # Plans and solvers need float64, also in a float32 run.
         stepper = prepared.parts.drive.stepper(prepared.problem)
     _check_devices(settings, stepper)
-    with precision(settings.precision):
+    with precision(settings.precision), _mixed_tables():
         recorder = _recorder(prepared, stepper, before)
         _ChunkLoop(stepper, prepared, recorder, began).run(progress, keep)
     return _result(prepared, recorder, stepper, Outcome.INTERRUPTED)
+
+
+@contextlib.contextmanager
+def _mixed_tables() -> Iterator[None]:
+    """Say which table of a user JAX cannot use in two precisions.
+
+    It keeps one converted copy of an array of NumPy, by its identity and not by the precision.
+    """
+    try:
+        yield
+    except ValueError as error:
+        if "Cannot lower jaxpr with verifier errors" not in str(error):
+            raise
+        raise SimulationError(
+            "JAX keeps one precision of each NumPy array that a model or law passes to a function "
+            "such as `jnp.interp`, and uses it in both; write `jnp.asarray(array)` there."
+        ) from error
 
 
 def _check_devices(settings: Settings, stepper: Stepper) -> None:
