@@ -198,22 +198,15 @@ LINES = {
 }
 """On which side the number of a line that holds is stated, where, and its factor."""
 
-SCENARIOS = {
-    "integrators": (),
-    "van-der-pol": (),
-    "unicycle": (),
-    "crossing": (),
-    "paper-radio": (),
-    "leader-lost": (),
-    "paper-global": (),
-    "paper-windy": ("follower.feedforward=parent", "graph={edges: [[0, 1], [1, 2], [2, 3]]}"),
-}
+PARENTS = ("follower.feedforward=parent", "graph={edges: [[0, 1], [1, 2], [2, 3]]}")
+QUICK = ("integrators", "van-der-pol", "unicycle", "paper-global")
+SLOW = ("crossing", "leader-lost", "paper-radio", "paper-windy")
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(x, marks=pytest.mark.slow) for x in SLOW)])
 def test_no_line_of_a_check_states_more_than_its_number(name):
-    seen = 0
-    for line in ech.check(*ech.build(ech.load_scenario(name, SCENARIOS[name]))).lines:
+    seen, changes = 0, PARENTS if name == "paper-windy" else ()
+    for line in ech.check(*ech.build(ech.load_scenario(name, changes))).lines:
         side, pattern, scale = LINES.get(line.statement, (0, "", 1.0))
         found = re.findall(pattern, line.number_text) if side else ()
         if line.verdict is Verdict.HOLDS and found and math.isfinite(line.number):
@@ -222,6 +215,7 @@ def test_no_line_of_a_check_states_more_than_its_number(name):
     assert seen
 
 
+@pytest.mark.slow
 def test_a_guarantee_in_single_precision_says_that_it_ignores_its_rounding():
     """At 300 km numbers are 3 cm apart, and followers stay farther off than the guarantee says."""
     circle = ech.references.Circle(center=(3e5, 0.0, 0.0))
@@ -253,6 +247,7 @@ class Mixed(ech.models.DoubleIntegrator):
 METRES = re.compile(r"\b(m|cm|mm|m/s|m/s\^2)\b(?! 2 c)")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "unit"), [(Feet(), "ft"), (Mixed(), "1")])
 def test_nothing_is_stated_in_metres_of_positions_in_other_units(model, unit):
     """Nor in the unit of one coordinate where the others have another one."""

@@ -24,6 +24,7 @@ from echelon.experiments.scenario.self_contained import without_folders
 from echelon.experiments.scenario.yaml import read_yaml
 from echelon.experiments.studies.check import check
 from echelon.experiments.studies.design import with_gain
+from echelon.experiments.studies.older_rounding import as_rounded_now
 from echelon.guarantees.promises.promise import promise
 from echelon.guarantees.verifier.findings import Finding, decide
 from echelon.guarantees.verifier.stored_values import Digits, compare_values
@@ -166,6 +167,8 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
     (run, data), (parts, settings), name = recording_with_data(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
     value = _as_json(promise(parts, settings).as_mapping())
+    older = run.attributes["format"] != FORMAT
+    stored = as_rounded_now(stored, value) if older else stored
     yield from compare_values(f"{name}: promise", stored, value)
     text = read_yaml(str(run.attributes.get("scenario_text", "")), str(file))
     # A key twice is a fault; readers differ in which one they use.
@@ -176,7 +179,6 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
     yield from compare_values(f"{name}: states", run.states[:1].tolist(), starts.tolist())
     fixed = labelled_parts(prepare(parts, settings).parts, settings)
     stated = {**run.attributes, **data.arrays()}
-    older = stated["format"] != FORMAT
     yield from _compare_frames(run, data, experiment, name)
     yield from compare_values(f"{name}: scenario", run.attributes.get("scenario"), scenario.name)
     for key, part in {**fixed.attributes, **fixed.arrays()}.items():
