@@ -375,6 +375,19 @@ def test_every_word_of_a_message_is_explained():
 
 
 PHRASES = {
+    "chain": "integrators",
+    "ellipsoid": "keep apart",
+    "exact arithmetic": "fractions",
+    "feedback": "measured",
+    "float32": "digits",
+    "integral action": "constant",
+    "Jacobian": "derivatives",
+    "Laplacian": "neighbours",
+    "quantile": "share",
+    "SDP": "matrix",
+    "spectral radius": "a step",
+    "yaw": "vertical axis",
+    "zeta": "stopping point",
     "active rows": "pairs",
     "coupling edge": "above which every mode",
     "eigenvalue": "lambda_max",

@@ -4,6 +4,7 @@ import io
 import re
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -169,3 +170,24 @@ def test_native_code_that_there_is_not_is_refused_before_a_run_begins(here, eche
     code, _, err = echelon("run", "integrators", *native, "--out", "o")
     assert code == 2 and "no native code for a network that is not ideal" in err
     assert begun == ["preparing integrators"] and not (here / "o").exists()
+
+
+def test_a_time_that_is_over_is_not_repeated(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(status.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(status, "_SILENT", 1e-3)
+    log = io.StringIO()
+
+    def late():
+        clock[0] = 25.0
+        while "2 of 4 parts ..." not in log.getvalue():
+            threading.Event().wait(1e-3)
+
+    def half():
+        clock[0] = 10.0
+        STATUS.count(2, 4, "parts")
+
+    begun = [lambda: STATUS.begin("preparing"), lambda: STATUS.count(0, 4, "parts")]
+    text = shown(log, monkeypatch, *begun, half, late)
+    assert "2 of 4 parts, 10 s left ..." in text
+    assert text.endswith("preparing: 2 of 4 parts ...\n")

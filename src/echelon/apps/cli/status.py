@@ -58,6 +58,7 @@ class Status:
         self._text, self._counted, self._drawn, self._terminal = "", "", False, False
         self._paused = False
         self._since, self._written, self._first = 0.0, 0.0, (0.0, -1)
+        self._until = 0.0
 
     @contextlib.contextmanager
     def show(self, stream: _Screen) -> Iterator[None]:
@@ -95,6 +96,7 @@ class Status:
         with self._lock:
             self._text, self._paused = text if log or self._terminal else "", False
             self._since, self._counted, self._first = time.monotonic(), "", (0.0, -1)
+            self._until = 0.0
             self._write(0.0)
 
     def count(self, done: float, total: int, unit: str) -> None:
@@ -103,13 +105,13 @@ class Status:
             now, (begun, before), self._paused = time.monotonic(), self._first, False
             if before < 0:
                 self._first = (now, done)
-            left = ""
+            self._until = 0.0
             if 0 <= before < done:
                 seconds = (total - done) * (now - begun) / (done - before)
                 # Before that, most of the time was taken by what is compiled once.
                 foreseen = done - before >= _FORESEEN * total or now - begun >= _LATE
-                left = f", {duration(seconds)} left" if foreseen else ""
-            self._counted = f": {int(done)} of {total} {unit}{left if done < total else ''}"
+                self._until = now + seconds if foreseen and done < total else 0.0
+            self._counted = f": {int(done)} of {total} {unit}"
             self._write(_DRAWN if self._terminal else _PLAIN)
 
     def counter(self, unit: str) -> Callable[[int, int], None]:
@@ -130,6 +132,9 @@ class Status:
         while not ended.wait(wait):
             wait = _TICK if self._terminal else _SILENT
             with self._lock:
+                # A time that is over was wrong, as parts of work may take unlike times.
+                if self._until < time.monotonic():
+                    self._until = 0.0
                 if ended is self._ended:
                     self._write(wait)
 
@@ -141,7 +146,8 @@ class Status:
         if apart and now - self._written < apart:
             return
         self._written, took = now, now - self._since
-        text = f"echelon: {self._text}{self._counted} ..."
+        left = f", {duration(self._until - now)} left" if self._until else ""
+        text = f"echelon: {self._text}{self._counted}{left} ..."
         text += f" {duration(took)}" if took > 2.0 and not self._counted else ""
         if self._terminal:
             self._drawn = True
