@@ -460,3 +460,8 @@ def test_lines_that_have_names_differ_in_grey_too():
         for j, other in enumerate(looks[:i]):
             apart = abs(shades[i] - shades[j]) > 0.06
             assert apart or one["linestyle"] != other["linestyle"], (i, j)
+
+
+def test_axes_that_are_none_are_refused(run):
+    with pytest.raises(OutputError, match="^`ax` is a `int`, and must be axes of matplotlib\\.$"):
+        figures(run, "formation", ax=3)

@@ -245,12 +245,13 @@ def _set_line(run: StoppingRun, border: Border) -> Statement:
         text = f"{text}, which keeps to its path in {border.outputs}"
         return holds(Hypothesis.SET, _PROOF, text, *number)
     if not border.fastest > 0.0:
-        text = f"on the leader's path {border.what()} comes to {border.path:.3g}, and the chart "
-        text, remedy = f"{text}ends at {bound.above:.3g}", "choose a path that keeps away from it"
+        text = f"on the leader's path {border.what()} reaches {border.path:.3g}, and the equations "
+        text = f"{text}hold above {bound.above:.3g}"
+        remedy = "choose a gentler path, which keeps away from this limit"
     else:
         s = run.speed(run.law.ready.chains.outputs.index(bound.outputs[0]))
         text = f"at a `speed` of {s:.3g} agreement alone may take {border.what()} to "
-        text = f"{text}{bound.above:.3g}, where the chart ends"
+        text = f"{text}{bound.above:.3g}, where the equations end"
         # What one link may have of a speed against the leader.
         least = border.fastest / run.links
         remedy = f"lower the `speed` of {border.outputs} below {least:.3g}"
