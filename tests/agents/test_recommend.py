@@ -137,8 +137,8 @@ def test_what_is_told_is_what_the_changed_graph_has():
     (i, j), (k, m) = found.edges
     assert found.sentence() == (
         f"The slowest disagreement decays with a time constant of {found.now:.3g} s; "
-        f"{found.with_leaders:.3g} s with the further leader {found.leaders[0]}; "
-        f"{found.with_edges:.3g} s with the further edges {i}-{j}, {k}-{m}."
+        f"{found.with_leaders:.3g} s with agent {found.leaders[0]} as a further leader; "
+        f"{found.with_edges:.3g} s with further edges {i}-{j}, {k}-{m}."
     )
 
 
