@@ -7,6 +7,7 @@ date.
 """
 
 import hashlib
+import re
 import shutil
 import subprocess
 import sys
@@ -58,8 +59,11 @@ def build_formulas() -> None:
     # Browsers take the first format of a font that they know, and all of today's know this one.
     for font in (package / "dist" / "fonts").glob("*.woff2"):
         shutil.copyfile(font, KATEX / "fonts" / font.name)
-    for name in ("dist/katex.min.js", "dist/katex.min.css", "LICENSE"):
+    for name in ("dist/katex.min.js", "LICENSE"):
         shutil.copyfile(package / name, KATEX / Path(name).name)
+    style = (package / "dist" / "katex.min.css").read_text("utf-8")
+    others = r",url\([^)]*\.(?:woff|ttf)\) format\(\"\w+\"\)"
+    (KATEX / "katex.min.css").write_text(re.sub(others, "", style), "utf-8")
     mark.write_bytes(lock)
 
 

@@ -138,8 +138,8 @@ def test_what_is_told_is_what_the_changed_graph_has():
     (i, j), (k, m) = found.edges
     assert found.sentence() == (
         f"The slowest disagreement decays with a time constant of {at_least(found.now)} s; "
-        f"{at_least(found.with_leaders)} s with the further leader {found.leaders[0]}; "
-        f"{at_least(found.with_edges)} s with the further edges {i}-{j}, {k}-{m}."
+        f"{at_least(found.with_leaders)} s with agent {found.leaders[0]} as a further leader; "
+        f"{at_least(found.with_edges)} s with further edges {i}-{j}, {k}-{m}."
     )
 
 

@@ -13,6 +13,7 @@ main()
 """
 PORT = "`--port` is {}, and must be from 0 to 65535."
 GONE = "`gone` does not exist; give the folder of a run, or its `run.nc`."
+SCENARIO = "`wrong.yaml` is a scenario; run it first (`echelon run wrong.yaml --out FOLDER`), and"
 KINDS = "`csv`, `parquet`, `npz`, `mat`, `nc`, `json`, `html`"
 
 
@@ -28,6 +29,10 @@ KINDS = "`csv`, `parquet`, `npz`, `mat`, `nc`, `json`, `html`"
         ("video . out.avi", "`out.avi` ends in `.avi`, and must end in .mp4 or .gif."),
         ("export gone", GONE),
         ("export . --to xls", f"`--to` is `xls`, allowed are {KINDS}."),
+        ("export . --out run.xls", f"`run.xls` ends in `xls`, allowed are {KINDS}."),
+        ("export . --to mat --out run.csv", "`--to` is `mat`, and `run.csv` ends in `.csv`; leave"),
+        ("view wrong.yaml", SCENARIO),
+        ("export wrong.yaml", SCENARIO),
         ("plot . --what top_vieu", "the figure is `top_vieu`, allowed are"),
         (
             "sweep paper --over seed=0..3 --cluster tcp://127.0.0.1:1",
@@ -41,6 +46,7 @@ KINDS = "`csv`, `parquet`, `npz`, `mat`, `nc`, `json`, `html`"
     ],
 )
 def test_a_bad_option_is_rejected_before_anything_is_loaded(tmp_path, arguments, sentence):
+    (tmp_path / "wrong.yaml").touch()
     done = subprocess.run(
         [sys.executable, "-c", CALL, *arguments.split()],
         cwd=tmp_path,

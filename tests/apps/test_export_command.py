@@ -90,7 +90,7 @@ def test_a_law_without_scalar_operations_is_refused_with_its_line():
     ("arguments", "sentence"),
     [
         (("--to", "law"), "`--to law` needs `--agent`, the number of an agent."),
-        (("--agent", 1, "--to", "csv"), "`--agent` is of a law, and `--to` is `csv`; leave out"),
+        (("--agent", 1, "--to", "csv"), "`--agent` is of a law, and `--to` is `csv`; use `law`"),
         (("--set", "seed=1"), "`--set` is of a scenario, and a run is written as it is"),
         ((), "`integrators` does not exist; give the folder of a run, or its `run.nc`."),
     ],

@@ -14,7 +14,7 @@ import pytest
 
 import echelon as ech
 from echelon.agents.models import Pendulum, VanDerPol
-from echelon.core.identity import digest, process_key
+from echelon.core.identity import digest, foreign_key, process_key
 from echelon.core.memoize import BoundedCache, memoize
 from echelon.core.words import Feedforward, Kind
 
@@ -176,3 +176,10 @@ def test_a_cache_has_room_for_a_size():
     assert cache.total() == 8 and cache.pop("four") is None
     cache.put("long", "longer than all")
     assert len(cache) == 0 == cache.total()
+
+
+def test_code_that_belongs_to_no_module_is_foreign():
+    names = {}
+    exec("def cost(sums):\n    return 2 * sums", names)
+    assert names["cost"].__module__ is None
+    assert foreign_key(names["cost"])

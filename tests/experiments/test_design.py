@@ -169,7 +169,7 @@ def test_an_inner_loop_comes_with_what_would_shorten_it(echelon):
     _, out, _ = echelon("design", "paper-line", "--method", "inner-loop", "--json")
     (row,) = json.loads(out)["methods"]
     wanted = inner_loop_speedup("paper-line").sentence()
-    assert row["advice"] == wanted and "with the further leader 2" in wanted
+    assert row["advice"] == wanted and "with agent 2 as a further leader" in wanted
     _, out, _ = echelon("design", "paper-line", "--method", "inner-loop")
     assert f"- inner-loop: {wanted}" in out
 

@@ -36,7 +36,7 @@ def test_a_scenario_changes_as_on_the_command_line():
     assert (changed.seed, changed.simulation.horizon) == (3, 20.0) and first.seed == 0
     array = first.with_(**{"formation.offsets": {1: np.array([1.0, 0.0, 0.5])}})
     assert array.data["formation"]["offsets"] == {1: [1.0, 0.0, 0.5]}
-    with pytest.raises(ech.errors.ScenarioError, match=r"--set sed=3: .*did you mean `seed`"):
+    with pytest.raises(ech.errors.ScenarioError, match=r"^sed=3: .*did you mean `seed`"):
         first.with_(sed=3)
 
 
@@ -67,7 +67,7 @@ def adjacency(graph):
         ([[0, 1], [1]], {}, r"must be a square matrix .* with rows of one length"),
         ([[0, 1], [0, 0]], {"directed": False}, "is not symmetric"),
         ([[0, -1], [-1, 0]], {}, "weight"),
-        ([[0, np.nan], [np.nan, 0]], {}, "weight"),
+        ([[0, np.nan], [np.nan, 0]], {}, "entries that are NaN"),
         ([[1, 1], [1, 0]], {}, "itself"),
     ],
 )

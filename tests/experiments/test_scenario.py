@@ -441,6 +441,14 @@ def test_an_unknown_scenario_is_refused_with_the_bundled_names(tmp_path, monkeyp
     )
 
 
+@pytest.mark.parametrize("ending", ["", ".yml"])
+def test_a_scenario_without_its_ending_is_named(tmp_path, ending):
+    (tmp_path / "blimps.yaml").touch()
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(tmp_path / f"blimps{ending}")
+    assert str(caught.value).endswith(f" (did you mean `{tmp_path / 'blimps.yaml'}`?).")
+
+
 def test_a_mapping_is_checked_like_a_file():
     data = read_yaml("\n".join(LINES.values()), "s.yaml").data
     given = data | {

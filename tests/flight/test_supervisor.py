@@ -4,6 +4,8 @@ import math
 
 import pytest
 
+from echelon.core.errors import FlightError
+from echelon.flight import __main__ as process
 from echelon.flight.links.link import Reading
 from echelon.flight.supervisor import Fault, Fence, Supervisor
 
@@ -95,3 +97,11 @@ def test_states_at_half_the_rate_end_the_flight(step, fault):
         # A hiccup now and then is none.
         watch.judge(Reading(0.0, state()), step * k + 0.5 * (k > 30))
     assert watch.fault is fault and abs(watch.step - step) < 1e-9
+
+
+def test_a_vehicle_that_sends_no_state_is_named_by_its_link(monkeypatch):
+    monkeypatch.setattr(process, "_READY", 0.0)
+    with pytest.raises(
+        FlightError, match="^no state of the vehicle arrived .* the link `udp`; swi"
+    ):
+        process._wait_for_state(None, "udp")

@@ -31,7 +31,9 @@ from echelon.guarantees.verifier.exact_minors import (
     product,
     rows_of,
 )
+from echelon.guarantees.verifier.findings import unchecked
 from echelon.guarantees.verifier.saved_gain import SavedGraph
+from echelon.guarantees.verifier.verify import judge
 
 ROOT = Path(__file__).resolve().parents[2]
 LINE = ech.Graph.path(4)
@@ -322,7 +324,7 @@ def test_the_command_prints_a_table_and_exits_by_what_holds(files, echelon, tmp_
     code, out, err = echelon("verify", file)
     assert (code, out) == (2, "") and "is not valid JSON" in err and err.count("\n") == 1
     code, _, err = echelon("verify", tmp_path / "nothing.json")
-    assert code == 2 and "cannot be read" in err
+    assert code == 2 and "does not exist" in err
 
 
 # ---- its algebra ----
@@ -425,3 +427,11 @@ def test_a_run_without_what_it_promised_is_told_so(echelon, here, summary, sente
     (here / "run" / "summary.json").write_text(summary)
     code, _, fault = echelon("verify", "run")
     assert code == 2 and fault.startswith(f"echelon: {sentence}") and fault.count("\n") == 1
+
+
+def test_a_verdict_names_a_few_claims_that_are_open_and_counts_the_rest():
+    found = [unchecked(f"claim {k}", "", "no code") for k in range(9)]
+    assert judge(found).sentence == (
+        "Incomplete: no claim was checked; not checked: claim 0; claim 1; claim 2 and 6 more."
+    )
+    assert judge(found[:4]).sentence.endswith("not checked: claim 0; claim 1; claim 2; claim 3.")

@@ -477,3 +477,8 @@ def test_a_lost_leader_has_no_values_after_its_loss(long):
             line = ax.get_lines()[0]
             times, values = line.get_xdata(), line.get_ydata()
             assert np.array_equal(np.isfinite(values), times < 5.0)
+
+
+def test_axes_that_are_none_are_refused(run):
+    with pytest.raises(OutputError, match="^`ax` is a `int`, and must be axes of matplotlib\\.$"):
+        figures(run, "formation", ax=3)

@@ -92,9 +92,9 @@ class Outcome(enum.Enum):
         return self in (Outcome.COMPLETED, Outcome.LEFT_CHART)
 
 
-def did_you_mean(got: object, allowed: Iterable[str]) -> str:
+def did_you_mean(got: object, allowed: Iterable[str], likeness: float = 0.6) -> str:
     """Return `` (did you mean `name`?)`` if an allowed name is close to `got`, otherwise ""."""
-    close = difflib.get_close_matches(str(got), list(allowed), n=1, cutoff=0.6)
+    close = difflib.get_close_matches(str(got), list(allowed), n=1, cutoff=likeness)
     return f" (did you mean `{close[0]}`?)" if close else ""
 
 

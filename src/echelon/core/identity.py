@@ -180,7 +180,8 @@ class _Walk:
 
     def _name(self, named: type | FunctionType) -> None:
         """Collect a class or function by the name under which echelon or a library has it."""
-        home, name = named.__module__, named.__qualname__
+        # Code that `exec` ran without a `__name__` belongs to no module.
+        home, name = named.__module__ or "", named.__qualname__
         place: object = sys.modules.get(home)
         for part in name.split("."):
             place = getattr(place, part, None)

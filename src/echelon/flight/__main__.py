@@ -17,7 +17,7 @@ from echelon.flight.plan_clock import PlanClock
 from echelon.flight.supervisor import Fault
 from echelon.flight.wire import GROUND, require_key, wire_of
 
-_READY = 5.0  # s, in which a vehicle says its state
+_READY = 5.0  # s, within which a state of the vehicle must arrive
 
 
 def main() -> None:
@@ -113,7 +113,7 @@ def _fly(mission: Mission, options: argparse.Namespace) -> int:
     # The start may have been said often while the link was opened.
     air.skip()
     if options.dry_run:
-        _wait_for_state(link)
+        _wait_for_state(link, options.link)
         print(f"agent {options.agent}: all checks passed; nothing was sent to other agents.")
         return 0
     seconds = mission.facts["horizon"] if options.seconds is None else options.seconds
@@ -122,11 +122,11 @@ def _fly(mission: Mission, options: argparse.Namespace) -> int:
     return 0 if fault in (Fault.END, Fault.SIGNAL) else 1
 
 
-def _wait_for_state(link: Link) -> None:
-    """Wait until the vehicle says its state.
+def _wait_for_state(link: Link, address: str) -> None:
+    """Wait for a state of the vehicle.
 
     Raises:
-        FlightError: it does not.
+        FlightError: none came.
     """
     deadline = time.monotonic() + _READY
     while time.monotonic() < deadline:
@@ -134,7 +134,10 @@ def _wait_for_state(link: Link) -> None:
         if reading is not None and all(map(math.isfinite, reading.x)):
             link.close()
             return
-    raise FlightError(f"the vehicle sends no state within {_READY:g} s.")
+    raise FlightError(
+        f"no state of the vehicle arrived within {_READY:g} s over the link `{address}`; switch it "
+        "on, and check `--link`. To check the flight without vehicles, use `--all --dry-run`."
+    )
 
 
 def _watch(mission: Mission, options: argparse.Namespace) -> int:

@@ -36,7 +36,7 @@ class Fault(enum.Enum):
     TWIN = "two agents have the number {:.0f}"
     BATTERY = "{:.0%} of the battery is left, less than 15 %"
     LINK = "the link to the vehicle failed"
-    SIGNAL = "the process received a signal to end"
+    SIGNAL = "the process was asked to end"
     END = "the flight is over"
 
     def sentence(self, amount: float) -> str:

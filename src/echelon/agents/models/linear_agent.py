@@ -44,11 +44,12 @@ class Linear(ControlAffine):
         """Check and keep the matrices as float64."""
         # NumPy's float64: a JAX array made outside of an x64 context would already be rounded.
         self.A, self.B = _matrix("A", A), _matrix("B", B)
-        n = len(self.A)
+        n, m = len(self.A), self.B.shape[1]
         self.C = np.eye(n) if C is None else _matrix("C", C)
         self.names = tuple(names) or tuple(f"x{k + 1}" for k in range(n))
         if (
             self.A.shape != (n, n)
+            or n * m == 0
             or len(self.B) != n
             or self.C.shape[1] != n
             or len(self.names) != n
@@ -56,7 +57,7 @@ class Linear(ControlAffine):
             raise ModelError(
                 f"the shapes of `Linear` are A {self.A.shape}, B {self.B.shape}, C {self.C.shape} "
                 f"with {len(self.names)} names, "
-                "and must be A (n, n), B (n, m), C (q, n) with n names."
+                "and must be A (n, n), B (n, m), C (q, n) with n names, n and m from 1 on."
             )
 
     @classmethod
@@ -96,7 +97,7 @@ class Linear(ControlAffine):
         With a positive Ts (s) it is a discrete-time model, see `discrete`.
 
         Raises:
-            ModelError: the file cannot be read, lacks A or B, or D is not zero.
+            ModelError: the file cannot be read, lacks A or B, D is not zero, or Ts is no step.
         """
         found = read_matrices(file)
         if found.get("D", np.zeros(1)).any():
@@ -105,8 +106,14 @@ class Linear(ControlAffine):
                 "only; leave `D` out, or add the input's filter to the states."
             )
         matrices, C, Ts = (found["A"], found["B"]), found.get("C"), found.get("Ts", np.zeros(1))
-        if Ts.size != 1 or not Ts.any():
+        if not Ts.any():
             return cls(*matrices, C, names)
+        # MATLAB has -1 for a discrete-time model whose step is not specified.
+        if Ts.size != 1 or not Ts.item() > 0.0:
+            raise ModelError(
+                f"`Ts` of `{file}` is {' '.join(map(str, Ts.ravel()[:3]))}, and must be one step "
+                "in s, or 0 of a model in continuous time."
+            )
         return cls.discrete(*matrices, Ts.item(), C, names)
 
     @property

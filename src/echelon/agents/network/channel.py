@@ -150,9 +150,9 @@ class Network:
     def information(self) -> str:
         """What each agent receives, in words."""
         if self.messages is MessageContent.STATE:
-            return "late: neighbours' signals, and the feed-forward of the leader"
+            return "neighbours' signals and the feed-forward of the leader, all late"
         leader = _LEADERS[self.prediction]
-        return f"late: neighbours' deviations from where they expect the leader; {leader}"
+        return f"neighbours' deviations from where they expect the leader; {leader}; all late"
 
     def __str__(self) -> str:
         """Return the network in words."""

@@ -177,14 +177,8 @@ def name_agents(agents: np.ndarray) -> str:
     return f"agent {numbers} has" if len(agents) == 1 else f"agents {numbers} have"
 
 
-def edges_of_matrix(
-    matrix: ArrayLike, leaders: Iterable[int], directed: bool | None
-) -> tuple[list[list[float]], Iterable[int], int, bool]:
-    """Return edges, leaders, the number of agents and whether edges are directed, of an adjacency.
-
-    Raises:
-        GraphError: the matrix is not square, not finite, or not that of such a graph.
-    """
+def _square(matrix: ArrayLike) -> Array:
+    """Return an adjacency matrix as numbers, after checking it."""
     try:
         weights = np.asarray(matrix, np.float64)
     except (TypeError, ValueError):
@@ -197,6 +191,20 @@ def edges_of_matrix(
             f"the adjacency matrix has shape {np.shape(weights)}, and must be a square matrix of "
             "numbers (agents, agents)."
         )
+    if not np.isfinite(weights).all():
+        raise GraphError("the adjacency matrix has entries that are NaN or infinite.")
+    return weights
+
+
+def edges_of_matrix(
+    matrix: ArrayLike, leaders: Iterable[int], directed: bool | None
+) -> tuple[list[list[float]], Iterable[int], int, bool]:
+    """Return edges, leaders, the number of agents and whether edges are directed, of an adjacency.
+
+    Raises:
+        GraphError: the matrix is not square, not finite, or not that of such a graph.
+    """
+    weights = _square(matrix)
     symmetric = bool((weights == weights.T).all())
     if directed is False and not symmetric:
         raise GraphError(

@@ -23,7 +23,11 @@ def export(
     ],
     to: Annotated[
         str | None,
-        typer.Option("--to", help="csv (the default), parquet, npz, mat, nc, json, html; law."),
+        typer.Option(
+            "--to",
+            help="csv, parquet, npz, mat, nc, json, html (default: the ending of --out, else csv); "
+            "law.",
+        ),
     ] = None,
     agent: Annotated[
         int | None, typer.Option(help="Write the law of this agent of a scenario.")
@@ -43,22 +47,25 @@ def export(
         raise OutputError(
             "`--to law` needs `--agent`, the number of an agent."
             if agent is None
-            else f"`--agent` is of a law, and `--to` is `{to}`; leave out one of them."
+            else f"`--agent` is of a law, and `--to` is `{to}`; use `law`, or leave `--agent` out."
         )
     if agent is not None:
         _write_law(source, agent, set_ or [], Path(f"law-{agent}") if out is None else out)
         return
     if set_:
         raise OutputError("`--set` is of a scenario, and a run is written as it is; leave it out.")
-    _write_run(Path(source), to or "csv", out, force)
+    _write_run(Path(source), to, out, force)
 
 
-def _write_run(run: Path, to: str, out: Path | None, force: bool) -> None:
+def _write_run(run: Path, to: str | None, out: Path | None, force: bool) -> None:
     from echelon.output.archive.export import content_of
 
     check_exists(run)
-    content = content_of(to)
-    file = Path(f"run.{to}") if out is None else out
+    file = Path(f"run.{to or 'csv'}") if out is None else out
+    ending = file.suffix.lower().removeprefix(".")
+    content = content_of(to) if to else content_of(ending or "csv", f"`{file}` ends in")
+    if to and ending and to != ending:
+        raise OutputError(f"`--to` is `{to}`, and `{file}` ends in `.{ending}`; leave out `--to`.")
     claim_file(file, force)
     STATUS.begin(f"reading {run}")
     from echelon.output.archive.load_folder import load

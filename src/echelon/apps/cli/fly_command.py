@@ -24,9 +24,9 @@ _Dry = Annotated[
     bool, typer.Option("--dry-run", help="Check everything, and send nothing to others.")
 ]
 _Link = Annotated[str, typer.Option(help="Link to the vehicle: udp, cflib://... or px4://...")]
-_Key = Annotated[Path | None, typer.Option(help="The key file of the formation.")]
+_Key = Annotated[Path | None, typer.Option(help="Key file that all agents and the ground share.")]
 _Listen = Annotated[
-    str | None, typer.Option(help="ADDRESS:PORT to hear others at, as a multicast group.")
+    str | None, typer.Option(help="Receive from others at ADDRESS:PORT, as of a multicast group.")
 ]
 _Interface = Annotated[
     str | None, typer.Option(help="Own address on the network of a multicast group.")

@@ -13,8 +13,8 @@ def live(
     scenario: Annotated[
         str,
         typer.Argument(
-            help="The name of a bundled scenario, a YAML file, or the folder of a run, which goes "
-            "on from its last state."
+            help="The name of a bundled scenario, a YAML file, or the folder of a run, which "
+            "continues from its last state."
         ),
     ],
     set_: SetOption = None,

@@ -93,7 +93,9 @@ def meant(wrong: tuple[str | int, ...], allowed: list[str], scenario: type[BaseM
     if colon and value and before in allowed:
         return f" (did you mean `{before}: {value}`, with a space?)"
     places = places_of(wrong, scenario)
-    if not places:
-        return did_you_mean(wrong[-1], allowed)
+    # A slip such as `leader` for `leaders` is likelier than a key of another section.
+    here = did_you_mean(wrong[-1], allowed, likeness=0.85 if places else 0.6)
+    if here or not places:
+        return here
     first, *others = (f"`{path}`" for path in places[:3])
     return f" (did you mean {' or '.join([', '.join([first, *others[:-1]]), *others[-1:]])}?)"

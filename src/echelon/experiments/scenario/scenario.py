@@ -106,7 +106,11 @@ class Scenario(BaseModel, **STRICT):
             f"{key.replace('__', '.')}={inline_yaml(_plain(value))}"
             for key, value in values.items()
         )
-        return with_overrides(self, [*changes, *named])
+        try:
+            return with_overrides(self, [*changes, *named])
+        except ScenarioError as error:
+            # `--set` is an option of commands.
+            raise ScenarioError(re.sub("^--set ", "", str(error), flags=re.MULTILINE)) from None
 
     def place(self, *path: str | int) -> str:
         """Return the place of a key, as in `paper.yaml:4`; else its parent's."""
@@ -245,7 +249,8 @@ def _locate(source: str | Path) -> tuple[Path, str]:
     if file != Path(source):
         what = f"it is a folder without `{SCENARIO_FILE}`"
     allowed = f"allowed is a file, the folder of a run or a bundled scenario: {listing(names)}"
-    close = did_you_mean(Path(source).stem, names)
+    beside = [x for x in map(file.with_suffix, (".yaml", ".yml")) if x.is_file()]
+    close = f" (did you mean `{beside[0]}`?)" if beside else did_you_mean(file.stem, names)
     raise ScenarioError(f"got the scenario `{source}`, {what}, {allowed}{close}.")
 
 

@@ -31,12 +31,13 @@ class Speedup(NamedTuple):
         parts = [f"The slowest disagreement decays with a time constant of {at_least(self.now)} s"]
         if self.leaders:
             names = ", ".join(map(str, self.leaders))
-            role = f"leader {names}" if len(self.leaders) == 1 else f"leaders {names}"
-            parts.append(f"{at_least(self.with_leaders)} s with the further {role}")
+            role = f"agent {names} as a" if len(self.leaders) == 1 else f"agents {names} as"
+            roles = "leader" if len(self.leaders) == 1 else "leaders"
+            parts.append(f"{at_least(self.with_leaders)} s with {role} further {roles}")
         if self.edges:
             names = ", ".join(f"{i}-{j}" for i, j in self.edges)
-            edges = "edge" if len(self.edges) == 1 else "edges"
-            parts.append(f"{at_least(self.with_edges)} s with the further {edges} {names}")
+            edges = "a further edge" if len(self.edges) == 1 else "further edges"
+            parts.append(f"{at_least(self.with_edges)} s with {edges} {names}")
         return f"{'; '.join(parts)}."
 
 

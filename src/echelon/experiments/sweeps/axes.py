@@ -47,8 +47,11 @@ def axes_of(values: Mapping[str, Iterable[Any]]) -> tuple[Axis, ...]:
     """Return axes from values by key.
 
     Raises:
-        ScenarioError: a key has no values, or a value twice; or one key is inside another.
+        ScenarioError: a key has no list of values, or a value twice; or one key is inside another.
     """
+    for key, v in values.items():
+        if isinstance(v, str) or not isinstance(v, Iterable):
+            raise ScenarioError(f"--over {key}: got {v!r}, allowed is a list of values, as [1, 2].")
     return _checked(
         [Axis(key, v if isinstance(v, range) else tuple(v)) for key, v in values.items()]
     )

@@ -247,13 +247,13 @@ def _set_line(run: StoppingRun, border: Border) -> Statement:
         text = f"{text}, which keeps to its path in {border.outputs}"
         return holds(Hypothesis.SET, _PROOF, text, *number)
     if not border.fastest > 0.0:
-        text = f"on the leader's path {border.what()} comes to {about(border.path)}, and the chart "
-        text += f"ends at {about(bound.above)}"
-        remedy = "choose a path that keeps away from it"
+        text = f"on the leader's path {border.what()} reaches {about(border.path)}, and the "
+        text = f"{text}equations hold above {about(bound.above)}"
+        remedy = "choose a gentler path, which keeps away from this limit"
     else:
         s = run.speed(run.law.ready.chains.outputs.index(bound.outputs[0]))
         text = f"at a `speed` of {about(s)} agreement alone may take {border.what()} to "
-        text = f"{text}{about(bound.above)}, where the chart ends"
+        text = f"{text}{about(bound.above)}, where the equations end"
         # What one link may have of a speed against the leader.
         least = border.fastest / run.links
         remedy = f"lower the `speed` of {border.outputs} below {at_most(least)}"

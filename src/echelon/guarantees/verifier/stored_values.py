@@ -91,7 +91,7 @@ def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> 
     if isinstance(stored, str) and isinstance(value, str):
         fine, at = _same_text(stored, value), _first_difference(stored, value)
         shown = [ascii(text[at : at + _SHOWN])[1:-1] for text in (stored, value)]
-        reason = f"from letter {at} on `{shown[0]}` is stored, and computed is `{shown[1]}`"
+        reason = f"from character {at} on `{shown[0]}` is stored, and computed is `{shown[1]}`"
         return _finding(claim, stored, value, fine, reason)
     if _is_number(stored) and _is_number(value):
         fine = _agree(np.array(stored, float), np.array(value, float), digits)

@@ -131,7 +131,8 @@ def judge(findings: Sequence[Finding], note: str = "") -> Verification:
         text = f"Refused: {'; '.join(false)} {does} not hold as stored.{note}"
         return Verification(tuple(findings), "refused", text, note)
     if open_ or not findings:
-        names = "; ".join(open_) or "anything"
+        more = f" and {len(open_) - 3} more" if len(open_) > 4 else ""
+        names = "; ".join(open_[:3] if more else open_) + more or "anything"
         text = f"Incomplete: {text}; not checked: {names}.{note}"
         return Verification(tuple(findings), "incomplete", text, note)
     return Verification(tuple(findings), "verified", f"Verified: {text}.{note}", note)

@@ -100,10 +100,15 @@ def check_exists(run: Path) -> Path:
     """Return the path of a run, after checking that there is something.
 
     Raises:
-        OutputError: there is nothing.
+        OutputError: there is nothing, or a scenario.
     """
     if not run.exists():
         raise OutputError(f"`{run}` does not exist; give the folder of a run, or its `{DATA}`.")
+    if run.is_file() and run.suffix in (".yaml", ".yml"):
+        raise OutputError(
+            f"`{run}` is a scenario; run it first (`echelon run {run} --out FOLDER`), and give the "
+            "folder."
+        )
     return run
 
 

@@ -9,7 +9,7 @@ from echelon.experiments.scenario.scenario import SCENARIO_FILE
 from echelon.guarantees.verifier.strict_json import read_json
 from echelon.guarantees.verifier.verify import states_gain
 from echelon.output.archive.chunks import Chunks
-from echelon.output.archive.folder import DATA, GAIN, SUMMARY
+from echelon.output.archive.folder import DATA, GAIN, SUMMARY, check_exists
 
 
 class ClaimFiles(NamedTuple):
@@ -36,11 +36,9 @@ def claim_files(place: PathLike) -> ClaimFiles:
 
     Raises:
         GainError: a file cannot be read, or is no JSON.
-        OutputError: the folder holds no claims, or its gain file is missing.
+        OutputError: there is nothing, or nothing that makes claims; or a gain file is missing.
     """
-    path = Path(place)
-    if path.name == SUMMARY and (path.parent / SCENARIO_FILE).is_file():
-        path = path.parent
+    path = _place(Path(place))
     if not path.is_dir():
         return ClaimFiles(path) if states_gain(read_json(path)) else ClaimFiles(claims=path)
     names = GAIN, SUMMARY, DATA, SCENARIO_FILE
@@ -56,3 +54,16 @@ def claim_files(place: PathLike) -> ClaimFiles:
     if "promise" not in summary:
         raise OutputError(f"`{files.claims}` is damaged: it has no `promise`.")
     return files
+
+
+def _place(path: Path) -> Path:
+    """Return the folder or file that a path means, after checking that it may make claims."""
+    if not path.exists():
+        raise OutputError(f"`{path}` does not exist; give the folder of a run, or a gain file.")
+    check_exists(path)
+    if path.name == DATA:
+        raise OutputError(
+            f"`{path}` is data alone; give the folder in which it is, `{path.parent}`."
+        )
+    within = path.name == SUMMARY and (path.parent / SCENARIO_FILE).is_file()
+    return path.parent if within else path

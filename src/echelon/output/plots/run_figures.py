@@ -73,6 +73,8 @@ def figures(
     names = check_names(what)
     if ax is not None and len(names) != 1:
         raise OutputError(f"`ax` takes one figure, and `what` has {len(names)} names.")
+    if ax is not None and not hasattr(ax, "figure"):
+        raise OutputError(f"`ax` is a `{type(ax).__name__}`, and must be axes of matplotlib.")
     data = recording_of(run)
     if not len(data.times):
         return {}

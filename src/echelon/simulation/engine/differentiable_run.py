@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import SimulationError, check_name
+from echelon.core.trace import error_summary
 from echelon.core.types import Array
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.step.drive import Drive, Problem
@@ -79,9 +80,16 @@ def cost_number(cost: Cost, sums: Sums) -> jax.Array:
     """Return the cost of sums.
 
     Raises:
-        SimulationError: it is not one number.
+        SimulationError: it fails, or is not one number.
     """
-    value = cost(sums)
+    try:
+        value = cost(sums)
+    # The cost is the user's code, which may raise whatever it likes.
+    except Exception as error:
+        raise SimulationError(
+            f"the cost of a run fails with {error_summary(error)}; it must be a function of the "
+            "run's sums, written with `jax.numpy`."
+        ) from error
     if (shape := jnp.shape(value)) != ():
         raise SimulationError(
             f"the cost of a run has shape {shape}, and must be one number, such as a sum of it."

@@ -48,10 +48,11 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
 
     Raises:
         EchelonError: a part is malformed or does not fit the others; the agents are not driven by
-            laws, or these have no gain; messages are late; a variable is unknown; the cost is not
-            one number;
-            `settings.engine` is `native`, and native code is unavailable.
+            laws, or these have no gain; messages are late; a variable is unknown; the cost fails,
+            or is not one number; `settings.engine` is `native`, and native code is unavailable.
     """
+    if isinstance(wrt, str):
+        raise SimulationError(f"`wrt` is the text {wrt!r}, and must be a list, such as [{wrt!r}].")
     if parts.formation.motion is not None:
         raise SimulationError(
             "got a formation that changes, but derivatives are of constant ones; leave out "

@@ -11,7 +11,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, read_states
 
 
 def initial_states(parts: Parts, seed: int) -> Float[Array, "N n"]:
@@ -22,8 +22,8 @@ def initial_states(parts: Parts, seed: int) -> Float[Array, "N n"]:
     the spread of each state. The same seed draws the same deviations whatever the spreads are.
 
     Raises:
-        SimulationError: given states have a wrong shape or are not finite; a spread is negative.
-        ModelError: a spread or error names no state or group.
+        SimulationError: the state given for an agent has a wrong shape or is not finite, or there
+            is no such agent; a start error is not finite.
     """
     return Starts(parts)(seed)
 
@@ -47,7 +47,7 @@ class Starts:
         self.states: np.ndarray | None = None
         self.named: dict[int, ArrayLike] = {}
         if initial is not None and not isinstance(initial, Mapping):
-            self.states = _read_states(
+            self.states = read_states(
                 initial, self.shape, "initial states have", "(agents, states)"
             )
             # The caller's states are where leaders belong; the error is added to them.
@@ -56,9 +56,6 @@ class Starts:
         named = dict(initial or {})
         spreads = {key: value for key, value in named.items() if isinstance(key, str)}
         self.spread = _per_state(model, spreads, "initial spread")
-        if (self.spread < 0.0).any():
-            least = self.spread.min()
-            raise SimulationError(f"an initial spread is {least}, and must not be negative.")
         self.named = {key: value for key, value in named.items() if not isinstance(key, str)}
         leaders = np.asarray(parts.drive.start(model), np.float64) + self.error
         self.goals = leaders + parts.formation.offsets_at([0.0])[0]
@@ -87,7 +84,7 @@ def _place(states: Float[Array, "K N n"], named: Mapping[int, ArrayLike], graph:
     """Put agents into the states that are given for them, in all starts (K, N, n)."""
     for agent, state in named.items():
         _check_agent(agent, graph)
-        states[:, agent] = _read_states(
+        states[:, agent] = read_states(
             state, states.shape[2:], f"the initial state of agent {agent} has", "(states,)"
         )
 
@@ -98,16 +95,6 @@ def _check_agent(agent: int, graph: Graph) -> None:
             f"an initial state is given for agent {agent}, "
             f"and agents are numbered from 0 to {graph.agents - 1}."
         )
-
-
-def _read_states(values: object, shape: tuple[int, ...], what: str, meaning: str) -> np.ndarray:
-    # A copy: the error of the leaders is added to it, and the caller's array stays.
-    array = np.array(values, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise SimulationError(
-            f"{what} shape {array.shape}, and must be finite with shape {shape} {meaning}."
-        )
-    return array
 
 
 def _per_state(model: ControlAffine, named: Mapping[str, Any], what: str) -> Float[Array, " n"]:

@@ -1,6 +1,7 @@
 """The gradient of a cost of a run by native code."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, final
 
 import equinox as eqx
@@ -100,7 +101,8 @@ class Native:
 @memoize
 def _uses_distances(cost: Cost, shapes: tuple[tuple[int, ...], ...]) -> bool:
     """Tell whether a cost depends on the distances between agents."""
-    return Sums(*used_leaves(cost, Sums(*map(np.zeros, shapes)))).spacing
+    number = partial(cost_number, cost)
+    return Sums(*used_leaves(number, Sums(*map(np.zeros, shapes)))).spacing
 
 
 def _gain_numbers(loop: Loop, names: Sequence[str]) -> tuple[VaryingNumbers, list[str]]:

@@ -90,7 +90,7 @@ class Settings(NamedTuple):
             value = getattr(self, name)
             if not (isinstance(value, numbers.Real) and 0.0 < float(value) < math.inf):
                 raise SimulationError(
-                    f"`{name}` is {value}, and must be a positive finite number of seconds."
+                    f"`{name}` is {_shown(value)}, and must be a positive finite number of seconds."
                 )
         # Any text that is not empty would count as true.
         if not isinstance(self.limits, bool):
@@ -127,8 +127,13 @@ class Settings(NamedTuple):
             if not whole or not least <= int(value) <= most:
                 end = f"to {most}" if whole and int(value) > most else "on"
                 raise SimulationError(
-                    f"`{name}` is {value}, and must be a whole number from {least} {end}."
+                    f"`{name}` is {_shown(value)}, and must be a whole number from {least} {end}."
                 )
+
+
+def _shown(value: object) -> str:
+    """Return a value as in a message: text in its quotes, so that it is no number."""
+    return repr(value) if isinstance(value, str) else str(value)
 
 
 def _check_name(what: str, name: str, allowed: tuple[str, ...]) -> None:
