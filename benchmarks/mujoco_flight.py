@@ -78,7 +78,8 @@ def fly(parts: ech.Parts, settings: ech.Settings, starts: np.ndarray) -> np.ndar
             data.ctrl[4 * k : 4 * k + 4], message = agent.step(n * settings.dt, state(data, k))
             if n % every == 0 and message is not None:
                 for other in agents:
-                    if k in other.neighbours:
+                    # Agents that keep apart regard all others, whatever the graph.
+                    if k in other.neighbours or (k != other.number and parts.drive.safety):
                         heapq.heappush(queue, (n + late, next(order), other.number, message))
         for _ in range(5):
             mujoco.mj_step(plant, data)

@@ -9,6 +9,7 @@ import pytest
 import echelon as ech
 from echelon.core.errors import EchelonError
 from echelon.guarantees.promises.event_lines import events_in_words
+from echelon.simulation.engine.prepare import prepare
 
 Cut, Join, Lose = ech.network.Cut, ech.network.Join, ech.network.Lose
 CART = ech.models.DoubleIntegrator()
@@ -264,6 +265,17 @@ def test_nothing_is_stated_until_an_event_that_brings_back_who_was_cut_off():
     """Without the arrival of agent 1 agents 2 and 3 would have no path to the leader for ever."""
     guarantee = ech.promise(_parts(TREE, events=[Lose(1, 2.0), Join(1, 3.0)]), SETTINGS)
     assert not guarantee.promised and guarantee.prefix is None
+
+
+def test_who_hears_no_leader_for_some_time_under_a_law_of_states_is_warned_of():
+    gain = ech.synthesize(CART, TREE, ech.gains.Riccati())
+    states = ech.Laws(ech.laws.Tracking(CIRCLE), ech.laws.Consensus(gain))
+    late = [Join(1, 3.0)]
+    (text,) = prepare(_parts(TREE, states, events=late), SETTINGS).warnings
+    assert text.startswith("agents 2, 3 have no path to a leader from 0 to 3 s, in which the law ")
+    assert "`Consensus`" in text and text.endswith("add links, or use `stopping-point`.")
+    assert prepare(_parts(RING, states, events=late), SETTINGS).warnings == ()
+    assert prepare(_parts(TREE, events=late), SETTINGS).warnings == ()
 
 
 @pytest.mark.parametrize(

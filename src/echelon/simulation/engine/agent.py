@@ -68,7 +68,8 @@ class Agent:
 
     A message may be missing: the last one of its sender is used, and a neighbour that sent none is
     left out. Agents of other models are heard in the outputs that both have. Nothing that is not
-    finite reaches the memory.
+    finite reaches the memory. With `safety` an agent keeps apart only from those whose messages it
+    receives: give it those of all agents, neighbours or not.
 
     Args:
         parts: of the whole formation; the starts are not used.

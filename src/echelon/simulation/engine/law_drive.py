@@ -8,6 +8,7 @@ import jax
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
+from echelon.agents.network.reach import lost_at_times
 from echelon.agents.world.world import World
 from echelon.core.errors import (
     EchelonError,
@@ -246,8 +247,14 @@ class Laws(Drive):
             choose_engine(problem.settings, 0, lambda: BlockRows.of(loop), _no_rows)
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
-        """Return the warnings of both laws, and about references that leaders cannot follow."""
+        """Return the warnings of both laws, and of what they cannot follow or do not hear."""
         warnings = self.leader.warnings(model, graph) + self.follower.warnings(model, graph)
+        lost = lost_at_times(graph) if graph.events and self.lags else ""
+        if lost:
+            warnings += (
+                f"{lost}, in which the law `{type(self.follower).__name__}` does not correct their "
+                "errors, so that the run may diverge; add links, or use `stopping-point`.",
+            )
         return warnings + leader_warnings(self.leader, model, settings.horizon, settings.limits)
 
     def start(self, model: ControlAffine) -> State:
