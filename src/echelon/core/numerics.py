@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
-_N = TypeVar("_N", float, jax.Array)
 _R = TypeVar("_R")
 Precision: TypeAlias = Literal["float64", "float32"]
 Field: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
@@ -30,13 +29,13 @@ def inlined(function: Callable[..., _R]) -> Callable[..., _R]:
     return jax.jit(lambda *arguments: function(*arguments), inline=True)
 
 
-def lesser(a: float, b: _N) -> _N | jax.Array:
+def lesser(a: float, b: jax.Array | float) -> jax.Array | float:
     """Return the smaller of two numbers, of which the second may be traced."""
     # JAX would compile a program for two plain numbers.
     return jnp.minimum(a, b) if isinstance(b, jax.Array) else min(a, b)
 
 
-def greater(a: _N, b: float) -> _N | jax.Array:
+def greater(a: jax.Array | float, b: float) -> jax.Array | float:
     """Return the larger of two numbers, of which the first may be traced."""
     return jnp.maximum(a, b) if isinstance(a, jax.Array) else max(a, b)
 

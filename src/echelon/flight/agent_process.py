@@ -23,6 +23,8 @@ _LONGEST: Final = 20.0  # s of a descent
 _REST: Final = 0.05  # m/s
 _CLOCK: Final = 0.1
 """s, by which the clock that names the start may be beside this one, without a network's delay."""
+_TWIN: Final = 0.5
+"""s after its own beginning from which on nobody else may have its number."""
 _MADE_UP: Final = 5
 """Ticks that are made up for at most; after a longer gap the law goes on from where it was."""
 _TOLD: Final = (Drop.VERSION, Drop.FORMATION, Drop.SIGNATURE, Drop.CLOCK, Drop.AHEAD, Drop.START)
@@ -109,7 +111,7 @@ class AgentProcess:
         reading = self._read()
         now = time.monotonic()
         for datagram in self._crew.air.receive():
-            self._hear(datagram, now)
+            self._hear(datagram)
         if reading is not None and all(map(math.isfinite, reading.x)):
             self._reading, self._heard_at = reading, now
             speed = math.hypot(*(reading.x[k] for k in self._crew.flight["velocity"]))
@@ -196,10 +198,10 @@ class AgentProcess:
 
     # ---- others ----------------------------------------------------------------------------------
 
-    def _hear(self, datagram: bytes, now: float) -> None:
+    def _hear(self, datagram: bytes) -> None:
         wire, clock = self._crew.wire, self._crew.clock
         opened = wire.open(datagram, clock.now, time.time())
-        why = opened if isinstance(opened, Drop) else self._use(opened, now)
+        why = opened if isinstance(opened, Drop) else self._use(opened)
         if why is None:
             return
         if not isinstance(opened, Drop):
@@ -208,12 +210,12 @@ class AgentProcess:
         if why in _TOLD and (why is not Drop.START or wire.dropped[why] > 2):
             self._say(f"a datagram of {name_of(sender_of(datagram))} {why.value}")
 
-    def _use(self, opened: Opened, now: float) -> Drop | None:
+    def _use(self, opened: Opened) -> Drop | None:
         """Use what a datagram says, or return why it is not used."""
         if opened.kind is DatagramKind.NOTE:
             return None
         if opened.sender == self._crew.wire.number:
-            self._meet(opened, now)
+            self._meet(opened)
         elif isinstance(opened.body, Letter):
             return self._pilot.box.receive(opened.body, self._crew.clock.now or 0.0)
         elif opened.kind is DatagramKind.START and isinstance(opened.body, float):
@@ -231,10 +233,11 @@ class AgentProcess:
             clock.start(at)
         return None
 
-    def _meet(self, opened: Opened, now: float) -> None:
+    def _meet(self, opened: Opened) -> None:
         """Judge a datagram with the agent's own number."""
-        # What a process before this one sent may still be on its way.
-        if opened.boot != self._crew.wire.boot and now > self._began + 2.0:
+        # What a process before this one sent may still be on its way. Letters have another clock.
+        boot, alive = self._crew.wire.boot, 1e-3 * self._crew.wire.boot + _TWIN
+        if opened.boot != boot and opened.kind is not Kind.LETTER and opened.stamp > alive:
             self._supervisor.trip(Fault.TWIN, opened.sender)
             if self._supervisor.fault is not Fault.TWIN:
                 self._say(Fault.TWIN.sentence(opened.sender))
