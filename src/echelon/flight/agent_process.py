@@ -237,7 +237,7 @@ class AgentProcess:
         """Judge a datagram with the agent's own number."""
         # What a process before this one sent may still be on its way. Letters have another clock.
         boot, alive = self._crew.wire.boot, 1e-3 * self._crew.wire.boot + _TWIN
-        if opened.boot != boot and opened.kind is not Kind.LETTER and opened.stamp > alive:
+        if opened.boot != boot and opened.kind is not DatagramKind.LETTER and opened.stamp > alive:
             self._supervisor.trip(Fault.TWIN, opened.sender)
             if self._supervisor.fault is not Fault.TWIN:
                 self._say(Fault.TWIN.sentence(opened.sender))

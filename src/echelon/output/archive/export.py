@@ -68,7 +68,7 @@ def table(run: "Result | Recording", every: int = 1) -> "pd.DataFrame":
     frame = pd.DataFrame(columns)
     # What is stored of an agent that is absent is where it was lost, and no motion.
     if run.presence is not None:
-        frame = frame[run.presence[::every].ravel()].reset_index(drop=True)
+        frame = frame.loc[run.presence[::every].ravel(), :].reset_index(drop=True)
     frame.attrs["units"] = {name: unit for name, unit in units.items() if unit}
     return frame
 

@@ -62,7 +62,8 @@ def _alone(result: Result) -> _Alone | None:
         frames = np.flatnonzero((result.times >= start) & (result.times <= end))
         errors = away[frames, agent]
         lost = len(frames) and not errors[-1] <= max(SETTLED, errors[0])
-        if lost and end - start > np.subtract(*spans.get(agent, (0.0, 0.0))[::-1]):
+        before = spans.get(agent, (0.0, 0.0))
+        if lost and end - start > before[1] - before[0]:
             spans[agent] = start, end
     if not spans:
         return None
