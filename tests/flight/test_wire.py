@@ -121,6 +121,14 @@ def test_replays_are_old_and_a_restarted_process_is_not():
     assert receiver.open(signed(body_of(), count=9), NOW, WALL) is Drop.OLD
 
 
+def test_own_datagrams_that_return_hide_no_other_process_with_the_same_number():
+    elder, newer = wire(1), wire(1, boot=BOOT + 1)
+    assert newer.open(newer.note(WALL, "here"), None, WALL).boot == BOOT + 1
+    datagram = elder.note(WALL, "here too")
+    assert newer.open(datagram, None, WALL).boot == BOOT
+    assert newer.open(datagram, None, WALL) is Drop.OLD
+
+
 def test_only_the_ground_starts_a_plan():
     agent = wire(2)
     assert agent.open(wire(1).start(WALL, WALL), None, WALL) is Drop.SENDER

@@ -297,6 +297,10 @@ class Wire:
         # A process whose clock was once far ahead would be believed for ever by its boot.
         if abs(stamp - clock) > APART or boot > 1e3 * (wall + APART):
             return Drop.CLOCK
+        # Own datagrams return from a multicast group, and are newer than those of a process that
+        # was started before with the same number.
+        if (sender, boot) == (self.number, self.boot):
+            return Opened(DatagramKind(kind), sender, boot, stamp, body)
         newest = self._newest.get((sender, DatagramKind(kind)), (0, 0))
         if (boot, count) <= newest:
             return Drop.OLD
