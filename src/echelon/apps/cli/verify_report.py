@@ -42,8 +42,8 @@ def print_verification(verification: "Verification", run: Path | None) -> None:
     for text in _reasons(verification.findings):
         _print(f"- {text}")
     if run is not None:
-        text = "Not covered: figures, and by which versions and engine the run was computed how "
-        _print(f"{text}fast; `echelon plot {run} --out OTHER` draws the figures again.")
+        text = "Not covered: the figures, the computing time, and the stated versions and engine. "
+        _print(f"{text}`echelon plot {run} --out OTHER` draws the figures again.")
     _print(verification.sentence)
 
 
