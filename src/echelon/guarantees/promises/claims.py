@@ -39,8 +39,8 @@ def _difference(
     """Return the first difference in words; empty without any."""
     claim, low = gain.certificate, parts.graph.spectrum().low
     if abs(claim.lambda_min - low) > _SAME * low:
-        made = about(claim.lambda_min, 4)
-        return f"the gain was made for lambda_min {made}, and this graph has {about(low, 4)}"
+        ours, theirs = about(low, 4), about(claim.lambda_min, 4)
+        return f"the gain was made for lambda_min {theirs}, and this graph has {ours}"
     slowest = grounded_slowest(gain, loop.linear, parts.graph)
     fastest = float(np.abs(np.linalg.eigvals(loop.linear.A - loop.linear.B @ loop.gains[-1])).max())
     bends = at_trim(parts.model).bends.any()

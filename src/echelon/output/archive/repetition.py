@@ -66,9 +66,10 @@ def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -
     result = dataclasses.replace(result, **origin_of(scenario))
     # Where errors may grow, so may the rounding of another processor: a difference proves nothing.
     decided = bool(promise(*experiment).promised)
-    for each in _compare(files, data, result):
-        open_ = each.verdict == "refused" and not decided and each.stored and each.value
-        yield unchecked(each.claim, each.stored, _GROWN) if open_ else each
+    for finding in _compare(files, data, result):
+        differs = finding.verdict == "refused" and finding.stored and finding.value
+        open_ = differs and not decided
+        yield unchecked(finding.claim, finding.stored, _GROWN) if open_ else finding
 
 
 _GROWN = "the run computed again differs, perhaps by rounding, which may grow without a guarantee"
@@ -120,16 +121,16 @@ def _compare_dataset(
     name: str, data: Labelled, result: Result, digits: Digits
 ) -> Iterator[Finding]:
     """Compare arrays and attributes of a dataset, but those of the parts of the run."""
-    known = labelled_parts(result.parts, result.settings)
+    parts = labelled_parts(result.parts, result.settings)
     stored, again = data.arrays(), with_sums(result)
     for key, value in again.arrays().items():
-        if key not in known.arrays():
+        if key not in parts.arrays():
             theirs = stored.get(key)
             theirs = None if theirs is None else np.asarray(theirs)
             yield compare_arrays(f"{name}: observed.{key}", theirs, np.asarray(value), digits)
     values, attributes = again.attributes, data.attributes
     stopped = ("outcome", "message") if values["outcome"] in _STOPPED else ()
-    skipped = {*_ATTRIBUTES, *stopped, *known.attributes}
+    skipped = {*_ATTRIBUTES, *stopped, *parts.attributes}
     for key in {**values, **attributes}:
         if key not in skipped and not key.startswith("version_"):
             theirs, ours = [{key: x[key]} if key in x else {} for x in (attributes, values)]

@@ -96,9 +96,9 @@ def _computed(
     begin("computing the guarantee again, which takes up to a minute")
     experiment, findings = experiment_of(source, files.claims, files.gain)
     yield from findings
-    for each in recompute(experiment, source, files.claims, files.data):
-        findings.append(each)
-        yield each
+    for finding in recompute(experiment, source, files.claims, files.data):
+        findings.append(finding)
+        yield finding
     if files.data is None:
         return
     if not repeat:

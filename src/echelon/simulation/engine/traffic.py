@@ -74,8 +74,8 @@ class Traffic(NamedTuple):
         ages = np.full((agents, len(self.ages)), -np.inf)
         both = True if presence is None else presence[:, edges].all(axis=2)
         for end in (0, 1):
-            known = np.nan_to_num(np.where(both, self.ages[:, :, end], np.nan), nan=-np.inf)
-            np.maximum.at(ages, edges[:, end], known.T)
+            own = np.nan_to_num(np.where(both, self.ages[:, :, end], np.nan), nan=-np.inf)
+            np.maximum.at(ages, edges[:, end], own.T)
         return np.where(ages > -np.inf, ages, np.nan).T
 
 
