@@ -41,7 +41,7 @@ SHOWN = (
     "descends: the vehicle is 0.50 m outside its fence",
     "Dropped here: a datagram of agent 0 is signed with another key: 1.",
     "not heard yet. the address is in use",
-    "12 × is not newer than the last one of its sender",
+    "12 × is not newer than the last one from its sender",
     "1, -0.25, ?",
     "50 %",
 )
