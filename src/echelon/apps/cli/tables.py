@@ -64,7 +64,7 @@ _PARTS = (
     ("longest_step", "condition", "gain_margin", "delay_margin"),
     ("rate", "kind", "theorem", "radius"),
 )
-"""The columns of each of the tables of designs, which so fit into 80 columns."""
+"""The columns of each table of designs; each table is at most 80 characters wide."""
 _SAFE: dict[str, tuple[Callable[[float], str], ...]] = {
     "edge": (at_least,),
     "slowest_mode": (at_least,),
@@ -74,7 +74,7 @@ _SAFE: dict[str, tuple[Callable[[float], str], ...]] = {
     "rate": (at_most,),
     "radius": (at_most,),
 }
-"""Towards where numbers that are guaranteed are rounded."""
+"""How numbers that are guaranteed are rounded; of a range, its two ends."""
 
 
 def design_row(design: "Design") -> "JsonObject":

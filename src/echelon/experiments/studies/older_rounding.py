@@ -9,7 +9,8 @@ from echelon.core.digits import about, at_least, at_most
 _NUMBER = re.compile(r"((?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]\d+)?)")
 _FACTORS = (1.0, -1.0, 1e3, 100.0, math.degrees(1.0))
 """Of numbers in texts: rates of modes, ms, percent, degrees."""
-_MOST = 6
+_DIGITS = range(3, 7)
+"""Of numbers in texts. With fewer, a count could pass for a rounded number."""
 
 
 def as_rounded_now(stored: object, value: object) -> object:
@@ -22,7 +23,7 @@ def as_rounded_now(stored: object, value: object) -> object:
     pairs = {
         (about(x, digits), text(x, digits))
         for x in exact
-        for digits in range(1, _MOST + 1)
+        for digits in _DIGITS
         for text in (at_most, at_least)
     }
     return _renewed(stored, value, pairs)

@@ -22,10 +22,12 @@ from echelon.guarantees.verifier.findings import Finding, unchecked
 from echelon.guarantees.verifier.stored_values import Digits, compare_arrays, compare_values
 from echelon.guarantees.verifier.strict_json import read_json
 from echelon.output.archive.open_folder import ClaimFiles
+from echelon.output.reports.causes import sizes
 from echelon.output.reports.run_report import report
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import RunSoFar, simulate
+from echelon.simulation.step.meter import SETTLED
 
 OBSERVATIONS = "what the run observed"
 """The claim that stands for all of them where they are not computed again."""
@@ -64,15 +66,25 @@ def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -
         yield unchecked(OBSERVATIONS, "", "the run was stopped at a step that is not repeated")
         return
     result = dataclasses.replace(result, **origin_of(scenario))
-    # Where errors may grow, so may the rounding of another processor: a difference proves nothing.
-    decided = bool(promise(*experiment).promised)
+    decided = bool(promise(*experiment).promised) and _converged(result)
     for finding in _compare(files, data, result):
         differs = finding.verdict == "refused" and finding.stored and finding.value
         open_ = differs and not decided
         yield unchecked(finding.claim, finding.stored, _GROWN) if open_ else finding
 
 
-_GROWN = "the run computed again differs, perhaps by rounding, which may grow without a guarantee"
+_GROWN = "the run computed again differs, perhaps by rounding, which may grow where errors do"
+
+
+def _converged(result: Result) -> bool:
+    """Tell whether errors shrank or remained small: a local guarantee does not cover every start.
+
+    Where errors grow, so may the rounding of another processor, and a difference proves nothing.
+    """
+    if result.outcome in (Outcome.DIVERGED, Outcome.LEFT_CHART):
+        return False
+    first, last = sizes(result)
+    return last <= max(first, SETTLED)
 
 
 def _repeated(experiment: Experiment, data: Labelled, steps: int) -> Result | None:

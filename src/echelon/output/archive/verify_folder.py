@@ -75,7 +75,7 @@ def check_files(
         files: of a run, or a gain file.
         trusted: the scenario whose code may be executed.
         repeat: whether to simulate the scenario again.
-        begin: called with what is begun that may take a minute or longer.
+        begin: called with a text before each part that may take a minute or longer.
     """
     source, obstacle = _source(files, trusted)
     findings, note = _independent(files, trusted)
