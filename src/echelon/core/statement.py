@@ -30,7 +30,7 @@ class Hypothesis(Word):
     SET = "certified set"
     STARTS = "starts in the certified set"
     SEPARATION = "distance between agents"
-    LIMITS = "motors, from these starts"
+    LIMITS = "inputs within limits"
     CLAIMS = "claims of the gain"
 
 
@@ -90,6 +90,7 @@ class Statement:
         text: what was found, in words.
         remedy: what would be needed; empty where nothing fails.
         reason: what the failure says against any promise; empty where it leaves one.
+        condition: what the claim is conditional on, since the failure leaves it to the run.
     """
 
     statement: Line
@@ -100,6 +101,7 @@ class Statement:
     text: str = ""
     remedy: str = ""
     reason: str = ""
+    condition: str = ""
 
     def __post_init__(self) -> None:
         """Hold that nobody is left with a failure and nothing to do."""

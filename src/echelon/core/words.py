@@ -99,11 +99,8 @@ moves, which is seldom what is meant; the paper's own network is `none`."""
 class Kind(Word):
     """The kind of an argument, and how a promise that rests on it begins; the strongest first."""
 
-    PROOF = "Proved in exact arithmetic, in continuous time and within the inputs' limits"
-    VERTICES = (
-        "By eigenvalues at the corners of a hull of all Jacobians, in continuous time and within "
-        "the inputs' limits"
-    )
+    PROOF = "Proved in exact arithmetic, in continuous time"
+    VERTICES = "By eigenvalues at the corners of a hull of all Jacobians, in continuous time"
     SAMPLES = "Seen at samples, which is no proof"
     LINEARIZATION = "By linearization at the trim"
 
@@ -126,6 +123,14 @@ class Theorem(Word):
     def __str__(self) -> str:
         """Return the theorem's name as the theory page has it."""
         return self.name
+
+
+class Standing(Word):
+    """Whether what is claimed of a run is guaranteed."""
+
+    GUARANTEED = "all conditions hold by computation"
+    CONDITIONAL = "a condition is left that only the run can show"
+    NONE = "nothing is claimed"
 
 
 class Verdict(Word):

@@ -336,20 +336,6 @@ def carried_pieces(time: Scalar) -> tuple[jax.Array, jax.Array]:
     return count, time / jnp.maximum(count, 1)
 
 
-def declares(law: Law, name: str) -> bool:
-    """Tell whether a declaration of a law, such as `metric`, is of the law that runs.
-
-    A subclass that replaces a method inherits what its base declares about the replaced one.
-    """
-    kinds = type(law).__mro__
-    place = next(k for k, kind in enumerate(kinds) if name in vars(kind))
-    return not any(
-        not key.startswith("_") and key != "prover" and callable(getattr(kinds[place], key, None))
-        for kind in kinds[:place]
-        for key in vars(kind)
-    )
-
-
 def check_gain_fits(
     law: Law, model: ControlAffine, P_shape: tuple[int, ...], R_shape: tuple[int, ...]
 ) -> None:

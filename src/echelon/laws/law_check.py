@@ -55,12 +55,12 @@ def _check_law(law: Law, model: ControlAffine) -> None:
             f"`feedforward` of `{name}` is {law.feedforward!r}, and must be a member of "
             "`Feedforward`, such as `Feedforward.RELAY`."
         )
-    memory = _memory(law)
+    view, memory = traced_arguments(law, model)
     output = checked_trace(
         LawError,
         f"`update` of `{name}`",
         lambda view, memory: law.update(model, view, memory),
-        _view(law, model),
+        view,
         memory,
         advice=_ADVICE,
     ).result
@@ -76,6 +76,11 @@ def _check_law(law: Law, model: ControlAffine) -> None:
             f"the memory of `{name}` is {_in_words(memory)} at first and {_in_words(output[1])} "
             "after a step, and must keep its form."
         )
+
+
+def traced_arguments(law: Law, model: ControlAffine) -> tuple[LocalView, Memory]:
+    """Return a view of zeros and the memory at the beginning, in the shapes that a law uses."""
+    return _view(law, model), _memory(law)
 
 
 def _memory(law: Law) -> Memory:

@@ -44,7 +44,7 @@ class Knobs(NamedTuple):
     Attributes:
         coupling: c; None of a law without one.
         weight: factor on the scenario's input weight R in the Riccati equation of the gain.
-        feedforward: 1 if followers receive the scenario's feed-forward, 0 if none.
+        feedforward: the share of the scenario's feed-forward that followers use, 0 to 1.
         size: factor on the size of the formation.
         turn: of the formation, degrees.
         wind: added to the rate of the first velocity, or of the first position.
@@ -83,6 +83,11 @@ class Knobs(NamedTuple):
     def roomy(self) -> bool:
         """Whether the loop needs room for events."""
         return bool(self.events or self.reshaping)
+
+    @property
+    def partial(self) -> bool:
+        """Whether followers use less than the feed-forward that the scenario's law is about."""
+        return self.feedforward < 1.0
 
     @property
     def before(self) -> "Knobs":
@@ -237,7 +242,8 @@ class LiveParts:
         """
         gain, parts = self.gain(knobs), self.parts
         switches = parts.graph.schedule is not None or knobs.events
-        if gain is None or switches or parts.world.network is not None:
+        unknown = getattr(parts.drive, "unknown", "")
+        if gain is None or switches or unknown or parts.world.network is not None:
             return None
         gain = eqx.tree_at(lambda gain: gain.coupling, gain, knobs.coupling)
         assert isinstance(parts.drive, Laws)

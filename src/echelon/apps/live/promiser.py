@@ -137,6 +137,10 @@ def _badge(compute: Callable[[Panel, Knobs], JsonObject], request: _Request) -> 
 
 def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
     """Return the badge at a position of the knobs: `holds`, `edge` or `lost`, with the causes."""
+    if knobs.partial:
+        text = f"Nothing is guaranteed at a feed-forward of {100.0 * knobs.feedforward:.3g} %: "
+        text += "guarantees are of the scenario's law, which uses all of it."
+        return {"state": "lost", "short": "no guarantee", "whole": text, "causes": [text]}
     try:
         unchanged = knobs == panel.start
         guarantee = promise(*(panel.experiment if unchanged else build(panel.scenario_at(knobs))))
@@ -150,7 +154,8 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
     badge["causes"] = [cause.sentence() for cause in guarantee.causes]
     badge["edge"], badge["end"] = guarantee.edge, _end(panel, knobs, guarantee.edge)
     badge["above"] = None if guarantee.edge is None else at_least(guarantee.edge)
-    badge["rate"], certified = guarantee.rate, guarantee.certified
+    badge["rate"] = guarantee.rate if guarantee.promised else None
+    certified = guarantee.certified
     badge["anywhere"] = certified is not None and certified.radius == float("inf")
     # Shown where the guarantee does not cover the state.
     badge["beyond"] = [cause.sentence() for cause in beyond(0.0, guarantee)]
@@ -192,6 +197,8 @@ def first_look(panel: Panel, knobs: Knobs) -> JsonObject:
     A mode that grows rules out a guarantee.
     """
     settings = panel.experiment.settings
+    if knobs.partial:
+        return badge_of(panel, knobs)
     try:
         loop = panel.live.loop(knobs)
     except GraphError as error:

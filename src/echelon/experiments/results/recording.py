@@ -216,7 +216,9 @@ class Recording(FrameNumbers):
         """
         promise, certified = self.promise, self.promise.get("certified_set")
         verdicts = {x["statement"]: x["verdict"] for x in promise["hypotheses"]}
-        proved = promise["theorem"] == "T1" and certified is not None and self.rate is not None
+        # While no limit acts, which is looked at here, a conditional claim holds as well.
+        rate = promise["rate"]
+        proved = promise["theorem"] == "T1" and certified is not None and rate is not None
         covered = verdicts.get(Hypothesis.STARTS.value) == str(Verdict.HOLDS)
         if not (proved and covered) or self.metric is None:
             return None
@@ -227,7 +229,7 @@ class Recording(FrameNumbers):
         start = float(np.einsum("ia,ab,ib->", first, self.metric, first))
         block = np.linalg.inv(self.metric)[np.ix_(self.measured, self.measured)]
         largest = float(np.linalg.eigvalsh(block)[-1])
-        return np.sqrt(start * largest) * np.exp(-(self.rate or 0.0) * self.times)
+        return np.sqrt(start * largest) * np.exp(-rate * self.times)
 
     @property
     def loads(self) -> Float[np.ndarray, "T N k"] | None:

@@ -96,6 +96,13 @@ class RunNumbers:
         return self.result.goal_distances([0, -1])[:, followers]
 
     @property
+    def covered(self) -> bool | None:
+        """Whether the run kept to the conditions of its claim; None where no theorem claims any."""
+        from echelon.guarantees.promises.covering import covered
+
+        return covered(self.result, self.promise)
+
+    @property
     def certified_radius(self) -> float | None:
         """The radius of the certified set; None where nothing is guaranteed on one."""
         certified = self.promise.certified if self.promise.promised else None
@@ -271,7 +278,12 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         "rate at which errors are guaranteed to decay",
         "1/s",
         column="guaranteed,\n1/s",
-        of=lambda run: run.promise.rate,
+        of=lambda run: run.promise.rate if run.promise.promised else None,
+    ),
+    "covered": Quantity(
+        "whether every step of the run kept to what its theorem rests on, limits of inputs included",
+        of=lambda run: run.covered,
+        shown=Shown.SWEEP | Shown.SUMMARY,
     ),
     "certified_radius": Quantity(
         "r of the certified set: sum_i delta_i'P delta_i <= r^2",

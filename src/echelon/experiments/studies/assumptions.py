@@ -83,6 +83,10 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
     if promise.paper_lines:
         yield from promise.paper_lines
         return
+    if not promise.governed:
+        conditions = (Topic.MONOTONE, Topic.DRIFT_ALONG_Z, Topic.LMI_AS_PRINTED, Topic.FINITE)
+        yield from (unneeded(name, _PROOF, "no P of the law is known") for name in conditions)
+        return
     monotone = _monotone_line(parts, promise)
     yield monotone
     both = not promise.hypotheses[Hypothesis.SYMMETRY].fails
@@ -102,7 +106,7 @@ def _leader_line(promise: Promise) -> Statement:
     name, slow = Topic.LEADER_TRACKING, promise.leader_mode
     if slow is None:
         return unneeded(name, _PROOF, "there is no reference")
-    if not promise.linear:
+    if promise.hypotheses[Hypothesis.SMOOTH].fails:
         return vacuous(name, _LINEAR, _NOT_SMOOTH)
     # NaN counts as not damped.
     if slow < -ZERO:

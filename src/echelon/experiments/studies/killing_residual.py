@@ -8,7 +8,7 @@ from jaxtyping import Float
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
 from echelon.core.digits import at_least
-from echelon.core.statement import Statement, Topic, fails, holds
+from echelon.core.statement import Statement, Topic, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind
 from echelon.guarantees.promises.promise import Promise
@@ -22,6 +22,8 @@ _RADIUS = 0.5  # half-width about the trim on which g is checked without a domai
 
 def killing_line(parts: Parts, promise: Promise) -> Statement:
     """Return the Killing residual of g, on the domain of the gain if it has one."""
+    if not (promise.governed or promise.paper_lines):
+        return unneeded(Topic.KILLING, Kind.PROOF, "no P of the law is known")
     gain = parts.drive.gain
     claim = None if gain is None else gain.certificate.region
     domain = _box(parts.model) if claim is None else claim.domain

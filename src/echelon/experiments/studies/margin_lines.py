@@ -37,6 +37,9 @@ def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
         yield unneeded(Topic.MARGINS, _KIND, text)
         yield from _agreement_lines(promise.agreement)
         return
+    if not promise.governed:
+        yield unneeded(Topic.MARGINS, _KIND, "no law is known whose margins these would be")
+        return
     if not promise.linear:
         text = "the model is not smooth at the trim, and has no modes there"
         yield vacuous(Topic.MARGINS, _KIND, text)

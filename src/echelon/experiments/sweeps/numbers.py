@@ -23,7 +23,7 @@ SUMMARIZED = tuple(shown_in(RUN_NUMBERS, Shown.DISTRIBUTION))
 """The numbers that reports and figures show the distribution of."""
 UNIT = "error_unit"
 WORDS = (
-    *("message", "promise_kind", "promise_theorem", "promise_against", "engine", "warnings"),
+    *("message", "promise_verdict", "promise_kind", "promise_theorem", "promise_against", "engine", "warnings"),
     UNIT,
 )
 Columns = Mapping[str, Array]
@@ -46,9 +46,10 @@ def numbers_of(result: Result, promise: Promise) -> JsonObject:
         "warnings": "\n".join(result.warnings),
         UNIT: result.unit,
         "promised": int(promise.promised),
+        "promise_verdict": str(promise.verdict),
         "promise_kind": str(promise.kind) if promise.promised else "",
         "promise_theorem": "" if promise.theorem is None else str(promise.theorem),
-        "promise_against": "; ".join(promise.reasons),
+        "promise_against": "; ".join(promise.reasons + promise.conditions),
     }
 
 

@@ -38,7 +38,8 @@ _MEANINGS = {
     "outcome": "how the run ended",
     "promised": "whether anything was guaranteed before the run",
     "warnings": "settings of the run that are probably not intended, a line each",
-    "promise_against": "why nothing is guaranteed",
+    "promise_against": "why nothing is guaranteed, or what only the run can show",
+    "promise_verdict": "whether the claim before the run is guaranteed, conditional, or none",
 }
 _QUANTITIES = {**AGENT_NUMBERS, **RUN_NUMBERS}
 

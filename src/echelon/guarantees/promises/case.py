@@ -10,7 +10,6 @@ from echelon.core.words import Feedforward
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.frozen_laws import FrozenLaws
 from echelon.guarantees.promises.leaders import Leaders
-from echelon.laws.law import Law, declares
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate
@@ -54,9 +53,6 @@ class Case(NamedTuple):
     @property
     def governed(self) -> bool:
         """Whether the followers run a law that a theorem speaks of, u = u_ff - c R^-1 g'P z."""
-        law = getattr(self.parts.drive, "follower", None)
-        if isinstance(law, Law) and not declares(law, "metric"):
-            return False
         return self.parts.drive.metric(self.parts.model) is not None
 
     @property

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from echelon.core.digits import about
+from echelon.core.statement import Hypothesis
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.promise import Promise
@@ -23,23 +24,45 @@ class Exit(NamedTuple):
 
 
 def coverage(result: Result, promise: Promise) -> Iterator[str]:
-    """Say of a theorem's promise whether a run kept to what it rests on."""
+    """Say of a theorem's claim whether a run kept to what it rests on."""
     if promise.theorem is None or not len(result.times):
         return
     what = "proof" if promise.kind is Kind.PROOF else "guarantee on the domain"
-    left = None if promise.region is None else first_exit(result, promise)
-    limited = float(result.saturated.max())
-    against, remedy = promise.without, "leave it out to see what it costs"
-    if left is not None:
-        against = f"agent {left.agent} left the domain at {about(left.time, 4)} s (`{left.name}`)"
-        remedy = "widen the `domain`, start nearer to the goals, or slow the reference"
-    elif limited:
-        against = f"a limit acted on an agent in {about(100.0 * limited)} % of the steps"
-        remedy = "start nearer to the goals, or slow the reference"
+    what = "conditional claim" if promise.conditions else what
+    against, remedy = _against(result, promise)
     if against:
         yield f"The {what} does not cover this run: {against}; {remedy}."
     else:
         yield f"The {what} covers this run: {promise.why_covered()}."
+
+
+def covered(result: Result, promise: Promise) -> bool | None:
+    """Return whether a run kept, in every step, to what a theorem's claim rests on.
+
+    None where no theorem claims anything.
+    """
+    if promise.theorem is None or not len(result.times):
+        return None
+    return not _against(result, promise)[0]
+
+
+def _against(result: Result, promise: Promise) -> tuple[str, str]:
+    """Return why a claim does not cover a run, and a remedy; empty where it does."""
+    left = None if promise.region is None else first_exit(result, promise)
+    limited = float(result.saturated.max())
+    if left is not None:
+        text = f"agent {left.agent} left the domain at {about(left.time, 4)} s (`{left.name}`)"
+        return text, "widen the `domain`, start nearer to the goals, or slow the reference"
+    if limited:
+        text = f"a limit acted on an agent in {about(100.0 * limited)} % of the steps"
+        return text, "start nearer to the goals, or slow the reference"
+    if promise.without:
+        return promise.without, "leave it out to see what it costs"
+    certified = not promise.hypotheses[Hypothesis.STARTS].fails and promise.theorem != Theorem.T2
+    if promise.region is not None and not certified and result.settings.store_every > 1:
+        text = "it is not known whether all agents stayed in the domain between stored frames"
+        return text, "set `simulation.store_every: 1`"
+    return "", ""
 
 
 def first_exit(result: Result, promise: Promise) -> Exit | None:

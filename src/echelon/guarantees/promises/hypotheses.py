@@ -24,7 +24,9 @@ from echelon.guarantees.promises.event_lines import events_line
 from echelon.guarantees.promises.leaders import apart
 from echelon.guarantees.promises.modes import modes
 from echelon.laws.law import Law
+from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.jacobians import offsets_are_symmetries
 
 _LINEAR = Kind.LINEARIZATION
@@ -44,7 +46,7 @@ def hypotheses(case: Case) -> Iterator[Statement]:
 def agent_lines(case: Case) -> Iterator[Statement]:
     """Yield what any promise asks of the agents and their leaders."""
     yield _trim_applied(case)
-    yield _trim_within_limits(case)
+    yield trim_line(case.parts, case.settings)
     yield _exact(case)
     yield _agreement(case)
     yield from events_line(case.parts)
@@ -80,11 +82,11 @@ def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> ja
     return jax.vmap(lambda x: law.drift(model, x))(states)
 
 
-def _trim_within_limits(case: Case) -> Statement:
-    """Within limits an agent holds its trim only if its actuators deliver that input."""
-    model, plant, name = case.parts.model, case.parts.world.plant, Hypothesis.TRIM_WITHIN_LIMITS
-    moved = case.parts.world.plant_for(model)
-    if not (case.settings.limits and is_limited(moved)):
+def trim_line(parts: Parts, settings: Settings) -> Statement:
+    """Say whether the actuators deliver the trim input, without which no agent holds its trim."""
+    model, plant, name = parts.model, parts.world.plant, Hypothesis.TRIM_WITHIN_LIMITS
+    moved = parts.world.plant_for(model)
+    if not (settings.limits and is_limited(moved)):
         return unneeded(name, Kind.PROOF, "the inputs have no limits")
     short = trim_shortfall(moved, np.asarray(model.trim[1], float))
     if plant is not None:

@@ -26,6 +26,7 @@ from echelon.guarantees.promises.frozen_laws import (
 )
 from echelon.guarantees.promises.hypotheses import hypotheses
 from echelon.guarantees.promises.leaders import leaders_of
+from echelon.guarantees.promises.limits_line import limits_line
 from echelon.guarantees.promises.modes import sampling_line
 from echelon.guarantees.promises.promise import Promise, Promises
 from echelon.guarantees.promises.region import (
@@ -80,6 +81,7 @@ class MetricPromise(Promise):
         lines += [region.line, set_line(certificate, certified)]
         lines += [starts_line(parts, states, certificate, certified)]
         lines += [claims_line(parts, loop, region.relayed)]
+        lines += limits_line(parts, settings) if certificate is not None else ()
         return cls(
             loop=loop,
             hypotheses=MappingProxyType({cast(Hypothesis, x.statement): x for x in lines}),
@@ -124,14 +126,19 @@ class MetricPromise(Promise):
         return dataclasses.replace(self, hypotheses=MappingProxyType(lines), case=case)
 
     @property
+    def governed(self) -> bool:
+        """Whether the followers run a law that a theorem speaks of."""
+        return self.case.governed
+
+    @property
     def ground(self) -> RegionCertificate | None:
         """The region of a theorem, where anything is guaranteed."""
-        return self.region if self.promised else None
+        return self.region if self.claimed else None
 
     @property
     def rate(self) -> float | None:
         """At what rate errors shrink, 1/s; None where nothing is guaranteed."""
-        if not self.promised:
+        if not self.claimed:
             return None
         if self.region is not None:
             return self.region.rate

@@ -116,11 +116,8 @@ def _decaying(case: Case) -> Statement:
             f"no theorem covers `{type(drive).__name__}`",
             "use laws that a theorem covers",
         )
-        if isinstance(drive, Laws) and drive.metric(case.parts.model) is None:
+        if isinstance(drive, Laws):
             text, remedy = "the followers' law does not act on the disagreement", "use `consensus`"
-        elif isinstance(drive, Laws):
-            text = f"`{type(drive.follower).__name__}` inherits `metric` of a law whose methods it "
-            text, remedy = f"{text}replaces", "declare `metric` in its own class"
         return fails(name, _LINEAR, text, remedy=remedy, reason=text)
     text = f"over {amount(loop.certificate.modes, 'eigenvalue')} of the graph"
     if case.fed_by_parents:

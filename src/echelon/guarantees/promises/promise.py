@@ -21,7 +21,7 @@ from echelon.core.numerics import precision
 from echelon.core.statement import Cause, Hypothesis, Statement
 from echelon.core.trace import shared_traces
 from echelon.core.types import Array
-from echelon.core.words import Kind, Theorem, Verdict
+from echelon.core.words import Kind, Standing, Theorem, Verdict
 from echelon.guarantees.promises.certified_set import CertifiedSet
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.laws.law import Law
@@ -135,6 +135,11 @@ class Promise(abc.ABC):
 
     @property
     @abc.abstractmethod
+    def governed(self) -> bool:
+        """Whether `loop` is near the trim what runs, and not that of another law."""
+
+    @property
+    @abc.abstractmethod
     def ground(self) -> Proved | None:
         """What a theorem says; None where nothing is guaranteed, or by linearization alone."""
 
@@ -181,8 +186,13 @@ class Promise(abc.ABC):
 
     @property
     def linear(self) -> bool:
-        """Whether the model has a linearization at its trim, and so modes."""
-        return not self.hypotheses[Hypothesis.SMOOTH].fails
+        """Whether the loop has a linearization at the trim, and so modes."""
+        return self.governed and not self.hypotheses[Hypothesis.SMOOTH].fails
+
+    @property
+    def coupling(self) -> float | None:
+        """The coupling c; None of a law that has none."""
+        return self.loop.closed.coupling if self.governed else None
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -191,9 +201,26 @@ class Promise(abc.ABC):
         return tuple(dict.fromkeys(line.reason for line in failed if line.reason))
 
     @property
-    def promised(self) -> bool:
-        """Whether anything is guaranteed."""
+    def conditions(self) -> tuple[str, ...]:
+        """What the claim is conditional on: what only the run can show."""
+        lines = self.hypotheses.values()
+        return tuple(dict.fromkeys(x.condition for x in lines if x.fails and x.condition))
+
+    @property
+    def claimed(self) -> bool:
+        """Whether anything is claimed, be it conditional."""
         return not self.reasons
+
+    @property
+    def verdict(self) -> Standing:
+        """Whether the claim is guaranteed, conditional, or none."""
+        left = Standing.CONDITIONAL if self.conditions else Standing.GUARANTEED
+        return left if self.claimed else Standing.NONE
+
+    @property
+    def promised(self) -> bool:
+        """Whether anything is guaranteed, without a condition that is left to the run."""
+        return self.verdict is Standing.GUARANTEED
 
     @property
     def theorem(self) -> Theorem | None:
@@ -230,8 +257,8 @@ class Promise(abc.ABC):
 
     def sentence(self) -> str:
         """Return what is guaranteed, in sentences, and no more than that."""
-        text = self.guarantee() if self.promised else self._against()
-        if self.promised and self.without:
+        text = self._claim() if self.claimed else self._against()
+        if self.claimed and self.without:
             text += f" {self.ignored()}"
         noted = (self.hypotheses.get(name) for name in _NOTED)
         notes = (f" Note: {x.explanation}." for x in noted if x and x.fails and not x.reason)
@@ -240,6 +267,12 @@ class Promise(abc.ABC):
     def ignored(self) -> str:
         """Return what the guarantee leaves out of what acts, in a sentence; empty for nothing."""
         return f"The guarantee ignores that {self.without}." if self.without else ""
+
+    def _claim(self) -> str:
+        """Return what is claimed, after the conditions that are left to the run."""
+        if not self.conditions:
+            return self.guarantee()
+        return f"{conditional(self.conditions)} {self.guarantee()}"
 
     def _against(self) -> str:
         """Return all that stands against a guarantee, and what would help."""
@@ -256,14 +289,16 @@ class Promise(abc.ABC):
         """Return it ready for JSON; what does not exist is None."""
         certificate, certified = self.loop.certificate, self.certified
         return {
+            "verdict": str(self.verdict),
             "promised": self.promised,
             "sentence": self.sentence(),
             "reasons": list(self.reasons),
+            "conditions": list(self.conditions),
             "theorem": None if self.theorem is None else str(self.theorem),
             "kind": str(self.kind),
             "rate": self.rate,
             "slowest_mode": self.slowest,
-            "coupling": self.loop.closed.coupling,
+            "coupling": self.coupling,
             "edge": self.edge,
             "lambda_min": certificate.lambda_min,
             "lambda_max": certificate.lambda_max,
@@ -273,6 +308,11 @@ class Promise(abc.ABC):
             "hypotheses": [line.as_mapping() for line in self.hypotheses.values()],
             **({} if self.prefix is None else {"prefix": self.prefix.as_mapping()}),
         }
+
+
+def conditional(conditions: Sequence[str]) -> str:
+    """Return how a claim begins that holds only under conditions that are left to the run."""
+    return f"Not guaranteed: this holds while {' and '.join(conditions)}."
 
 
 class Prefix(NamedTuple):
@@ -300,6 +340,8 @@ def prover_of(drive: Drive) -> type[Promise]:
     law = drive.follower if isinstance(drive, Laws) else Law
     # By name, since a law is below all that is proved of it.
     module, _, name = law.prover.partition(":")
+    if isinstance(drive, Laws) and drive.unknown and module.partition(".")[0] == "echelon":
+        module, name = "echelon.guarantees.promises.unknown_law", "UnknownLaw"
     return getattr(importlib.import_module(module), name)
 
 
@@ -377,7 +419,7 @@ def _prefix_of(computed: Promise, parts: Parts, settings: Settings) -> Prefix | 
     except EchelonError:
         # Without what happens later somebody has no path to a leader for ever.
         return None
-    return Prefix(line.number, first) if first.promised else None
+    return Prefix(line.number, first) if first.claimed else None
 
 
 def _stored(parts: Parts) -> dict[Settings, Promise]:

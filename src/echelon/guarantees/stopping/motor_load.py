@@ -10,14 +10,14 @@ import numpy as np
 from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.declarations import is_by_user, undeclared
 from echelon.agents.models.model import ControlAffine, in_metres
-from echelon.agents.models.model_check import is_limited
 from echelon.core.digits import at_least, at_most
 from echelon.core.enclosure.interval import Interval
 from echelon.core.memoize import memoize
 from echelon.core.rational import bisect, float_above, float_below, norm_above
-from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
+from echelon.core.statement import Hypothesis, Statement, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind
+from echelon.guarantees.promises.limits_line import left_to_run, limits_act
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.declared_borders import airframe_fault
 from echelon.guarantees.stopping.motor_bounds import (
@@ -37,12 +37,13 @@ _OUTPUTS, _DEGREES = ("x", "y", "z", "yaw"), (4, 4, 4, 2)
 """Of the body that the motors move, as its flat coordinates."""
 _ROUNDED = Fraction(1, 10**6)
 """Of a start in flat coordinates: a thousand times what floats leave of it."""
+_PROOF = Kind.PROOF
 _STARTS = 64
 """Starts that are looked at one by one where all together are too many for the motors."""
 _STEPS = 8
 """Of a bisection for how far a start may be off: a 250th of where it begins."""
 _ZERO = Fraction(0)
-_UNKNOWN = "no certificate is known for these limits; a run reports whether one acted"
+_UNKNOWN = "no certificate is known for these limits"
 _STILL = Pushed((), (), (), (_ZERO, _ZERO, _ZERO))
 
 
@@ -158,7 +159,8 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
     """Return the load of the motors of a run's agents, if they suffice, and its line."""
     frame, reason = _airframe(run)
     if frame is None:
-        return None, unneeded(Hypothesis.LIMITS, Kind.PROOF, reason)
+        free = not limits_act(run.parts, run.settings)
+        return None, unneeded(Hypothesis.LIMITS, _PROOF, reason) if free else left_to_run(reason)
     kind = Kind.SAMPLES if is_by_user(run.parts.model, "airframe") else Kind.PROOF
     case = _MotorCase.of(run, frame)
     motors, starts = _from(case)
@@ -169,8 +171,7 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
         text += f": {number[1]}" if number[1] else ", and the thrust is not proved to stay positive"
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
         remedy += "to the leader's velocity and attitude; `echelon design` finds some"
-        # Without a reason: a promise of agents without limits is one too.
-        return None, fails(Hypothesis.LIMITS, kind, text, *number, remedy=remedy)
+        return None, left_to_run(text, *number, remedy, kind)
     ahead = _ahead(frame, run.ahead)
     load = MotorLoad(
         float_below(motors.least),
@@ -197,7 +198,7 @@ def _airframe(run: StoppingRun) -> tuple[Airframe | None, str]:
 def _beyond(run: StoppingRun) -> str:
     """Return why nothing is to be asked of motors, or nothing is known; empty where it is."""
     chains = run.law.ready.chains
-    if not (run.settings.limits and is_limited(run.parts.model)):
+    if not limits_act(run.parts, run.settings):
         return "the inputs have no limits"
     if not in_metres(run.parts.model):
         return "motors are judged where positions are in m"

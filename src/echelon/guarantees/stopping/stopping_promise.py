@@ -42,20 +42,20 @@ class StoppingPromise(Promise):
     Attributes:
         run: what it was computed of.
         tube: what is guaranteed; None for nothing.
-        coupling: c.
+        strength: the coupling c.
         hold: the longest step (s) that keeps the largest stopping point from growing.
         separation: what is guaranteed of distances; None where agents do not keep apart.
     """
 
     run: StoppingRun
     tube: Tube | None
-    coupling: float
+    strength: float
     hold: float
     separation: Separation | None
 
     @classmethod
     def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "StoppingPromise":
-        """Return what is guaranteed of prepared parts; `brief` leaves out arrival and motors."""
+        """Return what is guaranteed of prepared parts; `brief` leaves out arrival."""
         parts, states = prepared.parts, prepared.problem.states
         run, leaders = stopping_run_of(parts, settings, states), leaders_of(parts, states)
         case = Case(parts, settings, loop_of(parts), leaders)._replace(
@@ -80,7 +80,7 @@ class StoppingPromise(Promise):
             complete=not brief,
             run=run,
             # In float64, which a law computes in only here.
-            coupling=run.coupling,
+            strength=run.coupling,
             hold=run.longest_step,
             tube=tube,
             separation=separation,
@@ -90,6 +90,16 @@ class StoppingPromise(Promise):
     def design(cls, parts: Parts, settings: Settings) -> MotorDesign | None:
         """Return the roots and speeds with which these starts are soonest there, with motors."""
         return design_with_motors(parts, settings)
+
+    @property
+    def governed(self) -> bool:
+        """Whether modes at the trim are those of what runs: chains are closed by roots instead."""
+        return False
+
+    @property
+    def coupling(self) -> float:
+        """The coupling c, with which stopping points agree."""
+        return self.strength
 
     @property
     def ground(self) -> Tube | Separation | None:
@@ -104,8 +114,8 @@ class StoppingPromise(Promise):
 
     @property
     def slowest(self) -> float | None:
-        """The slowest mode of the formation, 1/s."""
-        return self.loop.slowest if self.tube is None else -self.tube.rate
+        """The slowest mode of the formation, 1/s; None where nothing is guaranteed of it."""
+        return None if self.tube is None else -self.tube.rate
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) that keeps the largest stopping point from growing."""
@@ -123,7 +133,7 @@ class StoppingPromise(Promise):
     @property
     def agreement(self) -> AgreementModes:
         """How stopping points agree, zeta~' = -c lambda zeta~."""
-        return AgreementModes(self.coupling, agreement_modes(self.run.parts.graph, self.run.law))
+        return AgreementModes(self.strength, agreement_modes(self.run.parts.graph, self.run.law))
 
     @property
     def paper_lines(self) -> tuple[Statement, ...]:

@@ -264,25 +264,13 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     text = f"the slowest of the roots, {text}; far away the `speed` limits it"
     text += ", and not while agents hold each other back" * (run.law.safety is not None)
     rate = -run.rate, f"{at_least(-run.rate)} 1/s"
-    yield _changed(run) or holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, *rate)
+    yield holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, *rate)
     text = "the law is linear in flat coordinates everywhere"
     yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)
     yield _step_line(run)
     if run.parts.graph.schedule is not None:
         yield switching_line(run.parts.graph, run.law.leaderward, run.left_out, run.rate)
     yield unneeded(Hypothesis.CLAIMS, _PROOF, "there is no gain")
-
-
-def _changed(run: StoppingRun) -> Statement | None:
-    """Say that a law is a subclass, whose methods may be others than those that T5 is about."""
-    pairs = (run.law, StoppingPoint), (run.leader, StoppingLeader)
-    names = [f"`{type(law).__name__}`" for law, proved in pairs if type(law) is not proved]
-    if not names:
-        return None
-    text = f"T5 is about the bundled law, and nothing is known of its subclass {names[0]}"
-    remedy = "use the bundled law, or name a `prover` of your own"
-    name, kind = Hypothesis.DISAGREEMENT_DECAY, Kind.PROOF
-    return fails(name, kind, text, remedy=remedy, reason=text)
 
 
 def _offsets_line(run: StoppingRun) -> Statement:

@@ -115,7 +115,7 @@ class Tube(NamedTuple):
 def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[Statement]]:
     """Return the tube, if it holds, and its lines: the inner gains, the set, and the starts.
 
-    Arrival and motors are most of the work and nothing rests on them: `brief` leaves them out.
+    Arrival is most of the work and nothing rests on it: `brief` leaves it out.
     """
     model, chains = run.parts.model, run.law.ready.chains
     longest = int(np.argmax(chains.degrees))
@@ -163,10 +163,9 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
         known.kind,
         motion and offsets_mapping(motion),
     )
-    if brief:
-        return tube, lines
     # Agents that hold each other back come later than they would alone.
-    arrival = None if run.law.safety is not None else arrival_of(run, _positions(run))
+    late = brief or run.law.safety is not None
+    arrival = None if late else arrival_of(run, _positions(run))
     motor_load, line = motor_load_of(run)
     tube = tube._replace(arrival=arrival, motor_load=motor_load)
     if motor_load is not None and line.kind is Kind.SAMPLES:

@@ -160,6 +160,8 @@ def _guaranteed(promise: Promise) -> str:
     """Return the guaranteed rate, with its theorem if there is one."""
     if promise.rate is None:
         return "none"
+    if not promise.promised:
+        return f"while {promise.conditions[0]} ({promise.theorem})"
     source = "" if promise.theorem is None else f" ({promise.kind}, {promise.theorem})"
     return f"{at_most(promise.rate)}{source}"
 

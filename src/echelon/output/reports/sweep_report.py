@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from echelon.core.types import Array, JsonObject
-from echelon.core.words import amount
+from echelon.core.words import Standing, amount
 from echelon.experiments.results.quantity import settling_bound
 from echelon.experiments.sweeps.axes import SEED
 from echelon.experiments.sweeps.numbers import SUMMARIZED
@@ -31,6 +31,10 @@ def sweep_mapping(data: "xr.Dataset") -> JsonObject:
         "outcomes": {name: count for name, count in counts.items() if count},
         "settled": int(succeeded(data).sum()),
         "promised": int((data["promised"] == 1).sum()),
+        "conditional": int((data["promise_verdict"] == str(Standing.CONDITIONAL)).sum()),
+        "covered": int(
+            ((data["promise_verdict"] != str(Standing.NONE)) & (data["covered"] == 1)).sum()
+        ),
         "quantiles": {name: _quantiles(data[name].values) for name in SUMMARIZED},
     }
 
@@ -46,6 +50,9 @@ def sweep_report(data: "xr.Dataset") -> str:
     within = settling_bound(data["worst_final_error"].attrs.get("units", ""))
     lines += [f"- Settled to {within}: {_share(summary['settled'], done)}."]
     lines += [f"- With a guarantee: {summary['promised']} of {summary['runs']}."]
+    if summary["conditional"]:
+        text = f"- With a claim while no input is at a limit: {summary['conditional']}; "
+        lines += [f"{text}covered by a claim, in every step: {summary['covered']}."]
     for name, values in summary["quantiles"].items():
         if values is not None:
             low, median, high = (f"{value:.3g}" for value in values)

@@ -7,7 +7,9 @@ import numpy as np
 
 from echelon.core.digits import at_most
 from echelon.core.errors import OutputError
+from echelon.core.statement import Hypothesis
 from echelon.core.types import Array, JsonObject
+from echelon.core.words import Verdict
 from echelon.experiments.results.recording import MessageAges, Recording
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
 from echelon.output.plots.style import raised
@@ -233,7 +235,10 @@ def _notes(run: Recording, space: Space) -> list[str]:
 def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
     """Return the badge of a promise: its state `holds` or `lost`, a short and a whole text."""
     if not promise["promised"]:
-        return {"state": "lost", "short": "no guarantee", "whole": promise["sentence"]}
+        if not promise.get("conditions"):
+            return {"state": "lost", "short": "no guarantee", "whole": promise["sentence"]}
+        short = f"no guarantee: {promise['theorem']} holds while {promise['conditions'][0]}"
+        return {"state": "edge", "short": short, "whole": promise["sentence"]}
     apart = (promise.get("anywhere") or {}).get("separation")
     if apart is not None:
         return _badge_of_distances(apart["ideal"], promise)
@@ -251,6 +256,13 @@ def _badge_of_distances(ideal: bool, promise: Mapping[str, Any]) -> dict[str, st
     return {"state": "holds" if ideal else "edge", "short": short, "whole": promise["sentence"]}
 
 
+_WIDER = {
+    Hypothesis.SWITCHING: "all graphs of the scenario",
+    Hypothesis.HEADING_FRAME: "all turns of the leader",
+}
+"""What a rate holds for beyond one graph and one heading, by the line that says so."""
+
+
 def _rate_in_words(promise: Mapping[str, Any]) -> str:
     """Return a sentence on the rate in the badge; empty if the promise's sentence states it."""
     rate, slowest = promise["rate"], promise.get("slowest_mode")
@@ -258,9 +270,12 @@ def _rate_in_words(promise: Mapping[str, Any]) -> str:
         return ""
     if slowest is None or abs(rate + slowest) <= 1e-6 * rate:
         return f"The rate of {at_most(rate)} 1/s is that of the slowest mode."
+    holding = {x["statement"] for x in promise["hypotheses"] if x["verdict"] == str(Verdict.HOLDS)}
+    what = " and ".join(text for name, text in _WIDER.items() if name.value in holding)
+    what = what or "inputs that are held over a step"
     return (
-        f"The rate of {at_most(rate)} 1/s holds for all graphs and turns of the scenario; the "
-        f"slowest mode alone decays at {at_most(-slowest)} 1/s."
+        f"The rate of {at_most(rate)} 1/s holds for {what}; the slowest mode alone decays at "
+        f"{at_most(-slowest)} 1/s."
     )
 
 

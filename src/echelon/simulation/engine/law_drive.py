@@ -22,6 +22,7 @@ from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.flat_loop import FlatMemory
+from echelon.laws.known_law import information_of, unknown_class
 from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import leader_warnings, prepare_law
 from echelon.laws.safety import Safety
@@ -61,6 +62,16 @@ class Laws(Drive):
     def information(self) -> Information:
         """What the two laws must receive from others."""
         return Information(self.leader.information, self.follower.information)
+
+    def information_for(self, model: ControlAffine, graph: Graph) -> Information:
+        """Return the same, with what an unknown law uses of what it receives."""
+        laws = self.leader, self.follower
+        return Information(*(information_of(law, model, graph) for law in laws))
+
+    @property
+    def unknown(self) -> str:
+        """The class of a law that echelon does not know; empty without any."""
+        return unknown_class(self.leader) or unknown_class(self.follower)
 
     @property
     def gain(self) -> "Gain | None":

@@ -127,7 +127,8 @@ class Parts:
     @property
     def information(self) -> Information:
         """What leaders and followers receive from others, over the network that there is."""
-        ideal, network = self.drive.information, self.world.network
+        ideal = self.drive.information_for(self.model, self.graph)
+        network = self.world.network
         return ideal if network is None else ideal._replace(follower=(network.information,))
 
     @property
@@ -139,7 +140,7 @@ class Parts:
     @property
     def receives(self) -> Bool[np.ndarray, "E 2"]:
         """Whether each end of each edge receives from the other."""
-        reacts = self.drive.reacts or "neighbours' states" in self.drive.information.leader
+        reacts = self.drive.reacts or "neighbours' states" in self.information.leader
         return heard_along(self.graph, self.leaderward, reacts)
 
     def replace(self, **changes: object) -> "Parts":

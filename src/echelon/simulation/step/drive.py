@@ -183,6 +183,10 @@ class Drive(eqx.Module):
     def information(self) -> Information:
         """What the agents must receive from others."""
 
+    def information_for(self, model: ControlAffine, graph: Graph) -> Information:
+        """Return the same, with what an unknown law uses of what it receives."""
+        return self.information
+
     @abc.abstractmethod
     def stepper(self, problem: Problem) -> Stepper:
         """Return the stepper of agents under a prepared drive.
