@@ -46,7 +46,10 @@ _DESIGN: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "condition": ("cond(P)", lambda design: _condition(design.gain)),
     "gain_margin": ("gain\nmargin", lambda design: design.factors),
     "delay_margin": ("delay\nmargin, s", lambda design: design.delay),
-    "rate": ("guaranteed,\n1/s", lambda design: design.promise.rate if design.promise.promised else None),
+    "rate": (
+        "guaranteed,\n1/s",
+        lambda design: design.promise.rate if design.promise.promised else None,
+    ),
     "kind": ("by", lambda design: str(design.promise.kind) if design.promise.promised else None),
     "theorem": ("theorem", lambda design: design.promise.theorem),
     "radius": (

@@ -281,7 +281,7 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         of=lambda run: run.promise.rate if run.promise.promised else None,
     ),
     "covered": Quantity(
-        "whether every step of the run kept to what its theorem rests on, limits of inputs included",
+        "whether every step of the run kept to what its theorem rests on, limits included",
         of=lambda run: run.covered,
         shown=Shown.SWEEP | Shown.SUMMARY,
     ),

@@ -23,7 +23,15 @@ SUMMARIZED = tuple(shown_in(RUN_NUMBERS, Shown.DISTRIBUTION))
 """The numbers that reports and figures show the distribution of."""
 UNIT = "error_unit"
 WORDS = (
-    *("message", "promise_verdict", "promise_kind", "promise_theorem", "promise_against", "engine", "warnings"),
+    *(
+        "message",
+        "promise_verdict",
+        "promise_kind",
+        "promise_theorem",
+        "promise_against",
+        "engine",
+        "warnings",
+    ),
     UNIT,
 )
 Columns = Mapping[str, Array]

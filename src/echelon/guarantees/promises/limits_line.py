@@ -18,7 +18,8 @@ def limits_act(parts: Parts, settings: Settings) -> bool:
     """Tell whether an input of an agent may be at a limit."""
     world = parts.world
     return settings.limits and any(
-        is_limited(one) for one in (parts.model, world.plant_for(parts.model), *world.plants.values())
+        is_limited(one)
+        for one in (parts.model, world.plant_for(parts.model), *world.plants.values())
     )
 
 

@@ -78,4 +78,3 @@ class UnknownLaw(Promise):
     def why_covered(self) -> str:
         """Return why a theorem covers a run: none does."""
         return ""
-

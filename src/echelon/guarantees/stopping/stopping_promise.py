@@ -15,7 +15,7 @@ from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import agent_lines
 from echelon.guarantees.promises.leaders import leaders_of
 from echelon.guarantees.promises.promise import AgreementModes, Promise
-from echelon.guarantees.stopping.leader_drift import leader_drift_line
+from echelon.guarantees.stopping.lasting_drift import drift_line
 from echelon.guarantees.stopping.motor_design import MotorDesign, design_with_motors
 from echelon.guarantees.stopping.separation import Separation, separation_of
 from echelon.guarantees.stopping.stopping_run import (
@@ -61,7 +61,7 @@ class StoppingPromise(Promise):
         case = Case(parts, settings, loop_of(parts), leaders)._replace(
             over_network=run.network is not None
         )
-        (tube, tube_lines), drifts = tube_of(run, brief), leader_drift_line(run)
+        (tube, tube_lines), drifts = tube_of(run, brief), drift_line(run)
         lines = [*agent_lines(case), *condition_lines(run), *tube_lines]
         own = None if brief else _own_line(run, prepared.problem)
         more = drifts, messages_line(parts, settings, run.late), own

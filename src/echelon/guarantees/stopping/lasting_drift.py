@@ -1,10 +1,11 @@
-"""Whether a plant that differs from the model, or a push that lasts, carries a leader away.
+"""Whether a plant that differs from the model, or wind that lasts, carries an agent away.
 
 The law computes zeta' as the model has it. Where the plant follows the path, it differs by the
 speeds and accelerations of outputs that the model lacks in that state, at that input; agreement has
 to make up for their mean, and has a speed of s alone (theory page, T5).
 """
 
+from collections.abc import Hashable
 from typing import NamedTuple
 
 import jax
@@ -15,12 +16,15 @@ from echelon.agents.models.chains import flat_output
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.flatness import follow_at
 from echelon.agents.references.reference import Reference
+from echelon.agents.world.disturbance import disturbed
 from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_least
+from echelon.core.identity import process_key
 from echelon.core.statement import Hypothesis, Statement, fails
-from echelon.core.types import State
-from echelon.core.words import Kind
+from echelon.core.types import Array, State
+from echelon.core.words import Feedforward, Kind
 from echelon.guarantees.stopping.stopping_run import StoppingRun
+from echelon.laws.flat_law import FlatLaw
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader
 
@@ -47,38 +51,91 @@ class _Missing(NamedTuple):
     left: jax.Array
 
 
-def leader_drift_line(run: StoppingRun) -> Statement | None:
-    """Return why what lasts carries the leader away for ever; None where it does not."""
-    world, loop = run.parts.world, run.leader.ready
-    if world.plant is None and world.disturbance is None:
+def drift_line(run: StoppingRun) -> Statement | None:
+    """Return why what lasts carries an agent away for ever; None where it carries none away.
+
+    A leader makes up for it by its own speed of agreement. Followers receive what it commands, or
+    what their parent does, and make up for what moves them more or less than the sender.
+    """
+    world, model, graph = run.parts.world, run.parts.model, run.parts.graph
+    if world.plant is None and world.disturbance is None and not world.plants:
         return None
-    missing = _missing_on_path(run)
-    if not np.asarray(missing.left).max() <= _FOLLOWED:
-        text = "no motion of the plant along the leader's path is known, and it may drift away"
-        return _fails(text, "choose a plant or a disturbance nearer to the model")
-    current, force = (np.asarray(part).mean(axis=0) for part in missing[:2])
-    for k, degree in enumerate(loop.chains.degrees):
-        s, inner = run.leader.speed_of(k), degree > 1
-        # The observer watches y' as the model has it, and of what is commanded at once y itself.
-        seen = run.leader.observer
-        flow = 0.0 if seen and not inner else float(current[k])
-        push = float(loop.weights[1, k] * force[k]) if inner and not seen else 0.0
-        if abs(flow + push) >= s:
-            return _drifts(loop.chains.outputs[k], flow, push, s, inner)
+    plants = [world.plants.get(k) or world.plant_for(model) for k in range(graph.agents)]
+    laws = {k: run.leader if k in graph.leaders else run.law for k in range(graph.agents)}
+    moves = dict[Hashable, _Lasting | None]()
+    lasting = list[_Lasting]()
+    for k, plant in enumerate(plants):
+        key = process_key(plant) or id(plant), laws[k].ready.observer
+        if key not in moves:
+            moves[key] = _lasting(run, laws[k], plant)
+        one = moves[key]
+        if one is None:
+            text = f"no motion of the plant of agent {k} along the leader's path is known, and it "
+            return _fails(f"{text}may drift away", "choose a plant nearer to the model")
+        lasting.append(one)
+    parents = graph.parents() if run.law.feedforward is Feedforward.PARENT else None
+    for k in (*graph.leaders, *graph.followers):
+        law = laws[k]
+        senders = graph.leaders if parents is None else (int(parents[k]),)
+        against = [_Lasting.none(law)] if law is run.leader else [lasting[j] for j in senders]
+        for other in against:
+            line = _drifts(k, law, lasting[k].less(other))
+            if line is not None:
+                return line
     return None
 
 
-def _drifts(name: str, current: float, force: float, s: float, inner: bool) -> Statement:
-    """Say what a current, and a force by what it asks of agreement, do to a leader of speed s."""
-    asked = abs(current + force)
-    what = " and ".join(word for word, d in (("current", current), ("push", force)) if d)
-    text = (
-        f"a lasting {what} along `{name}` demands a speed of {at_least(asked)} from agreement, the "
-    )
-    text += f"leader's is {about(s)}, and it can drift away for ever"
-    helps = "" if inner and abs(current) >= s else "set `observer: true`, or "
-    remedy = f"{helps}raise the leader's `speed` above {at_least(asked)}"
-    return _fails(text, remedy, asked, f"{at_least(asked)}")
+class _Lasting(NamedTuple):
+    """What the model lacks of an agent's motion in the mean, as speeds of its outputs, (m,).
+
+    Attributes:
+        current: what it lacks of the speed.
+        push: the speed that an acceleration which it lacks demands of agreement.
+    """
+
+    current: Array
+    push: Array
+
+    @classmethod
+    def none(cls, law: FlatLaw) -> "_Lasting":
+        """Return that of a model that lacks nothing."""
+        return cls(*np.zeros((2, len(law.ready.chains.degrees))))
+
+    def less(self, other: "_Lasting") -> "_Lasting":
+        """Return what is left of it beside another agent's."""
+        return _Lasting(self.current - other.current, self.push - other.push)
+
+
+def _lasting(run: StoppingRun, law: FlatLaw, plant: ControlAffine) -> _Lasting | None:
+    """Return what lasts of an agent under a law; None where its plant does not follow the path."""
+    missing = _missing_on_path(run, law.ready, plant)
+    if not np.asarray(missing.left).max() <= _FOLLOWED:
+        return None
+    current, force = (np.asarray(part, float).mean(axis=0) for part in missing[:2])
+    inner = np.array(law.ready.chains.degrees) > 1
+    if law.ready.observer:
+        # It watches y' as the model has it, and of what is commanded at once y itself.
+        return _Lasting(np.where(inner, current, 0.0), 0.0 * force)
+    return _Lasting(current, np.where(inner, law.ready.weights[1:2].sum(axis=0) * force, 0.0))
+
+
+def _drifts(agent: int, law: FlatLaw, lasting: _Lasting) -> Statement | None:
+    """Return that an agent may drift away, by what a current and a push demand of agreement."""
+    chains = law.ready.chains
+    for k, (name, degree) in enumerate(zip(chains.outputs, chains.degrees, strict=True)):
+        current, push, s = float(lasting.current[k]), float(lasting.push[k]), law.speed_of(k)
+        asked = abs(current + push)
+        if not asked >= s:
+            continue
+        what = " and ".join(word for word, d in (("current", current), ("push", push)) if d)
+        text = (
+            f"a lasting {what} along `{name}` demands a speed of {at_least(asked)} from agreement, "
+            f"that of agent {agent} is {about(s)}, and it can drift away for ever"
+        )
+        helps = "" if degree > 1 and abs(current) >= s else "set `observer: true`, or "
+        remedy = f"{helps}raise its `speed` above {at_least(asked)}"
+        return _fails(text, remedy, asked, f"{at_least(asked)}")
+    return None
 
 
 def _fails(text: str, remedy: str, number: float | None = None, shown: str = "") -> Statement:
@@ -86,20 +143,20 @@ def _fails(text: str, remedy: str, number: float | None = None, shown: str = "")
     return fails(name, Kind.PROOF, text, number, shown, remedy=remedy, reason=text)
 
 
-def _missing_on_path(run: StoppingRun) -> _Missing:
-    """Return what the model lacks along the leader's path until the horizon."""
+def _missing_on_path(run: StoppingRun, loop: FlatLoop, plant: ControlAffine) -> _Missing:
+    """Return what the model lacks of a plant along the leader's path until the horizon."""
     world, model, leader = run.parts.world, run.parts.model, run.leader
-    push = np.zeros(len(model.state_names))
+    push, air = np.zeros(len(model.state_names)), np.zeros((2, len(model.state_names)))
     if world.disturbance is not None:
-        push = model.per_state(world.disturbance.constant)
+        wind = world.disturbance.prepared(plant, run.settings.dt, run.settings.seed)
+        push, air = wind.constant, air if wind.air is None else wind.air
     x, u = (np.asarray(part, float)[None] for part in model.trim)
     times = np.zeros(1)
     if isinstance(leader.reference, Reference):
         times = np.modf(_GOLDEN * np.arange(_TIMES))[0] * run.settings.horizon
         x, u = follow_at(model, leader.reference, times)
     path = np.asarray(_path(leader, model, jnp.asarray(times)))[:, :3]
-    plant = world.plants.get(run.parts.graph.leaders[0], world.plant_for(model))
-    driven = _Driven(model, plant, leader.ready, jnp.asarray(push))
+    driven = _Driven(model, plant, loop, jnp.asarray(push), jnp.asarray(air))
     return _missing(driven, *map(jnp.asarray, (path, x, u)))
 
 
@@ -109,12 +166,13 @@ def _path(leader: StoppingLeader, model: ControlAffine, times: jax.Array) -> jax
 
 
 class _Driven(NamedTuple):
-    """A plant under a push, driven through integrators; z = (x, e, w) are its states and inputs."""
+    """A plant under wind, driven through integrators; z = (x, e, w) are its states and inputs."""
 
     model: ControlAffine
     plant: ControlAffine
     loop: FlatLoop
     push: jax.Array
+    air: jax.Array
 
     @property
     def states(self) -> int:
@@ -142,11 +200,16 @@ class _Driven(NamedTuple):
         """Return the flat outputs (m,)."""
         return flat_output(self.model, self.loop.chains.outputs, x)
 
+    def velocity(self, x: State, u: jax.Array) -> State:
+        """Return the rate of the state."""
+        return disturbed(self.plant, self.push, None, self.air)(x, u)
+
     def moved(self, z: jax.Array) -> jax.Array:
         """Return the rate of z."""
         x, e, w = self.parts(z)
-        pushed = self.plant.velocity(x, self.input(z)) + self.push
-        return jnp.concatenate([pushed, self.loop.chains.rate(e, w), jnp.zeros_like(w)])
+        return jnp.concatenate(
+            [self.velocity(x, self.input(z)), self.loop.chains.rate(e, w), jnp.zeros_like(w)]
+        )
 
     def derivatives(self, z: jax.Array) -> jax.Array:
         """Return the flat outputs with their first two derivatives, (3, m)."""
@@ -164,7 +227,7 @@ class _Driven(NamedTuple):
         def speed(x: State) -> jax.Array:
             return jax.jvp(self.output, (x,), (self.model.velocity(x, u),))[1]
 
-        more = self.plant.velocity(x, u) + self.push - self.model.velocity(x, u)
+        more = self.velocity(x, u) - self.model.velocity(x, u)
         return jax.jvp(self.output, (x,), (more,))[1], jax.jvp(speed, (x,), (more,))[1]
 
 
