@@ -23,12 +23,12 @@ _AXIS = 64 * float(np.finfo(float).eps)  # of the fastest mode's rate, that of r
 
 
 def discretize(
-    A: np.ndarray, B: np.ndarray, dt: float, integrator: str | None = None
+    A: np.ndarray, B: np.ndarray, dt: float, integrator: str | None = None, substeps: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (F, G) of a step x+ = F x + G u of xdot = A x + B u, u held over dt (s).
 
-    An integrator makes of a linear field a linear map, read off what it does to unit vectors; the
-    exact flow is taken without one. Shapes are (..., n, n) and (..., n, m).
+    An integrator makes of a linear field a linear map, read off what it does to unit vectors in one
+    of its substeps; the exact flow is taken without one. Shapes are (..., n, n) and (..., n, m).
     """
     n, m = B.shape[-2:]
     unit = np.eye(n + m)
@@ -40,7 +40,11 @@ def discretize(
         step_map = scipy.linalg.expm(block * dt)[..., :n, :]
     else:
         step = cast(Callable[..., np.ndarray], INTEGRATORS[integrator])
-        step_map = step(lambda x, u: A @ x + B @ u, unit[:n], unit[n:], dt)
+        step_map = step(lambda x, u: A @ x + B @ u, unit[:n], unit[n:], dt / substeps)
+        if substeps > 1:
+            held = np.broadcast_to(unit[n:], (*step_map.shape[:-2], m, n + m))
+            whole = np.concatenate([step_map, held], axis=-2)
+            step_map = np.linalg.matrix_power(whole, substeps)[..., :n, :]
     return step_map[..., :n], step_map[..., n:]
 
 
@@ -63,7 +67,12 @@ def matrix_exponential(X: np.ndarray) -> np.ndarray:
 
 
 def sampled_radius(
-    A: np.ndarray, B: np.ndarray, gains: np.ndarray, dt: float, integrator: str | None = None
+    A: np.ndarray,
+    B: np.ndarray,
+    gains: np.ndarray,
+    dt: float,
+    integrator: str | None = None,
+    substeps: int = 1,
 ) -> float:
     """Return the largest spectral radius of a step of xdot = A x - B K x(t_k), u held over dt.
 
@@ -73,8 +82,9 @@ def sampled_radius(
         gains: (..., m, n), broadcast with them for several loops.
         dt: s.
         integrator: its name; the exact flow without.
+        substeps: of the integrator in a step.
     """
-    F, G = discretize(A, B, dt, integrator)
+    F, G = discretize(A, B, dt, integrator, substeps)
     return float(spectral_radii(F - G @ gains).max())
 
 
@@ -122,7 +132,11 @@ def _fall(steps: Array, middles: Array) -> Array:
 
 
 def longest_step(
-    A: np.ndarray, B: np.ndarray, gains: np.ndarray, integrator: str | None = None
+    A: np.ndarray,
+    B: np.ndarray,
+    gains: np.ndarray,
+    integrator: str | None = None,
+    substeps: int = 1,
 ) -> float:
     """Return the longest dt (s) with which every loop xdot = A x - B K x(t_k) still decays.
 
@@ -135,7 +149,7 @@ def longest_step(
     dt, end = 1e-3 / np.abs(poles).max(), 1e3 / max(1e-9, float(np.abs(poles.real).min()))
 
     def decays(dt: float) -> bool:
-        return sampled_radius(A, B, gains, dt, integrator) < 1.0
+        return sampled_radius(A, B, gains, dt, integrator, substeps) < 1.0
 
     while decays(1.1 * dt):
         dt *= 1.1

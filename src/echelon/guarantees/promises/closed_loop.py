@@ -74,12 +74,12 @@ class LinearLoop(NamedTuple):
         A, B = self.linear
         return np.linalg.eigvals(A - self.closed.strengths[:, None, None] * (B @ self.closed.K))
 
-    def radius(self, settings: Settings) -> float:
-        """Return the largest spectral radius of a step of the integrator that runs.
+    def radius(self, settings: Settings, exact: bool = False) -> float:
+        """Return the largest spectral radius of a step of the integrator, or of the exact flow.
 
         Of an interval of eigenvalues it is at least 1 unless all of them are shown to decay.
         """
-        F, G = discretize(*self.open, settings.dt, settings.integrator)
+        F, G = discretize(*self.open, *(settings.held[:1] if exact else settings.held))
         radius = float(spectral_radii(F - G @ self.gains).max())
         if not self.closed.between or not radius < 1.0:
             return radius
@@ -93,7 +93,7 @@ class LinearLoop(NamedTuple):
         """
         if self.common is None or not self.common.weakest > 0.0:
             return 0.0
-        F, G = discretize(*self.open, settings.dt, settings.integrator)
+        F, G = discretize(*self.open, *settings.held)
         return self.common.growth(F - G @ self.inner, G, self.closed.K, settings.dt)
 
     def held_rate(self, settings: Settings) -> float:
@@ -103,7 +103,7 @@ class LinearLoop(NamedTuple):
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) of that integrator with which every mode decays."""
-        step = longest_step(*self.open, self.gains, settings.integrator)
+        step = longest_step(*self.open, self.gains, *settings.held[1:])
         if not (self.closed.between or self.common) or not np.isfinite(step):
             return step
 

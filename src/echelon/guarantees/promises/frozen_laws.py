@@ -124,12 +124,12 @@ class ModeMatrices(NamedTuple):
         if not len(self.A):
             return 0.0
         A, B, gains = self.A[:, None], self.B[:, None], self.gains
-        return sampled_radius(A, B, gains, settings.dt, settings.integrator)
+        return sampled_radius(A, B, gains, *settings.held)
 
     def decaying(self, settings: Settings) -> Array:
         """Return about which states, (K,), held steps decay wherever the loops themselves do."""
         A, B, gains = self.A[:, None], self.B[:, None], self.gains
-        F, G = discretize(A, B, settings.dt, settings.integrator)
+        F, G = discretize(A, B, *settings.held)
         radii = np.abs(np.linalg.eigvals(F - G @ gains)).max(axis=(1, 2))
         return (self.growth() >= 0.0) | (radii < 1.0)
 
@@ -138,7 +138,7 @@ class ModeMatrices(NamedTuple):
         if not len(self.A):
             return float("inf")
         A, B, gains = self.hardest()
-        return linear.longest_step(A[:, None], B[:, None], gains, settings.integrator)
+        return linear.longest_step(A[:, None], B[:, None], gains, *settings.held[1:])
 
 
 class FrozenLaws(NamedTuple):

@@ -117,7 +117,6 @@ def _exact(case: Case) -> Statement:
         text = "states are known exactly, and nothing disturbs the agents"
         return holds(Hypothesis.EXACT_STATES, Kind.PROOF, text)
     text = f"{case.disturbed}; the guarantee ignores this"
-    text += "" if case.parts.world.ideal else ", and bounds on its effect are below"
     return fails(
         Hypothesis.EXACT_STATES, Kind.PROOF, text, remedy="leave it out to see what it costs"
     )

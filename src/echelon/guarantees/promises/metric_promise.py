@@ -163,7 +163,8 @@ class MetricPromise(Promise):
     def guarantee(self) -> str:
         """Return what is guaranteed near the trim, and what the region adds."""
         if self.linear:
-            text = "Local guarantee (linearization): followers converge to their goals from "
+            text = "Local guarantee (linearization)" if self.promised else "By linearization"
+            text += ": followers converge to their goals from "
             text += "sufficiently close starts, with the leader sufficiently close to the trim"
             text += f"{self.turns}{self.condition}"
         else:

@@ -9,6 +9,7 @@ from echelon.core.linear import sampled_radius
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded, vacuous
 from echelon.core.words import Kind, Theorem, amount
 from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.frozen_laws import longest_step
 from echelon.guarantees.promises.turning import turning
 from echelon.simulation.engine.law_drive import Laws
@@ -17,6 +18,9 @@ from echelon.synthesis.certificates.margins import detectability
 _LINEAR = Kind.LINEARIZATION
 _GROWS = "with the input held over the step `dt` the disagreement grows"
 _IN_TURNS = "on one of the graphs errors are multiplied by {} a step in the norm of P"
+_INTEGRATOR = "errors grow in steps of the integrator"
+_NO_SUM = "no sum of squares is known that decreases in held steps on all graphs"
+_SUBSTEPS = (2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _ON_PATH = "spectral radius {} a step along the leader's path"
 _AT_STARTS = "spectral radius {} a step where agents start"
 _NOT_STABLE = "the disagreement does not decay at the trim"
@@ -63,7 +67,7 @@ def _sampled_bend(case: Case) -> Statement:
     if case.region is None or case.slopes is None:
         return vacuous(name, Kind.SAMPLES, _BENT, None, dt_text)
     A, dt = case.slopes[:, None], settings.dt
-    radius = sampled_radius(A, loop.linear.B, loop.gains, dt, settings.integrator)
+    radius = sampled_radius(A, loop.linear.B, loop.gains, *settings.held)
     text = f"spectral radius {at_least(radius, 4)} a step, over the slopes of all sides of the trim"
     if radius < 1.0:
         return holds(name, Kind.SAMPLES, text, radius, dt_text)
@@ -144,8 +148,7 @@ def _taking_turns(case: Case) -> Statement:
     if not case.governed:
         text = "no theorem covers this law on switching graphs"
         return fails(name, _LINEAR, text, remedy="use `consensus`", reason=text)
-    # At the edge the sum may only stay; what feels nothing then decays by detectability.
-    if common is not None and edge is not None and c >= edge and common.weakest > 0.0:
+    if _has_sum(loop) and common is not None:
         text, rate = (
             "sum_i delta_i'P delta_i increases on no graph, whenever they switch",
             max(0.0, common.rate),
@@ -156,6 +159,14 @@ def _taking_turns(case: Case) -> Statement:
     if edge is not None and not c >= edge:
         remedy = f"raise `coupling` to {at_least(edge, 4)} or more, or {remedy}"
     return fails(name, _LINEAR, text, remedy=remedy, reason=text)
+
+
+def _has_sum(loop: LinearLoop) -> bool:
+    """Tell whether a sum of squares is known that increases on no graph of a schedule."""
+    edge, common = loop.certificate.edge, loop.common
+    # At the edge the sum may only stay; what feels nothing then decays by detectability.
+    enough = edge is not None and loop.closed.coupling >= edge
+    return enough and common is not None and common.weakest > 0.0
 
 
 def _along(case: Case) -> Statement:
@@ -198,14 +209,33 @@ def sampling_line(case: Case) -> Statement:
         text = "`printed` takes f + g u as the next state, which ignores the goals"
         return _step_line(case, np.inf, text, "use `simulation.integrator: rk4`")
     where = f"spectral radius {{}} a step, {loop.where}"
-    radii = {where: radius, _IN_TURNS: loop.growth(settings)}
+    radii = {where: radius} | ({_IN_TURNS: loop.growth(settings)} if _has_sum(loop) else {})
     if case.frozen and not printed:
         radii |= zip((_ON_PATH, _AT_STARTS), case.frozen.radii(settings))
     where = next((x for x, one in radii.items() if not one < 1.0), where)
-    remedy = "use `simulation.integrator: rk4`" if printed else ""
-    text = where.format(at_least(radii[where], 4))
+    text, reasons = where.format(at_least(radii[where], 4)), {_AT_STARTS: "", _IN_TURNS: _NO_SUM}
+    if printed:
+        return _step_line(case, radii[where], text, "use `simulation.integrator: rk4`")
+    exact = loop.radius(settings, exact=True)
+    if radii[where] < 1.0 <= exact:
+        text = "the integrator damps falsely what the input, held over `dt`, drives: spectral "
+        text += f"radius {at_least(exact, 4)} a step in the exact flow"
+        return _step_line(case, exact, text, "shorten `simulation.dt`", _GROWS)
+    if not radius < 1.0 and exact < 1.0:
+        text = f"the integrator, but not the exact flow, grows in such steps: {text}"
+        return _step_line(case, radius, text, _by_substeps(case), _INTEGRATOR)
     # At the starts it lasts a moment, and a guarantee is for starts near the goals.
-    return _step_line(case, radii[where], text, remedy, "" if where == _AT_STARTS else _GROWS)
+    return _step_line(case, radii[where], text, "", reasons.get(where, _GROWS))
+
+
+def _by_substeps(case: Case) -> str:
+    """Return how many substeps of the integrator decay, as a remedy."""
+    settings = case.settings
+    tried = (settings._replace(substeps=k) for k in _SUBSTEPS if k > settings.substeps)
+    enough = next((x.substeps for x in tried if case.loop.radius(x) < 1.0), None)
+    if enough is None:
+        return "shorten `simulation.dt`"
+    return f"set `simulation.substeps: {enough}`, or shorten `simulation.dt`"
 
 
 def _step_line(
@@ -216,8 +246,9 @@ def _step_line(
     number = radius, f"dt {dt:g} s"
     if radius < 1.0:
         return holds(Hypothesis.SAMPLING, _LINEAR, text, *number)
-    if not remedy:
-        longest = longest_step(case.loop, case.frozen, case.settings)
+    longest = 0.0 if remedy else longest_step(case.loop, case.frozen, case.settings)
+    if longest > 0.0:
+        text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
         remedy = f"shorten `simulation.dt` below {at_most(longest)} s, or lower the gain"
-    text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
+    remedy = remedy or "use the law `stopping-point`"
     return fails(Hypothesis.SAMPLING, _LINEAR, text, *number, remedy=remedy, reason=reason)

@@ -4,7 +4,7 @@ import dataclasses
 from types import MappingProxyType
 from typing import final
 
-from echelon.core.statement import Hypothesis, fails, unneeded
+from echelon.core.statement import Cause, Hypothesis, fails, unneeded
 from echelon.core.words import Kind
 from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import trim_line
@@ -66,6 +66,11 @@ class UnknownLaw(Promise):
     @property
     def slowest(self) -> None:
         """The slowest mode near the trim: it is not known."""
+
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        """What explains that errors do not shrink: nothing is known."""
+        return ()
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which modes decay: none is known."""

@@ -338,8 +338,7 @@ def _step_radius(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:
         stop = loop.stiffness[k] * loop.weights[:degree, k]
         inner = np.append(0.0, stop[:-1])
         gains = inner + strengths[:, None] * stop
-        dt, how = run.settings.dt, run.settings.integrator
-        radius = max(radius, sampled_radius(A, B, gains[:, None], dt, how))
+        radius = max(radius, sampled_radius(A, B, gains[:, None], *run.settings.held))
     return radius
 
 

@@ -26,15 +26,14 @@ def sweep_mapping(data: "xr.Dataset") -> JsonObject:
         name: int((outcome == code).sum())
         for name, code in zip(names, outcome.attrs["flag_values"], strict=True)
     }
+    conditional = data["promise_verdict"] == str(Standing.CONDITIONAL)
     return {
         "runs": int(outcome.size),
         "outcomes": {name: count for name, count in counts.items() if count},
         "settled": int(succeeded(data).sum()),
         "promised": int((data["promised"] == 1).sum()),
-        "conditional": int((data["promise_verdict"] == str(Standing.CONDITIONAL)).sum()),
-        "covered": int(
-            ((data["promise_verdict"] != str(Standing.NONE)) & (data["covered"] == 1)).sum()
-        ),
+        "conditional": int(conditional.sum()),
+        "covered": int((conditional & (data["covered"] == 1)).sum()),
         "quantiles": {name: _quantiles(data[name].values) for name in SUMMARIZED},
     }
 
@@ -51,8 +50,9 @@ def sweep_report(data: "xr.Dataset") -> str:
     lines += [f"- Settled to {within}: {_share(summary['settled'], done)}."]
     lines += [f"- With a guarantee: {summary['promised']} of {summary['runs']}."]
     if summary["conditional"]:
-        text = f"- With a claim while no input is at a limit: {summary['conditional']}; "
-        lines += [f"{text}covered by a claim, in every step: {summary['covered']}."]
+        text = f"- While no input is at a limit: {summary['conditional']}, of which"
+        text += f" {summary['covered']} {'is' if summary['covered'] == 1 else 'are'} covered"
+        lines += [f"{text} in every step."]
     for name, values in summary["quantiles"].items():
         if values is not None:
             low, median, high = (f"{value:.3g}" for value in values)

@@ -70,6 +70,11 @@ class Settings(NamedTuple):
         return max(1, round(self.horizon / self.dt))
 
     @property
+    def held(self) -> tuple[float, str, int]:
+        """Over what an input is held, s, with the integrator and its substeps in it."""
+        return self.dt, self.integrator, self.substeps
+
+    @property
     def window(self) -> float:
         """The last part of the run that counts as steady, s."""
         return self.horizon / 5.0 if self.steady_window is None else self.steady_window

@@ -1,0 +1,168 @@
+"""Claims of theorems where inputs have limits that nothing bounds: conditional, never guaranteed."""
+
+import json
+
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon.core.statement import Hypothesis
+from echelon.core.words import Standing
+from echelon.output.viewer.replay import promise_badge
+
+GRAPH = ech.Graph.path(3)
+SETTINGS = ech.Settings(horizon=4.0, dt=0.01)
+WHILE = "no input of any agent is at a limit"
+
+
+class Cart(ech.models.DoubleIntegrator):
+    """A double integrator whose inputs have limits."""
+
+    most: float = 0.05
+
+    @property
+    def input_limits(self):
+        m = len(self.input_names)
+        return ech.models.Limits(np.eye(m), (-self.most,) * m, (self.most,) * m)
+
+
+def parts_of(model, kind, spread=1.0, **more):
+    """Parts under a law whose claim is that of a theorem."""
+    formation = ech.Formation.line(model, GRAPH)
+    if kind == "T5":
+        circle = ech.references.Circle(radius=0.5, rate=0.2)
+        laws = ech.Laws(ech.laws.StoppingLeader(reference=circle), ech.laws.StoppingPoint())
+    else:
+        domain = {"position": 90.0, "velocity": 90.0}
+        gain = ech.synthesize(model, GRAPH, ech.gains.RobustLQR(domain=domain))
+        laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    return ech.Parts(model, GRAPH, formation, laws, initial={"position": spread}, **more)
+
+
+@pytest.mark.parametrize("kind", ["T1", "T5"])
+def test_a_limit_leaves_a_claim_to_the_run(kind):
+    weak, strong = (Cart(dimension=2, most=most) for most in (0.05, 1e3))
+    found = ech.promise(parts_of(weak, kind), SETTINGS)
+    told = found.as_mapping()
+    assert found.verdict is Standing.CONDITIONAL and not found.promised and found.claimed
+    assert str(found.theorem) == kind == told["theorem"]
+    assert told["verdict"] == "conditional" and told["promised"] is False
+    assert told["conditions"] == [WHILE]
+    assert found.sentence().startswith(f"Not guaranteed: this holds while {WHILE}.")
+    assert found.hypotheses[Hypothesis.LIMITS].fails
+    # The run that meets its limits, and misses, is not covered; the one that never does is.
+    for model, covered in ((weak, False), (strong, True)):
+        result = ech.simulate(parts_of(model, kind), SETTINGS)
+        assert bool(result.saturated.max() == 0.0) is covered
+        assert ech.summary(result)["covered"] is covered
+        says = "covers this run" if covered else "does not cover this run: a limit acted"
+        assert f"The conditional claim {says}" in " ".join(str(ech.report(result)).split())
+
+
+@pytest.mark.parametrize("kind", ["T1", "T5"])
+def test_without_limits_the_same_claim_is_guaranteed(kind):
+    free = ech.models.DoubleIntegrator(dimension=2)
+    for parts, settings in (
+        (parts_of(free, kind), SETTINGS),
+        (parts_of(Cart(dimension=2), kind), SETTINGS._replace(limits=False)),
+    ):
+        found = ech.promise(parts, settings)
+        assert found.verdict is Standing.GUARANTEED and found.promised, found.sentence()
+        assert found.sentence().startswith(("Proved", "Local guarantee"))
+
+
+@pytest.mark.parametrize("kind", ["T1", "T5"])
+@pytest.mark.parametrize("whose", ["all", "one"])
+def test_limits_of_a_plant_count_as_those_of_the_model(kind, whose):
+    wide, weak = (Cart(dimension=2, most=most) for most in (np.inf, 0.05))
+    world = ech.World(plant=weak) if whose == "all" else ech.World(plants={2: weak})
+    parts = parts_of(wide, kind, world=world)
+    assert ech.promise(parts, SETTINGS).verdict is Standing.CONDITIONAL
+
+
+def test_only_the_leader_at_its_limit_leaves_a_run_uncovered():
+    model = Cart(dimension=2, most=0.5)
+    parts = parts_of(model, "T5", spread=0.0)
+    leader = ech.laws.StoppingLeader(reference=ech.references.Circle(radius=1.0, rate=1.0))
+    parts = parts.replace(drive=ech.Laws(leader, parts.drive.follower))
+    result = ech.simulate(parts, SETTINGS)
+    assert result.saturated[0] > 0.0
+    assert ech.summary(result)["covered"] is False
+
+
+def test_certified_motors_leave_a_guarantee_as_it_is():
+    parts, settings = ech.build(ech.load_scenario("paper-global"))
+    found = ech.promise(parts, settings)
+    assert found.verdict is Standing.CONDITIONAL
+    design = type(found).design(parts, settings)
+    assert design is not None
+    found = design.promise
+    assert found.verdict is Standing.GUARANTEED and not found.hypotheses[Hypothesis.LIMITS].fails
+
+
+def test_agents_that_keep_apart_with_too_weak_motors_are_conditional():
+    found = ech.promise(*ech.build(ech.load_scenario("crossing")))
+    assert found.verdict is Standing.CONDITIONAL and str(found.theorem) == "T10"
+    badge = promise_badge(found.as_mapping())
+    assert badge["state"] == "edge" and WHILE in badge["short"]
+
+
+def test_a_domain_that_was_seen_at_stored_frames_alone_covers_no_run_from_outside_the_set():
+    model = ech.models.DoubleIntegrator(dimension=2)
+    gain = ech.synthesize(
+        model, GRAPH, ech.gains.RobustLQR(domain={"position": 1.0, "velocity": 4.0})
+    )
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    formation = ech.Formation.line(model, GRAPH)
+    starts = formation.offsets + np.array([[0, 0, 0, 0], [0.9, 0, 0, 0], [0.9, 0, 0, 0.0]])
+    parts = ech.Parts(model, GRAPH, formation, laws, initial=starts)
+    assert ech.promise(parts, SETTINGS).hypotheses[Hypothesis.STARTS].fails
+    for every, covered in ((1, True), (5, False)):
+        result = ech.simulate(parts, SETTINGS._replace(store_every=every))
+        assert ech.summary(result)["covered"] is covered
+
+
+# ---- every reader --------------------------------------------------------------------------------
+
+FILE = """
+import numpy as np
+import echelon as ech
+
+class Cart(ech.models.DoubleIntegrator):
+    most: float = 0.05
+    @property
+    def input_limits(self):
+        return ech.models.Limits(np.eye(2), (-self.most,) * 2, (self.most,) * 2)
+"""
+SCENARIO = """
+name: carts
+model: {python: "cart.py:Cart", parameters: {dimension: 2}}
+graph: {name: path, agents: 3}
+formation: {name: line}
+reference: {name: circle, radius: 0.5, rate: 0.2}
+follower: {law: stopping-point}
+initial: {spread: {position: 1.0}}
+simulation: {horizon: 2.0, dt: 0.01}
+"""
+
+
+def test_check_run_sweep_verify_and_json_agree(echelon, tmp_path):
+    (tmp_path / "cart.py").write_text(FILE)
+    (tmp_path / "carts.yaml").write_text(SCENARIO)
+    code, out, _ = echelon("check", "carts.yaml")
+    assert code == 1 and f"while {WHILE}" in " ".join(out.split())
+    code, out, _ = echelon("check", "carts.yaml", "--json")
+    assert code == 1 and json.loads(out)["promise"]["verdict"] == "conditional"
+    code, out, _ = echelon("run", "carts.yaml", "--no-figures", "--out", "o")
+    assert code == 0 and "does not cover this run" in " ".join(out.split())
+    told = json.loads((tmp_path / "o" / "summary.json").read_text())
+    assert told["promise"]["verdict"] == "conditional" and told["covered"] is False
+    assert echelon("verify", "o", "--scenario", "o")[0] == 0
+    told["promise"]["verdict"], told["promise"]["promised"] = "guaranteed", True
+    (tmp_path / "o" / "summary.json").write_text(json.dumps(told))
+    assert echelon("verify", "o", "--scenario", "o")[0] == 1
+    over = ("--over", "model.parameters.most=0.05,1000")
+    _, out, _ = echelon("sweep", "carts.yaml", *over, "--out", "s")
+    said = " ".join(out.split())
+    assert "With a guarantee: 0 of 2." in said
+    assert "While no input is at a limit: 2, of which 1 is covered in every step." in said
