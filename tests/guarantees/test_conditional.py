@@ -1,4 +1,4 @@
-"""Claims of theorems where inputs have limits that nothing bounds: conditional, never guaranteed."""
+"""Claims where inputs have limits that nothing bounds: conditional, never guaranteed."""
 
 import json
 
