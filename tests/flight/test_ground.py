@@ -7,8 +7,9 @@ import pytest
 from processes import free_port
 
 from echelon.flight.air import LOOPBACK, Air, ports_of
+from echelon.flight.datagrams import Drop
 from echelon.flight.ground import Ground
-from echelon.flight.wire import GROUND, Drop, Letter, Report, Wire
+from echelon.flight.wire import GROUND, Letter, Report, Wire
 
 KEY, BOOT = b"k" * 32, time.time_ns() // 1_000_000
 REPORT = Report(1, 0, 0, 0.0, math.nan, 0.0, 0.0, 1.0, 0.0, 2e-4, 0.01, math.nan, (0,) * len(Drop))
