@@ -125,6 +125,16 @@ def test_a_restarted_process_comes_back_and_its_start_is_no_other_s():
     assert late.open(ground.start(WALL, WALL + 1.0, 1), None, WALL) is Drop.FLIGHT
 
 
+def test_a_recorded_start_for_others_keeps_no_genuine_one_out():
+    """The station that was recorded began later, by its clock."""
+    ground, agent, ahead = wire(GROUND), wire(1), wire(GROUND, boot=BOOT + 900)
+    ahead.begin(BOOT)
+    for to in (0, 0xFFFE):
+        assert agent.open(ahead.start(WALL, WALL + 1.0, to), None, WALL).body is None
+    ground.begin(ground.next_flight(WALL))
+    assert join(ground, agent)
+
+
 def test_an_agent_s_letter_tells_no_flight():
     agent, leader = wire(1), wire(0)
     leader.begin(BOOT + 7)
@@ -153,7 +163,7 @@ def test_a_genuine_stop_gets_through(wrong):
     assert stops(wire(GROUND, boot=BOOT + 90), flies, WALL + wrong)
 
 
-def test_a_stop_ends_one_flight_and_not_the_next(monkeypatch, tmp_path):
+def test_a_stop_ends_one_flight_and_not_the_next(tmp_path):
     """The station's clock goes back after the stop; what it stored does not."""
     key = tmp_path / "key"
     stop = None
@@ -229,8 +239,10 @@ def test_the_number_is_stored_before_the_flight_and_after_a_stop(monkeypatch):
     scene.ground.highest += 9
     scene.air.send(scene.ground.stop(time.time()))
     scene.link.x = [0.0, 0.0]
+    scene.rounds(2)
+    assert scene.fault is Fault.STOP and len(stored) == 1
     scene.process.run()
-    assert scene.fault is Fault.STOP and stored[1:] == [(scene.ground.highest, True)]
+    assert stored[1:] == [(scene.ground.highest, True)]
 
 
 def test_a_number_that_cannot_be_stored_keeps_a_vehicle_on_the_ground(monkeypatch, capsys):
