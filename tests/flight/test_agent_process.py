@@ -89,10 +89,10 @@ def test_a_vehicle_that_says_nothing_is_not_taken_for_one_that_rests(scene, caps
     assert scene.process._over()
 
 
-def report(scene, number=1):
-    """A report of another process of the same number, as it is sent."""
+def report(scene, number=1, earlier=0):
+    """A report of another process of the same number, as it is sent, maybe in an earlier flight."""
     nothing, wire = Report(*[0] * 12, dropped=(0,) * len(Drop)), scene.wire(number)
-    wire.begin(scene.crew.wire.flight)
+    wire.begin(scene.crew.wire.flight - earlier)
     return wire.report(time.time(), nothing)
 
 
@@ -104,6 +104,9 @@ def test_a_process_with_the_same_number_ends_the_flight(scene):
     scene.rounds(2)
     assert scene.fault is Fault.NONE
     scene.crew.wire.boot -= 3000
+    scene.air.send(report(scene, earlier=1))
+    scene.rounds(2)
+    assert scene.fault is Fault.NONE
     scene.air.send(report(scene))
     scene.rounds(2)
     assert scene.fault is Fault.TWIN

@@ -74,6 +74,19 @@ def test_a_number_that_cannot_be_stored_is_shown_and_starts_nothing():
         ground.close()
 
 
+def test_the_station_keeps_the_number_of_a_flight_and_of_a_stop(tmp_path):
+    file = NumberFile(tmp_path / "key", "ground")
+    own = Wire(KEY, "ab" * 32, GROUND, 2, (1, 1), BOOT, file.read(), file.write)
+    ground = Ground(Air((LOOPBACK, free_port()), []), own, 2)
+    try:
+        ground.start(time.time())
+        assert BOOT <= (flight := file.read()) == own.flight <= 1e3 * time.time()
+        ground.stop()
+        assert file.read() > flight == own.flight
+    finally:
+        ground.close()
+
+
 def shown(ground, holds):
     """What the page shows, once it holds."""
     for _ in range(200):
