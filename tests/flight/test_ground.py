@@ -1,6 +1,7 @@
 """The ground station, beside agents that this test plays."""
 
 import math
+import threading
 import time
 import urllib.request
 from pathlib import Path
@@ -83,6 +84,26 @@ def test_the_station_keeps_the_number_of_a_flight_and_of_a_stop(tmp_path):
         assert BOOT <= (flight := file.read()) == own.flight <= 1e3 * time.time()
         ground.stop()
         assert file.read() > flight == own.flight
+    finally:
+        ground.close()
+
+
+def test_a_button_that_is_pressed_twice_starts_one_flight():
+    stored = []
+
+    def store(number):
+        time.sleep(0.1)
+        stored.append(number)
+
+    own = Wire(KEY, "ab" * 32, GROUND, 2, (1, 1), BOOT, 0, store)
+    ground = Ground(Air((LOOPBACK, free_port()), []), own, 2)
+    try:
+        presses = [threading.Thread(target=ground.start, args=(time.time(),)) for _ in range(3)]
+        for press in presses:
+            press.start()
+        for press in presses:
+            press.join()
+        assert stored == [own.flight]
     finally:
         ground.close()
 

@@ -52,7 +52,7 @@ class Ground:
         self._reports, self._boots = dict[int, tuple[float, Report]](), dict[int, int]()
         self._notes: dict[int, dict[str, int]] = {k: {} for k in range(agents)}
         self._start: float | None = None
-        self.problem = ""
+        self.problem, self._starting = "", threading.Lock()
         self._stopped, self._said, self._closed = False, -math.inf, False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -63,9 +63,11 @@ class Ground:
         Raises:
             FlightError: the number of the flight cannot be stored.
         """
-        if self._start is None:
-            self._wire.begin(self._wire.next_flight(time.time()))
-            self._start = at
+        # A disk may be slow, and the button is pressed again meanwhile: that is no other flight.
+        with self._starting:
+            if self._start is None:
+                self._wire.begin(self._wire.next_flight(time.time()))
+                self._start = at
 
     def stop(self) -> None:
         """Let everybody level and descend, in whatever flight of which it knows."""
