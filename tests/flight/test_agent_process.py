@@ -1,114 +1,16 @@
 """One agent's process, with a vehicle and others that this test plays."""
 
 import math
-import socket
 import time
 
 import pytest
+from agent_scene import DT, Scene
 
-from echelon.core.errors import FlightError
 from echelon.core.packet import Packet
-from echelon.flight.agent_process import AgentProcess, Crew
-from echelon.flight.air import LOOPBACK, Air
-from echelon.flight.links.link import Link, Reading
-from echelon.flight.plan_clock import PlanClock
+from echelon.flight.datagrams import DatagramKind, Drop
+from echelon.flight.links.link import Reading
 from echelon.flight.supervisor import Fault
-from echelon.flight.wire import GROUND, DatagramKind, Drop, Letter, Report, Wire
-
-DT, KEY = 0.01, b"k" * 32
-FLIGHT = {
-    **{"dt": DT, "leadership": None, "weather": {"delay": 0.02, "jitter": 0.03, "loss": 0.0}},
-    "position": [0],
-    "velocity": [1],
-    "tilt": [],
-    "fence": {"low": [-5.0], "high": [5.0], "speed": 10.0},
-}
-NETWORK = {
-    "moves": False,
-    "period": 0.02,
-    "forget": 0.5,
-    "forget_hops": 5.0,
-    "agents": 2,
-    "leaders": [0],
-}
-FACTS = {
-    **{"agent": 1, "dt": DT, "leads": False, "hears": [0], "weights": [1.0]},
-    **{"signal": ["x"], "message": ["v"], "network": {**NETWORK, "uses": "all"}},
-}
-
-
-class Law:
-    """A law that returns its disagreement, or what a test wants."""
-
-    u, ticks = 0.0, 0
-
-    def begin(self, x):
-        return []
-
-    def difference(self, t, x, memory, place):
-        return [x[0] - place[0]]
-
-    def expected(self, t, content, age):
-        return [t], [1.0], True
-
-    def tick(self, t, x, z, forward, memory):
-        self.ticks += 1
-        return [self.u - z[0]], [], [x[0]], [0.0], math.isfinite(self.u)
-
-
-class Fake(Link):
-    """A vehicle that reads as this test says."""
-
-    def __init__(self):
-        self.x, self.sent, self.sinks, self.fails, self.age = [0.0, 1.0], [], 0, False, 0.0
-        self.battery, self.silent = None, False
-
-    def read(self, wait):
-        time.sleep(DT / 2)
-        if self.fails:
-            raise FlightError("the link is gone.")
-        return None if self.silent else Reading(time.monotonic() - self.age, self.x, self.battery)
-
-    def send(self, u):
-        self.sent.append(u)
-
-    def level_descend(self):
-        self.sinks += 1
-
-    def close(self):
-        pass
-
-
-class Scene:
-    """An agent's process, its vehicle, and the socket of all others."""
-
-    def __init__(self, monkeypatch):
-        monkeypatch.setattr("signal.signal", lambda *_: None)
-        ways = []
-        for _ in range(2):
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-                probe.bind((LOOPBACK, 0))
-                ways.append(probe.getsockname())
-        self.air, self.law, self.link = Air(ways[0], [ways[1]]), Law(), Fake()
-        air = Air(ways[1], [ways[0]])
-        crew = Crew(self.law, FACTS, FLIGHT, self.link, air, self.wire(1), PlanClock())
-        self.process = AgentProcess(crew)
-        self.crew, self.ground, self.leader = crew, self.wire(GROUND), self.wire(0)
-
-    def wire(self, number, key=KEY, formation="ab" * 32):
-        return Wire(key, formation, number, 2, (1, 1), time.time_ns() // 1_000_000)
-
-    def start(self):
-        self.air.send(self.ground.start(time.time(), time.time() - 1.0))
-        self.rounds(10)
-
-    def rounds(self, count):
-        for _ in range(count):
-            self.process._round()
-
-    @property
-    def fault(self):
-        return self.process._supervisor.fault
+from echelon.flight.wire import GROUND, Letter, Report
 
 
 @pytest.fixture
@@ -132,6 +34,7 @@ def test_letters_are_heard_and_answered(scene):
     # The leader is expected at t, and the vehicle is at 0.
     assert scene.link.sent[-1][0] == pytest.approx(t, abs=1.0)
     wire = scene.wire(0)
+    wire.begin(scene.ground.flight)
     letters = [wire.open(each, scene.crew.clock.now, time.time()) for each in scene.air.receive()]
     bodies = [x.body for x in letters if not isinstance(x, Drop) and isinstance(x.body, Letter)]
     assert bodies and bodies[-1].packet == packet and bodies[-1].hops == 1
@@ -186,10 +89,11 @@ def test_a_vehicle_that_says_nothing_is_not_taken_for_one_that_rests(scene, caps
     assert scene.process._over()
 
 
-def report(scene, number=1):
-    """A report of another process of the same number, as it is sent."""
-    nothing = Report(*[0] * 12, dropped=(0,) * len(Drop))
-    return scene.wire(number).report(time.time(), nothing)
+def report(scene, number=1, earlier=0):
+    """A report of another process of the same number, as it is sent, maybe in an earlier flight."""
+    nothing, wire = Report(*[0] * 12, dropped=(0,) * len(Drop)), scene.wire(number)
+    wire.begin(scene.crew.wire.flight - earlier)
+    return wire.report(time.time(), nothing)
 
 
 def test_a_process_with_the_same_number_ends_the_flight(scene):
@@ -200,6 +104,9 @@ def test_a_process_with_the_same_number_ends_the_flight(scene):
     scene.rounds(2)
     assert scene.fault is Fault.NONE
     scene.crew.wire.boot -= 3000
+    scene.air.send(report(scene, earlier=1))
+    scene.rounds(2)
+    assert scene.fault is Fault.NONE
     scene.air.send(report(scene))
     scene.rounds(2)
     assert scene.fault is Fault.TWIN
@@ -249,10 +156,11 @@ CLOCKS = {
 
 @pytest.mark.parametrize("why", CLOCKS)
 def test_a_clock_that_is_off_keeps_a_vehicle_on_the_ground(why, scene, capsys):
+    scene.introduce()
     for off in CLOCKS[why]:
         for _ in range(3):
             now = time.time() + off
-            scene.air.send(scene.ground.start(now, now))
+            scene.air.send(scene.ground.start(now, now, 1))
             scene.rounds(1)
     scene.process._report(time.monotonic())
     sentence = f"a datagram of the ground {why}"
@@ -287,7 +195,7 @@ def test_a_process_of_the_same_number_that_could_not_begin_changes_nothing(scene
 def test_the_first_start_counts(scene):
     scene.start()
     before = scene.crew.clock.now
-    scene.air.send(scene.ground.start(time.time(), time.time() + 100.0))
+    scene.air.send(scene.ground.start(time.time(), time.time() + 100.0, 1))
     scene.rounds(2)
     assert scene.crew.clock.now >= before
 

@@ -8,9 +8,10 @@ import pytest
 from browser import chromium, until
 
 from echelon.flight.air import LOOPBACK, Air
+from echelon.flight.datagrams import DatagramKind, Drop
 from echelon.flight.ground import Ground, page_of
 from echelon.flight.supervisor import Fault
-from echelon.flight.wire import GROUND, DatagramKind, Drop, Opened, Report, Wire
+from echelon.flight.wire import GROUND, Opened, Report, Wire
 from echelon.output.viewer.serve import serve, serving
 
 SIZES = {"desktop": (1280, 720), "phone": (390, 844)}
@@ -74,6 +75,7 @@ def test_the_page_shows_agents_and_stops_all_of_them(browser, size):
             page.click("#stop")
             until(lambda: page.inner_text("#note").startswith("Stop was sent."))
             receiver, kinds = wire(1), []
+            receiver.begin(1)
             for datagram in agents.receive():
                 opened = receiver.open(datagram, None, time.time())
                 kinds += [opened.kind] * isinstance(opened, Opened)

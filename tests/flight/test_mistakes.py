@@ -18,7 +18,7 @@ from echelon.flight.air import Air, bound, ports_of
 from echelon.flight.ground import Ground
 from echelon.flight.local_flight import make_key
 from echelon.flight.mission import Mission
-from echelon.flight.wire import GROUND, wire_of
+from echelon.flight.wire import GROUND, is_letter, sender_of, wire_of
 from echelon.output.archive.flight_folder import flight_files, save_flight
 
 pytestmark = pytest.mark.slow
@@ -138,6 +138,55 @@ def test_a_key_that_is_missing_or_readable_by_others(flight):
         flight.start_agent(1, key=key)
         text, code = flight.said(1, end=False)
         assert sentence in text and text.count("\n") == 1 and code == 2
+
+
+def test_a_flight_number_that_is_damaged_or_cannot_be_stored(flight):
+    damaged, folder = (flight.own / f"key.agent-{k}.flight" for k in (0, 1))
+    damaged.write_text("x")
+    folder.mkdir()
+    for k, sentence in ((0, "is `x`, and must be a whole number"), (1, "(is a directory)")):
+        flight.start_agent(k)
+        text, code = flight.said(k, end=False)
+        assert sentence in text and text.count("\n") == 1 and code == 2
+
+
+def record(air, count, seconds):
+    """What is in the air until so much is: each with its time."""
+    datagrams, until = [], time.monotonic() + seconds
+    while len(datagrams) < count and time.monotonic() < until:
+        datagrams += [(time.time(), each) for each in air.receive()]
+        time.sleep(0.005)
+    return datagrams
+
+
+def test_a_recorded_flight_starts_no_process_whose_clock_is_that_of_its_day(folder, tmp_path):
+    """The start and the letters of the leader, into a process that is new and one that flew."""
+    flight = Flight(folder, tmp_path, "239.255.71.32")
+    air = Air(flight.way, [flight.way])
+    try:
+        flight.start_vehicles()
+        for k in (0, 1):
+            flight.start_agent(k)
+        flight.start(0, 1)
+        datagrams = [x for x in record(air, 400, 4.0) if sender_of(x[1]) != 1]
+        assert any(is_letter(x) for _, x in datagrams)
+        flight.wait(lambda state: state["agents"][1]["mode"] == "flies")
+        for k in (0, 1):
+            flight.said(k)
+        flight.ground.close()
+        # Beside this one there is no number.
+        shutil.copy(flight.own / "key", flight.own / "another key")
+        for name in ("key", "another key"):
+            late = time.time() - datagrams[0][0] + 1.5
+            flight.start_agent(1, key=name, code=SHIFTED.format(-late), name=name)
+            for at, datagram in datagrams:
+                time.sleep(max(0.0, at + late - time.time()))
+                air.send(datagram)
+            text, _ = flight.said(name)
+            assert "it never flew" in text and "clock" not in text
+    finally:
+        air.close()
+        flight.close()
 
 
 UNLIKE = {

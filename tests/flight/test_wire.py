@@ -9,14 +9,25 @@ import struct
 import pytest
 
 from echelon.core.errors import FlightError
-from echelon.flight.wire import GROUND, DatagramKind, Drop, Letter, Packet, Report, Wire, read_key
+from echelon.flight.datagrams import DatagramKind, Drop
+from echelon.flight.key_files import read_key
+from echelon.flight.wire import GROUND, Letter, Packet, Report, Wire
 
 KEY, FORMATION, AGENTS, SIZES = b"k" * 32, "ab" * 32, 4, (4, 4)
 NOW, WALL, BOOT = 3.0, 1.8e9, 1_800_000_000_000
+FLIGHT = BOOT + 5
 
 
 def wire(number=1, key=KEY, formation=FORMATION, boot=BOOT):
-    return Wire(key, formation, number, AGENTS, SIZES, boot)
+    """What signs for a process in a flight."""
+    one = waiting(number, key, formation, boot)
+    one.begin(FLIGHT)
+    return one
+
+
+def waiting(number=1, key=KEY, formation=FORMATION, boot=BOOT, highest=0):
+    """What signs for a process that waits for the start."""
+    return Wire(key, formation, number, AGENTS, SIZES, boot, highest)
 
 
 def letter(time=NOW, sender=1, value=(0.1, -0.2, 0.3, 1e-9)):
@@ -34,9 +45,10 @@ def test_a_letter_is_read_as_it_was_written():
 
 
 def test_commands_and_reports_are_read_without_a_plan():
-    ground, agent = wire(GROUND), wire(2)
-    assert agent.open(ground.start(WALL, WALL + 2.0), None, WALL).body == WALL + 2.0
-    assert agent.open(ground.stop(WALL), None, WALL).kind is DatagramKind.STOP
+    ground, agent = wire(GROUND), waiting(2)
+    ground.challenges[2] = agent.challenge
+    assert agent.open(ground.start(WALL, WALL + 2.0, 2), None, WALL).body == WALL + 2.0
+    assert agent.open(ground.stop(WALL, 2), None, WALL).kind is DatagramKind.STOP
     assert agent.open(wire(1).letter(letter()), None, WALL) is Drop.EARLY
     for sentence in ("the key is another one", "é" * 200, ""):
         opened = ground.open(agent.note(WALL, sentence), None, WALL)
@@ -50,16 +62,25 @@ def test_commands_and_reports_are_read_without_a_plan():
 def test_the_layout_is_the_one_that_is_documented():
     """Written by hand, so that programs in other languages find what docs/fly.md says."""
     datagram = wire(1).letter(letter())
-    head = struct.unpack_from("<BB8sHQId", datagram)
-    assert head == (1, 1, bytes.fromhex("ab" * 8), 1, BOOT, 1, NOW)
-    body = struct.unpack_from("<HHB4dHd4d", datagram, 32)
+    head = struct.unpack_from("<BB8sHQQId", datagram)
+    assert head == (2, 1, bytes.fromhex("ab" * 8), 1, BOOT, FLIGHT, 1, NOW)
+    body = struct.unpack_from("<HHB4dHd4d", datagram, 40)
     assert body == (0, 1, 1, *letter().value, 0, NOW - 0.02, *letter().packet.content)
-    assert len(datagram) == 32 + 79 + 16
+    assert len(datagram) == 40 + 79 + 16
 
 
-def signed(body, kind=DatagramKind.LETTER, number=1, stamp=NOW, count=1, boot=BOOT, version=1):
+def signed(
+    body,
+    kind=DatagramKind.LETTER,
+    number=1,
+    stamp=NOW,
+    count=1,
+    boot=BOOT,
+    version=2,
+    flight=FLIGHT,
+):
     """A datagram of somebody who has the key and knows the format."""
-    head = struct.pack("<BB8sHQId", version, kind, b"\xab" * 8, number, boot, count, stamp)
+    head = struct.pack("<BB8sHQQId", version, kind, b"\xab" * 8, number, boot, flight, count, stamp)
     return head + body + hmac.digest(KEY, head + body, "sha256")[:16]
 
 
@@ -77,7 +98,7 @@ BAD = {
         signed(b""),
         signed(body_of(), DatagramKind.START),
     ],
-    Drop.VERSION: [signed(body_of(), version=2)],
+    Drop.VERSION: [signed(body_of(), version=1)],
     Drop.FORMATION: [wire(formation="cd" * 32).letter(letter())],
     Drop.SIGNATURE: [
         wire(key=b"other" * 8).letter(letter()),
@@ -188,5 +209,5 @@ def test_a_key_is_read_only_from_a_file_of_its_owner(tmp_path):
 
 
 def test_a_letter_that_would_be_split_is_refused():
-    with pytest.raises(FlightError, match="a letter has 543 bytes"):
+    with pytest.raises(FlightError, match="a letter has 551 bytes"):
         Wire(KEY, FORMATION, 0, 4, (30, 30), BOOT)

@@ -11,11 +11,12 @@ from pathlib import Path
 from echelon.core.errors import EchelonError, FlightError
 from echelon.flight.agent_process import AgentProcess, Crew
 from echelon.flight.air import LOOPBACK, PORT, Address, Air, ports_of, read_address, tell_once
+from echelon.flight.key_files import require_key
 from echelon.flight.links.link import Link, open_link
 from echelon.flight.mission import Mission
 from echelon.flight.plan_clock import PlanClock
 from echelon.flight.supervisor import Fault
-from echelon.flight.wire import GROUND, require_key, wire_of
+from echelon.flight.wire import GROUND, wire_of
 
 _READY = 5.0  # s, within which a state of the vehicle must arrive
 

@@ -1,5 +1,6 @@
 """The process of one agent: its loop from states and letters to inputs and letters."""
 
+import contextlib
 import math
 import os
 import signal
@@ -12,11 +13,12 @@ from typing import Any, Final, NamedTuple, final
 
 from echelon.core.errors import FlightError
 from echelon.flight.air import Air
+from echelon.flight.datagrams import DatagramKind, Drop
 from echelon.flight.links.link import Link, Reading
 from echelon.flight.pilot import Pilot
 from echelon.flight.plan_clock import PlanClock
 from echelon.flight.supervisor import Fault, Fence, Supervisor
-from echelon.flight.wire import DatagramKind, Drop, Letter, Opened, Report, Wire, name_of, sender_of
+from echelon.flight.wire import Letter, Opened, Report, Wire, name_of, sender_of
 
 _REPORTS: Final = 0.1  # s between two
 _LONGEST: Final = 20.0  # s of a descent
@@ -27,7 +29,10 @@ _TWIN: Final = 0.5
 """s after its own beginning from which on nobody else may have its number."""
 _MADE_UP: Final = 5
 """Ticks that are made up for at most; after a longer gap the law goes on from where it was."""
-_TOLD: Final = (Drop.VERSION, Drop.FORMATION, Drop.SIGNATURE, Drop.CLOCK, Drop.AHEAD, Drop.START)
+_TOLD: Final = (
+    *(Drop.VERSION, Drop.FORMATION, Drop.SIGNATURE, Drop.CLOCK, Drop.AHEAD, Drop.START),
+    Drop.FLIGHT,
+)
 """Reasons that somebody on the ground can remove."""
 
 
@@ -85,6 +90,10 @@ class AgentProcess:
             self._round()
         self._report(time.monotonic())
         self._crew.link.close()
+        if self._supervisor.fault is Fault.STOP:
+            # Not while it descends: a disk may take long.
+            with contextlib.suppress(FlightError):
+                self._crew.wire.keep()
         self._say(f"{self._supervisor.sentence}; {self._summary()}")
         return self._supervisor.fault
 
@@ -219,17 +228,22 @@ class AgentProcess:
         elif isinstance(opened.body, Letter):
             return self._pilot.box.receive(opened.body, self._crew.clock.now or 0.0)
         elif opened.kind is DatagramKind.START and isinstance(opened.body, float):
-            return self._take_start(opened.body, time.time() - opened.stamp)
+            return self._take_start(opened.body, opened.flight, time.time() - opened.stamp)
         elif opened.kind is DatagramKind.STOP:
             self._supervisor.trip(Fault.STOP)
         return None
 
-    def _take_start(self, at: float, late: float) -> Drop | None:
-        """Let the plan start at a time (s since 1970) of a clock that is not beside this one."""
+    def _take_start(self, at: float, flight: int, late: float) -> Drop | None:
+        """Let the plan of a flight start at a time (s since 1970) of a clock beside this one."""
         clock, weather = self._crew.clock, self._crew.flight["weather"]
         if not clock.started:
             if not -_CLOCK < late < _CLOCK + (weather["delay"] + weather["jitter"]) / clock.speed:
                 return Drop.START
+            try:
+                self._crew.wire.begin(flight)
+            except FlightError as error:
+                self._say(str(error).rstrip("."))
+                return None
             clock.start(at)
         return None
 
@@ -237,6 +251,8 @@ class AgentProcess:
         """Judge a datagram with the agent's own number."""
         # What a process before this one sent may still be on its way. Letters have another clock.
         boot, alive = self._crew.wire.boot, 1e-3 * self._crew.wire.boot + _TWIN
+        if opened.flight != self._crew.wire.flight:
+            return
         if opened.boot != boot and opened.kind is not DatagramKind.LETTER and opened.stamp > alive:
             self._supervisor.trip(Fault.TWIN, opened.sender)
             if self._supervisor.fault is not Fault.TWIN:

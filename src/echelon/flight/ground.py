@@ -1,5 +1,6 @@
 """The ground station: hears every agent, starts the plan, says stop, and serves a page."""
 
+import contextlib
 import json
 import math
 import threading
@@ -8,10 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, final
 
+from echelon.core.errors import FlightError
 from echelon.flight.air import Air
+from echelon.flight.datagrams import Drop
 from echelon.flight.letterbox import NOBODY
 from echelon.flight.supervisor import Fault
-from echelon.flight.wire import GROUND, Drop, Opened, Report, Wire, is_letter, name_of
+from echelon.flight.wire import ALL, GROUND, Opened, Report, Wire, is_letter, name_of
 from echelon.output.viewer.serve import Handler
 
 _AGAIN: Final = 0.2
@@ -32,6 +35,9 @@ class Ground:
         wire: that signs for the ground.
         agents: how many there are.
         watch: called with the number of an agent and each of its reports.
+
+    Attributes:
+        problem: why the last start failed.
     """
 
     def __init__(
@@ -46,17 +52,31 @@ class Ground:
         self._reports, self._boots = dict[int, tuple[float, Report]](), dict[int, int]()
         self._notes: dict[int, dict[str, int]] = {k: {} for k in range(agents)}
         self._start: float | None = None
+        self.problem, self._starting = "", threading.Lock()
         self._stopped, self._said, self._closed = False, -math.inf, False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def start(self, at: float) -> None:
-        """Let the plan start at a time, s since 1970, once."""
-        self._start = self._start or at
+        """Let the plan start at a time, s since 1970, once.
+
+        Raises:
+            FlightError: the number of the flight cannot be stored.
+        """
+        # A disk may be slow, and the button is pressed again meanwhile: that is no other flight.
+        with self._starting:
+            if self._start is None:
+                self._wire.begin(self._wire.next_flight(time.time()))
+                self._start = at
 
     def stop(self) -> None:
-        """Let everybody level and descend."""
+        """Let everybody level and descend, in whatever flight of which it knows."""
+        # Above this flight and below the next one, in which the command no longer counts.
+        self._wire.highest = self._wire.next_flight(time.time())
         self._stopped, self._said = True, -math.inf
+        # What cannot be stored delays no stop.
+        with contextlib.suppress(FlightError):
+            self._wire.keep()
 
     def close(self) -> None:
         """End."""
@@ -91,11 +111,15 @@ class Ground:
                     self._hear(opened)
             if time.monotonic() > self._said + _AGAIN:
                 self._said = time.monotonic()
-                if self._start is not None and not self._stopped:
-                    self._air.send(self._wire.start(time.time(), self._start))
-                if self._stopped:
-                    self._air.send(self._wire.stop(time.time()))
+                self._command(ALL)
             time.sleep(0.01)
+
+    def _command(self, to: int) -> None:
+        """Send what the buttons said to an agent that waits, or to all that fly."""
+        if self._stopped:
+            self._air.send(self._wire.stop(time.time(), to))
+        elif self._start is not None:
+            self._air.send(self._wire.start(time.time(), self._start, to))
 
     def _hear(self, opened: Opened) -> None:
         """Remember a report or a note."""
@@ -109,12 +133,15 @@ class Ground:
             self._boots[sender] = opened.boot
             self._reports[sender] = time.monotonic(), opened.body
             self._watch(sender, opened.body)
+            if not opened.flight:
+                self._command(sender)
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows."""
         return {
             "started": self._start is not None,
             "stopped": self._stopped,
+            "problem": self.problem,
             "agents": [self._row(k) for k in range(self._agents)],
             "dropped": [self._dropped(why, n) for why, n in [*self._wire.dropped.items()]],
         }
@@ -182,7 +209,10 @@ def page_of(ground: Ground) -> type[Handler]:
             actions = {"/start": lambda: ground.start(time.time() + 2.0), "/stop": ground.stop}
             action = actions.get(self.path)
             if action is not None:
-                action()
+                try:
+                    action()
+                except FlightError as error:
+                    ground.problem = str(error)
             self.send(b"\n", "text/plain", 404 if action is None else 200)
 
     return Page

@@ -8,7 +8,8 @@ from collections.abc import Collection, Sequence
 from typing import Final, final
 
 from echelon.core.packet import Packet
-from echelon.flight.wire import Drop, Letter
+from echelon.flight.datagrams import Drop
+from echelon.flight.wire import Letter
 
 NOBODY: Final = 0xFFFF
 """Hops of an agent that no leader reaches, and the leader of one that knows none, as datagrams have

@@ -1,27 +1,32 @@
 """What agents and the ground send each other: one signed datagram each, dropped if in doubt.
 
 Little-endian: version, kind, formation (8 bytes), sender, its boot (ms since 1970), number of the
-datagram, stamp (s), body, and 16 bytes of HMAC-SHA256. Letters are stamped with the time of the
-plan; commands and reports, which come before there is one, with that since 1970.
+flight, number of the datagram, stamp (s), body, and 16 bytes of HMAC-SHA256. Letters are stamped
+with the time of the plan; commands and reports, which come before there is one, with that since
+1970. The ground chooses the number of a flight. A process on the ground draws a challenge, sends it
+in its reports, and obeys commands that repeat it: nobody can have recorded them earlier.
 """
 
-import enum
 import hmac
 import math
-import stat
+import secrets
 import struct
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple, final
 
 from echelon.core.errors import FlightError
 from echelon.core.packet import Packet
+from echelon.flight.datagrams import DatagramKind, Drop
+from echelon.flight.key_files import NumberFile, read_key
 
-VERSION: Final = 1
+VERSION: Final = 2
 GROUND: Final = 0xFFFF
 """The number of the ground station as a sender."""
+ALL: Final = 0xFFFE
+"""Whom a command is for that answers no challenge."""
 LONGEST: Final = 480
 """Bytes, which no network splits; 200 suffice for four outputs."""
 LARGEST: Final = 1e6
@@ -29,36 +34,8 @@ LARGEST: Final = 1e6
 APART: Final = 1.0
 """s; clocks that differ by more are wrong."""
 
-_HEAD: Final = struct.Struct("<BB8sHQId")
+_HEAD: Final = struct.Struct("<BB8sHQQId")
 _SIGNATURE: Final = 16
-
-
-class DatagramKind(enum.IntEnum):
-    """What a datagram is."""
-
-    LETTER = 1
-    START = 2
-    STOP = 3
-    REPORT = 4
-    NOTE = 5
-
-
-class Drop(enum.Enum):
-    """Why a datagram is not used."""
-
-    LENGTH = "has a length that no datagram of this formation has"
-    VERSION = "is of another version of the protocol"
-    FORMATION = "is of another formation"
-    SIGNATURE = "is signed with another key"
-    NOT_FINITE = "has a number that is not finite"
-    TOO_LARGE = "has a deviation larger than 1e6"
-    CLOCK = "has a time stamp that differs from this clock by more than 1 s"
-    OLD = "is not newer than the last one from its sender"
-    SENDER = "is from a sender that this process does not listen to"
-    AHEAD = "has a time stamp ahead of this clock"
-    PACKET = "has no packet of a leader"
-    EARLY = "came before the start"
-    START = "gives the start by a clock that differs from this one by more than 0.1 s"
 
 
 class Letter(NamedTuple):
@@ -112,53 +89,26 @@ class Report(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """A datagram that is used: its kind, who sent it since when, its stamp (s), and its body."""
+    """A datagram that is used: its kind, sender, its boot, flight and stamp (s), and its body.
+
+    A start that is for others has no body.
+    """
 
     kind: DatagramKind
     sender: int
     boot: int
+    flight: int
     stamp: float
     body: "Letter | Report | float | str | None"
 
 
 _FIELDS: Final = len(Report._fields) - 1
 _REPORT: Final = struct.Struct(f"<BBHdd{_FIELDS - 5}f{len(Drop)}I")
-_START: Final = struct.Struct("<d")
+_START: Final = struct.Struct("<HQd")
+_STOP: Final = struct.Struct("<HQ")
+_KNOWN: Final = struct.Struct("<QQ")
+"""Before a report: the sender's challenge, and the highest flight number it has used."""
 _NOTE: Final = struct.Struct("<240s")
-
-
-def require_key(file: Path | None) -> Path:
-    """Return the key file.
-
-    Raises:
-        FlightError: none is named.
-    """
-    if file is None:
-        raise FlightError("give `--key` with the key file, which all agents and the ground share.")
-    return file
-
-
-def read_key(file: Path) -> bytes:
-    """Return the key of a formation, which its owner alone may read.
-
-    Raises:
-        FlightError: there is none, others may read it, or it is too short.
-    """
-    try:
-        mode, key = file.stat().st_mode, file.read_bytes()
-    except OSError as error:
-        raise FlightError(
-            f"the key file `{file}` cannot be read ({(error.strerror or '').lower()}); make one "
-            f"with `(umask 077; head -c 32 /dev/urandom > {file})`, and copy it to every vehicle."
-        ) from None
-    if stat.S_IMODE(mode) & 0o077:
-        raise FlightError(
-            f"the key file `{file}` has mode {stat.S_IMODE(mode):04o}, and others may read it; "
-            f"use `chmod 600 {file}`."
-        )
-    if len(key) < 16:
-        raise FlightError(f"the key file `{file}` has {len(key)} bytes, and must have at least 16.")
-    return key
 
 
 @final
@@ -173,8 +123,14 @@ class Wire:
         sizes: of a letter's value and of a packet's content.
         boot: when the process began, ms since 1970, so that its numbers are no replay of the last
             process's.
+        highest: flight number that a process of this number has used.
+        store: keeps a flight number.
 
     Attributes:
+        flight: the number of the flight; 0 before it begins.
+        highest: flight number of which it knows.
+        challenge: drawn by this process.
+        challenges: of the others, by their newest reports.
         dropped: how many datagrams, by reason.
         suspects: who last sent one, by reason, as the datagram says.
     """
@@ -187,21 +143,25 @@ class Wire:
         agents: int,
         sizes: tuple[int, int],
         boot: int,
+        highest: int = 0,
+        store: Callable[[int], object] = lambda number: None,
     ) -> None:
         """Begin to count."""
         self._key, self._formation = key, bytes.fromhex(formation)[:8]
         self.number, self.boot, self._agents, self._count = number, boot, agents, 0
         self._letter = struct.Struct(f"<HHB{sizes[0]}dHd{sizes[1]}d")
-        self._sizes = sizes
+        self._sizes, self._store = sizes, store
+        self.flight, self.highest = 0, highest
+        self.challenge, self.challenges = secrets.randbits(64), dict[int, int]()
         bodies = {
             DatagramKind.LETTER: self._letter,
             DatagramKind.START: _START,
-            DatagramKind.REPORT: _REPORT,
+            DatagramKind.STOP: _STOP,
             DatagramKind.NOTE: _NOTE,
         }
         around = _HEAD.size + _SIGNATURE
         self._lengths = {kind: around + body.size for kind, body in bodies.items()}
-        self._lengths[DatagramKind.STOP] = around
+        self._lengths[DatagramKind.REPORT] = around + _KNOWN.size + _REPORT.size
         self._newest = dict[tuple[int, DatagramKind], tuple[int, int]]()
         self.dropped, self.suspects = Counter[Drop](), dict[Drop, int]()
         if max(self._lengths.values()) > LONGEST:
@@ -209,6 +169,28 @@ class Wire:
                 f"a letter has {max(self._lengths.values())} bytes, with {sizes[0]} numbers of a "
                 f"deviation and {sizes[1]} of a leader, and may have {LONGEST}."
             )
+
+    def begin(self, flight: int) -> None:
+        """Store the number of a flight, and take part in it.
+
+        Raises:
+            FlightError: it cannot be stored.
+        """
+        if flight > self.highest:
+            self._store(flight)
+        self.flight, self.highest = flight, max(flight, self.highest)
+
+    def keep(self) -> None:
+        """Store the highest flight number of which it knows.
+
+        Raises:
+            FlightError: it cannot be stored.
+        """
+        self._store(self.highest)
+
+    def next_flight(self, wall: float) -> int:
+        """Return a number above all flights of which it knows, at a time (s since 1970)."""
+        return max(int(1e3 * wall), self.highest + 1)
 
     # ---- writing ---------------------------------------------------------------------------------
 
@@ -221,25 +203,32 @@ class Wire:
             DatagramKind.LETTER, letter.time, self._letter.pack(*head, *letter.value, *rest)
         )
 
-    def start(self, wall: float, at: float) -> bytes:
-        """Return the command that the plan starts at a time, both in s since 1970."""
-        return self._sign(DatagramKind.START, wall, _START.pack(at))
+    def start(self, wall: float, at: float, to: int = ALL) -> bytes:
+        """Return the command that the plan starts at a time, both in s since 1970, to an agent."""
+        body = _START.pack(to, self.challenges.get(to, 0), at)
+        return self._sign(DatagramKind.START, wall, body)
 
-    def stop(self, wall: float) -> bytes:
-        """Return the command that everybody levels and descends."""
-        return self._sign(DatagramKind.STOP, wall, b"")
+    def stop(self, wall: float, to: int = ALL) -> bytes:
+        """Return the command that everybody levels and descends, whatever flight they are in."""
+        body = _STOP.pack(to, self.challenges.get(to, 0))
+        return self._sign(DatagramKind.STOP, wall, body, self.highest)
 
     def report(self, wall: float, report: Report) -> bytes:
         """Return the datagram of a report."""
-        return self._sign(DatagramKind.REPORT, wall, _REPORT.pack(*report[:-1], *report.dropped))
+        body = _KNOWN.pack(self.challenge, self.highest)
+        body += _REPORT.pack(*report[:-1], *report.dropped)
+        return self._sign(DatagramKind.REPORT, wall, body)
 
     def note(self, wall: float, sentence: str) -> bytes:
         """Return the datagram of a sentence to the ground, of which 240 bytes are sent."""
         return self._sign(DatagramKind.NOTE, wall, _NOTE.pack(sentence.encode()))
 
-    def _sign(self, kind: DatagramKind, stamp: float, body: bytes) -> bytes:
+    def _sign(
+        self, kind: DatagramKind, stamp: float, body: bytes, flight: int | None = None
+    ) -> bytes:
         self._count += 1
-        who = VERSION, kind, self._formation, self.number, self.boot, self._count
+        number = self.flight if flight is None else flight
+        who = VERSION, kind, self._formation, self.number, self.boot, number, self._count
         text = _HEAD.pack(*who, stamp) + body
         return text + hmac.digest(self._key, text, "sha256")[:_SIGNATURE]
 
@@ -273,7 +262,7 @@ class Wire:
     def _open(self, datagram: bytes, plan: float | None, wall: float) -> Opened | Drop:
         if len(datagram) not in self._lengths.values():
             return Drop.LENGTH
-        version, kind, formation, sender, boot, count, stamp = _HEAD.unpack_from(datagram)
+        version, kind, formation, sender, boot, flight, count, stamp = _HEAD.unpack_from(datagram)
         if version != VERSION:
             return Drop.VERSION
         if self._lengths.get(kind) != len(datagram):
@@ -288,41 +277,77 @@ class Wire:
         ground = sender == GROUND and kind in (DatagramKind.START, DatagramKind.STOP)
         if not (ground or sender < self._agents and kind != DatagramKind.START):
             return Drop.SENDER
-        body = self._body(DatagramKind(kind), sender, stamp, text[_HEAD.size :])
+        kind = DatagramKind(kind)
+        if self._is_foreign(kind, flight):
+            return Drop.FLIGHT
+        body = self._body(kind, sender, stamp, text[_HEAD.size :])
         if isinstance(body, Drop):
             return body
-        clock = plan if kind == DatagramKind.LETTER else wall
+        clock = plan if kind is DatagramKind.LETTER else wall
         if clock is None:
             return Drop.EARLY
         # A process whose clock was once far ahead would be believed for ever by its boot.
-        if abs(stamp - clock) > APART or boot > 1e3 * (wall + APART):
+        # A stop is known to be new by its flight or challenge, and counts whatever the clocks say.
+        wrong = abs(stamp - clock) > APART or boot > 1e3 * (wall + APART)
+        if wrong and kind is not DatagramKind.STOP:
             return Drop.CLOCK
+        opened = Opened(kind, sender, boot, flight, stamp, body)
         # Own datagrams return from a multicast group, and are newer than those of a process that
-        # was started before with the same number.
-        if (sender, boot) == (self.number, self.boot):
-            return Opened(DatagramKind(kind), sender, boot, stamp, body)
-        newest = self._newest.get((sender, DatagramKind(kind)), (0, 0))
-        if (boot, count) <= newest:
+        # was started before with the same number. A start for others is not remembered: it may be
+        # of any time.
+        own = (sender, boot) == (self.number, self.boot)
+        if own or kind is DatagramKind.START and body is None:
+            return opened
+        if (boot, count) <= self._newest.get((sender, kind), (0, 0)):
             return Drop.OLD
-        self._newest[sender, DatagramKind(kind)] = boot, count
-        return Opened(DatagramKind(kind), sender, boot, stamp, body)
+        self._newest[sender, kind] = boot, count
+        if kind is DatagramKind.REPORT:
+            self.challenges[sender], known = _KNOWN.unpack_from(text, _HEAD.size)
+            flight = max(flight, known)
+        if kind is DatagramKind.STOP or self.number == GROUND:
+            self.highest = max(self.highest, flight)
+        return opened
+
+    def _is_foreign(self, kind: DatagramKind, flight: int) -> bool:
+        """Tell whether a datagram is of a flight that does not count here."""
+        if kind is DatagramKind.STOP:
+            return flight < (self.flight or self.highest)
+        if kind is DatagramKind.START and not self.flight:
+            # A process that was restarted comes back to the flight whose number it has stored.
+            return flight < self.highest
+        if kind in (DatagramKind.START, DatagramKind.LETTER):
+            return self.flight not in (0, flight)
+        # The ground sees who waits, and who began a later flight.
+        return self.number == GROUND and 0 < flight < self.flight
 
     def _body(
         self, kind: DatagramKind, sender: int, stamp: float, text: bytes
     ) -> Drop | Letter | Report | float | str | None:
         if not math.isfinite(stamp):
             return Drop.NOT_FINITE
-        if kind is DatagramKind.STOP:
-            return None
-        if kind is DatagramKind.START:
-            [at] = _START.unpack(text)
-            return at if math.isfinite(at) else Drop.NOT_FINITE
+        if kind in (DatagramKind.START, DatagramKind.STOP):
+            return self._read_command(kind, text)
         if kind is DatagramKind.NOTE:
             return text.rstrip(b"\0").decode(errors="ignore")
         if kind is DatagramKind.REPORT:
-            numbers = _REPORT.unpack(text)
+            numbers = _REPORT.unpack_from(text, _KNOWN.size)
             return Report(*numbers[:_FIELDS], dropped=numbers[_FIELDS:])
         return self._read_letter(sender, stamp, text)
+
+    def _read_command(self, kind: DatagramKind, text: bytes) -> Drop | float | None:
+        """Return when a plan starts, if a process on the ground may believe it; None for others."""
+        to, challenge, *rest = (_START if kind is DatagramKind.START else _STOP).unpack(text)
+        if not all(map(math.isfinite, rest)):
+            return Drop.NOT_FINITE
+        own, start = to == self.number, kind is DatagramKind.START
+        if not start and (self.flight or self.number == GROUND):
+            # In a flight a stop for anybody counts for all.
+            return None
+        if own and challenge != self.challenge:
+            return Drop.CHALLENGE
+        if start:
+            return rest[0] if own else None
+        return None if own else Drop.EARLY
 
     def _read_letter(self, sender: int, stamp: float, text: bytes) -> Letter | Drop:
         epoch, hops, has, *numbers = self._letter.unpack(text)
@@ -359,8 +384,10 @@ def wire_of(flight: Mapping[str, Any], number: int, key: Path) -> Wire:
     """Return what signs for an agent or the ground, by the content of flight.json and a key file.
 
     Raises:
-        FlightError: the key cannot be used.
+        FlightError: the key cannot be used, or the flight number beside it.
     """
     boot, (first, second) = time.time_ns() // 1_000_000, flight["sizes"]
-    sizes = first, second
-    return Wire(read_key(key), flight["formation"], number, flight["agents"], sizes, boot)
+    name, sizes = "ground" if number == GROUND else f"agent-{number}", (first, second)
+    secret, file = read_key(key), NumberFile(key, name)
+    common = secret, flight["formation"], number, flight["agents"], sizes, boot
+    return Wire(*common, file.read(), file.write)

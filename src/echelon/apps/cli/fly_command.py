@@ -11,9 +11,9 @@ import typer
 from echelon.apps.cli import options
 from echelon.apps.cli.status import STATUS
 from echelon.core.errors import FlightError
+from echelon.flight.key_files import read_key, require_key
 from echelon.flight.links.link import check_scheme
 from echelon.flight.mission import FACTS
-from echelon.flight.wire import read_key, require_key
 from echelon.output.archive.folder import check_empty
 
 _SCENARIO = "The name of a bundled scenario, a YAML file, or a folder that `--out` wrote."
