@@ -13,7 +13,6 @@ from echelon.core.types import Array
 from echelon.laws.stopping_point import StoppingPoint
 from echelon.simulation.engine.parts import Parts
 
-
 _TURN = 2.0 * np.pi
 
 

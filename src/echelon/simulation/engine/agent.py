@@ -32,6 +32,8 @@ from echelon.simulation.engine.own_step import (
     OwnState,
     Step,
     begin_alone,
+    begin_late,
+    expected_alone,
     hull_of,
     is_finite,
     measured_alone,
@@ -43,14 +45,7 @@ from echelon.simulation.engine.own_step import (
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.action import feedforward_of
-from echelon.simulation.step.knowledge import (
-    NOBODY,
-    Ages,
-    Mail,
-    Packets,
-    Readers,
-    packet_size,
-)
+from echelon.simulation.step.knowledge import NOBODY, Ages, Mail, Packets, Readers, packet_size
 from echelon.simulation.step.loop import Loop, assemble
 from echelon.simulation.step.settings import Settings
 
@@ -357,10 +352,26 @@ class Agent:
         before = self._estimator.begin(model, y) if before is None else before
         return measured_alone(self._estimator, model, before, y, jnp.asarray(not self._begun))
 
+    def _others_at(self, time: jax.Array) -> Array | jax.Array:
+        """Return signals of others (K, s), NaN where they are not known."""
+        stamps = self._stamps
+        if stamps is None or not stamps.needs_packet:
+            return self._inbox.signals
+        if stamps.packet is None:
+            return np.full((1, self._sizes[0]), np.nan)
+        content, age = (
+            jnp.asarray(stamps.packet.content),
+            max(0.0, float(time) - stamps.packet.time),
+        )
+        return expected_alone(self._loop, time, content, jnp.asarray(age), self._sizes[0])[None]
+
     def _own(self, state: State, time: jax.Array) -> "OwnState":
         # As in a run, where leaders may follow their heirs.
         law = self._law if self._loop.succession is None else self._loop.follower
-        memory = self._memory if self._begun else begin_alone(self._loop, law, state)
+        memory = self._memory
+        if not self._begun:
+            others = self._others_at(time) if float(time) > 0.0 else np.zeros((0, self._sizes[0]))
+            memory = begin_late(self._loop, law, state, others)
         if self._loop.moving is None:
             return OwnState(state, jnp.asarray(self._loop.offsets[self.number]), memory)
         number = jnp.asarray(self.number)

@@ -15,6 +15,7 @@ from echelon.agents.network.switching import Schedule
 from echelon.agents.world.estimator import Estimate, Estimator
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, PyTree, Scalar, State
+from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act
 from echelon.simulation.step.knowledge import (
@@ -23,6 +24,7 @@ from echelon.simulation.step.knowledge import (
     Mail,
     Readers,
     content_of,
+    expected_of,
     understand,
     write,
 )
@@ -49,6 +51,27 @@ class OwnState(NamedTuple):
 def begin_alone(loop: Loop, law: Law, x: State) -> Memory:
     """Return the memory of an agent that begins at x."""
     return law.begin(loop.model, x)
+
+
+@cached_jit
+def begin_late(loop: Loop, law: Law, x: State, others: Float[jax.Array, "K s"]) -> Memory:
+    """Return the same of an agent that begins after others, whose signals (K, s) may be NaN.
+
+    An angle is a number that grows with every turn, and who begins late takes that of another one.
+    """
+    memory, known = law.begin(loop.model, x), ~jnp.isnan(others).any(axis=1)
+    if not isinstance(law, FlatLaw) or not law.ready.angles or not len(others):
+        return memory
+    beside = law.beside(memory, others[jnp.argmax(known)])
+    return jax.tree.map(lambda *pair: jnp.where(known.any(), *pair), beside, memory)
+
+
+@cached_jit
+def expected_alone(
+    loop: Loop, t: Scalar, content: Float[jax.Array, " p"], age: Scalar, s: int
+) -> Signal:
+    """Return the signal (s,) at which an agent expects the leader, by its packet of an age (s)."""
+    return expected_of(loop, s, t, content, age)[0]
 
 
 @cached_jit

@@ -270,7 +270,7 @@ def step(loop: Loop, now: Moment) -> Moment:
 
 
 def _with_arrivals(loop: Loop, now: Moment) -> Moment:
-    """Return the moment in which who returns is where it began, and who joins turns no whole turn."""
+    """Return the moment with who returns where it began, who joins beside others' headings."""
     here, before = present_at(loop, now.step), present_at(loop, now.step - 1)
     returns = now.world.starts is not None
     if here is None or before is None or not (returns or has_angles(loop.follower)):
