@@ -214,10 +214,8 @@ class Agent:
             raise SimulationError("the formation changes with time; call `hello(x, t)`.")
         with precision("float64"):
             own = self._own(self._measured(self._state(x))[0], jnp.asarray(float(t or 0.0)))
-            signal, hull = (
-                signal_of(self._loop, self._law, own),
-                hull_of(self._loop, self._law, own),
-            )
+            signal = signal_of(self._loop, self._law, own)
+            hull = hull_of(self._loop, self._law, own)
         message = self._message(np.asarray(signal))
         finite = bool(is_finite((signal, hull)))
         return self._with_hull(message, hull) if finite else self._last[1]
@@ -359,11 +357,8 @@ class Agent:
             return self._inbox.signals
         if stamps.packet is None:
             return np.full((1, self._sizes[0]), np.nan)
-        content, age = (
-            jnp.asarray(stamps.packet.content),
-            max(0.0, float(time) - stamps.packet.time),
-        )
-        return expected_alone(self._loop, time, content, jnp.asarray(age), self._sizes[0])[None]
+        content, age = jnp.asarray(stamps.packet.content), time - stamps.packet.time
+        return expected_alone(self._loop, time, content, age, self._sizes[0])[None]
 
     def _own(self, state: State, time: jax.Array) -> "OwnState":
         # As in a run, where leaders may follow their heirs.

@@ -71,7 +71,7 @@ def expected_alone(
     loop: Loop, t: Scalar, content: Float[jax.Array, " p"], age: Scalar, s: int
 ) -> Signal:
     """Return the signal (s,) at which an agent expects the leader, by its packet of an age (s)."""
-    return expected_of(loop, s, t, content, age)[0]
+    return expected_of(loop, s, t, content, jnp.maximum(age, 0.0))[0]
 
 
 @cached_jit
