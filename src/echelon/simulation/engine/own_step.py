@@ -54,16 +54,12 @@ def begin_alone(loop: Loop, law: Law, x: State) -> Memory:
 
 
 @cached_jit
-def begin_late(loop: Loop, law: Law, x: State, others: Float[jax.Array, "K s"]) -> Memory:
-    """Return the same of an agent that begins after others, whose signals (K, s) may be NaN.
+def beside_alone(law: Law, memory: Memory, other: Signal) -> Memory:
+    """Return the memory of an agent that begins late, with its headings beside another signal's.
 
-    An angle is a number that grows with every turn, and who begins late takes that of another one.
+    An angle is a number that grows with every turn, and who begins late knows none of them.
     """
-    memory, known = law.begin(loop.model, x), ~jnp.isnan(others).any(axis=1)
-    if not isinstance(law, FlatLaw) or not law.ready.angles or not len(others):
-        return memory
-    beside = law.beside(memory, others[jnp.argmax(known)])
-    return jax.tree.map(lambda *pair: jnp.where(known.any(), *pair), beside, memory)
+    return law.beside(memory, other) if isinstance(law, FlatLaw) else memory
 
 
 @cached_jit

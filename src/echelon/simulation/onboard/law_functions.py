@@ -144,12 +144,15 @@ class _Traces:
 
     def _conversions(self) -> Iterator[LawFunction]:
         """Yield what makes physical inputs of normalized ones, and the other way round."""
-        model, equation = self.loop.model, normalized_equation(self.loop.model)
-        pairs = ("physical", "u", "v", model.physical), ("normalized", "v", "u", model.normalized)
+        model = self.loop.model
+        # Not `v`, with which numbers in between begin.
+        v, about = "normalized_u", f", {normalized_equation(model)}"
+        pairs = ("physical", "u", v, model.physical), ("normalized", v, "u", model.normalized)
         for name, result, given, convert in pairs:
-            about = f"the {name} inputs {result} of {given}: {equation}"
+            words = "u of normalized inputs v" if given == v else "v of physical inputs u"
+            text = f"the {name} inputs {words}{about}"
             yield self._function(
-                name, about, lambda x, f=convert: (f(x),), (result,), {given: self.m}
+                name, text, lambda x, f=convert: (f(x),), (result,), {given: self.m}
             )
 
     def _signal(self) -> LawFunction:
