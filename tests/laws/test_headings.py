@@ -184,6 +184,7 @@ def test_an_agent_turns_the_shorter_way(model, engine):
 SPINNING = ech.references.Hover(position=(0.0, 0.0, 0.0), yaw_rate=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("network", [None, RADIO], ids=["ideal", "radio"])
 def test_who_joins_a_formation_that_has_turned_does_not_make_up_for_it(network):
     joins = 12.56
