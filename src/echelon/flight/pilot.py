@@ -60,6 +60,7 @@ class Pilot:
         if leadership is not None and self._number in heirs:
             self._patience = leadership["timeout"] * (heirs.index(self._number) + 1)
         self._began: float | None = None
+        self._late = False
         self._memory: list[float] | None = None
         self._estimate: list[float] | None = None
         self._last: Ticked | None = None
@@ -78,8 +79,13 @@ class Pilot:
     def _act(self, t: float, x: list[float]) -> Ticked:
         """Return what the agent does in a state (n,)."""
         memory = self._law.begin(x) if self._memory is None else self._memory
+        # Who begins late does not know how often the others have turned.
+        late = self._began is None and t > 0.0 and hasattr(self._law, "face")
+        self._late = self._late or late
         self._inherit(t)
         leader, forward = self._expected(t, x, memory)
+        if self._late and leader is not None and self.box.packet is not None:
+            memory, self._late = self._law.face(memory, leader), False
         ages = self.box.ages(t)
         hops = self._hops(ages)
         z = self._disagreement(t, x, memory, leader, ages, hops)

@@ -212,8 +212,14 @@ class FlatLaw(Law):
 
     def initial_memory(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x, with the derivatives of its reference."""
-        e = switch_on(model, self.ready.chains, x, ahead)
-        return self._counting(self.ready.initial_memory(model, x, e))
+        loop, e = self.ready, switch_on(model, self.ready.chains, x, ahead)
+        # All take the turn that is next to one heading, so that it is a number like any other (T5).
+        memory = loop.beside(loop.initial_memory(model, x, e), loop.stop(ahead))
+        return self._counting(memory)
+
+    def beside(self, memory: FlatMemory, signal: jax.Array) -> FlatMemory:
+        """Return the memory of an agent that begins late, its heading next to that of a signal."""
+        return self.ready.beside(memory, signal)
 
     def init(self) -> FlatMemory:
         """Return a memory of zeros."""

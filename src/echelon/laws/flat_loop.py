@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.chains import Chains, flat_output, flatten
-from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.chains import Chains, angles_among, flat_output, flatten
+from echelon.agents.models.model import ControlAffine, wrap_angles
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.errors import LawError, listing
 from echelon.core.types import Array, Input, Scalar, State
+from echelon.laws.law import LocalView
 
 _LEAST_THRUST = 0.3
 """Of the thrust at rest; below it the thrust scale changes no faster."""
@@ -84,6 +85,8 @@ class FlatMemory(NamedTuple):
         half: half of the step before, s; 0 at first.
         scale: of the observer: the thrust relative to the model's; None where it is not estimated.
         active: how many others changed the rate in the step before; None where none may.
+        heading: the angles of zeta less the offset in the step before, rad, next to which the next
+            ones are taken; None where no flat output is an angle.
     """
 
     chain: jax.Array
@@ -94,6 +97,7 @@ class FlatMemory(NamedTuple):
     half: jax.Array
     scale: jax.Array | None = None
     active: jax.Array | None = None
+    heading: jax.Array | None = None
 
 
 @final
@@ -106,6 +110,7 @@ class FlatLoop(eqx.Module):
         stiffness: (m,) k0.
         observer: of the acceleration that the model lacks, which is compensated.
         thrust: the number of the input whose scale is estimated; None for none.
+        angles: which outputs are angles, such as a yaw.
     """
 
     chains: Chains = eqx.field(static=True)
@@ -113,6 +118,7 @@ class FlatLoop(eqx.Module):
     stiffness: Array
     observer: Observer = eqx.field(static=True)
     thrust: int | None = eqx.field(static=True, default=None)
+    angles: tuple[int, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def of(
@@ -129,7 +135,8 @@ class FlatLoop(eqx.Module):
             q = np.atleast_1d(np.poly(-np.array(roots[: degree - 1])))[::-1]
             weights[:degree, k], stiffness[k] = q / q[0], q[0]
         thrust = thrust_of(model, chains) if observer.scale else None
-        return cls(chains, weights, stiffness, observer, thrust)
+        angles = angles_among(model, chains.outputs)
+        return cls(chains, weights, stiffness, observer, thrust, angles)
 
     # ---- memory ----
 
@@ -137,7 +144,8 @@ class FlatLoop(eqx.Module):
         """Return a memory of zeros."""
         zero = jnp.zeros(len(self.stiffness))
         scale = None if self.thrust is None else jnp.ones(())
-        return FlatMemory(jnp.zeros(self.chains.size), zero, zero, zero, zero, jnp.zeros(()), scale)
+        memory = jnp.zeros(self.chains.size), zero, zero, zero, zero, jnp.zeros(()), scale
+        return self.beside(FlatMemory(*memory), zero)
 
     def initial_memory(self, model: ControlAffine, x: State, chain: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x, with an exact model."""
@@ -150,7 +158,24 @@ class FlatLoop(eqx.Module):
 
     def place(self, model: ControlAffine, x: State, offset: State, memory: FlatMemory) -> jax.Array:
         """Return zeta less the offset, (m,): where the agent would come to rest."""
-        return self.stop(self.flat_values(model, x, memory)) - self.shift(model, offset)
+        return self._place(model, self.flat_values(model, x, memory), offset, memory)
+
+    def _place(
+        self, model: ControlAffine, values: jax.Array, offset: State, memory: FlatMemory
+    ) -> jax.Array:
+        place = self.stop(values) - self.shift(model, offset)
+        if memory.heading is None:
+            return place
+        # A measured angle may jump by a whole turn, and this one does not. Without a turn to
+        # subtract no bit changes.
+        angles = np.array(self.angles)
+        turns = jnp.round((place[angles] - memory.heading) / (2.0 * jnp.pi))
+        return place.at[angles].add(-2.0 * jnp.pi * turns)
+
+    def beside(self, memory: FlatMemory, place: jax.Array) -> FlatMemory:
+        """Return the memory of an agent that takes its angles next to those of a place (m,)."""
+        angles = np.array(self.angles, int)
+        return memory._replace(heading=place[angles]) if self.angles else memory
 
     def shift(self, model: ControlAffine, offset: State) -> jax.Array:
         """Return the flat outputs (m,) of an offset."""
@@ -202,16 +227,16 @@ class FlatLoop(eqx.Module):
     def obey(
         self,
         model: ControlAffine,
-        x: State,
+        view: LocalView,
         rate: jax.Array,
         memory: FlatMemory,
-        period: Scalar | float,
         offset_rate: State | None = None,
     ) -> tuple[Input, FlatMemory]:
         """Return the physical input that makes zeta move at a rate (m,), and the next memory.
 
         The rate of the own offset (n,) is added to it.
         """
+        x, period = view.x, view.period
         flat, values = (
             flatten(model, self.chains, x, memory.chain),
             self.flat_values(model, x, memory),
@@ -227,6 +252,7 @@ class FlatLoop(eqx.Module):
         w = flat.invert(tops)
         chain, mean = self._integrate(memory.chain, w, period)
         command = self._scaled(model, mean, None if memory.scale is None else 1.0 / memory.scale)
+        memory = self.beside(memory, self._place(model, values, view.offset, memory))
         return model.physical(command), memory._replace(chain=chain, rate=rate)
 
     def _integrate(self, e: jax.Array, w: Input, period: Scalar | float) -> tuple[jax.Array, Input]:
@@ -306,7 +332,9 @@ class FlatLoop(eqx.Module):
         """Return the speed less what the model and the estimate predict, (m,)."""
         speed, pull = self._observed(model, x, memory.delivered)
         # A trapezoid from the start of the hold to its end, in which the input is the same.
-        return speed - (memory.base + memory.half * pull)
+        error = speed - (memory.base + memory.half * pull)
+        jumps = [k for k in self.angles if self.chains.degrees[k] == 1]
+        return wrap_angles(error, *jumps) if jumps else error
 
     def _push_rate(self, model: ControlAffine, x: State, memory: FlatMemory) -> jax.Array:
         """Return the rate of the estimated push, (m,)."""

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.model import ControlAffine, FlatBound
+from echelon.agents.models.model import ControlAffine, FlatBound, wrap_angles
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.near import Near
 from echelon.agents.references.flatness import first_state, followed_states
@@ -227,7 +227,7 @@ class StoppingPoint(FlatLaw):
             pull, active = self._held_apart(model, view, view.near, pull)
             # What the filter lets through has the offset's rate in it.
             memory, moving = memory._replace(active=active), None
-        return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period, moving)
+        return self.ready.obey(model, view, view.feedforward - pull, memory, moving)
 
     def _held_apart(
         self, model: ControlAffine, view: LocalView, near: Near, pull: jax.Array
@@ -343,7 +343,7 @@ class StoppingLeader(FlatLaw):
             memory = memory._replace(active=0.0 * memory.half)
         away = self.deviation(model, view.t, view.x, view.offset, memory)
         rate = self._rate(model, view.t, away, view.period, view.pace)
-        return self.ready.obey(model, view.x, rate, memory, view.period, view.offset_rate)
+        return self.ready.obey(model, view, rate, memory, view.offset_rate)
 
     def _rate(
         self,
@@ -368,7 +368,8 @@ class StoppingLeader(FlatLaw):
     ) -> jax.Array:
         """Return zeta_0 - zeta_r, (m,)."""
         loop = self.ready
-        return loop.place(model, x, offset, memory) - loop.stop(self.path(model, t)[:-1])
+        away = loop.place(model, x, offset, memory) - loop.stop(self.path(model, t)[:-1])
+        return wrap_angles(away, *loop.angles) if loop.angles else away
 
     def expected(
         self,

@@ -29,6 +29,8 @@ _RANK = 1e-8
 """Relative threshold of singular values and derivatives; what is smaller is rounding."""
 _MATCHED = 1e-6
 """Relative; what rounding leaves between rates and what they are stated to be."""
+_ANGLE = 1e-9
+"""rad; what rounding leaves of a whole turn."""
 _MAX_INTEGRATORS = 4
 _MAX_CHOICES = 20
 """How many sets of outputs are tried."""
@@ -78,6 +80,24 @@ class Chains(NamedTuple):
 def flat_output(model: ControlAffine, outputs: tuple[str, ...], x: State) -> jax.Array:
     """Return the flat outputs (m,) of a state."""
     return model.output(x)[np.array([model.output_names.index(name) for name in outputs])]
+
+
+@memoize
+def angles_among(model: ControlAffine, outputs: tuple[str, ...]) -> tuple[int, ...]:
+    """Return which flat outputs are angles: states whose `difference` is 0 after a whole turn."""
+    with precision("float64"):
+        x = jnp.asarray(np.asarray(model.trim[0], float))
+        found = list[int]()
+        for k, name in enumerate(outputs):
+            if name not in model.state_names:
+                continue
+            i = model.state_names.index(name)
+            turned = x.at[i].add(2.0 * np.pi)
+            moved = flat_output(model, outputs, turned) - flat_output(model, outputs, x)
+            alone = np.abs(moved - 2.0 * np.pi * np.eye(len(outputs))[k]).max() < _ANGLE
+            if alone and abs(float(model.difference(turned, x)[i])) < _ANGLE:
+                found.append(k)
+    return tuple(found)
 
 
 def flatten(model: ControlAffine, chains: Chains, x: State, e: Float[jax.Array, " k"]) -> Flattened:

@@ -13,6 +13,8 @@ from echelon.core.types import Array
 from echelon.laws.stopping_point import StoppingPoint
 from echelon.simulation.engine.parts import Parts
 
+_TURN = 2.0 * np.pi
+
 
 def flat_starts(
     parts: Parts, law: StoppingPoint, states: Float[Array, "N n"]
@@ -37,9 +39,13 @@ def _flat(
     chains = law.ready.chains
 
     def one(x: jax.Array, offset: jax.Array) -> jax.Array:
-        values = flatten(model, chains, x, law.begin(model, x).chain).values
+        memory = law.begin(model, x)
+        values = flatten(model, chains, x, memory.chain).values
         shift = flat_output(model, chains.outputs, offset)
-        return values.at[0].add(flat_output(model, chains.outputs, 0.0 * offset) - shift)
+        values = values.at[0].add(flat_output(model, chains.outputs, 0.0 * offset) - shift)
+        # The law takes the turn of a heading that is next to the beginning of the leader's path.
+        turns = jnp.round((law.signal(model, x, offset, memory) - law.ready.stop(values)) / _TURN)
+        return values.at[0].add(_TURN * turns) if law.ready.angles else values
 
     return jax.vmap(one)(states, offsets)
 

@@ -5,6 +5,8 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from echelon import __version__
 from echelon.core.errors import OutputError
 from echelon.core.files import write_atomic
@@ -19,6 +21,11 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.onboard.c_text import c_text, header_text
 from echelon.simulation.onboard.law_functions import LawFunction, law_functions
 from echelon.simulation.onboard.llvm_text import object_file
+from echelon.simulation.onboard.message_meaning import (
+    message_meaning,
+    message_words,
+    normalized_equation,
+)
 from echelon.simulation.onboard.python_text import python_text
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.knowledge import HOP_LIFE
@@ -136,8 +143,11 @@ def _description(own: OwnLaw, functions: Mapping[str, LawFunction]) -> JsonObjec
         "states": dict(zip(model.state_names, model.state_units, strict=True)),
         "inputs": dict(zip(model.input_names, model.input_units, strict=True)),
         "trim": dict(zip(model.input_names, model.trim[1], strict=True)),
+        "scale": np.asarray(model.input_scale, float).tolist(),
+        "normalized": normalized_equation(model),
         "signal": list(own.signal_names),
-        "message": list(own.forward_names),
+        "message": message_words(own),
+        "message_meaning": message_meaning(own),
         "memory": len(functions["begin"].outputs["memory"]),
         "operations": {name: f.operations for name, f in functions.items()},
     }

@@ -32,6 +32,8 @@ from echelon.simulation.engine.own_step import (
     OwnState,
     Step,
     begin_alone,
+    beside_alone,
+    expected_alone,
     hull_of,
     is_finite,
     measured_alone,
@@ -43,14 +45,7 @@ from echelon.simulation.engine.own_step import (
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.action import feedforward_of
-from echelon.simulation.step.knowledge import (
-    NOBODY,
-    Ages,
-    Mail,
-    Packets,
-    Readers,
-    packet_size,
-)
+from echelon.simulation.step.knowledge import NOBODY, Ages, Mail, Packets, Readers, packet_size
 from echelon.simulation.step.loop import Loop, assemble
 from echelon.simulation.step.settings import Settings
 
@@ -134,6 +129,7 @@ class Agent:
         self._estimate: Estimate | None = None
         self._memory: Memory | None = None
         self._begun, self._time, self.blind, self._since = False, -math.inf, 0, math.inf
+        self._late = False
         self._last: tuple[Array, Message | None] = np.array(self._loop.model.trim[1], float), None
 
     def _stamps_of(self, leaders: Sequence[int], heirs: Sequence[int]) -> Stamps | None:
@@ -219,10 +215,8 @@ class Agent:
             raise SimulationError("the formation changes with time; call `hello(x, t)`.")
         with precision("float64"):
             own = self._own(self._measured(self._state(x))[0], jnp.asarray(float(t or 0.0)))
-            signal, hull = (
-                signal_of(self._loop, self._law, own),
-                hull_of(self._loop, self._law, own),
-            )
+            signal = signal_of(self._loop, self._law, own)
+            hull = hull_of(self._loop, self._law, own)
         message = self._message(np.asarray(signal))
         finite = bool(is_finite((signal, hull)))
         return self._with_hull(message, hull) if finite else self._last[1]
@@ -271,6 +265,7 @@ class Agent:
                 step = step_over_network(self._loop, self.leads, *rows)
         if step.finite:
             self._memory, self._begun = step.action.memory, True
+            self._late = self._late and self._heard_at(time) is None
             if estimate is not None and self._estimator is not None:
                 self._estimate = self._estimator.act(estimate, step.action.input)
             message = self._with_hull(self._written(step), step.hull)
@@ -357,10 +352,24 @@ class Agent:
         before = self._estimator.begin(model, y) if before is None else before
         return measured_alone(self._estimator, model, before, y, jnp.asarray(not self._begun))
 
+    def _heard_at(self, time: jax.Array) -> Array | jax.Array | None:
+        """Return the signal of another agent (s,), of the leader over a network; None before it."""
+        stamps = self._stamps
+        if stamps is None or not stamps.needs_packet:
+            return next((x for x in self._inbox.signals if np.isfinite(x).all()), None)
+        if stamps.packet is None:
+            return None
+        content, age = jnp.asarray(stamps.packet.content), time - stamps.packet.time
+        return expected_alone(self._loop, time, content, age, self._sizes[0])
+
     def _own(self, state: State, time: jax.Array) -> "OwnState":
         # As in a run, where leaders may follow their heirs.
         law = self._law if self._loop.succession is None else self._loop.follower
         memory = self._memory if self._begun else begin_alone(self._loop, law, state)
+        self._late = self._late if self._begun else float(time) > 0.0
+        other = self._heard_at(time) if self._late else None
+        if other is not None:
+            memory = beside_alone(law, memory, other)
         if self._loop.moving is None:
             return OwnState(state, jnp.asarray(self._loop.offsets[self.number]), memory)
         number = jnp.asarray(self.number)

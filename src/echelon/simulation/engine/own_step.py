@@ -15,6 +15,7 @@ from echelon.agents.network.switching import Schedule
 from echelon.agents.world.estimator import Estimate, Estimator
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, PyTree, Scalar, State
+from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act
 from echelon.simulation.step.knowledge import (
@@ -23,6 +24,7 @@ from echelon.simulation.step.knowledge import (
     Mail,
     Readers,
     content_of,
+    expected_of,
     understand,
     write,
 )
@@ -49,6 +51,23 @@ class OwnState(NamedTuple):
 def begin_alone(loop: Loop, law: Law, x: State) -> Memory:
     """Return the memory of an agent that begins at x."""
     return law.begin(loop.model, x)
+
+
+@cached_jit
+def beside_alone(law: Law, memory: Memory, other: Signal) -> Memory:
+    """Return the memory of an agent that begins late, with its headings beside another signal's.
+
+    An angle is a number that grows with every turn, and who begins late knows none of them.
+    """
+    return law.beside(memory, other) if isinstance(law, FlatLaw) else memory
+
+
+@cached_jit
+def expected_alone(
+    loop: Loop, t: Scalar, content: Float[jax.Array, " p"], age: Scalar, s: int
+) -> Signal:
+    """Return the signal (s,) at which an agent expects the leader, by its packet of an age (s)."""
+    return expected_of(loop, s, t, content, jnp.maximum(age, 0.0))[0]
 
 
 @cached_jit

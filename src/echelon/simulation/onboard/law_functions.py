@@ -17,6 +17,7 @@ from echelon.agents.world.estimator import Estimate, Estimator
 from echelon.core.numerics import rk4
 from echelon.core.types import PyTree
 from echelon.core.words import MessageContent, Prediction
+from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law, carried_pieces
 from echelon.simulation.engine.own_step import (
     OwnLaw,
@@ -34,6 +35,7 @@ from echelon.simulation.native.agent_step import (
     single,
     unflatten,
 )
+from echelon.simulation.onboard.message_meaning import message_meaning, normalized_equation
 from echelon.simulation.scalars import Node, ScalarGraph, lower, needed, nodes, rewritten
 from echelon.simulation.step.knowledge import (
     carried_time,
@@ -98,6 +100,9 @@ class _Traces:
     def all(self) -> Iterator[LawFunction]:
         """Yield all functions that the agent needs."""
         yield self._begin()
+        if isinstance(self.law, FlatLaw) and self.law.ready.angles:
+            yield self._face(self.law)
+        yield from self._conversions()
         yield self._signal()
         difference = self._difference()
         yield difference
@@ -123,6 +128,32 @@ class _Traces:
             ("memory",),
             {"x": self.n},
         )
+
+    def _face(self, law: FlatLaw) -> LawFunction:
+        def face(flat: jax.Array, received: jax.Array) -> tuple[jax.Array]:
+            return (_flat(law.beside(unflatten(law.init(), flat), received)),)
+
+        return self._function(
+            "face",
+            "the memory of an agent that begins late, with its angles, which grow with every turn, "
+            "beside those of a received signal",
+            face,
+            ("memory",),
+            {"memory": self.memory, "received": self.s},
+        )
+
+    def _conversions(self) -> Iterator[LawFunction]:
+        """Yield what makes physical inputs of normalized ones, and the other way round."""
+        model = self.loop.model
+        # Not `v`, with which numbers in between begin.
+        v, about = "normalized_u", f", {normalized_equation(model)}"
+        pairs = ("physical", "u", v, model.physical), ("normalized", v, "u", model.normalized)
+        for name, result, given, convert in pairs:
+            words = "u of normalized inputs v" if given == v else "v of physical inputs u"
+            text = f"the {name} inputs {words}{about}"
+            yield self._function(
+                name, text, lambda x, f=convert: (f(x),), (result,), {given: self.m}
+            )
 
     def _signal(self) -> LawFunction:
         return self._function(
@@ -163,12 +194,13 @@ class _Traces:
             content = content_of(loop, t, *own[:3], step.signal, action.message, action.input)
             return *results, content, _flat((x, signal, action, content))
 
+        words = message_meaning(self.own)
         outputs = ("u", "memory", "signal", "message", *(("content",) if sends_packets else ()))
         sizes = {"t": None, "x": self.n, "z": gap, "feed_forward": self.k, "memory": self.memory}
         return self._function(
             "tick",
             "a step at t (s), with z, the sum of weights times `difference`, and the feed-forward "
-            "that was received, NaN if none was",
+            f"that was received, NaN if none was; that and the message are {words}",
             tick,
             outputs,
             sizes,

@@ -14,6 +14,7 @@ from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act, limit_sides
+from echelon.simulation.step.arrivals import beside_others, has_angles
 from echelon.simulation.step.knowledge import no_packets
 from echelon.simulation.step.loop import (
     Loop,
@@ -269,15 +270,16 @@ def step(loop: Loop, now: Moment) -> Moment:
 
 
 def _with_arrivals(loop: Loop, now: Moment) -> Moment:
-    """Return the moment with agents that return in this step where they began, without memory."""
+    """Return the moment with who returns where it began, who joins beside others' headings."""
     here, before = present_at(loop, now.step), present_at(loop, now.step - 1)
-    if here is None or before is None or now.world.starts is None:
+    returns = now.world.starts is not None
+    if here is None or before is None or not (returns or has_angles(loop.follower)):
         return now
     new = here & ~before & (now.step > 0)
 
     def begun(now: Moment) -> Moment:
-        start = begin(loop, now.world.starts)
-        return _where(loop, new, start, now)
+        moment = _where(loop, new, begin(loop, now.world.starts), now) if returns else now
+        return beside_others(loop, moment, new, here & before, _sent(loop, now)[0])
 
     return jax.lax.cond(new.any(), begun, lambda now: now, now)
 
