@@ -19,7 +19,7 @@ _SHARE = 0.9
 
 
 def forecast(parts: Parts, settings: Settings) -> str:
-    """Return the guarantee of a run; if its errors will grow, with options that make it stable.
+    """Return the guarantee of a run; where it is unstable, with options that give one.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
@@ -31,7 +31,7 @@ def forecast(parts: Parts, settings: Settings) -> str:
     changes = " or ".join(f"`--set {change}`" for change in _changes(parts, settings) if grows)
     if not changes:
         return guarantee.sentence()
-    return f"{guarantee.sentence()} Errors will grow; to avoid that: {changes}."
+    return f"{guarantee.sentence()} There is a guarantee with {changes}."
 
 
 def _changes(parts: Parts, settings: Settings) -> Iterator[str]:

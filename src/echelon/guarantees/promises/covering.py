@@ -29,15 +29,13 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
     what = "proof" if promise.kind is Kind.PROOF else "guarantee on the domain"
     left = None if promise.region is None else first_exit(result, promise)
     limited = float(result.saturated.max())
-    against, remedy = promise.without, "leave it out to see what it costs"
+    against = promise.without
     if left is not None:
         against = f"agent {left.agent} left the domain at {about(left.time, 4)} s (`{left.name}`)"
-        remedy = "widen the `domain`, start nearer to the goals, or slow the reference"
     elif limited:
         against = f"a limit acted on an agent in {about(100.0 * limited)} % of the steps"
-        remedy = "start nearer to the goals, or slow the reference"
     if against:
-        yield f"The {what} does not cover this run: {against}; {remedy}."
+        yield f"The {what} does not cover this run: {against}."
     else:
         yield f"The {what} covers this run: {promise.why_covered()}."
 

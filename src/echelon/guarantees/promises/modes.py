@@ -131,7 +131,7 @@ def _decaying(case: Case) -> Statement:
     if loop.every:
         return holds(name, _LINEAR, text, *number)
     text = f"not every mode decays, {text}"
-    remedy = "raise `coupling`, or let `echelon design` find a gain that decays"
+    remedy = "another gain, coupling or model is needed"
     reason = "the disagreement does not decay"
     return fails(name, _LINEAR, text, *number, remedy=remedy, reason=reason)
 
@@ -221,6 +221,8 @@ def _step_line(
         return holds(Hypothesis.SAMPLING, _LINEAR, text, *number)
     if not remedy:
         longest = longest_step(case.loop, case.frozen, case.settings)
-        remedy = f"shorten `simulation.dt` below {at_most(longest)} s, or lower the gain"
+        remedy = "use another gain; no shorter `simulation.dt` is known to suffice"
+        if 0.0 < longest < dt:
+            remedy = f"shorten `simulation.dt` below {at_most(longest)} s"
     text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
     return fails(Hypothesis.SAMPLING, _LINEAR, text, *number, remedy=remedy, reason=reason)
