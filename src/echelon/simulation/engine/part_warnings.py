@@ -13,6 +13,7 @@ from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.simulation.engine.closest_pair import ClosestPair
 from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.settings import Settings
 
 _HALF_TURN = 3.0
 """Below half a turn in rad: no smaller spread is looked at, since `difference` is compiled."""
