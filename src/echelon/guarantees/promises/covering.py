@@ -37,7 +37,10 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
     if against:
         yield f"The {what} does not cover this run: {against}."
     else:
-        yield f"The {what} covers this run: {promise.why_covered()}."
+        # Whether agents left the domain is looked up in the frames.
+        sampled = promise.region is not None and result.settings.store_every > 1
+        when = f" at its {len(result.times)} stored times" * sampled
+        yield f"The {what} covers this run{when}: {promise.why_covered()}."
 
 
 def first_exit(result: Result, promise: Promise) -> Exit | None:

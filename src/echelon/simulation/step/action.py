@@ -79,6 +79,7 @@ def limit_sides(
     if model.input_limits is not None:
         # A change that moves no limited row by a millionth of its range is rounding too.
         G, low, high = (jnp.asarray(part, change.dtype) for part in model.input_limits)
-        clear &= change * (jnp.abs(G) / (high - low)[:, None]).max(axis=0) > 1e-6
+        share = (jnp.abs(G) / (high - low)[:, None]).max(axis=0)
+        clear &= change * jnp.broadcast_to(share, change.shape) > 1e-6
     side = jnp.where(delivered > desired, 1.0, -1.0)
     return limited, jnp.where(limited & clear, side, 0.0)
