@@ -144,7 +144,7 @@ def test_an_increase_of_v_names_no_cause():
 
 
 def cut_off(span):
-    """Return what the report says of links, of carts in a line whose last one is cut off for a time."""
+    """Return what the report says of the links of carts whose last one is cut off for a time."""
     cart, graph = ech.models.DoubleIntegrator(), ech.Graph.path(4)
     places = ech.Formation.from_offsets(cart, graph, {k: [float(k), 0.0] for k in (1, 2, 3)})
     events = [ech.network.Cut((2, 3), at=0.5, duration=span)]

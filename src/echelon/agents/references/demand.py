@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -133,7 +134,7 @@ def without_heading(
     if not isinstance(reference, Reference) or model.flat_order < 1:
         return np.zeros(len(times), bool)
     with precision("float64"):
-        rest = model.flat(np.zeros((model.flat_order + 1, len(model.flat_outputs))))
+        rest = model.flat(jnp.zeros((model.flat_order + 1, len(model.flat_outputs))))
         if all(np.isfinite(part).all() for part in rest):
             return np.zeros(len(times), bool)
         rates = [
