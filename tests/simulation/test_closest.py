@@ -58,7 +58,7 @@ def many(agents):
     return {
         "name": "many",
         "model": {"name": "double-integrator", "parameters": {"dimension": 2}},
-        "graph": {"name": "ring", "agents": agents},
+        "graph": {"name": "star", "agents": agents},
         "formation": {"name": "circle", "spacing": 1.0},
         "reference": {"name": "circle", "radius": 3.0, "rate": 0.3},
         "initial": {"spread": {"position": 3.0}},
