@@ -11,6 +11,8 @@ from echelon.simulation.native.blocks import Places
 
 _SPAN, _NUMBERS, _TIE = 32, 4_000_000, 1e-9
 """Steps compared at once, recorded numbers, and the relative difference that is not resolved."""
+_FEW = 10_000
+"""Distances that are computed in less time than it takes to find which are needed."""
 
 
 @final
@@ -76,7 +78,37 @@ class PairWatch:
         """Compare the recorded steps with the closest two before."""
         if not self.used:
             return
-        (i, j), places = self.pairs, self._places()
+        if self.used * self.formations * len(self.pairs[0]) <= _FEW:
+            self._search_all()
+        else:
+            self._search_spans(self._places())
+        self.used = 0
+
+    def _search_all(self) -> None:
+        """Compare all pairs at all steps."""
+        (i, j), count = self.pairs, self.formations
+        axes = self.tape[: self.used].transpose(2, 0, 1, 3).reshape(self.tape.shape[2], -1)
+        places = axes.reshape(len(axes), self.used, -1)[..., self.position].astype(float)
+        places = places.reshape(*places.shape[:2], count, -1)
+        squares = ((places[..., i] - places[..., j]) ** 2).sum(axis=0).swapaxes(0, 1)
+        squares = squares.reshape(count, -1)
+        squares[np.isnan(squares)] = np.inf
+        best = squares.argmin(axis=1)
+        step, pair = np.divmod(best, len(i))
+        self._keep(np.arange(count), np.sqrt(squares[np.arange(count), best]), step, pair)
+
+    def _keep(self, f: Array, least: Array, step: Array, pair: Array) -> None:
+        """Keep the distances of some formations that are smaller than those before."""
+        new, (i, j) = least < self.closest[f], self.pairs
+        self.closest[f[new]] = least[new]
+        rows = self.first + step[new], i[pair[new]], j[pair[new]]
+        self.met[f[new]] = np.stack(rows, axis=1)
+
+    def _search_spans(self, places: Float[np.ndarray, "d S K F N"]) -> None:
+        """Compare the pairs that may be closer than the closest, span by span."""
+        i, j = self.pairs
+        # What all agents do together changes no distance.
+        places = places - places.mean(axis=-1, keepdims=True)
         start = places[:, 0]
         moved = np.sqrt(((places - start[:, None]) ** 2).sum(axis=0).max(axis=0))
         gaps = np.sqrt(((start[..., i] - start[..., j]) ** 2).sum(axis=0))
@@ -86,15 +118,17 @@ class PairWatch:
         searched = gaps - moved[..., i] - moved[..., j] < bound[:, None]
         nearest = gaps.swapaxes(0, 1).reshape(self.formations, -1).argmin(axis=1)
         searched[nearest // len(i), np.arange(self.formations), nearest % len(i)] = True
-        k, f, p = np.nonzero(searched)
+        self._search_some(places, *np.nonzero(searched))
+
+    def _search_some(
+        self, places: Float[np.ndarray, "d S K F N"], k: Array, f: Array, p: Array
+    ) -> None:
+        """Compare pairs p of formations f in spans k."""
+        i, j = self.pairs
         apart = places[:, :, k, f, i[p]] - places[:, :, k, f, j[p]]
         distances = np.sqrt((apart**2).sum(axis=0))
         distances[np.isnan(distances)] = np.inf
         least, s = distances.min(axis=0), distances.argmin(axis=0)
         order = np.lexsort((k, least, f))
         best = order[np.unique(f[order], return_index=True)[1]]
-        best = best[least[best] < self.closest[f[best]]]
-        self.closest[f[best]] = least[best]
-        step = self.first + _SPAN * k[best] + s[best]
-        self.met[f[best]] = np.stack([step, i[p[best]], j[p[best]]], axis=1)
-        self.used = 0
+        self._keep(f[best], least[best], _SPAN * k[best] + s[best], p[best])
