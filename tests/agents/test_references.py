@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import echelon as ech
 import echelon.agents.references
 from echelon.agents.references import (
     Circle,
@@ -19,6 +20,7 @@ from echelon.agents.references import (
     StatePath,
     Waypoints,
 )
+from echelon.agents.references.demand import reference_warnings
 from echelon.core import numerics
 from echelon.experiments.scenario import registry
 
@@ -226,3 +228,25 @@ def test_two_waypoints_are_joined_by_the_known_polynomial(s):
     smooth = 35.0 * s**4 - 84.0 * s**5 + 70.0 * s**6 - 20.0 * s**7
     got = at(path, 2.0 + 3.0 * s)[:3]
     assert got == pytest.approx(smooth * np.array([1.0, -2.0, 4.0]), abs=1e-11)
+
+
+def test_a_path_from_rest_is_refused_for_a_unicycle_since_its_speed_is_zero():
+    path = Waypoints([0.0, 5.0, 10.0], [[0, 0, 0], [2, 0, 0], [4, 1, 0]])
+    model, graph = ech.models.UnicyclePoint(ahead=0.1), ech.Graph.path(2)
+    gain = ech.synthesize(model, graph, ech.gains.FixedGain([1.0, 1.0, 0.1], coupling=2.0))
+    with pytest.raises(ech.EchelonError, match="its speed is 0 at t = 0 s"):
+        ech.laws.Tracking(path, gain).prepared(model, graph)
+    # A circle never rests.
+    ech.laws.Tracking(Circle(), gain).prepared(model, graph)
+
+
+def test_a_recorded_path_that_moves_at_its_ends_is_told_that_the_spline_rests_there():
+    times = 0.02 * np.arange(101)
+    points = np.column_stack([0.5 * times, 0.0 * times, 1.0 + 0.0 * times])
+    path = Waypoints(times, points)
+    [text] = [
+        text
+        for text in reference_warnings(ech.models.Quadrotor.crazyflie(), path, 2.0)
+        if "too fast" in text
+    ]
+    assert "the spline rests at both ends" in text and "slower or smaller" not in text

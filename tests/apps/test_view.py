@@ -352,7 +352,9 @@ def test_ellipsoids_are_marked_below_the_limit_and_the_chart_has_distance_and_ro
         scaled = states[:, :, :3] * [1.0, 1.0, 1.0 / 3.0]
         gaps = np.linalg.norm(scaled[:, :, None] - scaled[:, None], axis=3) + 9.0 * np.eye(4)
         least = f"{gaps[:201].min():#.3g} m"
-        assert shown.startswith(f"overlap: smallest scaled distance so far {least}, agents ")
+        assert shown.startswith(
+            f"overlap: smallest scaled distance in the frames so far {least}, agents "
+        )
         assert page.evaluate("echelon.player.view.ellipsoids.shown.value") == 1
         page.get_by_role("button", name="ellipsoids").click()
         assert page.evaluate("echelon.player.view.ellipsoids.shown.value") == 0

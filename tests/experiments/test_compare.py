@@ -6,6 +6,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -146,6 +147,31 @@ def test_the_scenario_s_own_law_is_always_a_row(changes, labels):
     for row in found.rows:
         result = row.flight.result
         assert told[row.label]["promise"] == ech.promise(result.parts, result.settings).as_mapping()
+
+
+class Halved(ech.Law):
+    """Half of the input of the consensus law, with its gain."""
+
+    gain: ech.Gain | None = None
+
+    def update(self, model, view, memory):
+        u = -0.5 * jnp.asarray(self.gain.K(model)) @ view.disagreement
+        return model.physical(u), memory
+
+
+def test_the_row_of_a_law_of_ones_own_has_the_name_of_its_class():
+    given = {
+        "name": "own",
+        "model": {"name": "double-integrator"},
+        "graph": {"name": "path", "agents": 3},
+        "follower": {"law": {"python": f"{__file__}:Halved"}, "gain": {"method": "riccati"}},
+        "simulation": {"horizon": 0.1, "dt": 0.01},
+    }
+    found = ech.compare(ech.scenario_from_mapping(given), only=("stopping-point", "own"))
+    assert [row.label for row in found.rows] == ["stopping-point", "Halved"]
+    assert "Halved" in comparison_mapping(found)["methods"]
+    text = comparison_report(found, 100)
+    assert "Halved" in text and "riccati" not in text
 
 
 @pytest.mark.study

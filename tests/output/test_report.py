@@ -1,5 +1,7 @@
 """The report: its table, and the sentences that say what happened and why."""
 
+import re
+
 import numpy as np
 import pytest
 from runs import made_up, simulate
@@ -7,7 +9,7 @@ from runs import made_up, simulate
 import echelon as ech
 from echelon.core.statement import Cause, Hypothesis, Statement
 from echelon.core.words import Kind, Verdict
-from echelon.output.reports.causes import causes
+from echelon.output.reports.causes import observations
 
 
 def run(scenario, *changes):
@@ -28,24 +30,20 @@ def test_the_table_stands_beside_the_papers():
     assert text.count("follower ") >= 3 and "within 1 cm" in text
 
 
-def test_the_literal_law_names_its_cause(literal):
+def test_the_literal_law_grows_and_no_cause_is_guessed(literal):
     text = " ".join(ech.report(literal).split())
     assert "The formation error grows: 1.16 m at the start, " in text
-    assert (
-        "Cause: no input feels 8 of 12 directions of disagreement, and along `x`, `y`, `z`, `yaw` "
-        "it does not decay by itself; choose another P." in text
-    )
-    assert "Cause: the law leaves out the trim input; set `follower.trim: true`." in text
-    assert "Warning" not in text and "Assumption 5 fails" in text
+    assert "Nothing is guaranteed: " in text and "the law leaves out the trim input" in text
+    assert "Warning" not in text and "Cause" not in text and "would help" not in text
 
 
 @pytest.mark.study
-def test_the_lag_without_feed_forward_is_told():
+def test_a_run_without_feed_forward_states_its_error_and_no_remedy():
     text = " ".join(
         ech.report(run("paper", "follower.feedforward=none", "simulation.horizon=20")).split()
     )
-    assert "do not know the leader's motion and lag: 0.0" in text
-    assert "`feedforward: relay` removes the lag" in text
+    assert "3 of 3 followers have not settled to 0.01 m" in text
+    assert "Cause" not in text and "removes the lag" not in text
     assert "Information used by each follower: neighbours' states." in text
 
 
@@ -87,33 +85,47 @@ def test_of_many_followers_the_best_the_worst_and_one_in_the_middle_are_shown(fo
     assert any(f"median (follower {k})" in text for k in middle)
 
 
-# ---- every cause ends in what to do ----
+# ---- what was observed, and no cause that was not tried ----
 
 
 def told(*changes, scenario="paper"):
-    """The causes of a short run, each as text and remedy."""
+    """What was observed of a short run."""
     quick = ["simulation.horizon=2", "report.steady_window=0.5"]
     result = run(scenario, *quick, *changes)
     found = ech.promise(result.parts, result.settings)
-    return {each.text: each.remedy for each in causes(result, ech.metrics(result), found)}
+    return [*observations(result, ech.metrics(result), found)]
 
 
 def test_a_horizon_shorter_than_the_slowest_mode_is_told():
-    found = told("graph={name: path, agents: 12}", "formation={name: line}", scenario="integrators")
-    [(text, remedy)] = found.items()
-    assert "the slowest mode takes" in text and "the horizon is 2 s" in text
-    assert "`simulation.horizon`" in remedy and "`echelon design`" in remedy
+    [text] = told(
+        "graph={name: path, agents: 12}", "formation={name: line}", scenario="integrators"
+    )
+    assert text.startswith("The slowest mode takes ")
+    assert text.endswith(" s from 1 m to 1 cm, and the horizon is 2 s.")
     # The angles of pendulums have no metres.
     starts = "initial.spread={angle: 0.1}", "leader.start_error={angle: 0.1}"
     [text] = told("model={name: pendulum}", *starts, scenario="van-der-pol")
     assert "s from 1 to 0.01, and the horizon is 2 s" in text
 
 
-@pytest.mark.study
-def test_a_leader_that_a_heavier_plant_holds_off_its_path_is_told():
-    found = told("plant.scale.mass=1.1", "simulation.horizon=20", scenario="planar-quadrotor")
-    [text] = [each for each in found if "the leader has a steady error" in each]
-    assert "no law has integral action" in text and "`leader.gain`" in found[text]
+LATE = {
+    "model": {"name": "double-integrator", "parameters": {"dimension": 2}},
+    "graph": {"name": "path", "agents": 3},
+    "reference": {"name": "circle", "radius": 2.0, "rate": 1.0},
+    "simulation": {"horizon": 10.0, "dt": 0.01, "store_every": 10},
+}
+
+
+def test_the_steady_error_of_a_leader_that_measures_late_names_no_cause():
+    # Only the late measurement holds it off: without, the error is below 1 cm.
+    late = ech.run(ech.scenario_from_mapping({"name": "late", **LATE, "sensing": {"delay": 0.5}}))
+    exact = ech.run(ech.scenario_from_mapping({"name": "exact", **LATE}))
+    steady, least = (ech.metrics(each).leader.steady_rmse for each in (late, exact))
+    assert steady > 0.05 > 0.01 > least
+    text = " ".join(ech.report(late).split())
+    assert f"The leader has a steady error of {steady:.3g} m from its reference." in text
+    for guess in ("Cause", "integral action", "stronger", "would help", "plant's parameters"):
+        assert guess not in text
 
 
 def test_no_failing_line_and_no_cause_is_without_a_remedy():
@@ -123,18 +135,16 @@ def test_no_failing_line_and_no_cause_is_without_a_remedy():
         Cause("it fails")
 
 
-def test_wind_is_not_blamed_where_the_loop_grows_by_itself():
+def test_an_increase_of_v_names_no_cause():
     wind = "disturbance={rms: {position: 0.01}}"
-    told = [
-        ech.report(ech.simulate(*ech.build(ech.load_scenario("integrators", [wind, *more]))))
-        for more in ([], ["simulation.dt=1.0", "simulation.horizon=20"])
-    ]
-    assert "as expected under a disturbance" in told[0]
-    assert "`dt` is too long for an input" in told[1] and "as expected" not in told[1]
+    for more in ([], ["simulation.dt=1.0", "simulation.horizon=20"]):
+        result = ech.simulate(*ech.build(ech.load_scenario("integrators", [wind, *more])))
+        text = " ".join(ech.report(result).split())
+        assert re.search(r"V increased in \d+ of \d+ frames\.", text)
 
 
 def cut_off(span):
-    """Return the causes in the report of carts in a line whose last one is cut off for a time."""
+    """Return what the report says of the links of carts whose last one is cut off for a time."""
     cart, graph = ech.models.DoubleIntegrator(), ech.Graph.path(4)
     places = ech.Formation.from_offsets(cart, graph, {k: [float(k), 0.0] for k in (1, 2, 3)})
     events = [ech.network.Cut((2, 3), at=0.5, duration=span)]
@@ -142,20 +152,18 @@ def cut_off(span):
     laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
     parts = ech.Parts(cart, graph, places, laws, {"position": 0.5}, events=events)
     result = ech.simulate(parts, ech.Settings(horizon=5.0, dt=0.01))
-    return [line for line in ech.report(result).split("- ") if line.startswith("Cause: ")]
+    return [line for line in ech.report(result).split("- ") if "received nothing" in line]
 
 
 def test_an_agent_that_nobody_sent_anything_is_named_with_the_times():
     first = " ".join(cut_off(4.0)[0].split())
     assert first == (
-        "Cause: agent 3 received nothing from 0.5 s to 4.5 s, since no link led to it; give it "
-        "another link at that time, or use the law `stopping-point`, under which an agent alone "
-        "remains stable."
+        "Agent 3 received nothing from 0.5 s to 4.5 s, since no link led to it, and its error grew."
     )
 
 
-def test_a_short_silence_without_harm_and_an_agent_that_is_heard_are_no_cause():
-    assert not any("received nothing" in cause for cause in cut_off(0.05))
+def test_a_short_silence_without_harm_and_an_agent_that_is_heard_are_not_told():
+    assert not cut_off(0.05)
 
 
 def test_a_mode_that_does_not_decay_is_a_cause_in_words():

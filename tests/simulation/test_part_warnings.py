@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
+from echelon.simulation.engine.part_warnings import coarse
 from echelon.simulation.engine.prepare import prepare
 
 QUADROTOR, GRAPH = ech.models.Quadrotor.crazyflie(), ech.Graph.path(3)
@@ -56,3 +57,13 @@ def test_a_start_outside_of_the_chart_is_named_however_it_is_given():
     state[7] = 2.0
     (text,) = warnings(initial={2: state})
     assert text.startswith("agent 2 starts with `pitch` at 2, and the equations of `Quadrotor` ")
+
+
+def test_coordinates_that_single_precision_does_not_resolve_are_named():
+    single = ech.Settings(horizon=1.0, dt=0.01, precision="float32")
+    model, states = ech.models.DoubleIntegrator(1), np.zeros((2, 2))
+    for place, named in ((5.4e6, True), (100.0, False)):
+        states[:, 0] = place
+        [text] = [*coarse(model, states, single)] or [""]
+        assert text.startswith("single precision resolves 0.5 m") is named
+        assert not [*coarse(model, states, single._replace(precision="float64"))]

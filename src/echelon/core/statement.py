@@ -66,14 +66,14 @@ Line: TypeAlias = Hypothesis | Topic
 
 
 class Cause(NamedTuple):
-    """The cause of a fault and its remedy; neither is empty."""
+    """Why nothing is guaranteed and what would be needed; neither is empty."""
 
     text: str
     remedy: str
 
     def sentence(self) -> str:
-        """Return both, as a report has them."""
-        return f"Cause: {self.text}; {self.remedy}."
+        """Return why nothing is guaranteed, as the live page has it."""
+        return f"Not guaranteed: {self.text}."
 
 
 @final

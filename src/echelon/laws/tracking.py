@@ -9,6 +9,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.spectrum import Spectrum
+from echelon.agents.references.demand import without_heading
 from echelon.agents.references.flatness import follow_at
 from echelon.agents.references.reference import check_reference
 from echelon.core.errors import LawError, ReferenceError
@@ -52,11 +53,15 @@ class Tracking(PathLeader):
             check_gain_fits(self, model, self.reaction.P.shape, self.reaction.R.shape)
         regulator = tracking_gain(self, model, self.gain)
         # Checked here, since a run would only say that the leader diverged at once.
-        begin = follow_at(model, self.reference, np.zeros(1))
-        if not all(np.isfinite(part).all() for part in begin):
+        start = np.zeros(1)
+        begin, still = follow_at(model, self.reference, start), ""
+        if without_heading(model, self.reference, start).any():
+            still = "its speed is 0 at t = 0 s, and the model has no heading at rest"
+        if still or not all(np.isfinite(part).all() for part in begin):
             raise ReferenceError(
                 f"the reference `{type(self.reference).__name__}` cannot be followed by "
-                f"`{type(model).__name__}`: its flat state and input are not finite at t = 0 s."
+                f"`{type(model).__name__}`: "
+                f"{still or 'its flat state and input are not finite at t = 0 s'}."
             )
         turns = model.heading is not None and not self.keeps_heading(model)
         return Tracking(self.reference, self.gain, self.reaction, turns, regulator)

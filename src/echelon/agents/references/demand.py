@@ -4,7 +4,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.flatness import follow_at
@@ -104,16 +106,41 @@ def reference_warnings(
     """
     required, model_name = reference_demand(model, reference, horizon), type(model).__name__
     name, warnings = type(reference).__name__, [*reference.remarks()]
+    times = np.linspace(0.0, horizon, _SAMPLES)
+    still = without_heading(model, reference, times)
+    if still.any():
+        return (
+            *warnings,
+            f"the reference `{name}` cannot be followed by `{model_name}` at t = "
+            f"{times[still][0]:.4g} s: its speed is 0 there, and the model has no heading at rest.",
+        )
     if limits and required.share > 1.0:
+        why = reference.special_at(required.at)
         warnings.append(
-            f"the reference `{name}` is too fast for `{model_name}`: {too_fast(model, required)}; "
-            "make it slower or smaller."
+            f"the reference `{name}` is too fast for `{model_name}`: {too_fast(model, required)}"
+            f"{why and '; '}{why}."
         )
     if not required.feasible:
         warnings.append(
             f"the reference `{name}` is no motion of `{model_name}`: {infeasible(model, required)}."
         )
     return (*warnings, *_turned_over(model, reference, horizon))
+
+
+def without_heading(
+    model: ControlAffine, reference: Guide, times: Float[Array, " T"]
+) -> Bool[np.ndarray, " T"]:
+    """Return when a path has speed 0, of a model that has no state at rest, such as a unicycle."""
+    if not isinstance(reference, Reference) or model.flat_order < 1:
+        return np.zeros(len(times), bool)
+    with precision("float64"):
+        rest = model.flat(jnp.zeros((model.flat_order + 1, len(model.flat_outputs))))
+        if all(np.isfinite(part).all() for part in rest):
+            return np.zeros(len(times), bool)
+        rates = [
+            np.asarray(_derivative(reference, times, (name,), 1)) for name in model.flat_outputs
+        ]
+    return np.linalg.norm(rates, axis=0) <= _AT_REST
 
 
 def _turned_over(model: ControlAffine, reference: Guide, horizon: float) -> Iterator[str]:

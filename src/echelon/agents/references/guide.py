@@ -24,6 +24,10 @@ class Guide(eqx.Module):
         """Tell whether the heading may differ from the trim's at some time."""
         return True
 
+    def special_at(self, t: float) -> str:
+        """Return what is special about a path at a time (s), in words; empty for nothing."""
+        return ""
+
     def remarks(self) -> tuple[str, ...]:
         """Return what is probably not meant, a sentence each."""
         return ()

@@ -66,6 +66,19 @@ class Waypoints(PolynomialPath):
         values, _ = read_columns(file, ("t", *COORDINATES), optional=("yaw",))
         return cls(values[:, 0], values[:, 1:4], values[:, 4], degrees)
 
+    def special_at(self, t: float) -> str:
+        """Return that the path starts from rest, or comes to rest, within its outer points."""
+        first, last = (float(x) for x in (self.knots[1], self.knots[-2]))
+        if not (t < first or t > last):
+            return ""
+        what, span = ("starts from", first - self.knots[0])
+        if t > last:
+            what, span = "comes to", self.knots[-1] - last
+        return (
+            f"the spline rests at both ends, and {what} rest within the {span:.3g} s between its "
+            f"{'last' if t > last else 'first'} two points"
+        )
+
     def remarks(self) -> tuple[str, ...]:
         """Return what is probably wrong with the yaw: degrees that count as radians."""
         most = float(np.abs(self.coefficients[-1, :, 3]).max())

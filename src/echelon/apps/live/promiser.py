@@ -158,7 +158,7 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
     certified = guarantee.certified
     badge["anywhere"] = certified is not None and certified.radius == float("inf")
     # Shown where the guarantee does not cover the state.
-    badge["beyond"] = [cause.sentence() for cause in beyond(0.0, guarantee)]
+    badge["beyond"] = [*beyond(0.0, guarantee)]
     if guarantee.promised and _near_edge(guarantee, knobs):
         badge |= {"state": "edge", "short": f"{badge['short']}, near its edge"}
     elif not guarantee.promised and guarantee.slowest is not None:

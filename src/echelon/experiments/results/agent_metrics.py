@@ -78,7 +78,7 @@ class Metrics(NamedTuple):
     """All numbers of a run; what does not exist is None, never NaN.
 
     Errors are of the position (m) where the model has one, else of the whole state. A run that
-    diverged has no errors. The closest pair is that of the stored frames.
+    diverged has no errors. The closest pair is that of all steps, or of the stored `frames`.
     """
 
     leaders: tuple[LeaderMetrics, ...]
@@ -95,7 +95,7 @@ class Metrics(NamedTuple):
 
     @property
     def minimum_distance(self) -> float | None:
-        """The smallest distance between two agents in the stored frames, m."""
+        """The smallest distance between two agents, m; `closest` says over what."""
         return None if self.closest is None else self.closest.distance
 
     @property

@@ -27,6 +27,7 @@ class EventOutcome(NamedTuple):
         near: the scaled distance to another agent at which one joins that keeps apart, m, where it
             is less than what they keep; else None.
         guarantee: what is guaranteed through it, in words.
+        sampled: whether there are steps between the frames.
     """
 
     at: float
@@ -38,6 +39,7 @@ class EventOutcome(NamedTuple):
     leader: tuple[int, float] | None
     near: float | None
     guarantee: str
+    sampled: bool = False
 
     def as_mapping(self) -> JsonObject:
         """Return what was observed, ready for JSON."""
@@ -57,6 +59,7 @@ class EventOutcome(NamedTuple):
             seen = f"errors reach {size}, and are not below {limit} by {self.until:.4g} s"
         else:
             seen = f"errors reach {size}, and stay below {limit} from {self.restored:.4g} s on"
+        seen = f"in the stored frames {seen}" if self.sampled else seen
         if self.leader is not None:
             agent, off = self.leader
             seen += (
@@ -98,6 +101,7 @@ def _outcome(result: Result, event: JsonObject, end: float) -> EventOutcome:
         leader=_new_leader(result, frames),
         near=_too_near(result, event, frames),
         guarantee=event["guarantee"]["sentence"],
+        sampled=result.settings.store_every > 1,
     )
 
 

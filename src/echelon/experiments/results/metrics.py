@@ -28,7 +28,7 @@ def metrics(result: Result) -> Metrics:
             leaders=_leaders(result, exists),
             followers=_followers(result, exists),
             edges=_edges(result, exists),
-            closest=result.closest_pair(),
+            closest=result.closest,
             saturation_fraction=float(result.saturated.mean()),
             steady_window=result.settings.window,
         )

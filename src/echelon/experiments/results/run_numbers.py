@@ -197,18 +197,23 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         digits=3,
     ),
     "minimum_distance": Quantity(
-        "smallest distance between any two agents, over the stored frames",
+        "smallest distance between any two agents, over all steps",
         "m",
         column="smallest\ndistance",
         of=lambda run: run.metrics.minimum_distance,
         shown=Shown.COMPARISON | Shown.SUMMARY,
     ),
     "minimum_distance_time": Quantity(
-        "time of the stored frame in which two agents were closest to each other",
+        "time at which two agents were closest to each other",
         "s",
         of=lambda run: getattr(run.metrics.closest, "time", None),
         shown=Shown.SUMMARY,
         key="minimum_distance_time_s",
+    ),
+    "minimum_distance_frames": Quantity(
+        "in how many stored frames that distance was found; null: over all steps",
+        of=lambda run: getattr(run.metrics.closest, "frames", None),
+        shown=Shown.SUMMARY,
     ),
     "closest_agents": Quantity(
         "the two agents that were closest to each other",

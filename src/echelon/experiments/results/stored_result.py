@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from echelon.core.errors import Outcome, OutputError
 from echelon.core.lazy_field import Later
 from echelon.core.types import JsonObject
@@ -80,6 +82,8 @@ def _result(
 
 
 def _sums(file: Path, sums: Mapping[str, object]) -> Sums:
+    # Earlier versions found the closest two agents in stored frames only.
+    sums = {"closest": np.zeros(0), "met": np.zeros((0, 3)), **sums}
     missing = [name for name in Sums._fields if name not in sums]
     if missing:
         raise OutputError(

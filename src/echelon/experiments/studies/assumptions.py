@@ -129,7 +129,7 @@ def _reference_line(model: ControlAffine, demand: ReferenceDemand, settings: Set
         text, remedy = infeasible(model, demand), "give knots that the model can follow"
         return fails(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number, remedy=remedy)
     if limited and demand.share > 1.0:
-        text, remedy = too_fast(model, demand), "make it slower or smaller"
+        text, remedy = too_fast(model, demand), "a path within the limits is needed"
         return fails(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number, remedy=remedy)
     bound = "only the input limits bound it" if limited else "there is no bound"
     text = f"at most, over {settings.horizon:g} s; {bound}"

@@ -146,7 +146,8 @@ def compare(
         landed: called with each row as soon as it is complete.
 
     A method that does not apply, or whose solver is missing, has a row with the reason. The
-    scenario's drive has a row under the name of its gain, unless another row has the same drive.
+    scenario's drive has a row under the name of its gain, or of a user's class, unless another row
+    has the same drive.
 
     Raises:
         ScenarioError: a part cannot be built.
@@ -235,9 +236,11 @@ def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
     # By value, gains included: the scenario may describe one of the methods.
     if any(eqx.tree_equal(drive, other) for other in others):
         return None
-    gain, feedforward = drive.gain, drive.feedforward
+    law, gain, feedforward = getattr(drive, "follower", drive), drive.gain, drive.feedforward
     name = _law_name(drive) if gain is None else gain.method
     label = name if feedforward is Feedforward.NONE else f"{name}-{feedforward}"
+    if not type(law).__module__.startswith("echelon."):
+        label = type(law).__name__
     return f"{label}, own" if label in {row.label for row in rows} else label
 
 

@@ -31,7 +31,7 @@ def forecast(parts: Parts, settings: Settings) -> str:
     changes = " or ".join(f"`--set {change}`" for change in _changes(parts, settings) if grows)
     if not changes:
         return guarantee.sentence()
-    return f"{guarantee.sentence()} Something is guaranteed with {changes}."
+    return f"{guarantee.sentence()} There is a guarantee with {changes}."
 
 
 def _changes(parts: Parts, settings: Settings) -> Iterator[str]:

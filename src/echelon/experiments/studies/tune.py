@@ -266,8 +266,8 @@ def _check_parameters(scenario: Scenario, parameters: Sequence[str]) -> None:
         or spec.method != Riccati.name
     ):
         raise EchelonError(
-            f"the followers have {got}, but only weights of `riccati` can be tuned; set "
-            "`follower={law: consensus, gain: {method: riccati}}`."
+            f"the followers have {got}, but only weights of `riccati` under the law "
+            "`consensus` can be tuned."
         )
 
 

@@ -29,9 +29,9 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
         return
     what = "proof" if promise.kind is Kind.PROOF else "guarantee on the domain"
     what = "conditional claim" if promise.conditions else what
-    against, remedy = _against(result, promise)
+    against = _against(result, promise)
     if against:
-        yield f"The {what} does not cover this run: {against}; {remedy}."
+        yield f"The {what} does not cover this run: {against}."
     else:
         yield f"The {what} covers this run: {promise.why_covered()}."
 
@@ -43,26 +43,23 @@ def covered(result: Result, promise: Promise) -> bool | None:
     """
     if promise.theorem is None or not len(result.times):
         return None
-    return not _against(result, promise)[0]
+    return not _against(result, promise)
 
 
-def _against(result: Result, promise: Promise) -> tuple[str, str]:
-    """Return why a claim does not cover a run, and a remedy; empty where it does."""
+def _against(result: Result, promise: Promise) -> str:
+    """Return why a claim does not cover a run; empty where it does."""
     left = None if promise.region is None else first_exit(result, promise)
     limited = float(result.saturated.max())
     if left is not None:
-        text = f"agent {left.agent} left the domain at {about(left.time, 4)} s (`{left.name}`)"
-        return text, "widen the `domain`, start nearer to the goals, or slow the reference"
+        return f"agent {left.agent} left the domain at {about(left.time, 4)} s (`{left.name}`)"
     if limited:
-        text = f"a limit acted on an agent in {about(100.0 * limited)} % of the steps"
-        return text, "start nearer to the goals, or slow the reference"
+        return f"a limit acted on an agent in {about(100.0 * limited)} % of the steps"
     if promise.without:
-        return promise.without, "leave it out to see what it costs"
+        return promise.without
     certified = not promise.hypotheses[Hypothesis.STARTS].fails and promise.theorem != Theorem.T2
-    if promise.region is not None and not certified and result.settings.store_every > 1:
-        text = "it is not known whether all agents stayed in the domain between stored frames"
-        return text, "set `simulation.store_every: 1`"
-    return "", ""
+    if promise.region is None or certified or result.settings.store_every == 1:
+        return ""
+    return "it is not known whether all agents stayed in the domain between stored frames"
 
 
 def first_exit(result: Result, promise: Promise) -> Exit | None:

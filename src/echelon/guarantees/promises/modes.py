@@ -132,7 +132,7 @@ def _decaying(case: Case) -> Statement:
     if loop.every:
         return holds(name, _LINEAR, text, *number)
     text = f"not every mode decays, {text}"
-    remedy = "raise `coupling`, or let `echelon design` find a gain that decays"
+    remedy = "another gain, coupling or model is needed"
     reason = "the disagreement does not decay"
     return fails(name, _LINEAR, text, *number, remedy=remedy, reason=reason)
 
@@ -247,8 +247,8 @@ def _step_line(
     if radius < 1.0:
         return holds(Hypothesis.SAMPLING, _LINEAR, text, *number)
     longest = 0.0 if remedy else longest_step(case.loop, case.frozen, case.settings)
-    if longest > 0.0:
+    if 0.0 < longest < dt:
         text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
-        remedy = f"shorten `simulation.dt` below {at_most(longest)} s, or lower the gain"
-    remedy = remedy or "use the law `stopping-point`"
+        remedy = f"shorten `simulation.dt` below {at_most(longest)} s"
+    remedy = remedy or "use another gain; no shorter `simulation.dt` is known to suffice"
     return fails(Hypothesis.SAMPLING, _LINEAR, text, *number, remedy=remedy, reason=reason)

@@ -63,7 +63,10 @@ def turning(case: Case) -> Iterator[Statement]:
         return
     text = f"in a steady turn of {about(worst)} rad/s, as on the leader's path, the disagreement "
     text += "does not decay"
-    remedy = f"turn no faster than {at_most(_fastest(case, worst))} rad/s"
+    fastest = _fastest(case, worst)
+    remedy = (
+        f"turn no faster than {at_most(fastest)} rad/s" if fastest > 0.0 else "use another gain"
+    )
     yield fails(_NAME, kind, text, *number, remedy=remedy, reason=text)
 
 

@@ -14,7 +14,7 @@ from echelon.experiments.results.run_numbers import AGENT_NUMBERS
 from echelon.guarantees.promises.promise import promise
 from echelon.output.plots.figure_files import html_image
 from echelon.output.plots.run_figures import figures
-from echelon.output.reports.causes import causes, ends_farther, grows
+from echelon.output.reports.causes import ends_farther, grows, observations
 from echelon.output.reports.run_report import labelled
 from echelon.output.viewer.replay import replay_page
 from echelon.simulation.engine.result import Result
@@ -24,12 +24,12 @@ _PICTURES = ("trajectories", "formation")
 
 
 def result_page(result: Result) -> str:
-    """Return the outcome of a run, its causes, a table of its agents, and pictures, as HTML.
+    """Return the outcome of a run, what was observed, a table of its agents, and pictures, as HTML.
 
     Of many agents the table has the best, the median and the worst, like the report.
     """
     head = f"<b>{html.escape(_name(result))}</b>: {html.escape(result.message)}"
-    numbers = "" if result in STORED else f"{_causes(result)}{_table(result)}"
+    numbers = "" if result in STORED else f"{_observed(result)}{_table(result)}"
     return f"<p>{head}</p>{numbers}{_pictures(result)}"
 
 
@@ -56,15 +56,15 @@ def result_replay(result: Result) -> str:
     return replay_page(dataclasses.replace(_recorded(result), lyapunov=V and V.value))
 
 
-def _causes(result: Result) -> str:
-    """Return the causes of growing errors as a list."""
+def _observed(result: Result) -> str:
+    """Return what was observed of growing errors as a list."""
     # A promise takes seconds to compute, so other runs do without.
     if not len(result.times) or not ends_farther(result):
         return ""
     guarantee = promise(result.parts, result.settings)
     if not grows(result, guarantee):
         return ""
-    sentences = (cause.sentence() for cause in causes(result, metrics(result), guarantee))
+    sentences = observations(result, metrics(result), guarantee)
     items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences)
     return f"<ul>{items}</ul>" if items else ""
 

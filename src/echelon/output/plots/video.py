@@ -250,7 +250,7 @@ def _name_closest(ax: "Axes", run: Recording) -> None:
     """Write which agents came closest to each other, in a warning colour if they touched."""
     closest, sizes = run.closest_pair(run.scales), run.ellipsoid
     if closest is not None:
-        text = "smallest {}distance {:.3g} m: {} and {} at {:.4g} s".format(
+        text = "smallest {}distance in the frames {:.3g} m: {} and {} at {:.4g} s".format(
             "scaled " * (run.avoidance is not None),
             closest.distance,
             *closest.agents,

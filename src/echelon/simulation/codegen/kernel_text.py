@@ -92,6 +92,7 @@ def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str
         "mirror": (blocks, plan.mirror),
         "next_mirror": (blocks, plan.mirror),
         "edges": (edges, (len(plan.edges) + 2) * plan.lanes),
+        "tape": (blocks, plan.tape_rows * plan.lanes),
     }
     return slots | {name: w.part(slots[name], *part) for name, part in parts.items()}
 

@@ -12,12 +12,14 @@ class ClosestPair(NamedTuple):
     Attributes:
         distance: between them, m.
         agents: their numbers, ascending.
-        time: of the stored frame, s.
+        time: s.
+        frames: of how many stored frames it is; None if it is of all steps.
     """
 
     distance: float
     agents: tuple[int, int]
     time: float
+    frames: int | None = None
 
     @classmethod
     def of(cls, places: Float[np.ndarray, "N k"], time: float) -> "ClosestPair":
@@ -42,13 +44,16 @@ class ClosestPair(NamedTuple):
     def sentence(self, radius: float | None, unit: str = "m") -> str:
         """Return who was closest, how close and when, beside the size of agents of a radius (m)."""
         (one, other), near = self.agents, f"{self.distance:.3g} {unit}".rstrip()
+        when = f"{self.time:.4g} s"
+        if self.frames is not None:
+            when += f" in the {self.frames} stored frames"
         size = ""
         if radius is not None:
             sizes = (f"{x} {unit}".rstrip() for x in (f"{radius:.2g}", f"{2.0 * radius:.3g}"))
             size = "; agents of radius {} touch below {}".format(*sizes)
         if self.touch(radius):
             return (
-                f"Warning: agents {one} and {other} came within {near} at {self.time:.4g} s{size}, "
+                f"Warning: agents {one} and {other} came within {near} at {when}{size}, "
                 "and the simulation lets them pass through each other."
             )
-        return f"Smallest distance: {near}, agents {one} and {other} at {self.time:.4g} s{size}."
+        return f"Smallest distance: {near}, agents {one} and {other} at {when}{size}."

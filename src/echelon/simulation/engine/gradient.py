@@ -106,7 +106,8 @@ class _PreparedRun:
     def __init__(
         self, parts: Parts, settings: Settings, wrt: tuple[str, ...], key: Hashable | None
     ) -> None:
-        self.key, self.wrt, prepared = key, wrt, prepare(parts, settings)
+        # No frame is stored, and no cost depends on who is closest.
+        self.key, self.wrt, prepared = key, wrt, prepare(parts, settings._replace(store_every=1))
         self.problem, drive = copied((prepared.problem, prepared.parts.drive))
         values = values_of(self.problem, drive, wrt)
         assert isinstance(drive, Laws)  # `values_of` rejects all others

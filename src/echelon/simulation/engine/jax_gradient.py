@@ -18,8 +18,9 @@ from echelon.simulation.engine.differentiable_run import (
     cost_number,
     symmetric,
 )
+from echelon.simulation.step.distances import distance_of
 from echelon.simulation.step.loop import Loop, Moment
-from echelon.simulation.step.meter import Sums, distance_of
+from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.sequence import begin, measured_step
 
 

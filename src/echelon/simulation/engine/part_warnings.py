@@ -13,11 +13,14 @@ from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.simulation.engine.closest_pair import ClosestPair
 from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.settings import Settings
 
 _HALF_TURN = 3.0
 """Below half a turn in rad: no smaller spread is looked at, since `difference` is compiled."""
 _MET = 1e-9
 """m; agents without a radius that come so near to each other meet."""
+_COARSE = 1e-3
+"""m; a run whose positions are not resolved to this is warned of."""
 _SETTLES = 3.0
 """Time constants after which an actuator has made 95 % of a step."""
 
@@ -42,6 +45,19 @@ def part_warnings(parts: Parts, states: Array, horizon: float) -> Iterator[str]:
         yield (
             f"the actuators need {_SETTLES * actuator.lag:.3g} s for 95 % of a command, since "
             f"their lag is {actuator.lag:.3g} s, and the horizon is {horizon:g} s."
+        )
+
+
+def coarse(model: ControlAffine, states: Array, settings: Settings) -> Iterator[str]:
+    """Yield that positions (N, n) are too large for the digits of single precision."""
+    if settings.precision != "float32" or not model.position:
+        return
+    farthest = np.abs(states[:, list(model.position_indices())]).max()
+    step = float(np.spacing(np.float32(farthest)))
+    if _COARSE < step < np.inf:
+        yield (
+            f"single precision resolves {step:.2g} m at the coordinate {farthest:.3g} m; "
+            "`float64` resolves a billionth of that."
         )
 
 

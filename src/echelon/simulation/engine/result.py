@@ -18,6 +18,7 @@ from echelon.core.lazy_field import LazyField
 from echelon.core.pages import CellPage, notebook_page
 from echelon.core.types import Array
 from echelon.core.words import amount
+from echelon.simulation.engine.closest_pair import ClosestPair
 from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.traffic import Traffic, traffic
@@ -127,6 +128,20 @@ class Result(FrameNumbers):
     def chatter(self) -> Array:
         """How many times (N,) an input jumped from one limit to the opposite one in a step."""
         return self.sums.chatter
+
+    @property
+    def closest(self) -> ClosestPair | None:
+        """Which agents were closest to each other, over all steps or, of many, in the frames."""
+        pair, sums = self.closest_pair(), self.sums
+        if pair is None or self.settings.store_every == 1:
+            return pair
+        if not len(sums.closest):
+            return pair._replace(frames=len(self.times))
+        # The last state begins no step, and is a frame.
+        if pair.distance <= sums.closest[0] * (1.0 + 1e-9):
+            return pair
+        step, one, other = (int(number) for number in sums.met[0])
+        return ClosestPair(float(sums.closest[0]), (one, other), step * self.settings.dt)
 
     @functools.cached_property
     def traffic(self) -> Traffic | None:

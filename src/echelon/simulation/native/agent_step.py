@@ -217,7 +217,7 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
         x, offset = inputs.x, inputs.offset
         view = LocalView(inputs.t, x, offset, inputs.z, inputs.message, motion.dt)
         desired, u, memory, message = act(loop, law, view, inputs.memory, leads)
-        limited, cut = limit_sides(u, desired)
+        limited, cut = limit_sides(model, u, desired)
         metered = meter.of_agent(inputs.step, inputs.steady, x, offset, inputs.leader, u)
         tracking, outputs = jnp.zeros(2), jnp.zeros(len(model.output_names))
         if inputs.reference is not None:
@@ -295,6 +295,7 @@ def body_of(
         sums=_placed(rows, sums),
         minima=_placed(rows, {"inside": outputs.inside}),
         on_request=_placed(rows, {"input": outputs.input}),
+        tape=dict(enumerate(inputs.x[list(loop.meter.paired)].tolist())),
         mirror_before=[*subtract(inputs.x, inputs.offset), *outputs.signal],
         mirror=[*subtract(outputs.state, inputs.offset), *outputs.next_signal],
         difference=_difference(loop, graph, len(inputs.x), len(outputs.signal)),

@@ -85,6 +85,7 @@ def plan_of(
         exception_row=rows.exception.start,
         table=(n if tracks else 0) + (varying.count if in_table else 0),
         dt=loop.motion.dt,
+        tape_rows=len(loop.meter.paired),
     )
     # A leader that receives nothing waits for nobody.
     ahead = not batched and loop.levels is None and not plan.first.reads_neighbours

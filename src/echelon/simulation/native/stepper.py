@@ -16,6 +16,7 @@ from echelon.simulation.native.agent_step import signal_size, unflatten
 from echelon.simulation.native.blocks import FormationBlocks, Places, SwarmBlocks, neighbour_slots
 from echelon.simulation.native.buffers import BufferPool
 from echelon.simulation.native.kernel_cache import KERNELS, LANES, Make
+from echelon.simulation.native.pair_watch import PairWatch
 from echelon.simulation.native.signals import mirror_values, offsets_of
 from echelon.simulation.native.threads import ThreadPool
 from echelon.simulation.native.varying import VaryingNumbers
@@ -82,10 +83,9 @@ class NativeStepper(Stepper):
         self.followers = (first + self.loop.followers).reshape(-1)
         row_major, weights_change = self.places.row_major, variant is not None
         apart = weights_change or any(np.any(loop.meter.spacings) for loop in loops)
-        kernel = (make or KERNELS.of)(
+        self.code, self.rows, self.plan, self.uniform_count = (make or KERNELS.of)(
             self.varying, bits, batched, row_major, weights_change, apart, self.places.shifts
         )
-        self.code, self.rows, self.plan, self.uniform_count = kernel
         self._signals = signal_size(self.loop)
         # Once, because to call a law takes as long as many small steps.
         self.memories = self.loop.leader.init(), self.loop.follower.init()
@@ -94,8 +94,9 @@ class NativeStepper(Stepper):
         # The moment in the blocks: a chunk that continues from it need not be written there.
         self._moment: Moment | None = None
         self._hold, self._fallback_step = -1, -1
-        self._inexact = np.zeros(len(loops), bool)
         self._tape: Array | None = None
+        axes, count = len(self.loop.meter.paired), len(loops)
+        self._pairs = PairWatch(self.places, axes, count, self.dtype, STEPS)
         self._draws_ahead = holds_at_once(len(states))
 
     # ---- memory ----
@@ -167,8 +168,7 @@ class NativeStepper(Stepper):
             return begin_forgetful(self.loop, states)
         pairs = zip(self.loops, np.split(np.asarray(self.states), len(self.loops)), strict=True)
         moments = [jax.tree.map(np.asarray, begin(loop, jnp.asarray(x))) for loop, x in pairs]
-        parts = (moment[1:] for moment in moments)
-        many = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        many = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(m[1:] for m in moments))
         return Moment(moments[0].step, *many)._replace(states=states)
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
@@ -228,6 +228,7 @@ class NativeStepper(Stepper):
         self._run(step, 1, first, table)
         self._read(self.rows.input, out)
         self._find_inexact()
+        self._pairs.undo()
         self.mirrors.reverse()
         for array, before in zip(arrays, copies, strict=True):
             array[:] = before
@@ -247,7 +248,7 @@ class NativeStepper(Stepper):
         while steps:
             row, constant = stretch_at(self.loop, step)
             self.neighbourhood = self.neighbourhood._replace(weights=self.edge_weights[row])
-            count = min(steps, STEPS, max(1, most), constant)
+            count = min(steps, self._pairs.steps, max(1, most), constant)
             if wind is not None:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
@@ -282,11 +283,12 @@ class NativeStepper(Stepper):
         values |= {"leader_blocks": self.leader_blocks, "row_stride": places.row_stride}
         values |= {"blocks": int(places.segments[-1]), "edge_blocks": places.edge_blocks}
         values["first_steady"] = int(self.loop.meter.first_steady)
-        if self._tape is not None:
-            tape = self._tape[step - self._tape_start]
-            values |= {"tape": tape.ctypes.data, "tape_step": tape.size}
         now, after = self.mirrors
         firsts = {"rows": self.blocks, "mirror": now, "next_mirror": after, "edges": self.edges}
+        tape = self._pairs.room(step, steps)
+        tape = tape if self._tape is None else self._tape[step - self._tape_start]
+        if tape.size:
+            values["tape_step"], firsts["tape"] = tape.size, tape
         uniform_values = np.empty(steps * self.uniform_count, self.dtype)
         self.threads.run(self.code, values, firsts, uniform_values)
         if steps % 2:
@@ -340,18 +342,14 @@ class NativeStepper(Stepper):
         """Return the moment in the blocks, and the sums from one step to another."""
         rows = self.rows
         sums = range(rows.errors.start, rows.tracking.start)
-        parts = (rows.state, self.dtype), (rows.memory, self.dtype), (rows.cut, self.dtype)
+        parts = ((part, self.dtype) for part in (rows.state, rows.memory, rows.cut))
         x, memory, cut, agent_sums = (
             self._read(part, self.buffers.empty((len(self.places.position), len(part)), kind))
             for part, kind in (*parts, (sums, np.float64))
         )
-        fields: Any = [
-            np.asarray(step, np.int32),
-            x,
-            unflatten(self.memories[0], memory[self.leaders]),
-            unflatten(self.memories[1], memory[self.followers]),
-            cut.astype(np.int8),
-        ]
+        pairs = zip(self.memories, (self.leaders, self.followers), strict=True)
+        memories = [unflatten(like, memory[agents]) for like, agents in pairs]
+        fields: Any = [np.asarray(step, np.int32), x, *memories, cut.astype(np.int8)]
         return Moment(*fields), self._sums(first, step, agent_sums)
 
     def _find_inexact(self) -> None:
@@ -363,6 +361,7 @@ class NativeStepper(Stepper):
 
     def _clear_sums(self) -> None:
         self._inexact = np.zeros(len(self.loops), bool)
+        self._pairs.clear()
         self.blocks[:, self.rows.errors.start :] = self._no_sums
         self.edges[..., -1, :] = 0.0
 
@@ -391,6 +390,7 @@ class NativeStepper(Stepper):
             inside=np.minimum(of(rows.inside), ALWAYS),
             chatter=of(rows.chatter)[:, 0],
             **dict.fromkeys(("separation", "avoidance"), np.zeros((len(agent_sums), 0))),
+            **self._pairs.terms(),
         )
         return Sums(*(np.asarray(part, np.float64) for part in sums)).split(len(self.loops))
 

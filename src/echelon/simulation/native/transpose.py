@@ -33,8 +33,8 @@ from echelon.simulation.native.agent_step import (
 from echelon.simulation.native.kernel_cache import LANES
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
+from echelon.simulation.step.distances import spacing_error
 from echelon.simulation.step.loop import Loop
-from echelon.simulation.step.meter import spacing_error
 
 
 class CotangentRows(NamedTuple):

@@ -67,11 +67,19 @@ def feedforward_of(
     return follower.message(model, x, v, memory)
 
 
-def limit_sides(delivered: jax.Array, desired: jax.Array) -> tuple[jax.Array, jax.Array]:
+def limit_sides(
+    model: ControlAffine, delivered: jax.Array, desired: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Return which desired inputs (..., m) limits changed, and to which side, -1, 0 or 1."""
     # To the bit, as `limit` returns what fits. NaN differs from itself, and is a divergence.
     limited = (delivered != desired) & ~jnp.isnan(desired)
     # Where one input is cut, mixing there and back rounds all others, which says nothing of a side.
-    clear = jnp.abs(delivered - desired) > 1e-6 * (jnp.abs(delivered) + jnp.abs(desired))
+    change = jnp.abs(delivered - desired)
+    clear = change > 1e-6 * (jnp.abs(delivered) + jnp.abs(desired))
+    if model.input_limits is not None:
+        # A change that moves no limited row by a millionth of its range is rounding too.
+        G, low, high = (jnp.asarray(part, change.dtype) for part in model.input_limits)
+        share = (jnp.abs(G) / (high - low)[:, None]).max(axis=0)
+        clear &= change * jnp.broadcast_to(share, change.shape) > 1e-6
     side = jnp.where(delivered > desired, 1.0, -1.0)
     return limited, jnp.where(limited & clear, side, 0.0)

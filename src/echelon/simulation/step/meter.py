@@ -18,6 +18,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.core.types import Array, Input, Inputs, Output, PyTree, State, States
+from echelon.simulation.step.distances import finds_pairs, spacing_error
 from echelon.simulation.step.settings import Settings
 
 Total: TypeAlias = PyTree
@@ -55,6 +56,8 @@ class Sums(NamedTuple):
         separation: (N, B) where agents keep apart, the least scaled distance to another agent, m,
             in each of B slices of the run; infinite before.
         avoidance: (N, B) how many others changed the agent's rate, summed over the steps of each.
+        closest: (1,) the smallest distance between two agents at the beginning of a step, and `met`
+            (1, 3) that step and the two; (0,) and (0, 3) where `Meter.paired` is empty.
     """
 
     steps: Total
@@ -69,6 +72,8 @@ class Sums(NamedTuple):
     chatter: Total
     separation: Total
     avoidance: Total
+    closest: Total
+    met: Total
 
     def plus(self, more: "Sums") -> "Sums":
         """Return the sums of two stretches of a run."""
@@ -78,7 +83,10 @@ class Sums(NamedTuple):
         # chunk both have it.
         last = self.unsettled + (more.unsettled - self.unsettled).clip(0)
         first = self.inside - (self.inside - more.inside).clip(0)
-        return total._replace(unsettled=last, inside=first)
+        closer = more.closest < self.closest
+        met = self.met + closer[..., None] * (more.met - self.met)
+        closest = self.closest.clip(None, more.closest)
+        return total._replace(unsettled=last, inside=first, closest=closest, met=met)
 
     # ---- sums of formations: an axis F in front of each part ----
 
@@ -150,6 +158,8 @@ class Meter(eqx.Module):
     # Static, since they decide shapes.
     measured: tuple[int, ...] = eqx.field(static=True)
     slices: int = eqx.field(static=True, default=0)
+    # The states of the position, where the closest two are found at every step.
+    paired: tuple[int, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def of(
@@ -182,6 +192,7 @@ class Meter(eqx.Module):
             scales=np.zeros(0) if scales is None else scales,
             measured=measured,
             slices=0 if scales is None else -(-settings.steps // per_slice),
+            paired=measured if finds_pairs(model, graph.agents, settings) else (),
         )
 
     def zero_sums(self, xp: ModuleType = jnp) -> Sums:
@@ -202,6 +213,8 @@ class Meter(eqx.Module):
             chatter=xp.zeros(agents, np.int32),
             separation=xp.full((agents, self.slices), jnp.inf, dtype),
             avoidance=xp.zeros((agents, self.slices), dtype),
+            closest=xp.full(min(1, len(self.paired)), jnp.inf, dtype),
+            met=xp.zeros((min(1, len(self.paired)), 3), np.int32),
         )
 
     def read(
@@ -248,6 +261,8 @@ class Meter(eqx.Module):
             chatter=chatter.astype(jnp.int32),
             separation=jnp.full((len(states), self.slices), jnp.inf, states.dtype),
             avoidance=jnp.zeros((len(states), self.slices), states.dtype),
+            closest=jnp.full(min(1, len(self.paired)), jnp.inf, states.dtype),
+            met=jnp.zeros((min(1, len(self.paired)), 3), jnp.int32),
         )
 
     def following(self, nearest: jax.Array) -> "Meter":
@@ -352,18 +367,6 @@ class Meter(eqx.Module):
         if goals is not None:
             desired = jnp.sqrt(jax.vmap(self._length)(goals[i] - goals[j]))
         return spacing_error(square, jnp.asarray(desired, states.dtype))
-
-
-def spacing_error(square: jax.Array, desired: jax.Array) -> jax.Array:
-    """Return the squared errors of distances, given as squares, from the desired ones."""
-    return (distance_of(square) - desired) ** 2
-
-
-def distance_of(square: jax.Array) -> jax.Array:
-    """Return the root of a square, with a slope of 1 where two agents meet."""
-    # A root has no slope at 0, and a single `where` would still differentiate it there.
-    positive = square > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), square)
 
 
 def outside(bounded: _Numbers, low: _Numbers, high: _Numbers) -> _Numbers:

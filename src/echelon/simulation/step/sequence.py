@@ -15,6 +15,7 @@ from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act, limit_sides
 from echelon.simulation.step.arrivals import beside_others, has_angles
+from echelon.simulation.step.distances import closest_two
 from echelon.simulation.step.knowledge import no_packets
 from echelon.simulation.step.loop import (
     Loop,
@@ -148,7 +149,7 @@ def control(loop: Loop, now: Moment) -> Control:
     if loop.sensors is not None and loop.sensors.estimator is not None:
         world = world._replace(estimates=jax.vmap(loop.sensors.estimator.act)(world.estimates, u))
     desired = jnp.concatenate([led.desired, followed.desired])[loop.order]
-    limited, cut = limit_sides(u, desired)
+    limited, cut = limit_sides(loop.model, u, desired)
     if here is not None:
         limited, cut = (jnp.where(here[:, None], part, 0) for part in (limited, cut))
     return Control(u, limited.any(axis=1), cut.astype(jnp.int8), led.memory, followed.memory, world)
@@ -351,6 +352,9 @@ def measured_step(
             every = every.at[loop.leaders].set(loop.follower.active(acted.leader_memory))
         read = read._replace(**meter.of_slice(now.step, now.states, every, here))
     read = read if here is None else meter.of_present(read, here)
+    if meter.paired:
+        places = now.states[:, jnp.array(meter.paired)]
+        read = read._replace(**closest_two(now.step, places, here))
     return _move(loop, now, acted), read
 
 

@@ -62,6 +62,5 @@ def _check_stabilizable(model: ControlAffine, linear: Linearization, Q: Array, R
             raise GainError(
                 f"the linearization of `{type(model).__name__}` at its trim cannot be stabilized: "
                 f"no input moves the mode at {eigenvalue_text(eigenvalue)} 1/s, which lies along "
-                f"{states}; give the gain yourself (method `given`) or choose another model of the "
-                "vehicle."
+                f"{states}; give the gain yourself (method `given`)."
             )

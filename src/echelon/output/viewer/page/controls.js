@@ -53,7 +53,7 @@ function showClosest(element, closest, { ellipsoid }) {
   const [time, distance, i, j] = closest, touch = ellipsoid && distance < ellipsoid.touching;
   element.classList.toggle("touch", Boolean(touch));
   const scaled = ellipsoid?.kept, size = ellipsoid ? ` (${scaled ? "ellipsoids" : "vehicles"} touch below ${brief(ellipsoid.touching)} m)` : "";
-  element.textContent = `${touch ? "overlap: " : ""}smallest ${scaled ? "scaled " : ""}distance so far ${brief(distance)} m, agents ${i} and ${j} at ${time.toFixed(2)} s${size}`;
+  element.textContent = `${touch ? "overlap: " : ""}smallest ${scaled ? "scaled " : ""}distance in the frames so far ${brief(distance)} m, agents ${i} and ${j} at ${time.toFixed(2)} s${size}`;
 }
 
 // Shows the newest event.

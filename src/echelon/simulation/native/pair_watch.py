@@ -1,0 +1,134 @@
+"""The closest two agents over all steps, of positions that a kernel records."""
+
+from typing import final
+
+import numpy as np
+from jaxtyping import Float
+
+from echelon.core.types import Array
+from echelon.simulation.codegen import aligned
+from echelon.simulation.native.blocks import Places
+
+_SPAN, _NUMBERS, _TIE = 32, 4_000_000, 1e-9
+"""Steps compared at once, recorded numbers, and the relative difference that is not resolved."""
+_FEW = 10_000
+"""Distances that are computed in less time than it takes to find which are needed."""
+
+
+@final
+class PairWatch:
+    """Finds the closest two agents of formations, some steps at a time.
+
+    Args:
+        places: of the agents.
+        axes: of the positions that a kernel records; 0 if it records none.
+        formations: how many follow each other.
+        dtype: of the numbers.
+        steps: of a call, at most.
+    """
+
+    def __init__(
+        self, places: Places, axes: int, formations: int, dtype: np.dtype, steps: int
+    ) -> None:
+        """Allocate memory for some steps."""
+        numbers = places.blocks * axes * places.lanes
+        self.steps = max(1, min(steps, _NUMBERS // max(1, numbers)))
+        self.tape = aligned((self.steps, places.blocks, axes, places.lanes), dtype)
+        self.position, self.formations = places.position, formations
+        self.pairs = np.triu_indices(len(places.position) // formations if numbers else 0, 1)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all steps."""
+        count = self.formations if self.tape.size else 0
+        self.used, self.first = 0, 0
+        self.closest, self.met = np.full(count, np.inf), np.zeros((count, 3))
+
+    def room(self, step: int, steps: int) -> Array:
+        """Return memory in which some steps from one on are recorded; empty where none are."""
+        if not self.tape.size:
+            return self.tape[0]
+        if self.used + steps > self.steps:
+            self._search()
+        self.first = step if not self.used else self.first
+        self.used += steps
+        return self.tape[self.used - steps]
+
+    def undo(self) -> None:
+        """Forget the last step, which is not taken."""
+        self.used = max(0, self.used - 1)
+
+    def terms(self) -> dict[str, Array]:
+        """Return the terms `closest` and `met` of the sums."""
+        self._search()
+        return {"closest": self.closest.copy(), "met": self.met.copy()}
+
+    def _places(self) -> Float[np.ndarray, "d S K F N"]:
+        """Return the recorded positions in K spans of S steps; the last step fills its span."""
+        rows = np.minimum(np.arange(-(-self.used // _SPAN) * _SPAN), self.used - 1)
+        # Axis by axis: (T, blocks, d, lanes) -> (d, T, positions).
+        by_axis = np.ascontiguousarray(self.tape[rows].transpose(2, 0, 1, 3), float)
+        places = by_axis.reshape(len(by_axis), len(rows), -1)[..., self.position]
+        agents = len(self.position) // self.formations
+        spans = places.reshape(len(by_axis), -1, _SPAN, self.formations, agents)
+        return spans.swapaxes(1, 2)
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def _search(self) -> None:
+        """Compare the recorded steps with the closest two before."""
+        if not self.used:
+            return
+        if self.used * self.formations * len(self.pairs[0]) <= _FEW:
+            self._search_all()
+        else:
+            self._search_spans(self._places())
+        self.used = 0
+
+    def _search_all(self) -> None:
+        """Compare all pairs at all steps."""
+        (i, j), count = self.pairs, self.formations
+        axes = self.tape[: self.used].transpose(2, 0, 1, 3).reshape(self.tape.shape[2], -1)
+        places = axes.reshape(len(axes), self.used, -1)[..., self.position].astype(float)
+        places = places.reshape(*places.shape[:2], count, -1)
+        squares = ((places[..., i] - places[..., j]) ** 2).sum(axis=0).swapaxes(0, 1)
+        squares = squares.reshape(count, -1)
+        squares[np.isnan(squares)] = np.inf
+        best = squares.argmin(axis=1)
+        step, pair = np.divmod(best, len(i))
+        self._keep(np.arange(count), np.sqrt(squares[np.arange(count), best]), step, pair)
+
+    def _keep(self, f: Array, least: Array, step: Array, pair: Array) -> None:
+        """Keep the distances of some formations that are smaller than those before."""
+        new, (i, j) = least < self.closest[f], self.pairs
+        self.closest[f[new]] = least[new]
+        rows = self.first + step[new], i[pair[new]], j[pair[new]]
+        self.met[f[new]] = np.stack(rows, axis=1)
+
+    def _search_spans(self, places: Float[np.ndarray, "d S K F N"]) -> None:
+        """Compare the pairs that may be closer than the closest, span by span."""
+        i, j = self.pairs
+        # What all agents do together changes no distance.
+        places = places - places.mean(axis=-1, keepdims=True)
+        start = places[:, 0]
+        moved = np.sqrt(((places - start[:, None]) ** 2).sum(axis=0).max(axis=0))
+        gaps = np.sqrt(((start[..., i] - start[..., j]) ** 2).sum(axis=0))
+        gaps[np.isnan(gaps)] = np.inf
+        # Two agents that move by so much within a span come no closer than their gap less that.
+        bound = (1.0 - _TIE) * np.minimum(self.closest, gaps.min(axis=(0, 2)))
+        searched = gaps - moved[..., i] - moved[..., j] < bound[:, None]
+        nearest = gaps.swapaxes(0, 1).reshape(self.formations, -1).argmin(axis=1)
+        searched[nearest // len(i), np.arange(self.formations), nearest % len(i)] = True
+        self._search_some(places, *np.nonzero(searched))
+
+    def _search_some(
+        self, places: Float[np.ndarray, "d S K F N"], k: Array, f: Array, p: Array
+    ) -> None:
+        """Compare pairs p of formations f in spans k."""
+        i, j = self.pairs
+        apart = places[:, :, k, f, i[p]] - places[:, :, k, f, j[p]]
+        distances = np.sqrt((apart**2).sum(axis=0))
+        distances[np.isnan(distances)] = np.inf
+        least, s = distances.min(axis=0), distances.argmin(axis=0)
+        order = np.lexsort((k, least, f))
+        best = order[np.unique(f[order], return_index=True)[1]]
+        self._keep(f[best], least[best], _SPAN * k[best] + s[best], p[best])
