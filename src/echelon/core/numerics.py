@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from echelon.core.jax_state import require_jax
+
 _R = TypeVar("_R")
 Precision: TypeAlias = Literal["float64", "float32"]
 Field: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
@@ -18,7 +20,12 @@ Field: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 def precision(name: Precision) -> contextlib.AbstractContextManager[object]:
-    """Return a context in which JAX computes in `name`, whatever the user's own flags are."""
+    """Return a context in which JAX computes in `name`, whatever the user's own flags are.
+
+    Raises:
+        EchelonError: JAX cannot run in this process.
+    """
+    require_jax()
     # A context and no `jax.config.update`: importing or calling echelon changes no global setting.
     return jax.enable_x64(name == "float64")
 
