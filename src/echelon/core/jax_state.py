@@ -26,7 +26,7 @@ def require_jax() -> None:
             "JAX had started before this process was forked, and would hang in it; start processes"
             " with `multiprocessing.get_context('spawn')`, or use `echelon sweep`."
         )
-    if jax.config.jax_disable_jit:
+    if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         raise EchelonError(
             "JAX's `jax_disable_jit` (`JAX_DISABLE_JIT`) is on, which echelon does not support;"
             " turn it off, and debug a model by calling its functions alone."

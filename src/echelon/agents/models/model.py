@@ -9,7 +9,6 @@ import abc
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar, cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from jax.core import Tracer
 
 from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.heading import Heading
+from echelon.core.declared import Declared
 from echelon.core.errors import ModelError, did_you_mean, is_number, listing
 from echelon.core.trace import call_once_traced
 from echelon.core.types import Input, InputMap, Output, State
@@ -111,7 +111,7 @@ class Flattened(NamedTuple):
     invert: Callable[[jax.Array], Input]
 
 
-class ControlAffine(eqx.Module):
+class ControlAffine(Declared):
     """One agent, xdot = f(x) + g(x) u with output y = h(x).
 
     Shapes are those of one agent: x (n,), u (m,), f (n,), g (n, m), h (q,). The methods must be
