@@ -25,8 +25,9 @@ def _checked(cls: type[_T]) -> type[_T]:
     @functools.wraps(create)
     def new(own: type[_T], *arguments: Any, **named: Any) -> _T:
         settings = create(own, *arguments, **named)
+        settings = create(own, *(_plain(field, getattr(settings, field)) for field in own._fields))
         settings.check()
-        return create(own, *(_plain(field, getattr(settings, field)) for field in own._fields))
+        return settings
 
     setattr(cls, "__new__", new)
     return cls
@@ -137,9 +138,10 @@ class Settings(NamedTuple):
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Return a checked value as a plain float, int or bool of Python."""
-    if name in ("horizon", "dt", "steady_window"):
-        return None if value is None else float(value)
+    """Return a number as a plain float or int of Python, and any other value as it is."""
+    if name in ("horizon", "dt", "steady_window") and is_number(value):
+        # A whole number may be beyond every float.
+        return float(value) if abs(value) < 1e300 else math.copysign(math.inf, value)
     return int(value) if isinstance(value, np.integer) else value
 
 
