@@ -140,8 +140,10 @@ class Settings(NamedTuple):
 def _plain(name: str, value: Any) -> Any:
     """Return a number as a plain float or int of Python, and any other value as it is."""
     if name in ("horizon", "dt", "steady_window") and is_number(value):
-        # A whole number may be beyond every float.
-        return float(value) if abs(value) < 1e300 else math.copysign(math.inf, value)
+        try:
+            return float(value)
+        except OverflowError:  # a whole number beyond every float
+            return math.inf
     return int(value) if isinstance(value, np.integer) else value
 
 
