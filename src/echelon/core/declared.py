@@ -1,5 +1,6 @@
 """The base of the classes that users derive from: equinox's modules, with a clear error."""
 
+import abc
 import dataclasses
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import jax
 from echelon.core.errors import EchelonError
 
 
-class Declared(eqx.Module):
+class Declared(eqx.Module, abc.ABC):
     """An immutable object whose parameters are annotated fields."""
 
     def __setattr__(self, name: str, value: Any) -> None:
