@@ -331,14 +331,16 @@ def test_every_dependency_is_imported_or_has_its_reason():
 
 
 def test_every_advice_to_install_names_this_distribution():
-    """The import is `echelon`, but on the index that name belongs to another project."""
-    files = [*FILES, ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
+    """echelon is installed from its clone: the distribution is on no index."""
+    files = [*FILES, ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
     advice = re.compile(r"pip install (?:-\S+ )*['\"]?([\w.-]+)(?:\[([\w,-]+)\])?")
     named = {found for path in files for found in advice.findall(path.read_text("utf-8"))}
-    here = {(name, extra) for name, extra in named if name == "."}
-    extras = {extra for _, extra in named if extra}
-    assert {name for name, _ in named - here} == {project()["name"]}
-    assert extras and extras <= set(project()["optional-dependencies"])
+    extras, declared = {extra for _, extra in named if extra}, project()["optional-dependencies"]
+    assert {name for name, _ in named} == {"."}
+    assert extras and extras <= set(declared)
+    # Whoever reads how to install sees every extra.
+    start = (ROOT / "docs" / "start.md").read_text("utf-8")
+    assert all(f"`{extra}`" in start for extra in {*declared} - {"dev"})
     everything = f"{project()['name']}[certify,cluster,fast,optimal,video,parquet]"
     assert everything in project()["optional-dependencies"]["all"]
 

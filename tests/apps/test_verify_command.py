@@ -4,8 +4,11 @@ import json
 import os
 import shutil
 
+import h5netcdf
 import h5py
+import numpy as np
 import pytest
+import xarray as xr
 from runs import OWN_PENDULUM
 
 import echelon as ech
@@ -146,6 +149,58 @@ def moved(name):
     return act
 
 
+def marked(place, name, value):
+    """Add an attribute to a variable or group in the dataset of a run, or change it."""
+
+    def act(folder):
+        with h5py.File(folder / "run.nc", "r+") as data:
+            data[place].attrs[name] = value
+
+    return act
+
+
+def added(group, name="flown"):
+    """Add a variable to a group of the dataset of a run, as xarray does."""
+
+    def act(folder):
+        extra = xr.Dataset({name: (("trial",), np.zeros(3))})
+        extra.to_netcdf(folder / "run.nc", mode="a", group=group, engine="h5netcdf")
+
+    return act
+
+
+def retyped(name):
+    """Store a variable of the dataset of a run in single precision."""
+
+    def act(folder):
+        with h5netcdf.File(folder / "run.nc", "r+") as data:
+            old = data.variables[name]
+            values, over, attributes = old[...], old.dimensions, dict(old.attrs)
+            del data._h5file[name]
+        with h5netcdf.File(folder / "run.nc", "r+") as data:
+            new = data.create_variable(name, over, "f4", fillvalue=np.float32(np.nan))
+            new[...] = values
+            new.attrs.update({k: v for k, v in attributes.items() if k != "_FillValue"})
+
+    return act
+
+
+def without(name):
+    """Remove a variable from the dataset of a run."""
+
+    def act(folder):
+        with h5py.File(folder / "run.nc", "r+") as data:
+            del data[name]
+
+    return act
+
+
+def dimension(folder):
+    """Add a dimension that no variable has to the dataset of a run."""
+    with h5netcdf.File(folder / "run.nc", "r+") as data:
+        data.dimensions["trial"] = 3
+
+
 def link(folder):
     """A link to the gain file of another run, which is a correct gain."""
     other = ech.load_scenario(folder / "scenario.yaml", ["graph.agents=5"])
@@ -256,7 +311,29 @@ FORGED = {
     "a version": ("gain", in_json("summary.json", lambda d: d["versions"].update(jax="9")), 1),
     "an attribute": ("gain", in_data(proved=lambda _: "stable"), 1),
     "a report": ("gain", in_text("report.txt", "reached", "passed"), 1),
-    "a number of a report": ("gain", in_text("report.txt", "0.2", "0.1"), 5),
+    "a last digit of a report": ("gain", in_text("report.txt", "0.2", "0.1"), 5),
+    "a number of a report": ("gain", in_text("report.txt", "0.2", "0.9"), 1),
+    # What readers of the dataset see beside its arrays.
+    "a scale": ("gain", marked("error", "scale_factor", 1e-9), 1),
+    "a shift": ("gain", marked("error", "add_offset", -0.1), 1),
+    "a missing value": ("gain", marked("error", "missing_value", 1.0), 1),
+    "another missing value": ("gain", marked("error", "_FillValue", 0.0), 1),
+    "a scale of inputs": ("gain", marked("inputs/inputs", "scale_factor", 0.5), 1),
+    "a long name": ("gain", marked("states", "long_name", "measured by cameras"), 1),
+    "another unit": ("gain", marked("time", "units", "ms"), 1),
+    "a unit of another variable": ("gain", marked("states", "units", "s"), 1),
+    "a unit of a group's time": ("gain", marked("inputs/time", "units", "m"), 1),
+    "other coordinates": ("gain", marked("error", "coordinates", "time"), 1),
+    "an attribute of a group": ("gain", marked("graph", "comment", "flown"), 1),
+    "a group": ("gain", added("/flight"), 1),
+    "a group in a group": ("gain", added("/sums/flight"), 1),
+    "a variable": ("gain", added("/"), 1),
+    "a variable of a group": ("gain", added("/modes"), 1),
+    "a dimension": ("gain", dimension, 1),
+    "another type": ("gain", retyped("saturated"), 1),
+    "a variable less": ("gain", without("lyapunov_drift"), 1),
+    "a scale without a guarantee": ("loose", marked("error", "scale_factor", 1e-9), 1),
+    "a variable without a guarantee": ("loose", added("/"), 1),
     # Without a guarantee rounding may grow, and a difference proves nothing.
     "states without a guarantee": ("loose", scaled("states"), 5),
     "states where errors grow": ("falls", scaled("states"), 5),

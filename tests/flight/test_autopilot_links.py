@@ -237,7 +237,7 @@ def test_a_full_thrust_is_a_number():
 def test_a_missing_library_is_named_with_its_extra(monkeypatch, link, extra):
     for name in ("cflib", "cflib.crtp", "pymavlink"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(MissingExtraError, match=rf"pip install 'echelon-formation\[{extra}\]'"):
+    with pytest.raises(MissingExtraError, match=rf"pip install '\.\[{extra}\]'"):
         link("udp://127.0.0.1:19850", facts())
 
 

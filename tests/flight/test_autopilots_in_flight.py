@@ -43,7 +43,7 @@ def extra(library, name):
     try:
         return importlib.import_module(library)
     except ImportError:
-        pytest.fail(f"this study needs `pip install 'echelon-formation[{name}]'`.", pytrace=False)
+        pytest.fail(f"this study needs `pip install '.[{name}]'`.", pytrace=False)
 
 
 def consensus(model):

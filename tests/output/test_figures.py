@@ -1,6 +1,8 @@
 """Figures drawn from recordings: limits, guarantees, distances, and sizes for a page."""
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -482,3 +484,28 @@ def test_a_lost_leader_has_no_values_after_its_loss(long):
 def test_axes_that_are_none_are_refused(run):
     with pytest.raises(OutputError, match="^`ax` is a `int`, and must be axes of matplotlib\\.$"):
         figures(run, "formation", ax=3)
+
+
+BACKEND = """
+import os, sys
+os.environ["MPLBACKEND"] = sys.argv[1]
+import echelon
+from echelon.output.plots.style import sheet, style
+assert "matplotlib" not in sys.modules
+with style():
+    sheet(3.0)[0].savefig(sys.argv[2])
+import matplotlib
+assert os.environ["MPLBACKEND"] == sys.argv[1] and "matplotlib.pyplot" not in sys.modules
+print(matplotlib.get_backend(auto_select=False))
+"""
+
+
+@pytest.mark.parametrize("backend", ["nonsense", "module://nothing.installed", "svg"])
+def test_figures_are_drawn_whatever_backend_the_environment_names(backend, tmp_path):
+    """Jupyter names its own one to child processes; a user's choice remains."""
+    file = tmp_path / "figure.png"
+    command = [sys.executable, "-c", BACKEND, backend, str(file)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == ("None" if backend == "nonsense" else backend)
+    assert file.read_bytes().startswith(b"\x89PNG")

@@ -194,5 +194,5 @@ def test_a_primitive_without_an_expression_is_named_with_the_model():
 
 def test_a_missing_extra_is_told_with_its_remedy(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "casadi", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'echelon-formation\[optimal\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install '\.\[optimal\]'"):
         casadi_function("f", jnp.sin, 1)

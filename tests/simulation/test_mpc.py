@@ -301,7 +301,7 @@ def test_a_state_that_nothing_brings_back_is_told():
 
 def test_a_missing_extra_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'echelon-formation\[optimal\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install '\.\[optimal\]'"):
         swarm()
 
 

@@ -423,7 +423,7 @@ def test_a_cost_that_no_expression_holds_is_named():
 
 def test_a_missing_extra_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'echelon-formation\[optimal\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install '\.\[optimal\]'"):
         ech.optimal.solve(transfer(5), [0, 0], [1, 0])
 
 

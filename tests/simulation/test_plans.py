@@ -378,5 +378,5 @@ def test_a_distance_needs_a_position():
 
 def test_a_missing_extra_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'echelon-formation\[optimal\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install '\.\[optimal\]'"):
         simulate_plans(QUADROTOR, TREE, DRAWN, reference=LOOP, **SHORT)

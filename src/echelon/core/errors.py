@@ -6,7 +6,9 @@ event during a run is not an exception but an `Outcome`, stored with the compute
 
 import difflib
 import enum
+import numbers
 from collections.abc import Iterable
+from typing import TypeGuard
 
 
 class EchelonError(Exception):
@@ -116,6 +118,11 @@ def check_name(
     names = list(allowed)
     if name not in names:
         raise fault(f"{what} `{name}`, allowed are {listing(names)}{did_you_mean(name, names)}.")
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Tell whether a value is a real number, of Python or NumPy; truth values are none."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
 def check_kind(

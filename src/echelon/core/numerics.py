@@ -4,12 +4,14 @@ None of them depends on an agent model.
 """
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Literal, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
+
+from echelon.core.jax_state import require_jax
 
 _R = TypeVar("_R")
 Precision: TypeAlias = Literal["float64", "float32"]
@@ -17,10 +19,33 @@ Field: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 """A right-hand side (x, u) -> xdot."""
 
 
+_USUAL = (
+    ("jax_debug_nans", False),
+    ("jax_debug_infs", False),
+    ("jax_numpy_dtype_promotion", "standard"),
+)
+"""Settings of JAX and the values with which echelon computes."""
+
+
 def precision(name: Precision) -> contextlib.AbstractContextManager[object]:
-    """Return a context in which JAX computes in `name`, whatever the user's own flags are."""
+    """Return a context in which JAX computes in `name`, whatever the user's own flags are.
+
+    Raises:
+        EchelonError: JAX cannot run in this process.
+    """
+    require_jax()
+    if any(getattr(jax.config, setting) != usual for setting, usual in _USUAL):
+        return _usual(name)
     # A context and no `jax.config.update`: importing or calling echelon changes no global setting.
     return jax.enable_x64(name == "float64")
+
+
+@contextlib.contextmanager
+def _usual(name: Precision) -> Iterator[None]:
+    """Compute without what would end a run that diverges, or refuse sums of two integer types."""
+    promotion = jax.numpy_dtype_promotion("standard")
+    with jax.enable_x64(name == "float64"), jax.debug_nans(False), jax.debug_infs(False), promotion:
+        yield
 
 
 def inlined(function: Callable[..., _R]) -> Callable[..., _R]:

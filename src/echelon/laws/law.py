@@ -17,6 +17,7 @@ from echelon.agents.network.formation_motion import OwnOffset
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.near import Near
 from echelon.agents.references.guide import Guide
+from echelon.core.declared import Declared
 from echelon.core.errors import LawError
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, PyTree, Scalar, State
@@ -84,7 +85,7 @@ class Expected(NamedTuple):
     feedforward: Float[jax.Array, " k"] | None = None
 
 
-class Law(eqx.Module):
+class Law(Declared):
     """A control law: a pure function of what one agent knows.
 
     It is the same for one agent in its own process and for a million in a batch.

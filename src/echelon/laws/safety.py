@@ -7,7 +7,6 @@ differences changes by its last point alone, which the filter holds back (theory
 
 import dataclasses
 import math
-import numbers
 from typing import NamedTuple, final
 
 import jax
@@ -17,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from echelon.agents.models.model import ControlAffine, in_metres
 from echelon.agents.network.near import Near
-from echelon.core.errors import LawError, listing
+from echelon.core.errors import LawError, is_number, listing
 from echelon.core.types import Array
 from echelon.laws.nearest_point import nearest_point
 
@@ -246,8 +245,4 @@ def _check_position(model: ControlAffine) -> None:
 
 
 def _positive(value: object) -> bool:
-    return (
-        isinstance(value, numbers.Real)
-        and not isinstance(value, bool)
-        and 0.0 < float(value) < math.inf
-    )
+    return is_number(value) and 0.0 < float(value) < math.inf

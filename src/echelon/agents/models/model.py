@@ -6,11 +6,9 @@ name replaces.
 """
 
 import abc
-import numbers
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar, cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +16,8 @@ from jax.core import Tracer
 
 from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.heading import Heading
-from echelon.core.errors import ModelError, did_you_mean, listing
+from echelon.core.declared import Declared
+from echelon.core.errors import ModelError, did_you_mean, is_number, listing
 from echelon.core.trace import call_once_traced
 from echelon.core.types import Input, InputMap, Output, State
 
@@ -112,7 +111,7 @@ class Flattened(NamedTuple):
     invert: Callable[[jax.Array], Input]
 
 
-class ControlAffine(eqx.Module):
+class ControlAffine(Declared):
     """One agent, xdot = f(x) + g(x) u with output y = h(x).
 
     Shapes are those of one agent: x (n,), u (m,), f (n,), g (n, m), h (q,). The methods must be
@@ -351,7 +350,7 @@ def check_positive(owner: object, **values: float) -> None:
     """
     # The comparisons are false for NaN, which is rejected too.
     for name, value in values.items():
-        if not (isinstance(value, numbers.Real) and 0.0 < value < float("inf")):
+        if not (is_number(value) and 0.0 < value < float("inf")):
             raise ModelError(
                 f"`{name}` of `{type(owner).__name__}` is {value}, "
                 "and must be a positive finite number."
@@ -365,7 +364,7 @@ def check_not_negative(owner: object, **values: float) -> None:
         ModelError: one is not.
     """
     for name, value in values.items():
-        if not (isinstance(value, numbers.Real) and 0.0 <= value < float("inf")):
+        if not (is_number(value) and 0.0 <= value < float("inf")):
             raise ModelError(
                 f"`{name}` of `{type(owner).__name__}` is {value}, and must be finite "
                 "and not negative."

@@ -1,6 +1,5 @@
 """The checks of a model, run once for each model in `synthesize` and `simulate`."""
 
-import numbers
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ from echelon.agents.models.heading_symmetry import check_heading
 from echelon.agents.models.linearization import AtTrim, at_trim
 from echelon.agents.models.model import ControlAffine, Limits
 from echelon.core.compiled import cached_jit
-from echelon.core.errors import ModelError, did_you_mean, listing
+from echelon.core.errors import ModelError, did_you_mean, is_number, listing
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.trace import check_function, error_summary
@@ -172,7 +171,7 @@ def _check_radius(model: ControlAffine, name: str) -> None:
     radius = model.radius
     if radius is None or not model.position:
         return
-    if isinstance(radius, bool) or not isinstance(radius, numbers.Real) or not 0 < radius < np.inf:
+    if not is_number(radius) or not 0 < radius < np.inf:
         raise ModelError(
             f"`radius` of `{name}` is {radius!r}, and must be None or a positive finite number of "
             "metres."

@@ -6,7 +6,6 @@ the others arrive, depends only on the seed, the message's number, its sender an
 
 import dataclasses
 import math
-import numbers
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, final
 
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from echelon.core.draws import Draw, key_of, uniforms
-from echelon.core.errors import SimulationError, check_kind
+from echelon.core.errors import SimulationError, check_kind, is_number
 from echelon.core.types import Array, PyTree
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 
@@ -188,7 +187,7 @@ def _steps(time: float, step: float) -> int:
 
 
 def _check_number(name: str, value: object, allowed: str, fits: Callable[[float], bool]) -> None:
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+    if not is_number(value):
         raise SimulationError(f"`{name}` of the network is {value!r}, and must be a number.")
     if not (math.isfinite(value) and fits(float(value))):
         raise SimulationError(f"`{name}` of the network is {value}, and must be {allowed}.")

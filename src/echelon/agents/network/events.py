@@ -15,7 +15,7 @@ from echelon.agents.network.edges import name_agents
 from echelon.agents.network.matrices import GraphMatrices
 from echelon.agents.network.reach import nearest_leaders, unreached
 from echelon.agents.network.switching import Schedule
-from echelon.core.errors import GraphError
+from echelon.core.errors import GraphError, is_number
 from echelon.core.types import Array
 
 
@@ -149,7 +149,7 @@ def _alone(graph: GraphMatrices, events: Sequence[Event], horizon: float) -> Ite
 
 
 def _is_time(value: object) -> bool:
-    return isinstance(value, numbers.Real) and 0.0 < float(value) < math.inf
+    return is_number(value) and 0.0 < float(value) < math.inf
 
 
 def _is_agent(value: object, agents: int) -> bool:

@@ -19,7 +19,7 @@ from echelon.agents.network.formation_motion import (
 )
 from echelon.agents.network.graph import Graph
 from echelon.core.compiled import cached_jit
-from echelon.core.errors import FormationError
+from echelon.core.errors import FormationError, is_number
 from echelon.core.numerics import precision
 from echelon.core.types import Array, States
 from echelon.core.words import amount
@@ -166,7 +166,7 @@ class Formation:
         cls, model: ControlAffine, graph: Graph, plan: np.ndarray, spacing: float
     ) -> "Formation":
         """Place a plan (N, 2), in units of the spacing, on the first two position coordinates."""
-        if not 0.0 < spacing < float("inf"):
+        if not (is_number(spacing) and 0.0 < spacing < float("inf")):
             raise FormationError(
                 f"the spacing of a formation is {spacing}, and must be positive and finite."
             )

@@ -2,14 +2,13 @@
 
 import abc
 
-import equinox as eqx
-
 from echelon.agents.models.heading_symmetry import heading_index
 from echelon.agents.models.model import ControlAffine
+from echelon.core.declared import Declared
 from echelon.core.types import Input, Scalar, State
 
 
-class Guide(eqx.Module):
+class Guide(Declared):
     """The motion that a leader follows: a path in space, or one of states and inputs."""
 
     @abc.abstractmethod

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import numbers
 from typing import final
 
 import equinox as eqx
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.errors import SimulationError
+from echelon.core.errors import SimulationError, is_number
 from echelon.core.types import Array, Input
 
 
@@ -39,7 +38,7 @@ class Actuator:
     def __post_init__(self) -> None:
         """Check every number."""
         for name, value in (("lag", self.lag), ("minimum", self.minimum or 0.0)):
-            if not (isinstance(value, numbers.Real) and 0.0 <= float(value) < math.inf):
+            if not (is_number(value) and 0.0 <= float(value) < math.inf):
                 raise SimulationError(
                     f"`{name}` of the actuator is {value}, and must be finite and not negative."
                 )

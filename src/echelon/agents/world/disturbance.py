@@ -16,7 +16,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.draws import Draw, key_of, normals
-from echelon.core.errors import ModelError, SimulationError, did_you_mean, listing
+from echelon.core.errors import ModelError, SimulationError, did_you_mean, is_number, listing
 from echelon.core.numerics import Field
 from echelon.core.types import Array, Input, State
 from echelon.core.words import amount
@@ -63,27 +63,27 @@ class Disturbance:
         for what in ("constant", "rms", "input_rms"):
             least = -math.inf if what == "constant" else 0.0
             for name, value in getattr(self, what).items():
-                if not (math.isfinite(value) and value >= least):
+                if not (is_number(value) and math.isfinite(value) and value >= least):
                     allowed = "finite" if what == "constant" else "finite and not negative"
                     raise SimulationError(
                         f"`{what}` of the disturbance is {value} for `{name}`, "
                         f"and must be {allowed}."
                     )
-        if not 0.0 < self.hold < math.inf:
+        if not (is_number(self.hold) and 0.0 < self.hold < math.inf):
             raise SimulationError(
                 f"`hold` of the disturbance is {self.hold}, and must be a positive finite number "
                 "of seconds."
             )
         for name, value, fits in (
-            ("time", self.time, self.time is None or self.time > 0.0),
-            ("drag", self.drag, self.drag >= 0.0),
+            ("time", self.time, lambda value: value is None or is_number(value) and value > 0.0),
+            ("drag", self.drag, lambda value: is_number(value) and value >= 0.0),
         ):
-            if not fits or not math.isfinite(value or 0.0):
+            if not fits(value) or not math.isfinite(value or 0.0):
                 raise SimulationError(
                     f"`{name}` of the disturbance is {value}, and must be finite and "
                     f"{'positive' if name == 'time' else 'not negative'}."
                 )
-        if not all(map(math.isfinite, self.air)):
+        if not all(is_number(value) and math.isfinite(value) for value in self.air):
             raise SimulationError(
                 f"`air` of the disturbance is {list(self.air)}, and must be finite."
             )

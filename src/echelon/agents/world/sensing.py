@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import numbers
 from collections.abc import Mapping
 from typing import final
 
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.world.estimator import Estimator
 from echelon.core.draws import Draw, key_of, normals
-from echelon.core.errors import SimulationError
+from echelon.core.errors import SimulationError, is_number
 from echelon.core.types import Array, State, States
 from echelon.core.words import Estimation
 
@@ -44,7 +43,7 @@ class Sensing:
     def __post_init__(self) -> None:
         """Check every number."""
         for name, value in (("delay", self.delay), *self.noise.items()):
-            if not (isinstance(value, numbers.Real) and 0.0 <= float(value) < math.inf):
+            if not (is_number(value) and 0.0 <= float(value) < math.inf):
                 what = "`delay`" if name == "delay" else f"`noise` of `{name}`"
                 raise SimulationError(
                     f"{what} of the sensing is {value}, and must be finite and not negative."

@@ -93,6 +93,9 @@ def _main() -> None:
         except Exception as error:
             if isinstance(error, OSError) and error.errno == errno.ENOSPC:
                 _leave(f"the output cannot be written: {error.strerror}.", EchelonError.exit_code)
+            # JAX reads its variables when it is imported, which then fails as a whole.
+            if isinstance(error, ValueError) and "jax" not in sys.modules and "JAX" in str(error):
+                _leave(f"JAX refuses a setting: {error!s:.200}; unset the variable.", 2)
             _leave(note_crash(error), CRASHED)
 
 

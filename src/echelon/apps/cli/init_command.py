@@ -15,4 +15,4 @@ def init(folder: Annotated[Path, typer.Argument(help="A new folder, such as my-s
     print(f"- Written to {folder}: {', '.join(file.name for file in files)}.")
     print(f"- Next: cd {folder} && echelon run scenario.yaml")
     if find_spec("jupyterlab") is None:
-        print("- The notebook needs JupyterLab: pip install 'echelon-formation[notebook]'")
+        print("- The notebook needs JupyterLab: in echelon's clone, pip install '.[notebook]'")

@@ -111,7 +111,7 @@ def read_labelled(file: Path) -> Labelled:
 
     result = Labelled({}, {}, {})
     with h5netcdf.File(file, "r") as stored:
-        for group in _groups(stored):
+        for group in groups_of(stored):
             named = [group.attrs, *(each.attrs for each in group.variables.values())]
             labels = {label for each in named for label in str(each.get("coordinates", "")).split()}
             for name, variable in group.variables.items():
@@ -131,10 +131,11 @@ _OF_FORMAT = ("coordinates", "_FillValue")
 """Attributes of variables that belong to the format of the file."""
 
 
-def _groups(group: "h5netcdf.Group") -> "Iterator[h5netcdf.Group]":
+def groups_of(group: "h5netcdf.Group") -> "Iterator[h5netcdf.Group]":
+    """Yield a group and all groups in it."""
     yield group
     for inner in group.groups.values():
-        yield from _groups(inner)
+        yield from groups_of(inner)
 
 
 def _values(stored: Array) -> Array:

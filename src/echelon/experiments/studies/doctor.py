@@ -16,7 +16,8 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references import Lemniscate
 from echelon.core import disk_cache, numerics
-from echelon.core.errors import ModelError
+from echelon.core.errors import EchelonError, ModelError
+from echelon.core.jax_state import require_jax
 from echelon.core.provenance import versions
 from echelon.core.words import amount
 from echelon.experiments.results.metrics import metrics
@@ -43,16 +44,23 @@ class Check(NamedTuple):
 
 def facts() -> dict[str, str]:
     """Return versions and devices."""
-    devices = ", ".join(
-        f"{device.platform}:{device.id} ({device.device_kind})" for device in jax.devices()
-    )
+    try:
+        require_jax()
+        devices = ", ".join(f"{x.platform}:{x.id} ({x.device_kind})" for x in jax.devices())
+    except EchelonError:
+        devices = "none"
     count = processors()
     native = f"{vectors()}; {amount(count, 'thread')}, as many as processors"
     return {**versions(), "devices": devices, "native code": native}
 
 
 def checks() -> Iterator[Check]:
-    """Run the self-checks one after the other."""
+    """Run the self-checks one after the other; where JAX cannot run, that alone is found."""
+    try:
+        require_jax()
+    except EchelonError as error:
+        yield Check("JAX runs in this process", False, str(error).rstrip("."))
+        return
     for test in CHECKS:
         # Results on disk may come from another machine or an earlier state of this one.
         with numerics.precision("float64"), disk_cache.use_folder(None):

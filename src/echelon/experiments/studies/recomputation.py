@@ -23,6 +23,7 @@ from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.self_contained import without_folders
 from echelon.experiments.scenario.yaml import read_yaml
 from echelon.experiments.studies.check import check
+from echelon.experiments.studies.data_structure import compare_attributes
 from echelon.experiments.studies.design import with_gain
 from echelon.experiments.studies.older_rounding import as_rounded_now
 from echelon.guarantees.promises.promise import promise
@@ -85,6 +86,7 @@ def recompute(
         yield from compare_claims(read_json(claims), experiment, scenario.name)
     if data is not None:
         yield from _compare_data(data, scenario, experiment)
+        yield from compare_attributes(data)
 
 
 def with_gain_of(experiment: Experiment, file: Path) -> Experiment:

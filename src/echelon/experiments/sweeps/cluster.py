@@ -118,6 +118,6 @@ def _distributed() -> Any:
     except ImportError:
         raise MissingExtraError(
             "a sweep on a cluster needs dask.distributed; "
-            "install it with `pip install 'echelon-formation[cluster]'`."
+            "install it with `pip install '.[cluster]'` in echelon's clone."
         ) from None
     return distributed

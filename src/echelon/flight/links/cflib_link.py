@@ -210,7 +210,7 @@ def _connected(uri: str) -> Any:
     except ImportError:
         raise MissingExtraError(
             "a Crazyflie needs cflib, which is not installed; "
-            "`pip install 'echelon-formation[crazyflie]'`."
+            "`pip install '.[crazyflie]'` in echelon's clone."
         ) from None
     if not cflib.crtp.CLASSES:
         cflib.crtp.init_drivers()

@@ -147,7 +147,8 @@ def _connected(address: str) -> Any:
         from pymavlink import mavutil  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MissingExtraError(
-            "PX4 needs pymavlink, which is not installed; `pip install 'echelon-formation[px4]'`."
+            "PX4 needs pymavlink, which is not installed; "
+            "`pip install '.[px4]'` in echelon's clone."
         ) from None
     try:
         wire = mavutil.mavlink_connection(address, dialect="common")

@@ -131,7 +131,7 @@ def _parquet(run: "Result") -> bytes:
     except ImportError as error:
         raise MissingExtraError(
             "Parquet needs pyarrow, which is not installed; "
-            "`pip install 'echelon-formation[parquet]'`, or use `csv`."
+            "`pip install '.[parquet]'` in echelon's clone, or use `csv`."
         ) from error
     return content.getvalue()
 

@@ -104,7 +104,7 @@ def _computed(
     if not repeat:
         yield unchecked(OBSERVATIONS, "", "the run was not computed again")
     elif any(each.verdict == "refused" for each in findings):
-        yield unchecked(OBSERVATIONS, "", "the scenario is not that of the run")
+        yield unchecked(OBSERVATIONS, "", "other values of the run are refused")
     else:
         begin("computing the run again")
         yield from compare_run(files, source, experiment)

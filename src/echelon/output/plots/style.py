@@ -1,5 +1,9 @@
 """The style of figures, and their canvases, axes and lines; without pyplot and its state."""
 
+import contextlib
+import importlib
+import os
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -81,8 +85,7 @@ def style(page: FigureSize = SCREEN, ax: "Axes | None" = None) -> Iterator[None]
 
     With axes `ax`, figures are drawn into these and not into figures of their own.
     """
-    import matplotlib
-
+    matplotlib = _matplotlib()
     large, small = ("font.size", "axes.labelsize"), ("xtick", "ytick")
     letters: dict[Any, Any] = dict.fromkeys(large, page.letters)
     letters |= {f"{axis}.labelsize": page.letters - 1.0 for axis in small}
@@ -94,6 +97,24 @@ def style(page: FigureSize = SCREEN, ax: "Axes | None" = None) -> Iterator[None]
     finally:
         _page.reset(token)
         _target.reset(into)
+
+
+def _matplotlib() -> Any:
+    """Return matplotlib, whatever `MPLBACKEND` says: figures are files and need no backend.
+
+    Jupyter sets the variable for all its child processes, whose Python may lack that backend.
+    """
+    if "matplotlib" in sys.modules or not os.environ.get("MPLBACKEND"):
+        return importlib.import_module("matplotlib")
+    asked = os.environ.pop("MPLBACKEND")
+    try:
+        matplotlib = importlib.import_module("matplotlib")
+    finally:
+        os.environ["MPLBACKEND"] = asked
+    # As matplotlib does itself when it is imported, but that would then fail.
+    with contextlib.suppress(ValueError):
+        matplotlib.rcParams["backend"] = asked
+    return matplotlib
 
 
 def page() -> FigureSize:

@@ -112,7 +112,7 @@ def encoder() -> str:
     except (ImportError, RuntimeError) as error:
         raise MissingExtraError(
             "a video needs ffmpeg, and none is on the PATH; install it, or "
-            "`pip install 'echelon-formation[video]'`."
+            "`pip install '.[video]'` in echelon's clone."
         ) from error
 
 

@@ -29,7 +29,7 @@ def llvm() -> ModuleType:
     except ImportError:
         raise MissingExtraError(
             "the native engine needs llvmlite; "
-            "install it with `pip install 'echelon-formation[fast]'`."
+            "install it with `pip install '.[fast]'` in echelon's clone."
         ) from None
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
@@ -55,7 +55,7 @@ _WIDTHS = {"avx512f": 512, "avx2": 256, "avx": 256}
 def vectors() -> str:
     """Return the processor and the vectors that native code uses here, in words."""
     if not is_installed():
-        return "none; install `echelon-formation[fast]`"
+        return "none; `pip install '.[fast]'` in echelon's clone"
     has = set(features().split(","))
     width = next((bits for name, bits in _WIDTHS.items() if f"+{name}" in has), 128)
     fused = "with" if has & {"+fma", "+neon", "+fp-armv8"} else "without"

@@ -36,7 +36,7 @@ def casadi() -> ModuleType:
     except ImportError:
         raise MissingExtraError(
             "optimal control needs casadi; "
-            "install it with `pip install 'echelon-formation[optimal]'`."
+            "install it with `pip install '.[optimal]'` in echelon's clone."
         ) from None
     return casadi
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from echelon.core.errors import PlanError, listing
+from echelon.core.errors import PlanError, is_number, listing
 from echelon.core.types import Array
 
 
@@ -17,7 +17,7 @@ def check_seconds(name: str, value: float) -> None:
         PlanError: it is not.
     """
     # By its type first: a comparison with a word would raise an error of Python's own.
-    if not (isinstance(value, numbers.Real) and 0.0 < value < math.inf):
+    if not (is_number(value) and 0.0 < value < math.inf):
         raise PlanError(f"`{name}` is {value}, and must be a positive finite number of seconds.")
 
 

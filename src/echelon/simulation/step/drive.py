@@ -7,7 +7,6 @@ import abc
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.sensing import Sensors
 from echelon.agents.world.world import World
+from echelon.core.declared import Declared
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.core.words import Feedforward, Frame
@@ -175,7 +175,7 @@ class Information(NamedTuple):
     follower: tuple[str, ...]
 
 
-class Drive(eqx.Module):
+class Drive(Declared):
     """What gives the agents their inputs: laws, plans made before, or a receding horizon."""
 
     @property

@@ -8,7 +8,6 @@ left.
 
 import dataclasses
 import math
-import numbers
 from collections.abc import Sequence
 from typing import NamedTuple, final
 
@@ -19,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from echelon.agents.network.channel import Network
 from echelon.agents.network.graph import Graph
-from echelon.core.errors import SimulationError
+from echelon.core.errors import SimulationError, is_number
 from echelon.core.types import Array
 
 _NO_HEIR = -1
@@ -54,7 +53,7 @@ class Leadership:
             raise SimulationError("`heirs` is empty, and must name at least one follower.")
         for name in ("timeout", "waits"):
             value = getattr(self, name)
-            fine = isinstance(value, numbers.Real) and 0.0 < float(value) < math.inf
+            fine = is_number(value) and 0.0 < float(value) < math.inf
             if not (fine or (name == "waits" and value is None)):
                 raise SimulationError(f"`{name}` is {value}, and must be positive and finite.")
 

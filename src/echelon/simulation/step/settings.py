@@ -5,7 +5,9 @@ import math
 import numbers
 from typing import Any, NamedTuple, TypeVar
 
-from echelon.core.errors import SimulationError, did_you_mean, listing
+import numpy as np
+
+from echelon.core.errors import SimulationError, did_you_mean, is_number, listing
 from echelon.core.limits import MOST_STEPS, horizon_fault
 from echelon.core.numerics import INTEGRATORS, Precision
 from echelon.core.words import ENGINES
@@ -14,12 +16,16 @@ _T = TypeVar("_T", bound="Settings")
 
 
 def _checked(cls: type[_T]) -> type[_T]:
-    """Return a class of tuples whose constructor checks the numbers; `_replace` does not."""
+    """Return a class of tuples whose constructor checks the numbers; `_replace` does not.
+
+    It makes plain numbers of integers and of NumPy's: JAX has no derivative by an integer.
+    """
     create = cls.__new__
 
     @functools.wraps(create)
     def new(own: type[_T], *arguments: Any, **named: Any) -> _T:
         settings = create(own, *arguments, **named)
+        settings = create(own, *(_plain(field, getattr(settings, field)) for field in own._fields))
         settings.check()
         return settings
 
@@ -93,7 +99,7 @@ class Settings(NamedTuple):
         """
         for name in ("horizon", "dt"):
             value = getattr(self, name)
-            if not (isinstance(value, numbers.Real) and 0.0 < float(value) < math.inf):
+            if not (is_number(value) and 0.0 < float(value) < math.inf):
                 raise SimulationError(
                     f"`{name}` is {_shown(value)}, and must be a positive finite number of seconds."
                 )
@@ -104,7 +110,7 @@ class Settings(NamedTuple):
         if fault is not None:
             raise SimulationError(f"`horizon` is {self.horizon} s, and {fault}.")
         window = self.window
-        if not 0.0 < window <= self.horizon:
+        if not (is_number(window) and 0.0 < window <= self.horizon):
             raise SimulationError(
                 f"`steady_window` is {window} s, and must be above 0 and at most the horizon, "
                 f"{self.horizon} s."
@@ -128,12 +134,22 @@ class Settings(NamedTuple):
         ):
             value = getattr(self, name)
             # By its type: neither a seed nor a count of list entries may be 2.0, or NaN.
-            whole = isinstance(value, numbers.Integral)
+            whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
             if not whole or not least <= int(value) <= most:
                 end = f"to {most}" if whole and int(value) > most else "on"
                 raise SimulationError(
                     f"`{name}` is {_shown(value)}, and must be a whole number from {least} {end}."
                 )
+
+
+def _plain(name: str, value: Any) -> Any:
+    """Return a number as a plain float or int of Python, and any other value as it is."""
+    if name in ("horizon", "dt", "steady_window") and is_number(value):
+        try:
+            return float(value)
+        except OverflowError:  # a whole number beyond every float
+            return math.inf
+    return int(value) if isinstance(value, np.integer) else value
 
 
 def _shown(value: object) -> str:

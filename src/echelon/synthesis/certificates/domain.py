@@ -1,6 +1,5 @@
 """A domain: the box of states and inputs on which a certificate holds."""
 
-import numbers
 from collections.abc import Mapping
 from typing import TypeAlias, final
 
@@ -9,7 +8,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.straight_range import straight_range
 from echelon.core.digits import at_least, at_most
-from echelon.core.errors import GainError, did_you_mean, listing
+from echelon.core.errors import GainError, did_you_mean, is_number, listing
 from echelon.core.types import Array
 
 Bound: TypeAlias = float | tuple[float, float]
@@ -125,9 +124,9 @@ class Domain:
 
 
 def _interval(name: str, bound: Bound) -> tuple[float, float]:
-    pair = (-bound, bound) if isinstance(bound, (int, float)) else bound
+    pair = (-bound, bound) if is_number(bound) else bound
     ends = np.asarray(pair, object)
-    if ends.shape != (2,) or not all(isinstance(end, numbers.Real) for end in ends):
+    if ends.shape != (2,) or not all(is_number(end) for end in ends):
         raise GainError(
             f"the domain of `{name}` is {bound}, and must be a half-width or a pair "
             "`[lower, upper]`."

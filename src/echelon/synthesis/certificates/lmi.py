@@ -262,7 +262,7 @@ def _cvxpy() -> Any:
     except ImportError:
         raise MissingExtraError(
             "a metric for a polytope of Jacobians needs cvxpy and clarabel; "
-            "install them with `pip install 'echelon-formation[certify]'`."
+            "install them with `pip install '.[certify]'` in echelon's clone."
         ) from None
     return cvxpy
 

@@ -24,6 +24,7 @@ from echelon.agents.models.model_check import check_model
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.reach import lost_at_times
 from echelon.agents.network.spectrum import Spectrum
+from echelon.core.declared import Declared
 from echelon.core.errors import GainError, GraphError, check_kind
 from echelon.core.linear import check_definite
 from echelon.core.numerics import precision
@@ -153,7 +154,7 @@ class Feedback(NamedTuple):
     inner: Array | None = None
 
 
-class Method(eqx.Module):
+class Method(Declared):
     """A synthesis method; its arguments are its keys in a scenario.
 
     Args:
