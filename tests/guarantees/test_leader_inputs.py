@@ -33,14 +33,16 @@ def parts_of(domain, gain_of, leader):
     return ech.Parts(model, LINE, ech.Formation(np.zeros((4, 2))), drive)
 
 
-class Pushed(ech.Law):
-    """A leader with an input of its own, whatever it sees."""
-
-    push: float = 0.9
-
-    def update(self, model, view, memory):
-        swing = self.push * jnp.stack([jnp.sin(3.0 * view.t), jnp.cos(3.0 * view.t)])
-        return swing, memory
+def pushed(gain, push):
+    """A leader that follows states of its own, under inputs of a size."""
+    times = np.linspace(0.0, 4.0, 401)
+    inputs = push * np.stack([np.sin(3.0 * times), np.cos(3.0 * times)], axis=1)
+    states = [np.zeros(2)]
+    for u in inputs[:-1]:
+        x = states[-1]
+        states.append(x + 0.01 * (-0.1 * x + (1.0 + 0.5 * x) * u))
+    path = ech.references.StatePath(times, states, inputs)
+    return ech.laws.Tracking(path, gain)
 
 
 @pytest.mark.parametrize("push", [0.9, 0.3])
@@ -49,7 +51,7 @@ def test_small_errors_are_guaranteed_only_with_inputs_that_the_hull_covers(push)
     named = {"x": 0.5, "y": 0.5}
 
     def promise(domain):
-        parts = parts_of(domain, ech.gains.RobustLQR, lambda gain: Pushed(push))
+        parts = parts_of(domain, ech.gains.RobustLQR, lambda gain: pushed(gain, push))
         return ech.promise(parts, chosen)
 
     bare = promise(named)

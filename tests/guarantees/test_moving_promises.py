@@ -67,7 +67,7 @@ def test_bounds_of_offsets_hold_at_all_times_and_are_not_far_above():
 
 def test_a_motion_is_guaranteed_with_what_it_asks_of_the_chart():
     still, moving = (promise(parts(x), SETTINGS) for x in ([], CHANGES))
-    assert moving.promised and moving.rate == still.rate
+    assert moving.claimed and moving.rate == still.rate
     assert "offsets may change as they do" in moving.sentence()
     assert "offsets" in moving.anywhere() and "offsets" not in still.anywhere()
     # Offsets that rise and fall use up a part of the thrust.

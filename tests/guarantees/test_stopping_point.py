@@ -543,7 +543,7 @@ def test_graphs_that_take_turns_are_there_in_time_or_are_told_none(told):
 def test_a_vehicle_is_promised_as_far_as_its_thrust_reaches():
     scenario = ech.load_scenario("paper-global")
     found = promise(*ech.build(scenario))
-    assert found.promised and found.kind is Kind.PROOF and found.theorem is Theorem.T5
+    assert found.claimed and found.kind is Kind.PROOF and found.theorem is Theorem.T5
     assert found.tube.left == pytest.approx(3.770, abs=1e-3)
     assert found.tube.steepest == pytest.approx(5.6, abs=0.05)
     assert found.tube.gains == pytest.approx((1.0, 2.4159, 12.3925, 221.2039), rel=1e-4)
@@ -679,7 +679,7 @@ def test_parents_add_their_speeds():
         drive = ech.Laws(StoppingLeader(reference=ech.references.Hover()), law)
         formation = ech.Formation.from_offsets(QUADROTOR, chain, offsets)
         found = promised(ech.Parts(QUADROTOR, chain, formation, drive))
-        shown[speed] = found.promised, found.sentence()
+        shown[speed] = found.claimed, found.sentence()
     assert shown[0.8][0] and not shown[2.5][0]
     # 9.81 / 2.4159 / 3 links.
     assert "below 1.35" in shown[2.5][1]

@@ -229,7 +229,7 @@ class Recording(FrameNumbers):
         start = float(np.einsum("ia,ab,ib->", first, self.metric, first))
         block = np.linalg.inv(self.metric)[np.ix_(self.measured, self.measured)]
         largest = float(np.linalg.eigvalsh(block)[-1])
-        return np.sqrt(start * largest) * np.exp(-rate * self.times)
+        return np.sqrt(start * largest) * np.exp(-(rate or 0.0) * self.times)
 
     @property
     def loads(self) -> Float[np.ndarray, "T N k"] | None:

@@ -79,7 +79,8 @@ class LinearLoop(NamedTuple):
 
         Of an interval of eigenvalues it is at least 1 unless all of them are shown to decay.
         """
-        F, G = discretize(*self.open, *(settings.held[:1] if exact else settings.held))
+        dt, integrator, substeps = settings.held
+        F, G = discretize(*self.open, dt, None if exact else integrator, substeps)
         radius = float(spectral_radii(F - G @ self.gains).max())
         if not self.closed.between or not radius < 1.0:
             return radius

@@ -16,7 +16,6 @@ from echelon.agents.models.chains import flat_output
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.flatness import follow_at
 from echelon.agents.references.reference import Reference
-from echelon.agents.world.disturbance import disturbed
 from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_least
 from echelon.core.identity import process_key
@@ -79,7 +78,8 @@ def drift_line(run: StoppingRun) -> Statement | None:
         senders = graph.leaders if parents is None else (int(parents[k]),)
         against = [_Lasting.none(law)] if law is run.leader else [lasting[j] for j in senders]
         for other in against:
-            line = _drifts(k, law, lasting[k].less(other))
+            whose = "the leader's" if law is run.leader else "the followers'"
+            line = _drifts(k, law, whose, lasting[k].less(other))
             if line is not None:
                 return line
     return None
@@ -119,7 +119,7 @@ def _lasting(run: StoppingRun, law: FlatLaw, plant: ControlAffine) -> _Lasting |
     return _Lasting(current, np.where(inner, law.ready.weights[1:2].sum(axis=0) * force, 0.0))
 
 
-def _drifts(agent: int, law: FlatLaw, lasting: _Lasting) -> Statement | None:
+def _drifts(agent: int, law: FlatLaw, whose: str, lasting: _Lasting) -> Statement | None:
     """Return that an agent may drift away, by what a current and a push demand of agreement."""
     chains = law.ready.chains
     for k, (name, degree) in enumerate(zip(chains.outputs, chains.degrees, strict=True)):
@@ -133,7 +133,7 @@ def _drifts(agent: int, law: FlatLaw, lasting: _Lasting) -> Statement | None:
             f"that of agent {agent} is {about(s)}, and it can drift away for ever"
         )
         helps = "" if degree > 1 and abs(current) >= s else "set `observer: true`, or "
-        remedy = f"{helps}raise its `speed` above {at_least(asked)}"
+        remedy = f"{helps}raise {whose} `speed` above {at_least(asked)}"
         return _fails(text, remedy, asked, f"{at_least(asked)}")
     return None
 
@@ -202,7 +202,8 @@ class _Driven(NamedTuple):
 
     def velocity(self, x: State, u: jax.Array) -> State:
         """Return the rate of the state."""
-        return disturbed(self.plant, self.push, None, self.air)(x, u)
+        drag, wind = self.air
+        return self.plant.velocity(x, u) + self.push + drag * (wind - x)
 
     def moved(self, z: jax.Array) -> jax.Array:
         """Return the rate of z."""

@@ -270,7 +270,9 @@ def _rate_in_words(promise: Mapping[str, Any]) -> str:
         return ""
     if slowest is None or abs(rate + slowest) <= 1e-6 * rate:
         return f"The rate of {at_most(rate)} 1/s is that of the slowest mode."
-    holding = {x["statement"] for x in promise["hypotheses"] if x["verdict"] == str(Verdict.HOLDS)}
+    holding = {
+        x["statement"] for x in promise.get("hypotheses", ()) if x["verdict"] == str(Verdict.HOLDS)
+    }
     what = " and ".join(text for name, text in _WIDER.items() if name.value in holding)
     what = what or "inputs that are held over a step"
     return (
