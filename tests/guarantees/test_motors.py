@@ -190,6 +190,7 @@ def test_motors_that_suffice_are_promised_and_verified(hovering, tmp_path):
     _, _, found = hovering
     load, line = found.tube.motor_load, found.hypotheses[Hypothesis.LIMITS]
     assert line.verdict is Verdict.HOLDS and line.kind is Kind.PROOF
+    assert found.promised and not found.conditions
     assert 0.0 < load.least < QUADROTOR.mass * QUADROTOR.gravity / 4.0 < load.largest < 0.15975
     assert "thrust stays between" in found.sentence() and load.alone.rest
     told = found.as_mapping()

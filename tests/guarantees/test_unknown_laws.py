@@ -226,6 +226,7 @@ simulation: {horizon: 2.0, dt: 0.01}
 """
 
 
+@pytest.mark.slow
 def test_check_run_sweep_verify_and_page_agree(echelon, tmp_path):
     (tmp_path / "anti.py").write_text(FILE)
     (tmp_path / "anti.yaml").write_text(SCENARIO)

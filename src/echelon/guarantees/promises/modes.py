@@ -132,7 +132,9 @@ def _decaying(case: Case) -> Statement:
     if loop.every:
         return holds(name, _LINEAR, text, *number)
     text = f"not every mode decays, {text}"
-    remedy = "another gain, coupling or model is needed"
+    edge = loop.certificate.edge
+    remedy = "another gain, coupling or model"
+    remedy = remedy if edge is None else f"a coupling of {at_least(edge, 4)} or more"
     reason = "the disagreement does not decay"
     return fails(name, _LINEAR, text, *number, remedy=remedy, reason=reason)
 
@@ -250,5 +252,5 @@ def _step_line(
     if 0.0 < longest < dt:
         text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
         remedy = f"shorten `simulation.dt` below {at_most(longest)} s"
-    remedy = remedy or "use another gain; no shorter `simulation.dt` is known to suffice"
+    remedy = remedy or "another gain; no shorter `simulation.dt` is known to suffice"
     return fails(Hypothesis.SAMPLING, _LINEAR, text, *number, remedy=remedy, reason=reason)

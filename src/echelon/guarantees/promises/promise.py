@@ -275,10 +275,14 @@ class Promise(abc.ABC):
         return f"{conditional(self.conditions)} {self.guarantee()}"
 
     def _against(self) -> str:
-        """Return all that stands against a guarantee."""
+        """Return all that stands against a guarantee, and what would help."""
+        against = (line for line in self.hypotheses.values() if line.fails and line.reason)
+        remedies = "; ".join(dict.fromkeys(x.remedy for x in against))
         until = "" if self.prefix is None else f" {self.prefix.sentence()}"
         which = "" if self.prefix is None else f" from {at_most(self.prefix.at, 6)} s on"
-        text = f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}."
+        text = (
+            f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. What would help: {remedies}."
+        )
         return text + until
 
     def as_mapping(self) -> dict[str, Any]:

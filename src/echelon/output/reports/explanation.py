@@ -136,7 +136,7 @@ def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
     """Yield the guarantee, whether it covers this run, and the information that the law uses."""
     yield guarantee.sentence()
     slowest, coupling = guarantee.slowest, guarantee.coupling
-    if guarantee.governed and slowest is not None:
+    if result.drive.gain is not None and guarantee.governed and slowest is not None:
         mode = "the slowest mode decays" if slowest < 0.0 else "a mode grows"
         text = f"{mode} at {at_most(abs(slowest))} 1/s (coupling {coupling:.4g})"
         if guarantee.edge is not None:
