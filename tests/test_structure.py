@@ -199,11 +199,6 @@ def test_folders_are_layers_and_packages():
     assert max(len(path.relative_to(PACKAGE).parts) for path in FILES) <= 3
 
 
-@pytest.mark.parametrize("module", PATHS)
-def test_files_are_short(module):
-    assert len(PATHS[module].read_text("utf-8").splitlines()) <= 400
-
-
 def test_the_names_of_files_and_classes_are_unique():
     stems = Counter(path.stem for path in FILES if not path.stem.startswith("__"))
     classes = Counter(

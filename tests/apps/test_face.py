@@ -462,12 +462,10 @@ def test_a_result_is_a_table_in_a_notebook_with_its_pictures():
     assert repr(made_up(states, model, graph)).startswith("Result(3 agents, 2 frames, ")
 
 
-def test_of_a_flock_a_notebook_shows_the_best_the_median_and_the_worst_and_why_it_failed():
+def test_of_a_flock_a_notebook_shows_the_best_the_median_and_the_worst():
     model, graph = ech.models.SingleIntegrator(dimension=1), ech.Graph.path(30)
     away = np.arange(30.0)[:, None]
     page = made_up(np.stack([away, 3.0 * away]), model, graph)._repr_html_()
     assert page.count("<tr>") == 5 and "<td>worst (follower 29)</td><td>29</td><td>87</td>" in page
     assert "<td>best (follower 1)</td>" in page and "<td>median (follower 15)</td>" in page
-    assert (
-        "<li>" in page and "<li>" not in made_up(np.stack([away, away]), model, graph)._repr_html_()
-    )
+    assert "<li>" not in made_up(np.stack([away, away]), model, graph)._repr_html_()

@@ -436,7 +436,7 @@ def test_code_is_executed_for_a_verification_only_where_it_is_named(echelon, her
     (here / "own.yaml").write_text(text.replace("position: 1.0", "angle: 0.1"))
     assert echelon("run", "own.yaml", "--no-figures", "--out", "own")[0] == 0
     code, out, err = echelon("verify", "own")
-    assert (code, err) == (5, "") and "promise.promised; " in out
+    assert (code, err) == (5, "") and "promise.verdict; " in out
     assert out.splitlines()[-1].endswith("echelon verify own --scenario own")
     assert echelon("verify", "own", "--scenario", "own")[0] == 0
     assert echelon("verify", "own", "--scenario", "own.yaml")[0] == 0

@@ -814,7 +814,10 @@ def test_the_badge_says_which_rate_it_has_and_is_not_green_over_a_run_that_was_l
     told = {"promised": True, "sentence": "Promised.", "theorem": None, "kind": "linearization"}
     slow = promise_badge(told | {"rate": 0.5, "slowest_mode": -0.5})
     assert slow["whole"].endswith("0.5 1/s is that of the slowest mode.")
-    turns = promise_badge(told | {"rate": 0.452, "slowest_mode": -1.32})
+    both = {"rate": 0.452, "slowest_mode": -1.32}
+    assert "holds for inputs that are held over a step" in promise_badge(told | both)["whole"]
+    lines = [{"statement": "graphs that take turns", "verdict": "holds"}]
+    turns = promise_badge(told | both | {"hypotheses": lines})
     assert "0.452 1/s holds for all graphs" in turns["whole"]
     for ideal, state, short in (
         (True, "holds", "guaranteed: agents stay apart, T10"),

@@ -105,7 +105,7 @@ def test_a_formation_says_its_size():
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"horizon": -1}, "`horizon` is -1, and must be a positive finite number"),
+        ({"horizon": -1}, "`horizon` is -1.0, and must be a positive finite number"),
         ({"dt": 0.3}, "must be a whole number of steps"),
         ({"seed": -1}, "`seed` is -1"),
         ({"engine": "jx"}, "did you mean `jax`"),

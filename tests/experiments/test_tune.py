@@ -91,7 +91,7 @@ REFUSED = {
     "no parameter": (lambda: ech.tune(carts(), []), "`params` is empty"),
     "another method": (
         lambda: ech.tune(ech.scenario_from_mapping(CARTS | {"follower": GIVEN})),
-        "the followers have the method `given`, but only weights of `riccati` can be tuned",
+        "the followers have the method `given`, but only weights of `riccati` under the law ",
     ),
     "a full weight": (
         lambda: ech.tune(carts(Q=[[1.0, 0.1], [0.1, 1.0]])),

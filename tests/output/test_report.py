@@ -34,7 +34,7 @@ def test_the_literal_law_grows_and_no_cause_is_guessed(literal):
     text = " ".join(ech.report(literal).split())
     assert "The formation error grows: 1.16 m at the start, " in text
     assert "Nothing is guaranteed: " in text and "the law leaves out the trim input" in text
-    assert "Warning" not in text and "Cause" not in text and "would help" not in text
+    assert "Warning" not in text and "Cause" not in text
 
 
 @pytest.mark.study
@@ -164,8 +164,3 @@ def test_an_agent_that_nobody_sent_anything_is_named_with_the_times():
 
 def test_a_short_silence_without_harm_and_an_agent_that_is_heard_are_not_told():
     assert not cut_off(0.05)
-
-
-def test_a_mode_that_does_not_decay_is_a_cause_in_words():
-    told = cut_off(4.0)
-    assert any("not every mode decays, over " in " ".join(cause.split()) for cause in told)

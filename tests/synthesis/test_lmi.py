@@ -386,7 +386,7 @@ def test_a_missing_solver_is_told_with_the_line_that_adds_it(monkeypatch):
         monotone(pendulum(1.0, 1.0, 0.5))
     assert str(caught.value) == (
         "a metric for a polytope of Jacobians needs cvxpy and clarabel; "
-        "install them with `pip install '.[certify]'`."
+        "install them with `pip install '.[certify]'` in echelon's clone."
     )
     # What eigenvalues forbid is told without it.
     with pytest.raises(GainError, match="Jordan block"):

@@ -218,7 +218,9 @@ class Recording(FrameNumbers):
         verdicts = {x["statement"]: x["verdict"] for x in promise["hypotheses"]}
         # While no limit acts, which is looked at here, a conditional claim holds as well.
         rate = promise["rate"]
-        proved = promise["theorem"] == "T1" and certified is not None and rate is not None
+        claimed = promise["promised"] or bool(promise.get("conditions"))
+        proved = claimed and promise["theorem"] == "T1" and certified is not None
+        proved = proved and rate is not None
         covered = verdicts.get(Hypothesis.STARTS.value) == str(Verdict.HOLDS)
         if not (proved and covered) or self.metric is None:
             return None

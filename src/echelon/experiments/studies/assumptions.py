@@ -104,6 +104,8 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
 def _leader_line(promise: Promise) -> Statement:
     """Assumption 4: the leader tracks its reference, by linearization."""
     name, slow = Topic.LEADER_TRACKING, promise.leader_mode
+    if slow is None and not promise.governed and not promise.paper_lines:
+        return unneeded(name, _PROOF, "no modes are computed beside an unknown law")
     if slow is None:
         return unneeded(name, _PROOF, "there is no reference")
     if promise.hypotheses[Hypothesis.SMOOTH].fails:

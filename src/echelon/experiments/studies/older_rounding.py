@@ -9,6 +9,7 @@ from echelon.core.digits import about, at_least, at_most
 _NUMBER = re.compile(r"((?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]\d+)?)")
 _FACTORS = (1.0, -1.0, 1e3, 100.0, math.degrees(1.0))
 """Of numbers in texts: rates of modes, ms, percent, degrees."""
+_LATER = ("verdict", "conditions")
 _DIGITS = range(3, 7)
 """Of numbers in texts. With fewer, a count could pass for a rounded number."""
 
@@ -39,7 +40,10 @@ def _numbers(value: object) -> Iterator[float]:
 
 def _renewed(stored: object, value: object, pairs: set[tuple[str, str]]) -> object:
     if isinstance(stored, dict) and isinstance(value, dict):
-        return {key: _renewed(x, value.get(key), pairs) for key, x in stored.items()}
+        renewed = {key: _renewed(x, value.get(key), pairs) for key, x in stored.items()}
+        # What earlier formats did not state.
+        later = {key: value[key] for key in _LATER if key in value and "promised" in stored}
+        return later | renewed
     if isinstance(stored, list) and isinstance(value, list) and len(stored) == len(value):
         return [_renewed(*both, pairs) for both in zip(stored, value, strict=True)]
     if not (isinstance(stored, str) and isinstance(value, str)):

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterator
 
 from echelon.agents.models.model_check import is_limited
+from echelon.core.identity import digest
 from echelon.core.statement import Hypothesis, Statement, fails
 from echelon.core.words import Kind
 from echelon.simulation.engine.parts import Parts
@@ -21,6 +22,17 @@ def limits_act(parts: Parts, settings: Settings) -> bool:
         is_limited(one)
         for one in (parts.model, world.plant_for(parts.model), *world.plants.values())
     )
+
+
+def other_limits(parts: Parts) -> bool:
+    """Tell whether an agent that moves has other limits than the model, or motors with a minimum."""
+    world, model = parts.world, parts.model
+    actuator = world.actuator
+    if actuator is not None and (actuator.levels or actuator.minimum is not None):
+        return True
+    plants = {id(x): x for x in (world.plant_for(model), *world.plants.values())}
+    own = type(model).limit, digest(model.input_limits)
+    return any((type(x).limit, digest(x.input_limits)) != own for x in plants.values())
 
 
 def limits_line(parts: Parts, settings: Settings) -> Iterator[Statement]:

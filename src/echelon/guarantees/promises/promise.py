@@ -202,8 +202,8 @@ class Promise(abc.ABC):
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """What the claim is conditional on: what only the run can show."""
-        lines = self.hypotheses.values()
+        """What the claim is conditional on: what only the run can show; nothing without a claim."""
+        lines = self.hypotheses.values() if self.claimed else ()
         return tuple(dict.fromkeys(x.condition for x in lines if x.fails and x.condition))
 
     @property
@@ -279,7 +279,10 @@ class Promise(abc.ABC):
         against = (line for line in self.hypotheses.values() if line.fails and line.reason)
         remedies = "; ".join(dict.fromkeys(x.remedy for x in against))
         until = "" if self.prefix is None else f" {self.prefix.sentence()}"
-        which = "" if self.prefix is None else f" from {at_most(self.prefix.at, 6)} s on"
+        before = self.prefix is not None and self.prefix.promise.promised
+        which = (
+            "" if self.prefix is None or not before else f" from {at_most(self.prefix.at, 6)} s on"
+        )
         text = (
             f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. What would help: {remedies}."
         )

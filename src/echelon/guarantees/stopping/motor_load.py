@@ -17,7 +17,7 @@ from echelon.core.rational import bisect, float_above, float_below, norm_above
 from echelon.core.statement import Hypothesis, Statement, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind
-from echelon.guarantees.promises.limits_line import left_to_run, limits_act
+from echelon.guarantees.promises.limits_line import left_to_run, limits_act, other_limits
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.declared_borders import airframe_fault
 from echelon.guarantees.stopping.motor_bounds import (
@@ -161,6 +161,8 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
     if frame is None:
         free = not limits_act(run.parts, run.settings)
         return None, unneeded(Hypothesis.LIMITS, _PROOF, reason) if free else left_to_run(reason)
+    if other_limits(run.parts):
+        return None, left_to_run("the motors of an agent have other limits than the model's")
     kind = Kind.SAMPLES if is_by_user(run.parts.model, "airframe") else Kind.PROOF
     case = _MotorCase.of(run, frame)
     motors, starts = _from(case)

@@ -66,7 +66,9 @@ def beyond(saturated: float, guarantee: Promise) -> Iterator[str]:
 
     `saturated` is the largest fraction of steps in which an agent's input was at a limit.
     """
-    if not guarantee.promised:
+    # With a theorem, `coverage` says more.
+    acts = guarantee.without or saturated
+    if not guarantee.promised or guarantee.theorem is not None or not acts:
         return
     text = "The guarantee does not cover this run"
     text += f": {guarantee.without}" if guarantee.without else ""

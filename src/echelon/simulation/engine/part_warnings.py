@@ -53,7 +53,8 @@ def coarse(model: ControlAffine, states: Array, settings: Settings) -> Iterator[
     if settings.precision != "float32" or not model.position:
         return
     farthest = np.abs(states[:, list(model.position_indices())]).max()
-    step = float(np.spacing(np.float32(farthest)))
+    with np.errstate(over="ignore"):
+        step = float(np.spacing(np.float32(farthest)))
     if _COARSE < step < np.inf:
         yield (
             f"single precision resolves {step:.2g} m at the coordinate {farthest:.3g} m; "
