@@ -16,8 +16,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.named_class import resolve
 

@@ -506,8 +506,8 @@ def test_plans_are_promised_nothing():
     goals = ech.Formation(np.zeros((4, 4)))
     parts = ech.Parts(model, PATH, goals, ech.optimal.Plans(ech.references.Circle()))
     assert ech.promise(parts, settings()).sentence() == (
-        "Nothing is guaranteed: no theorem covers `Plans`. What would help: use laws that a theorem "
-        "covers."
+        "Nothing is guaranteed: no theorem covers `Plans`. What would help: use laws that a "
+        "theorem covers."
     )
 
 

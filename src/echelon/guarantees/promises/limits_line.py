@@ -25,7 +25,7 @@ def limits_act(parts: Parts, settings: Settings) -> bool:
 
 
 def other_limits(parts: Parts) -> bool:
-    """Tell whether an agent that moves has other limits than the model, or motors with a minimum."""
+    """Tell whether an agent has other limits than the model, or motors with a minimum."""
     world, model = parts.world, parts.model
     actuator = world.actuator
     if actuator is not None and (actuator.levels or actuator.minimum is not None):

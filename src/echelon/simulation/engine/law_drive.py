@@ -261,12 +261,11 @@ class Laws(Drive):
         """Return the warnings of both laws, and of what they cannot follow or do not hear."""
         warnings = self.leader.warnings(model, graph) + self.follower.warnings(model, graph)
         lost = lost_at_times(graph) if graph.events and self.lags else ""
-        if lost:
-            lost = f"{lost}, and receives nothing then." if self.unknown else lost
+        if lost and self.unknown:
+            warnings += (f"{lost}, and receives nothing then.",)
+        elif lost:
             warnings += (
-                lost
-                if self.unknown
-                else f"{lost}, in which the law `{type(self.follower).__name__}` does not correct their "
+                f"{lost}, in which the law `{type(self.follower).__name__}` does not correct their "
                 "errors, so that the run may diverge; add links, or use `stopping-point`.",
             )
         return warnings + leader_warnings(self.leader, model, settings.horizon, settings.limits)
