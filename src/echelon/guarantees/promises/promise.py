@@ -279,10 +279,8 @@ class Promise(abc.ABC):
         against = (line for line in self.hypotheses.values() if line.fails and line.reason)
         remedies = "; ".join(dict.fromkeys(x.remedy for x in against))
         until = "" if self.prefix is None else f" {self.prefix.sentence()}"
-        before = self.prefix is not None and self.prefix.promise.promised
-        which = (
-            "" if self.prefix is None or not before else f" from {at_most(self.prefix.at, 6)} s on"
-        )
+        first = self.prefix if self.prefix and self.prefix.promise.promised else None
+        which = "" if first is None else f" from {at_most(first.at, 6)} s on"
         text = (
             f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. What would help: {remedies}."
         )
