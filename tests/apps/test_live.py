@@ -581,7 +581,7 @@ def test_a_growing_mode_is_told_at_once(panel):
     look, found = first_look(own, weak), badge_of(own, weak)
     assert look["state"] == found["state"] == "lost"
     assert look["short"] == found["short"] and "a mode grows at " in look["short"]
-    assert any("not every mode decays" in cause for cause in found["causes"])
+    assert any("is below the edge" in cause for cause in found["causes"])
 
 
 HELD = {"state": "holds", "short": "promised", "whole": "Promised.", "rate": 1.0, "causes": []}

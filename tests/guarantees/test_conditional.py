@@ -97,6 +97,21 @@ def test_agents_that_keep_apart_with_too_weak_motors_are_conditional():
     assert badge["state"] == "edge" and WHILE in badge["short"]
 
 
+def test_what_claims_nothing_has_no_condition():
+    found = ech.promise(*ech.build(ech.load_scenario("leader-lost")))
+    assert found.verdict is Standing.NONE and found.conditions == ()
+    assert promise_badge(found.as_mapping())["short"] == "no guarantee"
+
+
+@pytest.mark.parametrize(("minimum", "promised"), [(0.07, False), (0.03, True)])
+def test_motors_that_cannot_give_as_little_as_the_trim_leave_nothing_guaranteed(minimum, promised):
+    # A Crazyflie of 28 g hovers at 0.028 * 9.81 / 4 = 0.0687 N a motor.
+    change = f"actuator={{minimum: {minimum}}}"
+    found = ech.promise(*ech.build(ech.load_scenario("paper", [change])))
+    assert found.promised is promised
+    assert ("the trim needs less" in found.sentence()) is not promised
+
+
 def test_a_domain_that_was_seen_at_stored_frames_alone_covers_no_run_from_outside_the_set():
     model = ech.models.DoubleIntegrator(dimension=2)
     gain = ech.synthesize(

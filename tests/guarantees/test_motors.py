@@ -1,5 +1,6 @@
 """The motor certificate of `stopping-point`: enclosures by a second computation, and attacks."""
 
+import dataclasses
 import json
 from fractions import Fraction
 
@@ -232,6 +233,20 @@ def test_motors_that_may_not_suffice_leave_the_tube_to_the_run(hovering):
     assert line.fails and "gentler `roots`" in line.remedy
     free = promise(parts, settings._replace(limits=False))
     assert free.hypotheses[Hypothesis.LIMITS].verdict is Verdict.NOT_NEEDED
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        ech.World(plants={1: dataclasses.replace(QUADROTOR, motor_thrust=0.08)}),
+        ech.World(actuator=ech.Actuator(minimum=0.06)),
+    ],
+)
+def test_other_motors_than_the_model_s_are_left_to_the_run(hovering, world):
+    parts, settings, found = hovering
+    assert found.promised
+    other = promise(parts.replace(world=world), settings)
+    assert other.claimed and not other.promised and "while no input" in other.sentence()
 
 
 @pytest.mark.slow

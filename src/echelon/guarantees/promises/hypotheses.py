@@ -3,9 +3,11 @@
 A failed line with a `reason` rules out any guarantee; without one it weakens or explains it.
 """
 
+import dataclasses
 from collections.abc import Iterator
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.linearization import at_trim
@@ -88,6 +90,10 @@ def trim_line(parts: Parts, settings: Settings) -> Statement:
     moved = parts.world.plant_for(model)
     if not (settings.limits and is_limited(moved)):
         return unneeded(name, Kind.PROOF, "the inputs have no limits")
+    least = _forced_off_trim(parts, moved)
+    if least:
+        text, remedy = f"motors give {least} or more, and the trim needs less", "lower `minimum`"
+        return fails(name, Kind.PROOF, text, remedy=remedy, reason=f"{text}: no agent holds it")
     short = trim_shortfall(moved, np.asarray(model.trim[1], float))
     if plant is not None:
         # A heavier plant needs more than the model's trim to stay where it is.
@@ -109,6 +115,18 @@ def trim_line(parts: Parts, settings: Settings) -> Statement:
     remedy = "lighten the agents or strengthen their actuators"
     number, reason = (worst, f"{about(100.0 * worst)} %"), f"{text}, and cannot hold the trim"
     return fails(name, Kind.PROOF, text, *number, remedy=remedy, reason=reason)
+
+
+def _forced_off_trim(parts: Parts, moved: ControlAffine) -> str:
+    """Return the least thrust of a motor that is more than its share at the trim; empty if not."""
+    actuator, trim = parts.world.actuator, np.asarray(parts.model.trim[1], float)
+    if actuator is None or actuator.minimum is None:
+        return ""
+    with precision("float64"):
+        motors = dataclasses.replace(actuator, levels=0).prepared(moved)
+        given = trim if motors is None else np.asarray(motors.command(jnp.asarray(trim)))
+    near = np.allclose(given, trim, rtol=1e-9, atol=1e-9 * float(np.abs(trim).max()))
+    return "" if near else about(actuator.minimum, 4)
 
 
 def _exact(case: Case) -> Statement:
