@@ -173,7 +173,8 @@ class Laws(Drive):
                 "`safety` keeps agents apart that move relative to the leader, whose own offset "
                 "must be constant; leave out its new offset."
             )
-        if not self.lags:
+        # What an unknown law does with an offset is not known.
+        if not self.lags or self.unknown:
             return ()
         return (
             f"the law `{type(self.follower).__name__}` uses the position and the velocity of "
