@@ -138,7 +138,9 @@ def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
     slowest, coupling = guarantee.slowest, guarantee.coupling
     if result.drive.gain is not None and guarantee.governed and slowest is not None:
         mode = "the slowest mode decays" if slowest < 0.0 else "a mode grows"
-        text = f"{mode} at {at_most(abs(slowest))} 1/s" if slowest else "a mode does not decay"
+        text = f"{mode} at {at_most(abs(slowest))} 1/s"
+        # Rounding of a mode at 0 is no growth.
+        text = "a mode does not decay" if 0.0 <= slowest < 1e-9 else text
         text = f"{text} (coupling {coupling:.4g})"
         if guarantee.edge is not None:
             text += f". Couplings above {at_least(guarantee.edge, 4)} are sufficient for stability"
