@@ -155,8 +155,11 @@ def motors_suffice_for(run: StoppingRun) -> bool:
     return _from(case)[0].within(Fraction(frame.motor_thrust))
 
 
-def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
-    """Return the load of the motors of a run's agents, if they suffice, and its line."""
+def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | None, Statement]:
+    """Return the load of the motors of a run's agents, if they suffice, and its line.
+
+    `brief` leaves out the numbers of motors that do not suffice from the leader's own start.
+    """
     frame, reason = _airframe(run)
     if frame is None:
         free = not limits_act(run.parts, run.settings)
@@ -165,6 +168,8 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
         return None, left_to_run("the motors of an agent have other limits than the model's")
     kind = Kind.SAMPLES if is_by_user(run.parts.model, "airframe") else Kind.PROOF
     case = _MotorCase.of(run, frame)
+    if brief and not _suffice_at_rest(frame, case.chain, case.base):
+        return None, left_to_run("the motors are not proved to suffice from any start", kind=kind)
     motors, starts = _from(case)
     most = Fraction(frame.motor_thrust)
     number = None if motors.slope is None else float(motors.least), _thrust_text(motors)
@@ -286,6 +291,12 @@ def _pushed(
     own = _STILL._replace(speeds=speeds)
     pairs = zip(slices_of(chain), path, strict=True)
     return tuple(add_pushes(piece, demand, (leader, own)) for piece, demand in pairs)
+
+
+@memoize
+def _suffice_at_rest(frame: Airframe, chain: Chain, base: tuple[MotorDemand, ...]) -> bool:
+    """Tell whether the motors suffice for agents that start as their leader: the least demand."""
+    return motors_suffice(frame, slices_of(chain), base, _STILL)
 
 
 def _from(case: _MotorCase) -> tuple[Motors, Sequence[Pushed]]:

@@ -166,7 +166,7 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
     # Agents that hold each other back come later than they would alone.
     late = brief or run.law.safety is not None
     arrival = None if late else arrival_of(run, _positions(run))
-    motor_load, line = motor_load_of(run)
+    motor_load, line = motor_load_of(run, brief)
     tube = tube._replace(arrival=arrival, motor_load=motor_load)
     if motor_load is not None and line.kind is Kind.SAMPLES:
         tube = tube._replace(kind=line.kind)
