@@ -68,23 +68,6 @@ def test_a_stiff_model_asks_for_substeps_and_not_for_a_weaker_gain():
     assert errors[-1] < errors[0]
 
 
-def test_a_cut_link_leaves_a_sum_unknown_and_no_step_below_zero():
-    mapping = {
-        "name": "cut",
-        "model": {"name": "double-integrator", "parameters": {"dimension": 2}},
-        "graph": {"name": "ring", "agents": 6},
-        "formation": {"name": "line"},
-        "reference": {"name": "circle", "radius": 3.0, "rate": 0.3},
-        "events": [{"at": 5.0, "cut": [0, 1]}],
-        "simulation": {"horizon": 15.0, "dt": 0.01},
-    }
-    parts, _ = ech.build(ech.scenario_from_mapping(mapping))
-    found = ech.promise(parts, ech.Settings(horizon=15.0, dt=0.01))
-    text = found.sentence()
-    assert not found.promised and "grows" not in text and "below 0 s" not in text
-    assert "no one P is known" in text
-
-
 @pytest.mark.parametrize("integrator", ["rk4", "euler"])
 @pytest.mark.parametrize("substeps", [1, 2, 7])
 def test_substeps_are_steps_of_the_integrator_one_after_another(integrator, substeps):

@@ -755,4 +755,28 @@ def test_no_remedy_asks_for_a_step_of_zero_or_less():
         for line in promise.hypotheses.values():
             for number in re.findall(r"(?:below|than|to) (-?[\d.e+-]*\d|inf|nan)", line.remedy):
                 assert 0.0 < float(number) < np.inf, line.remedy
+        assert not promise.promised and "no one P is known" in promise.sentence()
         assert "grows" not in promise.sentence()
+
+
+# ---- models of one's own ----
+
+
+class Reversed(ech.models.DoubleIntegrator):
+    """Its difference of two states has the wrong sign, which no slope of f or g shows."""
+
+    def difference(self, x, y):
+        return y - x
+
+
+def test_a_difference_that_is_not_x_minus_y_leaves_nothing_guaranteed():
+    model = Reversed(dimension=1)
+    gain = ech.synthesize(model, PATH, ech.gains.Riccati())
+    laws = ech.Laws(TrimInput(), ech.laws.Consensus(gain))
+    formation = ech.Formation.from_offsets(model, PATH, {})
+    parts = ech.Parts(model, PATH, formation, laws, initial={"position": 0.1})
+    result = ech.simulate(parts, settings())
+    assert np.abs(result.errors[-1]).max() > 10.0 * np.abs(result.errors[0]).max()
+    found = ech.promise(parts, settings())
+    assert not found.promised and found.slowest is None
+    assert "is not x - y" in found.sentence()

@@ -115,6 +115,26 @@ def test_what_a_law_uses_of_others_is_read_off_its_trace(name, information):
     assert parts_of(LAWS[name]).information.follower == information
 
 
+class Late(Alone):
+    """It reads its neighbours after the step alone, into a memory."""
+
+    def init(self):
+        return jnp.zeros(2)
+
+    def settle(self, model, view, desired, delivered, memory):
+        return memory + view.disagreement
+
+
+def test_what_a_law_reads_after_a_step_is_information_too():
+    assert parts_of(Late()).information.follower == ("neighbours' states",)
+
+
+def test_a_leader_with_a_path_beside_an_unknown_law_has_a_reference():
+    parts = parts_of(Alone(), ech.laws.Tracking(ech.references.Circle(rate=0.1)))
+    lines = {line.name: line for line in ech.check(parts, SETTINGS).lines}
+    assert lines["Assumption 4, leader tracks"].text == "no mode of the leader is known"
+
+
 def test_a_leader_that_echelon_does_not_know_leaves_nothing_guaranteed():
     class Away(ech.laws.TrimInput):
         """A leader that drives away."""

@@ -17,7 +17,6 @@ from echelon.core.packet import Packet
 from echelon.flight.pilot import Pilot
 from echelon.flight.wire import Letter
 from echelon.output.archive.law_folder import network_facts, python_law
-from echelon.simulation.codegen import is_installed
 from echelon.simulation.onboard.law_functions import law_functions
 from echelon.simulation.onboard.python_text import python_text
 from echelon.synthesis.gains import FixedGain
@@ -149,7 +148,7 @@ def test_an_agent_by_itself_takes_one_heading_in_two_ways_for_one():
 # ---- a run ---------------------------------------------------------------------------------------
 
 SETTINGS = ech.Settings(horizon=12.0, dt=0.02)
-ENGINES = ["jax", pytest.param("native", marks=pytest.mark.skipif(not is_installed(), reason=""))]
+ENGINES = ["jax", "native"]
 
 
 @pytest.mark.slow

@@ -38,7 +38,9 @@ MODEL, GRAPH = ech.models.SingleIntegrator(dimension=2), ech.Graph.path(3)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("what", PARTS)
 def test_whole_numbers_of_any_kind_are_numbers(what, kind):
-    PARTS[what](KINDS[kind](1))
+    whole, same = (PARTS[what](number) for number in (KINDS[kind](1), 1.0))
+    fields = [each._asdict() if isinstance(each, tuple) else vars(each) for each in (whole, same)]
+    np.testing.assert_equal(*fields)
 
 
 @pytest.mark.parametrize("what", PARTS)

@@ -125,7 +125,7 @@ class Theorem(Word):
         return self.name
 
 
-class Standing(Word):
+class GuaranteeVerdict(Word):
     """Whether what is claimed of a run is guaranteed."""
 
     GUARANTEED = "all conditions hold by computation"

@@ -67,7 +67,8 @@ def information_of(law: Law, model: ControlAffine, graph: Graph) -> tuple[str, .
 
         def update(z: jax.Array, sent: jax.Array) -> PyTree:
             known = eqx.tree_at(lambda v: (v.disagreement, v.feedforward), view, (z, sent))
-            return law.update(model, known, memory)
+            u, after = law.update(model, known, memory)
+            return u, law.settle(model, known, u, u, after)
 
         z, sent = used_leaves(update, view.disagreement, view.feedforward)
     signal = type(law).signal is not Law.signal

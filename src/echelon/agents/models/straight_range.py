@@ -22,6 +22,7 @@ _FARTHEST = 1e12
 """Beyond it nothing is tried, and so nothing is said."""
 _DISTANCES = np.geomspace(1e-9, _FARTHEST, 3000)
 _PAIRS = 2000
+_CLOSE = 1e-6
 _SAME = 1e-9  # relative
 _ROUNDING = 1e-8  # what a formula such as (d + T/2) % T - T/2 is off, T below 1e8
 
@@ -48,6 +49,11 @@ def straight_range(model: ControlAffine) -> StraightRange:
         if _is_traced_as(model, angles):
             return StraightRange(np.where(np.isin(range(n), angles), np.pi, np.inf), True)
     return StraightRange(reach, False)
+
+
+def is_straight(model: ControlAffine) -> bool:
+    """Tell whether the difference of states that are close is x - y, on which modes rest."""
+    return bool(straight_range(model).reach.min() > _CLOSE)
 
 
 def _is_traced_as(model: ControlAffine, angles: tuple[int, ...]) -> bool:

@@ -242,8 +242,7 @@ class LiveParts:
         """
         gain, parts = self.gain(knobs), self.parts
         switches = parts.graph.schedule is not None or knobs.events
-        unknown = getattr(parts.drive, "unknown", "")
-        if gain is None or switches or unknown or parts.world.network is not None:
+        if gain is None or switches or parts.drive.unknown or parts.world.network is not None:
             return None
         gain = eqx.tree_at(lambda gain: gain.coupling, gain, knobs.coupling)
         assert isinstance(parts.drive, Laws)

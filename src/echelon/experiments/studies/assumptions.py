@@ -75,8 +75,8 @@ def _other_graph(graph: Graph) -> str:
 
 def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
     """Yield the conditions on leader and drift: Assumptions 4 and 5, Lemma 4, conditions on P."""
-    yield _leader_line(promise)
     reference = reference_of(getattr(parts.drive, "leader", parts.drive))
+    yield _leader_line(promise, reference is not None)
     if reference is not None:
         demand = reference_demand(parts.model, reference, settings.horizon)
         yield _reference_line(parts.model, demand, settings)
@@ -101,13 +101,12 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
     yield _finite_line(parts, promise)
 
 
-def _leader_line(promise: Promise) -> Statement:
+def _leader_line(promise: Promise, follows: bool) -> Statement:
     """Assumption 4: the leader tracks its reference, by linearization."""
     name, slow = Topic.LEADER_TRACKING, promise.leader_mode
-    if slow is None and not promise.governed and not promise.paper_lines:
-        return unneeded(name, _PROOF, "no modes are computed beside an unknown law")
     if slow is None:
-        return unneeded(name, _PROOF, "there is no reference")
+        text = "no mode of the leader is known" if follows else "there is no reference"
+        return unneeded(name, _PROOF, text)
     if promise.hypotheses[Hypothesis.SMOOTH].fails:
         return vacuous(name, _LINEAR, _NOT_SMOOTH)
     # NaN counts as not damped.

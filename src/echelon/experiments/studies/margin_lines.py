@@ -38,7 +38,7 @@ def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
         yield from _agreement_lines(promise.agreement)
         return
     if not promise.governed:
-        yield unneeded(Topic.MARGINS, _KIND, "no law is known whose margins these would be")
+        yield unneeded(Topic.MARGINS, _KIND, "no modes of this loop are known")
         return
     if not promise.linear:
         text = "the model is not smooth at the trim, and has no modes there"

@@ -4,6 +4,7 @@ import math
 from typing import NamedTuple
 
 from echelon.agents.models.linearization import at_trim
+from echelon.agents.models.straight_range import is_straight
 from echelon.agents.world.world import LATE
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
@@ -53,7 +54,8 @@ class Case(NamedTuple):
     @property
     def governed(self) -> bool:
         """Whether the followers run a law that a theorem speaks of, u = u_ff - c R^-1 g'P z."""
-        return self.parts.drive.metric(self.parts.model) is not None
+        model = self.parts.model
+        return self.parts.drive.metric(model) is not None and is_straight(model)
 
     @property
     def fed_by_parents(self) -> bool:

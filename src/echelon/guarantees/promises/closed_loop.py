@@ -138,7 +138,7 @@ class NetworkModes(NamedTuple):
 
 def loop_of(parts: Parts) -> LinearLoop:
     """Return the closed loop of prepared parts; of a law without a gain that is known, -g'z."""
-    model, known = parts.model, not getattr(parts.drive, "unknown", "")
+    model, known = parts.model, not parts.drive.unknown
     n, m = len(model.state_names), len(model.input_names)
     gain, P = (parts.drive.gain, parts.drive.metric(model)) if known else (None, None)
     R, c, inner = np.eye(m), 1.0, None
@@ -200,7 +200,7 @@ def all_alike(drive: Drive, model: ControlAffine) -> bool:
     """Tell whether the leaders obey the followers' law, with nothing fed forward."""
     leader, follower = getattr(drive, "leader", None), getattr(drive, "follower", None)
     same = leader is not None and type(leader) is type(follower)
-    same = same and not getattr(drive, "unknown", "")
+    same = same and not drive.unknown
     silent = drive.feedforward is Feedforward.NONE and drive.metric(model) is not None
     return same and silent and bool(eqx.tree_equal(leader, follower))
 

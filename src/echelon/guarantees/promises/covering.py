@@ -30,7 +30,10 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
     what = "proof" if promise.kind is Kind.PROOF else "guarantee on the domain"
     what = "conditional claim" if promise.conditions else what
     against = _against(result, promise)
-    if against:
+    if not against and _unseen(result, promise):
+        text = f"Whether the {what} covers this run is not known: agents may have left the domain "
+        yield f"{text}between the stored frames."
+    elif against:
         yield f"The {what} does not cover this run: {against}."
     else:
         yield f"The {what} covers this run: {promise.why_covered()}."
@@ -39,11 +42,12 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
 def covered(result: Result, promise: Promise) -> bool | None:
     """Return whether a run kept, in every step, to what a theorem's claim rests on.
 
-    None where no theorem claims anything.
+    None where no theorem claims anything, and where the stored frames do not show it.
     """
     if promise.theorem is None or not len(result.times):
         return None
-    return not _against(result, promise)
+    against = _against(result, promise)
+    return None if not against and _unseen(result, promise) else not against
 
 
 def _against(result: Result, promise: Promise) -> str:
@@ -54,12 +58,13 @@ def _against(result: Result, promise: Promise) -> str:
         return f"agent {left.agent} left the domain at {about(left.time, 4)} s (`{left.name}`)"
     if limited:
         return f"a limit acted on an agent in {about(100.0 * limited)} % of the steps"
-    if promise.without:
-        return promise.without
+    return promise.without
+
+
+def _unseen(result: Result, promise: Promise) -> bool:
+    """Tell whether stored frames alone show that agents stayed in the domain."""
     certified = not promise.hypotheses[Hypothesis.STARTS].fails and promise.theorem != Theorem.T2
-    if promise.region is None or certified or result.settings.store_every == 1:
-        return ""
-    return "it is not known whether all agents stayed in the domain between stored frames"
+    return promise.region is not None and not certified and result.settings.store_every > 1
 
 
 def first_exit(result: Result, promise: Promise) -> Exit | None:

@@ -89,6 +89,10 @@ def _through(graph: Graph, event: Event, guarantee: Promise) -> JsonObject:
     why = uncovered(graph, event)
     if why or not guarantee.promised:
         text = f"Nothing is guaranteed through it: {why}." if why else "Nothing is guaranteed."
+        if not why and guarantee.conditions:
+            text = (
+                f"Not guaranteed: the claim covers it while {' and '.join(guarantee.conditions)}."
+            )
         return {"promised": False, "kind": None, "sentence": text}
     verb, what = _SEVERED if isinstance(event, Cut) else _BEREFT
     if guarantee.without:

@@ -12,7 +12,8 @@ import numpy as np
 
 from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine, position_unit
-from echelon.agents.models.model_check import at_limits, is_limited, trim_shortfall
+from echelon.agents.models.model_check import Shortfall, at_limits, is_limited, trim_shortfall
+from echelon.agents.world.actuator import Actuator
 from echelon.core.compiled import compiled_for_one_call
 from echelon.core.digits import about, at_least
 from echelon.core.errors import listing
@@ -86,20 +87,22 @@ def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> ja
 
 def trim_line(parts: Parts, settings: Settings) -> Statement:
     """Say whether the actuators deliver the trim input, without which no agent holds its trim."""
-    model, plant, name = parts.model, parts.world.plant, Hypothesis.TRIM_WITHIN_LIMITS
-    moved = parts.world.plant_for(model)
-    if not (settings.limits and is_limited(moved)):
-        return unneeded(name, Kind.PROOF, "the inputs have no limits")
-    least = _forced_off_trim(parts, moved)
-    if least:
-        text, remedy = f"motors give {least} or more, and the trim needs less", "lower `minimum`"
+    model, world, name = parts.model, parts.world, Hypothesis.TRIM_WITHIN_LIMITS
+    plants, trim = (
+        (world.plant_for(model), *world.plants.values()),
+        np.asarray(model.trim[1], float),
+    )
+    if any(_forced_off_trim(world.actuator, plant, trim) for plant in plants):
+        text, remedy = "the motors' `minimum` is more than the trim needs", "lower `minimum`"
         return fails(name, Kind.PROOF, text, remedy=remedy, reason=f"{text}: no agent holds it")
-    short = trim_shortfall(moved, np.asarray(model.trim[1], float))
-    if plant is not None:
+    if not (settings.limits and any(map(is_limited, plants))):
+        return unneeded(name, Kind.PROOF, "the inputs have no limits")
+    short = dict[str, Shortfall]()
+    for plant in plants:
         # A heavier plant needs more than the model's trim to stay where it is.
-        short |= trim_shortfall(plant)
+        short |= trim_shortfall(plant, trim) | (trim_shortfall(plant) if plant is not model else {})
     if not short:
-        stuck = at_limits(moved, np.asarray(model.trim[1], float))
+        stuck = tuple(dict.fromkeys(i for plant in plants for i in at_limits(plant, trim)))
         if stuck:
             text = "the trim is at a limit of the actuators, which leaves no margin for "
             text, remedy = text + listing(stuck), "give the actuators a margin about the trim"
@@ -117,16 +120,14 @@ def trim_line(parts: Parts, settings: Settings) -> Statement:
     return fails(name, Kind.PROOF, text, *number, remedy=remedy, reason=reason)
 
 
-def _forced_off_trim(parts: Parts, moved: ControlAffine) -> str:
-    """Return the least thrust of a motor that is more than its share at the trim; empty if not."""
-    actuator, trim = parts.world.actuator, np.asarray(parts.model.trim[1], float)
+def _forced_off_trim(actuator: Actuator | None, plant: ControlAffine, trim: Array) -> bool:
+    """Tell whether the least thrust of a motor is more than its share of the trim input (m,)."""
     if actuator is None or actuator.minimum is None:
-        return ""
+        return False
     with precision("float64"):
-        motors = dataclasses.replace(actuator, levels=0).prepared(moved)
+        motors = dataclasses.replace(actuator, levels=0).prepared(plant)
         given = trim if motors is None else np.asarray(motors.command(jnp.asarray(trim)))
-    near = np.allclose(given, trim, rtol=1e-9, atol=1e-9 * float(np.abs(trim).max()))
-    return "" if near else about(actuator.minimum, 4)
+    return not np.allclose(given, trim, rtol=1e-9, atol=1e-9 * float(np.abs(trim).max()))
 
 
 def _exact(case: Case) -> Statement:

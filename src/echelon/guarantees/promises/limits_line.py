@@ -16,12 +16,12 @@ _REMEDY = "see whether a run is covered, or set `simulation.limits: false`"
 
 
 def limits_act(parts: Parts, settings: Settings) -> bool:
-    """Tell whether an input of an agent may be at a limit."""
-    world = parts.world
-    return settings.limits and any(
-        is_limited(one)
-        for one in (parts.model, world.plant_for(parts.model), *world.plants.values())
-    )
+    """Tell whether an input of an agent may be at a limit, or at the least thrust of a motor."""
+    world, model, actuator = parts.world, parts.model, parts.world.actuator
+    if actuator is not None and actuator.minimum is not None:
+        return True
+    plants = model, world.plant_for(model), *world.plants.values()
+    return settings.limits and any(map(is_limited, plants))
 
 
 def other_limits(parts: Parts) -> bool:

@@ -21,7 +21,7 @@ from echelon.core.numerics import precision
 from echelon.core.statement import Cause, Hypothesis, Statement
 from echelon.core.trace import shared_traces
 from echelon.core.types import Array
-from echelon.core.words import Kind, Standing, Theorem, Verdict
+from echelon.core.words import GuaranteeVerdict, Kind, Theorem, Verdict
 from echelon.guarantees.promises.certified_set import CertifiedSet
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.laws.law import Law
@@ -212,15 +212,15 @@ class Promise(abc.ABC):
         return not self.reasons
 
     @property
-    def verdict(self) -> Standing:
+    def verdict(self) -> GuaranteeVerdict:
         """Whether the claim is guaranteed, conditional, or none."""
-        left = Standing.CONDITIONAL if self.conditions else Standing.GUARANTEED
-        return left if self.claimed else Standing.NONE
+        left = GuaranteeVerdict.CONDITIONAL if self.conditions else GuaranteeVerdict.GUARANTEED
+        return left if self.claimed else GuaranteeVerdict.NONE
 
     @property
     def promised(self) -> bool:
         """Whether anything is guaranteed, without a condition that is left to the run."""
-        return self.verdict is Standing.GUARANTEED
+        return self.verdict is GuaranteeVerdict.GUARANTEED
 
     @property
     def theorem(self) -> Theorem | None:
@@ -272,7 +272,8 @@ class Promise(abc.ABC):
         """Return what is claimed, after the conditions that are left to the run."""
         if not self.conditions:
             return self.guarantee()
-        return f"{conditional(self.conditions)} {self.guarantee()}"
+        text = f"Not guaranteed: this holds while {' and '.join(self.conditions)}."
+        return f"{text} {self.guarantee()}"
 
     def _against(self) -> str:
         """Return all that stands against a guarantee, and what would help."""
@@ -311,11 +312,6 @@ class Promise(abc.ABC):
         }
 
 
-def conditional(conditions: Sequence[str]) -> str:
-    """Return how a claim begins that holds only under conditions that are left to the run."""
-    return f"Not guaranteed: this holds while {' and '.join(conditions)}."
-
-
 class Prefix(NamedTuple):
     """What is guaranteed until a time (s), at which something happens that nothing covers."""
 
@@ -341,7 +337,7 @@ def prover_of(drive: Drive) -> type[Promise]:
     law = drive.follower if isinstance(drive, Laws) else Law
     # By name, since a law is below all that is proved of it.
     module, _, name = law.prover.partition(":")
-    if isinstance(drive, Laws) and drive.unknown and module.partition(".")[0] == "echelon":
+    if drive.unknown and module.partition(".")[0] == "echelon":
         module, name = "echelon.guarantees.promises.unknown_law", "UnknownLaw"
     return getattr(importlib.import_module(module), name)
 

@@ -9,7 +9,6 @@ from echelon.core.words import Kind
 from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import trim_line
 from echelon.guarantees.promises.promise import REQUIRED, Promise
-from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.settings import Settings
 
@@ -40,7 +39,6 @@ class UnknownLaw(Promise):
     def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "UnknownLaw":
         """Return that nothing is guaranteed, and what of the agents and the world is known."""
         parts = prepared.parts
-        assert isinstance(parts.drive, Laws)
         text = f"echelon does not know the law `{parts.drive.unknown}`"
         lines = {each: unneeded(each, Kind.LINEARIZATION, text) for each in _ASKED}
         lines[Hypothesis.TRIM_WITHIN_LIMITS] = trim_line(parts, settings)

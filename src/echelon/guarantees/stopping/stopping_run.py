@@ -338,7 +338,8 @@ def _step_radius(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:
         stop = loop.stiffness[k] * loop.weights[:degree, k]
         inner = np.append(0.0, stop[:-1])
         gains = inner + strengths[:, None] * stop
-        radius = max(radius, sampled_radius(A, B, gains[:, None], *run.settings.held))
+        exact = sampled_radius(A, B, gains[:, None], run.settings.dt)
+        radius = max(radius, exact, sampled_radius(A, B, gains[:, None], *run.settings.held))
     return radius
 
 

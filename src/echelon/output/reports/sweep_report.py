@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from echelon.core.types import Array, JsonObject
-from echelon.core.words import Standing, amount
+from echelon.core.words import GuaranteeVerdict, amount
 from echelon.experiments.results.quantity import settling_bound
 from echelon.experiments.sweeps.axes import SEED
 from echelon.experiments.sweeps.numbers import SUMMARIZED
@@ -26,7 +26,7 @@ def sweep_mapping(data: "xr.Dataset") -> JsonObject:
         name: int((outcome == code).sum())
         for name, code in zip(names, outcome.attrs["flag_values"], strict=True)
     }
-    conditional = data["promise_verdict"] == str(Standing.CONDITIONAL)
+    conditional = data["promise_verdict"] == str(GuaranteeVerdict.CONDITIONAL)
     return {
         "runs": int(outcome.size),
         "outcomes": {name: count for name, count in counts.items() if count},

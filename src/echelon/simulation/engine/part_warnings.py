@@ -25,13 +25,13 @@ _SETTLES = 3.0
 """Time constants after which an actuator has made 95 % of a step."""
 
 
-def part_warnings(parts: Parts, states: Array, horizon: float) -> Iterator[str]:
+def part_warnings(parts: Parts, states: Array, settings: Settings) -> Iterator[str]:
     """Yield a sentence for each thing that is probably not intended.
 
     Args:
         parts: checked.
         states: (N, n) at time zero.
-        horizon: s.
+        settings: of the run.
     """
     for shape in parts.formation.shapes:
         yield from _goals(parts.model, shape)
@@ -40,7 +40,8 @@ def part_warnings(parts: Parts, states: Array, horizon: float) -> Iterator[str]:
         yield from _meetings(parts.model, motion)
     yield from _starts(parts.model, states)
     yield from _spreads(parts)
-    actuator = parts.world.actuator
+    yield from _coarse(parts.model, states, settings)
+    actuator, horizon = parts.world.actuator, settings.horizon
     if actuator is not None and _SETTLES * actuator.lag > horizon:
         yield (
             f"the actuators need {_SETTLES * actuator.lag:.3g} s for 95 % of a command, since "
@@ -48,7 +49,7 @@ def part_warnings(parts: Parts, states: Array, horizon: float) -> Iterator[str]:
         )
 
 
-def coarse(model: ControlAffine, states: Array, settings: Settings) -> Iterator[str]:
+def _coarse(model: ControlAffine, states: Array, settings: Settings) -> Iterator[str]:
     """Yield that positions (N, n) are too large for the digits of single precision."""
     if settings.precision != "float32" or not model.position:
         return

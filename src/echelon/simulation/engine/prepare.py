@@ -17,7 +17,7 @@ from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
 from echelon.core.words import amount
 from echelon.simulation.engine.initial import initial_states
-from echelon.simulation.engine.part_warnings import coarse, part_warnings
+from echelon.simulation.engine.part_warnings import part_warnings
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.meter import Meter
@@ -110,8 +110,7 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         warnings += parts.drive.warnings(model, graph, settings)
         if parts.formation.motion is not None:
             warnings += parts.drive.check_motion(parts.formation, graph)
-    warnings += (*part_warnings(parts, problem.states, settings.horizon),)
-    warnings += (*coarse(model, problem.states, settings),)
+    warnings += (*part_warnings(parts, problem.states, settings),)
     # Model and drive may say the same; a dictionary keeps the first, and the order.
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
 

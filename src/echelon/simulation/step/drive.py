@@ -183,6 +183,11 @@ class Drive(Declared):
     def information(self) -> Information:
         """What the agents must receive from others."""
 
+    @property
+    def unknown(self) -> str:
+        """The class of a law that echelon does not know; empty without any."""
+        return ""
+
     def information_for(self, model: ControlAffine, graph: Graph) -> Information:
         """Return the same, with what an unknown law uses of what it receives."""
         return self.information
