@@ -746,3 +746,15 @@ def test_a_thrust_that_is_a_state_changes_nothing_but_its_lag():
         slow = numpy(thrust.velocity, np.append(x, v[0]), np.append(0.5, v[1:]))
         assert slow[:12] == pytest.approx(numpy(euler.velocity, x, v), abs=1e-12)
         assert slow[12] == 0.5
+
+
+def test_a_property_that_fails_is_named_with_what_it_raises():
+    class Weak(SingleIntegrator):
+        most: float = 1.0
+
+        @property
+        def input_limits(self):
+            return Limits(np.eye(1), (-self.most,), (self.most,))
+
+    with pytest.raises(ModelError, match="`input_limits` of `Weak` fails with TypeError"):
+        check_model(Weak(dimension=1, most="fast"))

@@ -177,4 +177,4 @@ def test_check_run_sweep_verify_and_json_agree(echelon, tmp_path):
     _, out, _ = echelon("sweep", "carts.yaml", *over, "--out", "s")
     said = " ".join(out.split())
     assert "With a guarantee: 0 of 2." in said
-    assert "While no input is at a limit: 2, of which 1 is covered in every step." in said
+    assert "while no input is at a limit: 2; covered in every step: 1." in said

@@ -150,9 +150,18 @@ def _check_names(model: ControlAffine, name: str) -> None:
             )
 
 
+_CONSTANTS = "trim", "weights", "input_scale", "symmetry_inputs", "radius", "input_limits"
+
+
 def _check_constants(model: ControlAffine, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the trim as arrays, after checking all constant data."""
     n, m = len(model.state_names), len(model.input_names)
+    for what in _CONSTANTS:
+        # A property may be anyone's code, of parameters that may be of any kind.
+        try:
+            getattr(model, what)
+        except Exception as error:
+            raise ModelError(f"`{what}` of `{name}` fails with {error_summary(error)}.") from error
     x, u = _pair(name, "trim", model.trim, n, m)
     _pair(name, "weights", model.weights, n, m)
     scale = _numbers(name, "input_scale", model.input_scale, (m, m))

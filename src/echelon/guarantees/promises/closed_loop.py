@@ -137,7 +137,7 @@ class NetworkModes(NamedTuple):
 
 
 def loop_of(parts: Parts) -> LinearLoop:
-    """Return the closed loop of prepared parts; of a law without a gain that is known, -g'z."""
+    """Return the closed loop of prepared parts; without a known gain that of u = -g'z."""
     model, known = parts.model, not parts.drive.unknown
     n, m = len(model.state_names), len(model.input_names)
     gain, P = (parts.drive.gain, parts.drive.metric(model)) if known else (None, None)

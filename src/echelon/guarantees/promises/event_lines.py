@@ -90,9 +90,9 @@ def _through(graph: Graph, event: Event, guarantee: Promise) -> JsonObject:
     if why or not guarantee.promised:
         text = f"Nothing is guaranteed through it: {why}." if why else "Nothing is guaranteed."
         if not why and guarantee.conditions:
-            text = (
-                f"Not guaranteed: the claim covers it while {' and '.join(guarantee.conditions)}."
-            )
+            conditions = " and ".join(guarantee.conditions)
+            text = f"Not guaranteed: the claim covers it while {conditions}. {guarantee.ignored()}"
+            text = text.rstrip()
         return {"promised": False, "kind": None, "sentence": text}
     verb, what = _SEVERED if isinstance(event, Cut) else _BEREFT
     if guarantee.without:

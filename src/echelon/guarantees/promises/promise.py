@@ -266,7 +266,8 @@ class Promise(abc.ABC):
 
     def ignored(self) -> str:
         """Return what the guarantee leaves out of what acts, in a sentence; empty for nothing."""
-        return f"The guarantee ignores that {self.without}." if self.without else ""
+        what = "claim" if self.conditions else "guarantee"
+        return f"The {what} ignores that {self.without}." if self.without else ""
 
     def _claim(self) -> str:
         """Return what is claimed, after the conditions that are left to the run."""

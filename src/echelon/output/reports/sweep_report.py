@@ -50,9 +50,8 @@ def sweep_report(data: "xr.Dataset") -> str:
     lines += [f"- Settled to {within}: {_share(summary['settled'], done)}."]
     lines += [f"- With a guarantee: {summary['promised']} of {summary['runs']}."]
     if summary["conditional"]:
-        text = f"- While no input is at a limit: {summary['conditional']}, of which"
-        text += f" {summary['covered']} {'is' if summary['covered'] == 1 else 'are'} covered"
-        lines += [f"{text} in every step."]
+        text = f"- With a claim that holds while no input is at a limit: {summary['conditional']}"
+        lines += [f"{text}; covered in every step: {summary['covered']}."]
     for name, values in summary["quantiles"].items():
         if values is not None:
             low, median, high = (f"{value:.3g}" for value in values)
