@@ -19,7 +19,7 @@ def marked(name):
     return name if name in QUICK else pytest.param(name, marks=mark)
 
 
-@pytest.mark.parametrize("name", map(marked, bundled_scenarios()))
+@pytest.mark.parametrize("name", [marked(name) for name in bundled_scenarios()])
 def test_a_check_of_a_bundled_scenario_fits_a_terminal(name):
     found = ech.check(*ech.build(ech.load_scenario(name)))
     text = check_report(found)

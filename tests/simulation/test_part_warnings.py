@@ -4,18 +4,17 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.simulation.engine.part_warnings import coarse
 from echelon.simulation.engine.prepare import prepare
 
 QUADROTOR, GRAPH = ech.models.Quadrotor.crazyflie(), ech.Graph.path(3)
 APART = {1: (1.0, 0.0, 0.0), 2: (2.0, 0.0, 0.0)}
 
 
-def warnings(offsets=APART, horizon=10.0, **parts):
+def warnings(offsets=APART, horizon=10.0, precision="float64", **parts):
     formation = ech.Formation.from_offsets(QUADROTOR, GRAPH, offsets)
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
     given = ech.Parts(QUADROTOR, GRAPH, formation, drive, **parts)
-    return prepare(given, ech.Settings(horizon, 0.1)).warnings
+    return prepare(given, ech.Settings(horizon, 0.1, precision=precision)).warnings
 
 
 def test_nothing_is_said_of_what_is_usual():
@@ -59,11 +58,12 @@ def test_a_start_outside_of_the_chart_is_named_however_it_is_given():
     assert text.startswith("agent 2 starts with `pitch` at 2, and the equations of `Quadrotor` ")
 
 
-def test_coordinates_that_single_precision_does_not_resolve_are_named():
-    single = ech.Settings(horizon=1.0, dt=0.01, precision="float32")
-    model, states = ech.models.DoubleIntegrator(1), np.zeros((2, 2))
-    for place, named in ((5.4e6, True), (100.0, False)):
-        states[:, 0] = place
-        [text] = [*coarse(model, states, single)] or [""]
-        assert text.startswith("single precision resolves 0.5 m") is named
-        assert not [*coarse(model, states, single._replace(precision="float64"))]
+@pytest.mark.parametrize(
+    ("place", "precision", "named"),
+    [(5.4e6, "float32", True), (100.0, "float32", False), (5.4e6, "float64", False)],
+)
+def test_coordinates_that_single_precision_does_not_resolve_are_named(place, precision, named):
+    states = np.zeros((3, len(QUADROTOR.state_names)))
+    states[:, 0] = place + np.arange(3)
+    texts = warnings(initial=dict(enumerate(states)), precision=precision)
+    assert any(text.startswith("single precision resolves 0.5 m") for text in texts) is named
