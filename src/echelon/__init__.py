@@ -5,8 +5,21 @@ closed loop, `report` what happened. The public names stand in `__init__.pyi`, e
 heavy is imported until it is used, and importing changes no global setting.
 """
 
+from typing import Any
+
 import lazy_loader
 
 __version__ = "0.2.0"
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    try:
+        return _load(name)
+    except AttributeError as error:
+        from echelon.core.gone import NAMES, gone
+
+        raise AttributeError(
+            f"`echelon.{name}`{gone(NAMES, name) or ' does not exist.'}"
+        ) from error

@@ -28,7 +28,7 @@ from echelon.apps.cli.fly_command import fly
 from echelon.apps.cli.init_command import init
 from echelon.apps.cli.list_command import list_, schema
 from echelon.apps.cli.live_command import live
-from echelon.apps.cli.options import EchelonCommand
+from echelon.apps.cli.options import EchelonCommand, EchelonGroup
 from echelon.apps.cli.path_command import path
 from echelon.apps.cli.plot_command import plot
 from echelon.apps.cli.report_command import report
@@ -55,6 +55,7 @@ _EPILOG = (
 )
 
 app = typer.Typer(
+    cls=EchelonGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

@@ -4,9 +4,10 @@ from pathlib import Path
 from typing import Annotated, Any, final
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
-from echelon.core.errors import OutputError, ScenarioError
+from echelon.core.errors import EchelonError, OutputError, ScenarioError
+from echelon.core.gone import COMMANDS, gone
 from echelon.output.archive.folder import check_exists
 
 
@@ -61,6 +62,21 @@ SetOption = Annotated[
         help="Change a value of the scenario, as in simulation.horizon=10.",
     ),
 ]
+
+
+@final
+class EchelonGroup(TyperGroup):
+    """The commands, which name what to use instead of one that is gone."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command that the arguments name.
+
+        Raises:
+            EchelonError: an earlier version had it.
+        """
+        if ended := gone(COMMANDS, args[0]):
+            raise EchelonError(f"the command `{args[0]}`{ended}")
+        return super().resolve_command(ctx, args)
 
 
 @final

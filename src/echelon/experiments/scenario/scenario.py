@@ -13,6 +13,7 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
 
 from echelon.core.errors import ScenarioError, did_you_mean, listing
+from echelon.core.gone import VALUES, gone, gone_key
 from echelon.experiments.scenario import event_sections, law_sections, sections
 from echelon.experiments.scenario.checks import cross_faults, law_of, number_of, section
 from echelon.experiments.scenario.formation_sections import FormationSpec
@@ -155,10 +156,14 @@ def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
     if kind == "missing":
         return path, "got nothing, this key is required."
     if kind in ("extra_forbidden", "invalid_key"):
+        if ended := gone_key(*path):
+            return path, f"the key{ended}"
         keys = _keys(path[:-1])
         hint = meant(path, keys, Scenario)
         return path, f"got an unknown key, allowed {is_or_are(keys)}{hint}."
     got = context.get("got", error["input"])
+    if path and (ended := gone(VALUES, f"{path[-1]}: {got}")):
+        return path, f"the value `{got}`{ended}"
     allowed = _ALLOWED[kind].format(**context) if kind in _ALLOWED else error["msg"]
     close = did_you_mean(got, context.get("names", "").split()) or _like_key(path)
     return path, f"got {quoted(got)}, allowed {allowed}{close}."

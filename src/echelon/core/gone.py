@@ -1,0 +1,29 @@
+"""Keys, values, commands and names of earlier versions, each with what to use instead.
+
+Whoever uses one in a scenario, on the command line or in Python gets one sentence. What goes from
+echelon adds a line here, which stays for two minor versions.
+"""
+
+KEYS: dict[str, str] = {}
+"""Scenario keys; `section.key` is that key alone, and `key` is it in any section."""
+
+VALUES: dict[str, str] = {}
+"""Values of scenario keys, as in `prediction: none`, and of options, as in `export --to json`."""
+
+COMMANDS: dict[str, str] = {}
+"""Commands of the command line."""
+
+NAMES: dict[str, str] = {}
+"""Public names below `echelon`."""
+
+
+def gone_key(*path: str | int) -> str:
+    """Return ` is gone; ...` of a scenario's key, or "" where no earlier version had it."""
+    names = [key for key in path if isinstance(key, str)]
+    tails = (".".join(names[start:]) for start in range(len(names)))
+    return next((gone(KEYS, tail) for tail in tails if tail in KEYS), "")
+
+
+def gone(table: dict[str, str], name: str) -> str:
+    """Return ` is gone; ...` of an entry of a table, or "" where no earlier version had it."""
+    return f" is gone; {table[name]}." if name in table else ""
