@@ -35,7 +35,7 @@ TESTS = {
     "core/enclosure": ["interval", "hull", "jaxpr", "exact", "regional"],
     "core/enclosure/curve_polygons.py": ["interval", "hull"],
     "core/enclosure/interval.py": ["interval", "hull"],
-    "agents/network": ["graph", "formation", "recommend", "limits"],
+    "agents/network": ["graph", "formation", "limits"],
     "synthesis/certificates": ["exact", "regional", "lmi", "lyapunov", "margins", "gains"],
     "synthesis/certificates/exact_proofs.py": ["exact"],
     "synthesis/certificates/jacobians.py": ["regional", "exact"],

@@ -14,7 +14,6 @@ import echelon as ech
 from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Kind, Theorem, Verdict
 from echelon.experiments.studies.basin import Radii
-from echelon.experiments.studies.speedup import Speedup
 from echelon.guarantees.messages.late_agreement import LateRate
 from echelon.guarantees.messages.late_messages import LateMessages
 from echelon.guarantees.messages.message_ages import AgeLimits
@@ -125,8 +124,6 @@ KINDS = {
         ("x", "y"), x, 1.0, 2.0, 1.0).sentence()),
     "observed radius": (BELOW, r"observed (\S+),", lambda x: Radii(
         ("x", "y"), 1.0, x, 2.0 * x, 1.0).sentence()),
-    "time constant": (ABOVE, r"constant of (\S+) s", lambda x: Speedup(
-        x, (), x, (), x).sentence()),
     "badge": (BELOW, r": (\S+) 1/s", lambda x: badge(x)["short"]),
     "badge, by linearization": (BELOW, r"rate of (\S+) 1/s", lambda x: badge(x, None)["whole"]),
     "badge, slowest": (BELOW, r"decays at (\S+) 1/s", lambda x: badge(

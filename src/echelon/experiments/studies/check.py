@@ -6,7 +6,6 @@ from echelon.core.numerics import precision
 from echelon.core.statement import Statement
 from echelon.core.types import JsonObject
 from echelon.experiments.studies.assumptions import drift_lines, graph_lines
-from echelon.experiments.studies.killing_residual import killing_line
 from echelon.experiments.studies.margin_lines import margin_lines
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.simulation.engine.parts import Parts
@@ -48,7 +47,6 @@ def check(parts: Parts, settings: Settings) -> CheckResult:
             *graph_lines(parts),
             *drift_lines(parts, settings, guarantee),
             *guarantee.hypotheses.values(),
-            killing_line(parts, guarantee),
             *margin_lines(parts, guarantee),
         )
     return CheckResult(lines, guarantee, warnings)

@@ -19,7 +19,6 @@ from echelon.experiments.scenario.law_sections import GainSpec
 from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.yaml import ScenarioFault
-from echelon.experiments.studies.speedup import speedup
 from echelon.guarantees.promises.promise import LawDesign, Promise, promise, prover_of
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.law_drive import Laws
@@ -30,9 +29,6 @@ from echelon.synthesis.certificates.delays import delay_margin
 from echelon.synthesis.certificates.domain import Domain
 from echelon.synthesis.gains.fixed import FixedGain
 from echelon.synthesis.gains.gain import Gain, Method, synthesize
-
-_ADVISED = 100
-"""Most followers for which a change of the graph is recommended; more would take minutes."""
 
 
 class Design(NamedTuple):
@@ -48,7 +44,6 @@ class Design(NamedTuple):
         step: the longest sampling period (s) for which all checked modes remain stable.
         factors: the interval of stable factors on the coupling; None if unstable.
         delay: the largest stable delay of all disagreements, s; None if unstable.
-        advice: a recommendation for users of the method.
         seconds: computing time of the synthesis.
     """
 
@@ -61,7 +56,6 @@ class Design(NamedTuple):
     step: float = 0.0
     factors: margins.GainMargin | None = None
     delay: float | None = None
-    advice: str = ""
     seconds: float = 0.0
 
     @property
@@ -270,23 +264,7 @@ def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Promise) 
         step=guarantee.longest_step(settings),
         factors=margins.gain_margin(closed),
         delay=delay_margin(closed).delay,
-        advice=_advice(gain, parts),
     )
-
-
-def _advice(gain: Gain, parts: Parts) -> str:
-    """Return a recommendation for an inner loop: an edge or a leader that makes it faster.
-
-    It is stable on any graph, so its rate depends only on the graph.
-    """
-    graph = parts.graph
-    followers, pairs = len(graph.followers), graph.agents * (graph.agents - 1) // 2
-    fixed = not graph.directed and graph.schedule is None
-    if gain.inner is None or followers > _ADVISED or not fixed:
-        return ""
-    # One follower must remain, and a complete graph has no pair left to link.
-    more = int(followers > 1), int(len(graph.edges) < pairs)
-    return speedup(parts.model, graph, gain, *more).sentence()
 
 
 def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dict[str, Any]:
