@@ -19,7 +19,7 @@ from echelon.experiments.scenario.law_sections import GainSpec
 from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.yaml import ScenarioFault
-from echelon.guarantees.promises.promise import LawDesign, Promise, promise, prover_of
+from echelon.guarantees.promises.promise import Promise, promise
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
@@ -82,17 +82,12 @@ _RANK = {Theorem.T1: 3, Theorem.T2: 2, Theorem.A5: 1}
 
 
 class Designs(NamedTuple):
-    """The designs of all methods, the recommended one if any, and the reason.
-
-    `settings` are those of all designs. `law_design` is a guaranteed design of the scenario's law,
-    if that law computes one.
-    """
+    """The designs of all methods, the recommended one if any, the reason, and their settings."""
 
     designs: tuple[Design, ...]
     recommended: Design | None
     because: str
     settings: Settings
-    law_design: LawDesign | None = None
 
 
 def design(
@@ -127,8 +122,7 @@ def design(
     designs = tuple(designs)
     best, dt = recommended(designs, built.settings.dt), built.settings.dt
     reason = "No method gives a stable loop here." if best is None else because(best, designs, dt)
-    law_design = prover_of(built.parts.drive).design(*built) if method is None else None
-    return Designs(designs, best, reason, built.settings, law_design)
+    return Designs(designs, best, reason, built.settings)
 
 
 _SIMPLE_GAIN = GainSpec(method=FixedGain.name, P="identity")

@@ -63,23 +63,6 @@ class AgreementModes(NamedTuple):
     eigenvalues: Array
 
 
-class LawDesign(Protocol):
-    """Numbers of a law with which more is guaranteed than with those of a scenario."""
-
-    @property
-    def name(self) -> str:
-        """The key under which JSON has it."""
-        ...
-
-    def sentence(self) -> str:
-        """Return what to set, and what is guaranteed then."""
-        ...
-
-    def as_mapping(self) -> dict[str, Any]:
-        """Return it ready for JSON."""
-        ...
-
-
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Promise(abc.ABC):
     """What is guaranteed of a closed loop, and what that rests on.
@@ -127,11 +110,6 @@ class Promise(abc.ABC):
             except EchelonError as error:
                 outcome = error
             yield outcome
-
-    @classmethod
-    def design(cls, parts: Parts, settings: Settings) -> LawDesign | None:
-        """Return numbers of the law with which more is guaranteed; None where none are sought."""
-        return None
 
     @property
     def governed(self) -> bool:

@@ -146,15 +146,6 @@ class _MotorCase(NamedTuple):
         return cls(frame, chain, demands, leader, speeds, base, starts)
 
 
-def motors_suffice_for(run: StoppingRun) -> bool:
-    """Tell whether the motors are certified from the starts of a run."""
-    frame, _ = _airframe(run)
-    if frame is None:
-        return False
-    case = _MotorCase.of(run, frame)
-    return _from(case)[0].within(Fraction(frame.motor_thrust))
-
-
 def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | None, Statement]:
     """Return the load of the motors of a run's agents, if they suffice, and its line.
 
@@ -177,7 +168,7 @@ def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | No
         text = "the motors are not proved to suffice from these starts"
         text += f": {number[1]}" if number[1] else ", and the thrust is not proved to stay positive"
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
-        remedy += "to the leader's velocity and attitude; `echelon design` finds some"
+        remedy += "to the leader's velocity and attitude"
         return None, left_to_run(text, *number, remedy, kind)
     ahead = _ahead(frame, run.ahead)
     load = MotorLoad(
