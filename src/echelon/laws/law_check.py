@@ -63,7 +63,7 @@ def _check_law(law: Law, model: ControlAffine) -> None:
         view,
         memory,
         advice=_ADVICE,
-    ).result
+    )
     if not isinstance(output, tuple) or len(output) != 2:
         raise LawError(
             f"`update` of `{name}` returns one thing, and must return two, the input and the next "
@@ -108,7 +108,7 @@ def _view(law: Law, model: ControlAffine) -> LocalView:
             x,
             forward,
             advice=_ADVICE,
-        ).result
+        )
         forward = jnp.zeros(message.shape)
     return LocalView(jnp.zeros(()), x, x, z, forward)
 

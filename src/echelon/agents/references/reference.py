@@ -16,7 +16,7 @@ from echelon.core.enclosure.hull import Box, value_hull
 from echelon.core.errors import GainError, LawError, ReferenceError, check_kind, listing
 from echelon.core.memoize import memoize
 from echelon.core.numerics import derivatives, precision
-from echelon.core.trace import call_once_traced, check_array, check_function, checked_trace
+from echelon.core.trace import call_once_traced, check_array, checked_trace
 from echelon.core.types import Array, Input, Scalar, State
 
 COORDINATES = ("x", "y", "z", "yaw")
@@ -67,7 +67,7 @@ class Reference(Guide):
     def check(self) -> None:
         """Check that (x, y, z, yaw) is returned."""
         with precision("float64"):
-            check_function(
+            checked_trace(
                 ReferenceError,
                 f"the point of `{type(self).__name__}`",
                 self,
@@ -129,7 +129,7 @@ def _check_map(model: ControlAffine) -> None:
             model.flat,
             np.zeros((model.flat_order + 1, len(model.flat_outputs))),
             advice="it must be written with `jax.numpy` and take the outputs' derivatives",
-        ).result
+        )
     if not isinstance(returned, tuple | list) or len(returned) != 2:
         raise LawError(f"`flat` of `{name}` must return a pair, a state and an input.")
     for what, value, size in zip(("state", "input"), returned, shapes, strict=True):
