@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import adjacency, connected, laplacian, relabelled
 
-from echelon.agents.network.bound import rounded_bound
 from echelon.agents.network.graph import Graph
+from echelon.agents.network.spectrum import rounded_bound
 from echelon.core import errors, numerics
-from echelon.guarantees.verifier.exact_minors import is_positive_definite
+from echelon.guarantees.verifier.algebra import is_positive_definite
 
 
 def graphs(most=9, weighted=True):

@@ -17,7 +17,7 @@ from echelon.core.digits import at_most
 from echelon.core.linear import longest_step
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem, Verdict
-from echelon.experiments.studies.finite_condition import pair_values
+from echelon.experiments.studies.assumptions import pair_values
 
 PATH = ech.Graph.path(4)
 LOW, _, HIGH = PATH.spectrum().eigenvalues

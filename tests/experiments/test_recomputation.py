@@ -20,7 +20,7 @@ from echelon.experiments.studies.recomputation import (
     with_leader_gain,
 )
 from echelon.guarantees.verifier.stored_values import compare_values
-from echelon.synthesis.gains import contraction
+from echelon.synthesis.gains import domain_methods
 from echelon.synthesis.gains.gain_file import save_gain
 
 SMALL = {
@@ -141,7 +141,7 @@ SOLVED = SMALL | {
 
 def test_a_gain_of_the_leader_is_that_of_its_file_where_solvers_end_elsewhere(monkeypatch):
     document = stated(ech.build(ech.scenario_from_mapping(SOLVED)), "small")
-    solve, noise = contraction.contraction, np.random.default_rng(0).normal(size=(4, 4)) * 3e-5
+    solve, noise = domain_methods.contraction, np.random.default_rng(0).normal(size=(4, 4)) * 3e-5
 
     def another_machine(*arguments, **named):
         metric = solve(*arguments, **named)

@@ -14,15 +14,13 @@ import echelon as ech
 from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Kind, Theorem, Verdict
 from echelon.experiments.studies.basin import Radii
-from echelon.guarantees.messages.late_agreement import LateRate
-from echelon.guarantees.messages.late_messages import LateMessages
-from echelon.guarantees.messages.message_ages import AgeLimits
-from echelon.guarantees.promises.certified_set import CertifiedSet, set_line
+from echelon.guarantees.messages.late_messages import AgeLimits, LateMessages, LateRate
 from echelon.guarantees.promises.promise import Prefix
+from echelon.guarantees.promises.region import CertifiedSet, set_line
 from echelon.guarantees.stopping.motor_load import Alone, MotorLoad
 from echelon.guarantees.stopping.separation import Separation
 from echelon.guarantees.stopping.tube import Tube
-from echelon.laws.trim_input import TrimInput
+from echelon.laws.law import TrimInput
 from echelon.output.viewer.replay import promise_badge
 from echelon.synthesis.certificates.domain import Domain
 

@@ -19,7 +19,7 @@ from echelon.agents.references.demand import reference_demand, reference_warning
 from echelon.core.errors import LawError, ReferenceError
 from echelon.core.numerics import precision
 from echelon.core.words import Verdict
-from echelon.laws.lqr import sweep
+from echelon.laws.path_leader import sweep
 
 PAIR = ech.Graph.path(2)
 

@@ -11,7 +11,7 @@ from runs import simulate
 import echelon as ech
 from echelon.agents.models.linearization import linearize
 from echelon.core.numerics import precision
-from echelon.synthesis.gains.inner_loop import symmetric_states
+from echelon.synthesis.gains.riccati import symmetric_states
 
 AGENTS = {
     "double integrator": ech.models.DoubleIntegrator(2),

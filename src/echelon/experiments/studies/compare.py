@@ -24,10 +24,8 @@ from echelon.simulation.engine.simulate import RunSoFar, simulate
 from echelon.simulation.optimal.drives import Plans, RecedingHorizon
 from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.settings import Settings
-from echelon.synthesis.gains.fixed import FixedGain
-from echelon.synthesis.gains.gain import Gain, Method, synthesize
-from echelon.synthesis.gains.inner_loop import InnerLoop
-from echelon.synthesis.gains.riccati import Riccati
+from echelon.synthesis.gains.gain import FixedGain, Gain, Method, synthesize
+from echelon.synthesis.gains.riccati import InnerLoop, Riccati
 
 OWN = "own"
 """Label of the scenario's drive."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from echelon.core.statement import Hypothesis, Statement, Topic, holds, unneeded
 from echelon.core.words import Kind
-from echelon.guarantees.messages.network_lines import messages_line
+from echelon.guarantees.messages.late_messages import messages_line
 from echelon.guarantees.messages.own_delay import OwnCase, own_delay_line
 from echelon.guarantees.promises.case import Case
 from echelon.guarantees.promises.closed_loop import loop_of

@@ -9,7 +9,7 @@ import scipy.linalg
 from echelon.core.digits import at_least
 from echelon.core.types import Array
 from echelon.core.words import amount
-from echelon.guarantees.verifier import algebra, exact_minors
+from echelon.guarantees.verifier import algebra
 from echelon.guarantees.verifier.findings import (
     DECIDED,
     ROUNDING,
@@ -163,12 +163,12 @@ def _proof(facts: Facts, region: SavedRegion) -> Iterator[Finding]:
         for k in range(len(rows)):
             # lambda_min > low exactly when L_g - low I is positive definite.
             rows[k][k] -= low
-        fine = exact_minors.is_positive_definite(rows)
+        fine = algebra.is_positive_definite(rows)
         yield decide("lambda_min, proved", fine, facts.low, float(low), "exact minors")
     strength = 0 * low if region.theorem == "A5" else 2 * Fraction(saved.coupling) * low
     numbers = (saved.P, saved.model.B, saved.R, region.hull, region.error, strength, region.rate)
     # A negative error would relax the inequality instead of tightening it.
     failed = None if (region.error >= 0.0).all() else 0
-    failed = exact_minors.first_unproved(*numbers) if failed is None else failed
+    failed = algebra.first_unproved(*numbers) if failed is None else failed
     text = "exact minors" if failed is None else f"vertex {failed} is not negative definite"
     yield decide(claim, failed is None, region.rate, text=text)

@@ -11,7 +11,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.tree import shares
+from echelon.agents.network.matrices import shares
 from echelon.agents.references.demand import reference_warnings
 from echelon.agents.references.flatness import followed_states, reference_targets
 from echelon.agents.references.guide import Guide

@@ -9,7 +9,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.tree import shares
+from echelon.agents.network.matrices import shares
 from echelon.agents.references.flatness import (
     Targets,
     mean_targets,

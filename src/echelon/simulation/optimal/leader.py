@@ -22,7 +22,7 @@ from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.law import Law, LocalView, Memory
-from echelon.laws.tracking import tracking_gain
+from echelon.laws.path_leader import tracking_gain
 from echelon.simulation.optimal.formation_plan import Trajectory, plan_tracking
 from echelon.simulation.optimal.objectives import TrackingOptions, grid
 from echelon.synthesis.gains.gain import Gain
