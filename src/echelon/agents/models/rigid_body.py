@@ -1,4 +1,4 @@
-"""A rigid body in space: ZYX Euler angles zeta = (roll, pitch, yaw), body rates, inertia, motors."""
+"""A rigid body in space: ZYX Euler angles zeta = (roll, pitch, yaw), body rates and motors."""
 
 import math
 from collections.abc import Callable
