@@ -28,7 +28,7 @@ HELP = """usage: python3 dev.py COMMAND [ARGUMENT ...]
   demo       run the paper's experiment: echelon run paper [ARGUMENT ...]
   test       run the tests on all cores: pytest [ARGUMENT ...]; --quick leaves the slow tests out;
              installs Chromium for the tests of the web page where it is missing
-  setup      create .venv with all extras (2.5 GB) and build three.js for the web page; does nothing
+  setup      create .venv with all extras (2.2 GB) and build three.js for the web page; does nothing
              where it is up to date; --minimal installs what `echelon run` needs (1.1 GB)
   browser    find or install Chromium
   lint       check style, layout and imports between packages: ruff, import-linter
@@ -241,10 +241,8 @@ def run(command: list[str], folder: Path = ROOT) -> int:
 
 
 def is_minimal(verb: str, rest: list[str]) -> bool:
-    """Tell whether a small environment is asked for, or is there and suffices."""
-    if verb == "setup":
-        return "--minimal" in rest
-    return verb == "demo" and STAMP.is_file() and STAMP.read_text("utf-8").startswith("minimal\n")
+    """Tell whether a small environment suffices."""
+    return verb == "demo" or (verb == "setup" and "--minimal" in rest)
 
 
 def setup(minimal: bool) -> None:
