@@ -164,11 +164,8 @@ def _is_unknown(kind: type) -> bool:
     known = {base for cls in ours for base in cls.__mro__}
     names = {name for cls in ours for name in vars(cls) if not name.startswith("__")} | _LOOKUPS
     firsts = {name: next((c for c in order if name in vars(c)), object) for name in names - _WORDS}
-    return any(cls not in known and _is_code(vars(cls)[name]) for name, cls in firsts.items())
-
-
-def _is_code(value: object) -> bool:
-    return callable(value) or hasattr(type(value), "__get__")
+    others = (vars(cls)[name] for name, cls in firsts.items() if cls not in known)
+    return any(callable(value) or hasattr(type(value), "__get__") for value in others)
 
 
 @memoize

@@ -163,11 +163,12 @@ def late_rates(L: sp.csr_array, c: float, age: Fraction) -> tuple[LateRate, ...]
         age: tau, s.
     """
     L, ones = sp.csr_array(L), np.ones_like(L.diagonal())
+    own = sp.diags_array(L.diagonal())
 
     def weights(rate: float) -> Array | None:
         # Of a matrix without positive entries off its diagonal: v > 0 exactly if it is an M-matrix.
-        grown = _grown(L, float(np.exp(min(rate * float(age), 300.0))))
-        K = sp.csc_array(c * grown - rate * sp.diags_array(ones))
+        grown = own + float(np.exp(min(rate * float(age), 300.0))) * (L - own)
+        K = sp.csc_array(c * sp.csr_array(grown) - rate * sp.diags_array(ones))
         try:
             v = spla.splu(K).solve(ones)
         except RuntimeError:
@@ -185,12 +186,6 @@ def late_rates(L: sp.csr_array, c: float, age: Fraction) -> tuple[LateRate, ...]
     pairs = ((best * share, weights(best * share)) for share in shares)
     drafts = (LateRate(rate, v) for rate, v in pairs if v is not None)
     return tuple(each for each in drafts if is_proved(each, L, c, age))
-
-
-def _grown(L: sp.csr_array, factor: float) -> sp.csr_array:
-    """Return a Laplacian with everything heard times a factor."""
-    own = sp.diags_array(L.diagonal())
-    return sp.csr_array(own + factor * (L - own))
 
 
 def is_proved(late: LateRate, L: sp.csr_array, c: float, age: Fraction) -> bool:

@@ -381,7 +381,8 @@ def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Arra
     It is the same number of each run after the other.
     """
     starts = states - parts.formation.offsets
-    starts = starts[:, _few(starts[0])]
+    few = np.unique(np.linspace(0, starts.shape[1] - 1, _STARTS).astype(int))
+    starts = starts[:, few]
     rows = path.at_start(parts.model, starts.reshape(-1, starts.shape[2]))
     size = MOMENTS + _STARTS
     parts_of = [
@@ -389,11 +390,6 @@ def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Arra
         for k in range(0, len(rows.times), size)
     ]
     return ModeMatrices._make(map(np.concatenate, zip(*parts_of, strict=True)))
-
-
-def _few(starts: Array) -> Array:
-    """Return which agents' starts (N, n) are looked at."""
-    return np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))
 
 
 # ---- the laws there -----------------------------------------------------------------------------

@@ -168,8 +168,9 @@ class MetricPromise(Promise):
         for k, each in enumerate(settings):
             there = case._replace(settings=each)
             if case.frozen is not None and starts is not None:
-                frozen = case.frozen._replace(starts=_share(starts, k, len(states)))
-                there = there._replace(frozen=frozen)
+                size = len(starts.A) // len(states)
+                own = ModeMatrices(*(part[k * size : (k + 1) * size] for part in starts))
+                there = there._replace(frozen=case.frozen._replace(starts=own))
             yield self._from(there, states[k], bool(decays[k].all()))
 
     def _from(self, case: Case, states: Array, decays: bool) -> "MetricPromise":
@@ -258,9 +259,3 @@ class MetricPromise(Promise):
             return f"{text}agents stayed in the domain at every stored frame"
         text = f"the starts lie in the certified set ({starts.number_text}), and all agents stayed "
         return f"{text}in the domain"
-
-
-def _share(starts: ModeMatrices, k: int, runs: int) -> ModeMatrices:
-    """Return what is of one of so many runs."""
-    size = len(starts.A) // runs
-    return ModeMatrices(*(part[k * size : (k + 1) * size] for part in starts))

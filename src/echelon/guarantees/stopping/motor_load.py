@@ -10,7 +10,7 @@ import numpy as np
 from echelon.agents.models.declarations import is_by_user, undeclared
 from echelon.agents.models.model import Airframe, ControlAffine, in_metres
 from echelon.core.digits import at_least, at_most
-from echelon.core.enclosure.interval import ELEMENTARY, Interval, point
+from echelon.core.enclosure.interval import ELEMENTARY, point
 from echelon.core.memoize import memoize
 from echelon.core.rational import (
     bisect,
@@ -380,16 +380,13 @@ def _demand(pieces: Pieces, begin: Fraction, end: Fraction | None) -> MotorDeman
     rows = pieces.between(begin, end)
 
     def most(order: int, *outputs: int) -> Fraction:
-        return max(norm_above(*(_size(row[order][k]) for k in outputs)) for row in rows)
+        ends = ([(row[order][k].lo, row[order][k].hi) for k in outputs] for row in rows)
+        return max(norm_above(*(max(abs(low), abs(high)) for low, high in row)) for row in ends)
 
     low = min(row[2][2].lo for row in rows)
     high = max(row[2][2].hi for row in rows)
     sideways = (most(2, 0, 1), most(3, 0, 1), most(4, 0, 1))
     return MotorDemand(sideways, low, high, (most(3, 2), most(4, 2)), (most(1, 3), most(2, 3)))
-
-
-def _size(x: Interval) -> Fraction:
-    return max(abs(x.lo), abs(x.hi))
 
 
 # ---- agents --------------------------------------------------------------------------------------

@@ -112,7 +112,9 @@ def _all_together(
     stops: Array, graph: Graph, law: StoppingPoint, c: float, speed: float, times: Array
 ) -> _Reach:
     """Return how far stopping points (N,) are off by the largest |zeta_i| / w_i."""
-    followers, weights = list(graph.followers), _weights(graph, law.leaderward)
+    followers, [L] = list(graph.followers), graph.stretches(law.leaderward)
+    # L_g^-1 1, all positive.
+    weights = spla.splu(sp.csc_array(L)).solve(np.ones(len(followers)))
     away = np.abs(stops[followers] - stops[list(graph.nearest_leader())][followers])
     m = _falling((away / weights).max(), c, weights.max(), speed, times)
     return _Reach(m[None], np.zeros(len(followers), int), weights)
@@ -202,12 +204,6 @@ def _late(
     start, heaviest = float(off / weights.min()), float(weights.max())
     bounds = np.stack([_falling(start, c, heaviest, speed, clock) for clock in clocks])
     return _Reach(bounds, whose, weights)
-
-
-def _weights(graph: Graph, leaderward: bool) -> Array:
-    """Return w = L_g^-1 1 of the followers, all positive."""
-    [L] = graph.stretches(leaderward)
-    return spla.splu(sp.csc_array(L)).solve(np.ones(len(graph.followers)))
 
 
 def _solved(L: sp.csr_array) -> Array | None:

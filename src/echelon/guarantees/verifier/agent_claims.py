@@ -163,17 +163,14 @@ def points(saved: SavedGain, region: SavedRegion) -> Points:
     ends = np.stack([box.low[box.used], box.high[box.used]])
     parts = [_corners(ends, random)]
     # Quarters of the ranges hold corners and middles, where symmetric functions are extreme.
-    for fractions in (_lattice(box, random), random.uniform(size=(_COUNT, len(box.used)))):
+    size = _COUNT, len(box.used)
+    for fractions in (random.integers(0, 5, size) / 4.0, random.uniform(size=size)):
         parts.append(ends[0] + fractions * (ends[1] - ends[0]))
     result, n = box.fill(np.concatenate(parts), random), len(saved.P)
     # The trim, where many slopes are extreme.
     result[-1] = 0.0
     few = 2 ** len(box.used)
     return Points(result[:, :n], result[:, n:], few if few <= _COUNT else 0)
-
-
-def _lattice(box: _Box, random: np.random.Generator) -> Array:
-    return random.integers(0, 5, (_COUNT, len(box.used))) / 4.0
 
 
 def _corners(ends: Array, random: np.random.Generator) -> Array:

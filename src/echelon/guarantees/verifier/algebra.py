@@ -1,7 +1,7 @@
 """Linear algebra of the verifier: in floats with bounds of their rounding, and exactly."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from fractions import Fraction
 from typing import Any, NamedTuple, TypeAlias
 
@@ -222,12 +222,11 @@ def _whole(row: list[Fraction]) -> list[int]:
 def product(left: Rows, right: Rows) -> Rows:
     """Return the matrix product, exactly."""
     columns = list(zip(*right, strict=True))
-    return [[_dot(row, column) for column in columns] for row in left]
-
-
-def _dot(row: Iterable[Fraction], column: Iterable[Fraction]) -> Fraction:
     # Fractions are slow, and most entries of these matrices are zero.
-    return sum((x * y for x, y in zip(row, column, strict=True) if x and y), Fraction(0))
+    return [
+        [sum((x * y for x, y in zip(a, b, strict=True) if x and y), Fraction(0)) for b in columns]
+        for a in left
+    ]
 
 
 def transpose(matrix: Rows) -> Rows:

@@ -62,12 +62,6 @@ def _check_strength(facts: Facts, region: SavedRegion) -> Finding:
     return decide("strength", fine, region.strength, most, "at most the bound of the weighted sum")
 
 
-def _weight_ratio(facts: Facts) -> float:
-    """Return the square root of the ratio of the largest to the smallest weight of the sum."""
-    sums = facts.saved.graph.sums
-    return 1.0 if sums is None else float(np.sqrt(sums.max() / sums.min()))
-
-
 def needs_constant(facts: Facts, region: SavedRegion) -> bool:
     """Return whether the guarantee requires a constant g."""
     if facts.saved.graph.directed and region.theorem == "A5":
@@ -96,7 +90,8 @@ def _spread(facts: Facts) -> float:
 
 def _check_radius(facts: Facts, region: SavedRegion) -> Finding:
     """Compare with the largest r for which {x'P x <= r^2} lies inside the bounds."""
-    widest = _widest(facts.saved.P, region) / _weight_ratio(facts)
+    widest, sums = _widest(facts.saved.P, region), facts.saved.graph.sums
+    widest = widest if sums is None else widest / float(np.sqrt(sums.max() / sums.min()))
     if region.theorem == "T2":
         text = "a local guarantee certifies no set"
         return decide("radius", region.radius is None, str(region.radius), text=text)

@@ -307,7 +307,7 @@ def tube_of(promise: JsonObject) -> JsonObject | None:
 def tube_findings(tube: JsonObject) -> Iterator[Finding]:
     """Yield a finding for each claim of a tube."""
     for border in tube["borders"]:
-        roots = _as_fractions(border["roots"])
+        roots = [Fraction(str(root)) for root in border["roots"]]
         name = ", ".join(f"`{output}`" for output in border["outputs"])
         for order, stored in enumerate(border["gains"]):
             result = _gain(roots, order)
@@ -343,10 +343,6 @@ def _check_margin(border: JsonObject, roots: Sequence[Fraction], name: str) -> I
     )
     shown, text = f"{at_most(worst, 4)} left", "margin from this start"
     yield decide(f"steepest start of {name}", worst >= -1e-9, border["steepest"], shown, text)
-
-
-def _as_fractions(roots: Sequence[float]) -> list[Fraction]:
-    return [Fraction(str(root)) for root in roots]
 
 
 def _pad_start(start: Sequence[float], size: int) -> Array:
