@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 import echelon as ech
 from echelon.agents.models.chains import chains_of
 from echelon.agents.references import FigureEight, Polynomials, Waypoints
-from echelon.agents.references.demand import reference_warnings
+from echelon.agents.references.flatness import reference_warnings
 from echelon.core.numerics import precision
 from echelon.guarantees.stopping.path_bounds import path_fault
 

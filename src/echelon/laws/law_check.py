@@ -9,9 +9,8 @@ import jax.numpy as jnp
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.demand import reference_warnings
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import Reference
+from echelon.agents.references.flatness import reference_warnings
+from echelon.agents.references.reference import Guide, Reference
 from echelon.core.errors import LawError
 from echelon.core.jaxpr import used_leaves
 from echelon.core.memoize import memoize

@@ -12,10 +12,13 @@ import scipy.linalg
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.spectrum import Spectrum
-from echelon.agents.references.demand import without_heading
-from echelon.agents.references.flatness import first_state, follow_at, followed_states
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import check_kind_of, check_reference
+from echelon.agents.references.flatness import (
+    first_state,
+    follow_at,
+    followed_states,
+    without_heading,
+)
+from echelon.agents.references.reference import Guide, check_kind_of, check_reference
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ReferenceError
 from echelon.core.identity import process_key

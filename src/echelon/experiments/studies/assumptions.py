@@ -10,7 +10,12 @@ from echelon.agents.models.model import ControlAffine, position_unit
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import who_hears_whom
-from echelon.agents.references.demand import ReferenceDemand, infeasible, reference_demand, too_fast
+from echelon.agents.references.flatness import (
+    ReferenceDemand,
+    infeasible,
+    reference_demand,
+    too_fast,
+)
 from echelon.core.digits import about, at_least, at_most
 from echelon.core.errors import GainError
 from echelon.core.linear import check_definite, eigenvalue_text

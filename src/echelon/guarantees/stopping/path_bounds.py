@@ -11,8 +11,7 @@ import numpy as np
 
 from echelon.agents.models.chains import Chains
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import COORDINATES, Reference
+from echelon.agents.references.reference import COORDINATES, Guide, Reference
 from echelon.core.digits import about
 from echelon.core.enclosure.interval import Interval, point
 from echelon.core.enclosure.taylor import enclose_derivatives, enclose_finely
