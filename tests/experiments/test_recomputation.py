@@ -147,7 +147,7 @@ def test_a_gain_of_the_leader_is_that_of_its_file_where_solvers_end_elsewhere(mo
         metric = solve(*arguments, **named)
         return metric._replace(P=metric.P * (1.0 + noise + noise.T))
 
-    monkeypatch.setattr(contraction, "contraction", another_machine)
+    monkeypatch.setattr(domain_methods, "contraction", another_machine)
     experiment = ech.build(ech.scenario_from_mapping(SOLVED))
     # By its own solution the other machine would call an honest file a forgery.
     assert refused(compare_claims(document, experiment, "small"))
