@@ -10,7 +10,7 @@ from echelon.apps.cli import fly_command
 
 CARTS = """
 name: carts
-model: double-integrator
+model: {name: double-integrator}
 graph: {edges: [[0, 1]], leaders: [0]}
 formation: {offsets: {1: [1, 0]}}
 reference: {name: circle, rate: 0.5}

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-DT, SUBSTEPS, HORIZON = 0.02, 2, 6.0
+DT, SUBSTEPS, HORIZON = 0.02, 2, 8.0
 OFFSETS = [0.0, 0.0, 0.0], [0.0, 0.6, 0.0]
 STATES = {"x": "m", "y": "m", "z": "m", "vx": "m/s", "vy": "m/s", "vz": "m/s"}
 INPUTS = {"ax": "m/s^2", "ay": "m/s^2", "az": "m/s^2"}

@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from echelon_flight import FlightError
+from echelon_flight import FlightError, __version__
 from echelon_flight.agent_process import AgentContext, AgentProcess, PlanClock
 from echelon_flight.datagram_socket import (
     LOOPBACK,
@@ -43,6 +43,7 @@ def main() -> None:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser("python -m echelon_flight", description=__doc__)
     say = parser.add_argument
+    say("--version", action="version", version=f"echelon-flight {__version__}")
     say("folder", type=Path, help="a folder that `echelon fly --out` wrote")
     say("--agent", type=int, help="fly this agent")
     say("--all", action="store_true", help="fly all, with simulated vehicles")
