@@ -114,6 +114,7 @@ def test_a_recorded_flight_starts_no_process_whose_clock_is_that_of_its_day(
             clock.now = max(clock.now, 100.0 + at - recorded[0][0] + start)
             others.send(datagram)
             flight.agents[1].round()
+        assert not flight.agents[1].context.clock.started
         flight.agents[1].interrupt()
         assert flight.agents[1].over() and flight.agents[1].end() is Fault.SIGNAL
         flight.kill(1)
