@@ -40,7 +40,8 @@ HELP = """usage: python3 dev.py COMMAND [ARGUMENT ...]
   mutate     change the code in small ways and report the changes that no test notices
   results    compute the published numbers of docs/ again: results (3 minutes on two free cores),
              comparison (10) and certificates (30), or [PAGE ...] of them
-  wheel      build the wheel into build/, install it without extras, and try it
+  wheel      build the wheels into build/, install each by itself, and try it: what one prepares
+             the other one flies
   bare       run demo, wheel and page tests in a minimal Debian; needs root and apt; for a release
 
 Every command except `bare` sets up .venv first: `demo` a small one, the others a full one."""
@@ -108,19 +109,22 @@ def cores() -> int:
 
 
 def wheel(rest: list[str]) -> list[list[str]]:
-    """Build the wheel, install it into an empty environment, and return the commands that try it.
+    """Build the wheels of echelon and of flight, and return the commands that try them.
 
-    They find what an editable install hides: a file that is not shipped, a dependency that only an
-    extra or a development tool installs.
+    Each is in an empty environment, and they find what an editable install hides: a file that is
+    not shipped, a dependency that only an extra or a development tool installs.
     """
-    wheels, alone = BUILD / "wheels", BUILD / "alone"
-    clear(wheels)
-    clear(alone)
-    install = installer(alone)
-    step(builder(alone, wheels), "the wheel could not be built; see the messages above.")
-    [built] = wheels.glob("*.whl")
+    wheels, alone, vehicle = (BUILD / name for name in ("wheels", "alone", "vehicle"))
+    for folder in (wheels, alone, vehicle):
+        clear(folder)
+    install, install_flight = installer(alone), installer(vehicle)
+    for source in (".", "packages/flight"):
+        step(builder(alone, wheels, source), "a wheel could not be built; see the messages above.")
+    [built], [flight] = (wheels.glob(f"{name}-*.whl") for name in ("echelon_formation", FLIGHT))
     step([*install, str(built), *PINNED], "the wheel could not be installed; see above.")
-    echelon = str(program("echelon", alone))
+    step([*install_flight, "--no-index", str(flight)], "the wheel of flight needs an index.")
+    echelon, bare = str(program("echelon", alone)), str(program("python", vehicle))
+    prepared, slowly = str(alone / "flight"), ["--seconds", "0.5", "--speed", "0.25"]
     every_name = "import echelon; [getattr(echelon, name) for name in echelon.__all__]"
     return [
         [str(program("python", alone)), "-c", every_name],
@@ -128,7 +132,19 @@ def wheel(rest: list[str]) -> list[list[str]]:
         [echelon, "check", "paper"],
         [echelon, "run", "paper", "--set", "simulation.horizon=1", "--out", str(alone / "run")],
         [echelon, "view", str(alone / "run"), "--html", str(alone / "run.html")],
+        [echelon, "fly", "paper-radio", "--out", prepared],
+        [bare, "-c", NOTHING_ELSE],
+        [bare, "-m", FLIGHT, prepared, "--all", *slowly],
     ]
+
+
+FLIGHT = "echelon_flight"
+NOTHING_ELSE = """
+import importlib.metadata
+names = {each.metadata["Name"] for each in importlib.metadata.distributions()}
+assert "echelon-flight" in names <= {"echelon-flight", "pip", "setuptools"}, names
+"""
+"""What passes where no other package is installed."""
 
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -290,11 +306,11 @@ def installer(venv: Path) -> list[str]:
     return with_uv(venv) if shutil.which("uv") else with_pip(venv)
 
 
-def builder(venv: Path, folder: Path) -> list[str]:
-    """Return the command that builds the wheel into a folder."""
+def builder(venv: Path, folder: Path, source: str) -> list[str]:
+    """Return the command that builds the wheel of a source into a folder."""
     if shutil.which("uv"):
-        return ["uv", "build", "--wheel", "--out-dir", str(folder)]
-    return [*pip(venv), "wheel", *quiet(), "--no-deps", "--wheel-dir", str(folder), "."]
+        return ["uv", "build", "--wheel", "--out-dir", str(folder), source]
+    return [*pip(venv), "wheel", *quiet(), "--no-deps", "--wheel-dir", str(folder), source]
 
 
 def with_uv(venv: Path) -> list[str]:

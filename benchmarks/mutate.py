@@ -333,11 +333,12 @@ def main() -> None:
         )
         os.chdir(tree)
         # A test's own processes look here too; with `CI`, hypothesis draws the same every time.
-        os.environ |= {"PYTHONPATH": str(tree / "src"), "CI": "1"}
+        sources = [str(tree / "src"), str(tree / "packages" / "flight" / "src")]
+        os.environ |= {"PYTHONPATH": os.pathsep.join(sources), "CI": "1"}
         os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(tree / "compiled")
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
-        sys.path[:0] = [str(tree / "src")]
+        sys.path[:0] = sources
         for name in HEAVY:
             __import__(name)
         killed, survived = 0, []

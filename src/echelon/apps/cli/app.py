@@ -43,6 +43,7 @@ from echelon.apps.cli.video_command import video
 from echelon.apps.cli.view_command import view
 from echelon.core import disk_cache
 from echelon.core.errors import EchelonError, ModelError
+from echelon_flight import FlightError
 
 _EPILOG = (
     "Exit codes: 0 success; 1 nothing is guaranteed, verify or doctor refused, or an agent left "
@@ -87,7 +88,7 @@ def _main() -> None:
     with disk_cache.use_folder(folder), outlive_readers(), STOP.listen():
         try:
             _call()
-        except EchelonError as error:
+        except (EchelonError, FlightError) as error:
             _leave(str(error), error.exit_code)
         except Ended:
             _leave(NOTHING, STOP.exit_code)

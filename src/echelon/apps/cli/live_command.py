@@ -32,7 +32,7 @@ def live(
     from echelon.apps.cli.console import warn
     from echelon.apps.cli.view_command import keep_serving
     from echelon.apps.live.server import live as make_ready
-    from echelon.apps.live.server import serve_live
+    from echelon.apps.live.server import live_page
     from echelon.experiments.results.dataset import recording_of
     from echelon.output.archive.load_folder import load
 
@@ -41,9 +41,8 @@ def live(
     run = recording_of(load(folder)) if folder is not None and when_written(folder) else None
     session, html = make_ready(loaded, run, STATUS.counter("parts"))
     warn(session.swarm.warnings)
-    server = serve_live(session, html, port)
     session.start()
     try:
-        keep_serving(server, port, browser)
+        keep_serving(live_page(session, html), port, browser)
     finally:
         session.end()

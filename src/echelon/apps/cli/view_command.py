@@ -16,7 +16,7 @@ from echelon.core.errors import OutputError
 from echelon.output.archive.folder import DATA, check_exists, claim_file
 
 if TYPE_CHECKING:
-    from http.server import ThreadingHTTPServer
+    from echelon_flight.page_server import Handler
 
 
 def _check_runs(runs: list[Path] | None) -> list[Path] | None:
@@ -83,35 +83,34 @@ def _newest() -> Path:
 
 def show_page(page: bytes, port: int | None, browser: bool) -> None:
     """Serve a page until Ctrl-C."""
-    from echelon.output.viewer.serve import Handler, serve
+    from echelon_flight.page_server import Handler
 
     class RunPage(Handler):
         """The page of this run."""
 
     RunPage.page = page
-    keep_serving(serve(RunPage, port), port, browser)
+    keep_serving(RunPage, port, browser)
 
 
-def keep_serving(server: "ThreadingHTTPServer", port: int | None, browser: bool) -> None:
+def keep_serving(page: "type[Handler]", port: int | None, browser: bool) -> None:
     """Print the address of a page, open a browser if there is one, and serve until Ctrl-C."""
-    from echelon.output.viewer.serve import serving
-
-    with serving(server) as address, STOP.hold(message=""):
-        show_address(server, address, port, browser)
+    preferred = page.port if port is None else port
+    with page.serving(preferred) as address, STOP.hold(message=""):
+        show_address(address, preferred, browser)
         wait()
 
 
-def show_address(
-    server: "ThreadingHTTPServer", address: str, port: int | None, browser: bool
-) -> None:
+def show_address(address: str, preferred: int, browser: bool) -> None:
     """Print the address of a page, and open a browser if there is one."""
-    from echelon.output.viewer.serve import PORT, open_browser
+    import webbrowser
 
-    preferred, actual = PORT if port is None else port, server.server_address[1]
+    actual = int(address.rstrip("/").rpartition(":")[2])
     if preferred not in (actual, 0):
         print(f"echelon: port {preferred} is in use; using {actual}.", file=sys.stderr)
-    opened = browser and open_browser(address)
-    failed = browser and not opened
+    try:
+        failed = browser and not webbrowser.open(address)
+    except webbrowser.Error:
+        failed = True
     hint = " No browser could be started: open this address in one." if failed else ""
     print(f"echelon: serving {address}.{hint} Ctrl-C quits.", file=sys.stderr, flush=True)
 

@@ -69,11 +69,10 @@ class WatchedRun:
 @contextlib.contextmanager
 def watching(scenario: "Scenario", experiment: "Experiment") -> Iterator[WatchedRun]:
     """Serve the page of a run that is about to start, and open a browser."""
-    from echelon.output.viewer.growing import serve_growing
-    from echelon.output.viewer.serve import serving
+    from echelon.output.viewer.growing import growing_page
 
     watched = WatchedRun(scenario, experiment)
-    server = serve_growing(watched.page, None)
-    with serving(server) as address:
-        show_address(server, address, None, browser=True)
+    handler = growing_page(watched.page)
+    with handler.serving() as address:
+        show_address(address, handler.port, browser=True)
         yield watched
