@@ -17,7 +17,7 @@ def foretell(experiment: "Experiment", quiet: bool) -> None:
     """Print the warnings of a run, and its guarantee on a terminal or if nothing is guaranteed."""
     if quiet or STATUS.silent:
         return
-    from echelon.experiments.studies.forecast import forecast
+    from echelon.experiments.studies.design import forecast
     from echelon.guarantees.promises.promise import promise
     from echelon.simulation.engine.prepare import prepare
 

@@ -90,7 +90,7 @@ def _other_version(file: Path, files: "ClaimFiles") -> "Iterator[str]":
         return
     from echelon.apps.cli.verify_report import WIDTH
     from echelon.core.provenance import versions
-    from echelon.guarantees.verifier.strict_json import read_json
+    from echelon.guarantees.verifier.saved_gain import read_json
 
     made, ours = read_json(files.claims).get("versions"), versions()
     names = [f"{made.get('echelon')} ({made.get('git')})"] if isinstance(made, dict) else []

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, cast
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import Reference, check_reference
+from echelon.agents.references.reference import Guide, Reference, check_reference
 from echelon.agents.world.world import World
 from echelon.core.errors import ModelError, ScenarioError, did_you_mean, listing
 from echelon.core.numerics import precision

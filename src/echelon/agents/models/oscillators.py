@@ -1,4 +1,4 @@
-"""The damped pendulum, the smallest agent with a nonlinear drift and a stable equilibrium."""
+"""Small agents with a nonlinear drift: a damped pendulum and the Van der Pol oscillator."""
 
 import jax.numpy as jnp
 
@@ -9,6 +9,8 @@ from echelon.agents.models.model import (
     check_positive,
 )
 from echelon.core.types import InputMap, State
+
+# ---- the pendulum --------------------------------------------------------------------------------
 
 
 class Pendulum(ControlAffine):
@@ -35,6 +37,31 @@ class Pendulum(ControlAffine):
     def drift(self, x: State) -> State:
         """Return f(x)."""
         return jnp.stack([x[1], -self.stiffness * jnp.sin(x[0]) - self.damping * x[1]])
+
+    def input_map(self, x: State) -> InputMap:
+        """Return g = (0; 1)."""
+        return jnp.array([[0.0], [1.0]], x.dtype)
+
+
+# ---- the Van der Pol oscillator ------------------------------------------------------------------
+
+
+class VanDerPol(ControlAffine):
+    """x1dot = x2, x2dot = damping (1 - x1^2) x2 - x1 + u; dimensionless."""
+
+    damping: float = 1.0
+
+    state_names = ("position", "velocity")
+    input_names = ("force",)
+    flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
+
+    def __check_init__(self) -> None:
+        """Refuse a damping that is negative or not finite."""
+        check_not_negative(self, damping=self.damping)
+
+    def drift(self, x: State) -> State:
+        """Return f(x)."""
+        return jnp.stack([x[1], self.damping * (1.0 - x[0] ** 2) * x[1] - x[0]])
 
     def input_map(self, x: State) -> InputMap:
         """Return g = (0; 1)."""
