@@ -77,7 +77,10 @@ def _run(mission: Mission, options: argparse.Namespace) -> int:
 
         Vehicles(mission, simulated(mission), options.speed, options.port).run()
     if options.weather:
-        return _bridge(mission, options)
+        from echelon_flight.simulated_vehicles import LinkImpairment, carry
+
+        ports, impairment = ports_of(mission.agents, options.port), LinkImpairment(*options.weather)
+        carry(options.port + mission.agents + 1, ports, impairment, options.speed)
     if options.all:
         return _fly_all(mission, options)
     if options.ground:
@@ -85,14 +88,6 @@ def _run(mission: Mission, options: argparse.Namespace) -> int:
     if options.agent is None:
         raise FlightError("give `--agent` with a number, `--all` or `--ground`.")
     return _fly(mission, options)
-
-
-def _bridge(mission: Mission, options: argparse.Namespace) -> int:
-    from echelon_flight.simulated_vehicles import LinkImpairment, carry
-
-    ports, impairment = ports_of(mission.agents, options.port), LinkImpairment(*options.weather)
-    carry(options.port + mission.agents + 1, ports, impairment, options.speed)
-    return 0
 
 
 def _ways(
