@@ -14,8 +14,8 @@ import pytest
 
 import echelon as ech
 from echelon.agents.models import Pendulum, VanDerPol
+from echelon.core.cache import BoundedCache, memoize
 from echelon.core.identity import digest, foreign_key, process_key
-from echelon.core.memoize import BoundedCache, memoize
 from echelon.core.words import Feedforward, Kind
 
 

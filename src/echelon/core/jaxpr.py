@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
+from echelon.core.cache import BoundedCache
 from echelon.core.identity import process_key
-from echelon.core.memoize import BoundedCache
 from echelon.core.numeric_rules import MOVES, NUMERIC, Params, Rule, scatter_add
 from echelon.core.numerics import precision
 from echelon.core.types import PyTree

@@ -9,8 +9,8 @@ import jax
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide
+from echelon.core.cache import memoize
 from echelon.core.jaxpr import used_leaves
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import PyTree
 from echelon.core.words import Feedforward

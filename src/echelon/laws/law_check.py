@@ -7,8 +7,8 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.demand import reference_warnings
 from echelon.agents.references.reference import Reference
+from echelon.core.cache import memoize
 from echelon.core.errors import LawError
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.trace import check_array, checked_trace
 from echelon.core.words import Feedforward

@@ -17,11 +17,11 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import check_reference
+from echelon.core.cache import BoundedCache
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError
 from echelon.core.identity import process_key
 from echelon.core.linear import symmetric_part
-from echelon.core.memoize import BoundedCache
 from echelon.core.types import Array, Input
 from echelon.laws.law import LocalView, Memory
 from echelon.laws.path_leader import PathLeader

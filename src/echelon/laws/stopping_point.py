@@ -20,8 +20,8 @@ from echelon.agents.network.near import Near
 from echelon.agents.references.flatness import first_state, followed_states
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
+from echelon.core.cache import memoize
 from echelon.core.errors import LawError, check_kind, listing
-from echelon.core.memoize import memoize
 from echelon.core.numerics import greater, lesser, precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward, NeighbourChoice

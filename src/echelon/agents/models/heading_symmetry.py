@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from echelon.agents.models.heading import Heading, Turn
 from echelon.agents.models.model import ControlAffine
+from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import ModelError, did_you_mean, listing
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Input, Scalar, State
 

@@ -12,8 +12,8 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.flatness import follow_at
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference
+from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 

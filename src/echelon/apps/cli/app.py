@@ -16,7 +16,6 @@ from typing import Annotated
 import typer
 
 from echelon import __version__
-from echelon.apps.cli.cache import keep_compiled_code
 from echelon.apps.cli.check_command import check
 from echelon.apps.cli.compare_command import compare
 from echelon.apps.cli.crash import CRASHED, note_crash
@@ -41,7 +40,7 @@ from echelon.apps.cli.tune_command import tune
 from echelon.apps.cli.verify_command import verify
 from echelon.apps.cli.video_command import video
 from echelon.apps.cli.view_command import view
-from echelon.core import disk_cache
+from echelon.core import cache
 from echelon.core.errors import EchelonError, ModelError
 
 _EPILOG = (
@@ -83,8 +82,8 @@ def _main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Traces are made of many objects that last: Python would look through all of them at each 700.
     gc.set_threshold(20_000)
-    folder = keep_compiled_code(os.environ)
-    with disk_cache.use_folder(folder), outlive_readers(), STOP.listen():
+    folder = cache.open_user_folder(os.environ)
+    with cache.use_folder(folder), outlive_readers(), STOP.listen():
         try:
             _call()
         except EchelonError as error:

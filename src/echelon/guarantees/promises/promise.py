@@ -13,10 +13,10 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeAlias
 from weakref import WeakKeyDictionary
 
+from echelon.core.cache import load_or_compute
 from echelon.core.digits import at_most
 from echelon.core.errors import EchelonError
 from echelon.core.identity import foreign_key
-from echelon.core.memoize import load_or_compute
 from echelon.core.numerics import precision
 from echelon.core.statement import Cause, Hypothesis, Statement
 from echelon.core.trace import shared_traces

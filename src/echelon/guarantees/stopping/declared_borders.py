@@ -12,9 +12,9 @@ from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.chains import Chains, derivatives_of, flatten
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.quadrotor import Quadrotor
+from echelon.core.cache import memoize
 from echelon.core.compiled import compiled_for_one_call
 from echelon.core.digits import about
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
 

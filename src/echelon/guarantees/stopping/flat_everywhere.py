@@ -10,7 +10,7 @@ import numpy as np
 from echelon.agents.models.chains import Chains, derivatives_of
 from echelon.agents.models.declarations import is_by_user
 from echelon.agents.models.model import ControlAffine, FlatBound
-from echelon.core.memoize import memoize
+from echelon.core.cache import memoize
 from echelon.core.words import Kind
 from echelon.guarantees.stopping.declared_borders import border_fault
 from echelon.simulation.scalars import (

@@ -8,7 +8,7 @@ import numpy as np
 
 from echelon.agents.models.chains import Chains, flat_output, flatten
 from echelon.agents.models.model import ControlAffine
-from echelon.core.memoize import memoize
+from echelon.core.cache import memoize
 from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.declarations import is_by_user, undeclared
 from echelon.agents.models.model import ControlAffine, in_metres
+from echelon.core.cache import memoize
 from echelon.core.digits import at_least, at_most
 from echelon.core.enclosure.interval import Interval
-from echelon.core.memoize import memoize
 from echelon.core.rational import bisect, float_above, float_below, norm_above
 from echelon.core.statement import Hypothesis, Statement, holds, unneeded
 from echelon.core.types import Array

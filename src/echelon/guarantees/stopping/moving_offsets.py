@@ -20,8 +20,8 @@ from echelon.agents.network.formation_motion import (
     Rotate,
     Scale,
 )
+from echelon.core.cache import memoize
 from echelon.core.errors import GainError
-from echelon.core.memoize import memoize
 from echelon.core.rational import norm_above
 from echelon.core.types import Array, JsonObject
 from echelon.guarantees.stopping.chain_response import largest_between

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.network.formation_motion import ORDER, FormationMotion, Rotate, Scale, blend
+from echelon.core.cache import memoize
 from echelon.core.enclosure.taylor import enclose_finely
 from echelon.core.errors import GainError
-from echelon.core.memoize import memoize
 from echelon.core.types import Array
 from echelon.guarantees.stopping.path_smoothness import compare_derivatives
 

@@ -11,9 +11,9 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import COORDINATES, Reference
+from echelon.core.cache import memoize
 from echelon.core.enclosure.interval import Interval, point
 from echelon.core.enclosure.taylor import enclose_finely
-from echelon.core.memoize import memoize
 from echelon.core.rational import float_below, root_bounds
 from echelon.laws.stopping_point import StoppingLeader
 

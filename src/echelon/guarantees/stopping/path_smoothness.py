@@ -10,10 +10,10 @@ import numpy as np
 from echelon.agents.models.chains import Chains
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import COORDINATES, Reference
+from echelon.core.cache import memoize
 from echelon.core.digits import about
 from echelon.core.enclosure.taylor import enclose_derivatives, enclose_finely
 from echelon.core.errors import GainError
-from echelon.core.memoize import memoize
 from echelon.core.numerics import derivatives, precision
 
 _TIMES = 8

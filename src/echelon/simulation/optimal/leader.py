@@ -16,9 +16,9 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.references.demand import reference_warnings
 from echelon.agents.references.flatness import followed_states, reference_targets
 from echelon.agents.references.guide import Guide
+from echelon.core.cache import BoundedCache
 from echelon.core.errors import LawError
 from echelon.core.identity import process_key
-from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.law import Law, LocalView, Memory

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
+from echelon.core.cache import memoize
 from echelon.core.enclosure.atoms import OpenError
 from echelon.core.enclosure.hull import Box, slope_columns, slope_hull
 from echelon.core.enclosure.slopes import JumpError
 from echelon.core.errors import GainError
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.core.words import Kind
