@@ -12,7 +12,7 @@ from processes import without_status
 from runs import simulate
 
 import echelon as ech
-from echelon.apps.cli import crash
+from echelon.apps.cli import app
 from echelon.core.errors import Outcome
 
 LEAVES = """
@@ -91,8 +91,8 @@ def test_details_that_no_disk_takes_are_shown(monkeypatch, capsys):
     def full(*_, **__):
         raise OSError("no room")
 
-    monkeypatch.setattr(crash.tempfile, "NamedTemporaryFile", full)
-    assert "report it with the details above" in crash.note_crash(ValueError("odd"))
+    monkeypatch.setattr(app.tempfile, "NamedTemporaryFile", full)
+    assert "report it with the details above" in app.note_crash(ValueError("odd"))
     assert "ValueError: odd" in capsys.readouterr().err
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from echelon.apps.cli import options
-from echelon.apps.cli.status import STATUS
+from echelon.apps.cli.terminal import STATUS
 from echelon.core.errors import FlightError
 from echelon.flight.key_files import read_key, require_key
 from echelon.flight.links.link import check_scheme
