@@ -22,7 +22,7 @@ import numpy as np
 import planted_faults
 
 import echelon as ech
-from echelon.core.provenance import versions
+from echelon.core.files import versions
 from echelon.experiments.studies.speedup import time_constant
 
 HERE = Path(__file__).resolve().parent

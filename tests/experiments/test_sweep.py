@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import types
+from pathlib import Path
 
 import distributed
 import jax

@@ -71,8 +71,6 @@ def test_the_checker_loads_nothing_of_the_synthesis():
     shared |= {"core.compiled", "core.numerics", "core.types", "core.words"}
     # A model traces its own functions once in a call, whoever calls them.
     shared |= {"core.trace"}
-    # Whose parameters a class declares, and whether JAX can run, is asked of every class.
-    shared |= {"core.declared", "core.jax_state"}
     shared |= {"agents", "guarantees"}
     packages = ("agents.models", "guarantees.verifier")
     assert {name for name in ours if not name.startswith(packages)} <= shared

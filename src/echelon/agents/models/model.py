@@ -16,10 +16,9 @@ from jax.core import Tracer
 
 from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.heading import Heading
-from echelon.core.declared import Declared
 from echelon.core.errors import ModelError, did_you_mean, is_number, listing
 from echelon.core.trace import call_once_traced
-from echelon.core.types import Input, InputMap, Output, State
+from echelon.core.types import Declared, Input, InputMap, Output, State
 
 Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 Rows: TypeAlias = tuple[tuple[float, ...], ...]

@@ -4,8 +4,7 @@ import abc
 
 from echelon.agents.models.heading_symmetry import heading_index
 from echelon.agents.models.model import ControlAffine
-from echelon.core.declared import Declared
-from echelon.core.types import Input, Scalar, State
+from echelon.core.types import Declared, Input, Scalar, State
 
 
 class Guide(Declared):

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.world.estimator import Estimator
-from echelon.core.draws import Draw, key_of, normals
 from echelon.core.errors import SimulationError, is_number
+from echelon.core.numerics import Draw, key_of, normals
 from echelon.core.types import Array, State, States
 from echelon.core.words import Estimation
 

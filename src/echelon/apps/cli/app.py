@@ -95,7 +95,7 @@ def note_crash(error: Exception) -> str:
     sentence = f"internal error of echelon (your input may be correct): {kind}: {reason}"
     details = "".join(traceback.format_exception(error))
     try:
-        from echelon.core.provenance import versions
+        from echelon.core.files import versions
 
         head = f"{' '.join(sys.argv)}\n{versions()}\n\n"
         with tempfile.NamedTemporaryFile(

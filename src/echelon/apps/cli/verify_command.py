@@ -94,7 +94,7 @@ def _other_version(file: Path, files: "ClaimFiles") -> "Iterator[str]":
     """Yield that a run was written by another version, if its summary says so, and what to do."""
     if files.claims is None:
         return
-    from echelon.core.provenance import versions
+    from echelon.core.files import versions
     from echelon.guarantees.verifier.strict_json import read_json
 
     made, ours = read_json(files.claims).get("versions"), versions()

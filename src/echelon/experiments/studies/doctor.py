@@ -17,8 +17,8 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.references import Lemniscate
 from echelon.core import cache, numerics
 from echelon.core.errors import EchelonError, ModelError
-from echelon.core.jax_state import require_jax
-from echelon.core.provenance import versions
+from echelon.core.files import versions
+from echelon.core.numerics import require_jax
 from echelon.core.words import amount
 from echelon.experiments.results.metrics import metrics
 from echelon.experiments.scenario import registry
