@@ -22,7 +22,7 @@ import numpy as np
 import planted_faults
 
 import echelon as ech
-from echelon.core.provenance import versions
+from echelon.core.files import versions
 
 HERE = Path(__file__).resolve().parent
 PAGE = HERE.parent / "docs" / "certificates.md"

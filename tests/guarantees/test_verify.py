@@ -64,13 +64,11 @@ def test_the_checker_loads_nothing_of_the_synthesis():
     ours = {name.removeprefix("echelon.") for name in done.stdout.split() if "echelon." in name}
     assert "guarantees.verifier.algebra" in ours
     assert not ours & {"agents.models.linearization", "agents.models.model_check"}
-    # `core.compiled` and `core.disk_cache` save what is computed; the verifier never uses them.
-    shared = {"core", "core.errors", "core.identity", "core.memoize", "core.limits", "core.digits"}
-    shared |= {"core.compiled", "core.disk_cache", "core.numerics", "core.types", "core.words"}
+    # `core.compiled` and `core.cache` save what is computed; the verifier never uses them.
+    shared = {"core", "core.errors", "core.identity", "core.cache", "core.limits", "core.digits"}
+    shared |= {"core.compiled", "core.numerics", "core.types", "core.words"}
     # A model traces its own functions once in a call, whoever calls them.
-    shared |= {"core.trace", "core.reads"}
-    # Whose parameters a class declares, and whether JAX can run, is asked of every class.
-    shared |= {"core.declared", "core.jax_state"}
+    shared |= {"core.trace"}
     shared |= {"agents", "guarantees"}
     packages = ("agents.models", "guarantees.verifier")
     assert {name for name in ours if not name.startswith(packages)} <= shared

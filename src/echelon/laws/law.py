@@ -17,10 +17,9 @@ from echelon.agents.network.exchange import Near
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.reference import Guide
-from echelon.core.declared import Declared
 from echelon.core.errors import LawError
 from echelon.core.numerics import rk4
-from echelon.core.types import Array, Input, PyTree, Scalar, State
+from echelon.core.types import Array, Declared, Input, PyTree, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.laws.safety import Safety
 from echelon.synthesis.gains.gain import Gain

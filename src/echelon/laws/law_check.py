@@ -11,9 +11,9 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.flatness import reference_warnings
 from echelon.agents.references.reference import Guide, Reference
+from echelon.core.cache import memoize
 from echelon.core.errors import LawError
 from echelon.core.jaxpr import used_leaves
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.trace import check_array, checked_trace
 from echelon.core.types import PyTree

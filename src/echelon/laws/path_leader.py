@@ -19,11 +19,11 @@ from echelon.agents.references.flatness import (
     without_heading,
 )
 from echelon.agents.references.reference import Guide, check_kind_of, check_reference
+from echelon.core.cache import BoundedCache
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ReferenceError
 from echelon.core.identity import process_key
 from echelon.core.linear import symmetric_part
-from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.law import Expected, Law, LocalView, Memory, check_gain_fits

@@ -15,8 +15,8 @@ from echelon.agents.network.exchange import Near
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.flatness import first_state, followed_states
 from echelon.agents.references.reference import Guide, Reference, check_reference
+from echelon.core.cache import memoize
 from echelon.core.errors import LawError, check_kind, listing
-from echelon.core.memoize import memoize
 from echelon.core.numerics import greater, lesser, precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward, NeighbourChoice

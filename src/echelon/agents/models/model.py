@@ -10,10 +10,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float
 
-from echelon.core.declared import Declared
 from echelon.core.errors import ModelError, did_you_mean, is_number, listing
 from echelon.core.trace import call_once_traced
-from echelon.core.types import Array, Input, InputMap, Output, Scalar, State
+from echelon.core.types import Array, Declared, Input, InputMap, Output, Scalar, State
 
 # ---- what a model may state of its motors --------------------------------------------------------
 

@@ -10,9 +10,9 @@ from jaxtyping import Float
 from echelon.agents.models.heading_symmetry import check_heading
 from echelon.agents.models.linearization import AtTrim, at_trim
 from echelon.agents.models.model import ControlAffine, Limits
+from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import ModelError, did_you_mean, is_number, listing
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.trace import checked_trace, error_summary
 from echelon.core.types import Array

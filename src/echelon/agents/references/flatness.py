@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.reference import Guide, Reference, check_reference
+from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, PlanError
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array, State
 

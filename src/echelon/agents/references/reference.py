@@ -11,13 +11,12 @@ import numpy as np
 
 from echelon.agents.models.heading_symmetry import heading_index, heading_of, rest_heading
 from echelon.agents.models.model import ControlAffine
-from echelon.core.declared import Declared
+from echelon.core.cache import memoize
 from echelon.core.enclosure.hull import Box, value_hull
 from echelon.core.errors import GainError, LawError, ReferenceError, check_kind, listing
-from echelon.core.memoize import memoize
 from echelon.core.numerics import derivatives, precision
 from echelon.core.trace import call_once_traced, check_array, checked_trace
-from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.types import Array, Declared, Input, Scalar, State
 
 # ---- a motion of a model -------------------------------------------------------------------------
 

@@ -14,9 +14,8 @@ from jaxtyping import Float
 
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
-from echelon.core.draws import Draw, key_of, normals
 from echelon.core.errors import SimulationError, is_number
-from echelon.core.numerics import rk4
+from echelon.core.numerics import Draw, key_of, normals, rk4
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Estimation
 

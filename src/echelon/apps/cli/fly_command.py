@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from echelon.apps.cli import options
-from echelon.apps.cli.status import STATUS
+from echelon.apps.cli.terminal import STATUS
 from echelon.core.errors import FlightError
 from echelon.output.archive.folder import check_empty
 from echelon_flight import __version__

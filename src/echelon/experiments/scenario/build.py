@@ -11,8 +11,8 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.references.reference import Guide, Reference, check_reference
 from echelon.agents.world.world import World
 from echelon.core.errors import ModelError, ScenarioError, did_you_mean, listing
+from echelon.core.files import versions
 from echelon.core.numerics import precision
-from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.checks import ROLES, section
 from echelon.experiments.scenario.fault_list import FaultList

@@ -15,10 +15,10 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from echelon.core.cache import load_or_compute
 from echelon.core.digits import about, at_most
 from echelon.core.errors import EchelonError
 from echelon.core.identity import foreign_key
-from echelon.core.memoize import load_or_compute
 from echelon.core.numerics import precision
 from echelon.core.statement import Cause, Hypothesis, Statement
 from echelon.core.trace import shared_traces

@@ -13,9 +13,9 @@ from echelon.agents.models.chains import Chains, derivatives_of, flatten
 from echelon.agents.models.declarations import is_by_user
 from echelon.agents.models.model import Airframe, ControlAffine, FlatBound
 from echelon.agents.models.quadrotor import Quadrotor
+from echelon.core.cache import memoize
 from echelon.core.compiled import compiled_for_one_call
 from echelon.core.digits import about
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
 from echelon.core.words import Kind

@@ -9,9 +9,9 @@ import numpy as np
 
 from echelon.agents.models.declarations import is_by_user, undeclared
 from echelon.agents.models.model import Airframe, ControlAffine, in_metres
+from echelon.core.cache import memoize
 from echelon.core.digits import at_least, at_most
 from echelon.core.enclosure.interval import ELEMENTARY, point
-from echelon.core.memoize import memoize
 from echelon.core.rational import (
     bisect,
     float_above,

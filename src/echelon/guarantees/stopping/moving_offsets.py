@@ -19,9 +19,9 @@ from echelon.agents.network.formation_motion import (
     Scale,
     blend,
 )
+from echelon.core.cache import memoize
 from echelon.core.enclosure.taylor import enclose_finely
 from echelon.core.errors import GainError
-from echelon.core.memoize import memoize
 from echelon.core.rational import norm_above
 from echelon.core.types import Array, JsonObject
 from echelon.guarantees.stopping.chain_response import largest_between

@@ -12,11 +12,11 @@ import numpy as np
 from echelon.agents.models.chains import Chains
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.reference import COORDINATES, Guide, Reference
+from echelon.core.cache import memoize
 from echelon.core.digits import about
 from echelon.core.enclosure.interval import Interval, point
 from echelon.core.enclosure.taylor import enclose_derivatives, enclose_finely
 from echelon.core.errors import GainError
-from echelon.core.memoize import memoize
 from echelon.core.numerics import derivatives, precision
 from echelon.core.rational import float_below, root_bounds
 from echelon.laws.stopping_point import StoppingLeader

@@ -17,12 +17,12 @@ from echelon.agents.network.edges import name_agents
 from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.matrices import unreached
+from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_least, at_most
 from echelon.core.enclosure.interval import point
 from echelon.core.errors import GraphError
 from echelon.core.linear import sampled_radius
-from echelon.core.memoize import memoize
 from echelon.core.rational import float_above
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array

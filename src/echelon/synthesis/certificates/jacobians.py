@@ -10,11 +10,11 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.secants import find_gap, find_jump
+from echelon.core.cache import memoize
 from echelon.core.enclosure.atoms import OpenError
 from echelon.core.enclosure.hull import Box, Hull, slope_columns, slope_hull
 from echelon.core.enclosure.slopes import JumpError
 from echelon.core.errors import GainError
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.core.words import Kind

@@ -20,12 +20,11 @@ from echelon.agents.models.model_check import check_model
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.matrices import lost_at_times
 from echelon.agents.network.spectrum import Spectrum
-from echelon.core.declared import Declared
 from echelon.core.errors import GainError, GraphError, check_kind
 from echelon.core.linear import Weight, as_matrix, check_definite
 from echelon.core.numerics import precision
 from echelon.core.trace import shared_traces
-from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.types import Array, Declared, Input, Scalar, State
 from echelon.core.words import amount
 from echelon.synthesis.certificates.certificate import Certificate, RegionCertificate, certify
 
