@@ -13,7 +13,6 @@ from echelon.simulation.codegen.machine_code import (
     vectors,
 )
 from echelon.simulation.codegen.scheduling import shared
-from echelon.simulation.codegen.tape import contribution_widths, from_tape
 
 __all__ = [
     "SHIFTED",
@@ -23,10 +22,8 @@ __all__ = [
     "Code",
     "Plan",
     "aligned",
-    "contribution_widths",
     "copy_rows",
     "factored",
-    "from_tape",
     "has_flag",
     "is_installed",
     "object_code",

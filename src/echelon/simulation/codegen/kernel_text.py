@@ -33,7 +33,6 @@ from echelon.simulation.codegen.neighbours import (
     write_mirror,
 )
 from echelon.simulation.codegen.scheduling import fuse, separate_uniform, shared
-from echelon.simulation.codegen.tape import record, take_contributions, tape_block
 from echelon.simulation.codegen.vector_ir import Writer
 from echelon.simulation.scalars.scalar_graph import Node, needed
 
@@ -124,11 +123,7 @@ def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
 def _context(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers: int) -> Context:
     """Write where the numbers are that change from step to step."""
     step = w.put(f"add i64 {slots['first_step']}, {passed}")
-    parity = passed
-    if plan.backward:
-        last = w.put(f"sub i64 {slots['steps']}, 1")
-        parity = w.put(f"sub i64 {last}, {passed}")
-    odd = w.put(f"trunc i64 {parity} to i1")
+    odd = w.put(f"trunc i64 {passed} to i1")
     mirror, next_mirror = (
         w.put(f"select i1 {odd}, ptr {slots[a]}, ptr {slots[b]}")
         for a, b in (("next_mirror", "mirror"), ("mirror", "next_mirror"))
@@ -195,12 +190,11 @@ def _act(w: Writer, context: Context, body: Body, block: str) -> None:
         return w.load_row(base, leaf.value[1])
 
     z = exchange(w, context, general, block, entries, load_row) if entries else {}
-    contributions = take_contributions(w, context, general, block)
 
     def load(leaf: Node) -> str:
         kind, *rest = leaf.value
-        if kind in ("z", "contribution"):
-            return (z if kind == "z" else contributions)[rest[0]]
+        if kind == "z":
+            return z[rest[0]]
         return _load(w, context, block, base, kind, rest)
 
     # Without the differences, whose sums are computed before.
@@ -246,8 +240,6 @@ def _load(
         if plan.leaders_ahead:
             start, row = context.leader_messages, rest[0]
         return _look_up(w, context, "sources", start, row, block, plan.one_source)
-    if kind == "tape":
-        return w.load_row(tape_block(w, context, block), rest[0])
     if kind == "leader":
         return _look_up(w, context, "leaders", context.mirror, rest[0], block, plan.one_leader)
     return _load_uniform(w, context, kind, *rest)
@@ -270,7 +262,11 @@ def _write(
                 w.store_row(w.operation(op, [w.load_row(base, row), value]), base, row)
     _note_exceptions(w, context.plan.exception_row, body, emitter, base)
     write_mirror(w, context, [emitter.value(node) for node in body.mirror], block)
-    record(w, context, body, emitter, block)
+    if body.tape:
+        with only_if(w, w.put(f"ptrtoint ptr {context.slots['tape']} to i64")):
+            start = w.part(context.tape, block, context.plan.tape_rows * w.lanes)
+            for row, node in body.tape.items():
+                w.store_row(emitter.value(node), start, row)
 
 
 def _note_exceptions(w: Writer, row: int, body: Body, emitter: Emitter, base: str) -> None:

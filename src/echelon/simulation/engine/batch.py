@@ -28,7 +28,6 @@ from echelon.simulation.engine.prepare import Prepared, channel_of, prepare, sen
 from echelon.simulation.engine.record import Recorder
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import result_of, sample_reference, simulate
-from echelon.simulation.native.kernel_cache import KERNELS
 from echelon.simulation.native.program_key import ProgramKeys
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.native.threads import processors
@@ -133,14 +132,14 @@ class Batch:
         """Return the results of a group; none where its runs cannot be stepped together."""
         settings = jobs[0].prepared.problem.settings
         states = np.concatenate([job.prepared.problem.states for job in jobs])
-        bits, pool = int(settings.precision[5:]), (self.pool, KERNELS.of)
+        bits = int(settings.precision[5:])
         loops, began = [job.loop for job in jobs], time.perf_counter()
         with precision(settings.precision):
             try:
                 stepper = choose_engine(
                     settings,
                     len(states),
-                    lambda: NativeStepper(loops, states, bits, None, *pool),
+                    lambda: NativeStepper(loops, states, bits, None, self.pool),
                     lambda why: JaxFormations(loops, states, why),
                 )
                 problems = [job.prepared.problem for job in jobs]

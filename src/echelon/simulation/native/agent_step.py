@@ -78,7 +78,7 @@ class BlockRows(NamedTuple):
         sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m]
         sizes += [message_size(loop), m, varying]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q, 1]
-        return cls(*row_ranges(sizes))
+        return cls(*_row_ranges(sizes))
 
 
 def check_information(loop: Loop) -> None:
@@ -135,7 +135,7 @@ def unflatten(like: PyTree, flat: Array | jax.Array) -> PyTree:
     )
 
 
-def row_ranges(sizes: Sequence[int]) -> list[Any]:
+def _row_ranges(sizes: Sequence[int]) -> list[Any]:
     """Return the ranges of rows of so many numbers each, one after the other, and the last row."""
     ends = np.cumsum([0, *sizes]).tolist()
     return [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
@@ -245,12 +245,7 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
 
 
 def body_of(
-    varying: VaryingNumbers,
-    bits: int,
-    rows: BlockRows,
-    leads: bool,
-    follows: bool,
-    in_table: bool = False,
+    varying: VaryingNumbers, bits: int, rows: BlockRows, leads: bool, follows: bool
 ) -> Body:
     """Return what the leaders or all others compute in a step.
 
@@ -260,19 +255,19 @@ def body_of(
         rows: where the numbers of an agent are.
         leads: whether it is the body of the leaders.
         follows: whether they follow a reference, which is in the table.
-        in_table: whether the varying numbers are the same for all agents, and in the table behind.
 
     Raises:
         Unsupported: the law or the model has no scalar operations.
     """
     graph, loop = ScalarGraph(bits), varying.loop
     law = loop.leader if leads else loop.follower
-    inputs = step_inputs(loop, graph, rows, law, leads, follows)
+    inputs = _step_inputs(loop, graph, rows, law, leads, follows)
 
     def step(leaves: list[jax.Array], inputs: StepInputs) -> StepOutputs:
         return agent_step(varying.filled(leaves), leads)(inputs)
 
-    results = lower(step, graph, [varying_leaves(varying, graph, rows, follows, in_table), inputs])
+    leaves = varying.leaves(leaves_of(graph, "row", rows.varying))
+    results = lower(step, graph, [leaves, inputs])
     shapes = jax.tree.structure(StepOutputs(*[0] * 15)._replace(memory=law.init()))
     outputs: StepOutputs = shapes.unflatten([nodes(graph, part) for part in results])
     memory = jax.tree.leaves(outputs.memory, is_leaf=lambda part: isinstance(part, list))
@@ -323,15 +318,6 @@ def _before_and_in_window(inputs: StepInputs, sums: list[Node]) -> list[Node]:
     return [all_.graph.make("select", inputs.steady[()], 0.0, all_), steady]
 
 
-def varying_leaves(
-    varying: VaryingNumbers, graph: ScalarGraph, rows: BlockRows, follows: bool, in_table: bool
-) -> list[np.ndarray]:
-    """Return the leaves of a loop that have varying numbers: in rows, or in the table."""
-    begin = len(rows.state) if follows else 0
-    places = range(begin, begin + varying.count) if in_table else rows.varying
-    return varying.leaves(leaves_of(graph, "table" if in_table else "row", places, in_table))
-
-
 def _difference(loop: Loop, graph: ScalarGraph, states: int, signals: int) -> list[Node]:
     """Return the differences of what neighbours read: of states by the model, of signals plain."""
     # Of the first loop's model: the difference of two states is the same for all formations.
@@ -342,7 +328,7 @@ def _difference(loop: Loop, graph: ScalarGraph, states: int, signals: int) -> li
     return [*nodes(graph, difference), *(graph.make("sub", a, b) for a, b in plain)]
 
 
-def step_inputs(
+def _step_inputs(
     loop: Loop, graph: ScalarGraph, rows: BlockRows, law: Law, leads: bool, follows: bool
 ) -> StepInputs:
     """Return what a step depends on as leaves of a graph."""

@@ -6,7 +6,6 @@ from typing import NamedTuple, TypeAlias, final
 
 import numpy as np
 
-from echelon.agents.network.exchange import Exchange
 from echelon.core.types import Array
 from echelon.simulation.codegen import Plan, aligned, stride
 from echelon.simulation.native.agent_order import (
@@ -121,7 +120,7 @@ _SAMPLE = 1_000
 """Blocks from which the share of contiguous ones is estimated."""
 
 
-def senders_of(loop: Loop) -> Array:
+def _senders_of(loop: Loop) -> Array:
     """Return the sender of each agent's message, (N,)."""
     if loop.parents is None:
         return np.asarray(loop.meter.nearest)
@@ -185,12 +184,12 @@ class SwarmBlocks(Places):
         loop, lanes = self.loop, self.lanes
         far = 1 if self.row_major else stride(width, lanes)
         starts, positions, weights = self.slots
-        sources = self.position[senders_of(loop)[self.agents]]
+        sources = self.position[_senders_of(loop)[self.agents]]
         nearest = np.asarray(loop.meter.nearest)[self.agents]
         return Neighbourhood(
             starts,
             np.ascontiguousarray(positions * far, np.int32),
-            aligned_copy(weights, dtype),
+            _aligned_copy(weights, dtype),
             ((sources // lanes) * rows * lanes + sources % lanes).astype(np.int32),
             (self.position[nearest] * far).astype(np.int32),
             *edge_blocks(loop, self, dtype, far),
@@ -260,8 +259,8 @@ class FormationBlocks(Places):
         return Neighbourhood(
             starts,
             (positions * far).astype(np.int32),
-            aligned_copy(np.broadcast_to(weights, (*weights.shape[:2], lanes)), dtype),
-            (place[senders_of(loop)[self.swarm.agents]] * rows * lanes).astype(np.int32),
+            _aligned_copy(np.broadcast_to(weights, (*weights.shape[:2], lanes)), dtype),
+            (place[_senders_of(loop)[self.swarm.agents]] * rows * lanes).astype(np.int32),
             (place[np.asarray(loop.meter.nearest)[self.swarm.agents]] * far).astype(np.int32),
             self._edges(dtype),
             np.ascontiguousarray(ends, np.int32),
@@ -291,7 +290,7 @@ class FormationBlocks(Places):
         return by_formation[: len(self.loops)].reshape(-1)
 
 
-def aligned_copy(values: Array, dtype: np.dtype | type) -> Array:
+def _aligned_copy(values: Array, dtype: np.dtype | type) -> Array:
     """Return numbers in memory that is aligned for whole vectors."""
     copy = aligned(values.shape, dtype)
     copy[:] = values
@@ -299,24 +298,20 @@ def aligned_copy(values: Array, dtype: np.dtype | type) -> Array:
 
 
 def neighbour_slots(
-    loop: Loop,
-    places: Places,
-    exchange: Exchange | None = None,
-    blocks: Array | slice = slice(None),
+    loop: Loop, places: Places, blocks: Array | slice = slice(None)
 ) -> tuple[Array, Array, Array]:
     """Return the neighbours of each agent, slot by slot: the k-th neighbour of each of a block.
 
     Args:
         loop: of the agents.
         places: of the agents.
-        exchange: edges; by default those of the loop.
         blocks: for which neighbours are returned.
 
     Returns:
         The first slot of each block (blocks + 1,), and of all slots the positions (slots, lanes)
         and weights (rows, slots, lanes).
     """
-    exchange, place = exchange or loop.exchange, places.position.astype(np.int32)
+    exchange, place = loop.exchange, places.position.astype(np.int32)
     # By position and not by number, so that memory is read from end to end.
     first, order = grouped(place[np.asarray(exchange.receivers)], len(places.agents))
     senders = place[np.asarray(exchange.senders)][order]

@@ -15,7 +15,7 @@ from echelon.simulation.codegen import aligned, stride
 from echelon.simulation.native.agent_step import signal_size, unflatten
 from echelon.simulation.native.blocks import FormationBlocks, Places, SwarmBlocks, neighbour_slots
 from echelon.simulation.native.buffers import BufferPool
-from echelon.simulation.native.kernel_cache import KERNELS, LANES, Make
+from echelon.simulation.native.kernel_cache import KERNELS, LANES
 from echelon.simulation.native.pair_watch import PairWatch
 from echelon.simulation.native.signals import mirror_values, offsets_of
 from echelon.simulation.native.threads import ThreadPool
@@ -31,7 +31,7 @@ _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Agent steps of a chunk, which take some hundredths of a second, and its fewest steps."""
 _OPERATIONS, _ENOUGH = {64: 3e10, 32: 6e10}, 1_000
 """Operations of a chunk with at most so many steps: about a second of one thread."""
-STEPS, _TASKS, _LEADER_NUMBERS = 2_048, 200_000, 10_000_000
+_STEPS, _TASKS, _LEADER_NUMBERS = 2_048, 200_000, 10_000_000
 """Limits of a call: steps, each with its uniform values; tasks; stored numbers of leaders ahead."""
 
 
@@ -46,11 +46,9 @@ class NativeStepper(Stepper):
         fallback: repeats a chunk whose numbers are not what JAX computes; None if the caller
             does, by `Chunk.inexact`.
         pool: threads that step formations; None for the caller's only.
-        make: returns the kernel; by default from the cache of all runs.
         variant: a loop of the same structure: `turn` may change the numbers in which it differs,
             and the weights of edges; None if `turn` is not called.
         threads: that share the steps of one formation; by default depending on its size.
-        places: of the agents, if they were computed before.
 
     Raises:
         Unsupported: a law or the model has no scalar operations.
@@ -63,17 +61,15 @@ class NativeStepper(Stepper):
         bits: int,
         fallback: Stepper | None,
         pool: Executor | None = None,
-        make: Make | None = None,
         variant: Loop | None = None,
         threads: int | None = None,
-        places: Places | None = None,
     ) -> None:
         """Generate and compile the step."""
         self.varying = VaryingNumbers(loops, variant)
         self.loop, self.loops, self.states, self.fallback = loops[0], loops, states, fallback
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
         batched, lanes = len(loops) > 1, LANES[bits]
-        self.places: Places = places or (
+        self.places: Places = (
             FormationBlocks(loops, lanes) if batched else SwarmBlocks(self.loop, lanes)
         )
         self.threads, self.buffers = ThreadPool(self.places, pool, threads), BufferPool()
@@ -83,7 +79,7 @@ class NativeStepper(Stepper):
         self.followers = (first + self.loop.followers).reshape(-1)
         row_major, weights_change = self.places.row_major, variant is not None
         apart = weights_change or any(np.any(loop.meter.spacings) for loop in loops)
-        self.code, self.rows, self.plan, self.uniform_count = (make or KERNELS.of)(
+        self.code, self.rows, self.plan, self.uniform_count = KERNELS.of(
             self.varying, bits, batched, row_major, weights_change, apart, self.places.shifts
         )
         self._signals = signal_size(self.loop)
@@ -94,9 +90,8 @@ class NativeStepper(Stepper):
         # The moment in the blocks: a chunk that continues from it need not be written there.
         self._moment: Moment | None = None
         self._hold, self._fallback_step = -1, -1
-        self._tape: Array | None = None
         axes, count = len(self.loop.meter.paired), len(loops)
-        self._pairs = PairWatch(self.places, axes, count, self.dtype, STEPS)
+        self._pairs = PairWatch(self.places, axes, count, self.dtype, _STEPS)
         self._draws_ahead = holds_at_once(len(states))
 
     # ---- memory ----
@@ -190,10 +185,6 @@ class NativeStepper(Stepper):
         # Offsets, numbers and the wind are written with a moment.
         self._moment = None
 
-    def record(self, tape: Array | None, first: int) -> None:
-        """Record the steps from `first` on for derivatives: (steps, blocks, rows, lanes)."""
-        self._tape, self._tape_start = tape, first
-
     def _advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         self._clear_sums()
         first = int(now.step)
@@ -286,7 +277,6 @@ class NativeStepper(Stepper):
         now, after = self.mirrors
         firsts = {"rows": self.blocks, "mirror": now, "next_mirror": after, "edges": self.edges}
         tape = self._pairs.room(step, steps)
-        tape = tape if self._tape is None else self._tape[step - self._tape_start]
         if tape.size:
             values["tape_step"], firsts["tape"] = tape.size, tape
         uniform_values = np.empty(steps * self.uniform_count, self.dtype)

@@ -4,7 +4,6 @@ Or between one formation now and later, if its parameters are changed during a r
 """
 
 import dataclasses
-import operator
 from collections.abc import Sequence
 from typing import Any, final
 
@@ -62,9 +61,8 @@ class VaryingNumbers:
         flat = [self._flat, *(jax.tree.leaves(bare(loop)) for loop in others)]
         self._masks = [_differing(leaves) for leaves in zip(*flat, strict=True)]
         # Now: somebody may write to an array later, and code is generated from its present numbers.
-        constant = self._constant(self._flat)
-        self._digest = digest(constant)
-        self.signature = digest((self._tree.unflatten(constant), self._masks))
+        constant = self._tree.unflatten(self._constant(self._flat))
+        self.signature = digest((constant, self._masks))
         values = np.stack([self._values(leaves) for leaves in flat[: len(distinct)]])
         self.values = values[[places[id(loop)] for loop in loops]]
 
@@ -85,13 +83,6 @@ class VaryingNumbers:
     def count(self) -> int:
         """How many numbers differ."""
         return self.values.shape[1]
-
-    def covers(self, loop: Loop) -> bool:
-        """Tell whether a loop differs from the first only in these numbers."""
-        leaves, tree = jax.tree.flatten(bare(loop))
-        same = _forms(leaves, tree) == _forms(self._flat, self._tree)
-        # Functions have no digest: their bits are addresses.
-        return same and self._digest is not None and digest(self._constant(leaves)) == self._digest
 
     def replace_loop(self, loop: Loop) -> None:
         """Replace the loop by one that differs from it only in these numbers."""
@@ -129,16 +120,6 @@ class VaryingNumbers:
         return eqx.tree_at(
             _separate_parts, new, _separate_parts(self.loop), is_leaf=lambda x: x is None
         )
-
-
-def alike(loop: Loop, other: Loop) -> bool:
-    """Tell whether two loops are equal except for the numbers in their leaves."""
-    return operator.eq(*(_forms(*jax.tree.flatten(bare(one))) for one in (loop, other)))
-
-
-def _forms(leaves: Sequence[object], tree: Any) -> tuple[object, ...]:
-    arrays = [np.asarray(leaf) for leaf in leaves]
-    return tree, *((array.dtype, array.shape) for array in arrays)
 
 
 def _differing(leaves: Sequence[Any]) -> Array:
