@@ -57,7 +57,6 @@ from .experiments.studies.design import design as design
 from .experiments.studies.finite_condition import finite_condition as finite_condition
 from .experiments.studies.speedup import speedup as speedup
 from .experiments.studies.state_space import state_space as state_space
-from .experiments.studies.tune import tune as tune
 from .guarantees.promises.promise import Promise as Promise
 from .guarantees.promises.promise import promise as promise
 from .laws.law import Law as Law

@@ -10,10 +10,14 @@ KEYS: dict[str, str] = {}
 VALUES: dict[str, str] = {}
 """Values of scenario keys, as in `prediction: none`, and of options, as in `export --to json`."""
 
-COMMANDS: dict[str, str] = {}
+COMMANDS: dict[str, str] = {
+    "tune": "minimize the cost by `ech.gradient` and SciPy, as in docs/recipes.md",
+}
 """Commands of the command line."""
 
-NAMES: dict[str, str] = {}
+NAMES: dict[str, str] = {
+    "tune": "minimize the cost by `ech.gradient` and SciPy, as in docs/recipes.md",
+}
 """Public names below `echelon`."""
 
 

@@ -37,7 +37,6 @@ from echelon.apps.cli.status import STATUS
 from echelon.apps.cli.stop import NOTHING, STOP, Ended
 from echelon.apps.cli.streams import outlive_readers
 from echelon.apps.cli.sweep_command import sweep
-from echelon.apps.cli.tune_command import tune
 from echelon.apps.cli.verify_command import verify
 from echelon.apps.cli.video_command import video
 from echelon.apps.cli.view_command import view
@@ -147,7 +146,7 @@ def _guarded(command: Callable[..., None]) -> Callable[..., None]:
 # Listed here instead of decorated in their files, so that the order is that of `--help`.
 _COMMANDS: tuple[Callable[..., None], ...] = (
     *(init, run, sweep, view, live, fly, plot, video, report, export, path),
-    *(check, design, tune, compare, verify, list_, explain, doctor, schema),
+    *(check, design, compare, verify, list_, explain, doctor, schema),
 )
 for _command in _COMMANDS:
     app.command(_command.__name__.rstrip("_"), cls=EchelonCommand)(_guarded(_command))

@@ -72,7 +72,7 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
     if parts.formation.motion is not None:
         raise SimulationError(
             "got a formation that changes, but derivatives are of constant ones; leave out "
-            "`motion` to tune, and give it to the runs afterwards."
+            "`motion` here, and give it to the runs afterwards."
         )
     if parts.world.network is not None:
         raise SimulationError("got a network, but derivatives are of messages that are never late.")
