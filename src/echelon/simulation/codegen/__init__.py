@@ -9,7 +9,6 @@ from echelon.simulation.codegen.machine_code import (
     Code,
     aligned,
     is_installed,
-    object_code,
     vectors,
 )
 from echelon.simulation.codegen.scheduling import shared
@@ -26,7 +25,6 @@ __all__ = [
     "factored",
     "has_flag",
     "is_installed",
-    "object_code",
     "program",
     "shared",
     "stride",

@@ -101,21 +101,6 @@ class Code:
         self._run(slots.ctypes.data)
 
 
-def object_code(text: str, triple: str, cpu: str) -> bytes:
-    """Return the object file of a text for another processor.
-
-    Raises:
-        MissingExtraError: llvmlite is not installed.
-        Unsupported: LLVM rejects the text.
-    """
-    binding = llvm()
-    binding.initialize_all_targets()
-    binding.initialize_all_asmprinters()
-    target = binding.Target.from_triple(triple)
-    machine = target.create_target_machine(cpu=cpu, opt=2, reloc="static")
-    return _compiled(binding, machine, f'target triple = "{triple}"\n{text}')
-
-
 def _compiled(binding: ModuleType, machine: Any, text: str) -> bytes:
     try:
         module = binding.parse_assembly(text)

@@ -168,7 +168,6 @@ def _syntax(bits: int) -> Syntax:
         "    const law_real {word} = {name}[{place}];",
         "    const law_real {} = {};",
         "    const int {} = {};",
-        ("law_real", "int"),
         {name: Template(text).substitute(words) for name, text in _HELPERS.items()},
     )
 

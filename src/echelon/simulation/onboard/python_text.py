@@ -106,7 +106,6 @@ _PYTHON = Syntax(
     "    {word} = {name}[{place}]",
     "    {} = {}",
     "    {} = {}",
-    ("float", "bool"),
     _HELPERS,
 )
 

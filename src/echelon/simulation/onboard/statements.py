@@ -36,16 +36,13 @@ class Syntax(NamedTuple):
     """How a language writes what differs between languages.
 
     Attributes:
-        operations: operation -> text, with the places of its operands and of its type, `kind`.
+        operations: operation -> text, with the places of its operands.
         literal: returns a plain number, to the bit.
         word: a name, with the place of a plain one.
         entry: an assignment, with the places of a `word`, and of the `name` and `place` of a number
             in an array.
         number, truth: an assignment, with the places of a name and an expression.
-        kinds: of numbers and of truths.
         helpers: functions by name, each after those that it calls.
-        deep: whether each result is computed before the next is begun, so that a compiler needs
-            less of the stack; LLVM finds an order itself.
     """
 
     operations: Mapping[str, str]
@@ -54,9 +51,7 @@ class Syntax(NamedTuple):
     entry: str
     number: str
     truth: str
-    kinds: tuple[str, str]
     helpers: Mapping[str, str]
-    deep: bool = True
 
     def used_helpers(self, text: str) -> str:
         """Return the functions that a text calls, directly or not."""
@@ -77,8 +72,8 @@ class Statements(NamedTuple):
 def statements(function: LawFunction, syntax: Syntax) -> Statements:
     """Return the assignments that compute the results of a function."""
     lines, words = list[str](), dict[Node, str]()
-    nodes = needed(function.results)
-    for node in depth_first(function.results, lateness(nodes)) if syntax.deep else nodes:
+    # Each result is computed before the next is begun, so that a compiler needs less of the stack.
+    for node in depth_first(function.results, lateness(needed(function.results))):
         if node.op == "constant":
             words[node] = syntax.literal(node.value)
         elif node.op == "leaf":
@@ -87,7 +82,6 @@ def statements(function: LawFunction, syntax: Syntax) -> Statements:
             lines += [syntax.entry.format(word=word, name=name, place=k) for k in place]
         else:
             words[node] = word = syntax.word.format(f"v{len(lines)}")
-            pattern, kind = syntax.operations[node.op], syntax.kinds[node.truth]
-            expression = pattern.format(*(words[a] for a in node.args), kind=kind)
+            expression = syntax.operations[node.op].format(*(words[a] for a in node.args))
             lines.append((syntax.truth if node.truth else syntax.number).format(word, expression))
     return Statements(lines, words)
