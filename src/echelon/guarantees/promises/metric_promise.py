@@ -36,7 +36,7 @@ from echelon.guarantees.promises.region import (
     weaken,
 )
 from echelon.guarantees.promises.turning import slowest_in_turns, turns_in_words
-from echelon.simulation.engine.initial import Starts
+from echelon.simulation.engine.parts import Starts
 from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate

@@ -15,8 +15,7 @@ from echelon.core.types import JsonObject
 from echelon.guarantees.promises.promise import guaranteed
 from echelon.laws.law import Law
 from echelon.output.archive.folder import write_errors
-from echelon.simulation.engine.agent import Agent
-from echelon.simulation.engine.own_step import OwnLaw
+from echelon.simulation.engine.agent import Agent, OwnLaw
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.onboard.c_text import c_text, header_text
 from echelon.simulation.onboard.law_functions import LawFunction, law_functions

@@ -18,12 +18,10 @@ from jaxtyping import Bool
 from echelon.core.errors import EchelonError, Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.simulation.engine.divergence import advance_until_lost
-from echelon.simulation.engine.grid import ChunkGrid
-from echelon.simulation.engine.initial import Starts
+from echelon.simulation.engine.chunks import ChunkGrid, advance_until_lost
 from echelon.simulation.engine.jax_stepper import JaxFormations
 from echelon.simulation.engine.law_drive import Laws, choose_engine, is_long, worth_native
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.prepare import Prepared, channel_of, prepare, sensors_of
 from echelon.simulation.engine.record import Recorder
 from echelon.simulation.engine.result import Result

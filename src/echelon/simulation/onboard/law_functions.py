@@ -19,7 +19,7 @@ from echelon.core.types import PyTree
 from echelon.core.words import MessageContent, Prediction
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law, carried_pieces
-from echelon.simulation.engine.own_step import (
+from echelon.simulation.engine.agent import (
     OwnLaw,
     OwnState,
     begin_alone,

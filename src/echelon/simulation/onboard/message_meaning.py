@@ -7,7 +7,7 @@ from echelon.core.words import Feedforward
 from echelon.laws.consensus import Consensus
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law
-from echelon.simulation.engine.own_step import OwnLaw
+from echelon.simulation.engine.agent import OwnLaw
 
 
 def normalized_equation(model: ControlAffine) -> str:
