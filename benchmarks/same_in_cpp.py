@@ -18,9 +18,8 @@ from echelon.simulation.codegen import Body, Code, Plan, aligned, program, share
 from echelon.simulation.codegen.fast_path import general_case
 from echelon.simulation.native.agent_step import body_of
 from echelon.simulation.native.kernel_cache import LANES
-from echelon.simulation.native.schedule import step_by_step
 from echelon.simulation.native.stepper import NativeStepper
-from echelon.simulation.native.threads import call
+from echelon.simulation.native.threads import call, step_by_step
 from echelon.simulation.scalars import Node
 from echelon.simulation.scalars.scalar_graph import needed, rewritten
 

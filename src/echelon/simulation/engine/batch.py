@@ -26,9 +26,9 @@ from echelon.simulation.engine.prepare import Prepared, channel_of, prepare, sen
 from echelon.simulation.engine.record import Recorder
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import result_of, sample_reference, simulate
-from echelon.simulation.native.program_key import ProgramKeys
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.native.threads import processors
+from echelon.simulation.native.varying import ProgramKeys
 from echelon.simulation.step.drive import Stepper
 from echelon.simulation.step.loop import Loop, assemble
 from echelon.simulation.step.motion import Motion

@@ -4,7 +4,7 @@ It is traced from the same laws, model, integrator and meter that `step.loop` ru
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -14,9 +14,16 @@ import numpy as np
 from echelon.core.types import Array, PyTree
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.codegen import Body, factored
-from echelon.simulation.native.exceptions import exceptions_of
 from echelon.simulation.native.varying import VaryingNumbers
-from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
+from echelon.simulation.scalars import (
+    Node,
+    ScalarGraph,
+    Unsupported,
+    lower,
+    may_be_exception,
+    needed,
+    nodes,
+)
 from echelon.simulation.step.action import act, feedforward_of, limit_sides
 from echelon.simulation.step.loop import Loop
 
@@ -384,3 +391,38 @@ def _placed(rows: BlockRows, named: dict[str, list[Node]]) -> dict[int, Node]:
         for name, entries in named.items()
         for row, node in zip(getattr(rows, name), entries, strict=name != "memory")
     }
+
+
+# ---- where the numbers of an agent are not what JAX computes -------------------------------------
+
+
+_SIZES = (1e9, 1e6, 1e3)
+"""Sizes of what neighbours read, of which the first is taken for which a difference is right."""
+
+
+def exceptions_of(graph: ScalarGraph, body: Body) -> list[Node]:
+    """Return where the numbers of an agent are not what JAX computes.
+
+    Raises:
+        Unsupported: nothing is known of the angles in a difference.
+    """
+    truths, false = graph.exceptions_of(body.results()), graph.constant(False)
+    truths += _between(graph, body)
+    uniform = [truth for truth in truths if truth.uniform]
+    truths = [truth for truth in truths if not truth.uniform]
+    # One truth of a step for all agents.
+    return [*truths, functools.reduce(functools.partial(graph.make, "or"), uniform, false)]
+
+
+def _between(graph: ScalarGraph, body: Body) -> Iterator[Node]:
+    """Yield where what neighbours read of an agent is too large for the differences of two."""
+    inside = [node for node in needed(body.difference) if node in graph.exceptions]
+    if not inside:
+        return
+    for size in _SIZES:
+        if not any(may_be_exception(graph, node, size) for node in inside):
+            break
+    else:
+        raise Unsupported("a `difference` with angles of which no bound is known")
+    for mine in body.mirror_before:
+        yield graph.make("lt", size, graph.make("abs", mine))
