@@ -1,6 +1,5 @@
 """Machine code of a step: from a graph of scalars to vectors, to the loops around them."""
 
-from echelon.simulation.codegen.angle_differences import has_flag
 from echelon.simulation.codegen.block_copy import copy_rows
 from echelon.simulation.codegen.factoring import factored
 from echelon.simulation.codegen.kernel_plan import SHIFTED, SLOTS, TASK, Body, Plan, stride
@@ -11,6 +10,7 @@ from echelon.simulation.codegen.machine_code import (
     is_installed,
     vectors,
 )
+from echelon.simulation.codegen.neighbours import has_flag
 from echelon.simulation.codegen.scheduling import shared
 
 __all__ = [

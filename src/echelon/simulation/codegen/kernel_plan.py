@@ -86,7 +86,7 @@ class Plan(NamedTuple):
             vectors of neighbours are agents that follow each other: rings, paths, grids.
         rows: of a block.
         width: numbers that neighbours read of an agent, stored in whole vectors; with the flag of
-            `angle_differences.has_flag`, if there is one.
+            `neighbours.has_flag`, if there is one.
         first: the body of the agents that act first.
         others: the body of all others, level by level.
         message_start: the first row of what an agent sends besides its state.
@@ -136,6 +136,38 @@ class Plan(NamedTuple):
         """How many numbers neighbours read of a block."""
         in_rows = self.batched or self.row_major
         return self.lanes * (self.width if in_rows else stride(self.width, self.lanes))
+
+
+class Context(NamedTuple):
+    """The plan of a kernel, and names of addresses and numbers in its text.
+
+    Attributes:
+        plan: of the kernel.
+        slots: name of a slot -> its value.
+        mirror: what neighbours read at this step.
+        next_mirror: what they read after it.
+        step: the number of the step.
+        table: this step's numbers in the table.
+        uniform_values: this step's numbers that are the same for all agents.
+        leader_mirror: what leaders ahead showed at this step.
+        leader_messages: what they sent at this step.
+        leader_count: the positions of leaders.
+        tape: this step's part of the tape.
+        at_hand: place of a number that is the same for all agents -> the number, loaded before.
+    """
+
+    plan: Plan
+    slots: dict[str, str]
+    mirror: str
+    next_mirror: str
+    step: str
+    table: str
+    uniform_values: str
+    leader_mirror: str = ""
+    leader_messages: str = ""
+    leader_count: str = ""
+    tape: str = ""
+    at_hand: Mapping[int, str] = MappingProxyType({})
 
 
 SLOTS = (

@@ -13,7 +13,7 @@ from echelon.core import disk_cache
 from echelon.core.errors import MissingExtraError
 from echelon.core.private_folder import PrivateFolder
 from echelon.core.trace import error_summary
-from echelon.simulation.scalars.traced_entries import Unsupported
+from echelon.simulation.scalars import Unsupported
 
 
 @cache
