@@ -9,7 +9,7 @@ import echelon as ech
 from echelon.core.packet import Packet
 from echelon.output.archive.law_folder import network_facts
 from echelon.simulation.onboard.law_functions import law_functions
-from echelon.simulation.onboard.python_text import python_text
+from echelon.simulation.onboard.source_code import python_text
 
 FAR = 2**30
 

@@ -14,7 +14,7 @@ from echelon.flight.pilot import Pilot
 from echelon.flight.wire import Letter
 from echelon.output.archive.law_folder import network_facts
 from echelon.simulation.onboard.law_functions import law_functions
-from echelon.simulation.onboard.python_text import python_text
+from echelon.simulation.onboard.source_code import python_text
 
 CARTS, DT = ech.models.DoubleIntegrator(), 0.01
 

@@ -13,9 +13,8 @@ from plain_agents import as_python, compare
 
 import echelon as ech
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.onboard.c_text import c_text, header_text
-from echelon.simulation.onboard.law_functions import LawFunction, law_functions
-from echelon.simulation.onboard.vehicle_function import move_function
+from echelon.simulation.onboard.law_functions import LawFunction, law_functions, move_function
+from echelon.simulation.onboard.source_code import c_text, header_text
 from echelon.simulation.scalars import ScalarGraph, Unsupported
 from echelon.simulation.scalars.scalar_graph import OPERATIONS
 

@@ -23,8 +23,8 @@ from echelon.output.archive.law_folder import python_law
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.onboard.python_text import python_text
-from echelon.simulation.onboard.vehicle_function import motions_of, move_function
+from echelon.simulation.onboard.law_functions import motions_of, move_function
+from echelon.simulation.onboard.source_code import python_text
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.settings import Settings
 

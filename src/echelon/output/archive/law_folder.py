@@ -17,14 +17,14 @@ from echelon.laws.law import Law
 from echelon.output.archive.folder import write_errors
 from echelon.simulation.engine.agent import Agent, OwnLaw
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.onboard.c_text import c_text, header_text
-from echelon.simulation.onboard.law_functions import LawFunction, law_functions
-from echelon.simulation.onboard.message_meaning import (
+from echelon.simulation.onboard.law_functions import (
+    LawFunction,
+    law_functions,
     message_meaning,
     message_words,
     normalized_equation,
 )
-from echelon.simulation.onboard.python_text import python_text
+from echelon.simulation.onboard.source_code import c_text, header_text, python_text
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.knowledge import HOP_LIFE
 from echelon.simulation.step.settings import Settings
