@@ -10,13 +10,16 @@ KEYS: dict[str, str] = {}
 VALUES: dict[str, str] = {}
 """Values of scenario keys, as in `prediction: none`, and of options, as in `export --to json`."""
 
-COMMANDS: dict[str, str] = {}
+COMMANDS: dict[str, str] = {
+    "tune": "minimize the cost by `ech.gradient` and SciPy, as in docs/recipes.md",
+}
 """Commands of the command line."""
 
 NAMES: dict[str, str] = {
     "network.recommend_edges": "compare `graph.with_edges([pair]).spectrum().low`; see recipes.md",
     "network.recommend_leaders": "compare `graph.with_leaders([k]).spectrum().low`; see recipes.md",
     "speedup": "use `-1 / gain.certificate.abscissa` of each graph; see recipes.md",
+    "tune": "minimize the cost by `ech.gradient` and SciPy, as in docs/recipes.md",
 }
 """Public names below `echelon`."""
 

@@ -44,9 +44,8 @@ from echelon.experiments.scenario.yaml import quoted
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
 from echelon.laws.safety import Safety
-from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.prepare import check_engine, check_memory
 from echelon.simulation.engine.record import Stretch
 from echelon.simulation.engine.result import Result

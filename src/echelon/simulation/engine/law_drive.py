@@ -328,7 +328,6 @@ def choose_engine(
     agents: int,
     native: Callable[[], _R],
     by_jax: Callable[[str], _R],
-    least: int = _WORTH,
 ) -> _R:
     """Return the result of one of the two engines for so many agents.
 
@@ -337,12 +336,11 @@ def choose_engine(
         agents: how many.
         native: computes it by native code.
         by_jax: computes it by JAX; takes why there is no native code, empty where none is needed.
-        least: from how many steps of one agent on native code pays.
 
     Raises:
         SimulationError: native code is requested, and there is none.
     """
-    if not worth_native(settings, agents, least):
+    if not worth_native(settings, agents):
         return by_jax("")
     try:
         return native()
@@ -352,21 +350,21 @@ def choose_engine(
         return by_jax(_in_words(error))
 
 
-def worth_native(settings: Settings, agents: int, least: int = _WORTH) -> bool:
+def worth_native(settings: Settings, agents: int) -> bool:
     """Tell whether native code steps the agents: if it is requested, or saves time.
 
-    It computes on processors alone, and `least` is from how many steps of one agent on it pays.
+    It computes on processors alone.
     """
     if settings.engine != "auto":
         return settings.engine == "native"
-    if settings.devices > 1 or not is_long(settings, agents, least):
+    if settings.devices > 1 or not is_long(settings, agents):
         return False
     return is_installed() and jax.default_backend() == "cpu"
 
 
-def is_long(settings: Settings, agents: int, least: int = _WORTH) -> bool:
+def is_long(settings: Settings, agents: int) -> bool:
     """Tell whether a run is long enough for more compilation than that of its JAX steps."""
-    return settings.engine == "native" or settings.steps * agents >= least
+    return settings.engine == "native" or settings.steps * agents >= _WORTH
 
 
 def _in_words(error: EchelonError) -> str:
