@@ -419,7 +419,7 @@ def test_the_table_of_mutate_names_packages_and_tests_that_exist():
 def test_set_up_names_no_host():
     """Packages come from where the user's own pip, npm and apt are set to look."""
     files = [*ROOT.glob("*.*"), *(ROOT / ".ci").iterdir(), *(ROOT / "web").glob("*.*")]
-    files += [*(ROOT / ".github").rglob("*.*"), *(ROOT / "packages").glob("*/*.*")]
+    files += [*(ROOT / ".github").rglob("*.*"), *(ROOT / "packages").glob("*/*.toml")]
     texts = {path.name: path.read_text("utf-8") for path in files if path.is_file()}
     texts.pop("CHANGELOG.md")  # links to conventions
     assert [name for name, text in texts.items() if "://" in text] == []
