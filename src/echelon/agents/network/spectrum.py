@@ -229,8 +229,8 @@ def symmetric_spectrum(L: sp.csr_array, grounded: Grounded) -> Spectrum:
     proved = least_eigenvalue_bound(grounded, _spread(L, vector), near)
     if not proved > 0.0:
         raise _weights_too_far_apart(np.append(grounded.weights, grounded.leader_edges[:, 1]))
-    # Rounding may have raised the eigenvalue, so its bound limits it.
-    eigenvalues[0] = min(eigenvalues[0], proved / _ROUNDED)
+    # Rounding may have raised the eigenvalue, so its bound limits it, or made it negative.
+    eigenvalues[0] = min(low, proved / _ROUNDED) if low > 0.0 else proved
     eigenvalues.setflags(write=False)
     return Spectrum(eigenvalues, grounded.size, proved)
 
