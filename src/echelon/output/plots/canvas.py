@@ -52,7 +52,10 @@ def frame(ax: "Axes", points: Array, alike: bool = True) -> None:
     for name, middle, reach in zip("xyz", 0.5 * low + 0.5 * high, half, strict=False):
         getattr(ax, f"set_{name}lim")(middle - reach, middle + reach)
     if len(half) == 3:
-        _fit_box(ax, half)
+        width, side = draw.page().width, draw.page().side
+        low, high = fit_box(ax, half, (0.07 * width, 0.45, side, side))
+        ax.figure.set_figheight(high[1] - low[1] + 0.75)
+        fit_box(ax, half, (0.07 * width, 0.45, side, high[1] - low[1]))
     elif alike:
         ax.set_aspect("equal")
         wide, figure = draw.page().width / 1.4, cast("Figure", ax.figure)
@@ -60,37 +63,33 @@ def frame(ax: "Axes", points: Array, alike: bool = True) -> None:
             figure.set_figheight(np.clip(0.7 + wide * half[1] / half[0], 2.0, 1.04 * wide))
 
 
-def _fit_box(ax: Any, half: Array) -> None:
-    """Scale the box of a space to the width or height of the figure, and fit the figure to it."""
-    width, side = draw.page().width, draw.page().side
-    available, left = np.array([side, side]), 0.07 * width
-    ax.set_position((0.0, 0.0, side / width, side / width))
-    ax.set_box_aspect(half / half.max())
+def fit_box(ax: Any, size: Array, room: tuple[float, float, float, float]) -> tuple[Array, Array]:
+    """Scale the box of a space until it fits into a part of its figure, and label its axes.
+
+    Args:
+        ax: in space, with its limits.
+        size: of the box.
+        room: left, bottom, width and height of the part, inches.
+
+    Returns:
+        The lower left and the upper right corner of the drawn box, inches.
+    """
     zoom = 1.0
-    # Under perspective the size is not quite proportional to the zoom, so it is corrected once.
-    for _ in range(2):
+    # Under perspective the size is not quite proportional to the zoom.
+    for _ in range(3):
+        ax.set_box_aspect(size / size.max(), zoom=zoom)
         low, high = _box_on_paper(ax)
-        zoom *= (available / (high - low)).min()
-        ax.set_box_aspect(half / half.max(), zoom=zoom)
-    low, high = _box_on_paper(ax)
-    height = high[1] - low[1] + 0.75
-    corner = np.array([left + 0.5 * (available[0] - high[0] + low[0]), 0.45]) - low
-    ax.figure.set_figheight(height)
-    ax.set_position((corner[0] / width, corner[1] / height, side / width, side / height))
-    _label_box(ax, half)
-
-
-def _label_box(ax: Any, half: Array) -> None:
-    """Choose the ticks of a box, with the same distance of labels for any box."""
-    from matplotlib.ticker import MaxNLocator
-
+        zoom *= (room[2:] / (high - low)).min()
+    shift = np.array(room[:2]) + 0.5 * np.array(room[2:]) - 0.5 * (low + high)
+    page = ax.figure.get_size_inches()
+    ax.set_position(ax.get_position(original=True).translated(*(shift / page)))
     for k, name in enumerate("xyz"):
-        axis, count = getattr(ax, f"{name}axis"), 5 if half[k] > 0.4 * half.max() else 3
-        axis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10]))
         # Matplotlib measures these distances in widths of the box.
-        stretch = draw.page().side / 5.6 * half.max() / np.delete(half, k).max()
-        axis.labelpad = 24.5 * stretch - (15.0 if draw.page().narrow else 21.0)
-        ax.tick_params(axis=name, pad=11.0 * stretch - 8.0)
+        wide = size.max() / np.delete(size, k).max()
+        getattr(ax, f"{name}axis").labelpad = 18.5 * wide - 21.0
+        ax.tick_params(axis=name, pad=8.0 * wide - 8.0)
+        ax.locator_params(axis=name, nbins=5 if size[k] > 0.4 * size.max() else 3)
+    return low + shift, high + shift
 
 
 def _box_on_paper(ax: Any) -> tuple[Array, Array]:
@@ -98,6 +97,6 @@ def _box_on_paper(ax: Any) -> tuple[Array, Array]:
     ax.apply_aspect()
     corners = list(itertools.product(ax.get_xlim(), ax.get_ylim(), ax.get_zlim(), [1.0]))
     x, y, _, scale = ax.get_proj() @ np.array(corners).T
-    pixels = ax.transData.transform(np.column_stack([x, y]) / scale[:, None]) - ax.bbox.p0
+    pixels = ax.transData.transform(np.column_stack([x, y]) / scale[:, None])
     inches = pixels / ax.figure.dpi
     return inches.min(axis=0), inches.max(axis=0)
