@@ -15,8 +15,6 @@ from echelon.core.types import Array
 from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
-from echelon.output.plots.agent_style import pen_of
-from echelon.output.plots.canvas import fit_box
 from echelon.output.plots.over_time import above, error_rounding, mark_events, shade_rounding
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
 from echelon.simulation.engine.result import Result
@@ -137,7 +135,7 @@ def encoder() -> str:
         ) from error
 
 
-def _writer(kind: str, rate: float) -> Any:
+def _writer(kind: str, rate: Any) -> Any:
     """Return matplotlib's writer of a kind of file, within a context of its settings."""
     import matplotlib
     from matplotlib.animation import FFMpegWriter, PillowWriter
@@ -177,7 +175,7 @@ class Film:
         self.cursors = _curves(self.figure, run, ends)
         self.clock = self.figure.text(0.012, 0.985, "", size=12, va="top")
         _name_closest(self.figure, run)
-        self.colours = np.array([pen_of(run, agent)["color"] for agent in range(run.agents)])
+        self.colours = np.array([draw.pen_of(run, agent)["color"] for agent in range(run.agents)])
         self.size, self.trail, self.count = body_width(run, self.space), *_TRAILS[few]
         wide, names = 1.2 if few else 0.5, sorted({*self.colours, draw.LEADER})
         rotors = few and self.space.shape == "quadrotor"
@@ -293,14 +291,13 @@ def _scene(figure: Any, space: Space, places: Array) -> tuple[Any, float]:
     """Return the axes in which the agents move, and the inches of a unit in them."""
     low, high, tall = space.low, space.high, figure.get_figheight()
     if space.kind == "space":
-        ax = figure.add_axes((0.0, 0.0, _SCENE / _WIDTH, 1.0), projection="3d")
-        ax.view_init(elev=30.0, azim=-60.0)
+        ax = draw.space_axes(figure)
         room = 0.06 * float((high - low).max())
         # Down to the ground, on which the shadows are.
         low = np.maximum(low, np.nanmin(places, axis=(0, 1)) - room) * (1, 1, 0) + low * (0, 0, 1)
         high = np.minimum(high, np.nanmax(places, axis=(0, 1)) + room)
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-        left, right = fit_box(ax, high - low, (0.4, 0.6, _SCENE - 1.0, tall - 1.1))
+        left, right = draw.fit_box(ax, (0.4, 0.6, _SCENE - 1.0, tall - 1.1))
         inches = float((right - left)[0] / np.hypot(*(high - low)[:2]))
     else:
         ax = figure.add_axes((0.065, 0.12, _SCENE / _WIDTH - 0.075, 0.76))
@@ -356,7 +353,7 @@ def _draw_errors(ax: "Axes", run: Recording, keep: Array) -> None:
         ax.legend(loc="upper right", fontsize=8)
     else:
         for agent, line in zip(followers, above(errors, floor).T, strict=True):
-            ax.plot(run.times[keep], line, **pen_of(run, agent))
+            ax.plot(run.times[keep], line, **draw.pen_of(run, agent))
     draw.logarithmic(ax, errors)
     # Powers as mathematics would take half of the time of a picture.
     ax.yaxis.set_major_formatter("{x:.0e}")
@@ -385,7 +382,7 @@ def _draw_near(ax: "Axes", run: Recording, keep: Array) -> None:
         (near.ellipsoid.limit, "kept", "bottom"),
         (near.ellipsoid.touching, "touching", "top"),
     ):
-        ax.axhline(value, color=draw.COLOURS[1], linewidth=0.9)
+        ax.axhline(value, color=draw.COLOURS[1], linewidth=1.0)
         where = {"transform": ax.get_yaxis_transform(), "ha": "right", "va": side, "size": 7}
         ax.text(1.0, value, name, color=draw.COLOURS[1], **where)
     ax.set_ylim(0.0, 1.05 * max(np.nanmax(distance), near.ellipsoid.limit))
