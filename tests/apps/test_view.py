@@ -17,15 +17,16 @@ from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
 from echelon.experiments.results.dataset import recording_of
 from echelon.output.plots.space import space_of
-from echelon.output.viewer.growing import Growing, serve_growing
-from echelon.output.viewer.pack import Group, pack
+from echelon.output.viewer.page import Group, pack
 from echelon.output.viewer.replay import (
+    Growing,
     frames_of,
     header,
     link_shades,
     promise_badge,
     replay_data,
     replay_page,
+    serve_growing,
 )
 from echelon.output.viewer.serve import Handler, serve, serving
 

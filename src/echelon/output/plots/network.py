@@ -38,11 +38,12 @@ def poles(loop: LoopPoles) -> "Figure":
     figure, ax = draw.canvas(["real part (1/s)", "imaginary part (rad/s)"])
     colour = np.repeat(values, real.shape[1])
     norm = LogNorm(values[0], values[-1] if values[-1] > values[0] else 1.01 * values[0])
-    look = {"norm": norm, "cmap": "viridis", "edgecolors": "white", "linewidths": 0.4, "zorder": 3}
+    look = {"norm": norm, "cmap": "viridis", "edgecolors": "white", "zorder": 3}
     dots = ax.scatter(real.ravel(), imaginary.ravel(), 34, colour, **look)
     ax.axvline(0.0, color=draw.EDGE)
     slowest = float(real.max())
-    ax.axvline(slowest, **draw.LIMIT | {"color": draw.COLOURS[1]})
+    mark: draw.Style = draw.LIMIT | {"color": draw.COLOURS[1]}
+    ax.axvline(slowest, **mark)
     _wide_axis(ax, real, imaginary)
     text = f"slowest: {at_least(slowest)} 1/s".replace("-", "\u2212")
     ax.set_title(text, color=draw.COLOURS[1], loc="right")
@@ -51,7 +52,7 @@ def poles(loop: LoopPoles) -> "Figure":
         bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
         bar.set_label("eigenvalue \u03bb of the graph")
         if len(values) <= 8:
-            bar.set_ticks(values, labels=[f"{value:.3g}" for value in values])
+            bar.set_ticks(values.tolist(), labels=[f"{value:.3g}" for value in values])
             bar.ax.yaxis.set_minor_locator(NullLocator())
     return draw.finish(figure)
 
