@@ -22,8 +22,8 @@ from echelon.core.words import amount
 from echelon.experiments.results.recording import Recording
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
-from echelon.output.viewer.pack import pack
-from echelon.output.viewer.page import page
+from echelon.output.viewer.page import pack, page
+from echelon.output.viewer.serve import Handler
 from echelon.simulation.engine.law_drive import Laws
 from echelon_flight.page_server import Handler
 
