@@ -23,7 +23,6 @@ from echelon.experiments.results.recording import Recording
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.output.viewer.page import pack, page
-from echelon.output.viewer.serve import Handler
 from echelon.simulation.engine.law_drive import Laws
 from echelon_flight.page_server import Handler
 
