@@ -146,7 +146,9 @@ class Emitter:
         nodes = needed(results)
         # Uniform values first: they come before every branch, and are outside of all.
         self._write([n for n in nodes if n.uniform])
-        self._write_with_branches([n for n in nodes if not n.uniform], results)
+        nodes = [n for n in nodes if not n.uniform]
+        branches = find_branches(nodes, results)
+        self._write_in_order(nodes, {node: b for b in branches for node in b.nodes})
 
     def emit_fast(
         self, results: Sequence[Node], levels: Sequence[Sequence[Node]], otherwise: str
@@ -239,11 +241,6 @@ class Emitter:
         return w.operation(node.op, args, node.args[0].truth, uniform)
 
     # ---- branches ----
-
-    def _write_with_branches(self, nodes: list[Node], results: Sequence[Node]) -> None:
-        """Write nodes in order; those that only one side of a choice needs, behind a branch."""
-        owner = {node: b for b in find_branches(nodes, results) for node in b.nodes}
-        self._write_in_order(nodes, owner)
 
     def _write_in_order(self, nodes: Iterable[Node], owner: Mapping[Node, Branch]) -> None:
         """Write nodes outside of branches; each branch before the first node that reads it."""

@@ -68,7 +68,10 @@ def exchange(
     else:
         last = [plan.width - 1] * has_flag(plan)
         sums = _subtract(w, context, ends, first, [*entries, *last])
-        small = is_zero(w, sums.pop()) if last else "true"
+        small = "true"
+        if last:
+            large = w.put(f"fcmp une {w.vector} {sums.pop()}, zeroinitializer")
+            small = w.put(f"xor i1 {w.any_lane(large)}, true")
         if plan.leaders_ahead:
             small = w.put(f"and i1 {small}, {flag(w, slots['contiguous'], block)}")
         totals = either(w, small, lambda small: sums if small else add_up(False))
@@ -445,9 +448,3 @@ def angle_flag(w: Writer, plan: Plan, values: Sequence[str]) -> str:
             large = w.put(f"or {truths} {large}, {beyond}") if large else beyond
     nan = w.number(math.nan)
     return w.put(f"select {truths} {large}, {w.vector} {nan}, {w.vector} zeroinitializer")
-
-
-def is_zero(w: Writer, vector: str) -> str:
-    """Write whether a vector is 0 in all lanes."""
-    other = w.put(f"fcmp une {w.vector} {vector}, zeroinitializer")
-    return w.put(f"xor i1 {w.any_lane(other)}, true")

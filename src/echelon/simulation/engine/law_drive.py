@@ -255,7 +255,7 @@ class Laws(Drive):
         """
         if problem.settings.engine == "native":
             loop = assemble(problem, self.leader, self.follower)
-            choose_engine(problem.settings, 0, lambda: BlockRows.of(loop), _no_rows)
+            choose_engine(problem.settings, 0, lambda: BlockRows.of(loop), lambda _: None)
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws, and of what they cannot follow or do not hear."""
@@ -311,11 +311,6 @@ class Laws(Drive):
         return choose_engine(
             settings, len(states), native, lambda why: JaxStepper(loop, states, why, devices)
         )
-
-
-def _no_rows(_: str) -> BlockRows | None:
-    """Return nothing, in place of what native code needs."""
-    return None
 
 
 _WORTH = 100_000

@@ -60,7 +60,9 @@ def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepare
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
-    check_given(parts, settings)
+    check_kind("parts", parts, Parts)
+    check_kind("settings", settings, Settings)
+    settings.check()
     # By their bits too, since somebody may write to an array in them; a graph never changes.
     mutable = parts.model, parts.drive, parts.initial, parts.start_error, parts.world
     bits = digest((mutable, parts.formation.offsets, parts.formation.motion, settings))
@@ -129,17 +131,6 @@ def channel_of(parts: Parts, settings: Settings) -> Channel | None:
     """Return the channel of a run; None for the ideal network."""
     network = parts.world.network
     return network and network.prepared(settings.dt, settings.horizon, settings.seed)
-
-
-def check_given(parts: Parts, settings: Settings) -> None:
-    """Check the arguments of a run.
-
-    Raises:
-        EchelonError: they are of another kind, or a number of the settings is out of range.
-    """
-    check_kind("parts", parts, Parts)
-    check_kind("settings", settings, Settings)
-    settings.check()
 
 
 def check_engine(parts: Parts, settings: Settings) -> None:

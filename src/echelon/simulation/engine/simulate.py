@@ -100,7 +100,10 @@ def simulate(
         prepared.parts.drive.check_engine(prepared.problem)
         # Plans and solvers need float64, also in a float32 run.
         stepper = prepared.parts.drive.stepper(prepared.problem)
-    _check_devices(settings, stepper)
+    if settings.devices != stepper.devices:
+        raise SimulationError(
+            f"`devices` is {settings.devices}, and must be 1 where a solver drives the agents."
+        )
     with precision(settings.precision), _mixed_tables():
         recorder = _recorder(prepared, stepper, before)
         _ChunkLoop(stepper, prepared, recorder, began).run(progress, keep)
@@ -122,13 +125,6 @@ def _mixed_tables() -> Iterator[None]:
             "JAX keeps one precision of each NumPy array that a model or law passes to a function "
             "such as `jnp.interp`, and uses it in both; write `jnp.asarray(array)` there."
         ) from error
-
-
-def _check_devices(settings: Settings, stepper: Stepper) -> None:
-    if settings.devices != stepper.devices:
-        raise SimulationError(
-            f"`devices` is {settings.devices}, and must be 1 where a solver drives the agents."
-        )
 
 
 def reassemble(parts: Parts, settings: Settings, stretches: Sequence[Stretch]) -> Result:

@@ -4,6 +4,7 @@ It is traced from the same laws, model, integrator and meter that `step.loop` ru
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -85,7 +86,8 @@ class BlockRows(NamedTuple):
         sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m]
         sizes += [message_size(loop), m, varying]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q, 1]
-        return cls(*_row_ranges(sizes))
+        ends = np.cumsum([0, *sizes]).tolist()
+        return cls._make([*(range(a, b) for a, b in itertools.pairwise(ends)), ends[-1]])
 
 
 def check_information(loop: Loop) -> None:
@@ -140,12 +142,6 @@ def unflatten(like: PyTree, flat: Array | jax.Array) -> PyTree:
     return tree.unflatten(
         [flat[..., a:b].reshape((*flat.shape[:-1], *np.shape(leaf))) for leaf, a, b in parts]
     )
-
-
-def _row_ranges(sizes: Sequence[int]) -> list[Any]:
-    """Return the ranges of rows of so many numbers each, one after the other, and the last row."""
-    ends = np.cumsum([0, *sizes]).tolist()
-    return [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
 
 
 def message_size(loop: Loop) -> int:
@@ -282,7 +278,11 @@ def body_of(
     # Where no limit is, nothing was ever cut.
     if any(node is not graph.constant(0.0) for node in outputs.cut):
         stores["cut"] = outputs.cut
-    stores["unsettled"] = _last_steps(graph, rows.unsettled, outputs.unsettled)
+    # Steps ascend, so that the later one replaces the earlier one; -1 is no step.
+    earlier = leaves_of(graph, "row", rows.unsettled)
+    none = [graph.make("lt", step, 0.0) for step in outputs.unsettled]
+    pairs = zip(none, earlier, outputs.unsettled, strict=True)
+    stores["unsettled"] = [graph.make("select", *each) for each in pairs]
     # Unless inputs are passed on from parents, nobody reads the message of a follower.
     if leads or loop.levels is not None:
         stores["message"] = outputs.message
@@ -304,16 +304,6 @@ def body_of(
     )
     body = body._replace(exceptions=exceptions_of(graph, body))
     return body.map_nodes(factored(body.all()))
-
-
-def _last_steps(graph: ScalarGraph, rows: range, steps: list[Node]) -> list[Node]:
-    """Return the last steps of which rows are the earlier ones; -1 is no step.
-
-    Steps ascend, so that the later one replaces the earlier one.
-    """
-    before = leaves_of(graph, "row", rows)
-    none = [graph.make("lt", step, 0.0) for step in steps]
-    return [graph.make("select", *each) for each in zip(none, before, steps, strict=True)]
 
 
 def _before_and_in_window(inputs: StepInputs, sums: list[Node]) -> list[Node]:

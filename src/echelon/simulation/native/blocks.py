@@ -153,7 +153,9 @@ class SwarmBlocks(Places):
         contiguous, self.row_major = self._contiguous(self.slots)
         self.contiguous = contiguous.astype(np.int8)
         self._order_edges()
-        self.contiguous_edges = self._contiguous_edges()
+        ends = self.edge_ends().reshape(-1, 2, self.lanes)
+        leads = (ends < self.segments[1] * self.lanes).any(axis=(1, 2))
+        self.contiguous_edges = np.asarray(follow(ends).all(axis=1) & ~leads, np.int8)
         if self.row_major:
             starts = 2 * np.arange(self.edge_blocks + 1)
             self.shifts = (
@@ -208,11 +210,6 @@ class SwarmBlocks(Places):
         edges = np.asarray(self.loop.meter.edges)[self.edge_order]
         ends = np.resize(self.position[edges], (self.edge_blocks * self.lanes, 2))
         return ends.reshape(-1, self.lanes, 2).swapaxes(1, 2).reshape(-1, self.lanes)
-
-    def _contiguous_edges(self) -> Array:
-        ends = self.edge_ends().reshape(-1, 2, self.lanes)
-        leads = (ends < self.segments[1] * self.lanes).any(axis=(1, 2))
-        return np.asarray(follow(ends).all(axis=1) & ~leads, np.int8)
 
     def measure_reach(self, neighbourhood: Neighbourhood, far: int, bytes_: int) -> None:
         """Measure the reach of blocks of so many bytes, with agents `far` numbers apart."""
@@ -419,21 +416,14 @@ def nearby(loop: Loop) -> Array:
     starts, order = grouped(np.concatenate([i, j]), agents)
     ends = np.concatenate([j, i])[order]
     links = sp.csr_array((np.ones(len(ends)), ends, starts), shape=(agents, agents))
-    order = _from_an_end(links)
+    # By the distance from an agent at an end of the graph: neighbours are then at most about two
+    # layers apart, and layers are small if they begin at an end.
+    end = csgraph.breadth_first_order(links, 0, return_predecessors=False)[-1]
+    order = csgraph.breadth_first_order(links, end, return_predecessors=False)
     rank = np.empty(agents, np.int32)
     rank[order] = original
     better = np.abs(rank[i] - rank[j]).sum(dtype=int) < np.abs(i - j).sum(dtype=int)
     return np.asarray(order, int) if better else original
-
-
-def _from_an_end(links: sp.csr_array) -> Array:
-    """Return connected agents by their distance from one at an end of the graph.
-
-    Neighbours are then at most about two layers apart, and layers are small if they begin at an
-    end.
-    """
-    reached = csgraph.breadth_first_order(links, 0, return_predecessors=False)
-    return csgraph.breadth_first_order(links, reached[-1], return_predecessors=False)
 
 
 def grouped(keys: Array, count: int) -> tuple[Array, Array]:

@@ -92,7 +92,7 @@ class NativeStepper(Stepper):
         self._hold, self._fallback_step = -1, -1
         axes, count = len(self.loop.meter.paired), len(loops)
         self._pairs = PairWatch(self.places, axes, count, self.dtype, _STEPS)
-        self._draws_ahead = holds_at_once(len(states))
+        self._draws_ahead = max(1, min(_AHEAD, _AT_ONCE // len(states)))
 
     # ---- memory ----
 
@@ -254,7 +254,11 @@ class NativeStepper(Stepper):
         count = self._draws_ahead
         first, at = number - number % count, number % count
         if first != self._hold - self._hold % count or self._hold < 0:
-            self._draws = draw_holds(self.loops, first + np.arange(count), hold)
+            # Numbers beyond the end of the run may wrap: they are not used.
+            steps = ((first + np.arange(count)) * hold).astype(np.int32)
+            winds = [loop.motion.wind for loop in self.loops]
+            drawn = _drawn(winds, steps, np.arange(len(self.loop.offsets)))
+            self._draws = [part if part is None else np.asarray(part) for part in drawn]
         self._hold = number
         for rows, part in zip((self.rows.push, self.rows.noise), self._draws, strict=True):
             if part is not None:
@@ -440,19 +444,6 @@ def mirror_values(
 
 _AHEAD, _AT_ONCE = 64, 50_000
 """Holding intervals that are drawn in a call, and the most draws; a call takes 0.5 ms."""
-
-
-def holds_at_once(agents: int) -> int:
-    """Return the number of holding intervals that are drawn at once."""
-    return max(1, min(_AHEAD, _AT_ONCE // agents))
-
-
-def draw_holds(loops: Sequence[Loop], holds: Array, hold: int) -> list[Array | None]:
-    """Return what wind adds to the rates (T, F, N, n) and noise to the inputs in T intervals."""
-    # Numbers beyond the end of the run may wrap: they are not used.
-    steps, agents = (holds * hold).astype(np.int32), np.arange(len(loops[0].offsets))
-    drawn = _drawn([loop.motion.wind for loop in loops], steps, agents)
-    return [part if part is None else np.asarray(part) for part in drawn]
 
 
 @jax.jit
