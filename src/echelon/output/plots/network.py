@@ -171,10 +171,10 @@ def _agents_and_links(
 ) -> None:
     small = _dot(run, columns) / 12.0
     _links(ax, run, places, lines, weights, small)
-    for agent in range(run.agents):
-        leads = agent in run.leaders
-        look = draw.dots("s" if leads else "o", pen_of(run, agent)["color"], 12.0 * small)
-        draw.plot(ax, places[agent][None], **look)
+    looks = [(a in run.leaders, pen_of(run, a)["color"]) for a in range(run.agents)]
+    for look in dict.fromkeys(looks):
+        alike = np.array([other == look for other in looks])
+        draw.plot(ax, places[alike], **draw.dots("s" if look[0] else "o", look[1], 12.0 * small))
     for agent in range(run.agents if run.agents <= _NUMBERED else 0):
         text = {"color": "white", "size": 7.0 * small**0.5, "zorder": 5}
         ax.annotate(str(agent), tuple(places[agent]), ha="center", va="center", **text)
