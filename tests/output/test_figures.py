@@ -143,6 +143,26 @@ def test_distances_are_those_of_linked_agents_with_those_wanted(run):
     np.testing.assert_allclose(least, away.min(axis=(1, 2)))
 
 
+def test_desired_distances_of_a_formation_that_moves_are_lines(run):
+    moving = run.offsets * (1.0 + run.times[:, None, None])
+    figure = figures(dataclasses.replace(run, moving=moving), "distances")["distances"]
+    i, j = run.edges[0]
+    desired = np.linalg.norm(moving[:, i, :3] - moving[:, j, :3], axis=1)
+    assert any(np.array_equal(line.get_ydata(), desired) for line in figure.axes[0].lines)
+
+
+def test_settings_that_the_user_has_changed_apply_to_lines_and_legends(run):
+    import matplotlib
+
+    with matplotlib.rc_context({"lines.linewidth": 3.0, "legend.fontsize": 14.0}):
+        own = figures(run, "formation")["formation"]
+    plain = figures(run, "formation")["formation"]
+    for figure, width, size in ((own, 3.0, 14.0), (plain, 1.1, 8.33)):
+        assert {line.get_linewidth() for line in figure.axes[0].lines} == {width}
+        assert figure.legends[0].get_texts()[0].get_fontsize() == pytest.approx(size)
+        assert figure.axes[0].xaxis.label.get_fontname() == "STIXGeneral"
+
+
 def test_the_network_has_every_edge_and_an_arrow_from_who_leads(run):
     (ax,) = figures(run, ["network"])["network"].axes
     (drawn,) = [part for part in ax.collections if len(part.get_segments()) == len(run.edges)]

@@ -302,8 +302,7 @@ def test_without_v_there_is_no_figure_of_it_and_without_motion_no_panel(runs):
 def test_many_followers_have_no_names_and_their_worst_has(runs):
     result = runs("swarm")
     made = all_figures(result)
-    (ax,) = made["trajectories"].axes
-    told = [text.get_text() for text in ax.get_legend().get_texts()]
+    told = [text.get_text() for text in made["trajectories"].legends[0].get_texts()]
     assert told == ["leader 0", "24 followers", "graph, every 0.1 s", "start", "end"]
     lines = labelled(made["formation"])
     worst = next(name for name in lines if name.startswith("worst: follower "))

@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.network.exchange import Exchange
+from echelon.agents.network.exchange import Exchange, Near
 from echelon.agents.network.inbox import (
     Inbox,
     Message,
@@ -22,9 +22,8 @@ from echelon.agents.network.inbox import (
     Stamps,
     Surroundings,
 )
-from echelon.agents.network.near import Near
 from echelon.agents.network.switching import Schedule
-from echelon.agents.world.estimator import Estimate, Estimator
+from echelon.agents.world.sensing import Estimate, Estimator
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.numerics import precision

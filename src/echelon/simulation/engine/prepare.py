@@ -14,10 +14,10 @@ from echelon.agents.network.events import event_faults
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.world.sensing import Sensors
+from echelon.core.cache import BoundedCache
 from echelon.core.errors import SimulationError, check_kind, listing
 from echelon.core.identity import digest
 from echelon.core.limits import excess_frames
-from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.core.words import amount

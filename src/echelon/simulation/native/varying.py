@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.cache import BoundedCache
 from echelon.core.identity import digest, process_key
-from echelon.core.memoize import BoundedCache
 from echelon.core.types import Array, PyTree
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.settings import Settings
