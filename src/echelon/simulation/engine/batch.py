@@ -18,7 +18,7 @@ from jaxtyping import Bool
 from echelon.core.errors import EchelonError, Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.simulation.engine.chunks import ChunkGrid, advance_until_lost
+from echelon.simulation.engine.chunk_grid import ChunkGrid, advance_until_lost
 from echelon.simulation.engine.jax_stepper import JaxFormations
 from echelon.simulation.engine.law_drive import Laws, choose_engine, is_long, worth_native
 from echelon.simulation.engine.parts import Parts, Starts

@@ -13,7 +13,7 @@ from echelon.core.errors import Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.trace import shared_traces
 from echelon.core.types import Array
-from echelon.simulation.engine.chunks import ChunkGrid, advance_until_lost
+from echelon.simulation.engine.chunk_grid import ChunkGrid, advance_until_lost
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared, prepare
 from echelon.simulation.engine.record import Record, Recorder, Stretch, join
