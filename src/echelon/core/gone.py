@@ -4,7 +4,9 @@ Whoever uses one in a scenario, on the command line or in Python gets one senten
 echelon adds a line here, which stays for two minor versions.
 """
 
-KEYS: dict[str, str] = {}
+KEYS: dict[str, str] = {
+    "leadership.waits": "make the leader's path slower, as by a smaller `rate` of `reference`",
+}
 """Scenario keys; `section.key` is that key alone, and `key` is it in any section."""
 
 VALUES: dict[str, str] = {}

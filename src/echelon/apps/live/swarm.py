@@ -327,8 +327,6 @@ class LiveLoop:
         valid &= not np.any(chunk.inexact)
         V = float(self.potential(y[None])[0]) if valid.all() and self.potential else np.nan
         desired = None if reference is None else reference[counts[0]]
-        if chunk.followed is not None and chunk.followed.reference is not None:
-            desired = chunk.followed.reference[-1]
         beyond = np.logical_not(valid)
         shades = self._shades(int(counts[0]))
         rows = time, states, inputs, errors, offsets, desired, V, beyond, shades

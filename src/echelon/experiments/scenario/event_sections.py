@@ -38,16 +38,13 @@ class EventSpec(BaseModel, **either("lose", "cut", "join")):
 
 @final
 class LeadershipSpec(BaseModel, **STRICT):
-    """Who takes the lead when nobody hears of the leader any more, and whether leaders wait."""
+    """Who takes the lead when nobody hears of the leader any more."""
 
-    heirs: Agents = ()
+    heirs: Agents
     """Numbers of followers, in the order in which they take over."""
     timeout: Annotated[Positive, Unit("s")] = 0.3
     """Time without news of a leader after which the first heir takes the lead, s; the second does
     after twice that, and so on."""
-    waits: Annotated[Positive | None, Unit("m")] = None
-    """Distance of a follower from its place at which the leaders' plan stands still until it is
-    nearer, m; by default never."""
 
 
 @final

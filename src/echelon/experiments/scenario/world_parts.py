@@ -109,7 +109,7 @@ def network_of(scenario: Scenario, faults: FaultList) -> Network | None:
 
 
 def leadership_of(scenario: Scenario, faults: FaultList, graph: Graph) -> Leadership | None:
-    """Return who takes the lead after the leader, and whether it waits; None for neither."""
+    """Return who takes the lead after the leader; None for nobody."""
     spec = scenario.leadership
     if spec is None:
         return None
@@ -151,7 +151,5 @@ def check_world(faults: FaultList, parts: Parts, dt: float) -> None:
         parts.drive.check_heirs(parts.graph)
         if parts.leadership is not None:
             parts.leadership.check_network(parts.world.network)
-            if parts.leadership.waits is not None:
-                parts.drive.check_patience()
     with faults.at("network"):
         parts.drive.check_world(parts.world, parts.graph, dt)

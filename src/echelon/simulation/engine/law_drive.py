@@ -27,7 +27,6 @@ from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import leader_warnings, prepare_law
 from echelon.laws.safety import Safety
 from echelon.laws.safety_check import check_numbers, hulls_at, separations, too_near
-from echelon.laws.stopping_point import StoppingLeader
 from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.native import is_installed
 from echelon.simulation.native.agent_step import BlockRows
@@ -210,11 +209,6 @@ class Laws(Drive):
                 f"things than a leader under {name}, and could not take over; give both the same "
                 "kind of law, with the same `observer`."
             )
-
-    def check_patience(self) -> None:
-        """Check that the leader follows a path by stopping points."""
-        if not isinstance(self.leader, StoppingLeader) or self.leader.reference is None:
-            super().check_patience()
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of leaders and followers by their laws.
