@@ -9,7 +9,9 @@ KEYS: dict[str, str] = {
 }
 """Scenario keys; `section.key` is that key alone, and `key` is it in any section."""
 
-VALUES: dict[str, str] = {}
+VALUES: dict[str, str] = {
+    "prediction: none": "use `packet`, by which the model carries the leader on",
+}
 """Values of scenario keys, as in `prediction: none`, and of options, as in `export --to json`."""
 
 COMMANDS: dict[str, str] = {}

@@ -259,8 +259,8 @@ class NetworkSpec(BaseModel, **STRICT):
     `state`, its signal itself, with which followers lag behind a leader that moves."""
     prediction: Annotated[str, OneOf(map(str, Prediction))] = "preview"
     """How agents predict the leader from what it last sent: `preview`, by its plan, which they
-    know; `packet`, carried on by the model from its last state and input; `none`, as it was then.
-    Only for the messages `deviation`."""
+    know; `packet`, carried on by the model from its last state and input. Only for the messages
+    `deviation`."""
     forget: Annotated[Positive, Unit("s")] = 0.5
     """Age, s, beyond which a neighbour's deviation is not used."""
     hears: Annotated[str, OneOf(map(str, NeighbourChoice))] = "all"

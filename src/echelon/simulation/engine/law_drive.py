@@ -146,7 +146,7 @@ class Laws(Drive):
                 f"`{type(self.leader).__name__}` has no plan; use `packet`."
             )
         states, leader = (type(x).signal is Law.signal for x in (self.follower, self.leader))
-        if network.messages is MessageContent.DEVIATION and preview and states is not leader:
+        if deviations and preview and states is not leader:
             raise SimulationError(
                 f"`prediction` of the network is `preview`, and followers under the law "
                 f"`{type(self.follower).__name__}` do not send what the plan of a leader under "
