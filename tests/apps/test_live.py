@@ -117,14 +117,12 @@ IMPERFECT = {
 }
 
 
-def test_radio_gusts_lag_and_noise_are_knobs():
+def test_radio_and_noise_are_knobs_in_gusts_and_with_motors_that_lag():
     own = scenario(**IMPERFECT)
     panel = Panel(own, build(own))
     swarm = LiveLoop(*panel.experiment, panel.live)
-    assert {"delay", "loss", "outages", "gusts", "lag", "noise"} <= {*panel.ranges}
-    knobs = panel.start._replace(
-        **{"delay": 0.06, "loss": 0.5, "outages": 0.2, "gusts": 2.0, "lag": 0.1, "noise": 3.0}
-    )
+    assert {"delay", "loss", "outages", "noise"} <= {*panel.ranges}
+    knobs = panel.start._replace(delay=0.06, loss=0.5, outages=0.2, noise=3.0)
     for each in (panel.start, knobs):
         parts, settings = build(panel.scenario_at(each))
         run = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)

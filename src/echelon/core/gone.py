@@ -6,6 +6,8 @@ echelon adds a line here, which stays for two minor versions.
 
 KEYS: dict[str, str] = {
     "leadership.waits": "make the leader's path slower, as by a smaller `rate` of `reference`",
+    "live.gusts": "set `rms` of `disturbance` for the whole run",
+    "live.lag": "set `lag` of `actuator` for the whole run",
 }
 """Scenario keys; `section.key` is that key alone, and `key` is it in any section."""
 

@@ -51,8 +51,6 @@ class Knobs(NamedTuple):
         delay: of messages, s.
         loss: share of messages lost.
         outages: share of the time that a link is out.
-        gusts: factor on the random wind.
-        lag: of the actuators, s; None without one.
         noise: factor on the noise of measurements.
         cut: indices of the cut edges.
         method: of the gain; None for the scenario's own.
@@ -70,8 +68,6 @@ class Knobs(NamedTuple):
     delay: float = 0.0
     loss: float = 0.0
     outages: float = 0.0
-    gusts: float = 1.0
-    lag: float | None = None
     noise: float = 1.0
     cut: frozenset[int] = frozenset()
     method: str | None = None
@@ -258,12 +254,9 @@ class LiveParts:
 
 def _start(experiment: Experiment) -> Knobs:
     """Return the positions at which the knobs have no effect."""
-    world, knobs = experiment.parts.world, Knobs(_coupling(experiment))
-    if world.actuator is not None and world.actuator.lag:
-        knobs = knobs._replace(lag=world.actuator.lag)
-    if world.network is None:
+    network, knobs = experiment.parts.world.network, Knobs(_coupling(experiment))
+    if network is None:
         return knobs
-    network = world.network
     return knobs._replace(delay=network.delay, loss=network.loss, outages=network.bursts.share)
 
 

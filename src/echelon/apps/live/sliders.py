@@ -137,26 +137,6 @@ def _write_network(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
         data["network"]["bursts"] = {"share": knobs.outages, "length": length}
 
 
-def _gusts_range(live: LiveParts) -> Range | None:
-    disturbance = live.parts.world.disturbance
-    return Range(0.0, 5.0) if disturbance is not None and any(disturbance.rms.values()) else None
-
-
-def _write_gusts(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
-    if knobs.gusts != 1.0:
-        rms = data["disturbance"]["rms"]
-        data["disturbance"]["rms"] = {name: knobs.gusts * x for name, x in rms.items()}
-
-
-def _lag_range(live: LiveParts) -> Range | None:
-    return None if live.start.lag is None else Range(0.001, 0.2, True)
-
-
-def _write_lag(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
-    if knobs.lag != live.start.lag:
-        data["actuator"]["lag"] = knobs.lag
-
-
 def _noise_range(live: LiveParts) -> Range | None:
     sensing = live.parts.world.sensing
     return Range(0.0, 10.0) if sensing is not None and any(sensing.noise.values()) else None
@@ -178,7 +158,5 @@ SLIDERS = {
     "delay": Slider("delay", "s", _delay_range, _write_network),
     "loss": Slider("messages lost", "", _loss_range, _write_network),
     "outages": Slider("links out", "", _outages_range, _write_network),
-    "gusts": Slider("gusts", "\u00d7", _gusts_range, _write_gusts),
-    "lag": Slider("motor lag", "s", _lag_range, _write_lag),
     "noise": Slider("noise", "\u00d7", _noise_range, _write_noise),
 }

@@ -108,8 +108,6 @@ class LiveLoop:
         self.eventful = eventful
         if loop.channel is not None:
             self.loop = dataclasses.replace(self.loop, channel=self._roomy(loop.channel))
-        assert loop.motion.wind is not None
-        self.rms = loop.motion.wind.rms
         self.std = None if loop.sensors is None else loop.sensors.std
         self.potentials: dict[Hashable, Callable[[Array], Array]] = {}
         self.states, self.first = problem.states, 0
@@ -256,17 +254,11 @@ class LiveLoop:
         return dataclasses.replace(channel, slots=steps // int(channel.every) + 2, bursty=True)
 
     def _in_world(self, loop: Loop, knobs: Knobs) -> Loop:
-        """Return the loop with the network, the gusts, the lag and the noise of the knobs."""
-        network, motors, settings = self.panel.network(knobs), loop.motion.motors, self.settings
+        """Return the loop with the network and the noise of the knobs."""
+        network, settings = self.panel.network(knobs), self.settings
         if network is not None:
             channel = network.prepared(settings.dt, math.inf, settings.seed)
             loop = dataclasses.replace(loop, channel=self._roomy(channel))
-        if self.rms is not None:
-            rms = knobs.gusts * self.rms
-            loop = eqx.tree_at(lambda loop: loop.motion.wind.rms, loop, rms)
-        if motors is not None and motors.lag is not None:
-            lag = np.asarray(knobs.lag)
-            loop = eqx.tree_at(lambda loop: loop.motion.motors.lag, loop, lag)
         if self.std is not None:
             loop = eqx.tree_at(lambda loop: loop.sensors.std, loop, knobs.noise * self.std)
         return loop

@@ -82,10 +82,6 @@ class LiveSpec(BaseModel, **STRICT):
     """Share of these messages that is lost."""
     outages: Annotated[Share | None, Unit("1")] = None
     """Share of the time that each link of `network` is out."""
-    gusts: Annotated[NotNegative | None, Unit("1")] = None
-    """Size of the random wind, relative to that of `disturbance`."""
-    lag: Annotated[Positive | None, Unit("s")] = None
-    """Lag of the actuators, s, where `actuator` has one."""
     noise: Annotated[NotNegative | None, Unit("1")] = None
     """Size of the noise, relative to that of `sensing`."""
     lose: int | None = None
