@@ -308,7 +308,7 @@ def test_all_faults_of_a_file_are_told_at_once_by_line(refused):
         f"s.yaml:2: model.name: got `quadroto`, allowed are {listing(MODELS)} (did you mean"
         " `quadrotor`?).",
         "s.yaml:3: graph.edges.1: got `[1, 1]`, allowed is an edge between two different agents.",
-        "s.yaml:4: formation.offsets.1.2: got `.nan`, allowed is a finite number.",
+        "s.yaml:4: formation.offsets.1.2: got `.nan`, allowed is a number from -1e+75 to 1e+75.",
         "s.yaml:7: follower.feedforward: got `rely`, allowed are `none`, `relay`,"
         " `relay-velocity`, `parent` (did you mean `relay`?).",
         "s.yaml:11: simulation.dt: got `0`, allowed is a number above 0.",

@@ -4,14 +4,13 @@ They read the plain data of the file and skip whatever is malformed (the schema 
 one fault never hides another. Each check yields the path of a fault and its sentence.
 """
 
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeGuard
 
 from pydantic import BaseModel
 
-from echelon.core.errors import did_you_mean, listing
-from echelon.core.limits import horizon_fault
+from echelon.core.errors import did_you_mean, is_number, listing
+from echelon.core.limits import LARGEST, horizon_fault
 from echelon.core.words import amount
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.formation_sections import FormationSpec
@@ -64,13 +63,7 @@ def surplus_keys(role: str, law: object) -> list[str]:
 
 def number_of(value: object) -> float | None:
     """Return a real number as a float, anything else (a truth value too) as None."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        return float(value)
-    except OverflowError:
-        # A whole number of 400 digits has no float.
-        return math.inf
+    return float(value) if is_number(value) and abs(value) <= LARGEST else None
 
 
 def _whole(value: object) -> int | None:
@@ -78,14 +71,12 @@ def _whole(value: object) -> int | None:
     return value if type(value) is int else None
 
 
-def _infinite(value: object, path: KeyPath) -> Iterator[Finding]:
+def _too_large(value: object, path: KeyPath) -> Iterator[Finding]:
     if isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _infinite(item, (*path, key))
-        return
-    number = number_of(value)
-    if number is not None and not math.isfinite(number):
-        yield path, f"got {quoted(value)}, allowed is a finite number."
+            yield from _too_large(item, (*path, key))
+    elif is_number(value) and not abs(value) <= LARGEST:
+        yield path, f"got {quoted(value)}, allowed is a number from -{LARGEST:g} to {LARGEST:g}."
 
 
 def _sources(data: Part) -> Iterator[Finding]:
@@ -358,7 +349,7 @@ def _changed(data: Part) -> Iterator[Finding]:
 def _durations(data: Part) -> Iterator[Finding]:
     simulation = section(data, "simulation")
     horizon, dt = number_of(simulation.get("horizon")), number_of(simulation.get("dt"))
-    if horizon is None or dt is None or not (0 < horizon < math.inf and 0 < dt < math.inf):
+    if horizon is None or dt is None or not (horizon > 0.0 and dt > 0.0):
         return
     fault = horizon_fault(horizon, dt)
     if fault is not None:
@@ -382,10 +373,10 @@ def _events(data: Part) -> Iterator[Finding]:
 def cross_faults(document: Document) -> Iterator[Finding]:
     """Yield the path and the sentence of every fault that concerns more than one key.
 
-    Numbers that are not finite come first: of the schema's sentence and this one it is reported.
+    Numbers that are too large come first: of the schema's sentence and this one it is reported.
     """
     data = document.data
-    yield from _infinite(data, ())
+    yield from _too_large(data, ())
     yield from _sources(data)
     yield from _choices(data)
     yield from _edges(document)

@@ -3,7 +3,6 @@
 All faults of a file are reported at once, a line each: `file:line: field: got ..., allowed ...`.
 """
 
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -186,7 +185,7 @@ def _with_defaults(data: Mapping[Any, Any]) -> dict[Any, Any]:
     if isinstance(leader, dict):
         filled["leader"] = {**leader, "law": law_of(filled, "leader")}
     horizon = number_of(section(data, "simulation").get("horizon")) or 0.0
-    window = number_of(section(data, "report").get("steady_window", math.inf))
+    window = number_of(section(data, "report").get("steady_window", horizon))
     # A window as long as the run would count its transient as steady.
     if isinstance(report, dict) and window is not None and window >= horizon > 0:
         filled["report"] = {**report, "steady_window": horizon / 5}
