@@ -24,7 +24,7 @@ from echelon.core.compiled import CompiledFunction
 from echelon.core.memoize import load_or_compute
 from echelon.core.numerics import precision
 from echelon.core.private_folder import PrivateFolder
-from echelon.experiments.scenario.user_code import user_class
+from echelon.experiments.scenario.named_class import user_class
 
 
 @pytest.fixture(autouse=True)

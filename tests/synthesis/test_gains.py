@@ -441,9 +441,7 @@ def test_a_file_whose_coupling_was_raised_by_hand_is_refused_where_it_is_read(tm
     ech.save_gain(ech.synthesize(model, graph, ech.gains.Riccati()), model, graph, file)
     stored = json.loads(file.read_text())
     file.write_text(json.dumps(stored | {"coupling": 1e200}))
-    with pytest.raises(
-        ech.errors.GainError, match="`coupling` is 1e\\+200, and must be positive"
-    ):
+    with pytest.raises(ech.errors.GainError, match="`coupling` is 1e\\+200, and must be positive"):
         ech.load_gain(file, model, graph)
 
 

@@ -9,8 +9,9 @@ from echelon.core.errors import EchelonError, ScenarioError
 from echelon.core.types import Array
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
-from echelon.experiments.scenario.checks import surplus_keys
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
+from echelon.experiments.scenario.sections import FollowerSpec
+from echelon.experiments.scenario.values import foreign_keys
 from echelon.simulation.engine.parts import Parts
 
 AS_GIVEN = "scenario"
@@ -41,7 +42,7 @@ def _with_law(scenario: Scenario, law: str, keep_leader: bool) -> Scenario:
     """Return a scenario with another follower law and those of its keys that the law takes."""
     data = copy.deepcopy(scenario.data)
     data.pop("live", None)
-    surplus = surplus_keys("follower", law)
+    surplus = foreign_keys(FollowerSpec, law)
     # A feed-forward of another law may be none of a law whose agents exchange more.
     dropped = {"law", *surplus, *(["feedforward"] if registry.FOLLOWER_LAWS[law].leader else [])}
     follower = data.get("follower") or {}

@@ -15,9 +15,8 @@ from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment
-from echelon.experiments.scenario.override import rename_files
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
-from echelon.experiments.scenario.yaml import dump_yaml
+from echelon.experiments.scenario.yaml import dump_yaml, rename_files
 from echelon.synthesis.gains.inner_loop import InnerLoop
 from echelon.synthesis.gains.riccati import Riccati
 

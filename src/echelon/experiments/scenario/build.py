@@ -1,47 +1,65 @@
 """Builds the parts of a checked scenario, and runs them."""
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast, final
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
+from echelon.agents.network.channel import Bursts, Network
+from echelon.agents.network.events import Cut, Event, Join, Lose, check_heirs, event_faults
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
+from echelon.agents.world.actuator import Actuator
+from echelon.agents.world.disturbance import Disturbance
+from echelon.agents.world.plant import check_plant, vary_parameters
+from echelon.agents.world.sensing import Sensing
 from echelon.agents.world.world import World
-from echelon.core.errors import ModelError, ScenarioError, did_you_mean, listing
+from echelon.core.errors import (
+    EchelonError,
+    FormationError,
+    MissingExtraError,
+    ModelError,
+    ScenarioError,
+    did_you_mean,
+    listing,
+)
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.checks import ROLES, section
-from echelon.experiments.scenario.fault_list import FaultList
-from echelon.experiments.scenario.formation_parts import formation_of
-from echelon.experiments.scenario.law_sections import GainSpec, law_arguments
 from echelon.experiments.scenario.named_class import (
     NamedClass,
     accepted,
+    as_scenario_error,
     check_names,
     law_class,
     named_class,
     offered,
 )
-from echelon.experiments.scenario.scenario import Scenario, ScenarioLike, as_scenario
-from echelon.experiments.scenario.self_contained import self_contained
-from echelon.experiments.scenario.user_code import as_scenario_error
-from echelon.experiments.scenario.values import marked_keys
-from echelon.experiments.scenario.world_parts import (
-    actuator_of,
-    check_world,
-    disturbance_of,
-    events_of,
-    leadership_of,
-    network_of,
-    plants_of,
-    sensing_of,
+from echelon.experiments.scenario.scenario import (
+    Scenario,
+    ScenarioFault,
+    ScenarioLike,
+    as_scenario,
+    refuse,
 )
-from echelon.experiments.scenario.yaml import quoted
+from echelon.experiments.scenario.sections import (
+    EventSpec,
+    GainSpec,
+    MotionSpec,
+    PlantSpec,
+    ShapeKeys,
+    VariationSpec,
+    law_arguments,
+)
+from echelon.experiments.scenario.self_contained import self_contained
+from echelon.experiments.scenario.values import marked_keys
+from echelon.experiments.scenario.yaml import joined, quoted
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
 from echelon.laws.safety import Safety
@@ -52,9 +70,45 @@ from echelon.simulation.engine.prepare import check_engine, check_memory
 from echelon.simulation.engine.record import Stretch
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import Keep, Progress, simulate
+from echelon.simulation.step.leadership import Leadership
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain, Method, synthesize
 from echelon.synthesis.gains.gain_file import load_gain
+
+_Part = TypeVar("_Part")
+
+
+@final
+class _Faults:
+    """Collects the faults of parts, each with the place of its key."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.faults: list[ScenarioFault] = []
+
+    @contextlib.contextmanager
+    def at(self, *path: str | int) -> Iterator[None]:
+        """Record an error that is raised inside, and continue."""
+        try:
+            yield
+        except MissingExtraError:
+            raise
+        except EchelonError as error:
+            # Of a part that is checked key by key, and then whole, each fault once.
+            if str(error) not in {fault.message for fault in self.faults}:
+                place = self.scenario.place(*path)
+                self.faults.append(ScenarioFault(place, joined(path), str(error)))
+
+    def part(self, make: Callable[[], _Part], *path: str | int) -> _Part:
+        """Return a part; in place of one with a fault None, until `settle` raises the fault."""
+        with self.at(*path):
+            return make()
+        return cast(_Part, None)
+
+    def settle(self) -> None:
+        """Raise all recorded faults, a line each."""
+        if self.faults:
+            refuse(self.faults)
 
 
 class Experiment(NamedTuple):
@@ -77,7 +131,7 @@ def build(scenario: ScenarioLike, to_run: bool = False) -> Experiment:
         EchelonError: the engine cannot step a run of it.
     """
     scenario = as_scenario(scenario)
-    faults = FaultList(scenario)
+    faults = _Faults(scenario)
     # Gains are computed here, and would have 7 digits under float32.
     with precision("float64"):
         settings = faults.part(lambda: _settings(scenario), "simulation")
@@ -96,7 +150,7 @@ def build(scenario: ScenarioLike, to_run: bool = False) -> Experiment:
 
 
 def _check_run(
-    scenario: Scenario, faults: FaultList, model: ControlAffine, graph: Graph, settings: Settings
+    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, settings: Settings
 ) -> None:
     """Check that a scenario has no live events, and that its run fits in memory."""
     with faults.at("live"):
@@ -112,17 +166,17 @@ def _check_run(
 
 def _parts(
     scenario: Scenario,
-    faults: FaultList,
+    faults: _Faults,
     model: ControlAffine,
     graph: Graph,
     reference: Guide | None,
 ) -> Parts:
     """Return all parts, from the model, the graph and the reference."""
-    plant, plants = plants_of(scenario, faults, model)
-    disturbance = disturbance_of(scenario, faults, model)
-    leadership = leadership_of(scenario, faults, graph)
-    events = events_of(scenario, faults, graph, leadership)
-    formation = faults.part(lambda: formation_of(scenario, faults, model, graph), "formation")
+    plant, plants = _plants(scenario, faults, model)
+    disturbance = _disturbance(scenario, faults, model)
+    leadership = _leadership(scenario, faults, graph)
+    events = _events(scenario, faults, graph, leadership)
+    formation = faults.part(lambda: _formation(scenario, faults, model, graph), "formation")
     follower = faults.part(lambda: _follower(scenario, faults, model, graph), "follower")
     reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
     leader = faults.part(
@@ -148,16 +202,16 @@ def _parts(
         world=World(
             plant,
             disturbance,
-            network_of(scenario, faults),
-            actuator_of(scenario, faults, model),
-            sensing_of(scenario, faults, model),
+            _network(scenario, faults),
+            _actuator(scenario, faults, model),
+            _sensing(scenario, faults, model),
             plants,
         ),
         events=events,
         leadership=leadership,
     )
     faults.settle()
-    check_world(faults, parts, scenario.simulation.dt)
+    _check_world(faults, parts, scenario.simulation.dt)
     with faults.at("initial"):
         initial_states(parts, scenario.seed)
     faults.settle()
@@ -198,6 +252,9 @@ def origin_of(scenario: Scenario) -> dict[str, Any]:
         "provenance": {"scenario": scenario.name, "scenario_text": text, **software},
         "files": {name: file.read_bytes() for name, file in files.items()},
     }
+
+
+# ---- agents, graph and formation -----------------------------------------------------------------
 
 
 def _model(scenario: Scenario) -> ControlAffine:
@@ -244,6 +301,60 @@ def _graph(scenario: Scenario) -> Graph:
     return graph.one_way() if spec.directed and not graph.directed else graph
 
 
+def _formation(
+    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph
+) -> Formation:
+    """Return the formation of a scenario, with its motion; its faults are noted."""
+    spec, starts = scenario.formation, scenario.initial.states
+    formation = _shape(spec, model, graph)
+    if spec.assign == "nearest":
+        if not starts:
+            raise FormationError(
+                "`assign: nearest` needs `initial.states`: without them agents start about their "
+                "own places."
+            )
+        n = len(model.state_names)
+        whole = {agent: state for agent, state in starts.items() if len(state) == n}
+        formation = formation.nearest(model, graph, whole)
+    changes = list[OffsetMotion | Reshape]()
+    for k, change in enumerate(spec.motion):
+        with faults.at("formation", "motion", k):
+            changes.append(_change(scenario, change, model, graph))
+    # Of a motion with faults, which are noted, nothing else is said.
+    complete = changes and len(changes) == len(spec.motion)
+    return formation.moving(model, graph, changes) if complete else formation
+
+
+def _change(
+    scenario: Scenario, spec: MotionSpec, model: ControlAffine, graph: Graph
+) -> OffsetMotion | Reshape:
+    """Return a motion of the formation."""
+    if spec.rotate is not None:
+        return Rotate(spec.rotate)
+    if spec.scale is not None:
+        return Scale(spec.scale, cast(float, spec.rate))
+    if spec.reshape is None:
+        part = named_class(scenario, OffsetMotion, {}, None, spec.python, spec.parameters)
+        return part.create()
+    horizon, at = scenario.simulation.horizon, cast(float, spec.at)
+    if at >= horizon:
+        raise FormationError(
+            f"got a reshape at {at:g} s, allowed is a time before the horizon, {horizon:g} s."
+        )
+    shape = _shape(spec.reshape, model, graph)
+    return Reshape(shape.offsets, at, cast(float, spec.over), spec.assign == "nearest")
+
+
+def _shape(spec: ShapeKeys, model: ControlAffine, graph: Graph) -> Formation:
+    if spec.name is None:
+        return Formation.from_offsets(model, graph, spec.offsets or {})
+    make = getattr(Formation, spec.name)
+    return make(model, graph, **offered(make, {"spacing": spec.spacing, "columns": spec.columns}))
+
+
+# ---- laws and gains ------------------------------------------------------------------------------
+
+
 def _reference(scenario: Scenario, model: ControlAffine | None) -> Guide | None:
     spec = scenario.reference
     # Files use the model's names, and a model that fails is reported by itself.
@@ -285,7 +396,7 @@ def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, scenario: Scenario
 
 
 def _follower(
-    scenario: Scenario, faults: FaultList, model: ControlAffine, graph: Graph
+    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph
 ) -> Law | None:
     spec = scenario.follower
     part = law_class(scenario, registry.FOLLOWER_LAWS, spec.law)
@@ -299,7 +410,7 @@ def _follower(
     return _law(part, offers, model, graph)
 
 
-def _safety(scenario: Scenario, faults: FaultList, part: NamedClass) -> dict[str, Safety]:
+def _safety(scenario: Scenario, faults: _Faults, part: NamedClass) -> dict[str, Safety]:
     """Return how followers keep apart; nothing where they do not."""
     if scenario.safety is None:
         return {}
@@ -313,11 +424,12 @@ def _safety(scenario: Scenario, faults: FaultList, part: NamedClass) -> dict[str
     return {}
 
 
-def _check_keys(scenario: Scenario, faults: FaultList, role: str, part: NamedClass) -> None:
+def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: NamedClass) -> None:
     """Note the keys of a role that its law, a class of the user, does not take."""
     taken = accepted(part.cls)
-    for key in marked_keys(ROLES[role][0]):
-        if key in section(scenario.data, role) and key not in taken:
+    section = scenario.leader if role == "leader" else scenario.follower
+    for key in marked_keys(type(section)):
+        if key in section.model_fields_set and key not in taken:
             with faults.at(role, key):
                 raise ScenarioError(
                     f"got a key that the law `{part.name}` does not take, allowed are the "
@@ -334,7 +446,7 @@ def _law(part: NamedClass, offers: Mapping[str, object], model: ControlAffine, g
 
 def _leader(
     scenario: Scenario,
-    faults: FaultList,
+    faults: _Faults,
     model: ControlAffine,
     graph: Graph,
     reference: Guide | None,
@@ -368,6 +480,135 @@ def _leader(
         if "gain" not in offers:
             return None
     return _law(part, offers, model, graph)
+
+
+# ---- the world, and how it is computed -----------------------------------------------------------
+
+
+def _plants(
+    scenario: Scenario, faults: _Faults, model: ControlAffine
+) -> tuple[ControlAffine | None, dict[int, ControlAffine]]:
+    """Return the agents that move, where they differ from the model: all, and single ones."""
+    spec = scenario.plant
+    if spec is None:
+        return None, {}
+
+    def varied(part: VariationSpec | PlantSpec) -> ControlAffine:
+        plant = vary_parameters(model, part.parameters, part.scale)
+        check_model(plant)
+        check_plant(model, plant)
+        return plant
+
+    plants = {
+        k: faults.part(lambda part=part: varied(part), "plant", "agents", k)
+        for k, part in spec.agents.items()
+    }
+    alike = spec.agents and not (spec.parameters or spec.scale)
+    return (None if alike else faults.part(lambda: varied(spec), "plant")), plants
+
+
+def _disturbance(scenario: Scenario, faults: _Faults, model: ControlAffine) -> Disturbance | None:
+    """Return wind and noise; None without."""
+    spec = scenario.disturbance
+    if spec is None:
+        return None
+    for key in ("constant", "rms", "input_rms"):
+        with faults.at("disturbance", key):
+            # Each alone, so that its fault is reported at its own line.
+            Disturbance(**{key: getattr(spec, key)}).prepared(model, scenario.simulation.dt, 0)
+    disturbance = None
+    with faults.at("disturbance"):
+        numbers: dict[str, Any] = spec.model_dump() | {"air": spec.air or ()}
+        disturbance = Disturbance(**numbers)
+        disturbance.prepared(model, scenario.simulation.dt, 0)
+    return disturbance
+
+
+def _actuator(scenario: Scenario, faults: _Faults, model: ControlAffine) -> Actuator | None:
+    """Return the actuators; None for ideal ones."""
+    spec = scenario.actuator
+    if spec is None:
+        return None
+    actuator = None
+    with faults.at("actuator"):
+        actuator = Actuator(**spec.model_dump())
+        actuator.prepared(model)
+    return actuator
+
+
+def _sensing(scenario: Scenario, faults: _Faults, model: ControlAffine) -> Sensing | None:
+    """Return what agents measure; None for exact states."""
+    spec = scenario.sensing
+    if spec is None:
+        return None
+    sensing, simulation = None, scenario.simulation
+    with faults.at("sensing", "noise"):
+        model.per_state(spec.noise)
+    with faults.at("sensing"):
+        sensing = Sensing(**spec.model_dump())
+        sensing.prepared(model, simulation.dt, simulation.horizon, 0)
+    return sensing
+
+
+def _network(scenario: Scenario, faults: _Faults) -> Network | None:
+    """Return the network; None for the ideal one."""
+    spec, simulation = scenario.network, scenario.simulation
+    if spec is None:
+        return None
+    network = None
+    with faults.at("network"):
+        numbers: dict[str, Any] = spec.model_dump()
+        numbers["bursts"] = Bursts(**numbers["bursts"])
+        network = Network(**numbers)
+        network.prepared(simulation.dt, simulation.horizon, scenario.seed)
+    return network
+
+
+def _leadership(scenario: Scenario, faults: _Faults, graph: Graph) -> Leadership | None:
+    """Return who takes the lead after the leader; None for nobody."""
+    spec = scenario.leadership
+    if spec is None:
+        return None
+    leadership = None
+    with faults.at("leadership", "heirs"):
+        check_heirs(graph, spec.heirs)
+        leadership = Leadership(**spec.model_dump())
+    faults.settle()
+    return leadership
+
+
+def _events(
+    scenario: Scenario, faults: _Faults, graph: Graph, leadership: Leadership | None
+) -> list[Event]:
+    """Return what happens during the run; a fault is noted at its event."""
+    events = [_event(spec) for spec in scenario.events]
+    heirs = () if leadership is None else leadership.heirs
+    for k, text in event_faults(graph, events, heirs, scenario.simulation.horizon):
+        with faults.at("events", k):
+            raise ScenarioError(f"{text}.")
+    faults.settle()
+    return events
+
+
+def _event(spec: EventSpec) -> Event:
+    if spec.cut is not None:
+        return Cut(spec.cut, spec.at, spec.duration)
+    if spec.join is not None:
+        return Join(spec.join, spec.at)
+    assert spec.lose is not None, "the schema holds that there is one of three"
+    return Lose(spec.lose, spec.at)
+
+
+def _check_world(faults: _Faults, parts: Parts, dt: float) -> None:
+    """Record what of a world does not suit the agents or their laws."""
+    with faults.at("plant", "agents"):
+        parts.world.check_agents(parts.model, parts.graph.agents)
+    with faults.at("leadership"):
+        parts.drive.check_heirs(parts.graph)
+        if parts.leadership is not None:
+            parts.leadership.check_network(parts.world.network)
+    with faults.at("network"):
+        parts.drive.check_world(parts.world, parts.graph, dt)
 
 
 def _settings(scenario: Scenario) -> Settings:
