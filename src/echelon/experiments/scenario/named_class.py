@@ -14,12 +14,9 @@ from echelon.core import disk_cache
 from echelon.core.errors import EchelonError, ScenarioError, did_you_mean, listing
 from echelon.core.trace import error_summary
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.scenario import Scenario
-from echelon.experiments.scenario.sections import UserClass
-from echelon.laws.law import Law
 
 _T = TypeVar("_T")
-_NOTHING: Mapping[str, object] = MappingProxyType({})
+NOTHING: Mapping[str, object] = MappingProxyType({})
 
 
 def resolve(entry: registry.Entry) -> Any:
@@ -65,7 +62,7 @@ class NamedClass(NamedTuple):
     arguments: Mapping[str, object]
     by_user: bool
 
-    def create(self, offers: Mapping[str, object] = _NOTHING) -> Any:
+    def create(self, offers: Mapping[str, object] = NOTHING) -> Any:
         """Return an instance, from the arguments and from those of the offers that it takes.
 
         Raises:
@@ -86,30 +83,6 @@ class NamedClass(NamedTuple):
         if self.by_user:
             return as_scenario_error(f"`{self.name}` fails")
         return contextlib.nullcontext()
-
-
-def named_class(
-    scenario: Scenario,
-    kind: type,
-    table: Mapping[str, registry.Entry],
-    name: str | None,
-    python: str | None,
-    arguments: Mapping[str, object] = _NOTHING,
-) -> NamedClass:
-    """Return what a scenario names: a member of a table, or a class in a file of the user."""
-    if python is not None:
-        cls = user_class(scenario.folder, python, kind)
-        return NamedClass(cls, python, arguments, by_user=True)
-    return NamedClass(resolve(table[str(name)]), str(name), arguments, by_user=False)
-
-
-def law_class(
-    scenario: Scenario, table: Mapping[str, registry.Entry], law: str | UserClass
-) -> NamedClass:
-    """Return the law that a scenario names, a member of a table or a class of the user."""
-    if isinstance(law, UserClass):
-        return named_class(scenario, Law, table, None, law.python, law.parameters)
-    return named_class(scenario, Law, table, law, None)
 
 
 # ---- files of the user ---------------------------------------------------------------------------
