@@ -14,13 +14,12 @@ from browser import chromium, opened, until
 from recordings import recorded
 
 import echelon as ech
-from echelon.apps.live import promiser
+from echelon.apps.live import guarantee_status
 from echelon.apps.live import server as served
 from echelon.apps.live import swarm as looked
 from echelon.apps.live.attendance import as_changes
-from echelon.apps.live.guarantee_status import GuaranteeStatus
+from echelon.apps.live.guarantee_status import GuaranteeStatus, Promiser, badge_of, first_look
 from echelon.apps.live.panel import Panel
-from echelon.apps.live.promiser import Promiser, badge_of, first_look
 from echelon.apps.live.server import live, serve_live
 from echelon.apps.live.session import Session
 from echelon.apps.live.swarm import LiveLoop, Picture
@@ -522,7 +521,7 @@ def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_co
             ended.wait(10.0)
         return {"state": "holds", "short": str(knobs.coupling)}
 
-    monkeypatch.setattr(promiser, "badge_of", slow)
+    monkeypatch.setattr(guarantee_status, "badge_of", slow)
     answers = Promiser(told.append)
     answers.ask(panel, panel.start)
     assert began.wait(10.0)
@@ -544,7 +543,7 @@ def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_co
 
 def test_the_slider_marks_from_where_on_errors_grow_in_held_steps(panel):
     cheap = panel.start._replace(weight=0.02)
-    end, radii = promiser._end(panel, cheap, 0.5 * cheap.coupling), []
+    end, radii = guarantee_status._end(panel, cheap, 0.5 * cheap.coupling), []
     for c in (0.99 * end, 1.01 * end):
         steps = [step_of(panel, cheap._replace(coupling=c), value) for value in eigenvalues(panel)]
         radii.append(np.abs(np.linalg.eigvals(np.array(steps))).max())

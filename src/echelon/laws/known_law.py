@@ -8,7 +8,7 @@ import jax
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import Guide
 from echelon.core.jaxpr import used_leaves
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision

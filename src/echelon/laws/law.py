@@ -16,7 +16,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.near import Near
-from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import Guide
 from echelon.core.declared import Declared
 from echelon.core.errors import LawError
 from echelon.core.numerics import rk4

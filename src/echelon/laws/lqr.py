@@ -15,8 +15,7 @@ import scipy.linalg
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import check_reference
+from echelon.agents.references.reference import Guide, check_reference
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError
 from echelon.core.identity import process_key

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.flatness import first_state, follow_at, followed_states
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import check_kind_of
+from echelon.agents.references.demand import first_state, follow_at, followed_states
+from echelon.agents.references.reference import Guide, check_kind_of
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Scalar, State
 from echelon.laws.law import Expected, Law, LocalView, Memory

@@ -17,9 +17,8 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine, FlatBound, wrap_angles
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.near import Near
-from echelon.agents.references.flatness import first_state, followed_states
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import Reference, check_reference
+from echelon.agents.references.demand import first_state, followed_states
+from echelon.agents.references.reference import Guide, Reference, check_reference
 from echelon.core.errors import LawError, check_kind, listing
 from echelon.core.memoize import memoize
 from echelon.core.numerics import greater, lesser, precision

@@ -9,8 +9,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.spectrum import Spectrum
-from echelon.agents.references.demand import without_heading
-from echelon.agents.references.flatness import follow_at
+from echelon.agents.references.demand import follow_at, without_heading
 from echelon.agents.references.reference import check_reference
 from echelon.core.errors import LawError, ReferenceError
 from echelon.core.types import Input, Scalar, State

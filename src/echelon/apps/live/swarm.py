@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Hashable
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, TypeAlias, final
 
 import equinox as eqx
 import jax
@@ -18,23 +18,63 @@ from echelon.agents.network.hearing import edges_of
 from echelon.agents.world.disturbance import Disturbance
 from echelon.apps.live.attendance import attendance, room_for_events
 from echelon.apps.live.knobs import Knobs, LiveParts
-from echelon.apps.live.live_stepper import choose_stepper
 from echelon.core.compiled import cached_jit
-from echelon.core.errors import GraphError
+from echelon.core.errors import GraphError, MissingExtraError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, PyTree
 from echelon.experiments.results.lyapunov import fixed_metric, potential
 from echelon.laws.law import Law
 from echelon.laws.safety_check import separations
 from echelon.output.viewer.replay import link_shades
+from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.native import is_installed
+from echelon.simulation.native.stepper import NativeStepper
+from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.loop import Loop, Moment, Switches, assemble
 from echelon.simulation.step.nearby import all_hulls
 from echelon.simulation.step.sequence import begin
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain
+
+_MANY = 200
+"""With more agents than this JAX steps them in float32, which takes half the time."""
+
+TurnableStepper: TypeAlias = JaxStepper | NativeStepper
+"""Steps agents; a loop that is like the first but for its numbers compiles nothing again."""
+
+
+class LiveEngine(NamedTuple):
+    """A stepper, and the precision in which it computes."""
+
+    stepper: TurnableStepper
+    precision: Precision
+
+
+def choose_stepper(loop: Loop, unlike: Loop, states: Array, settings: Settings) -> LiveEngine:
+    """Return what steps a loop: native code wherever it can be made.
+
+    Args:
+        loop: to begin with.
+        unlike: one that differs from it in all numbers that will change.
+        states: (N, n) at the beginning.
+        settings: of the scenario.
+    """
+    by_jax = LiveEngine(
+        JaxStepper(loop, states), settings.precision if len(states) <= _MANY else "float32"
+    )
+    if settings.engine == "jax" or not is_installed() or jax.default_backend() != "cpu":
+        return by_jax
+    try:
+        # In float64: even so it takes a tenth of a picture's time.
+        with precision("float64"):
+            return LiveEngine(NativeStepper([loop], states, 64, None, variant=unlike), "float64")
+    except (Unsupported, MissingExtraError, TypeError):
+        # A law that needs its numbers as numbers is traced by JAX as it stands.
+        return by_jax
+
 
 PICTURE = 0.04
 """Seconds between two pictures."""

@@ -13,8 +13,7 @@ from echelon.agents.network.events import Cut, Event, Join, Lose, check_heirs, e
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import Reference, check_reference
+from echelon.agents.references.reference import Guide, Reference, check_reference
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.plant import check_plant, vary_parameters

@@ -107,7 +107,8 @@ def user_class(folder: Path, target: str, kind: type[_T]) -> type[_T]:
             "and on the command line to the working folder."
         )
     module = _imported(file)
-    classes = {key: value for key, value in vars(module).items() if _is_subclass(value, kind)}
+    own = ((key, value) for key, value in vars(module).items() if isinstance(value, type))
+    classes = {key: cls for key, cls in own if issubclass(cls, kind) and cls is not kind}
     if name not in classes:
         has = f"it has {listing(classes)}" if classes else "it has none"
         raise ScenarioError(
@@ -115,10 +116,6 @@ def user_class(folder: Path, target: str, kind: type[_T]) -> type[_T]:
             f"{did_you_mean(name, classes)}."
         )
     return classes[name]
-
-
-def _is_subclass(value: object, kind: type) -> bool:
-    return isinstance(value, type) and issubclass(value, kind) and value is not kind
 
 
 def _imported(file: Path) -> Any:

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import COORDINATES, Reference
+from echelon.agents.references.reference import COORDINATES, Guide, Reference
 from echelon.core.enclosure.interval import Interval, point
 from echelon.core.enclosure.taylor import enclose_finely
 from echelon.core.memoize import memoize

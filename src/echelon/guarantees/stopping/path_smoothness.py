@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.chains import Chains
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import COORDINATES, Reference
+from echelon.agents.references.reference import COORDINATES, Guide, Reference
 from echelon.core.digits import about
 from echelon.core.enclosure.taylor import enclose_derivatives, enclose_finely
 from echelon.core.errors import GainError

@@ -13,9 +13,8 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.demand import reference_warnings
-from echelon.agents.references.flatness import followed_states, reference_targets
-from echelon.agents.references.guide import Guide
+from echelon.agents.references.demand import followed_states, reference_targets, reference_warnings
+from echelon.agents.references.reference import Guide
 from echelon.core.errors import LawError
 from echelon.core.identity import process_key
 from echelon.core.memoize import BoundedCache
