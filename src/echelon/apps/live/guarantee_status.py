@@ -19,7 +19,7 @@ from echelon.core.types import JsonObject
 from echelon.experiments.results.avoidance import ROUNDING
 from echelon.experiments.scenario.build import build
 from echelon.guarantees.promises.closed_loop import LinearLoop
-from echelon.guarantees.promises.promise import Promise, promise
+from echelon.guarantees.promises.promise import promise
 from echelon.output.reports.causes import beyond
 from echelon.output.viewer.replay import promise_badge
 from echelon.simulation.step.meter import SETTLED, outside
@@ -166,7 +166,8 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
     badge["anywhere"] = certified is not None and certified.radius == float("inf")
     # Shown where the guarantee does not cover the state.
     badge["beyond"] = [*beyond(0.0, guarantee)]
-    if guarantee.promised and _near_edge(guarantee, knobs):
+    edge, c = guarantee.edge, knobs.coupling
+    if guarantee.promised and edge is not None and c is not None and c < _NEAR * edge:
         badge |= {"state": "edge", "short": f"{badge['short']}, near its edge"}
     elif not guarantee.promised and guarantee.slowest is not None:
         growth = _growth(panel.live.loop(knobs), panel.experiment.settings)
@@ -229,11 +230,6 @@ def _growth(loop: LinearLoop | None, settings: Settings) -> str:
         return f"no guarantee: a mode grows at {loop.slowest:.3g} 1/s"
     step = f"{1e3 * settings.dt:.3g} ms"
     return f"no guarantee: errors grow {radius:.3g}-fold in each step of {step}"
-
-
-def _near_edge(guarantee: Promise, knobs: Knobs) -> bool:
-    edge = guarantee.edge
-    return edge is not None and knobs.coupling is not None and knobs.coupling < _NEAR * edge
 
 
 # ---- the badge while the loop runs ---------------------------------------------------------------
@@ -322,17 +318,13 @@ class GuaranteeStatus:
 
     def _follow_transient(self, time: float, size: float, halved: bool) -> None:
         """Record the errors of the transient, and compare later errors with them."""
-        if time > self.since + self._duration():
+        rate = max(self.badge.get("rate") or 0.0, 1e-9)
+        if time > self.since + min(_LONGEST, max(_SHORTEST, _TRANSIENT / rate)):
             limit = max(_GROWTH * self.transient, SETTLED)
             self.growing = not halved if self.growing else size > limit
             return
         self.transient = max(self.transient, size)
         self.reference = self.transient if self.fresh else self.reference
-
-    def _duration(self) -> float:
-        """Return the duration of the transient (s)."""
-        rate = max(self.badge.get("rate") or 0.0, 1e-9)
-        return min(_LONGEST, max(_SHORTEST, _TRANSIENT / rate))
 
     def _departure(self, picture: Picture) -> str:
         """Return a sentence about an agent outside its domain; empty if all are inside."""

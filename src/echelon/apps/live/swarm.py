@@ -162,15 +162,13 @@ class LiveLoop:
         self.ahead = range(0)
         self._look_ahead(0)
         self._count(panel.start)
-        engine = choose_stepper(self.loop, self._variant(), self.states, settings)
+        # Other in all numbers that knobs change, except for weights.
+        other = (np.full(np.shape(leaf), np.nan) for leaf in self._adjustable(self.loop))
+        unlike = eqx.tree_at(self._adjustable, self.loop, tuple(other))
+        engine = choose_stepper(self.loop, unlike, self.states, settings)
         self.stepper = engine.stepper
         self.precision: Precision = engine.precision
         self.restart()
-
-    def _variant(self) -> Loop:
-        """Return a loop that differs in all numbers that knobs change, except for weights."""
-        other = [np.full(np.shape(leaf), np.nan) for leaf in self._adjustable(self.loop)]
-        return eqx.tree_at(self._adjustable, self.loop, tuple(other))
 
     def _adjustable(self, loop: Loop) -> tuple[PyTree, ...]:
         """Return the numbers that knobs change: the feed-forward's share, and those of the law."""
