@@ -4,10 +4,16 @@ Whoever uses one in a scenario, on the command line or in Python gets one senten
 echelon adds a line here, which stays for two minor versions.
 """
 
-KEYS: dict[str, str] = {}
+KEYS: dict[str, str] = {
+    "leadership.waits": "make the leader's path slower, as by a smaller `rate` of `reference`",
+    "live.gusts": "set `rms` of `disturbance` for the whole run",
+    "live.lag": "set `lag` of `actuator` for the whole run",
+}
 """Scenario keys; `section.key` is that key alone, and `key` is it in any section."""
 
-VALUES: dict[str, str] = {}
+VALUES: dict[str, str] = {
+    "prediction: none": "use `packet`, by which the model carries the leader on",
+}
 """Values of scenario keys, as in `prediction: none`, and of options, as in `export --to json`."""
 
 COMMANDS: dict[str, str] = {

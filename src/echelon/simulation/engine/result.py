@@ -48,7 +48,6 @@ class Result(FrameNumbers):
         engine: what computed the steps, `jax` or `native`.
         provenance: scenario text, versions and the like, as text.
         files: the files that the scenario text names, by the names that it gives them.
-        late: (T,) how late the plan is that the leaders follow, s; None where it does not wait.
 
     Raises:
         OutputError: when `parts` of a run from disk are first read, its scenario is missing or was
@@ -71,7 +70,6 @@ class Result(FrameNumbers):
     engine: str = "jax"
     provenance: Mapping[str, str] = dataclasses.field(default_factory=dict)
     files: Mapping[str, bytes] = dataclasses.field(default_factory=dict)
-    late: Array | None = None
 
     @property
     def model(self) -> ControlAffine:
