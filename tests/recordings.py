@@ -7,7 +7,13 @@ import numpy as np
 import xarray as xr
 
 from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
-from echelon.experiments.results.recording import InputBounds, LoopPoles, Recording, TrackingErrors
+from echelon.experiments.results.recording import (
+    FORMAT,
+    InputBounds,
+    LoopPoles,
+    Recording,
+    TrackingErrors,
+)
 
 PROMISE = {
     "promised": True,
@@ -124,7 +130,7 @@ def swinging(names, position, agents=3, n=2):
     )
 
 
-def as_file(run, version):
+def as_file(run):
     """A file of a recording, without V, limits and modes."""
     per_agent = ("time", "agent", "state")
     leads = np.isin(np.arange(run.agents), run.leaders).astype(np.int8)
@@ -151,7 +157,7 @@ def as_file(run, version):
         {
             "model": "Own",
             "position": " ".join(run.state_names[k] for k in run.position),
-            "format": version,
+            "format": FORMAT,
             "leader_needs": "nothing",
             "promise": json.dumps(run.promise),
             "horizon": run.horizon,
@@ -159,6 +165,8 @@ def as_file(run, version):
             "outcome": "completed",
             "message": "The run reached its horizon.",
             "warnings": "",
+            "computed_by": "jax",
+            "provenance": "",
             "settings": json.dumps({"horizon": run.horizon, "dt": run.dt}),
         },
     )

@@ -19,7 +19,7 @@ from echelon.core.errors import MissingExtraError, OutputError
 from echelon.experiments.results.avoidance import Ellipsoid
 from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.labelled import Labelled
-from echelon.experiments.results.recording import FORMAT, read_recording
+from echelon.experiments.results.recording import read_recording
 from echelon.experiments.scenario.registry import families
 from echelon.experiments.scenario.scenario import key_meanings
 from echelon.output.archive.export import export, table
@@ -35,7 +35,7 @@ def file(tmp_path_factory):
     """A stored run of four quadrotors."""
     path = tmp_path_factory.mktemp("stored") / "run.nc"
     run = dataclasses.replace(flown(seconds=1.0, rate=25.0), bounds=None)
-    path.write_bytes(as_file(run, FORMAT))
+    path.write_bytes(as_file(run))
     return path
 
 

@@ -738,7 +738,7 @@ BAD = {
     "nothing": ("none", "`none` does not exist; give the folder of a run, or its `run.nc`."),
     "no run": (".", "the folder `.` holds no run: it has no `run.nc`."),
     "damaged": ("junk.nc", "`junk.nc` cannot be read as a run: it is damaged, or was not written"),
-    "older": ("old.nc", "`old.nc`: the run was written in format 1 by echelon "),
+    "older": ("old.nc", "`old.nc`: the run has format 1, of echelon "),
 }
 
 

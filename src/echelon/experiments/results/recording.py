@@ -22,8 +22,8 @@ from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
 from echelon.experiments.results.labelled import Labelled, read_labelled
 from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
 
-FORMAT, READ = 4, (3, 4)
-"""Version of the format of `run.nc`, and those that are read; others are refused."""
+FORMAT = 4
+"""Version of the format of `run.nc`; files of others are refused."""
 
 
 class InputBounds(NamedTuple):
@@ -328,12 +328,11 @@ def _check_format(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> N
     if "states" not in arrays or "model" not in attributes:
         raise KeyError("it has no states of agents")
     version = int(attributes.get("format", 1))
-    if version not in READ:
-        by = attributes.get("version_echelon", "an unknown version")
+    if version != FORMAT:
+        by = attributes.get("version_echelon", "?")
         raise OutputError(
-            f"the run was written in format {version} by echelon {by}, but this version reads "
-            f"formats {READ[0]} and {READ[1]}; `echelon run FOLDER --out OTHER` computes it again "
-            "from its scenario."
+            f"the run has format {version}, of echelon {by}, and this version reads format "
+            f"{FORMAT}; run it again by `echelon run FOLDER --out OTHER`."
         )
 
 

@@ -5,11 +5,9 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from echelon.core.errors import Outcome, OutputError
 from echelon.core.lazy_field import Later
-from echelon.core.types import JsonObject
+from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.dataset import STORED
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.recording import recording_with_data
@@ -19,8 +17,6 @@ from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats
-
-_SETTINGS = tuple(name for name in Settings._fields if name != "limits")
 
 
 def read_result(
@@ -58,9 +54,8 @@ def _result(
     files: Mapping[str, bytes],
 ) -> Result:
     attributes, arrays = data.attributes, data.arrays()
-    sums = {name: arrays[SUM + name] for name in Sums._fields if SUM + name in arrays}
     solver, seconds = attributes.get("solver"), summary.get("wall_time_s")
-    settings = _settings(attributes)
+    settings = Settings(**json.loads(attributes["settings"]))
     return Result(
         times=arrays["time"],
         states=arrays["states"],
@@ -71,39 +66,20 @@ def _result(
         warnings=tuple(attributes["warnings"].splitlines()),
         settings=settings,
         wall_time=float("nan") if seconds is None else float(seconds),
-        sums=Later(partial(_sums, file, sums)),
+        sums=Later(partial(_sums, file, arrays)),
         parts=Later(partial(parts, attributes, settings)),
         work=None if solver is None else SolverStats(**json.loads(solver)),
-        engine=attributes.get("computed_by") or summary.get("engine", "jax"),
-        provenance={name: attributes[name] for name in _provenance(attributes)},
+        engine=attributes["computed_by"],
+        provenance={name: attributes[name] for name in attributes["provenance"].split()},
         files=files,
         late=arrays.get("late"),
     )
 
 
-def _sums(file: Path, sums: Mapping[str, object]) -> Sums:
-    # Earlier versions found the closest two agents in stored frames only.
-    sums = {"closest": np.zeros(0), "met": np.zeros((0, 3)), **sums}
-    missing = [name for name in Sums._fields if name not in sums]
-    if missing:
+def _sums(file: Path, arrays: Mapping[str, Array]) -> Sums:
+    if SUM + "steps" not in arrays:
         raise OutputError(
-            f"`{file}` was written by an earlier version and has no sums over all steps, which "
-            "the metrics and the report are computed from; `echelon run FOLDER --out OTHER` "
-            "computes the run again."
+            f"`{file}` has no sums over all steps, which metrics and the report are computed from; "
+            "`echelon run FOLDER --out OTHER` computes the run again."
         )
-    return Sums(**sums)
-
-
-def _settings(attributes: JsonObject) -> Settings:
-    if "settings" in attributes:
-        return Settings(**json.loads(attributes["settings"]))
-    # Format 3 has them one by one.
-    rest = {name: attributes[name] for name in _SETTINGS if name in attributes}
-    return Settings(**rest, limits=bool(attributes["limits"]))
-
-
-def _provenance(attributes: JsonObject) -> list[str]:
-    if "provenance" in attributes:
-        return attributes["provenance"].split()
-    own = ("scenario", "scenario_text")
-    return [name for name in attributes if name in own or name.startswith("version_")]
+    return Sums(*(arrays[SUM + name] for name in Sums._fields))

@@ -60,7 +60,7 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
         stretches = chunks.read()
         done = stretches[-1].done if stretches else 0
         # A run that was stopped, continued and killed is longer in its chunks.
-        if stored is None or done > _steps(stored):
+        if stored is None or done > int(stored.sums.steps[0]):
             return _unfinished(path, stretches)
     if stored is None:
         raise OutputError(_no_run(path))
@@ -73,15 +73,6 @@ def _no_run(path: Path) -> str:
     if (path / "sweep.nc").is_file():
         return f"`{path}` is a sweep, which holds numbers of many runs; open its `sweep.nc`."
     return f"the folder `{path}` holds no run: it has no `{DATA}`."
-
-
-def _steps(result: Result) -> int:
-    """Return how many steps a run took."""
-    try:
-        return int(result.sums.steps[0])
-    except OutputError:
-        # In format 3 the last frame says it.
-        return round(float(result.times.max(initial=0.0)) / result.settings.dt)
 
 
 def _unfinished(folder: Path, stretches: list[Stretch]) -> Result:
@@ -131,10 +122,7 @@ def _scenario(file: Path, digest: str, attributes: JsonObject) -> Scenario:
     scenario = scenario_from_text(text, file.with_name(SCENARIO_FILE))
     if not names_files(scenario):
         return scenario
-    if "inputs" not in attributes:
-        # The text in format 3 names files where they were; the scenario of the folder, its copies.
-        return load_scenario(file.with_name(SCENARIO_FILE))
-    if attributes["inputs"] != digest:
+    if attributes.get("inputs") != digest:
         raise OutputError(
             f"the files that the run in `{file}` was computed from are not in its folder, or were "
             f"changed; `echelon run` computes it again from its `{SCENARIO_FILE}`."

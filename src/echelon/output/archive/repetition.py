@@ -14,7 +14,7 @@ from echelon.core.types import JsonObject
 from echelon.experiments.results.dataset import OBSERVED, run_file, summary, with_sums
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.labelled_parts import labelled_parts
-from echelon.experiments.results.recording import FORMAT, recording_with_data
+from echelon.experiments.results.recording import recording_with_data
 from echelon.experiments.results.run_groups import SUM
 from echelon.experiments.scenario.build import Experiment, origin_of
 from echelon.experiments.scenario.scenario import Scenario
@@ -62,7 +62,7 @@ def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -
     assert files.data is not None
     _, data = recording_with_data(files.data)
     steps = data.arrays().get(SUM + "steps")
-    if data.attributes["format"] != FORMAT or steps is None or not int(steps[0]):
+    if steps is None or not int(steps[0]):
         yield unchecked(OBSERVATIONS, "", "the file has no sums over the steps of the run")
         return
     result = _repeated(experiment, data, int(steps[0]))

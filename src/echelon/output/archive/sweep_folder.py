@@ -66,10 +66,8 @@ class Batches:
             OutputError: there is none, or its inputs or versions changed.
         """
         self.chunks.check()
-        over = json.loads((self.folder / INPUTS / _OVER).read_text("utf-8"))
+        begun = json.loads((self.folder / INPUTS / _OVER).read_text("utf-8"))
         scenario = load_scenario(self.folder / SCENARIO_FILE)
-        # A list of axes, where an earlier version began it.
-        begun = {"over": over, "keep_states": None} if isinstance(over, list) else over
         return Sweep(scenario, read_axes(begun["over"]), begun["keep_states"])
 
     def write(self, batch: SweepBatch) -> None:
