@@ -279,6 +279,7 @@ def test_keys_choose_an_agent_and_are_listed_and_the_address_is_a_link_to_the_ti
         for key, agent in (("n", 0), ("n", 1), ("p", 0), ("p", 3), ("Escape", -1)):
             page.keyboard.press(key)
             assert page.evaluate("echelon.player.view.selected") == agent
+        assert not page.locator(".report").is_visible()
         page.keyboard.press("?")
         told = page.locator("#help").inner_text()
         assert "select the next agent" in told and "play, pause" in told
@@ -435,10 +436,18 @@ def test_the_reference_is_drawn_and_the_leader_s_error_told(browser, run, tmp_pa
 def test_two_runs_have_one_clock_one_scale_and_one_camera(browser, run, tmp_path):
     other = flown(seconds=3.0, rate=25.0)
     path = tmp_path / "runs.html"
-    path.write_text(replay_page(other, dataclasses.replace(run, name="second")), "utf-8")
+    both = other, dataclasses.replace(run, name="second")
+    path.write_text(replay_page(*both, reports=["one\n---\n- <first>", "two"]), "utf-8")
     moments = "echelon.player.panes.map((pane) => pane.run.moment.time)"
     with opened(browser, path.as_uri()) as page:
         assert page.locator("header h1").inner_text() == "made up and second"
+        for k, text in enumerate(("one\n---\n- <first>", "two")):
+            page.locator(".report").nth(k).click()
+            assert page.locator("dialog pre").inner_text() == text
+            page.keyboard.press("End")
+            page.locator("dialog button").click()
+            until(lambda: not page.locator("dialog").count())
+        assert page.evaluate(moments) == [0.0, 0.0]
         for time, shown in ((2.0, [2.0, 2.0]), (5.0, [3.0, 5.0])):
             page.evaluate(f"echelon.player.seekTime({time})")
             assert page.evaluate(moments) == pytest.approx(shown)

@@ -7,7 +7,10 @@ echelon adds a line here, which stays for two minor versions.
 KEYS: dict[str, str] = {}
 """Scenario keys; `section.key` is that key alone, and `key` is it in any section."""
 
-VALUES: dict[str, str] = {}
+VALUES: dict[str, str] = {
+    "export --to json": "use `csv`, or `nc` with xarray; numbers are in `summary.json`",
+    "report --out .html": "use `.txt`, or `echelon view RUN --html FILE`, which shows it",
+}
 """Values of scenario keys, as in `prediction: none`, and of options, as in `export --to json`."""
 
 COMMANDS: dict[str, str] = {}

@@ -25,8 +25,7 @@ def export(
         str | None,
         typer.Option(
             "--to",
-            help="csv, parquet, npz, mat, nc, json, html (default: the ending of --out, else csv); "
-            "law.",
+            help="csv, parquet, npz, mat, nc, html (default: the ending of --out, else csv); law.",
         ),
     ] = None,
     agent: Annotated[

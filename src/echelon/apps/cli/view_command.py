@@ -54,13 +54,16 @@ def view(
     STATUS.begin(f"reading {' and '.join(map(str, paths))}")
     from echelon.experiments.results.dataset import recording_of
     from echelon.output.archive.load_folder import load
+    from echelon.output.archive.run_folder import report_beside
+    from echelon.output.reports.run_report import whole_report
     from echelon.output.viewer.replay import replay_page
 
     opened = [recording_of(load(path)) for path in paths]
+    reports = [whole_report(*each) for each in zip(opened, map(report_beside, paths), strict=True)]
     if len(paths) > 1:
         # Both may be of one scenario.
         opened = [replace(run, name=_label(path)) for run, path in zip(opened, paths, strict=True)]
-    page = replay_page(*opened).encode()
+    page = replay_page(*opened, reports=reports).encode()
     if html is None:
         show_page(page, port, browser)
         return

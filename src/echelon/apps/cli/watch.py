@@ -56,9 +56,12 @@ class WatchedRun:
         """Show the complete run until Ctrl-C."""
         from echelon.experiments.results.dataset import recording_of
         from echelon.output.archive.load_folder import load
+        from echelon.output.archive.run_folder import report_beside
+        from echelon.output.reports.run_report import whole_report
 
         with STOP.hold(message=""):
-            self.page.finish(recording_of(load(folder)))
+            run = recording_of(load(folder))
+            self.page.finish(run, whole_report(run, report_beside(folder)))
             print(
                 "echelon: complete; the page is still served. Ctrl-C quits.",
                 file=sys.stderr,

@@ -23,6 +23,7 @@ from echelon.guarantees.promises.promise import promise
 from echelon.guarantees.verifier.findings import Finding, unchecked
 from echelon.guarantees.verifier.stored_values import Digits, compare_arrays, compare_values
 from echelon.guarantees.verifier.strict_json import read_json
+from echelon.output.archive.folder import REPORT
 from echelon.output.archive.open_folder import ClaimFiles
 from echelon.output.reports.causes import sizes
 from echelon.output.reports.run_report import report
@@ -45,7 +46,6 @@ _STOPPED = (Outcome.INTERRUPTED.name.lower(), Outcome.STOPPED.name.lower())
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _ROUNDING = Decimal("1e-8")
 """Printed numbers below it are mostly rounding of the run, which differs between processors."""
-_REPORT = "report.txt"
 
 
 def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
@@ -121,7 +121,7 @@ def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Find
         theirs, ours = [{k: x[k] for k in names if k in x} for x in (stored, value)]
         yield from compare_values("", theirs, ours, digits)
         yield from _compare_origin(stored, data)
-    written = files.data.parent / _REPORT
+    written = files.data.parent / REPORT
     if written.is_file() and not stopped:
         yield _compare_report(written, report(result) + "\n")
 

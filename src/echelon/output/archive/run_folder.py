@@ -13,6 +13,7 @@ from echelon.output.archive.folder import (
     DATA,
     GAIN,
     IN_PYTHON,
+    REPORT,
     SUMMARY,
     claim_folder,
     write_errors,
@@ -50,6 +51,13 @@ def save_run(
     return place
 
 
+def report_beside(place: Path) -> str:
+    """Return the report in the folder of a run, or beside its `run.nc`; empty without one."""
+    folder = place.parent if place.name == DATA else place
+    file = folder / REPORT
+    return file.read_text("utf-8", "replace") if file.is_file() else ""
+
+
 def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
     """Write the dataset of a run, then summary, report and figures.
 
@@ -63,7 +71,7 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
         # NaN is not JSON, and other parsers refuse it.
         content = json.dumps(summary(result), indent=2, allow_nan=False)
         write_atomic(folder / SUMMARY, content + "\n")
-        write_atomic(folder / "report.txt", report(result) + "\n")
+        write_atomic(folder / REPORT, report(result) + "\n")
         if result.drive.gain is not None:
             save_gain(result.drive.gain, result.model, result.graph, folder / GAIN)
         if figures and len(result.times):

@@ -1,9 +1,15 @@
-"""The report of a run: a table like the paper's Table II, and sentences that explain it."""
+"""The report of a run: a table like the paper's Table II, and sentences that explain it.
+
+The whole report adds the conditions of the guarantee, the scenario, versions, and how to cite.
+"""
 
 import io
+import textwrap
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
+from echelon import __version__
+from echelon.core.types import JsonObject
 from echelon.experiments.results.agent_metrics import (
     FollowerMetrics,
     LeaderMetrics,
@@ -13,6 +19,7 @@ from echelon.experiments.results.agent_metrics import (
 )
 from echelon.experiments.results.metrics import metrics
 from echelon.experiments.results.quantity import quantities, settling_bound
+from echelon.experiments.results.recording import Recording
 from echelon.output.reports.explanation import explain
 from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
 from echelon.simulation.engine.result import Result
@@ -21,6 +28,21 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+_WIDTH = 100
+_CITATION = f"""@software{{echelon,
+  title = {{echelon: leader-follower formation tracking for control-affine nonlinear agents}},
+  author = {{{{The echelon developers}}}},
+  version = {{{__version__}}}
+}}
+@inproceedings{{enwerem2023consensus,
+  title = {{Consensus-Based Leader-Follower Formation Tracking for Control-Affine Nonlinear
+    Multiagent Systems}},
+  author = {{Enwerem, Clinton and Baras, John S.}},
+  booktitle = {{9th International Conference on Control, Decision and Information Technologies
+    (CoDIT)}},
+  year = {{2023}},
+  note = {{arXiv:2309.09156}}
+}}"""
 # With more agents of a role the table shows the best, the median and the worst.
 _MANY = 12
 _COLUMNS = quantities(FollowerMetrics)
@@ -32,9 +54,44 @@ def report(result: Result) -> str:
 
     text = io.StringIO()
     # A forced terminal, so that sentences wrap; without colours the text stays plain.
-    console = Console(file=text, width=100, color_system=None, force_terminal=True)
+    console = Console(file=text, width=_WIDTH, color_system=None, force_terminal=True)
     print_report(console, result, metrics(result))
     return text.getvalue().rstrip("\n")
+
+
+def whole_report(run: Recording, numbers: str) -> str:
+    """Return the numbers of a run, its guarantee with all conditions, and where it is from.
+
+    Args:
+        run: as it is stored.
+        numbers: its `report`; empty where there is none.
+    """
+    message, promise = str(run.attributes["message"]), run.promise
+    facts = f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s"
+    versions = {k[8:]: v for k, v in run.attributes.items() if k.startswith("version_")}
+    sections = {
+        f"{run.name}: {facts}": numbers.rstrip() or _wrapped(message, promise["sentence"]),
+        "Conditions of the guarantee": _wrapped(*map(_condition, promise["hypotheses"])),
+        "Scenario": str(run.attributes.get("scenario_text", "")).rstrip(),
+        "Versions": "\n".join(f"{name} {version}" for name, version in versions.items()),
+        "Citation": _CITATION,
+    }
+    some = (f"{title}\n{'-' * len(title)}\n{text}" for title, text in sections.items() if text)
+    return "\n\n".join(some)
+
+
+def _wrapped(*sentences: str) -> str:
+    """Return sentences as the items of a list."""
+    fill = textwrap.TextWrapper(_WIDTH, initial_indent="- ", subsequent_indent="  ").fill
+    return "\n".join(map(fill, filter(None, sentences)))
+
+
+def _condition(line: JsonObject) -> str:
+    """Return a condition with its verdict, number, reason, and remedy if it fails."""
+    text = f"{line['statement']}: {line['verdict']}"
+    text += f" ({line['shown']})" if line["shown"] else ""
+    text += f"; {line['text']}" if line["text"] else ""
+    return text + (f"; to change: {line['remedy']}" if line["remedy"] else "")
 
 
 def print_report(console: "Console", result: Result, numbers: Metrics) -> None:

@@ -49,13 +49,13 @@ class Growing:
             self.last = stretch
             self.changed.notify_all()
 
-    def finish(self, run: Recording) -> None:
-        """Replace the parts by the complete run, which all pages then load.
+    def finish(self, run: Recording, report: str) -> None:
+        """Replace the parts by the complete run with its report, which all pages then load.
 
         Raises:
             OutputError: it is too large for a page.
         """
-        html = replay_page(run).encode()
+        html = replay_page(run, reports=[report]).encode()
         with self.changed:
             self.html, self.done = html, True
             self.changed.notify_all()

@@ -1,6 +1,6 @@
 """The data of a replay page: places, angles and motors at each frame, charts, and texts."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,18 +25,23 @@ _MOST = 20_000_000
 """Numbers in one file, which take some 25 MB."""
 
 
-def replay_page(*runs: Recording) -> str:
+def replay_page(*runs: Recording, reports: Sequence[str] = ()) -> str:
     """Return one run, or two beside each other with the same clock, as a self-contained HTML page.
+
+    Args:
+        runs: to show.
+        reports: the text of each, which the page shows on demand; none by default.
 
     Raises:
         OutputError: a run has no frame or is too large.
         MissingExtraError: the page's three.js is not built.
     """
-    return page(" and ".join(run.name for run in runs), *map(replay_data, runs))
+    texts = reports or [""] * len(runs)
+    return page(" and ".join(run.name for run in runs), *map(replay_data, runs, texts))
 
 
-def replay_data(run: Recording) -> bytes:
-    """Return a run packed for the page.
+def replay_data(run: Recording, report: str = "") -> bytes:
+    """Return a run packed for the page, with its report.
 
     Raises:
         OutputError: it has no frame, or is too large.
@@ -64,6 +69,7 @@ def replay_data(run: Recording) -> bytes:
     _check_size(run, groups, len(frames))
     description = {
         **header(run, space),
+        "report": report,
         "frames": len(frames),
         "clock": _clock(run, frames),
         "closest": _closest(run),
