@@ -552,10 +552,12 @@ def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_en
         chart = page.locator(".chart").nth(1).inner_text().replace("\n", " ")
         assert f"V {run.lyapunov[120]:.3g}" in chart and "guaranteed slope, −1 1/s" in chart
         with page.expect_event("load"):
-            growing.finish(run)
+            growing.finish(run, "all of it")
         # A time in between, so that the frame is rounded.
         shown = "Math.round(window.echelon?.frame) === 120 && !echelon.run.growing"
         until(lambda: page.evaluate(shown))
+        page.locator(".report").click()
+        assert page.locator("dialog pre").inner_text() == "all of it"
 
 
 # ---- other models -----------------------------------------------------------------------------
