@@ -6,14 +6,9 @@ import json
 import numpy as np
 import xarray as xr
 
-from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
-from echelon.experiments.results.recording import (
-    FORMAT,
-    InputBounds,
-    LoopPoles,
-    Recording,
-    TrackingErrors,
-)
+from echelon.experiments.results.dataset import FORMAT
+from echelon.experiments.results.metrics import Avoidance, Ellipsoid
+from echelon.experiments.results.recording import InputBounds, LoopPoles, Recording, TrackingErrors
 
 PROMISE = {
     "promised": True,

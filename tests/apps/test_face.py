@@ -18,10 +18,9 @@ import echelon as ech
 from echelon.apps.cli import init_command
 from echelon.apps.cli.explain_command import _names_and_keys
 from echelon.core.errors import MissingExtraError, OutputError
-from echelon.experiments.results.avoidance import Ellipsoid
-from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.labelled import Labelled
-from echelon.experiments.results.recording import read_recording
+from echelon.experiments.results.metrics import Ellipsoid
+from echelon.experiments.results.recording import read_recording, recording_of
 from echelon.experiments.scenario.registry import families
 from echelon.experiments.scenario.scenario import key_meanings
 from echelon.output.archive.export import export, table
@@ -43,7 +42,7 @@ def file(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(file):
-    return read_recording(file)
+    return read_recording(file)[0]
 
 
 # ---- numbers ----------------------------------------------------------------------------------

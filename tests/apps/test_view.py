@@ -15,7 +15,7 @@ from recordings import flown, separated, swinging
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
-from echelon.experiments.results.dataset import recording_of
+from echelon.experiments.results.recording import recording_of
 from echelon.output.plots.space import space_of
 from echelon.output.viewer.growing import Growing, serve_growing
 from echelon.output.viewer.pack import Group, pack

@@ -10,7 +10,7 @@ import pytest
 from forgeries import at, forged, places, replaced
 
 import echelon as ech
-from echelon.experiments.results.dataset import OBSERVED, statement, summary
+from echelon.experiments.results.summary import OBSERVED, statement, summary
 from echelon.experiments.scenario.scenario import bundled_scenarios
 from echelon.experiments.studies.design import with_gain
 from echelon.experiments.studies.recomputation import (

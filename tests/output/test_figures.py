@@ -10,7 +10,7 @@ from recordings import PROMISE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
-from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
+from echelon.experiments.results.metrics import Avoidance, Ellipsoid
 from echelon.experiments.results.recording import MessageAges
 from echelon.output.plots.network import curves_of
 from echelon.output.plots.over_time import start_of

@@ -13,7 +13,8 @@ import xarray as xr
 from runs import OWN_PENDULUM
 
 import echelon as ech
-from echelon.experiments.results.dataset import recording_of, run_file
+from echelon.experiments.results.dataset import run_file
+from echelon.experiments.results.recording import recording_of
 from echelon.experiments.scenario.build import build
 from echelon.output.archive import export as exporting
 from echelon.output.archive.chunks import Chunks
@@ -163,12 +164,6 @@ def test_python_is_answered_in_its_own_words(run, here):
             write()
     with pytest.raises(ech.errors.OutputError, match="`place` is 3, and must be the folder of"):
         ech.load(3)
-
-
-def test_the_names_of_before_lead_to_the_same_with_a_warning(run):
-    for name in (ech.load_run, ech.open_run):
-        with pytest.warns(DeprecationWarning, match="is now `load`"):
-            assert_same(run[0], name(run[1]))
 
 
 def test_a_run_from_python_is_read_and_its_parts_are_to_be_given(run, tmp_path):

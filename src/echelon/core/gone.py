@@ -16,7 +16,10 @@ VALUES: dict[str, str] = {
 COMMANDS: dict[str, str] = {}
 """Commands of the command line."""
 
-NAMES: dict[str, str] = {}
+NAMES: dict[str, str] = {
+    "load_run": "use `load`",
+    "open_run": "use `load`",
+}
 """Public names below `echelon`."""
 
 

@@ -33,7 +33,7 @@ def live(
     from echelon.apps.cli.view_command import keep_serving
     from echelon.apps.live.server import live as make_ready
     from echelon.apps.live.server import serve_live
-    from echelon.experiments.results.dataset import recording_of
+    from echelon.experiments.results.recording import recording_of
     from echelon.output.archive.load_folder import load
 
     # A bundled scenario wins over a folder of its name, and a folder may hold no run yet.

@@ -26,7 +26,7 @@ def report(
             raise OutputError(f"a report as `{out.suffix}`{ended}")
         claim_file(out, force)
     STATUS.begin(f"reading {run}")
-    from echelon.experiments.results.dataset import recording_of
+    from echelon.experiments.results.recording import recording_of
     from echelon.output.archive.load_folder import load
     from echelon.output.archive.run_folder import report_beside
     from echelon.output.reports.run_report import whole_report

@@ -143,7 +143,7 @@ def _simulate(
 def _print(result: "Result", as_json: bool) -> None:
     """Print the report before files are written, so that a full disk loses nothing of it."""
     if as_json:
-        from echelon.experiments.results.dataset import summary
+        from echelon.experiments.results.summary import summary
 
         print(json.dumps(summary(result), indent=2), flush=True)
         return

@@ -116,12 +116,11 @@ def _compute(
     plan: "Sweep", batches: "Batches", threads: int | None, cluster: str | None, quiet: bool
 ) -> "list[SweepBatch]":
     """Return the batches of a sweep, each written as soon as it is computed."""
-    from echelon.experiments.results.labelled import labelled
     from echelon.experiments.sweeps.sweep import compute
     from echelon.experiments.sweeps.sweep_dataset import dataset_of
 
     # What writes results is loaded before there are any: Ctrl-C then does not wait for it.
-    labelled(dataset_of(plan, ())[[]]).netcdf()
+    dataset_of(plan, ())[[]].to_netcdf(None, engine="h5netcdf")
     results = batches.read()
 
     def store(batch: "SweepBatch") -> None:

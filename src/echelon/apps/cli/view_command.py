@@ -52,7 +52,7 @@ def view(
         claim_file(html, force)
     paths = runs or [_newest()]
     STATUS.begin(f"reading {' and '.join(map(str, paths))}")
-    from echelon.experiments.results.dataset import recording_of
+    from echelon.experiments.results.recording import recording_of
     from echelon.output.archive.load_folder import load
     from echelon.output.archive.run_folder import report_beside
     from echelon.output.reports.run_report import whole_report

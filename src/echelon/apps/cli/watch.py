@@ -27,8 +27,8 @@ class WatchedRun:
 
     def __init__(self, scenario: "Scenario", experiment: "Experiment") -> None:
         """Prepare the page, as far as it is known before the run."""
-        from echelon.experiments.results.foreseen import foreseen
         from echelon.experiments.results.lyapunov import fixed_metric, potential
+        from echelon.experiments.results.recording import foreseen
         from echelon.guarantees.promises.promise import promise
         from echelon.output.viewer.growing import Growing
         from echelon.simulation.engine.prepare import prepare
@@ -45,7 +45,7 @@ class WatchedRun:
 
     def add(self, stretch: "Stretch") -> None:
         """Show a part that was computed."""
-        from echelon.experiments.results.foreseen import so_far
+        from echelon.experiments.results.recording import so_far
 
         # An agent without finite numbers cannot be drawn; the page says so at the end.
         if stretch.finite:
@@ -54,7 +54,7 @@ class WatchedRun:
 
     def show_all(self, folder: Path) -> None:
         """Show the complete run until Ctrl-C."""
-        from echelon.experiments.results.dataset import recording_of
+        from echelon.experiments.results.recording import recording_of
         from echelon.output.archive.load_folder import load
         from echelon.output.archive.run_folder import report_beside
         from echelon.output.reports.run_report import whole_report

@@ -16,7 +16,7 @@ from echelon.agents.network.graph import Graph
 from echelon.apps.live.swarm import Picture
 from echelon.core.digits import at_least, at_most
 from echelon.core.types import JsonObject
-from echelon.experiments.results.avoidance import ROUNDING
+from echelon.experiments.results.metrics import ROUNDING
 from echelon.simulation.step.meter import SETTLED, outside
 
 _TRANSIENT = 2.0

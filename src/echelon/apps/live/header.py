@@ -5,8 +5,7 @@ import numpy as np
 from echelon.apps.live.panel import Panel
 from echelon.apps.live.swarm import LiveLoop
 from echelon.core.types import JsonObject
-from echelon.experiments.results.foreseen import foreseen
-from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.recording import Recording, foreseen
 from echelon.output.plots.space import Space, space_of
 from echelon.output.viewer.charts import distance_chart
 from echelon.output.viewer.replay import header, motor_loads

@@ -14,10 +14,10 @@ import numpy as np
 
 from echelon.core.errors import GainError
 from echelon.core.types import JsonObject
-from echelon.experiments.results.dataset import OBSERVED, leader_gain_of, statement
+from echelon.experiments.results.dataset import labelled_parts
 from echelon.experiments.results.labelled import Labelled
-from echelon.experiments.results.labelled_parts import labelled_parts
-from echelon.experiments.results.recording import Recording, recording_with_data
+from echelon.experiments.results.recording import Recording, read_recording
+from echelon.experiments.results.summary import OBSERVED, leader_gain_of, statement
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.self_contained import without_folders
@@ -163,7 +163,7 @@ def _led_by(parts: Parts, gain: Gain) -> Parts:
 
 def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
     """Compare the guarantee, the scenario, the parts and the starts in a dataset."""
-    (run, data), (parts, settings), name = recording_with_data(file), experiment, file.name
+    (run, data), (parts, settings), name = read_recording(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
     value = _as_json(promise(parts, settings).as_mapping())
     yield from compare_values(f"{name}: promise", stored, value)

@@ -37,8 +37,7 @@ def table(run: "Result | Recording", every: int = 1) -> "pd.DataFrame":
     """
     import pandas as pd
 
-    from echelon.experiments.results.dataset import recording_of
-    from echelon.experiments.results.recording import Recording
+    from echelon.experiments.results.recording import Recording, recording_of
     from echelon.simulation.engine.result import Result
 
     if not isinstance(run, Recording):
@@ -140,7 +139,7 @@ def _parquet(run: "Result") -> bytes:
 
 def _arrays(run: "Result") -> "JsonObject":
     """Return the arrays of a run by name."""
-    from echelon.experiments.results.dataset import recording_of
+    from echelon.experiments.results.recording import recording_of
 
     data = recording_of(run)
     arrays: JsonObject = {
@@ -188,7 +187,8 @@ def _netcdf(run: "Result") -> bytes:
 
 
 def _page(run: "Result") -> bytes:
-    from echelon.experiments.results.dataset import STORED, recording_of
+    from echelon.experiments.results.dataset import STORED
+    from echelon.experiments.results.recording import recording_of
     from echelon.output.reports.run_report import report, whole_report
     from echelon.output.viewer.page import check_page
     from echelon.output.viewer.replay import replay_page

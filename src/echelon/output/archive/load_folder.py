@@ -3,15 +3,16 @@
 import dataclasses
 import json
 import os
-import warnings
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
-from echelon.core.errors import OutputError
+from echelon.core.errors import Outcome, OutputError
 from echelon.core.files import INPUTS
-from echelon.core.types import JsonObject, PathLike
-from echelon.experiments.results.dataset import digest_of
-from echelon.experiments.results.stored_result import read_result
+from echelon.core.types import Array, JsonObject, PathLike
+from echelon.experiments.results.dataset import STORED, SUM, digest_of
+from echelon.experiments.results.labelled import Labelled
+from echelon.experiments.results.recording import read_recording
 from echelon.experiments.scenario.build import build, origin_of
 from echelon.experiments.scenario.scenario import (
     SCENARIO_FILE,
@@ -25,9 +26,11 @@ from echelon.output.archive.folder import DATA, SUMMARY, check_exists
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.record import Stretch
-from echelon.simulation.engine.result import Result
+from echelon.simulation.engine.result import Later, Result
 from echelon.simulation.engine.simulate import reassemble
+from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.settings import Settings
+from echelon.simulation.step.solver_stats import SolverStats
 
 
 def load(place: PathLike, parts: Parts | None = None) -> Result:
@@ -62,17 +65,15 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
         # A run that was stopped, continued and killed is longer in its chunks.
         if stored is None or done > int(stored.sums.steps[0]):
             return _unfinished(path, stretches)
-    if stored is None:
-        raise OutputError(_no_run(path))
-    return stored
-
-
-def _no_run(path: Path) -> str:
+    if stored is not None:
+        return stored
     if (path / "comparison.json").is_file():
-        return f"`{path}` is a comparison; give one of its runs, `{path}/runs/NAME.nc`."
+        raise OutputError(f"`{path}` is a comparison; give one of its runs, `{path}/runs/NAME.nc`.")
     if (path / "sweep.nc").is_file():
-        return f"`{path}` is a sweep, which holds numbers of many runs; open its `sweep.nc`."
-    return f"the folder `{path}` holds no run: it has no `{DATA}`."
+        raise OutputError(
+            f"`{path}` is a sweep, which holds numbers of many runs; open its `sweep.nc`."
+        )
+    raise OutputError(f"the folder `{path}` holds no run: it has no `{DATA}`.")
 
 
 def _unfinished(folder: Path, stretches: list[Stretch]) -> Result:
@@ -86,12 +87,62 @@ def _unfinished(folder: Path, stretches: list[Stretch]) -> Result:
 
 def _stored(file: Path, parts: Parts | None) -> Result:
     """Return a run from its file, beside which its summary and its inputs may be."""
-    folder = file.parent if file.name == DATA else None
-    names = [] if folder is None else sorted((folder / INPUTS).rglob("*"))
+    _, data = read_recording(file)
+    within = file.name == DATA
+    names = sorted((file.parent / INPUTS).rglob("*")) if within else []
     files = {x.relative_to(file.parent).as_posix(): x.read_bytes() for x in names if x.is_file()}
-    summary = {} if folder is None else _mapping(folder / SUMMARY)
+    seconds = _seconds(file.with_name(SUMMARY)) if within else float("nan")
+    try:
+        result = _result(file, data, parts, files, seconds)
+    except (KeyError, ValueError, TypeError) as error:
+        raise OutputError(f"`{file}` is damaged: its attributes are not those of a run.") from error
+    rest = {name: part for name, part in data.variables.items() if not name.startswith(SUM)}
+    STORED[result] = data._replace(variables=rest)
+    return result
+
+
+def _seconds(summary: Path) -> float:
+    """Return how long a run took to compute, s; NaN where its summary does not say it."""
+    try:
+        return float(json.loads(summary.read_text("utf-8"))["wall_time_s"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return float("nan")
+
+
+def _result(
+    file: Path, data: Labelled, parts: Parts | None, files: Mapping[str, bytes], seconds: float
+) -> Result:
+    attributes, arrays = data.attributes, data.arrays()
+    solver, settings = attributes.get("solver"), Settings(**json.loads(attributes["settings"]))
     # No closures, so that a result can be pickled.
-    return read_result(file, partial(_built, file, parts, digest_of(files)), summary, files)
+    built = partial(_built, file, parts, digest_of(files), attributes, settings)
+    return Result(
+        times=arrays["time"],
+        states=arrays["states"],
+        inputs=arrays["inputs"],
+        reference=arrays.get("reference"),
+        outcome=Outcome[attributes["outcome"].upper()],
+        message=attributes["message"],
+        warnings=tuple(attributes["warnings"].splitlines()),
+        settings=settings,
+        wall_time=seconds,
+        sums=Later(partial(_sums, file, arrays)),
+        parts=Later(built),
+        work=None if solver is None else SolverStats(**json.loads(solver)),
+        engine=attributes["computed_by"],
+        provenance={name: attributes[name] for name in attributes["provenance"].split()},
+        files=files,
+        late=arrays.get("late"),
+    )
+
+
+def _sums(file: Path, arrays: Mapping[str, Array]) -> Sums:
+    if SUM + "steps" not in arrays:
+        raise OutputError(
+            f"`{file}` has no sums over all steps, which metrics and the report are computed from; "
+            "`echelon run FOLDER --out OTHER` computes the run again."
+        )
+    return Sums(*(arrays[SUM + name] for name in Sums._fields))
 
 
 def _built(
@@ -100,15 +151,6 @@ def _built(
     """Return the parts of a run, built from its scenario unless they are given."""
     own = build(_scenario(file, digest, attributes)).parts if parts is None else parts
     return prepare(own, settings).parts
-
-
-def _mapping(file: Path) -> JsonObject:
-    """Return the summary of a run; nothing where it is missing or damaged."""
-    try:
-        content = json.loads(file.read_text("utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _scenario(file: Path, digest: str, attributes: JsonObject) -> Scenario:
@@ -128,19 +170,3 @@ def _scenario(file: Path, digest: str, attributes: JsonObject) -> Scenario:
             f"changed; `echelon run` computes it again from its `{SCENARIO_FILE}`."
         )
     return scenario
-
-
-def load_run(folder: PathLike) -> Result:
-    """Return `load(folder)`, under an earlier name."""
-    return _renamed("load_run", folder)
-
-
-def open_run(place: PathLike) -> Result:
-    """Return `load(place)`, under an earlier name."""
-    return _renamed("open_run", place)
-
-
-def _renamed(name: str, place: PathLike) -> Result:
-    text = f"`{name}` is now `load`, which returns the `Result` of a run in any state."
-    warnings.warn(text, DeprecationWarning, stacklevel=3)
-    return load(place)

@@ -11,11 +11,10 @@ import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.types import JsonObject
-from echelon.experiments.results.dataset import OBSERVED, run_file, summary, with_sums
+from echelon.experiments.results.dataset import SUM, labelled_parts, run_file, with_sums
 from echelon.experiments.results.labelled import Labelled
-from echelon.experiments.results.labelled_parts import labelled_parts
-from echelon.experiments.results.recording import recording_with_data
-from echelon.experiments.results.run_groups import SUM
+from echelon.experiments.results.recording import read_recording
+from echelon.experiments.results.summary import OBSERVED, summary
 from echelon.experiments.scenario.build import Experiment, origin_of
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.studies.data_structure import compare_structure
@@ -60,7 +59,7 @@ def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -
         EchelonError: the run cannot be computed, or a file cannot be read.
     """
     assert files.data is not None
-    _, data = recording_with_data(files.data)
+    _, data = read_recording(files.data)
     steps = data.arrays().get(SUM + "steps")
     if steps is None or not int(steps[0]):
         yield unchecked(OBSERVATIONS, "", "the file has no sums over the steps of the run")

@@ -5,8 +5,9 @@ from pathlib import Path
 
 from echelon.core.files import write_atomic
 from echelon.core.types import PathLike
-from echelon.experiments.results.dataset import labelled, run_file, summary
+from echelon.experiments.results.dataset import labelled, run_file
 from echelon.experiments.results.recording import recording
+from echelon.experiments.results.summary import summary
 from echelon.experiments.scenario.scenario import SCENARIO_FILE
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.folder import (

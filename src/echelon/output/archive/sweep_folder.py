@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, final
 from echelon.core.errors import OutputError
 from echelon.core.files import INPUTS, make_atomic, write_atomic
 from echelon.core.types import JsonObject
-from echelon.experiments.results.labelled import labelled
 from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
 from echelon.experiments.sweeps.axes import read_axes
 from echelon.experiments.sweeps.frames import write_frames
@@ -120,7 +119,7 @@ def write_sweep(data: "xr.Dataset", text: str, folder: Path, figures: bool = Tru
     """
     with write_errors(folder):
         # In memory first: on a full disk the HDF5 library would end the whole process.
-        write_atomic(folder / "sweep.nc", labelled(data).netcdf())
+        write_atomic(folder / "sweep.nc", bytes(data.to_netcdf(None, engine="h5netcdf")))
         write_atomic(folder / "sweep.txt", text + "\n")
         if figures:
             # Here, since matplotlib takes long to load and only figures need it.

@@ -7,7 +7,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.experiments.results.metrics import SETTLED, output_errors
-from echelon.experiments.results.quantity import settling_bound
+from echelon.experiments.results.run_numbers import settling_bound
 from echelon.experiments.studies.compare import Comparison
 from echelon.output.plots import style as draw
 from echelon.output.plots.canvas import canvas, frame

@@ -12,8 +12,7 @@ import numpy as np
 from echelon.core.errors import MissingExtraError, OutputError
 from echelon.core.files import make_atomic
 from echelon.core.types import Array
-from echelon.experiments.results.dataset import recording_of
-from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.recording import Recording, recording_of
 from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import pen_of
 from echelon.output.plots.animation import MovingScene, frame_after, moving_of

@@ -9,10 +9,10 @@ from echelon.core.digits import at_least, at_most
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
 from echelon.core.words import amount
-from echelon.experiments.results.agent_metrics import Metrics
-from echelon.experiments.results.avoidance import avoidance
 from echelon.experiments.results.event_outcomes import event_outcomes
 from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.results.metrics import avoidance
+from echelon.experiments.results.run_numbers import Metrics
 from echelon.guarantees.promises.covering import coverage
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.output.reports.causes import grows, observations, sizes

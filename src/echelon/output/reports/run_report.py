@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, TypeVar
 
 from echelon import __version__
 from echelon.core.types import JsonObject
-from echelon.experiments.results.agent_metrics import (
+from echelon.experiments.results.metrics import metrics
+from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.run_numbers import (
     FollowerMetrics,
     LeaderMetrics,
     Metrics,
+    quantities,
     representatives,
+    settling_bound,
     steady_error,
 )
-from echelon.experiments.results.metrics import metrics
-from echelon.experiments.results.quantity import quantities, settling_bound
-from echelon.experiments.results.recording import Recording
 from echelon.output.reports.explanation import explain
 from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
 from echelon.simulation.engine.result import Result
