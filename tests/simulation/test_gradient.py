@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.core.memoize import BoundedCache
+from echelon.core.cache import BoundedCache
 from echelon.simulation.engine import gradient as gradients
 from echelon.simulation.engine.content import content_of
 from echelon.simulation.engine.gradient import gradient

@@ -726,9 +726,9 @@ def test_a_program_is_known_by_shapes_and_types_and_not_where_nobody_knows_what_
 def test_a_user_s_class_is_traced_anew_and_shares_machine_code(monkeypatch):
     made = list[str]()
 
-    def code(text, folder):
+    def code(text):
         made.append(text)
-        return kernels.Code(text, folder)
+        return kernels.Code(text)
 
     monkeypatch.setattr(kernel_code, "KERNELS", kernel_code.Kernels())
     monkeypatch.setattr(kernel_code, "Code", code)

@@ -19,6 +19,9 @@ COMMANDS: dict[str, str] = {}
 NAMES: dict[str, str] = {
     "load_run": "use `load`",
     "open_run": "use `load`",
+    "network.recommend_edges": "compare `graph.with_edges([pair]).spectrum().low`; see recipes.md",
+    "network.recommend_leaders": "compare `graph.with_leaders([k]).spectrum().low`; see recipes.md",
+    "speedup": "use `-1 / gain.certificate.abscissa` of each graph; see recipes.md",
 }
 """Public names below `echelon`."""
 
@@ -28,6 +31,11 @@ def gone_key(*path: str | int) -> str:
     names = [key for key in path if isinstance(key, str)]
     tails = (".".join(names[start:]) for start in range(len(names)))
     return next((gone(KEYS, tail) for tail in tails if tail in KEYS), "")
+
+
+def no_name(name: str) -> AttributeError:
+    """Return the error of a name below `echelon` that is gone, or never was."""
+    return AttributeError(f"`echelon.{name}`{gone(NAMES, name) or ' does not exist.'}")
 
 
 def gone(table: dict[str, str], name: str) -> str:

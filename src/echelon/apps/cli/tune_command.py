@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from echelon.apps.cli import options, tables
-from echelon.apps.cli.status import STATUS
+from echelon.apps.cli.terminal import STATUS
 from echelon.core.words import amount
 from echelon.output.archive.folder import claim_design
 

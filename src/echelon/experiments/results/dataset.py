@@ -15,7 +15,7 @@ from echelon.core.types import JsonObject, PathLike
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import avoidance, output_errors
-from echelon.guarantees.promises.event_lines import as_mapping
+from echelon.guarantees.promises.hypotheses import as_mapping
 from echelon.guarantees.promises.promise import promise
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result

@@ -28,8 +28,7 @@ from echelon.experiments.results.run_numbers import (
     Metrics,
     Shown,
 )
-from echelon.guarantees.promises.covering import covered
-from echelon.guarantees.promises.promise import Promise
+from echelon.guarantees.promises.promise import Promise, covered
 from echelon.simulation.engine.result import Result, finite_or_none
 from echelon.simulation.step.meter import SETTLED, output_error, steps_per_slice
 

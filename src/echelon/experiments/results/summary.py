@@ -19,7 +19,7 @@ from echelon.experiments.results.run_numbers import (
     shown_in,
     steady_error,
 )
-from echelon.guarantees.promises.event_lines import events_in_words
+from echelon.guarantees.promises.hypotheses import events_in_words
 from echelon.guarantees.promises.promise import promise
 from echelon.laws.law import gain_of
 from echelon.simulation.engine.law_drive import Laws

@@ -26,8 +26,7 @@ from echelon.simulation.engine.differentiable_run import Cost, Gradient
 from echelon.simulation.engine.gradient import gradient
 from echelon.simulation.step.meter import Sums
 from echelon.synthesis.gains.gain import Gain, synthesize
-from echelon.synthesis.gains.riccati import Riccati
-from echelon.synthesis.gains.weights import weights_of
+from echelon.synthesis.gains.riccati import Riccati, weights_of
 
 PARAMETERS: tuple[str, ...] = ("follower.gain.Q", "follower.gain.R", "follower.gain.coupling")
 """The keys of a scenario that can be tuned; of weights, the diagonal."""

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import threading
-from http.server import ThreadingHTTPServer
 from typing import Final, final
 
 import numpy as np
@@ -13,7 +12,7 @@ from echelon.output.plots.space import space_of
 from echelon.output.viewer.pack import pack
 from echelon.output.viewer.page import page
 from echelon.output.viewer.replay import header, replay_data, replay_page
-from echelon.output.viewer.serve import Handler, serve
+from echelon_flight.page_server import Handler
 
 _PATIENCE: Final = 10.0
 """Seconds after which a waiting page gets an empty answer."""
@@ -80,12 +79,8 @@ def _joined(before: Recording, stretch: Recording) -> Recording:
     return dataclasses.replace(stretch, **parts)
 
 
-def serve_growing(run: Growing, port: int | None) -> ThreadingHTTPServer:
-    """Return a server of a run that is being computed.
-
-    Raises:
-        OutputError: no port is free.
-    """
+def growing_page(run: Growing) -> type[Handler]:
+    """Return the handler of a run that is being computed."""
 
     class GrowingRun(Handler):
         """The handler of this run: its page, and its parts by number."""
@@ -109,4 +104,4 @@ def serve_growing(run: Growing, port: int | None) -> ThreadingHTTPServer:
                 code = 205 if block is None else 200 if block else 204
                 self.send(block or b"", "application/octet-stream", code)
 
-    return serve(GrowingRun, port)
+    return GrowingRun

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from echelon.agents.network.exchange import Near
 from echelon.agents.network.inbox import (
     Inbox,
     Message,
@@ -19,8 +20,7 @@ from echelon.agents.network.inbox import (
     Stamps,
     Surroundings,
 )
-from echelon.agents.network.near import Near
-from echelon.agents.world.estimator import Estimate
+from echelon.agents.world.sensing import Estimate
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.numerics import precision
 from echelon.core.types import Array, State

@@ -6,9 +6,9 @@ from typing import final
 import jax
 import numpy as np
 
+from echelon.core.cache import BoundedCache
 from echelon.core.errors import SimulationError
 from echelon.core.identity import digest
-from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
 from echelon.simulation.engine.content import content_of, copied
 from echelon.simulation.engine.differentiable_run import (

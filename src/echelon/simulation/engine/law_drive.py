@@ -8,7 +8,7 @@ import jax
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.reach import lost_at_times
+from echelon.agents.network.matrices import lost_at_times
 from echelon.agents.world.world import World
 from echelon.core.errors import (
     EchelonError,
@@ -22,9 +22,8 @@ from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.flat_loop import FlatMemory
-from echelon.laws.known_law import information_of, unknown_class
 from echelon.laws.law import Law, gain_of
-from echelon.laws.law_check import leader_warnings, prepare_law
+from echelon.laws.law_check import information_of, leader_warnings, prepare_law, unknown_class
 from echelon.laws.safety import Safety
 from echelon.laws.safety_check import check_numbers, hulls_at, separations, too_near
 from echelon.laws.stopping_point import StoppingLeader

@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.jaxpr import used_leaves
-from echelon.core.memoize import memoize
 from echelon.core.types import Array
 from echelon.simulation.engine.differentiable_run import (
     Cost,

@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.network.exchange import Exchange
-from echelon.agents.network.near import Near
+from echelon.agents.network.exchange import Exchange, Near
 from echelon.agents.network.switching import Schedule
-from echelon.agents.world.estimator import Estimate, Estimator
+from echelon.agents.world.sensing import Estimate, Estimator
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.laws.flat_law import FlatLaw

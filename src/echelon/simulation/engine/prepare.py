@@ -10,10 +10,10 @@ from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Channel
 from echelon.agents.network.events import event_faults
 from echelon.agents.world.sensing import Sensors
+from echelon.core.cache import BoundedCache
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.identity import digest
 from echelon.core.limits import excess_frames
-from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
 from echelon.core.words import amount
 from echelon.simulation.engine.initial import initial_states

@@ -14,7 +14,7 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.network.switching import Schedule
 from echelon.agents.world.world import World
 from echelon.core.errors import Outcome
-from echelon.core.pages import CellPage, notebook_page
+from echelon.core.files import CellPage, notebook_page
 from echelon.core.types import Array
 from echelon.core.words import amount
 from echelon.simulation.engine.closest_pair import ClosestPair

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from echelon.core.memoize import BoundedCache
+from echelon.core.cache import BoundedCache
 from echelon.core.types import Array
 from echelon.laws.law import Memory
 from echelon.simulation.codegen import Body, aligned, contribution_widths

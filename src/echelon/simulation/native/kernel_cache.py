@@ -6,8 +6,7 @@ from typing import NamedTuple, TypeAlias, final
 import jax
 import numpy as np
 
-from echelon.core import disk_cache
-from echelon.core.memoize import BoundedCache
+from echelon.core.cache import BoundedCache
 from echelon.core.numerics import precision
 from echelon.simulation.codegen import Code, Plan, has_flag, program, shared
 from echelon.simulation.native.agent_step import BlockRows, body_of, signal_size
@@ -97,9 +96,8 @@ def compiled(rows: BlockRows, plan: Plan, codes: BoundedCache[Code]) -> Kernel:
 
     `codes` are those compiled before, by their texts: other graphs are other numbers in the same.
     """
-    # In the folder where JAX keeps compiled code, so that one setting applies to both.
     text = program(plan)
-    code = codes.get_or_make(text, lambda: Code(text, disk_cache.jax_folder()))
+    code = codes.get_or_make(text, lambda: Code(text))
     return Kernel(code, rows, plan, len(shared(plan)))
 
 

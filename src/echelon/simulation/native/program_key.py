@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.cache import BoundedCache
 from echelon.core.identity import process_key
-from echelon.core.memoize import BoundedCache
 from echelon.core.types import PyTree
 from echelon.simulation.native.varying import bare, is_number
 from echelon.simulation.step.loop import Loop

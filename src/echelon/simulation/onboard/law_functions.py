@@ -13,7 +13,7 @@ from typing import NamedTuple, final
 import jax
 import jax.numpy as jnp
 
-from echelon.agents.world.estimator import Estimate, Estimator
+from echelon.agents.world.sensing import Estimate, Estimator
 from echelon.core.numerics import rk4
 from echelon.core.types import PyTree
 from echelon.core.words import MessageContent, Prediction

@@ -11,11 +11,13 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.tree import shares
-from echelon.agents.references.demand import reference_warnings
-from echelon.agents.references.flatness import followed_states, reference_targets
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import check_kind_of
+from echelon.agents.network.matrices import shares
+from echelon.agents.references.flatness import (
+    followed_states,
+    reference_targets,
+    reference_warnings,
+)
+from echelon.agents.references.reference import Guide, check_kind_of
 from echelon.core.types import Array, State
 from echelon.simulation.engine.host_stepper import HostStepper
 from echelon.simulation.optimal.formation_plan import plan_formation
