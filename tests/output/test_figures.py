@@ -12,10 +12,9 @@ from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
 from echelon.experiments.results.metrics import Avoidance, Ellipsoid
 from echelon.experiments.results.recording import MessageAges
-from echelon.output.plots.figure_files import NAMES
 from echelon.output.plots.network import curves_of
 from echelon.output.plots.over_time import start_of
-from echelon.output.plots.run_figures import figures
+from echelon.output.plots.run_figures import NAMES, figures
 from echelon.output.plots.style import ONE_COLUMN, TWO_COLUMNS, leader_pen, pen
 
 CERTIFIED = PROMISE | {

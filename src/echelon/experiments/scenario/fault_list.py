@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 from typing import TypeVar, cast, final
 
 from echelon.core.errors import EchelonError, MissingExtraError
-from echelon.experiments.scenario.scenario import Scenario, refuse
-from echelon.experiments.scenario.yaml import ScenarioFault, joined
+from echelon.experiments.scenario.scenario import Scenario, ScenarioFault, refuse
+from echelon.experiments.scenario.yaml import joined
 
 _Part = TypeVar("_Part")
 

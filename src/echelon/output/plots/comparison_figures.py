@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.experiments.results.metrics import output_errors
+from echelon.experiments.results.metrics import SETTLED, output_errors
 from echelon.experiments.results.run_numbers import settling_bound
 from echelon.experiments.studies.compare import Comparison
 from echelon.output.plots import style as draw
 from echelon.output.plots.canvas import canvas, frame
 from echelon.output.plots.figure_files import save
 from echelon.simulation.engine.result import Result
-from echelon.simulation.step.meter import SETTLED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

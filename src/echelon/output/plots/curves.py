@@ -9,6 +9,7 @@ import numpy as np
 from echelon.core.digits import at_most
 from echelon.core.types import Array
 from echelon.experiments.results.lyapunov import rises
+from echelon.experiments.results.metrics import SETTLED
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import (
@@ -28,7 +29,6 @@ from echelon.output.plots.over_time import (
     potential_rounding,
     shade_rounding,
 )
-from echelon.simulation.step.meter import SETTLED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,12 +7,12 @@ from jaxtyping import Float
 
 from echelon.core.digits import at_most
 from echelon.core.types import Array, JsonObject
+from echelon.experiments.results.metrics import SETTLED
 from echelon.experiments.results.recording import Recording
 from echelon.experiments.results.run_numbers import settling_bound
 from echelon.output.plots import style as draw
 from echelon.output.plots.style import FLOOR
 from echelon.output.viewer.pack import Group
-from echelon.simulation.step.meter import SETTLED
 
 NAMED = 6
 """With more followers than this, a chart shows the worst and the median."""
