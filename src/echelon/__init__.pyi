@@ -61,7 +61,7 @@ from .laws.law import Law as Law
 from .laws.safety import Safety as Safety
 from .output.archive.export import export as export
 from .output.archive.export import table as table
-from .output.archive.load_folder import load as load
+from .output.archive.run_folder import load as load
 from .output.archive.run_folder import save_run as save_run
 from .output.archive.verify_folder import verify as verify
 from .output.plots.run_figures import figures as figures

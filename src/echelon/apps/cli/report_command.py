@@ -27,8 +27,7 @@ def report(
         claim_file(out, force)
     STATUS.begin(f"reading {run}")
     from echelon.experiments.results.recording import recording_of
-    from echelon.output.archive.load_folder import load
-    from echelon.output.archive.run_folder import report_beside
+    from echelon.output.archive.run_folder import load, report_beside
     from echelon.output.reports.run_report import whole_report
 
     text = whole_report(recording_of(load(run)), report_beside(run))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from echelon.experiments.sweeps.plan import Sweep
     from echelon.experiments.sweeps.workers import SweepBatch
     from echelon.output.archive.chunks import Chunks
-    from echelon.output.archive.sweep_folder import Batches
+    from echelon.output.archive.study_folder import Batches
     from echelon.simulation.engine.record import Stretch
     from echelon.simulation.engine.result import Result
     from echelon.simulation.engine.simulate import RunSoFar
@@ -279,8 +279,7 @@ class WatchedRun:
     def show_all(self, folder: Path) -> None:
         """Show the complete run until Ctrl-C."""
         from echelon.experiments.results.recording import recording_of
-        from echelon.output.archive.load_folder import load
-        from echelon.output.archive.run_folder import report_beside
+        from echelon.output.archive.run_folder import load, report_beside
         from echelon.output.reports.run_report import whole_report
 
         with STOP.hold():
@@ -375,7 +374,7 @@ def _new_sweep(
     STATUS.begin(f"preparing {scenario.name}", not quiet)
     from echelon.experiments.sweeps.plan import Sweep
     from echelon.output.archive.folder import BATCHES, claim_folder
-    from echelon.output.archive.sweep_folder import Batches
+    from echelon.output.archive.study_folder import Batches
     from echelon.simulation.engine.prepare import prepare
 
     plan = Sweep(scenario, axes, keep_states)
@@ -390,7 +389,7 @@ def _new_sweep(
 
 def _unfinished_sweep(folder: Path) -> "tuple[Sweep, Batches, Job]":
     """Return the sweep and the job in a folder."""
-    from echelon.output.archive.sweep_folder import Batches
+    from echelon.output.archive.study_folder import Batches
 
     batches = Batches(folder)
     job = Job("sweep", batches.chunks)
@@ -437,7 +436,7 @@ def _write_sweep(
 ) -> None:
     """Write and print the results; the batches stay until all runs are in the dataset."""
     from echelon.experiments.sweeps.sweep_dataset import dataset_of
-    from echelon.output.archive.sweep_folder import write_sweep
+    from echelon.output.archive.study_folder import write_sweep
     from echelon.output.reports.sweep_report import sweep_mapping, sweep_report
 
     data = dataset_of(plan, results)

@@ -78,8 +78,7 @@ def view(
         print(f"echelon: showing `{paths[0]}`, the newest run.", file=sys.stderr)
     STATUS.begin(f"reading {' and '.join(map(str, paths))}")
     from echelon.experiments.results.recording import recording_of
-    from echelon.output.archive.load_folder import load
-    from echelon.output.archive.run_folder import report_beside
+    from echelon.output.archive.run_folder import load, report_beside
     from echelon.output.reports.run_report import whole_report
     from echelon.output.viewer.replay import replay_page
 
@@ -157,7 +156,7 @@ def live(
     from echelon.apps.live.server import live as make_ready
     from echelon.apps.live.server import live_page
     from echelon.experiments.results.recording import recording_of
-    from echelon.output.archive.load_folder import load
+    from echelon.output.archive.run_folder import load
 
     # A bundled scenario wins over a folder of its name, and a folder may hold no run yet.
     folder = Path(scenario) if loaded.folder == Path(scenario) else None
@@ -212,7 +211,7 @@ def plot(
 
 def _drawings(run: Path, names: Sequence[str], paper: bool) -> "dict[str, Figure]":
     """Return the figures of a run in all sizes, by the names of their files."""
-    from echelon.output.archive.load_folder import load
+    from echelon.output.archive.run_folder import load
     from echelon.output.plots.run_figures import figures
     from echelon.output.plots.style import ONE_COLUMN, SCREEN, TWO_COLUMNS
 
@@ -252,7 +251,7 @@ def video(
     pixels = None if size is None else _pixels(size)
     claim_file(file, force, endings=(".mp4", ".gif"))
     STATUS.begin(f"reading {run}")
-    from echelon.output.archive.load_folder import load
+    from echelon.output.archive.run_folder import load
     from echelon.output.plots.video import encoder, save_video
 
     # Before the run is read, so that a missing ffmpeg is reported at once.
