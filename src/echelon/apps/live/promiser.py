@@ -14,7 +14,7 @@ from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import build
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.promise import Promise, promise
-from echelon.output.reports.causes import beyond
+from echelon.output.reports.run_report import beyond
 from echelon.output.viewer.replay import promise_badge
 from echelon.simulation.step.settings import Settings
 

@@ -37,8 +37,7 @@ from echelon.guarantees.verifier.verify import PROMISE, Verification, judge, sta
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.folder import DATA, GAIN, REPORT, SUMMARY, check_exists
 from echelon.output.archive.run_folder import save_run
-from echelon.output.reports.causes import sizes
-from echelon.output.reports.run_report import report
+from echelon.output.reports.run_report import report, sizes
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import RunSoFar, simulate

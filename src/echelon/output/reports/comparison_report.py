@@ -19,8 +19,7 @@ from echelon.experiments.results.run_numbers import (
 )
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.guarantees.promises.promise import Promise
-from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
-from echelon.output.reports.run_report import say
+from echelon.output.reports.run_report import PRINTED, ROUNDING, is_papers_experiment, say
 from echelon.simulation.step.solver_stats import SolverStats
 
 if TYPE_CHECKING:
