@@ -422,6 +422,7 @@ def compute(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarr
 
 
 def by_jax(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the results of an equation for plain numbers as JAX computes them."""
     results = equation.primitive.bind(*map(jnp.asarray, operands), **equation.params)
     return [np.asarray(r) for r in (results if equation.primitive.multiple_results else [results])]
 
