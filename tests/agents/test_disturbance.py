@@ -23,7 +23,7 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references import Hover
 from echelon.agents.world.disturbance import Disturbance
-from echelon.agents.world.plant import differences, vary_parameters
+from echelon.agents.world.world import differences, vary_parameters
 from echelon.core.errors import EchelonError, Outcome, ScenarioError
 from echelon.core.numerics import precision
 from echelon.experiments.results.dataset import dataset, summary
@@ -456,8 +456,8 @@ def test_a_plant_s_parameter_may_be_given_or_scaled():
         ),
         (
             {"plant": {"scale": {"mass": 2}, "parameters": {"mass": 2}}},
-            "plant.scale.mass",
-            "got a factor for a parameter that `plant.parameters` sets, allowed is one of them.",
+            "plant",
+            "`mass` of the plant has a value and a factor; give one of them.",
         ),
         (
             {"plant": {"parameters": {"mass": -1}}},

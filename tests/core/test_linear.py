@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 import echelon as ech
 from echelon.core.errors import GainError
 from echelon.core.linear import check_definite, with_unit_diagonal
-from echelon.guarantees.verifier.exact_minors import is_positive_definite
+from echelon.guarantees.verifier.algebra import is_positive_definite
 from echelon.synthesis.certificates.lmi import rate_of
-from echelon.synthesis.gains.weights import weights_of
+from echelon.synthesis.gains.riccati import weights_of
 
 SEEDS = st.integers(0, 10**6)
 

@@ -4,16 +4,29 @@ Whoever uses one in a scenario, on the command line or in Python gets one senten
 echelon adds a line here, which stays for two minor versions.
 """
 
-KEYS: dict[str, str] = {}
+KEYS: dict[str, str] = {
+    "leadership.waits": "make the leader's path slower, as by a smaller `rate` of `reference`",
+    "live.gusts": "set `rms` of `disturbance` for the whole run",
+    "live.lag": "set `lag` of `actuator` for the whole run",
+}
 """Scenario keys; `section.key` is that key alone, and `key` is it in any section."""
 
-VALUES: dict[str, str] = {}
+VALUES: dict[str, str] = {
+    "prediction: none": "use `packet`, by which the model carries the leader on",
+}
 """Values of scenario keys, as in `prediction: none`, and of options, as in `export --to json`."""
 
-COMMANDS: dict[str, str] = {}
+COMMANDS: dict[str, str] = {
+    "tune": "minimize the cost by `ech.gradient` and SciPy, as in docs/recipes.md",
+}
 """Commands of the command line."""
 
-NAMES: dict[str, str] = {}
+NAMES: dict[str, str] = {
+    "network.recommend_edges": "compare `graph.with_edges([pair]).spectrum().low`; see recipes.md",
+    "network.recommend_leaders": "compare `graph.with_leaders([k]).spectrum().low`; see recipes.md",
+    "speedup": "use `-1 / gain.certificate.abscissa` of each graph; see recipes.md",
+    "tune": "minimize the cost by `ech.gradient` and SciPy, as in docs/recipes.md",
+}
 """Public names below `echelon`."""
 
 
@@ -22,6 +35,11 @@ def gone_key(*path: str | int) -> str:
     names = [key for key in path if isinstance(key, str)]
     tails = (".".join(names[start:]) for start in range(len(names)))
     return next((gone(KEYS, tail) for tail in tails if tail in KEYS), "")
+
+
+def no_name(name: str) -> AttributeError:
+    """Return the error of a name below `echelon` that is gone, or never was."""
+    return AttributeError(f"`echelon.{name}`{gone(NAMES, name) or ' does not exist.'}")
 
 
 def gone(table: dict[str, str], name: str) -> str:

@@ -13,10 +13,10 @@ from jaxtyping import Float
 
 from echelon.agents.models.heading_symmetry import heading_index, rest_heading
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.exchange import Near
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.near import Near
-from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import Guide
 from echelon.core.errors import LawError
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Declared, Input, PyTree, Scalar, State
@@ -45,7 +45,6 @@ class LocalView(eqx.Module):
         period: how long the input will be held, s; 0 where it is not known.
         near: the others, where the law keeps away from them; None elsewhere.
         offset_rate: of `offset` (n,), per s; None of a constant one, or if the law uses none.
-        pace: at which the time `t` of a leader's plan passes, s per s; None for 1.
 
     Raises:
         LawError: it is made of numbers while JAX computes in float32.
@@ -59,7 +58,6 @@ class LocalView(eqx.Module):
     period: Scalar | float = 0.0
     near: Near | None = None
     offset_rate: State | None = None
-    pace: Scalar | None = None
 
     def __check_init__(self) -> None:
         """Refuse to lose digits silently."""
@@ -380,3 +378,17 @@ def without_certificates(law: Law) -> Law:
 
     # A user's own law may have a gain anywhere, under any name.
     return jax.tree.map(strip, law, is_leaf=lambda node: isinstance(node, Gain))
+
+
+# ---- the law that does nothing -------------------------------------------------------------------
+
+
+class TrimInput(Law):
+    """u = u* + S v_ff, where v_ff = 0 since the law uses no feed-forward.
+
+    The agent moves freely about its trim.
+    """
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return the trim input."""
+        return model.physical(view.feedforward), memory

@@ -254,7 +254,7 @@ class WatchedRun:
         from echelon.experiments.results.foreseen import foreseen
         from echelon.experiments.results.lyapunov import fixed_metric, potential
         from echelon.guarantees.promises.promise import promise
-        from echelon.output.viewer.growing import Growing
+        from echelon.output.viewer.replay import Growing
         from echelon.simulation.engine.prepare import prepare
 
         prepared = prepare(*experiment)
@@ -291,13 +291,12 @@ class WatchedRun:
 @contextlib.contextmanager
 def watching(scenario: "Scenario", experiment: "Experiment") -> Iterator[WatchedRun]:
     """Serve the page of a run that is about to start, and open a browser."""
-    from echelon.output.viewer.growing import serve_growing
-    from echelon.output.viewer.serve import serving
+    from echelon.output.viewer.replay import growing_page
 
     watched = WatchedRun(scenario, experiment)
-    server = serve_growing(watched.page, None)
-    with serving(server) as address:
-        show_address(server, address, None, browser=True)
+    handler = growing_page(watched.page)
+    with handler.serving() as address:
+        show_address(address, handler.port, browser=True)
         yield watched
 
 

@@ -31,9 +31,9 @@ from echelon.output.archive.folder import (
 from echelon.output.plots.figure_files import NAMES, check_names, save
 
 if TYPE_CHECKING:
-    from http.server import ThreadingHTTPServer
-
     from matplotlib.figure import Figure
+
+    from echelon_flight.page_server import Handler
 
 _KINDS = ("png", "pdf", "svg")
 _DPI = 30, 1200
@@ -89,37 +89,36 @@ def view(
         opened = [replace(run, name=folder.name) for run, folder in pairs]
     page = replay_page(*opened).encode()
     if html is None:
-        from echelon.output.viewer.serve import Handler, serve
+        from echelon_flight.page_server import Handler
 
         class RunPage(Handler):
             """The page of this run."""
 
         RunPage.page = page
-        keep_serving(serve(RunPage, port), port, browser)
+        keep_serving(RunPage, port, browser)
         return
     tables.write_file(html, page, "{}, one self-contained file")
 
 
-def keep_serving(server: "ThreadingHTTPServer", port: int | None, browser: bool) -> None:
+def keep_serving(page: "type[Handler]", port: int | None, browser: bool) -> None:
     """Print the address of a page, open a browser if there is one, and serve until Ctrl-C."""
-    from echelon.output.viewer.serve import serving
-
-    with serving(server) as address, STOP.hold():
-        show_address(server, address, port, browser)
+    preferred = page.port if port is None else port
+    with page.serving(preferred) as address, STOP.hold():
+        show_address(address, preferred, browser)
         wait()
 
 
-def show_address(
-    server: "ThreadingHTTPServer", address: str, port: int | None, browser: bool
-) -> None:
+def show_address(address: str, preferred: int, browser: bool) -> None:
     """Print the address of a page, and open a browser if there is one."""
-    from echelon.output.viewer.serve import PORT, open_browser
+    import webbrowser
 
-    preferred, actual = PORT if port is None else port, server.server_address[1]
+    actual = int(address.rstrip("/").rpartition(":")[2])
     if preferred not in (actual, 0):
         print(f"echelon: port {preferred} is in use; using {actual}.", file=sys.stderr)
-    opened = browser and open_browser(address)
-    failed = browser and not opened
+    try:
+        failed = browser and not webbrowser.open(address)
+    except webbrowser.Error:
+        failed = True
     hint = " No browser could be started: open this address in one." if failed else ""
     print(f"echelon: serving {address}.{hint} Ctrl-C quits.", file=sys.stderr, flush=True)
 
@@ -153,7 +152,7 @@ def live(
     check_page()
     STATUS.begin(f"preparing {loaded.name} for the browser, which takes up to a minute")
     from echelon.apps.live.server import live as make_ready
-    from echelon.apps.live.server import serve_live
+    from echelon.apps.live.server import live_page
     from echelon.experiments.results.dataset import recording_of
     from echelon.output.archive.load_folder import load
 
@@ -162,10 +161,9 @@ def live(
     run = recording_of(load(folder)) if folder is not None and when_written(folder) else None
     session, html = make_ready(loaded, run, STATUS.counter("parts"))
     tables.warn(session.swarm.warnings)
-    server = serve_live(session, html, port)
     session.start()
     try:
-        keep_serving(server, port, browser)
+        keep_serving(live_page(session, html), port, browser)
     finally:
         session.end()
 
@@ -254,8 +252,9 @@ def video(
     from echelon.output.archive.load_folder import load
     from echelon.output.plots.video import encoder, save_video
 
-    # Before the run is read, so that a missing ffmpeg is reported at once.
-    encoder()
+    if file.suffix.lower() == ".mp4":
+        # Before the run is read, so that a missing ffmpeg is reported at once.
+        encoder()
     with write_errors(file):
         recording = load(run)
         STATUS.begin(f"drawing {file}")

@@ -78,7 +78,7 @@ def design(
     from echelon.synthesis.gains.gain_file import save_gain
 
     report = study(loaded, method, STATUS.counter("methods"))
-    sentence, best, law_design = report.because, report.recommended, report.law_design
+    sentence, best = report.because, report.recommended
     summary: JsonObject = {"recommended": None}
     if best is not None and best.gain is not None and best.parts is not None:
         summary = {"recommended": best.method, "because": sentence}
@@ -88,20 +88,17 @@ def design(
             radii = _draw(best.parts, report.settings, figures, slice_)
             sentence += f"\n{radii}" if radii else ""
             summary["radii"] = radii
-    if law_design is not None:
-        sentence += f"\n{law_design.sentence()}"
-        summary[law_design.name] = law_design.as_mapping()
     summary["methods"] = [tables.design_row(row) for row in report.designs]
     if as_json:
         print(json.dumps(summary, indent=2))
     else:
         tables.print_designs(summary["methods"], sentence)
-    raise typer.Exit(0 if best is not None or law_design is not None else 1)
+    raise typer.Exit(1 if best is None else 0)
 
 
 def _draw(parts: "Parts", settings: "Settings", folder: Path, states: str | None) -> str | None:
     """Draw a design's figures, and return a sentence on its radii if it has any."""
-    from echelon.output.plots.design_figures import save_design_figures
+    from echelon.output.plots.study_figures import save_design_figures
 
     with write_errors(folder):
         _, radii = save_design_figures(parts, settings, folder, states)

@@ -62,7 +62,6 @@ _DESIGN: dict[str, tuple[str, Callable[[Any], Any]]] = {
         lambda design: getattr(design.promise.certified, "radius", None),
     ),
     "seconds": ("seconds", lambda design: design.seconds),
-    "advice": ("", lambda design: design.advice),
     "promised": ("", lambda design: design.promise.promised),
     "promise": ("", lambda design: design.promise.as_mapping()),
 }
@@ -120,8 +119,7 @@ def print_designs(rows: "list[JsonObject]", sentence: str) -> None:
     for part in _PARTS:
         out.print(_design_table(rows, ("method", *part)))
     notes = [*_FOOTNOTES] if any(row.get("coupling") for row in rows) else []
-    for row in rows:
-        notes += [f"- {row['method']}: {row[key]}" for key in ("reason", "advice") if row.get(key)]
+    notes += [f"- {row['method']}: {row['reason']}" for row in rows if row["reason"]]
     for text in (*notes, sentence):
         out.print(text, highlight=False, markup=False, soft_wrap=not out.is_terminal)
 
@@ -177,7 +175,7 @@ def foretell(experiment: "Experiment", quiet: bool) -> None:
     """Print the warnings of a run, and its guarantee on a terminal or if nothing is guaranteed."""
     if quiet or STATUS.silent:
         return
-    from echelon.experiments.studies.forecast import forecast
+    from echelon.experiments.studies.design import forecast
     from echelon.guarantees.promises.promise import promise
     from echelon.simulation.engine.prepare import prepare
 

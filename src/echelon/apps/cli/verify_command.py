@@ -78,7 +78,8 @@ def _advice(
     scenario: str | None,
 ) -> "Iterator[str]":
     """Yield how what is open can be checked, and what a refusal may come from."""
-    from echelon.guarantees.verifier.verify import MODEL, PROMISE
+    from echelon.guarantees.verifier.agent_claims import MODEL
+    from echelon.guarantees.verifier.verify import PROMISE
 
     if verification.verdict == "refused":
         yield from _other_version(file, files)
@@ -95,7 +96,7 @@ def _other_version(file: Path, files: "ClaimFiles") -> "Iterator[str]":
     if files.claims is None:
         return
     from echelon.core.files import versions
-    from echelon.guarantees.verifier.strict_json import read_json
+    from echelon.guarantees.verifier.saved_gain import read_json
 
     made, ours = read_json(files.claims).get("versions"), versions()
     names = [f"{made.get('echelon')} ({made.get('git')})"] if isinstance(made, dict) else []

@@ -29,7 +29,7 @@ from echelon.experiments.results.quantity import Shown
 from echelon.experiments.results.recording import Recording, recording
 from echelon.experiments.results.run_groups import SUM, group_of
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
-from echelon.guarantees.promises.event_lines import events_in_words
+from echelon.guarantees.promises.hypotheses import events_in_words
 from echelon.guarantees.promises.promise import promise
 from echelon.laws.law import gain_of
 from echelon.simulation.engine.law_drive import Laws
@@ -65,8 +65,7 @@ def dataset(result: Result) -> "xr.Dataset":
     imaginary part `mode_eigenvalue_imaginary`), and the limits of the inputs u, `limit_low` <=
     `limit_matrix` u <= `limit_high`. Over a network that is late also `age` (of the oldest message
     that an agent has of a neighbour, NaN before the first), `edge_age` (of the newest one at each
-    end of an edge), `edge_lost` (messages lost since the frame before) and `forget`; of leaders
-    that wait for stragglers `late`, how late their plan is. The attribute
+    end of an edge), `edge_lost` (messages lost since the frame before) and `forget`. The attribute
     `promise` is JSON, and `format` the version of this list.
     """
     return labelled(result).dataset()
@@ -134,8 +133,6 @@ def _followed(result: Result) -> Variables:
     if result.reference is None:
         return {}
     variables: Variables = {"reference": (("time", "state"), result.reference)}
-    if result.late is not None:
-        variables["late"] = ("time", result.late, {"units": "s"})
     errors = [output_errors(result, leader) for leader in result.graph.leaders]
     errors = [error for error in errors if error is not None]
     if errors:

@@ -77,7 +77,6 @@ def _result(
         engine=attributes.get("computed_by") or summary.get("engine", "jax"),
         provenance={name: attributes[name] for name in _provenance(attributes)},
         files=files,
-        late=arrays.get("late"),
     )
 
 

@@ -23,7 +23,7 @@ from echelon.core.words import amount
 from echelon.experiments.results.metrics import metrics
 from echelon.experiments.scenario import registry
 from echelon.laws.consensus import Consensus
-from echelon.laws.tracking import Tracking
+from echelon.laws.path_leader import Tracking
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.simulate import simulate

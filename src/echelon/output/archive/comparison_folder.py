@@ -61,6 +61,6 @@ def write_comparison(
         write_atomic(folder / "comparison.txt", text + "\n")
         if figures:
             # Here, since matplotlib takes long to load and only figures need it.
-            from echelon.output.plots.comparison_figures import save_comparison_figures
+            from echelon.output.plots.study_figures import save_comparison_figures
 
             save_comparison_figures(comparison, folder)

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from echelon.agents.network.exchange import Difference
-from echelon.agents.network.near import Near
+from echelon.agents.network.exchange import Difference, Near
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.laws.law import Law, LocalView, Memory
@@ -42,8 +41,6 @@ from echelon.simulation.step.messages import (
 from echelon.simulation.step.meter import Sums, reference_at
 from echelon.simulation.step.motion import MotionState
 from echelon.simulation.step.nearby import begin_sightings, look_around
-from echelon.simulation.step.patience import followed_at, next_plan, plan_time
-from echelon.simulation.step.plan_phase import Followed, PlanPhase
 
 
 @cached_jit
@@ -81,8 +78,6 @@ def begin(loop: Loop, states: States) -> Moment:
         world = world._replace(led=no_packets(first_readers(loop), content, True))
     if loop.presence is not None and loop.presence.returns:
         world = world._replace(starts=moment.states)
-    if loop.patience is not None:
-        world = world._replace(plan=PlanPhase.begin(moment.states.dtype))
     return moment._replace(world=world)
 
 
@@ -143,7 +138,6 @@ def control(loop: Loop, now: Moment) -> Control:
         rows = sent, difference, said.message, said.input
         world = send_messages(loop, exchange, now, mail, knowledge, *rows)
         world = world._replace(seen=seen)
-    world = world._replace(plan=next_plan(loop, now))
     u = jnp.concatenate([led.input, followed.input])[loop.order]
     u = u if here is None else jnp.where(here[:, None], u, 0.0)
     if loop.sensors is not None and loop.sensors.estimator is not None:
@@ -186,7 +180,6 @@ def _act_all(
     """Return what some agents do, with what they are sent (K, k), remember and know of others."""
     x, t = now.states, time_of(loop, now)
     offsets, rates = offsets_at(loop, law, t, agents)
-    t, pace = plan_time(now, t) if leads else (t, None)
 
     # One time for all; of everything else, an agent sees its own row and no other.
     def one(
@@ -199,7 +192,7 @@ def _act_all(
         near: Near | None,
         rate: State | None,
     ) -> Action:
-        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near, rate, pace)
+        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near, rate)
         return act(loop.with_motion(row), law, view, memory, leads)
 
     rows, near = jax.tree.map(lambda leaf: leaf[agents], (loop.motion.rows, near))
@@ -339,8 +332,6 @@ def measured_step(
     now = _with_arrivals(loop, now)
     acted = control(loop, now)
     followed = reference_at(reference, now.step - first, now.states)
-    if followed is not None and now.world.plan is not None:
-        followed = followed_at(loop, now).reference
     chatter = (acted.cut * now.cut < 0).any(axis=1)
     moment, here = (now.step, now.states, acted.inputs), present_at(loop, now.step)
     meter = loop.meter if here is None else loop.meter.following(nearest_at(loop, now.step))
@@ -358,8 +349,8 @@ def measured_step(
     return _move(loop, now, acted), read
 
 
-Frames: TypeAlias = tuple[Float[jax.Array, "T N n"], Float[jax.Array, "T N m"], Followed | None]
-"""States and inputs at T times, and what leaders follow that wait."""
+Frames: TypeAlias = tuple[Float[jax.Array, "T N n"], Float[jax.Array, "T N m"]]
+"""States and inputs at T times."""
 
 
 @cached_jit
@@ -378,11 +369,10 @@ def advance(
 
     def frame(
         carry: tuple[Moment, Sums], count: jax.Array
-    ) -> tuple[tuple[Moment, Sums], tuple[States, Inputs, Followed | None]]:
+    ) -> tuple[tuple[Moment, Sums], tuple[States, Inputs]]:
         # The first step computes these inputs again, but after the last frame there is none.
         now = _with_arrivals(loop, carry[0])
-        followed = None if now.world.plan is None else followed_at(loop, now)
-        stored = (now.states, control(loop, now).inputs, followed)
+        stored = (now.states, control(loop, now).inputs)
         return jax.lax.fori_loop(0, count, one, carry), stored
 
     (now, sums), stored = jax.lax.scan(frame, (now, loop.meter.zero_sums()), counts)
