@@ -51,13 +51,11 @@ from .experiments.scenario.scenario import (
 from .experiments.scenario.scenario import (
     scenario_from_mapping as scenario_from_mapping,
 )
+from .experiments.studies.assumptions import finite_condition as finite_condition
 from .experiments.studies.check import check as check
 from .experiments.studies.compare import compare as compare
 from .experiments.studies.design import design as design
-from .experiments.studies.finite_condition import finite_condition as finite_condition
-from .experiments.studies.speedup import speedup as speedup
 from .experiments.studies.state_space import state_space as state_space
-from .experiments.studies.tune import tune as tune
 from .guarantees.promises.promise import Promise as Promise
 from .guarantees.promises.promise import promise as promise
 from .laws.law import Law as Law

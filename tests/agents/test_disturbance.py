@@ -23,7 +23,7 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references import Hover
 from echelon.agents.world.disturbance import Disturbance
-from echelon.agents.world.plant import differences, vary_parameters
+from echelon.agents.world.world import differences, vary_parameters
 from echelon.core.errors import EchelonError, Outcome, ScenarioError
 from echelon.core.numerics import precision
 from echelon.experiments.results.dataset import dataset, summary

@@ -4,8 +4,6 @@ import dataclasses
 import itertools
 import json
 import struct
-import urllib.error
-import urllib.request
 import zlib
 
 import numpy as np
@@ -21,14 +19,14 @@ from echelon.output.viewer.page import Group, pack
 from echelon.output.viewer.replay import (
     Growing,
     frames_of,
+    growing_page,
     header,
     link_shades,
     promise_badge,
     replay_data,
     replay_page,
-    serve_growing,
 )
-from echelon.output.viewer.serve import Handler, serve, serving
+from echelon_flight.page_server import Handler
 
 
 @pytest.fixture(scope="module")
@@ -514,7 +512,7 @@ def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_en
     run = dataclasses.replace(run, reference=run.states[:, 0] + 0.1)
     growing = Growing(run)
     first, second, third = parts_of(run, (0, 90, 91, 301))
-    with serving(serve_growing(growing, 0)) as address, opened(browser, address) as page:
+    with growing_page(growing).serving(0) as address, opened(browser, address) as page:
         assert page.evaluate("echelon.run.growing") and page.evaluate("echelon.last") == 0
         growing.add(first)
         until(lambda: page.evaluate("echelon.last") == 89)
@@ -757,38 +755,11 @@ def test_what_is_no_run_is_refused_in_a_sentence(echelon, here, stored, name):
     assert not (here / "out.html").exists()
 
 
-class Shown(Handler):
-    page = b"<html>"
-
-
-def answer(address, **headers):
-    request = urllib.request.Request(address, headers=headers)
-    try:
-        with urllib.request.urlopen(request, timeout=10) as got:
-            return got.status, got.read()
-    except urllib.error.HTTPError as error:
-        return error.code, error.read()
-
-
-def test_only_pages_of_this_server_are_answered_and_a_port_in_use_is_left(browser):
-    first = serve(Shown, 0)
-    port = first.server_address[1]
-    with serving(first) as address, serving(serve(Shown, port)) as other:
-        assert other != address
-        assert answer(address) == (200, b"<html>")
-        own = address.rstrip("/")
-        assert answer(address, Origin=own)[0] == 200
-        assert answer(address, Origin="http://example.org")[0] == 403
-        assert answer(address, Host="example.org")[0] == 403
-        assert answer(address, Host=f"example.org:{port}")[0] == 403
-        assert answer(address + "else")[0] == 404
-
-
 def test_a_page_that_is_served_is_drawn_too(browser, run):
     class Page(Handler):
         page = replay_page(run).encode()
 
-    with serving(serve(Page, 0)) as address, opened(browser, address) as page:
+    with Page.serving(0) as address, opened(browser, address) as page:
         assert page.evaluate("echelon.last") == 300
 
 
@@ -801,7 +772,7 @@ def test_a_notebook_shows_the_replay_in_a_cell_without_a_guarantee(browser, stor
         head = "<link rel='icon' href='data:,'><script>window.echelon = 1</script>"
         page = (head + shown._repr_html_()).encode()
 
-    with serving(serve(Notebook, 0)) as address, opened(browser, address) as page:
+    with Notebook.serving(0) as address, opened(browser, address) as page:
         cell = page.frames[1]
         until(lambda: cell.evaluate("Boolean(window.echelon)"))
         cell.evaluate("echelon.seek(echelon.last)")

@@ -20,7 +20,7 @@ from echelon.experiments.studies.recomputation import (
     with_leader_gain,
 )
 from echelon.guarantees.verifier.stored_values import compare_values
-from echelon.synthesis.gains import contraction
+from echelon.synthesis.gains import domain_methods
 from echelon.synthesis.gains.gain_file import save_gain
 
 SMALL = {
@@ -141,13 +141,13 @@ SOLVED = SMALL | {
 
 def test_a_gain_of_the_leader_is_that_of_its_file_where_solvers_end_elsewhere(monkeypatch):
     document = stated(ech.build(ech.scenario_from_mapping(SOLVED)), "small")
-    solve, noise = contraction.contraction, np.random.default_rng(0).normal(size=(4, 4)) * 3e-5
+    solve, noise = domain_methods.contraction, np.random.default_rng(0).normal(size=(4, 4)) * 3e-5
 
     def another_machine(*arguments, **named):
         metric = solve(*arguments, **named)
         return metric._replace(P=metric.P * (1.0 + noise + noise.T))
 
-    monkeypatch.setattr(contraction, "contraction", another_machine)
+    monkeypatch.setattr(domain_methods, "contraction", another_machine)
     experiment = ech.build(ech.scenario_from_mapping(SOLVED))
     # By its own solution the other machine would call an honest file a forgery.
     assert refused(compare_claims(document, experiment, "small"))

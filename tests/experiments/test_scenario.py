@@ -22,7 +22,6 @@ from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, Le
 from echelon.experiments.scenario.named_class import accepted, resolve
 from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.experiments.scenario.scenario import (
-    ScenarioFault,
     bundled_scenarios,
     json_schema,
     key_meanings,
@@ -31,7 +30,7 @@ from echelon.experiments.scenario.scenario import (
 )
 from echelon.experiments.scenario.sections import GraphSpec
 from echelon.experiments.scenario.values import marked_keys
-from echelon.experiments.scenario.yaml import read_yaml
+from echelon.experiments.scenario.yaml import ScenarioFault, read_yaml
 
 FOLDER = Path(echelon.experiments.scenario.scenario.__file__).parent
 

@@ -1,4 +1,4 @@
-"""The interface of a reference: a smooth path in space with a yaw, as functions of time."""
+"""What a leader follows: a motion of a model, or a smooth path in space with a yaw."""
 
 import abc
 import functools
@@ -9,15 +9,59 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.heading_symmetry import heading_of, rest_heading
+from echelon.agents.models.heading_symmetry import heading_index, heading_of, rest_heading
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.guide import Guide
+from echelon.core.cache import memoize
 from echelon.core.enclosure.hull import Box, value_hull
 from echelon.core.errors import GainError, LawError, ReferenceError, check_kind, listing
-from echelon.core.memoize import memoize
 from echelon.core.numerics import derivatives, precision
-from echelon.core.trace import call_once_traced, check_array, check_function, checked_trace
-from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.trace import call_once_traced, check_array, checked_trace
+from echelon.core.types import Array, Declared, Input, Scalar, State
+
+# ---- a motion of a model -------------------------------------------------------------------------
+
+
+class Guide(Declared):
+    """The motion that a leader follows: a path in space, or one of states and inputs."""
+
+    @abc.abstractmethod
+    def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
+        """Return the state (n,) and the input (m,) that follow it exactly at time t (s)."""
+
+    def heading(self, model: ControlAffine, t: Scalar) -> Scalar:
+        """Return the heading (rad) at time t of a model that states one."""
+        return self.follow(model, t)[0][heading_index(model)]
+
+    def turns(self, model: ControlAffine) -> bool:
+        """Tell whether the heading may differ from the trim's at some time."""
+        return True
+
+    def special_at(self, t: float) -> str:
+        """Return what is special about a path at a time (s), in words; empty for nothing."""
+        return ""
+
+    def remarks(self) -> tuple[str, ...]:
+        """Return what is probably not meant, a sentence each."""
+        return ()
+
+    @abc.abstractmethod
+    def check(self) -> None:
+        """Check the values that the reference returns.
+
+        Raises:
+            ReferenceError: it is malformed.
+        """
+
+    @abc.abstractmethod
+    def fit(self, model: ControlAffine) -> None:
+        """Check that a model can be led along it.
+
+        Raises:
+            LawError: it cannot; the message says why.
+        """
+
+
+# ---- a path in space -----------------------------------------------------------------------------
 
 COORDINATES = ("x", "y", "z", "yaw")
 _MAX_TIME = 10**9
@@ -67,7 +111,7 @@ class Reference(Guide):
     def check(self) -> None:
         """Check that (x, y, z, yaw) is returned."""
         with precision("float64"):
-            check_function(
+            checked_trace(
                 ReferenceError,
                 f"the point of `{type(self).__name__}`",
                 self,
@@ -129,7 +173,7 @@ def _check_map(model: ControlAffine) -> None:
             model.flat,
             np.zeros((model.flat_order + 1, len(model.flat_outputs))),
             advice="it must be written with `jax.numpy` and take the outputs' derivatives",
-        ).result
+        )
     if not isinstance(returned, tuple | list) or len(returned) != 2:
         raise LawError(f"`flat` of `{name}` must return a pair, a state and an input.")
     for what, value, size in zip(("state", "input"), returned, shapes, strict=True):

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.guide import Guide
 from echelon.agents.references.path_file import read_columns
-from echelon.agents.references.reference import numbers_of
+from echelon.agents.references.reference import Guide, numbers_of
 from echelon.core.errors import LawError, ReferenceError, listing
 from echelon.core.types import Array, Input, PathLike, Scalar, State
 

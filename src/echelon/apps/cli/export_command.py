@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from echelon.apps.cli import options
-from echelon.apps.cli.console import write_file
-from echelon.apps.cli.status import STATUS
+from echelon.apps.cli.tables import write_file
+from echelon.apps.cli.terminal import STATUS
 from echelon.core.errors import OutputError
 from echelon.output.archive.folder import check_empty, check_exists, claim_file
 

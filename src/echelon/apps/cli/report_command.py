@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from echelon.apps.cli.console import write_file
 from echelon.apps.cli.options import OverwriteOption, RunArgument
-from echelon.apps.cli.status import STATUS
+from echelon.apps.cli.tables import write_file
+from echelon.apps.cli.terminal import STATUS
 from echelon.output.archive.folder import claim_file
 
 

@@ -18,8 +18,7 @@ from echelon.experiments.scenario.build import Experiment
 from echelon.experiments.scenario.override import rename_files
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.experiments.scenario.yaml import dump_yaml
-from echelon.synthesis.gains.inner_loop import InnerLoop
-from echelon.synthesis.gains.riccati import Riccati
+from echelon.synthesis.gains.riccati import InnerLoop, Riccati
 
 _METHODS = (Riccati.name, InnerLoop.name)
 """Gain methods that take less than a picture's time, and need no parameters."""

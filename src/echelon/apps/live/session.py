@@ -30,7 +30,7 @@ from echelon.core.words import amount
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.plots.space import space_of
 from echelon.output.viewer.replay import heard_by
-from echelon.simulation.engine.closest_pair import ClosestPair
+from echelon.simulation.engine.frame_numbers import ClosestPair
 
 _PICTURE, _MESSAGE = 0, 1
 _EMPTY = struct.pack("<I", _MESSAGE) + b"{}"

@@ -8,7 +8,7 @@ import numpy as np
 from echelon.apps.live.attendance import RESHAPE
 from echelon.apps.live.knobs import Knobs, LiveParts
 from echelon.core.types import JsonObject
-from echelon.synthesis.gains.fixed import FixedGain
+from echelon.synthesis.gains.gain import FixedGain
 from echelon.synthesis.gains.riccati import Riccati
 
 

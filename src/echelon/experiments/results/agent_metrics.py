@@ -6,7 +6,7 @@ from typing import Annotated, NamedTuple, TypeVar
 import numpy as np
 
 from echelon.experiments.results.quantity import ERROR, Quantity
-from echelon.simulation.engine.closest_pair import ClosestPair
+from echelon.simulation.engine.frame_numbers import ClosestPair
 
 
 class LeaderMetrics(NamedTuple):

@@ -29,7 +29,7 @@ from echelon.experiments.results.quantity import Shown
 from echelon.experiments.results.recording import Recording, recording
 from echelon.experiments.results.run_groups import SUM, group_of
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
-from echelon.guarantees.promises.event_lines import events_in_words
+from echelon.guarantees.promises.hypotheses import events_in_words
 from echelon.guarantees.promises.promise import promise
 from echelon.laws.law import gain_of
 from echelon.simulation.engine.law_drive import Laws

@@ -8,7 +8,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.core.types import JsonObject
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.recording import FORMAT
-from echelon.guarantees.promises.event_lines import as_mapping
+from echelon.guarantees.promises.hypotheses import as_mapping
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 

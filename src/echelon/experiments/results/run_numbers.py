@@ -98,7 +98,7 @@ class RunNumbers:
     @property
     def covered(self) -> bool | None:
         """Whether the run kept to the conditions of its claim; None where no theorem claims any."""
-        from echelon.guarantees.promises.covering import covered
+        from echelon.guarantees.promises.promise import covered
 
         return covered(self.result, self.promise)
 

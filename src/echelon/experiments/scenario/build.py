@@ -8,12 +8,11 @@ from typing import Any, NamedTuple, cast
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.guide import Guide
-from echelon.agents.references.reference import Reference, check_reference
+from echelon.agents.references.reference import Guide, Reference, check_reference
 from echelon.agents.world.world import World
 from echelon.core.errors import ModelError, ScenarioError, did_you_mean, listing
+from echelon.core.files import versions
 from echelon.core.numerics import precision
-from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.checks import ROLES, section
 from echelon.experiments.scenario.fault_list import FaultList
@@ -45,9 +44,8 @@ from echelon.experiments.scenario.yaml import quoted
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
 from echelon.laws.safety import Safety
-from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.prepare import check_engine, check_memory
 from echelon.simulation.engine.record import Stretch
 from echelon.simulation.engine.result import Result

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-from echelon.core import disk_cache
+from echelon.core import cache
 from echelon.core.errors import EchelonError, ScenarioError, did_you_mean, listing
 from echelon.core.trace import error_summary
 
@@ -58,7 +58,7 @@ def _imported(file: Path) -> Any:
     # Before it is executed, as `import` does: dataclasses look up their module there.
     sys.modules[spec.name] = module
     # The file may change anything, and its text does not identify the values that it computes.
-    disk_cache.close()
+    cache.close()
     with as_scenario_error(f"the file `{file}` does not import"):
         spec.loader.exec_module(module)
     return module

@@ -16,8 +16,8 @@ from echelon.agents.network.events import (
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
-from echelon.agents.world.plant import check_plant, vary_parameters
 from echelon.agents.world.sensing import Sensing
+from echelon.agents.world.world import check_plant, vary_parameters
 from echelon.core.errors import ScenarioError
 from echelon.experiments.scenario.event_sections import EventSpec
 from echelon.experiments.scenario.fault_list import FaultList

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import Guide
 from echelon.agents.world.world import World
 from echelon.core.digits import about
 from echelon.core.errors import LawError, OutputError, SimulationError, check_kind

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from echelon.core.errors import Outcome
-from echelon.core.provenance import versions
+from echelon.core.files import versions
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.quantity import ERROR, Quantity

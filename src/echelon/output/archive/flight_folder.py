@@ -23,8 +23,8 @@ from echelon.output.archive.law_folder import python_law
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.onboard.python_text import python_text
-from echelon.simulation.onboard.vehicle_function import motions_of, move_function
+from echelon.simulation.onboard.law_functions import motions_of, move_function
+from echelon.simulation.onboard.source_code import python_text
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.settings import Settings
 
@@ -36,7 +36,7 @@ _EVERY = 0.02  # s between offsets of a formation that moves
 _SINKING = -0.5  # m/s
 
 
-def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, str | bytes]:
+def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, str]:
     """Return the files of a flight by name.
 
     Args:
@@ -51,7 +51,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     """
     network = _network(parts)
     agents = parts.graph.agents
-    files, sentence = dict[str, str | bytes](), guaranteed(parts, settings)
+    files, sentence = dict[str, str](), guaranteed(parts, settings)
     for k in range(agents):
         law = python_law(parts.replace(leadership=None), settings, k, formation, sentence)
         files |= {f"law-{k}/{name}": text for name, text in law.items()}
@@ -212,7 +212,7 @@ def _autopilot(model: ControlAffine, rest: list[float]) -> JsonObject:
     }
 
 
-def save_flight(files: dict[str, str | bytes], folder: Path) -> None:
+def save_flight(files: dict[str, str], folder: Path) -> None:
     """Write the files into a folder that is new or empty.
 
     Raises:

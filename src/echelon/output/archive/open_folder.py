@@ -6,7 +6,7 @@ from typing import NamedTuple
 from echelon.core.errors import OutputError
 from echelon.core.types import PathLike
 from echelon.experiments.scenario.scenario import SCENARIO_FILE
-from echelon.guarantees.verifier.strict_json import read_json
+from echelon.guarantees.verifier.saved_gain import read_json
 from echelon.guarantees.verifier.verify import states_gain
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.folder import DATA, GAIN, SUMMARY, check_exists

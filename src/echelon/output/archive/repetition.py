@@ -18,11 +18,11 @@ from echelon.experiments.results.recording import FORMAT, recording_with_data
 from echelon.experiments.results.run_groups import SUM
 from echelon.experiments.scenario.build import Experiment, origin_of
 from echelon.experiments.scenario.scenario import Scenario
-from echelon.experiments.studies.data_structure import compare_structure
+from echelon.experiments.studies.recomputation import compare_structure
 from echelon.guarantees.promises.promise import promise
 from echelon.guarantees.verifier.findings import Finding, unchecked
+from echelon.guarantees.verifier.saved_gain import read_json
 from echelon.guarantees.verifier.stored_values import Digits, compare_arrays, compare_values
-from echelon.guarantees.verifier.strict_json import read_json
 from echelon.output.archive.open_folder import ClaimFiles
 from echelon.output.reports.causes import sizes
 from echelon.output.reports.run_report import report

@@ -13,8 +13,7 @@ from echelon.experiments.results.agent_metrics import Metrics
 from echelon.experiments.results.avoidance import avoidance
 from echelon.experiments.results.event_outcomes import event_outcomes
 from echelon.experiments.results.lyapunov import lyapunov
-from echelon.guarantees.promises.covering import coverage
-from echelon.guarantees.promises.promise import Promise, promise
+from echelon.guarantees.promises.promise import Promise, coverage, promise
 from echelon.output.reports.causes import grows, observations, sizes
 from echelon.simulation.engine.result import Result
 

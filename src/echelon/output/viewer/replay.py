@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import threading
 from collections.abc import Mapping
-from http.server import ThreadingHTTPServer
 from typing import Any, Final, final
 
 import numpy as np
@@ -19,7 +18,7 @@ from echelon.output.plots.space import Space, body_width, clipped_places, space_
 from echelon.output.plots.style import raised
 from echelon.output.viewer.charts import charts_of
 from echelon.output.viewer.page import BYTE, COARSE, Group, pack, page
-from echelon.output.viewer.serve import Handler, serve
+from echelon_flight.page_server import Handler
 
 FLOCK = 200
 """With more agents than this, bodies are flat, and a motor load takes one byte."""
@@ -331,12 +330,8 @@ def _joined(before: Recording, stretch: Recording) -> Recording:
     return dataclasses.replace(stretch, **parts)
 
 
-def serve_growing(run: Growing, port: int | None) -> ThreadingHTTPServer:
-    """Return a server of a run that is being computed.
-
-    Raises:
-        OutputError: no port is free.
-    """
+def growing_page(run: Growing) -> type[Handler]:
+    """Return the handler of a run that is being computed."""
 
     class GrowingRun(Handler):
         """The handler of this run: its page, and its parts by number."""
@@ -360,4 +355,4 @@ def serve_growing(run: Growing, port: int | None) -> ThreadingHTTPServer:
                 code = 205 if block is None else 200 if block else 204
                 self.send(block or b"", "application/octet-stream", code)
 
-    return serve(GrowingRun, port)
+    return GrowingRun

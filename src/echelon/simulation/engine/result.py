@@ -14,12 +14,11 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.network.switching import Schedule
 from echelon.agents.world.world import World
 from echelon.core.errors import Outcome
+from echelon.core.files import CellPage, notebook_page
 from echelon.core.lazy_field import LazyField
-from echelon.core.pages import CellPage, notebook_page
 from echelon.core.types import Array
 from echelon.core.words import amount
-from echelon.simulation.engine.closest_pair import ClosestPair
-from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
+from echelon.simulation.engine.frame_numbers import ClosestPair, FrameChoice, FrameNumbers
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.traffic import Traffic, traffic
 from echelon.simulation.step.drive import Drive

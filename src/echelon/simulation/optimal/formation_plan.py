@@ -9,14 +9,14 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.tree import shares
+from echelon.agents.network.matrices import shares
 from echelon.agents.references.flatness import (
     Targets,
     mean_targets,
     reference_targets,
     shifted_targets,
 )
-from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import Guide
 from echelon.core.errors import PlanError
 from echelon.core.types import Array
 from echelon.simulation.optimal.objectives import (
