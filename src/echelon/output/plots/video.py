@@ -146,7 +146,9 @@ def _writer(kind: str, rate: Any) -> Any:
         def finish(self) -> None:
             few = self._frames[:: len(self._frames) // 8 + 1]
             strip = Image.fromarray(np.concatenate([np.asarray(each) for each in few]))
-            look = {"palette": strip.quantize(_COLOURS), "dither": Image.Dither.NONE}
+            # Other methods give the few pixels of an agent the colour of another one.
+            palette = strip.quantize(_COLOURS, Image.Quantize.FASTOCTREE)
+            look = {"palette": palette, "dither": Image.Dither.NONE}
             self._frames = [each.quantize(**look) for each in self._frames]
             super().finish()
 
