@@ -7,8 +7,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.experiments.results.run_numbers import RUN_NUMBERS
-from echelon.experiments.sweeps.axes import SEED
-from echelon.experiments.sweeps.numbers import SUMMARIZED
+from echelon.experiments.sweeps.plan import SEED, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import save
