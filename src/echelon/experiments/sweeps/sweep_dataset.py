@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -37,8 +37,6 @@ from echelon.simulation.engine.result import Result
 if TYPE_CHECKING:
     import xarray as xr
 
-    from echelon.experiments.sweeps.workers import SweepBatch
-
 REFUSED, MISSING = -1, -2
 """In place of an outcome: of a run whose parts cannot be built, and of one that is still to do."""
 OUTCOMES = {outcome: code for code, outcome in enumerate(Outcome)}
@@ -46,6 +44,22 @@ OUTCOMES = {outcome: code for code, outcome in enumerate(Outcome)}
 
 Columns = Mapping[str, Array]
 """Of some runs: an array (runs,) for each number, and (runs, agents) for those of an agent."""
+
+
+class SweepBatch(NamedTuple):
+    """Consecutive runs of a sweep: the number of the first one, their numbers and their frames.
+
+    `frames` is None if none are stored, or if they are in a file.
+    """
+
+    first: int
+    columns: Columns
+    frames: "StoredFrames | None" = None
+
+    @property
+    def runs(self) -> int:
+        """The number of runs."""
+        return len(self.columns["outcome"])
 
 
 def numbers_of(result: Result, promise: Promise) -> JsonObject:
@@ -111,7 +125,7 @@ _MEANINGS = {
 _QUANTITIES = {**AGENT_NUMBERS, **RUN_NUMBERS}
 
 
-def dataset_of(plan: Sweep, batches: "Sequence[SweepBatch]") -> "xr.Dataset":
+def dataset_of(plan: Sweep, batches: Sequence[SweepBatch]) -> "xr.Dataset":
     """Return the batches of a sweep as a dataset; runs that are in no batch are `missing`.
 
     Dimensions are the keys that vary, in their order, and `agent`. `outcome` is a code whose
@@ -155,7 +169,7 @@ def _key_attributes(key: str) -> JsonObject:
     return {"long_name": words} | ({"units": unit} if unit else {})
 
 
-def _all_frames(plan: Sweep, shape: FrameShape, batches: "Sequence[SweepBatch]") -> Labelled:
+def _all_frames(plan: Sweep, shape: FrameShape, batches: Sequence[SweepBatch]) -> Labelled:
     """Return the frames of all batches in the order of the axes; NaN of runs in no batch."""
     whole = dict[str, Array]()
     for name, empty in shape.stored([]).items():

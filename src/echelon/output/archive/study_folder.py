@@ -12,8 +12,7 @@ from echelon.experiments.results.dataset import save_dataset
 from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.experiments.sweeps.plan import Sweep, read_axes
-from echelon.experiments.sweeps.sweep_dataset import axis_values, write_frames
-from echelon.experiments.sweeps.workers import SweepBatch
+from echelon.experiments.sweeps.sweep_dataset import SweepBatch, axis_values, write_frames
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.folder import BATCHES, FRAMES, RUNS, write_errors
 
