@@ -19,7 +19,7 @@ from echelon.experiments.results.metrics import metrics
 from echelon.guarantees.stopping.motor_load import motor_load_of
 from echelon.guarantees.stopping.stopping_run import stopping_run_of
 from echelon.simulation.engine.batch import Batch
-from echelon.simulation.engine.initial import Starts
+from echelon.simulation.engine.parts import Starts
 from echelon.simulation.engine.prepare import prepare
 
 GENTLE = (

@@ -195,7 +195,7 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
     files = (
         "synthesis/gains/__init__.py",
         f"{scenario}/registry.py",
-        f"{scenario}/law_sections.py",
+        f"{scenario}/sections.py",
     )
     for file, (above, line) in zip(files, added, strict=True):
         text = (package / file).read_text("utf-8")

@@ -278,7 +278,7 @@ def test_every_class_is_abstract_or_final():
 
 def test_only_the_tables_and_the_verifier_name_laws_and_methods():
     """So that a new one needs its class, its entry in the registry and its keys, and no more."""
-    tables = ("experiments.scenario.registry", "experiments.scenario.law_sections")
+    tables = ("experiments.scenario.registry", "experiments.scenario.sections")
     names = {*registry.METHODS, *registry.FOLLOWER_LAWS, *registry.LEADER_LAWS}
     # These words have another meaning: a number of a run, and a column of the paper's table.
     others = {("tracking", ""), ("consensus", "output.reports")}
@@ -419,7 +419,7 @@ def test_the_table_of_mutate_names_packages_and_tests_that_exist():
 def test_set_up_names_no_host():
     """Packages come from where the user's own pip, npm and apt are set to look."""
     files = [*ROOT.glob("*.*"), *(ROOT / ".ci").iterdir(), *(ROOT / "web").glob("*.*")]
-    files += [*(ROOT / ".github").rglob("*.*"), *(ROOT / "packages").glob("*/*.*")]
+    files += [*(ROOT / ".github").rglob("*.*"), *(ROOT / "packages").glob("*/*.toml")]
     texts = {path.name: path.read_text("utf-8") for path in files if path.is_file()}
     texts.pop("CHANGELOG.md")  # links to conventions
     assert [name for name, text in texts.items() if "://" in text] == []

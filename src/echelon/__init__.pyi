@@ -54,7 +54,6 @@ from .experiments.studies.check import check as check
 from .experiments.studies.compare import compare as compare
 from .experiments.studies.design import design as design
 from .experiments.studies.state_space import state_space as state_space
-from .experiments.studies.tune import tune as tune
 from .guarantees.promises.promise import Promise as Promise
 from .guarantees.promises.promise import promise as promise
 from .laws.law import Law as Law

@@ -457,8 +457,8 @@ def test_a_plant_s_parameter_may_be_given_or_scaled():
         ),
         (
             {"plant": {"scale": {"mass": 2}, "parameters": {"mass": 2}}},
-            "plant.scale.mass",
-            "got a factor for a parameter that `plant.parameters` sets, allowed is one of them.",
+            "plant",
+            "`mass` of the plant has a value and a factor; give one of them.",
         ),
         (
             {"plant": {"parameters": {"mass": -1}}},

@@ -22,7 +22,7 @@ from echelon.experiments.results.labelled import read_labelled
 from echelon.laws.law import Law
 from echelon.output.archive.chunks import Chunks
 from echelon.simulation.engine import simulate as engine
-from echelon.simulation.engine.grid import ChunkGrid
+from echelon.simulation.engine.chunk_grid import ChunkGrid
 from echelon.simulation.engine.simulate import reassemble
 
 SCENARIO = """

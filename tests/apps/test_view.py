@@ -15,10 +15,11 @@ from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
 from echelon.experiments.results.recording import recording_of
 from echelon.output.plots.space import space_of
-from echelon.output.viewer.growing import Growing, growing_page
-from echelon.output.viewer.pack import Group, pack
+from echelon.output.viewer.page import Group, pack
 from echelon.output.viewer.replay import (
+    Growing,
     frames_of,
+    growing_page,
     header,
     link_shades,
     promise_badge,

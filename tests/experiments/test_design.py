@@ -19,7 +19,7 @@ from echelon.experiments.studies.basin import (
     trial,
 )
 from echelon.experiments.studies.design import because, recommended
-from echelon.output.plots.design_figures import save_design_figures
+from echelon.output.plots.study_figures import save_design_figures
 
 PATH = ech.Graph.path(4)
 

@@ -27,8 +27,8 @@ from echelon.experiments.sweeps.sweep import _missing, compute
 from echelon.experiments.sweeps.sweep_dataset import columns_of, dataset_of, share_bounds, succeeded
 from echelon.experiments.sweeps.workers import SweepBatch
 from echelon.guarantees.promises.promise import promise, promises
-from echelon.output.plots import sweep_figures as sweep_plots
-from echelon.output.plots.sweep_figures import sweep_figures
+from echelon.output.plots import study_figures as sweep_plots
+from echelon.output.plots.study_figures import sweep_figures
 from echelon.simulation.engine import batch, law_drive
 from echelon.simulation.engine.batch import Batch
 

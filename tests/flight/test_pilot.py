@@ -10,7 +10,7 @@ import echelon as ech
 from echelon.agents.network.formation_motion import Rotate
 from echelon.output.archive.flight_folder import network_facts
 from echelon.simulation.onboard.law_functions import law_functions
-from echelon.simulation.onboard.python_text import python_text
+from echelon.simulation.onboard.source_code import python_text
 from echelon_flight.pilot import NOBODY, Pilot
 from echelon_flight.wire import Letter, Packet
 

@@ -15,7 +15,7 @@ from echelon.agents.models.chains import angles_among
 from echelon.agents.models.model import wrap_angles
 from echelon.output.archive.flight_folder import network_facts, python_law
 from echelon.simulation.onboard.law_functions import law_functions
-from echelon.simulation.onboard.python_text import python_text
+from echelon.simulation.onboard.source_code import python_text
 from echelon.synthesis.gains import FixedGain
 from echelon.synthesis.gains.gain import synthesize
 from echelon_flight.pilot import Pilot

@@ -4,16 +4,23 @@ Whoever uses one in a scenario, on the command line or in Python gets one senten
 echelon adds a line here, which stays for two minor versions.
 """
 
-KEYS: dict[str, str] = {}
+KEYS: dict[str, str] = {
+    "leadership.waits": "make the leader's path slower, as by a smaller `rate` of `reference`",
+    "live.gusts": "set `rms` of `disturbance` for the whole run",
+    "live.lag": "set `lag` of `actuator` for the whole run",
+}
 """Scenario keys; `section.key` is that key alone, and `key` is it in any section."""
 
 VALUES: dict[str, str] = {
+    "prediction: none": "use `packet`, by which the model carries the leader on",
     "export --to json": "use `csv`, or `nc` with xarray; numbers are in `summary.json`",
     "report --out .html": "use `.txt`, or `echelon view RUN --html FILE`, which shows it",
 }
 """Values of scenario keys, as in `prediction: none`, and of options, as in `export --to json`."""
 
-COMMANDS: dict[str, str] = {}
+COMMANDS: dict[str, str] = {
+    "tune": "minimize the cost by `ech.gradient` and SciPy, as in docs/recipes.md",
+}
 """Commands of the command line."""
 
 NAMES: dict[str, str] = {
@@ -22,6 +29,7 @@ NAMES: dict[str, str] = {
     "network.recommend_edges": "compare `graph.with_edges([pair]).spectrum().low`; see recipes.md",
     "network.recommend_leaders": "compare `graph.with_leaders([k]).spectrum().low`; see recipes.md",
     "speedup": "use `-1 / gain.certificate.abscissa` of each graph; see recipes.md",
+    "tune": "minimize the cost by `ech.gradient` and SciPy, as in docs/recipes.md",
 }
 """Public names below `echelon`."""
 

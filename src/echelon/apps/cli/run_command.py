@@ -254,7 +254,7 @@ class WatchedRun:
         from echelon.experiments.results.lyapunov import fixed_metric, potential
         from echelon.experiments.results.recording import foreseen
         from echelon.guarantees.promises.promise import promise
-        from echelon.output.viewer.growing import Growing
+        from echelon.output.viewer.replay import Growing
         from echelon.simulation.engine.prepare import prepare
 
         prepared = prepare(*experiment)
@@ -293,7 +293,7 @@ class WatchedRun:
 @contextlib.contextmanager
 def watching(scenario: "Scenario", experiment: "Experiment") -> Iterator[WatchedRun]:
     """Serve the page of a run that is about to start, and open a browser."""
-    from echelon.output.viewer.growing import growing_page
+    from echelon.output.viewer.replay import growing_page
 
     watched = WatchedRun(scenario, experiment)
     handler = growing_page(watched.page)

@@ -254,8 +254,9 @@ def video(
     from echelon.output.archive.run_folder import load
     from echelon.output.plots.video import encoder, save_video
 
-    # Before the run is read, so that a missing ffmpeg is reported at once.
-    encoder()
+    if file.suffix.lower() == ".mp4":
+        # Before the run is read, so that a missing ffmpeg is reported at once.
+        encoder()
     with write_errors(file):
         recording = load(run)
         STATUS.begin(f"drawing {file}")

@@ -98,7 +98,7 @@ def design(
 
 def _draw(parts: "Parts", settings: "Settings", folder: Path, states: str | None) -> str | None:
     """Draw a design's figures, and return a sentence on its radii if it has any."""
-    from echelon.output.plots.design_figures import save_design_figures
+    from echelon.output.plots.study_figures import save_design_figures
 
     with write_errors(folder):
         _, radii = save_design_figures(parts, settings, folder, states)

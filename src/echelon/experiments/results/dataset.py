@@ -70,8 +70,7 @@ def dataset(result: Result) -> "xr.Dataset":
     imaginary part `mode_eigenvalue_imaginary`), and the limits of the inputs u, `limit_low` <=
     `limit_matrix` u <= `limit_high`. Over a network that is late also `age` (of the oldest message
     that an agent has of a neighbour, NaN before the first), `edge_age` (of the newest one at each
-    end of an edge), `edge_lost` (messages lost since the frame before) and `forget`; of leaders
-    that wait for stragglers `late`, how late their plan is. The attribute
+    end of an edge), `edge_lost` (messages lost since the frame before) and `forget`. The attribute
     `promise` is JSON, and `format` the version of this list.
     """
     return labelled(result).dataset()
@@ -161,8 +160,6 @@ def _followed(result: Result) -> Variables:
     if result.reference is None:
         return {}
     variables: Variables = {"reference": (("time", "state"), result.reference)}
-    if result.late is not None:
-        variables["late"] = ("time", result.late, _SECONDS)
     errors = [output_errors(result, leader) for leader in result.graph.leaders]
     errors = [error for error in errors if error is not None]
     if errors:

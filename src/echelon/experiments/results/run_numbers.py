@@ -18,7 +18,7 @@ from typing import (
 
 import numpy as np
 
-from echelon.simulation.engine.closest_pair import ClosestPair
+from echelon.simulation.engine.frame_numbers import ClosestPair
 
 ERROR = "error"
 """In place of a unit: that of the formation errors."""

@@ -16,9 +16,8 @@ from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
 from echelon.guarantees.promises.promise import promise
 from echelon.laws.consensus import Consensus
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
-from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.simulate import RunSoFar, simulate
 from echelon.simulation.optimal.drives import Plans, RecedingHorizon
 from echelon.simulation.step.drive import Drive

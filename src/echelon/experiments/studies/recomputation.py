@@ -27,9 +27,8 @@ from echelon.guarantees.verifier.findings import Finding, decide
 from echelon.guarantees.verifier.saved_gain import parse_json, read_json
 from echelon.guarantees.verifier.stored_values import Digits, compare_values
 from echelon.laws.consensus import Consensus
-from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.prepare import prepare
 from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.gain_file import gain_as_mapping, load_gain

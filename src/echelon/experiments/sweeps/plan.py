@@ -151,7 +151,7 @@ class FrameShape(NamedTuple):
     @classmethod
     def of(cls, experiment: "Experiment", every: int) -> "FrameShape":
         """Return the shape of a run that stores every so-manieth step."""
-        from echelon.simulation.engine.grid import ChunkGrid
+        from echelon.simulation.engine.chunk_grid import ChunkGrid
 
         parts, settings = experiment
         grid = ChunkGrid(settings._replace(store_every=every), 1)

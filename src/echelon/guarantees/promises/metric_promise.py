@@ -35,8 +35,7 @@ from echelon.guarantees.promises.region import (
     starts_line,
     weaken,
 )
-from echelon.simulation.engine.initial import Starts
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate

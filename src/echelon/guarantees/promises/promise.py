@@ -27,9 +27,8 @@ from echelon.core.words import GuaranteeVerdict, Kind, Theorem, Verdict
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.region import CertifiedSet
 from echelon.laws.law import Law
-from echelon.simulation.engine.initial import Starts
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.prepare import Prepared, prepare
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.drive import Drive

@@ -24,21 +24,20 @@ from echelon.core.words import MessageContent
 from echelon.guarantees.promises.promise import guaranteed
 from echelon.laws.law import Law
 from echelon.output.archive.folder import write_errors
-from echelon.simulation.engine.agent import Agent
+from echelon.simulation.engine.agent import Agent, OwnLaw
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.own_step import OwnLaw
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.onboard.c_text import c_text, header_text
-from echelon.simulation.onboard.law_functions import LawFunction, law_functions
-from echelon.simulation.onboard.llvm_text import object_file
-from echelon.simulation.onboard.message_meaning import (
+from echelon.simulation.onboard.law_functions import (
+    LawFunction,
+    law_functions,
     message_meaning,
     message_words,
+    motions_of,
+    move_function,
     normalized_equation,
 )
-from echelon.simulation.onboard.python_text import python_text
-from echelon.simulation.onboard.vehicle_function import motions_of, move_function
+from echelon.simulation.onboard.source_code import c_text, header_text, python_text
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.knowledge import HOP_LIFE
 from echelon.simulation.step.settings import Settings
@@ -53,10 +52,8 @@ _LATE = "other networks than `network`"
 
 
 @shared_traces()
-def law_files(
-    parts: Parts, settings: Settings, agent: int, formation: str
-) -> dict[str, str | bytes]:
-    """Return the files of one agent's law by name; machine code where llvmlite is installed.
+def law_files(parts: Parts, settings: Settings, agent: int, formation: str) -> dict[str, str]:
+    """Return the files of one agent's law by name.
 
     Args:
         parts: of the whole formation.
@@ -71,24 +68,22 @@ def law_files(
     own, double = _traced(parts, settings, agent)
     single, functions = law_functions(own, 32), double.values()
     about, constants = _head(settings, agent, formation)
-    files: dict[str, str | bytes] = {
+    files = {
         "law.py": python_text(functions, about, constants),
         "law.c": c_text(functions, single.values(), about),
         "law.h": header_text(functions, about, constants | _sizes(double)),
     }
-    image = object_file(single.values())
-    files |= {} if image is None else {"law.o": image}
     sentence = guaranteed(parts, settings)
     return {**files, "law.json": _facts(own, double, constants, sentence, files)}
 
 
 def python_law(
     parts: Parts, settings: Settings, agent: int, formation: str, sentence: str
-) -> dict[str, str | bytes]:
+) -> dict[str, str]:
     """Return law.py and law.json of one agent, as `law_files`, with the sentence of `promise`."""
     own, functions = _traced(parts, settings, agent)
     about, constants = _head(settings, agent, formation)
-    files: dict[str, str | bytes] = {"law.py": python_text(functions.values(), about, constants)}
+    files = {"law.py": python_text(functions.values(), about, constants)}
     return {**files, "law.json": _facts(own, functions, constants, sentence, files)}
 
 
@@ -114,7 +109,7 @@ def _facts(
     functions: Mapping[str, LawFunction],
     constants: Mapping[str, float | str],
     sentence: str,
-    files: Mapping[str, str | bytes],
+    files: Mapping[str, str],
 ) -> str:
     """Return law.json."""
     dt = float(constants["DT"])
@@ -127,13 +122,9 @@ def _facts(
         "guaranteed": sentence,
         "excluded": [*_EXCLUDES, _CURRENT if own.loop.channel is None else _LATE],
         "echelon": __version__,
-        "sha256": {name: _digest(content) for name, content in files.items()},
+        "sha256": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in files.items()},
     }
     return json.dumps(described, indent=2) + "\n"
-
-
-def _digest(content: str | bytes) -> str:
-    return hashlib.sha256(content.encode() if isinstance(content, str) else content).hexdigest()
 
 
 def _sizes(functions: Mapping[str, LawFunction]) -> dict[str, int]:
@@ -196,7 +187,7 @@ def network_facts(
     }
 
 
-def save_law(files: Mapping[str, str | bytes], folder: Path) -> None:
+def save_law(files: Mapping[str, str], folder: Path) -> None:
     """Write the files into a folder that is new or empty.
 
     Raises:
@@ -216,7 +207,7 @@ _EVERY = 0.02  # s between offsets of a formation that moves
 _SINKING = -0.5  # m/s
 
 
-def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, str | bytes]:
+def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, str]:
     """Return the files of a flight by name.
 
     Args:
@@ -231,7 +222,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
     """
     network = _network(parts)
     agents = parts.graph.agents
-    files, sentence = dict[str, str | bytes](), guaranteed(parts, settings)
+    files, sentence = dict[str, str](), guaranteed(parts, settings)
     for k in range(agents):
         law = python_law(parts.replace(leadership=None), settings, k, formation, sentence)
         files |= {f"law-{k}/{name}": text for name, text in law.items()}
@@ -392,7 +383,7 @@ def _autopilot(model: ControlAffine, rest: list[float]) -> JsonObject:
     }
 
 
-def save_flight(files: dict[str, str | bytes], folder: Path) -> None:
+def save_flight(files: dict[str, str], folder: Path) -> None:
     """Write the files into a folder that is new or empty.
 
     Raises:

@@ -202,7 +202,6 @@ def _result(
         engine=attributes["computed_by"],
         provenance={name: attributes[name] for name in attributes["provenance"].split()},
         files=files,
-        late=arrays.get("late"),
     )
 
 

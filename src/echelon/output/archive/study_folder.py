@@ -123,7 +123,7 @@ def write_sweep(data: "xr.Dataset", text: str, folder: Path, figures: bool = Tru
         write_atomic(folder / "sweep.txt", text + "\n")
         if figures:
             # Here, since matplotlib takes long to load and only figures need it.
-            from echelon.output.plots.sweep_figures import save_sweep_figures
+            from echelon.output.plots.study_figures import save_sweep_figures
 
             save_sweep_figures(data, folder)
 
@@ -178,6 +178,6 @@ def write_comparison(
         write_atomic(folder / "comparison.txt", text + "\n")
         if figures:
             # Here, since matplotlib takes long to load and only figures need it.
-            from echelon.output.plots.comparison_figures import save_comparison_figures
+            from echelon.output.plots.study_figures import save_comparison_figures
 
             save_comparison_figures(comparison, folder)

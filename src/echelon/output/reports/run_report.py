@@ -224,7 +224,6 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
         *_outcome(result, numbers, guarantee),
         *_closest(result, numbers),
         *(outcome.sentence() for outcome in event_outcomes(result)),
-        *_waiting(result),
         *_lag(result),
         *observations(result, numbers, guarantee),
         *_world(result),
@@ -268,21 +267,6 @@ def _closest(result: Result, numbers: Metrics) -> Iterator[str]:
         yield numbers.closest.sentence(result.radius, result.length_unit)
     kept = avoidance(result)
     yield from () if kept is None else (kept.sentence(),)
-
-
-def _waiting(result: Result) -> Iterator[str]:
-    """Yield for how long leaders waited that do."""
-    if result.late is None or not len(result.late):
-        return
-    late, end = float(result.late[-1]), result.times[-1]
-    if late < 0.5e-3:
-        yield "The leaders' plan waited for nobody."
-        return
-    until = result.times[np.flatnonzero(result.late < late - 1e-3)[-1:]].max(initial=0.0)
-    yield (
-        f"The leaders' plan waited for stragglers until about {until:.3g} s, and is {late:.3g} s "
-        f"late at {end:g} s."
-    )
 
 
 def _lag(result: Result) -> Iterator[str]:

@@ -5,9 +5,8 @@ from threading import Lock
 
 import numpy as np
 
-from echelon.simulation.codegen.ir_blocks import loop
 from echelon.simulation.codegen.machine_code import Code
-from echelon.simulation.codegen.vector_ir import Writer
+from echelon.simulation.codegen.vector_ir import Writer, loop
 
 _LOCK = Lock()
 """Threads ask for the same code at once, and a cache alone would compile it for each."""

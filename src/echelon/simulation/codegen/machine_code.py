@@ -12,7 +12,7 @@ import numpy as np
 from echelon.core.cache import load_or_compile
 from echelon.core.errors import MissingExtraError
 from echelon.core.trace import error_summary
-from echelon.simulation.scalars.traced_entries import Unsupported
+from echelon.simulation.scalars import Unsupported
 
 
 @cache
@@ -98,21 +98,6 @@ class Code:
     def call(self, slots: np.ndarray) -> None:
         """Run the kernel with the arguments in 64-bit slots: addresses and whole numbers."""
         self._run(slots.ctypes.data)
-
-
-def object_code(text: str, triple: str, cpu: str) -> bytes:
-    """Return the object file of a text for another processor.
-
-    Raises:
-        MissingExtraError: llvmlite is not installed.
-        Unsupported: LLVM rejects the text.
-    """
-    binding = llvm()
-    binding.initialize_all_targets()
-    binding.initialize_all_asmprinters()
-    target = binding.Target.from_triple(triple)
-    machine = target.create_target_machine(cpu=cpu, opt=2, reloc="static")
-    return _compiled(binding, machine, f'target triple = "{triple}"\n{text}')
 
 
 def _compiled(binding: ModuleType, machine: Any, text: str) -> bytes:

@@ -26,7 +26,6 @@ from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import information_of, leader_warnings, prepare_law, unknown_class
 from echelon.laws.safety import Safety
 from echelon.laws.safety_check import check_numbers, hulls_at, separations, too_near
-from echelon.laws.stopping_point import StoppingLeader
 from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.native import is_installed
 from echelon.simulation.native.agent_step import BlockRows
@@ -146,7 +145,7 @@ class Laws(Drive):
                 f"`{type(self.leader).__name__}` has no plan; use `packet`."
             )
         states, leader = (type(x).signal is Law.signal for x in (self.follower, self.leader))
-        if network.messages is MessageContent.DEVIATION and preview and states is not leader:
+        if deviations and preview and states is not leader:
             raise SimulationError(
                 f"`prediction` of the network is `preview`, and followers under the law "
                 f"`{type(self.follower).__name__}` do not send what the plan of a leader under "
@@ -210,11 +209,6 @@ class Laws(Drive):
                 "kind of law, with the same `observer`."
             )
 
-    def check_patience(self) -> None:
-        """Check that the leader follows a path by stopping points."""
-        if not isinstance(self.leader, StoppingLeader) or self.leader.reference is None:
-            super().check_patience()
-
     def accept(self, problem: Problem) -> None:
         """Check the starts of leaders and followers by their laws.
 
@@ -255,7 +249,7 @@ class Laws(Drive):
         """
         if problem.settings.engine == "native":
             loop = assemble(problem, self.leader, self.follower)
-            choose_engine(problem.settings, 0, lambda: BlockRows.of(loop), _no_rows)
+            choose_engine(problem.settings, 0, lambda: BlockRows.of(loop), lambda _: None)
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws, and of what they cannot follow or do not hear."""
@@ -313,11 +307,6 @@ class Laws(Drive):
         )
 
 
-def _no_rows(_: str) -> BlockRows | None:
-    """Return nothing, in place of what native code needs."""
-    return None
-
-
 _WORTH = 100_000
 """Agent steps above which native code saves more than its compilation takes, one second."""
 _R = TypeVar("_R")
@@ -328,7 +317,6 @@ def choose_engine(
     agents: int,
     native: Callable[[], _R],
     by_jax: Callable[[str], _R],
-    least: int = _WORTH,
 ) -> _R:
     """Return the result of one of the two engines for so many agents.
 
@@ -337,12 +325,11 @@ def choose_engine(
         agents: how many.
         native: computes it by native code.
         by_jax: computes it by JAX; takes why there is no native code, empty where none is needed.
-        least: from how many steps of one agent on native code pays.
 
     Raises:
         SimulationError: native code is requested, and there is none.
     """
-    if not worth_native(settings, agents, least):
+    if not worth_native(settings, agents):
         return by_jax("")
     try:
         return native()
@@ -352,21 +339,21 @@ def choose_engine(
         return by_jax(_in_words(error))
 
 
-def worth_native(settings: Settings, agents: int, least: int = _WORTH) -> bool:
+def worth_native(settings: Settings, agents: int) -> bool:
     """Tell whether native code steps the agents: if it is requested, or saves time.
 
-    It computes on processors alone, and `least` is from how many steps of one agent on it pays.
+    It computes on processors alone.
     """
     if settings.engine != "auto":
         return settings.engine == "native"
-    if settings.devices > 1 or not is_long(settings, agents, least):
+    if settings.devices > 1 or not is_long(settings, agents):
         return False
     return is_installed() and jax.default_backend() == "cpu"
 
 
-def is_long(settings: Settings, agents: int, least: int = _WORTH) -> bool:
+def is_long(settings: Settings, agents: int) -> bool:
     """Tell whether a run is long enough for more compilation than that of its JAX steps."""
-    return settings.engine == "native" or settings.steps * agents >= least
+    return settings.engine == "native" or settings.steps * agents >= _WORTH
 
 
 def _in_words(error: EchelonError) -> str:

@@ -17,8 +17,7 @@ from echelon.core.errors import Outcome
 from echelon.core.files import CellPage, notebook_page
 from echelon.core.types import Array
 from echelon.core.words import amount
-from echelon.simulation.engine.closest_pair import ClosestPair
-from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
+from echelon.simulation.engine.frame_numbers import ClosestPair, FrameChoice, FrameNumbers
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.traffic import Traffic, traffic
 from echelon.simulation.step.drive import Drive
@@ -75,7 +74,6 @@ class Result(FrameNumbers):
         engine: what computed the steps, `jax` or `native`.
         provenance: scenario text, versions and the like, as text.
         files: the files that the scenario text names, by the names that it gives them.
-        late: (T,) how late the plan is that the leaders follow, s; None where it does not wait.
 
     Raises:
         OutputError: when `parts` of a run from disk are first read, its scenario is missing or was
@@ -98,7 +96,6 @@ class Result(FrameNumbers):
     engine: str = "jax"
     provenance: Mapping[str, str] = dataclasses.field(default_factory=dict)
     files: Mapping[str, bytes] = dataclasses.field(default_factory=dict)
-    late: Array | None = None
 
     @property
     def model(self) -> ControlAffine:
