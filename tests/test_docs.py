@@ -21,7 +21,7 @@ import pytest
 import echelon as ech
 from echelon.apps.cli.app import main
 from echelon.experiments.scenario.registry import METHODS
-from echelon.output.reports.printed import PRINTED
+from echelon.output.reports.run_report import PRINTED
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

@@ -26,8 +26,9 @@ from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.world import differences, vary_parameters
 from echelon.core.errors import EchelonError, Outcome, ScenarioError
 from echelon.core.numerics import precision
-from echelon.experiments.results.dataset import dataset, summary
+from echelon.experiments.results.dataset import dataset
 from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.results.summary import summary
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.named_class import resolve

@@ -13,6 +13,8 @@ KEYS: dict[str, str] = {
 
 VALUES: dict[str, str] = {
     "prediction: none": "use `packet`, by which the model carries the leader on",
+    "export --to json": "use `csv`, or `nc` with xarray; numbers are in `summary.json`",
+    "report --out .html": "use `.txt`, or `echelon view RUN --html FILE`, which shows it",
 }
 """Values of scenario keys, as in `prediction: none`, and of options, as in `export --to json`."""
 
@@ -22,6 +24,8 @@ COMMANDS: dict[str, str] = {
 """Commands of the command line."""
 
 NAMES: dict[str, str] = {
+    "load_run": "use `load`",
+    "open_run": "use `load`",
     "network.recommend_edges": "compare `graph.with_edges([pair]).spectrum().low`; see recipes.md",
     "network.recommend_leaders": "compare `graph.with_leaders([k]).spectrum().low`; see recipes.md",
     "speedup": "use `-1 / gain.certificate.abscissa` of each graph; see recipes.md",
