@@ -11,7 +11,7 @@ from recordings import PROMISE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
-from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
+from echelon.experiments.results.metrics import Avoidance, Ellipsoid
 from echelon.experiments.results.recording import MessageAges
 from echelon.output.plots.network import curves_of
 from echelon.output.plots.over_time import start_of
@@ -24,7 +24,7 @@ CERTIFIED = PROMISE | {
     "certified_set": {"radius": 9.0, "kind": "proof", "why": ""},
     "hypotheses": [{"statement": "starts in the certified set", "verdict": "holds"}],
 }
-FEW = ("formation", "inputs", "trajectories")
+FEW = ("trajectories", "formation", "inputs")
 WINDY = {"statement": "Assumption 3, exact states", "verdict": "fails"}
 
 
@@ -49,14 +49,6 @@ def flock():
 
 def lines_of(figure, place=0):
     return {line.get_label(): line.get_xydata() for line in figure.axes[place].get_lines()}
-
-
-def test_there_is_a_figure_of_each_name(run):
-    made = figures(run, NAMES)
-    assert tuple(made) == NAMES
-    for name, figure in made.items():
-        for ax in figure.axes:
-            assert ax.get_ylabel() or name in ("inputs", "network"), name
 
 
 def test_inputs_stand_in_percent_of_their_limits_which_are_drawn(run):
@@ -239,7 +231,10 @@ def test_figures_fit_the_columns_of_a_page_with_letters_of_8_points(run, flock, 
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     for own, names in ((run, what), (flock, FEW)):
-        for name, figure in figures(own, names, page).items():
+        made = figures(own, names, page)
+        assert tuple(made) == names
+        for name, figure in made.items():
+            assert all(ax.get_ylabel() or name in ("inputs", "network") for ax in figure.axes)
             assert figure.get_figwidth() == width and figure.get_figheight() <= 9.0, name
             assert all(ax.yaxis.label.get_size() == 8.0 for ax in figure.axes)
             renderer = FigureCanvasAgg(figure).get_renderer()
@@ -331,9 +326,7 @@ def test_a_figure_that_is_none_is_refused_with_a_guess(run):
 
 
 def test_plot_draws_png_pdf_and_svg_from_the_file_and_loses_no_other(echelon, here):
-    from echelon.experiments.results.recording import FORMAT
-
-    (here / "run.nc").write_bytes(as_file(swinging(("x", "y", "z"), (0, 1, 2), n=3), FORMAT))
+    (here / "run.nc").write_bytes(as_file(swinging(("x", "y", "z"), (0, 1, 2), n=3)))
     code, told, _ = echelon("plot", "run.nc", "--what", "formation,network,ages", "--dpi", "60")
     assert code == 0
     assert told == (

@@ -15,8 +15,9 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references import Circle
 from echelon.core.errors import Outcome
-from echelon.experiments.results.dataset import recording_of, summary
 from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.results.recording import recording_of
+from echelon.experiments.results.summary import summary
 from echelon.laws import Consensus, Tracking, TrimInput
 from echelon.output.plots.run_figures import figures, save_figures
 from echelon.output.plots.style import COLOURS, thin
@@ -287,6 +288,8 @@ def test_without_v_there_is_no_figure_of_it_and_without_motion_no_panel(runs):
 def test_many_followers_have_no_names_and_their_worst_has(runs):
     result = runs("swarm")
     made = all_figures(result)
+    paths = [np.column_stack(coordinates(x)) for x in made["trajectories"].axes[0].lines[:16]]
+    np.testing.assert_array_equal(np.stack(paths, axis=1), result.states)
     told = [text.get_text() for text in made["trajectories"].legends[0].get_texts()]
     assert told == ["leader 0", "15 followers", "graph, every 0.1 s", "start", "end"]
     lines = labelled(made["formation"])
@@ -301,12 +304,6 @@ def test_many_followers_have_no_names_and_their_worst_has(runs):
     assert place == (steady**2).sum(axis=0).argmax()
     np.testing.assert_allclose(lines[worst][:, 1], errors[:, place], rtol=1e-12)
     np.testing.assert_allclose(lines["median follower"][:, 1], np.median(errors, axis=1))
-
-
-def test_all_agents_of_a_swarm_are_drawn(runs):
-    (ax,), _ = drawn(runs("swarm"), "trajectories")
-    paths = [np.column_stack(coordinates(line)) for line in ax.get_lines()[:16]]
-    np.testing.assert_array_equal(np.stack(paths, axis=1), runs("swarm").states)
 
 
 # ---- odd runs ---------------------------------------------------------------------------------
@@ -375,9 +372,11 @@ def test_long_runs_are_thinned_and_keep_their_ends():
 # ---- files and state --------------------------------------------------------------------------
 
 
-def test_each_figure_is_written_as_png_and_pdf(runs, tmp_path):
-    result = runs("quadrotor")
-    paths = save_figures(result, tmp_path)
+def test_each_figure_is_written_as_png_and_pdf_and_settings_are_left_alone(runs, tmp_path):
+    # To look the back end up would itself choose one; a copy does not.
+    before, errors = dict(matplotlib.rcParams.copy()), np.geterr()
+    paths = save_figures(runs("quadrotor"), tmp_path)
+    assert dict(matplotlib.rcParams.copy()) == before and np.geterr() == errors
     names = ["leader_3d", "trajectories", "tracking", "formation", "inputs", "lyapunov"]
     expected = [
         tmp_path / "figures" / f"{name}.{kind}" for name in names for kind in ("png", "pdf")
@@ -396,15 +395,6 @@ def test_the_same_run_writes_the_same_files(runs, tmp_path):
         for name in ("first", "again")
     )
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in again]
-
-
-def test_settings_of_matplotlib_are_left_alone(runs, tmp_path):
-    # To look the back end up would itself choose one; a copy does not.
-    before = dict(matplotlib.rcParams.copy())
-    errors = np.geterr()
-    save_figures(runs("quadrotor"), tmp_path, "formation")
-    assert dict(matplotlib.rcParams.copy()) == before
-    assert np.geterr() == errors
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,8 @@ import numpy as np
 from echelon.core.digits import at_most
 from echelon.core.types import Array
 from echelon.experiments.results.metrics import SETTLED, output_errors
-from echelon.experiments.results.quantity import settling_bound
 from echelon.experiments.results.recording import LoopPoles
-from echelon.experiments.results.run_numbers import RUN_NUMBERS
+from echelon.experiments.results.run_numbers import RUN_NUMBERS, settling_bound
 from echelon.experiments.studies.basin import (
     Radii,
     StateSlice,

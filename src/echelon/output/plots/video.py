@@ -12,8 +12,7 @@ import numpy as np
 from echelon.core.errors import MissingExtraError, OutputError
 from echelon.core.files import make_atomic
 from echelon.core.types import Array
-from echelon.experiments.results.dataset import recording_of
-from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.recording import Recording, recording_of
 from echelon.output.plots import style as draw
 from echelon.output.plots.over_time import above, error_rounding, mark_events, shade_rounding
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
@@ -147,7 +146,9 @@ def _writer(kind: str, rate: Any) -> Any:
         def finish(self) -> None:
             few = self._frames[:: len(self._frames) // 8 + 1]
             strip = Image.fromarray(np.concatenate([np.asarray(each) for each in few]))
-            look = {"palette": strip.quantize(_COLOURS), "dither": Image.Dither.NONE}
+            # Other methods give the few pixels of an agent the colour of another one.
+            palette = strip.quantize(_COLOURS, Image.Quantize.FASTOCTREE)
+            look = {"palette": palette, "dither": Image.Dither.NONE}
             self._frames = [each.quantize(**look) for each in self._frames]
             super().finish()
 
