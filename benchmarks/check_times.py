@@ -16,9 +16,14 @@ import numpy as np
 import echelon as ech
 from echelon.agents.models.linearization import linearize
 from echelon.core.numerics import precision
-from echelon.synthesis.certificates.bounds import invariant_ellipsoid, peak_gain
-from echelon.synthesis.certificates.delays import delay_margin
-from echelon.synthesis.certificates.margins import ClosedLoop, gain_margin, string_gain
+from echelon.synthesis.certificates.margins import (
+    ClosedLoop,
+    delay_margin,
+    gain_margin,
+    invariant_ellipsoid,
+    peak_gain,
+    string_gain,
+)
 
 GRAPH = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)])
 

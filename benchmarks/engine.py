@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 try:
+    import jax
     import numpy as np
     import plain_c
     import steppers as made
@@ -35,7 +36,6 @@ except ImportError:
 from steppers import FORMATIONS, STEPS, Yardstick, flock, rate
 
 import echelon as ech
-from echelon.core.private_folder import PrivateFolder
 from echelon.simulation.codegen import Code, program
 from echelon.simulation.engine.batch import Batch
 from echelon.simulation.native.kernel_cache import Kernels
@@ -80,8 +80,6 @@ _AT_MOST: Row = {
     "a model traced and compiled, the slowest, CPU s": 1.0,
     "code of a model from the cache, the slowest, ms": 10.0,
     "`echelon run paper` warm, without figures, wall s": 3.0,
-    "gradient of 200 steps, to forward": 10.0,
-    "gradient of 200 steps, to JAX": 0.2,
 }
 """What each must not exceed."""
 
@@ -309,32 +307,6 @@ def measure_models(_: Yardstick | None) -> Row:
     }
 
 
-def measure_gradient(_: Yardstick | None) -> Row:
-    """Return what a gradient of 200 steps takes, beside the steps alone and JAX's gradient."""
-    parts, steps = flock(ech.Graph.ring(104)), 200
-    side, chosen = made.steppers(parts, 64), ech.Settings(horizon=steps * made.DT, dt=made.DT)
-
-    def cost(sums: Any) -> Any:
-        return sums.errors[0].sum()
-
-    def differentiate(engine: Any) -> float:
-        begin = time.process_time()
-        ech.gradient(parts, chosen._replace(engine=engine), cost, ("P", "coupling"))
-        return 1.0 / (time.process_time() - begin)
-
-    def forward() -> float:
-        return rate(side.native, 104, [steps], side.reference, 64) / (104 * steps)
-
-    for engine in ("native", "jax"):
-        differentiate(engine)  # compiles
-    ways = {"JAX": partial(differentiate, "jax"), "forward": forward}
-    found = turns("", {"native": partial(differentiate, "native"), **ways}, 2)
-    return {
-        "gradient of 200 steps, to forward": round(1.0 / found[", to forward"], 2),
-        "gradient of 200 steps, to JAX": round(1.0 / found[", to JAX"], 3),
-    }
-
-
 def measure_command(_: Yardstick | None) -> Row:
     """Return the wall time of `echelon run paper` when what it compiles is kept already."""
     walls = list[float]()
@@ -386,7 +358,7 @@ GROUPS: dict[str, list[Measure]] = {
     "million": [partial(measure_ring, _MILLION, bits) for bits in _BITS],
     "geometric": [partial(measure_geometric, 32)],
     "fleet": [measure_fleet, measure_sweep],
-    "models": [measure_models, measure_gradient, measure_command],
+    "models": [measure_models, measure_command],
     "peers": [measure_peers],
 }
 
@@ -394,10 +366,14 @@ GROUPS: dict[str, list[Measure]] = {
 def _reloaded(text: str) -> float:
     """Return the CPU seconds in which code is there again that was kept."""
     with tempfile.TemporaryDirectory() as folder:
-        Code(text, PrivateFolder(Path(folder)))
+        before = jax.config.values["jax_compilation_cache_dir"]
+        jax.config.update("jax_compilation_cache_dir", folder)
+        Code(text)
         begin = time.process_time()
-        Code(text, PrivateFolder(Path(folder)))
-        return time.process_time() - begin
+        Code(text)
+        spent = time.process_time() - begin
+        jax.config.update("jax_compilation_cache_dir", before)
+        return spent
 
 
 def missed(row: Row) -> list[str]:

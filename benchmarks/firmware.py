@@ -5,9 +5,9 @@ holds `cffirmware`, the firmware's Python bindings, which Bitcraze's documentati
 build ("Python bindings" of crazyflie-firmware). It needs the extra `crazyflie` too.
 
 The firmware's attitude controller and its distribution of power to four motors act on the rigid
-bodies of `tests/fake_vehicles.py`, behind the packets of `tests/fake_crazyflie.py`. Radio,
-estimator, battery and scheduler are not the firmware's. Four fly in formation as in
-`tests/flight/test_autopilots_in_flight.py`, and the last 8 s count.
+bodies of `fake_vehicles.py`, behind the packets of `fake_crazyflie.py`, both in
+`packages/flight/tests/`. Radio, estimator, battery and scheduler are not the firmware's. Four fly
+in formation as in `tests/flight/test_autopilots_in_flight.py`, and the last 8 s count.
 """
 
 import argparse
@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-TESTS = Path(__file__).resolve().parents[1] / "tests"
-sys.path[:0] = [str(TESTS), str(TESTS / "flight")]
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT / "packages" / "flight" / "tests"), str(ROOT / "tests" / "flight")]
 
 FULL, MOTOR, MASS, LAG = 0.48, 0.12, 0.029, 0.03
 """N of all motors and of one, kg, s: of a Crazyflie 2.1+, with batteries compensated."""
@@ -143,7 +143,7 @@ def fly(options: argparse.Namespace, law: str) -> None:
     from cflib.crazyflie.swarm import Swarm  # type: ignore[import-not-found]
 
     from echelon.agents.models import CrazyflieAttitude
-    from echelon.flight.links.cflib_link import CflibLink
+    from echelon_flight.links.crazyflie import CflibLink
 
     cflib.crtp.CLASSES or cflib.crtp.init_drivers()
     model = CrazyflieAttitude.named("firmware")

@@ -46,29 +46,29 @@ def prepare(case: str, folder: Path) -> None:
 
 def fly(folder: Path, options: argparse.Namespace, kills: bool) -> None:
     """Fly, and print what was measured."""
-    from echelon.flight.local_flight import Together, flying
-    from echelon.flight.mission import Mission
+    from echelon_flight.local_flight import LocalFlight
+    from echelon_flight.mission import Mission
 
     mission = Mission(folder)
     own = [str(Path(__file__).resolve()), "--plant", str(folder)] if options.mujoco else []
     seconds = 2.0 + APART * mission.agents if kills else HORIZON
-    together = Together(mission, seconds, options.speed, 47300, vehicles=own)
+    flight = LocalFlight(mission, seconds, options.speed, 47300, vehicles=own)
     falls, heir = list[float](), folder.name == "heir"
-    with flying(together):
-        ready = max(together.ready.values())
-        memory = max(together.memory(k) for k in range(mission.agents))
+    with flight:
+        ready = max(flight.ready.values())
+        memory = max(flight.memory(k) for k in range(mission.agents))
         for k in range(mission.agents if kills else 0):
-            wait(together, 4.0 + APART * k)
-            falls.append(together.time())
-            together.kill(k)
-            wait(together, falls[-1] + DEAD)
-            together.start_agent(k)
+            wait(flight, 4.0 + APART * k)
+            falls.append(flight.time())
+            flight.kill(k)
+            wait(flight, falls[-1] + DEAD)
+            flight.start_agent(k)
         if heir:
-            hand_over(together)
+            hand_over(flight)
             # From now on its place is what the others' are measured from.
             mission.facts["leader"] = 1
-        wait(together, seconds - 0.1)
-        errors = together.errors()
+        wait(flight, seconds - 0.1)
+        errors = flight.errors()
     print(f"  ready after {ready:.2f} s at most, {memory:.1f} MB at most; late {errors.late} times")
     followers = [k for k in range(heir, mission.agents) if k != mission.facts["leader"]]
     for k, fall in enumerate(falls):
@@ -87,13 +87,13 @@ def fly(folder: Path, options: argparse.Namespace, kills: bool) -> None:
         print(f"  {1e3 * worst:.1f} mm at most in the last 4 s, {1e3 * mean:.1f} mm RMS")
 
 
-def hand_over(together: Any) -> None:
+def hand_over(flight: Any) -> None:
     """Kill the leader, and wait until an heir says that it leads."""
-    wait(together, 6.0)
-    fall = together.time()
-    together.kill(0)
-    while (report := together.ground.report(1)) is None or report.leader != 1:
-        if together.time() > fall + 3.0:
+    wait(flight, 6.0)
+    fall = flight.time()
+    flight.kill(0)
+    while (report := flight.ground.report(1)) is None or report.leader != 1:
+        if flight.time() > fall + 3.0:
             print("  nobody took the lead")
             return
         time.sleep(0.005)
@@ -101,9 +101,9 @@ def hand_over(together: Any) -> None:
     print(f"  leader killed: agent 1 leads after {report.time - fall:.2f} s at most")
 
 
-def wait(together: Any, t: float) -> None:
+def wait(flight: Any, t: float) -> None:
     """Wait until a time of the plan."""
-    while together.time() < t:
+    while flight.time() < t:
         time.sleep(0.005)
 
 
@@ -113,8 +113,8 @@ def simulate(folder: Path, speed: float, port: int) -> None:
     from mujoco_flight import bodies, place, state
 
     import echelon as ech
-    from echelon.flight.mission import Mission
-    from echelon.flight.vehicles import Vehicles
+    from echelon_flight.mission import Mission
+    from echelon_flight.simulated_vehicles import Vehicles
 
     mission = Mission(folder)
     facts, model = mission.facts["vehicles"], ech.models.Quadrotor.crazyflie()

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import echelon as ech
-from echelon.agents.references.demand import reference_targets
+from echelon.agents.references.flatness import reference_targets
 from echelon.core.errors import PlanError
 from echelon.simulation.optimal.horizon import Course, Horizon
 

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 import echelon as ech
-from echelon.agents.references.demand import Targets, reference_targets, shifted_targets
+from echelon.agents.references.flatness import Targets, reference_targets, shifted_targets
 from echelon.simulation.optimal.formation_plan import plan_tracking
 from echelon.simulation.optimal.objectives import PlanTimes, TrackingOptions, coarse, grid, tracking
 from echelon.simulation.optimal.problem import OptimalControl

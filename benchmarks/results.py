@@ -11,7 +11,7 @@ import numpy as np
 from pages import write_part
 
 import echelon as ech
-from echelon.core.provenance import versions
+from echelon.core.files import versions
 
 OFFSETS = {1: (1.0, 0.0, 0.0), 2: (1.0, 0.8, 0.0), 3: (1.0, -0.8, 0.0)}
 

@@ -15,14 +15,12 @@ from typing import Any, TypeAlias, final
 import numpy as np
 
 from echelon.simulation.codegen import Body, Code, Plan, aligned, program, shared
-from echelon.simulation.codegen.fast_path import general_case
+from echelon.simulation.codegen.emitter import general_case
 from echelon.simulation.native.agent_step import body_of
 from echelon.simulation.native.kernel_cache import LANES
-from echelon.simulation.native.schedule import step_by_step
 from echelon.simulation.native.stepper import NativeStepper
-from echelon.simulation.native.threads import call
-from echelon.simulation.scalars import Node
-from echelon.simulation.scalars.scalar_graph import needed, rewritten
+from echelon.simulation.native.threads import call, step_by_step
+from echelon.simulation.scalars import Node, needed, rewritten
 
 Run: TypeAlias = Callable[[np.ndarray, int], None]
 """Takes some steps of agents in rows (blocks, rows, lanes)."""

@@ -16,10 +16,10 @@ import echelon as ech
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.experiments.results.metrics import metrics
-from echelon.guarantees.stopping.motor_load import motors_suffice_for
+from echelon.guarantees.stopping.motor_load import motor_load_of
 from echelon.guarantees.stopping.stopping_run import stopping_run_of
 from echelon.simulation.engine.batch import Batch
-from echelon.simulation.engine.initial import Starts
+from echelon.simulation.engine.parts import Starts
 from echelon.simulation.engine.prepare import prepare
 
 GENTLE = (
@@ -43,7 +43,7 @@ def inside(count: int, *changes: str) -> int:
     with precision("float64"):
         starts = map(Starts(parts), range(count))
         runs = (stopping_run_of(parts, settings, states) for states in starts)
-        return sum(run is not None and motors_suffice_for(run) for run in runs)
+        return sum(motor_load_of(run)[0] is not None for run in runs)
 
 
 def table_of_starts(count: int) -> None:

@@ -12,10 +12,9 @@ sys.path.insert(0, str(HERE.parent / "tests"))
 from browser import chromium, opened, until  # noqa: E402 - of the tests
 
 import echelon as ech  # noqa: E402
-from echelon.apps.live.server import live, serve_live  # noqa: E402
-from echelon.experiments.results.dataset import recording_of  # noqa: E402
+from echelon.apps.live.server import live, live_page  # noqa: E402
+from echelon.experiments.results.recording import recording_of  # noqa: E402
 from echelon.output.viewer.replay import replay_page  # noqa: E402
-from echelon.output.viewer.serve import serving  # noqa: E402
 
 SHORT = ("simulation.horizon=20", "simulation.store_every=4")
 
@@ -33,7 +32,7 @@ def main() -> None:
         file.unlink()
         session, html = live(ech.load_scenario("paper"))
         session.start()
-        with serving(serve_live(session, html, 0)) as address, opened(browser, address) as page:
+        with live_page(session, html).serving(0) as address, opened(browser, address) as page:
             until(lambda: page.evaluate("echelon.time") > 8.0, 90.0)
             until(lambda: page.evaluate("echelon.promise.state") == "holds", 90.0)
             page.evaluate("echelon.ask('kick', 2)")

@@ -39,6 +39,9 @@ QUICKLY_COMPILED = " ".join(
 MAPPINGS = 30_000
 """Memory mappings from which on compiled programs are let go of between files."""
 
+DURATIONS = Path(__file__).resolve().parents[1] / "build" / "durations.csv"
+"""What each test took when it last ran: an artefact of a whole run, to cut from its top."""
+
 LIMIT = 5.0
 """Seconds of a processor from which on a test is `slow` or `study`; it fails from twice as many."""
 
@@ -107,10 +110,24 @@ def pytest_terminal_summary(terminalreporter):
     """Name the tests that take long and have no mark; how long depends on the machine."""
     reports = terminalreporter.getreports("passed")
     facts = [(report.nodeid, dict(report.user_properties)) for report in reports]
+    keep_durations({name: x["processor_time"] for name, x in facts if x})
     slow = [(x["processor_time"], name) for name, x in facts if x and not x["long"]]
     slow = sorted(pair for pair in slow if pair[0] > 2.0 * LIMIT)
     for spent, name in slow[::-1]:
         terminalreporter.write_line(f"{spent:.0f} s of a processor, and not marked `slow`: {name}")
+
+
+def keep_durations(spent):
+    """Write the seconds of a processor of each test, the longest first; others' stay."""
+    known = dict(line.rsplit(",", 1) for line in lines_of(DURATIONS))
+    known |= {name: f"{seconds:.2f}" for name, seconds in spent.items()}
+    DURATIONS.parent.mkdir(exist_ok=True)
+    longest = sorted(known.items(), key=lambda pair: -float(pair[1]))
+    DURATIONS.write_text("".join(f"{name},{seconds}\n" for name, seconds in longest), "utf-8")
+
+
+def lines_of(file):
+    return file.read_text("utf-8").splitlines() if file.exists() else []
 
 
 check_shapes()

@@ -54,12 +54,12 @@ def text_of(function, count, bits=64, lanes=None):
     return program(plan), len(results), plan
 
 
-def run(function, columns, bits=64, lanes=None, cache=None):
+def run(function, columns, bits=64, lanes=None):
     """Return what a function for JAX makes of columns (count, N), as (results, N)."""
-    return run_with_exceptions(function, columns, bits, lanes, cache)[:-1]
+    return run_with_exceptions(function, columns, bits, lanes)[:-1]
 
 
-def run_with_exceptions(function, columns, bits=64, lanes=None, cache=None):
+def run_with_exceptions(function, columns, bits=64, lanes=None):
     """Return the same, and in a last row 1 for each column of which JAX is to make it."""
     lanes, (count, agents) = lanes or 512 // bits, columns.shape
     text, results, plan = text_of(function, count, bits, lanes)
@@ -74,6 +74,6 @@ def run_with_exceptions(function, columns, bits=64, lanes=None, cache=None):
     values |= dict.fromkeys(("steps", "count", "groups", "threads"), 1)
     for name, value in values.items():
         slots[SLOTS.index(name)] = value
-    Code(text, cache).call(slots)
+    Code(text).call(slots)
     after = rows[:, count:].transpose(0, 2, 1)
     return after.reshape(blocks * lanes, results + 1)[:agents].T.copy()

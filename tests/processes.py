@@ -1,8 +1,7 @@
-"""Helpers that run the command line in a process of its own, and read its log; free ports."""
+"""Helpers that run the command line in a process of its own, and read its log."""
 
 import contextlib
 import re
-import socket
 import subprocess
 import sys
 import time
@@ -11,13 +10,6 @@ import time
 def without_status(text):
     """A log without the lines that say what the program is doing."""
     return re.sub(r"^echelon: [^\n]* \.\.\.( [^\n]*)?\n", "", text, flags=re.MULTILINE)
-
-
-def free_port():
-    """A port of UDP on this machine that nobody uses."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @contextlib.contextmanager

@@ -21,7 +21,7 @@ import pytest
 import echelon as ech
 from echelon.apps.cli.app import main
 from echelon.experiments.scenario.registry import METHODS
-from echelon.output.reports.printed import PRINTED
+from echelon.output.reports.run_report import PRINTED
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -205,7 +205,7 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
 
     def call(*arguments):
         command = [sys.executable, "-m", "echelon", "design", "pushed.yaml", *arguments]
-        given = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        given = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
         return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=given)
 
     done = call("--json")

@@ -18,8 +18,6 @@ def __getattr__(name: str) -> Any:
     try:
         return _load(name)
     except AttributeError as error:
-        from echelon.core.gone import NAMES, gone
+        from echelon.core.gone import no_name
 
-        raise AttributeError(
-            f"`echelon.{name}`{gone(NAMES, name) or ' does not exist.'}"
-        ) from error
+        raise no_name(name) from error

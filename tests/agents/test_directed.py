@@ -10,8 +10,8 @@ import scipy.linalg
 import echelon as ech
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import wrap_angles
-from echelon.agents.network.eigenvalues import _least
 from echelon.agents.network.hearing import heard_along
+from echelon.agents.network.spectrum import _least
 from echelon.core.digits import at_most
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision

@@ -23,11 +23,12 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references import Hover
 from echelon.agents.world.disturbance import Disturbance
-from echelon.agents.world.plant import differences, vary_parameters
+from echelon.agents.world.world import differences, vary_parameters
 from echelon.core.errors import EchelonError, Outcome, ScenarioError
 from echelon.core.numerics import precision
-from echelon.experiments.results.dataset import dataset, summary
+from echelon.experiments.results.dataset import dataset
 from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.results.summary import summary
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.named_class import resolve

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.agents.world.estimator import Estimator
+from echelon.agents.world.sensing import Estimator
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision, rk4
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.agents.models.heading import Heading
 from echelon.agents.models.heading_symmetry import (
     heading_gap,
     input_turn,
     rotate_state,
     state_turn,
 )
+from echelon.agents.models.model import Heading
 from echelon.core.errors import LawError, ModelError
 from echelon.experiments.results.lyapunov import lyapunov
-from echelon.guarantees.promises.turning import steady_turn
+from echelon.guarantees.promises.modes import steady_turn
 from echelon.laws.law import LocalView
 
 QUADROTOR = ech.models.Quadrotor.crazyflie()

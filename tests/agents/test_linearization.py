@@ -14,7 +14,7 @@ from echelon.agents.models.linearization import (
     linearize,
     trim_slopes,
 )
-from echelon.core.memoize import memoize
+from echelon.core.cache import memoize
 from echelon.core.numerics import precision
 
 

@@ -34,8 +34,8 @@ from echelon.agents.models import (
     UnicyclePoint,
     VanDerPol,
 )
-from echelon.agents.models.crazyflie_attitude import ATTITUDE_PARAMETERS
 from echelon.agents.models.model_check import check_model
+from echelon.agents.models.quadrotor_euler import ATTITUDE_PARAMETERS
 from echelon.agents.models.rigid_body import body_rates, euler_rates, free_spin
 from echelon.core import numerics
 from echelon.core.errors import ModelError

@@ -12,9 +12,9 @@ from ruamel.yaml import YAML
 import echelon as ech
 from echelon.agents.models.chains import chains_of
 from echelon.agents.references import FigureEight, Polynomials, Waypoints
-from echelon.agents.references.demand import reference_warnings
+from echelon.agents.references.flatness import reference_warnings
 from echelon.core.numerics import precision
-from echelon.guarantees.stopping.path_smoothness import path_fault
+from echelon.guarantees.stopping.path_bounds import path_fault
 
 TIMES = np.array([0.0, 1.0, 2.5, 4.0])
 POINTS = np.array([[0.0, 0.0, 1.0], [1.0, -0.5, 1.5], [2.0, 0.5, 1.0], [2.0, 0.0, 0.5]])

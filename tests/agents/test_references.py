@@ -20,7 +20,7 @@ from echelon.agents.references import (
     StatePath,
     Waypoints,
 )
-from echelon.agents.references.demand import reference_warnings
+from echelon.agents.references.flatness import reference_warnings
 from echelon.core import numerics
 from echelon.experiments.scenario import registry
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from echelon.agents.models import PlanarQuadrotor, Quadrotor
 from echelon.agents.models.rigid_body import (
+    attitude_priority,
     body_rates,
     check_inertia,
     euler_rates,
@@ -18,7 +19,6 @@ from echelon.agents.models.rigid_body import (
     thrust_axis,
     tilt_towards,
 )
-from echelon.agents.models.rotors import attitude_priority
 from echelon.core import numerics
 from echelon.core.errors import ModelError
 

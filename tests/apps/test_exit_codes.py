@@ -12,7 +12,7 @@ from processes import without_status
 from runs import simulate
 
 import echelon as ech
-from echelon.apps.cli import crash
+from echelon.apps.cli import app
 from echelon.core.errors import Outcome
 
 LEAVES = """
@@ -56,25 +56,23 @@ def test_help_names_every_code(echelon):
     assert [int(x) for x in re.findall(r"\b(\d+)\b", told)] == [0, 1, 2, 3, 4, 5, 70, 130, 143, 141]
 
 
-@pytest.mark.parametrize("where", ["top", "inside"])
-@pytest.mark.parametrize("command", ["run", "check"])
-def test_a_users_file_that_leaves_is_bad_input(here, echelon, where, command):
-    lines = {"top": "", "inside": "pass"} | {where: "sys.exit(0)"}
-    (here / "mine.py").write_text(LEAVES.format(**lines))
-    code, out, err = echelon(command, "mine.yaml")
-    assert code == 2 and out == "" and err.count("\n") == 1 and err.startswith("echelon: ")
-    assert "SystemExit" in err or "`sys.exit(0)`" in err
-    assert not (here / "runs").exists()
+def test_a_users_file_that_leaves_is_bad_input(here, echelon):
+    for command, where in (("run", "top"), ("check", "inside")):
+        lines = {"top": "", "inside": "pass"} | {where: "sys.exit(0)"}
+        (here / "mine.py").write_text(LEAVES.format(**lines))
+        code, out, err = echelon(command, "mine.yaml")
+        assert code == 2 and out == "" and err.count("\n") == 1 and err.startswith("echelon: ")
+        assert "SystemExit" in err or "`sys.exit(0)`" in err
+        assert not (here / "runs").exists()
 
 
-@pytest.mark.parametrize("command", ["check", "design", "run"])
-def test_a_fault_of_echelons_own_is_no_verdict(here, echelon, monkeypatch, command):
+def test_a_fault_of_echelons_own_is_no_verdict(here, echelon, monkeypatch):
     def fail(*_):
         raise ZeroDivisionError("nothing by nothing\nand more")
 
     monkeypatch.setattr("tempfile.tempdir", str(here))
     monkeypatch.setattr("echelon.experiments.scenario.build._graph", fail)
-    code, out, err = echelon(command, "integrators")
+    code, out, err = echelon("check", "integrators")
     assert code == 70 and out == ""
     said = re.fullmatch(
         r"echelon: internal error of echelon \(your input may be correct\): "
@@ -83,7 +81,7 @@ def test_a_fault_of_echelons_own_is_no_verdict(here, echelon, monkeypatch, comma
     )
     assert said is not None
     details = Path(said[1]).read_text()
-    assert command in details.splitlines()[0] and "'jax'" in details
+    assert "check" in details.splitlines()[0] and "'jax'" in details
     assert "Traceback" in details and "in fail" in details
 
 
@@ -91,8 +89,8 @@ def test_details_that_no_disk_takes_are_shown(monkeypatch, capsys):
     def full(*_, **__):
         raise OSError("no room")
 
-    monkeypatch.setattr(crash.tempfile, "NamedTemporaryFile", full)
-    assert "report it with the details above" in crash.note_crash(ValueError("odd"))
+    monkeypatch.setattr(app.tempfile, "NamedTemporaryFile", full)
+    assert "report it with the details above" in app.note_crash(ValueError("odd"))
     assert "ValueError: odd" in capsys.readouterr().err
 
 
@@ -123,43 +121,26 @@ def test_a_reader_that_has_left_is_no_fault(tmp_path):
     assert left_by_reader(tmp_path, "check", "integrators") == (141, "")
 
 
-COMMANDS = [
-    "--help",
-    "check integrators --json",
-    "design integrators --out again.json",
-    "verify gain.json",
-    "compare integrators --horizon 0.5 --no-figures --out compared",
-    "schema",
-    "doctor",
-]
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        pytest.param(line.split(), marks=pytest.mark.slow if "again" in line else pytest.mark.study)
-        for line in COMMANDS
-    ],
-    ids=lambda words: words[0],
-)
-def test_every_command_goes_on_without_its_reader(tmp_path, echelon, arguments):
+@pytest.mark.study
+def test_every_command_goes_on_without_its_reader(tmp_path, echelon):
     assert echelon("design", "integrators", "--out", tmp_path / "gain.json")[0] == 0
-    assert left_by_reader(tmp_path, *arguments) == (141, "")
-    if "--out" in arguments:
-        assert (tmp_path / arguments[-1]).exists()
+    lines = [
+        "--help",
+        "check integrators --json",
+        "design integrators --out again.json",
+        "verify gain.json",
+        "compare integrators --horizon 0.5 --no-figures --out compared",
+        "schema",
+        "doctor",
+    ]
+    codes = {line: left_by_reader(tmp_path, *line.split()) for line in lines}
+    assert codes == dict.fromkeys(lines, (141, ""))
+    assert (tmp_path / "again.json").exists() and (tmp_path / "compared").exists()
 
 
 def test_a_run_is_written_whole_whoever_reads(tmp_path):
     """Both streams go to one pipe, as with `2>&1 | head -0`."""
-    words = [
-        "run",
-        "integrators",
-        "--set",
-        "simulation.horizon=0.1",
-        "--no-figures",
-        "--out",
-        "kept",
-    ]
+    words = "run integrators --set simulation.horizon=0.1 --no-figures --out kept".split()
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     with started(*words, cwd=tmp_path, **pipes) as process:
         process.stdout.close()

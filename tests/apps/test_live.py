@@ -20,7 +20,7 @@ from echelon.apps.live import swarm as looked
 from echelon.apps.live.attendance import as_changes
 from echelon.apps.live.guarantee_status import GuaranteeStatus, Promiser, badge_of, first_look
 from echelon.apps.live.panel import Panel
-from echelon.apps.live.server import live, serve_live
+from echelon.apps.live.server import live, live_page
 from echelon.apps.live.session import Session
 from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.digits import at_least
@@ -30,7 +30,6 @@ from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import scenario_from_mapping
 from echelon.experiments.scenario.yaml import dump_yaml, read_yaml
 from echelon.output.viewer.replay import link_shades
-from echelon.output.viewer.serve import serving
 from echelon.simulation.native import kernel_cache
 from echelon.simulation.step import sequence
 
@@ -646,7 +645,7 @@ def page():
     follower = {"law": "consensus", "gain": {"method": "riccati", "R": [0.02, 0.02]}}
     session, html = live(scenario(follower=follower))
     session.start()
-    with serving(serve_live(session, html, 0)) as address:
+    with live_page(session, html).serving(0) as address:
         yield session, address
     session.end()
 

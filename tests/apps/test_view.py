@@ -4,8 +4,6 @@ import dataclasses
 import itertools
 import json
 import struct
-import urllib.error
-import urllib.request
 import zlib
 
 import numpy as np
@@ -15,19 +13,20 @@ from recordings import flown, separated, swinging
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
-from echelon.experiments.results.dataset import recording_of
+from echelon.experiments.results.recording import recording_of
 from echelon.output.plots.space import space_of
-from echelon.output.viewer.growing import Growing, serve_growing
-from echelon.output.viewer.pack import Group, pack
+from echelon.output.viewer.page import Group, pack
 from echelon.output.viewer.replay import (
+    Growing,
     frames_of,
+    growing_page,
     header,
     link_shades,
     promise_badge,
     replay_data,
     replay_page,
 )
-from echelon.output.viewer.serve import Handler, serve, serving
+from echelon_flight.page_server import Handler
 
 
 @pytest.fixture(scope="module")
@@ -279,6 +278,7 @@ def test_keys_choose_an_agent_and_are_listed_and_the_address_is_a_link_to_the_ti
         for key, agent in (("n", 0), ("n", 1), ("p", 0), ("p", 3), ("Escape", -1)):
             page.keyboard.press(key)
             assert page.evaluate("echelon.player.view.selected") == agent
+        assert not page.locator(".report").is_visible()
         page.keyboard.press("?")
         told = page.locator("#help").inner_text()
         assert "select the next agent" in told and "play, pause" in told
@@ -435,10 +435,18 @@ def test_the_reference_is_drawn_and_the_leader_s_error_told(browser, run, tmp_pa
 def test_two_runs_have_one_clock_one_scale_and_one_camera(browser, run, tmp_path):
     other = flown(seconds=3.0, rate=25.0)
     path = tmp_path / "runs.html"
-    path.write_text(replay_page(other, dataclasses.replace(run, name="second")), "utf-8")
+    both = other, dataclasses.replace(run, name="second")
+    path.write_text(replay_page(*both, reports=["one\n---\n- <first>", "two"]), "utf-8")
     moments = "echelon.player.panes.map((pane) => pane.run.moment.time)"
     with opened(browser, path.as_uri()) as page:
         assert page.locator("header h1").inner_text() == "made up and second"
+        for k, text in enumerate(("one\n---\n- <first>", "two")):
+            page.locator(".report").nth(k).click()
+            assert page.locator("dialog pre").inner_text() == text
+            page.keyboard.press("End")
+            page.locator("dialog button").click()
+            until(lambda: not page.locator("dialog").count())
+        assert page.evaluate(moments) == [0.0, 0.0]
         for time, shown in ((2.0, [2.0, 2.0]), (5.0, [3.0, 5.0])):
             page.evaluate(f"echelon.player.seekTime({time})")
             assert page.evaluate(moments) == pytest.approx(shown)
@@ -513,7 +521,7 @@ def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_en
     run = dataclasses.replace(run, reference=run.states[:, 0] + 0.1)
     growing = Growing(run)
     first, second, third = parts_of(run, (0, 90, 91, 301))
-    with serving(serve_growing(growing, 0)) as address, opened(browser, address) as page:
+    with growing_page(growing).serving(0) as address, opened(browser, address) as page:
         assert page.evaluate("echelon.run.growing") and page.evaluate("echelon.last") == 0
         growing.add(first)
         until(lambda: page.evaluate("echelon.last") == 89)
@@ -543,10 +551,12 @@ def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_en
         chart = page.locator(".chart").nth(1).inner_text().replace("\n", " ")
         assert f"V {run.lyapunov[120]:.3g}" in chart and "guaranteed slope, −1 1/s" in chart
         with page.expect_event("load"):
-            growing.finish(run)
+            growing.finish(run, "all of it")
         # A time in between, so that the frame is rounded.
         shown = "Math.round(window.echelon?.frame) === 120 && !echelon.run.growing"
         until(lambda: page.evaluate(shown))
+        page.locator(".report").click()
+        assert page.locator("dialog pre").inner_text() == "all of it"
 
 
 # ---- other models -----------------------------------------------------------------------------
@@ -738,7 +748,7 @@ BAD = {
     "nothing": ("none", "`none` does not exist; give the folder of a run, or its `run.nc`."),
     "no run": (".", "the folder `.` holds no run: it has no `run.nc`."),
     "damaged": ("junk.nc", "`junk.nc` cannot be read as a run: it is damaged, or was not written"),
-    "older": ("old.nc", "`old.nc`: the run was written in format 1 by echelon "),
+    "older": ("old.nc", "`old.nc`: the run has format 1, of echelon "),
 }
 
 
@@ -756,38 +766,11 @@ def test_what_is_no_run_is_refused_in_a_sentence(echelon, here, stored, name):
     assert not (here / "out.html").exists()
 
 
-class Shown(Handler):
-    page = b"<html>"
-
-
-def answer(address, **headers):
-    request = urllib.request.Request(address, headers=headers)
-    try:
-        with urllib.request.urlopen(request, timeout=10) as got:
-            return got.status, got.read()
-    except urllib.error.HTTPError as error:
-        return error.code, error.read()
-
-
-def test_only_pages_of_this_server_are_answered_and_a_port_in_use_is_left(browser):
-    first = serve(Shown, 0)
-    port = first.server_address[1]
-    with serving(first) as address, serving(serve(Shown, port)) as other:
-        assert other != address
-        assert answer(address) == (200, b"<html>")
-        own = address.rstrip("/")
-        assert answer(address, Origin=own)[0] == 200
-        assert answer(address, Origin="http://example.org")[0] == 403
-        assert answer(address, Host="example.org")[0] == 403
-        assert answer(address, Host=f"example.org:{port}")[0] == 403
-        assert answer(address + "else")[0] == 404
-
-
 def test_a_page_that_is_served_is_drawn_too(browser, run):
     class Page(Handler):
         page = replay_page(run).encode()
 
-    with serving(serve(Page, 0)) as address, opened(browser, address) as page:
+    with Page.serving(0) as address, opened(browser, address) as page:
         assert page.evaluate("echelon.last") == 300
 
 
@@ -800,7 +783,7 @@ def test_a_notebook_shows_the_replay_in_a_cell_without_a_guarantee(browser, stor
         head = "<link rel='icon' href='data:,'><script>window.echelon = 1</script>"
         page = (head + shown._repr_html_()).encode()
 
-    with serving(serve(Notebook, 0)) as address, opened(browser, address) as page:
+    with Notebook.serving(0) as address, opened(browser, address) as page:
         cell = page.frames[1]
         until(lambda: cell.evaluate("Boolean(window.echelon)"))
         cell.evaluate("echelon.seek(echelon.last)")

@@ -22,11 +22,17 @@ from quadrotor_hulls import (
 from scipy.optimize import linprog
 
 from echelon.agents.models import Pendulum, PlanarQuadrotor, Quadrotor, UnicyclePoint, VanDerPol
-from echelon.core.enclosure.atoms import Atoms, OpenError, corner_values
-from echelon.core.enclosure.curve_polygons import power_points, wave_points
+from echelon.core.enclosure.atoms import (
+    Atoms,
+    OpenError,
+    constant,
+    corner_values,
+    divides,
+    power_points,
+    wave_points,
+)
 from echelon.core.enclosure.hull import Box, slope_hull, value_hull
 from echelon.core.enclosure.interval import ELEMENTARY, Interval, circle, pi, point, wave
-from echelon.core.enclosure.polynomial import constant, divides
 from echelon.core.enclosure.slopes import JumpError
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision

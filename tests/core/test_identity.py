@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import types
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any
@@ -14,8 +15,10 @@ import pytest
 
 import echelon as ech
 from echelon.agents.models import Pendulum, VanDerPol
+from echelon.agents.models.linearization import linearize
+from echelon.core.cache import BoundedCache, memoize
+from echelon.core.compiled import cached_jit
 from echelon.core.identity import digest, foreign_key, process_key
-from echelon.core.memoize import BoundedCache, memoize
 from echelon.core.words import Feedforward, Kind
 
 
@@ -35,12 +38,12 @@ def test_an_array_that_is_modified_in_place_is_another_value():
         assert digest([array]) != before[0] and process_key([array]) != before[1]
 
 
-@pytest.mark.parametrize("wrap", [float, np.float64, np.asarray, jnp.asarray, lambda x: [1, (x,)]])
-def test_zeros_of_either_sign_differ_and_a_nan_is_itself(wrap):
-    zero, minus, nan = (digest(wrap(x)) for x in (0.0, -0.0, float("nan")))
-    assert None not in (zero, minus, nan) and len({zero, minus, nan}) == 3
-    assert digest(wrap(float("nan"))) == nan
-    assert process_key(wrap(-0.0)) != process_key(wrap(0.0))
+def test_zeros_of_either_sign_differ_and_a_nan_is_itself():
+    for wrap in (float, np.float64, np.asarray, jnp.asarray, lambda x: [1, (x,)]):
+        zero, minus, nan = (digest(wrap(x)) for x in (0.0, -0.0, float("nan")))
+        assert None not in (zero, minus, nan) and len({zero, minus, nan}) == 3
+        assert digest(wrap(float("nan"))) == nan
+        assert process_key(wrap(-0.0)) != process_key(wrap(0.0))
 
 
 def test_the_type_and_the_shape_of_numbers_count():
@@ -79,14 +82,13 @@ def test_a_static_field_counts_and_may_hold_an_array():
     assert process_key(Scaled(factors=numbers)) not in keys
 
 
-@pytest.mark.parametrize(
-    "value",
-    [Scaled(), Scaled, lambda x: x, Decimal(1), [1, {"a": (Scaled(),)}], frozenset([1])],
-    ids=["model", "class", "function", "decimal", "nested", "set"],
-)
-def test_what_is_not_echelon_s_own_has_no_digest_but_a_key_in_this_process(value):
-    assert digest(value) is None
-    assert process_key(value) is not None and process_key(value) == process_key(value)
+def test_what_is_not_echelon_s_own_has_no_digest_but_a_key_in_this_process():
+    values = Scaled(), Scaled, lambda x: x, Decimal(1), [1, {"a": (Scaled(),)}], frozenset([1])
+    for value in values:
+        assert digest(value) is None
+        assert process_key(value) is not None and process_key(value) == process_key(value)
+    for value in ({1}, np.array([object()]), (1, [np.array([object()])])):
+        assert digest(value) is None and process_key(value) is None
 
 
 def test_a_user_s_class_that_is_defined_anew_is_another_one():
@@ -102,23 +104,13 @@ def test_numbers_that_are_equal_across_classes_are_told_apart():
     assert process_key(Fraction(1)) == process_key(Fraction(2, 2))
 
 
-@pytest.mark.parametrize("value", [{1}, np.array([object()]), (1, [np.array([object()])])])
-def test_what_has_no_hash_is_not_identified(value):
-    assert digest(value) is None and process_key(value) is None
-
-
 def test_keys_of_random_numbers_are_known_by_their_bits():
     assert digest(jax.random.key(1)) == digest(jax.random.key(1)) != digest(jax.random.key(2))
 
 
 def test_what_is_traced_is_not_identified():
     keys = []
-
-    def traced(x):
-        keys.append((digest([x]), process_key([x])))
-        return x
-
-    jax.make_jaxpr(traced)(1.0)
+    jax.make_jaxpr(lambda x: keys.append((digest([x]), process_key([x]))))(1.0)
     assert keys == [(None, None)]
 
 
@@ -183,3 +175,118 @@ def test_code_that_belongs_to_no_module_is_foreign():
     exec("def cost(sums):\n    return 2 * sums", names)
     assert names["cost"].__module__ is None
     assert foreign_key(names["cost"])
+
+
+# ---- what a user's code reads ----
+
+SPEED = 1.0
+MATRIX = np.array([[-1.0, 0.0], [0.0, -1.0]])
+TABLE = {"damping": [0.5]}
+OTHER = types.ModuleType("someone_s_numbers")
+OTHER.pull = 2.0
+
+
+def pull():
+    return OTHER.pull
+
+
+class Reader(ech.ControlAffine):
+    state_names, input_names = ("a", "b"), ("u",)
+    share = 1.0
+
+    def drift(self, x):
+        return SPEED * self.share * (MATRIX @ x) - TABLE["damping"][0] * x - pull() * x
+
+    def input_map(self, x):
+        return jnp.array([[0.0], [1.0]])
+
+
+def closed_over(slope):
+    class Closed(ech.ControlAffine):
+        state_names, input_names = ("a", "b"), ("u",)
+
+        def drift(self, x):
+            return slope[0] * x
+
+        def input_map(self, x):
+            return jnp.array([[0.0], [1.0]])
+
+    return Closed()
+
+
+@cached_jit
+def at_one(model):
+    return model.drift(jnp.ones(2))
+
+
+def test_what_a_class_reads_is_part_of_what_is_remembered(monkeypatch):
+    changes = {
+        "a number of its module": lambda: monkeypatch.setitem(globals(), "SPEED", 3.0),
+        "an entry of an array": lambda: MATRIX.__setitem__((0, 0), -5.0),
+        "another array": lambda: monkeypatch.setitem(globals(), "MATRIX", -7.0 * np.eye(2)),
+        "an entry of a table": lambda: monkeypatch.setitem(TABLE, "damping", [9.0]),
+        "a number of another module": lambda: monkeypatch.setitem(OTHER.__dict__, "pull", 6.0),
+        "an attribute of the class": lambda: monkeypatch.setattr(Reader, "share", 4.0),
+    }
+    before, faults = MATRIX.copy(), []
+    for what, change in changes.items():
+        model, again = Reader(), Reader()
+        linear, ones, key = linearize(model), np.asarray(at_one(model)), process_key(model)
+        assert linearize(again) is linear and process_key(again) == key
+        change()
+        changed = np.asarray(at_one(model))
+        close = np.allclose(linearize(model).A @ np.ones(2), changed, rtol=1e-6)
+        if process_key(model) == key or np.array_equal(ones, changed) or not close:
+            faults.append(what)
+        monkeypatch.undo()
+        MATRIX[:] = before
+    assert faults == []
+
+
+def test_what_a_function_closes_over_counts():
+    slope = [-1.0]
+    model = closed_over(slope)
+    assert linearize(model).A[0, 0] == -1.0
+    slope[0] = -2.0
+    assert linearize(model).A[0, 0] == -2.0
+
+
+def test_a_proof_is_not_that_of_numbers_that_changed(monkeypatch):
+    graph, settings = ech.Graph.path(3), ech.Settings(1.0, 0.01)
+
+    def parts():
+        model = Reader()
+        gain = ech.synthesize(model, graph, ech.gains.Contraction({}, rate=0.1))
+        drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+        return ech.Parts(model, graph, ech.Formation(np.zeros((3, 2))), drive)
+
+    first = parts()
+    slow = ech.promise(first, settings).rate
+    assert ech.promise(first, settings) is ech.promise(first, settings)
+    monkeypatch.setitem(globals(), "SPEED", 3.0)
+    assert ech.promise(first, settings).rate > slow + 0.5
+    assert ech.promise(parts(), settings).rate > slow + 0.5
+
+
+class Caller:
+    """An object that JAX takes as one constant."""
+
+    def __init__(self, slope):
+        self.slope = slope
+
+    def __call__(self, x):
+        return self.slope * SPEED * x
+
+
+@cached_jit
+def called(function):
+    return function(jnp.ones(2))
+
+
+def test_an_object_that_is_called_counts_with_what_it_holds_and_reads(monkeypatch):
+    function = Caller(2.0)
+    assert called(function)[0] == called(jax.tree_util.Partial(function))[0] == 2.0
+    monkeypatch.setitem(globals(), "SPEED", 3.0)
+    assert called(function)[0] == 6.0
+    function.slope = 5.0
+    assert called(function)[0] == 15.0

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from echelon.core.enclosure.curve_polygons import power_points, wave_points
+from echelon.core.enclosure.atoms import power_points, wave_points
 from echelon.core.enclosure.interval import ELEMENTARY, Interval, circle, outward, pi, point, wave
 
 FRACTIONS = st.fractions(-50, 50, max_denominator=1000)

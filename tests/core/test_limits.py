@@ -20,9 +20,8 @@ def settings(**changes):
     return ech.Settings(**{"horizon": 1.0, "dt": 0.1} | changes)
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
+def test_what_does_not_fit_is_refused_before_it_is_made():
+    cases = [
         (lambda: ech.Graph.path(HUGE), "1e+23 agents are asked for, and 1000000 fit"),
         (lambda: ech.Graph.ring(HUGE), "1e+23 agents"),
         (lambda: ech.Graph.star(HUGE), "1e+23 agents"),
@@ -35,21 +34,17 @@ def settings(**changes):
         (lambda: ech.Graph.geometric(MOST_AGENTS, 5.0), "5e+11 edges"),
         (lambda: ech.models.SingleIntegrator(HUGE), "1e+23 states of an agent are asked for"),
         (lambda: ech.models.DoubleIntegrator(2000), "4000 states of an agent are asked for"),
-        (
-            lambda: settings(horizon=2.5e9, dt=1e-3).check(),
-            "has 2.5e+12 steps of 0.001 s, and",
-        ),
+        (lambda: settings(horizon=2.5e9, dt=1e-3).check(), "has 2.5e+12 steps of 0.001 s, and"),
         (lambda: settings(horizon=1e308, dt=1e-308).check(), "has 1e+616 steps"),
         (lambda: settings(dt=1e-308).check(), "has 1e+308 steps"),
         (lambda: settings(store_every=HUGE).check(), "`store_every` is 1000000"),
         (lambda: settings(seed=HUGE).check(), "`seed` is 1000000"),
-    ],
-)
-def test_what_does_not_fit_is_refused_before_it_is_made(make, said):
-    with pytest.raises(ech.EchelonError) as refused:
-        make()
-    text = str(refused.value)
-    assert said in text and text.count("\n") == 0 and text.endswith(".")
+    ]
+    for make, said in cases:
+        with pytest.raises(ech.EchelonError) as refused:
+            make()
+        text = str(refused.value)
+        assert said in text and text.count("\n") == 0 and text.endswith(".")
 
 
 def test_a_run_that_stores_too_much_is_told_what_would_fit(monkeypatch):
@@ -75,17 +70,18 @@ class Nameless(ech.models.SingleIntegrator):
         return None
 
 
-@pytest.mark.parametrize("model", ["car", None, ech.models.SingleIntegrator, Nameless(2)])
-def test_a_model_is_checked_before_its_states_are_counted_and_ends_no_other_run(model):
+def test_a_model_is_checked_before_its_states_are_counted_and_ends_no_other_run():
     agent, graph = ech.models.SingleIntegrator(2), ech.Graph.path(3)
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
     right = ech.Parts(agent, graph, ech.Formation.from_offsets(agent, graph, {}), drive)
-    wrong = right.replace(model=model)
-    with pytest.raises(ModelError):
-        ech.simulate(wrong, settings())
-    first, second = Batch(1).fly([(wrong, settings()), (right, settings())])
-    assert isinstance(first, ModelError)
-    assert isinstance(second, ech.Result) and second.outcome is Outcome.COMPLETED
+    models = "car", None, ech.models.SingleIntegrator, Nameless(2)
+    wrong = [right.replace(model=model) for model in models]
+    for parts in wrong:
+        with pytest.raises(ModelError):
+            ech.simulate(parts, settings())
+    *refused, last = Batch(1).fly([(parts, settings()) for parts in (*wrong, right)])
+    assert [type(each) for each in refused] == [ModelError] * 4
+    assert isinstance(last, ech.Result) and last.outcome is Outcome.COMPLETED
 
 
 def test_a_run_without_room_is_refused_before_a_gain_is_made(monkeypatch):
@@ -120,10 +116,10 @@ def test_a_part_of_a_step_is_told_with_the_horizons_beside_it(steps, part, dt):
     assert [float(below), float(above)] == pytest.approx([steps * dt, (steps + 1) * dt], rel=1e-11)
 
 
-@pytest.mark.parametrize("window", [-1.0, 0.0, 1.1, np.nan, np.inf])
-def test_a_steady_window_lies_within_the_run(window):
-    with pytest.raises(ech.EchelonError, match="`steady_window` is .* at most the horizon"):
-        settings(steady_window=window).check()
+def test_a_steady_window_lies_within_the_run():
+    for window in (-1.0, 0.0, 1.1, np.nan, np.inf):
+        with pytest.raises(ech.EchelonError, match="`steady_window` is .* at most the horizon"):
+            settings(steady_window=window).check()
     settings(steady_window=1.0).check()
 
 

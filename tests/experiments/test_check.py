@@ -15,11 +15,9 @@ from hypothesis import strategies as st
 import echelon as ech
 from echelon.core.digits import at_most
 from echelon.core.linear import longest_step
-from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem, Verdict
-from echelon.experiments.studies.finite_condition import pair_values
-from echelon.experiments.studies.killing_residual import killing_residual
+from echelon.experiments.studies.assumptions import pair_values
 
 PATH = ech.Graph.path(4)
 LOW, _, HIGH = PATH.spectrum().eigenvalues
@@ -293,44 +291,6 @@ def test_a_linear_agent_is_certified_everywhere():
     assert (
         lines["certified set"].number_text == "radius inf" and "from everywhere" in found.sentence()
     )
-
-
-# ---- what g does ----
-
-
-def test_turning_the_input_stretches_distances_by_half():
-    # g S = (cos, -sin; sin, cos; 0, 1/l): dg_k/dheading is a unit vector, so in P = diag(1, 1, w)
-    # it stretches by half of 1 / sqrt(w), whatever the heading is.
-    agent = ech.models.UnicyclePoint()
-    domain = ech.certificates.Domain.about(agent, {"heading": 1.0})
-    for weight in (0.25, 1.0, 9.0):
-        with precision("float64"):
-            found, kind = killing_residual(agent, np.diag([1.0, 1.0, weight]), domain)
-        assert (found, kind) == (pytest.approx(0.5 / np.sqrt(weight)), Kind.SAMPLES)
-
-
-def test_a_constant_input_map_is_a_proof():
-    agent = ech.models.QuadrotorThrust()
-    domain = ech.certificates.Domain.about(agent, {"attitude": 0.3, "thrust": 1.0})
-    with precision("float64"):
-        assert killing_residual(agent, np.eye(13), domain) == (0.0, Kind.PROOF)
-
-
-def test_a_skew_input_is_killing_in_the_metric_that_it_turns():
-    class Turning(ech.ControlAffine):
-        state_names = ("x", "y")
-        input_names = ("spin",)
-
-        def drift(self, x):
-            return -x
-
-        def input_map(self, x):
-            return jnp.stack([-2.0 * x[1], x[0]])[:, None]
-
-    domain = ech.certificates.Domain.about(Turning(), {"x": 1.0, "y": 1.0})
-    with precision("float64"):
-        assert killing_residual(Turning(), np.diag([1.0, 2.0]), domain)[0] == pytest.approx(0.0)
-        assert killing_residual(Turning(), np.eye(2), domain)[0] == pytest.approx(0.5)
 
 
 # ---- the step ----

@@ -19,7 +19,7 @@ from echelon.experiments.studies.basin import (
     trial,
 )
 from echelon.experiments.studies.design import because, recommended
-from echelon.output.plots.design_figures import save_design_figures
+from echelon.output.plots.study_figures import save_design_figures
 
 PATH = ech.Graph.path(4)
 
@@ -163,21 +163,6 @@ def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to(echelo
     )
     long = recommended(tried, 1.0)
     assert "It needs a step below" in because(long, tried, 1.0)
-
-
-def test_an_inner_loop_comes_with_what_would_shorten_it(echelon):
-    _, out, _ = echelon("design", "paper-line", "--method", "inner-loop", "--json")
-    (row,) = json.loads(out)["methods"]
-    wanted = inner_loop_speedup("paper-line").sentence()
-    assert row["advice"] == wanted and "with agent 2 as a further leader" in wanted
-    _, out, _ = echelon("design", "paper-line", "--method", "inner-loop")
-    assert f"- inner-loop: {wanted}" in out
-
-
-def inner_loop_speedup(scenario):
-    parts, _ = parts_of(scenario)
-    gain = ech.synthesize(parts.model, parts.graph, ech.gains.InnerLoop())
-    return ech.speedup(parts.model, parts.graph, gain)
 
 
 def test_agents_whose_states_are_all_symmetric_have_an_inner_loop_too(echelon):

@@ -13,7 +13,7 @@ import echelon as ech
 from echelon.agents.models import Pendulum, SingleIntegrator
 from echelon.agents.models.model_check import check_model
 from echelon.core import numerics
-from echelon.core.provenance import versions
+from echelon.core.files import versions
 from echelon.experiments.scenario import registry
 from echelon.experiments.studies import doctor
 

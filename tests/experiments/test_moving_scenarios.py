@@ -131,7 +131,7 @@ def test_a_reshape_through_itself_is_warned_of_before_it_runs(echelon, here, mon
 
     monkeypatch.setattr("echelon.experiments.scenario.build.run", stop)
     monkeypatch.setattr("echelon.experiments.sweeps.sweep.compute", stop)
-    monkeypatch.setattr("echelon.apps.cli.view_command.keep_serving", stop)
+    monkeypatch.setattr("echelon.apps.cli.show_command.keep_serving", stop)
     over = ["--over", "seed=0..1"] if command == "sweep" else []
     code, out, err = echelon(command, "through.yaml", *over)
     assert (code, out) == (2, "") and err.count(MEET) == 1 and err.endswith("nothing runs here.\n")

@@ -10,17 +10,16 @@ import pytest
 from forgeries import at, forged, places, replaced
 
 import echelon as ech
-from echelon.experiments.results.dataset import OBSERVED, statement, summary
+from echelon.experiments.results.summary import OBSERVED, statement, summary
 from echelon.experiments.scenario.scenario import bundled_scenarios
 from echelon.experiments.studies.design import with_gain
-from echelon.experiments.studies.older_rounding import as_rounded_now
 from echelon.experiments.studies.recomputation import (
     compare_claims,
     compare_gain,
     with_leader_gain,
 )
 from echelon.guarantees.verifier.stored_values import compare_values
-from echelon.synthesis.gains import contraction
+from echelon.synthesis.gains import domain_methods
 from echelon.synthesis.gains.gain_file import save_gain
 
 SMALL = {
@@ -141,13 +140,13 @@ SOLVED = SMALL | {
 
 def test_a_gain_of_the_leader_is_that_of_its_file_where_solvers_end_elsewhere(monkeypatch):
     document = stated(ech.build(ech.scenario_from_mapping(SOLVED)), "small")
-    solve, noise = contraction.contraction, np.random.default_rng(0).normal(size=(4, 4)) * 3e-5
+    solve, noise = domain_methods.contraction, np.random.default_rng(0).normal(size=(4, 4)) * 3e-5
 
     def another_machine(*arguments, **named):
         metric = solve(*arguments, **named)
         return metric._replace(P=metric.P * (1.0 + noise + noise.T))
 
-    monkeypatch.setattr(contraction, "contraction", another_machine)
+    monkeypatch.setattr(domain_methods, "contraction", another_machine)
     experiment = ech.build(ech.scenario_from_mapping(SOLVED))
     # By its own solution the other machine would call an honest file a forgery.
     assert refused(compare_claims(document, experiment, "small"))
@@ -260,23 +259,6 @@ def test_which_values_agree(stored, value, agree):
     findings = list(compare_values("x", stored, value))
     assert (refused(findings) == []) is agree
     assert all(x.claim.startswith("x") and x.by_scenario for x in findings)
-
-
-@pytest.mark.parametrize(
-    ("stored", "agree"),
-    [
-        ("errors shrink at 0.209 1/s", True),
-        ("errors shrink at 0.208 1/s", True),
-        ("errors shrink at 0.21 1/s", False),
-        ("errors shrink at 0.2 1/s", False),
-        ("errors shrink at 0.219 1/s", False),
-        ("errors grow at 0.209 1/s", False),
-    ],
-)
-def test_only_nearest_roundings_of_numbers_agree_in_files_of_earlier_formats(stored, agree):
-    now = {"rate": 0.2089, "sentence": "errors shrink at 0.208 1/s"}
-    told = as_rounded_now({"rate": 0.2089, "sentence": stored}, now)
-    assert (refused(list(compare_values("x", told, now))) == []) is agree
 
 
 @pytest.mark.slow

@@ -19,7 +19,6 @@ from echelon.experiments.scenario import key_paths, registry
 from echelon.experiments.scenario.named_class import accepted, resolve
 from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.experiments.scenario.scenario import (
-    ScenarioFault,
     bundled_scenarios,
     json_schema,
     key_meanings,
@@ -34,7 +33,7 @@ from echelon.experiments.scenario.sections import (
     LeaderSpec,
 )
 from echelon.experiments.scenario.values import marked_keys
-from echelon.experiments.scenario.yaml import read_yaml
+from echelon.experiments.scenario.yaml import ScenarioFault, read_yaml
 
 FOLDER = Path(echelon.experiments.scenario.scenario.__file__).parent
 

@@ -19,18 +19,17 @@ from fake_vehicles import MELLINGER
 
 import echelon as ech
 from echelon.agents.models import CrazyflieAttitude
-from echelon.flight.air import Air, ports_of
-from echelon.flight.ground import Ground
-from echelon.flight.links.cflib_link import CflibLink
-from echelon.flight.local_flight import make_key
-from echelon.flight.mission import Mission
-from echelon.flight.wire import GROUND, wire_of
-from echelon.output.archive.flight_folder import flight_files, save_flight
-from echelon.output.archive.law_folder import law_files
+from echelon.output.archive.flight_folder import flight_files, law_files, save_flight
+from echelon_flight.datagram_socket import DatagramSocket, ports_of
+from echelon_flight.ground import Ground
+from echelon_flight.links.crazyflie import CflibLink
+from echelon_flight.mission import Mission, make_key
+from echelon_flight.wire import GROUND
 
 pytestmark = pytest.mark.study
 
-TESTS = Path(__file__).parents[1]
+HERE = Path(__file__).parent
+STAND_INS = Path(__file__).parents[2] / "packages" / "flight" / "tests"
 GRAPH = ech.Graph([(0, 1), (1, 2), (1, 3)])
 OFFSETS = {1: (0.6, 0.0, 0.0), 2: (0.6, 0.5, 0.0), 3: (0.6, -0.5, 0.0)}
 PATH = ech.references.Circle(center=(0.0, 0.0, 1.0), radius=0.6, rate=0.8)
@@ -71,8 +70,8 @@ def facts(model, agent):
 
 @contextlib.contextmanager
 def served(script, **settings):
-    """A process of tests/ that serves vehicles while the block runs."""
-    command = [sys.executable, TESTS / script, json.dumps({"speed": SPEED} | settings)]
+    """A process that serves vehicles while the block runs."""
+    command = [sys.executable, STAND_INS / script, json.dumps({"speed": SPEED} | settings)]
     with subprocess.Popen(command, stdin=-1, stdout=-1, text=True) as process:
         assert process.stdout.readline() == "ready\n"
         try:
@@ -134,8 +133,9 @@ def started(folder, model, laws, links, port):
     save_flight(flight_files(parts, ech.Settings(horizon=SECONDS, dt=DT), "four"), folder)
     mission, key, ports = Mission(folder), folder / "key", ports_of(4, port)
     make_key(key)
-    ground = Ground(Air(ports[4], ports[:4]), wire_of(mission.facts, GROUND, key), 4)
-    command = [sys.executable, "-m", "echelon.flight", folder, "--key", key, "--port", str(port)]
+    ground = Ground(DatagramSocket(ports[4], ports[:4]), mission.wire(GROUND, key), 4)
+    ground.listen()
+    command = [sys.executable, "-m", "echelon_flight", folder, "--key", key, "--port", str(port)]
     command += ["--speed", str(SPEED)]
     flying = []
     for k, link in enumerate(links):
@@ -255,7 +255,7 @@ def test_a_crazyflie_whose_process_is_killed_levels_and_stops(tmp_path):
             "    link.send([0.2, 0.0, 0.0, 0.3206])",
             "    print('flies', flush=True); time.sleep(0.01)",
         ]
-        places = [TESTS, TESTS / "flight", *sys.path]
+        places = [HERE, STAND_INS, *sys.path]
         path = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, places))}
         with subprocess.Popen(
             [sys.executable, "-c", "\n".join(code)], stdout=-1, env=path

@@ -6,10 +6,8 @@ import random
 import numpy as np
 
 from echelon.agents.network.inbox import Inbox, Message, NamedValues, Received, Stamps
-from echelon.core.packet import Packet
-from echelon.flight.datagrams import Drop
-from echelon.flight.letterbox import Letterbox
-from echelon.flight.wire import Letter
+from echelon_flight.pilot import Letterbox
+from echelon_flight.wire import Drop, Letter, Packet
 
 HEARS, LEADERS, NAMES = (0, 1, 3), (0, 1), ("x", "y")
 SAME = {

@@ -8,13 +8,11 @@ import pytest
 
 import echelon as ech
 from echelon.agents.network.formation_motion import Rotate
-from echelon.core.packet import Packet
-from echelon.flight.letterbox import NOBODY
-from echelon.flight.pilot import Pilot
-from echelon.flight.wire import Letter
-from echelon.output.archive.law_folder import network_facts
+from echelon.output.archive.flight_folder import network_facts
 from echelon.simulation.onboard.law_functions import law_functions
-from echelon.simulation.onboard.python_text import python_text
+from echelon.simulation.onboard.source_code import python_text
+from echelon_flight.pilot import NOBODY, Pilot
+from echelon_flight.wire import Letter, Packet
 
 CARTS, DT = ech.models.DoubleIntegrator(), 0.01
 
@@ -96,13 +94,13 @@ def test_a_pilot_is_the_agent(case):
                 answer = agent.receive(as_message(letter, facts["signal"]))
                 assert taken == (str(answer) == "taken")
         u, message = agent.step(t, x)
-        ticked = pilot.tick(t, x.tolist())
-        assert ticked.valid
-        np.testing.assert_allclose(ticked.u, u, rtol=0, atol=1e-13 * max(1.0, np.abs(u).max()))
-        assert (ticked.letter is None) == (message is None)
+        result = pilot.tick(t, x.tolist())
+        assert result.valid
+        np.testing.assert_allclose(result.u, u, rtol=0, atol=1e-13 * max(1.0, np.abs(u).max()))
+        assert (result.letter is None) == (message is None)
         if message is not None:
             sent += 1
-            ours = ticked.letter
+            ours = result.letter
             assert ours.hops == min(message.hops, NOBODY) and ours.time == message.time
             np.testing.assert_allclose(ours.value, message.signal.values, rtol=0, atol=1e-12)
             assert ours.packet[:2] == message.packet[:2]
@@ -135,10 +133,10 @@ def test_an_heir_leads_by_the_plan_when_its_leader_is_lost():
         letters = []
         # The leader is lost after 3 s.
         for who in range(k > 300, 3):
-            ticked = pilots[who].tick(k * DT, x[who])
-            letters.append(ticked.letter)
+            result = pilots[who].tick(k * DT, x[who])
+            letters.append(result.letter)
             a, b, c, d = x[who]
-            x[who] = [a + DT * c, b + DT * d, c + DT * ticked.u[0], d + DT * ticked.u[1]]
+            x[who] = [a + DT * c, b + DT * d, c + DT * result.u[0], d + DT * result.u[1]]
         for letter in [each for each in letters if each is not None and k % 4 == 0]:
             for pilot in pilots:
                 pilot.box.receive(letter, k * DT)

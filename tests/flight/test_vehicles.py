@@ -6,8 +6,8 @@ import types
 import pytest
 
 import echelon as ech
-from echelon.flight.vehicles import Vehicle
 from echelon.output.archive.flight_folder import _vehicles
+from echelon_flight.simulated_vehicles import Vehicle
 
 
 def test_a_vehicle_of_any_mass_levels_and_lands_softly():

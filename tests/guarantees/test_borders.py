@@ -16,7 +16,7 @@ from echelon.core.errors import EchelonError
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.promise import promise
-from echelon.guarantees.stopping.chain_clearance import length_clearance_of
+from echelon.guarantees.stopping.borders import length_clearance_of
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
 from echelon.guarantees.verifier.verify import verify

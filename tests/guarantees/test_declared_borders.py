@@ -9,8 +9,7 @@ from echelon.agents.models.chains import chains_of
 from echelon.agents.models.model import FlatBound, FlatChains
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem, Verdict
-from echelon.guarantees.stopping.declared_borders import airframe_fault, border_fault
-from echelon.guarantees.stopping.flat_everywhere import bounds_of
+from echelon.guarantees.stopping.flat_everywhere import airframe_fault, border_fault, bounds_of
 from echelon.guarantees.stopping.stopping_promise import StoppingPromise
 
 Quadrotor, Planar, Unicycle = (

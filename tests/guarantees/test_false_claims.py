@@ -17,14 +17,15 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon.guarantees.verifier import algebra, exact_minors
-from echelon.guarantees.verifier.enclosed import (
+from echelon.guarantees.verifier import algebra
+from echelon.guarantees.verifier.agent_claims import (
     farthest_from_all,
     farthest_outside,
+    pairs,
+    points,
     steepest,
     support,
 )
-from echelon.guarantees.verifier.points import pairs, points
 from echelon.guarantees.verifier.saved_gain import SavedGraph, SavedRegion
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -343,7 +344,7 @@ def exact_bounds(edges, agents, leaders):
 
     def below(x):
         shifted = [[v - x * (i == j) for j, v in enumerate(row)] for i, row in enumerate(rows)]
-        return exact_minors.is_positive_definite(shifted)
+        return algebra.is_positive_definite(shifted)
 
     low, high = Fraction(1, 2**90), Fraction(2**90)
     while high > low * (1 + Fraction(1, 10**13)):
@@ -690,18 +691,18 @@ def test_a_proof_at_a_corner_holds_for_every_matrix_within_its_error(seed):
     edge = -0.5 * scipy.linalg.eigh(P @ A + A.T @ P - held + lost, P, eigvals_only=True)[-1]
     parts, strength = (P, B, R, A[None]), Fraction(2, 5)
     for moved in (error, -error):
-        assert exact_minors.first_unproved(*parts, moved, strength, edge - 1e-9) is None
-        assert exact_minors.first_unproved(*parts, moved, strength, edge + 1e-9) == 0
+        assert algebra.first_unproved(*parts, moved, strength, edge - 1e-9) is None
+        assert algebra.first_unproved(*parts, moved, strength, edge + 1e-9) == 0
     signs = [np.reshape(s, (2, 2)) for s in combinations((-1.0, 1.0), repeat=4)]
     assert all(slowest(A + s * error) >= edge - 1e-9 for s in signs)
     # Without an error it is the rate itself that decides.
-    assert exact_minors.first_unproved(*parts, 0.0 * error, strength, slowest(A) - 1e-9) is None
-    assert exact_minors.first_unproved(*parts, 0.0 * error, strength, slowest(A) + 1e-9) == 0
+    assert algebra.first_unproved(*parts, 0.0 * error, strength, slowest(A) - 1e-9) is None
+    assert algebra.first_unproved(*parts, 0.0 * error, strength, slowest(A) + 1e-9) == 0
     two = (P, B, R, np.stack([A - np.eye(2), A]))
-    assert exact_minors.first_unproved(*two, 0.0 * error, strength, slowest(A) + 1e-9) == 1
+    assert algebra.first_unproved(*two, 0.0 * error, strength, slowest(A) + 1e-9) == 1
 
 
 def test_definiteness_is_of_symmetric_matrices_to_the_last_bit():
     tiny = Fraction(1, 10**6)
-    assert exact_minors.is_positive_definite([[Fraction(2), tiny], [tiny, Fraction(2)]])
-    assert not exact_minors.is_positive_definite([[Fraction(2), tiny], [Fraction(0), Fraction(2)]])
+    assert algebra.is_positive_definite([[Fraction(2), tiny], [tiny, Fraction(2)]])
+    assert not algebra.is_positive_definite([[Fraction(2), tiny], [Fraction(0), Fraction(2)]])

@@ -10,8 +10,7 @@ import scipy.linalg
 import echelon as ech
 from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Verdict
-from echelon.synthesis.certificates.delays import delay_margin
-from echelon.synthesis.certificates.margins import ClosedLoop
+from echelon.synthesis.certificates.margins import ClosedLoop, delay_margin
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 from held_loops import delayed_growth, growth, radii  # noqa: E402

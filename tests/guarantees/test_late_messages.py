@@ -12,14 +12,15 @@ import scipy.optimize
 import scipy.sparse as sp
 
 from echelon.agents.network.channel import Bursts, Network
-from echelon.guarantees.messages.late_agreement import (
+from echelon.guarantees.messages.late_messages import (
     LateRate,
+    ages_of,
     is_proved,
     late_rates,
     longest_ways,
+    losses_in_a_row,
 )
-from echelon.guarantees.messages.message_ages import ages_of, losses_in_a_row
-from echelon.guarantees.stopping.arrival import _falling
+from echelon.guarantees.stopping.tube import _falling
 
 TREE = np.array([[3.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 """Of the paper's tree: the leader is heard by the first follower."""
@@ -314,7 +315,7 @@ def channel(**numbers):
 )  # fmt: skip
 def test_losses_in_a_row_are_those_of_many_links(numbers, monkeypatch):
     # As rare as one message in 2,000, which can be counted.
-    import echelon.guarantees.messages.message_ages as module
+    import echelon.guarantees.messages.late_messages as module
 
     monkeypatch.setattr(module, "RARE", 1.0)
     net, draw, links = channel(**numbers), np.random.default_rng(3), 200_000

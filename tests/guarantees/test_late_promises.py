@@ -13,8 +13,7 @@ import echelon as ech
 from echelon.agents.world.sensing import Sensing
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Theorem, Verdict
-from echelon.guarantees.messages.delayed_step import all_decay
-from echelon.guarantees.messages.own_delay import late_step
+from echelon.guarantees.messages.own_delay import all_decay, late_step
 from echelon.guarantees.promises.promise import promise
 from echelon.simulation.engine.prepare import prepare
 

@@ -18,9 +18,8 @@ from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Verdict
 from echelon.guarantees.promises.promise import promise, promises
-from echelon.guarantees.stopping.chain_response import Chain
-from echelon.guarantees.stopping.motor_bounds import MotorDemand, motors_for
-from echelon.guarantees.stopping.time_slices import slices_of
+from echelon.guarantees.stopping.chain_response import Chain, slices_of
+from echelon.guarantees.stopping.motor_load import MotorDemand, motors_for
 from echelon.guarantees.verifier.verify import verify
 from echelon.simulation.engine.prepare import prepare
 

@@ -9,7 +9,7 @@ import pytest
 
 import echelon as ech
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate
-from echelon.guarantees.stopping.offset_smoothness import offset_fault
+from echelon.guarantees.stopping.moving_offsets import offset_fault
 
 CART = ech.models.DoubleIntegrator()
 GRAPH = ech.Graph.path(3)

@@ -13,8 +13,7 @@ from echelon.core.enclosure.taylor import enclose_derivatives
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
 from echelon.guarantees.promises.promise import promise
-from echelon.guarantees.stopping.path_bounds import pieces_of
-from echelon.guarantees.stopping.path_smoothness import path_fault
+from echelon.guarantees.stopping.path_bounds import path_fault, pieces_of
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 
 MODEL = ech.models.DoubleIntegrator(2)

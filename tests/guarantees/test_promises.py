@@ -22,7 +22,7 @@ from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import agent_lines
 from echelon.guarantees.promises.leaders import leaders_of
 from echelon.guarantees.promises.promise import REQUIRED, Promise, promises
-from echelon.laws.trim_input import TrimInput
+from echelon.laws.law import TrimInput
 
 # ---- all tellers say the same ----
 

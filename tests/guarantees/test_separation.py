@@ -12,7 +12,7 @@ from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.promise import promise
 from echelon.guarantees.stopping import separation
-from echelon.guarantees.stopping.flat_states import FlatStates
+from echelon.guarantees.stopping.stopping_run import FlatStates
 from echelon.guarantees.verifier.verify import verify
 
 MODEL = ech.models.DoubleIntegrator()

@@ -14,16 +14,13 @@ import echelon as ech
 from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Kind, Theorem, Verdict
 from echelon.experiments.studies.basin import Radii
-from echelon.experiments.studies.speedup import Speedup
-from echelon.guarantees.messages.late_agreement import LateRate
-from echelon.guarantees.messages.late_messages import LateMessages
-from echelon.guarantees.messages.message_ages import AgeLimits
-from echelon.guarantees.promises.certified_set import CertifiedSet, set_line
+from echelon.guarantees.messages.late_messages import AgeLimits, LateMessages, LateRate
 from echelon.guarantees.promises.promise import Prefix
+from echelon.guarantees.promises.region import CertifiedSet, set_line
 from echelon.guarantees.stopping.motor_load import Alone, MotorLoad
 from echelon.guarantees.stopping.separation import Separation
 from echelon.guarantees.stopping.tube import Tube
-from echelon.laws.trim_input import TrimInput
+from echelon.laws.law import TrimInput
 from echelon.output.viewer.replay import promise_badge
 from echelon.synthesis.certificates.domain import Domain
 
@@ -125,8 +122,6 @@ KINDS = {
         ("x", "y"), x, 1.0, 2.0, 1.0).sentence()),
     "observed radius": (BELOW, r"observed (\S+),", lambda x: Radii(
         ("x", "y"), 1.0, x, 2.0 * x, 1.0).sentence()),
-    "time constant": (ABOVE, r"constant of (\S+) s", lambda x: Speedup(
-        x, (), x, (), x).sentence()),
     "badge": (BELOW, r": (\S+) 1/s", lambda x: badge(x)["short"]),
     "badge, by linearization": (BELOW, r"rate of (\S+) 1/s", lambda x: badge(x, None)["whole"]),
     "badge, slowest": (BELOW, r"decays at (\S+) 1/s", lambda x: badge(

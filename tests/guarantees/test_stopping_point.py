@@ -19,11 +19,10 @@ from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem, Verdict
 from echelon.guarantees.promises.promise import promise
-from echelon.guarantees.stopping.arrival import _falling, _in_turns
-from echelon.guarantees.stopping.chain_clearance import Push, clearance_of
+from echelon.guarantees.stopping.borders import Push, clearance_of
 from echelon.guarantees.stopping.chain_response import Chain, largest_between, spread_between, value
 from echelon.guarantees.stopping.stopping_run import stopping_run_of
-from echelon.guarantees.stopping.tube import tube_of
+from echelon.guarantees.stopping.tube import _falling, _in_turns, tube_of
 from echelon.guarantees.verifier.verify import verify
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.prepare import prepare

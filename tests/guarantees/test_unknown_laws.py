@@ -8,8 +8,8 @@ import pytest
 
 import echelon as ech
 from echelon.core.words import Feedforward
-from echelon.laws.known_law import unknown_class
 from echelon.laws.law import Law
+from echelon.laws.law_check import unknown_class
 from echelon.synthesis.gains.gain import Gain
 
 AGENT, GRAPH = ech.models.SingleIntegrator(), ech.Graph.path(4)

@@ -16,20 +16,18 @@ from hypothesis import strategies as st
 import echelon as ech
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.named_class import resolve
+from echelon.guarantees.verifier.agent_claims import farthest_outside
 from echelon.guarantees.verifier.algebra import (
     ends_of_many,
-    grounded_rows,
-    observable,
-    rightmost,
-    spectrum,
-)
-from echelon.guarantees.verifier.enclosed import farthest_outside
-from echelon.guarantees.verifier.exact_minors import (
     first_unproved,
+    grounded_rows,
     inverse,
     is_positive_definite,
+    observable,
     product,
+    rightmost,
     rows_of,
+    spectrum,
 )
 from echelon.guarantees.verifier.findings import unchecked
 from echelon.guarantees.verifier.saved_gain import SavedGraph
@@ -64,15 +62,13 @@ def test_the_checker_loads_nothing_of_the_synthesis():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     ours = {name.removeprefix("echelon.") for name in done.stdout.split() if "echelon." in name}
-    assert "guarantees.verifier.exact_minors" in ours
+    assert "guarantees.verifier.algebra" in ours
     assert not ours & {"agents.models.linearization", "agents.models.model_check"}
-    # `core.compiled` and `core.disk_cache` save what is computed; the verifier never uses them.
-    shared = {"core", "core.errors", "core.identity", "core.memoize", "core.limits", "core.digits"}
-    shared |= {"core.compiled", "core.disk_cache", "core.numerics", "core.types", "core.words"}
+    # `core.compiled` and `core.cache` save what is computed; the verifier never uses them.
+    shared = {"core", "core.errors", "core.identity", "core.cache", "core.limits", "core.digits"}
+    shared |= {"core.compiled", "core.numerics", "core.types", "core.words"}
     # A model traces its own functions once in a call, whoever calls them.
-    shared |= {"core.trace", "core.reads"}
-    # Whose parameters a class declares, and whether JAX can run, is asked of every class.
-    shared |= {"core.declared", "core.jax_state"}
+    shared |= {"core.trace"}
     shared |= {"agents", "guarantees"}
     packages = ("agents.models", "guarantees.verifier")
     assert {name for name in ours if not name.startswith(packages)} <= shared
@@ -278,7 +274,7 @@ def places(told, path=()):
 
 ODD = [None, 0, -1, 1e308, -1e50, 1e-320, 10**400, 10**9, "x", [], {}, True, [[1]], 2.5]
 ODD += [
-    "echelon.agents.models.pendulum:Nope",
+    "echelon.agents.models.oscillators:Nope",
     "echelon.agents.models.model_check:check_model",
     "echelon.agents.models._x:y",
 ]

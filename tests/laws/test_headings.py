@@ -13,14 +13,13 @@ from plain_agents import as_python
 import echelon as ech
 from echelon.agents.models.chains import angles_among
 from echelon.agents.models.model import wrap_angles
-from echelon.core.packet import Packet
-from echelon.flight.pilot import Pilot
-from echelon.flight.wire import Letter
-from echelon.output.archive.law_folder import network_facts, python_law
+from echelon.output.archive.flight_folder import network_facts, python_law
 from echelon.simulation.onboard.law_functions import law_functions
-from echelon.simulation.onboard.python_text import python_text
+from echelon.simulation.onboard.source_code import python_text
 from echelon.synthesis.gains import FixedGain
 from echelon.synthesis.gains.gain import synthesize
+from echelon_flight.pilot import Pilot
+from echelon_flight.wire import Letter, Packet
 
 TURN = 2.0 * math.pi
 PATH = ech.Graph.path(3)

@@ -15,11 +15,11 @@ from scipy.linalg import solve_continuous_are
 import echelon as ech
 from echelon.agents.models import DoubleIntegrator, Pendulum, Quadrotor, Unicycle
 from echelon.agents.references import Circle, FigureEight, Hover, StatePath
-from echelon.agents.references.demand import reference_demand, reference_warnings
+from echelon.agents.references.flatness import reference_demand, reference_warnings
 from echelon.core.errors import LawError, ReferenceError
 from echelon.core.numerics import precision
 from echelon.core.words import Verdict
-from echelon.laws.lqr import sweep
+from echelon.laws.path_leader import sweep
 
 PAIR = ech.Graph.path(2)
 

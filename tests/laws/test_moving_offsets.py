@@ -7,7 +7,6 @@ import pytest
 import echelon as ech
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.core.errors import LawError, SimulationError
-from echelon.simulation.engine.gradient import gradient
 from echelon.simulation.engine.prepare import prepare
 
 AGENT = ech.models.DoubleIntegrator()
@@ -157,7 +156,7 @@ def test_what_knows_constant_offsets_alone_refuses_others():
     for message, use in (
         (
             "derivatives are of constant ones",
-            lambda: gradient(one, settings, lambda sums: sums.errors[0].sum(), ["P"]),
+            lambda: ech.gradient(one, settings, lambda sums: sums.errors[0].sum(), ["P"]),
         ),
         ("the formation changes with time", lambda: ech.state_space(one)),
     ):

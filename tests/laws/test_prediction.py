@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import echelon as ech
-from echelon.laws.saturated_decay import saturated_decay
+from echelon.laws.stopping_point import saturated_decay
 
 
 @settings(max_examples=40, deadline=None)

@@ -9,13 +9,12 @@ import pytest
 import scipy.linalg
 
 import echelon as ech
-from echelon.agents.network.near import Near
+from echelon.agents.network.exchange import Near
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
-from echelon.experiments.results.avoidance import avoidance
-from echelon.experiments.results.labelled_parts import labelled_parts
-from echelon.laws.nearest_point import nearest_point
-from echelon.laws.safety import hull_points
+from echelon.experiments.results.dataset import labelled_parts
+from echelon.experiments.results.metrics import avoidance
+from echelon.laws.safety import hull_points, nearest_point
 
 ROOTS = (4.0, 4.5, 5.0)
 SAFETY = ech.Safety(radii=(0.125, 0.125, 0.375), margin=0.0)

@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from recordings import PROMISE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
-from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
+from echelon.experiments.results.metrics import Avoidance, Ellipsoid
 from echelon.experiments.results.recording import MessageAges
 from echelon.output.plots.network import curves_of
 from echelon.output.plots.over_time import start_of
@@ -23,6 +24,7 @@ CERTIFIED = PROMISE | {
     "certified_set": {"radius": 9.0, "kind": "proof", "why": ""},
     "hypotheses": [{"statement": "starts in the certified set", "verdict": "holds"}],
 }
+FEW = ("trajectories", "formation", "inputs")
 WINDY = {"statement": "Assumption 3, exact states", "verdict": "fails"}
 
 
@@ -47,14 +49,6 @@ def flock():
 
 def lines_of(figure, place=0):
     return {line.get_label(): line.get_xydata() for line in figure.axes[place].get_lines()}
-
-
-def test_there_is_a_figure_of_each_name(run):
-    made = figures(run, NAMES)
-    assert tuple(made) == NAMES
-    for name, figure in made.items():
-        for ax in figure.axes:
-            assert ax.get_ylabel() or name in ("inputs", "network"), name
 
 
 def test_inputs_stand_in_percent_of_their_limits_which_are_drawn(run):
@@ -143,6 +137,26 @@ def test_distances_are_those_of_linked_agents_with_those_wanted(run):
     np.testing.assert_allclose(least, away.min(axis=(1, 2)))
 
 
+def test_desired_distances_of_a_formation_that_moves_are_lines(run):
+    moving = run.offsets * (1.0 + run.times[:, None, None])
+    figure = figures(dataclasses.replace(run, moving=moving), "distances")["distances"]
+    i, j = run.edges[0]
+    desired = np.linalg.norm(moving[:, i, :3] - moving[:, j, :3], axis=1)
+    assert any(np.array_equal(line.get_ydata(), desired) for line in figure.axes[0].lines)
+
+
+def test_settings_that_the_user_has_changed_apply_to_lines_and_legends(run):
+    import matplotlib
+
+    with matplotlib.rc_context({"lines.linewidth": 3.0, "legend.fontsize": 14.0}):
+        own = figures(run, "formation")["formation"]
+    plain = figures(run, "formation")["formation"]
+    for figure, width, size in ((own, 3.0, 14.0), (plain, 1.1, 8.33)):
+        assert {line.get_linewidth() for line in figure.axes[0].lines} == {width}
+        assert figure.legends[0].get_texts()[0].get_fontsize() == pytest.approx(size)
+        assert figure.axes[0].xaxis.label.get_fontname() == "STIXGeneral"
+
+
 def test_the_network_has_every_edge_and_an_arrow_from_who_leads(run):
     (ax,) = figures(run, ["network"])["network"].axes
     (drawn,) = [part for part in ax.collections if len(part.get_segments()) == len(run.edges)]
@@ -210,12 +224,17 @@ def test_an_error_of_zero_is_no_tiny_number(flock):
     assert ax.get_ylim()[0] >= 1e-3
 
 
-@pytest.mark.parametrize(("page", "width"), [(ONE_COLUMN, 3.5), (TWO_COLUMNS, 7.16)])
-def test_figures_fit_the_columns_of_a_page_with_letters_of_8_points(run, flock, page, width):
+@pytest.mark.parametrize(
+    ("page", "width", "what"), [(ONE_COLUMN, 3.5, NAMES), (TWO_COLUMNS, 7.16, FEW)]
+)
+def test_figures_fit_the_columns_of_a_page_with_letters_of_8_points(run, flock, page, width, what):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    for own, names in ((run, NAMES), (flock, ("formation", "inputs", "trajectories"))):
-        for name, figure in figures(own, names, page).items():
+    for own, names in ((run, what), (flock, FEW)):
+        made = figures(own, names, page)
+        assert tuple(made) == names
+        for name, figure in made.items():
+            assert all(ax.get_ylabel() or name in ("inputs", "network") for ax in figure.axes)
             assert figure.get_figwidth() == width and figure.get_figheight() <= 9.0, name
             assert all(ax.yaxis.label.get_size() == 8.0 for ax in figure.axes)
             renderer = FigureCanvasAgg(figure).get_renderer()
@@ -307,9 +326,7 @@ def test_a_figure_that_is_none_is_refused_with_a_guess(run):
 
 
 def test_plot_draws_png_pdf_and_svg_from_the_file_and_loses_no_other(echelon, here):
-    from echelon.experiments.results.recording import FORMAT
-
-    (here / "run.nc").write_bytes(as_file(swinging(("x", "y", "z"), (0, 1, 2), n=3), FORMAT))
+    (here / "run.nc").write_bytes(as_file(swinging(("x", "y", "z"), (0, 1, 2), n=3)))
     code, told, _ = echelon("plot", "run.nc", "--what", "formation,network,ages", "--dpi", "60")
     assert code == 0
     assert told == (
@@ -490,22 +507,32 @@ BACKEND = """
 import os, sys
 os.environ["MPLBACKEND"] = sys.argv[1]
 import echelon
-from echelon.output.plots.style import sheet, style
 assert "matplotlib" not in sys.modules
-with style():
-    sheet(3.0)[0].savefig(sys.argv[2])
+exec(sys.argv[3])
+figure.savefig(sys.argv[2])
 import matplotlib
 assert os.environ["MPLBACKEND"] == sys.argv[1] and "matplotlib.pyplot" not in sys.modules
 print(matplotlib.get_backend(auto_select=False))
 """
 
 
-@pytest.mark.parametrize("backend", ["nonsense", "module://nothing.installed", "svg"])
-def test_figures_are_drawn_whatever_backend_the_environment_names(backend, tmp_path):
+SHEET = """
+from echelon.output.plots.style import sheet, style
+with style():
+    figure, _ = sheet(3.0)
+"""
+RUN = """
+from recordings import flown
+figure = echelon.figures(flown(seconds=0.1), "trajectories")["trajectories"]
+"""
+
+
+@pytest.mark.parametrize(("backend", "code"), [("module://nothing.installed", SHEET), ("svg", RUN)])
+def test_figures_are_drawn_whatever_backend_the_environment_names(backend, code, tmp_path):
     """Jupyter names its own one to child processes; a user's choice remains."""
     file = tmp_path / "figure.png"
-    command = [sys.executable, "-c", BACKEND, backend, str(file)]
-    done = subprocess.run(command, capture_output=True, text=True)
+    command = [sys.executable, "-c", BACKEND, backend, str(file), code]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
     assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == ("None" if backend == "nonsense" else backend)
+    assert done.stdout.strip() == backend
     assert file.read_bytes().startswith(b"\x89PNG")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon import Outcome
+from echelon.core.errors import Outcome
 
 
 def spinning(start, store_every=1):

@@ -14,7 +14,6 @@ from scipy.special import erf
 
 from echelon.agents.models import Quadrotor
 from echelon.core.numerics import precision, rk4
-from echelon.core.private_folder import PrivateFolder
 from echelon.simulation.codegen import factored, machine_code
 from echelon.simulation.scalars import ScalarGraph, Unsupported, needed
 from echelon.simulation.scalars.scalar_graph import OPERATIONS
@@ -626,28 +625,22 @@ def test_a_processor_with_less_computes_the_same_and_says_what_it_has(monkeypatc
 
 
 def test_what_was_compiled_is_kept_and_a_damaged_file_is_made_again(tmp_path):
-    columns = rng.normal(size=(3, 8))
-    first = run(PROGRAMS["a loop"], columns, cache=PrivateFolder(tmp_path))
-    [file] = tmp_path.iterdir()
-    whole = file.read_bytes()
-    assert (
-        run(PROGRAMS["a loop"], columns, cache=PrivateFolder(tmp_path)).tobytes() == first.tobytes()
-    )
-    for damaged in (whole[: len(whole) // 2], b"", whole[:40] + b"x" + whole[41:]):
-        file.write_bytes(damaged)
-        assert (
-            run(PROGRAMS["a loop"], columns, cache=PrivateFolder(tmp_path)).tobytes()
-            == first.tobytes()
-        )
-        assert file.read_bytes() == whole
-
-
-def test_a_folder_without_room_for_code_is_no_fault(tmp_path):
-    folder = PrivateFolder(tmp_path / "removed")
-    folder.path.rmdir()
-    columns = rng.normal(size=(3, 8))
-    found = run(PROGRAMS["a loop"], columns, cache=folder)
-    np.testing.assert_allclose(found, by_jax(PROGRAMS["a loop"], columns), rtol=1e-14)
+    columns, before = rng.normal(size=(3, 8)), jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "c"))
+    try:
+        first = run(PROGRAMS["a loop"], columns)
+        [file] = (tmp_path / "c").iterdir()
+        whole = file.read_bytes()
+        for content in (whole, whole[: len(whole) // 2], b"", whole[:40] + b"x" + whole[41:]):
+            file.write_bytes(content)
+            assert run(PROGRAMS["a loop"], columns).tobytes() == first.tobytes()
+            assert file.read_bytes() == whole
+        # A folder without room for code is no fault.
+        file.unlink()
+        file.parent.rmdir()
+        assert run(PROGRAMS["a loop"], columns).tobytes() == first.tobytes()
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
 
 
 def test_quotients_by_one_number_share_its_inverse_and_stay_whole_where_they_are_cut():

@@ -8,7 +8,7 @@ import pytest
 
 import echelon as ech
 from echelon.core.errors import EchelonError
-from echelon.guarantees.promises.event_lines import events_in_words
+from echelon.guarantees.promises.hypotheses import events_in_words
 from echelon.simulation.engine.prepare import prepare
 
 Cut, Join, Lose = ech.network.Cut, ech.network.Join, ech.network.Lose

@@ -5,8 +5,8 @@ import numpy as np
 
 import echelon as ech
 from echelon.core.numerics import precision
-from echelon.simulation.engine.host_stepper import HostStepper
 from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.optimal.drives import HostStepper
 
 
 def test_no_plan_is_made_from_a_state_that_is_not_finite():

@@ -19,7 +19,7 @@ from echelon.simulation import codegen as kernels
 from echelon.simulation.codegen import block_copy
 from echelon.simulation.engine.batch import Batch
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.native import agent_order, blocks, buffers, schedule, threads
+from echelon.simulation.native import blocks, threads
 from echelon.simulation.native import kernel_cache as kernel_code
 from echelon.simulation.native import stepper as native_stepper
 from echelon.simulation.native.varying import VaryingNumbers
@@ -245,7 +245,7 @@ def test_bits_do_not_depend_on_which_blocks_take_their_steps_first(graph, monkey
     whole, stepper = stepped(parts, run_settings(), (5, 0, 40), "native")
     reach = stepper.places.reach
     assert reach.reach < 4
-    monkeypatch.setattr(schedule, "_CACHES", (8 * reach.reach * reach.bytes,))
+    monkeypatch.setattr(threads, "_CACHES", (8 * reach.reach * reach.bytes,))
     for count in (1, 3):
         stepper.threads = threads.ThreadPool(stepper.places, None, count)
         with jax.enable_x64(True):
@@ -330,7 +330,7 @@ def test_the_code_that_moves_numbers_is_made_once_for_all_threads(monkeypatch):
 
 
 def test_memory_is_taken_again_when_nobody_holds_any_of_it():
-    here, shape = buffers.BufferPool(), (2**10, 2**8)
+    here, shape = native_stepper.BufferPool(), (2**10, 2**8)
     first = here.empty(shape, float)
     first[:] = 1.0
     kept, place = first[3, 5:7], first.ctypes.data
@@ -348,7 +348,7 @@ def test_memory_is_taken_again_when_nobody_holds_any_of_it():
 @given(keys=st.lists(st.integers(0, 9)))
 def test_keys_are_grouped_as_a_stable_sort_would(keys):
     keys = np.array(keys, int)
-    starts, places = agent_order.grouped(keys, 10)
+    starts, places = blocks.grouped(keys, 10)
     np.testing.assert_array_equal(places, np.argsort(keys, kind="stable"))
     np.testing.assert_array_equal(np.diff(starts), np.bincount(keys, minlength=10))
 
@@ -616,7 +616,7 @@ def test_where_agents_stand_changes_no_bit(monkeypatch):
     offsets = np.arange(60.0)[:, None] * [[1.0, 0.0]]
     parts = ech.Parts(model, graph, ech.Formation(offsets), drive, initial={"position": 1.0})
     (as_numbered, plain) = stepped(parts, run_settings(), (3, 20, 0), "native")
-    monkeypatch.setattr(agent_order, "_LARGE", 2)
+    monkeypatch.setattr(blocks, "_LARGE", 2)
     (nearby, moved) = stepped(parts, run_settings(), (3, 20, 0), "native")
     assert as_numbered.states.tobytes() == nearby.states.tobytes()
     for name, a, b in zip(nearby.sums._fields, as_numbered.sums, nearby.sums, strict=True):
@@ -711,8 +711,7 @@ def test_a_program_is_known_by_shapes_and_types_and_not_where_nobody_knows_what_
 ):
     assert own_of(ech.models.SingleIntegrator(1)).signature is not None
     assert own_of(Decaying(1)).signature is None
-    held = own_of(Driven(jnp.sin))
-    assert held.signature is None and not held.covers(held.loop)
+    assert own_of(Driven(jnp.sin)).signature is None
     # As of classes that may be trusted.
     for kind in (Driven, Tabled):
         monkeypatch.setattr(kind, "__module__", "echelon.agents.models")
@@ -726,9 +725,9 @@ def test_a_program_is_known_by_shapes_and_types_and_not_where_nobody_knows_what_
 def test_a_user_s_class_is_traced_anew_and_shares_machine_code(monkeypatch):
     made = list[str]()
 
-    def code(text, folder):
+    def code(text):
         made.append(text)
-        return kernels.Code(text, folder)
+        return kernels.Code(text)
 
     monkeypatch.setattr(kernel_code, "KERNELS", kernel_code.Kernels())
     monkeypatch.setattr(kernel_code, "Code", code)

@@ -5,7 +5,6 @@ import functools
 import math
 import re
 import shutil
-import struct
 import subprocess
 
 import numpy as np
@@ -14,10 +13,8 @@ from plain_agents import as_python, compare
 
 import echelon as ech
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.onboard.c_text import c_text, header_text
-from echelon.simulation.onboard.law_functions import LawFunction, law_functions
-from echelon.simulation.onboard.llvm_text import object_file
-from echelon.simulation.onboard.vehicle_function import move_function
+from echelon.simulation.onboard.law_functions import LawFunction, law_functions, move_function
+from echelon.simulation.onboard.source_code import c_text, header_text
 from echelon.simulation.scalars import ScalarGraph, Unsupported
 from echelon.simulation.scalars.scalar_graph import OPERATIONS
 
@@ -359,38 +356,3 @@ def test_a_flight_in_single_precision_is_that_in_double_to_ten_micrometres(tmp_p
     apart = np.linalg.norm(flights[0] - flights[1], axis=2).max()
     print(f"single precision is {1e6 * apart:.2f} micrometres from double")
     assert 0.0 < apart <= 1e-5
-
-
-# ---- machine code of a microcontroller -----------------------------------------------------------
-
-
-LARGEST = {"consensus": 4000, "stopping-point": 7000, "its-leader": 9000}
-"""Bytes of a tick."""
-
-
-def test_machine_code_of_a_microcontroller_is_small_and_calls_nothing(agent, request):
-    single = law_functions(agent.own_law, 32)
-    image = object_file(single.values())
-    sizes, undefined = symbols(image)
-    assert {*sizes} == {f"law_{name}" for name in single} and not undefined
-    assert sizes["law_tick"] <= LARGEST[request.node.callspec.params["agent"]], sizes
-    # "VFP registers" for numbers, as compilers pass them for this triple (Tag_ABI_VFP_args).
-    assert b"\x1c\x01" in image[image.index(b"aeabi\0") :][:80]
-
-
-def symbols(image):
-    """Return the size of each function, and what is undefined, of an ELF file for ARM."""
-    assert image[:5] == b"\x7fELF\x01" and struct.unpack_from("<H", image, 18) == (40,)
-    [start] = struct.unpack_from("<I", image, 32)
-    size, count = struct.unpack_from("<HH", image, 46)
-    sections = [struct.unpack_from("<10I", image, start + k * size) for k in range(count)]
-    [table] = (s for s in sections if s[1] == 2)
-    strings = sections[table[6]][4]
-    sizes, undefined = {}, set()
-    for at in range(table[4] + 16, table[4] + table[5], 16):
-        name, _, length, info, _, section = struct.unpack_from("<IIIBBH", image, at)
-        if info >> 4:
-            text = image[strings + name : image.index(b"\0", strings + name)].decode()
-            sizes |= {text: length} if section else {}
-            undefined |= set() if section else {text}
-    return sizes, undefined

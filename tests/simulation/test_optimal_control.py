@@ -13,7 +13,7 @@ from scipy.integrate import solve_bvp
 
 import echelon as ech
 from echelon.agents.models import Limits
-from echelon.agents.references.demand import (
+from echelon.agents.references.flatness import (
     demand,
     flat_inputs,
     reference_demand,

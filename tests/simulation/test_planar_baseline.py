@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import echelon as ech
-from echelon.agents.models.planar_quadrotor_linear import LinearPlanarQuadrotor
+from echelon.agents.models.planar_quadrotor import LinearPlanarQuadrotor
 from echelon.core.errors import ModelError, PlanError
 from echelon.core.numerics import precision
 from echelon.simulation.optimal.planar_baseline import PlanarBaseline

@@ -12,8 +12,8 @@ from echelon.agents.models.linearization import linearize
 from echelon.core.errors import GainError
 from echelon.synthesis.certificates.margins import ClosedLoop, string_gain
 from echelon.synthesis.gains.gain_file import load_gain, save_gain
+from echelon.synthesis.gains.riccati import weights_of
 from echelon.synthesis.gains.strings import string_growth
-from echelon.synthesis.gains.weights import weights_of
 
 CHAIN = ech.models.Linear([[0.0, 1.0], [0.0, -0.5]], [[0.0], [1.0]])
 PATH = ech.Graph.path(3, leaders=[0])

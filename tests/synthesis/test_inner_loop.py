@@ -11,7 +11,7 @@ from runs import simulate
 import echelon as ech
 from echelon.agents.models.linearization import linearize
 from echelon.core.numerics import precision
-from echelon.synthesis.gains.inner_loop import symmetric_states
+from echelon.synthesis.gains.riccati import symmetric_states
 
 AGENTS = {
     "double integrator": ech.models.DoubleIntegrator(2),
@@ -164,3 +164,14 @@ def test_a_weight_of_one_input_may_be_a_plain_number():
 
     gain = ech.synthesize(Cart(dimension=1), ech.Graph.path(3), ech.gains.InnerLoop())
     np.testing.assert_array_equal(gain.R, [[3.0]])
+
+
+def test_its_time_constant_grows_as_the_square_of_a_line():
+    model = ech.models.DoubleIntegrator(2)
+    graphs = [ech.Graph.path(size + 1) for size in (10, 30, 90)]
+    gains = [ech.synthesize(model, graph, ech.gains.InnerLoop()) for graph in graphs]
+    times = np.array([-1.0 / gain.certificate.abscissa for gain in gains])
+    lows = np.array([graph.spectrum().low for graph in graphs])
+    # First order: a position's zero eigenvalue moves by -c lambda times a constant of the loop.
+    assert times * lows == pytest.approx(times[-1] * lows[-1], rel=0.05)
+    assert np.log(times[2] / times[1]) / np.log(3.0) == pytest.approx(2.0, abs=0.05)

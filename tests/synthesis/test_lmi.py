@@ -14,8 +14,14 @@ from hypothesis import strategies as st
 from echelon.agents.models import Quadrotor
 from echelon.core.errors import GainError, MissingExtraError
 from echelon.synthesis.certificates import lmi
-from echelon.synthesis.certificates.axis_modes import axis_modes, obstacle
-from echelon.synthesis.certificates.lmi import contraction, monotone, rate_of, robust_lqr
+from echelon.synthesis.certificates.lmi import (
+    axis_modes,
+    contraction,
+    monotone,
+    obstacle,
+    rate_of,
+    robust_lqr,
+)
 
 GRAVITY = 9.81
 DOUBLE_INTEGRATOR = np.array([[0.0, 1.0], [0.0, 0.0]])

@@ -10,15 +10,16 @@ from hypothesis import strategies as st
 from echelon.agents.models import Quadrotor
 from echelon.core.errors import GainError
 from echelon.core.linear import matrix_exponential
-from echelon.synthesis.certificates.bounds import invariant_ellipsoid, peak_gain
-from echelon.synthesis.certificates.delays import delay_margin
 from echelon.synthesis.certificates.margins import (
     ClosedLoop,
     decays_between,
+    delay_margin,
     detectability,
     gain_margin,
     input_scaling,
+    invariant_ellipsoid,
     modes,
+    peak_gain,
     stiffness,
     string_gain,
 )

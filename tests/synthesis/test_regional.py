@@ -19,9 +19,9 @@ from echelon.synthesis.certificates.jacobians import (
     has_constant_input_map,
     jacobians,
     offsets_are_symmetries,
+    sample_jacobians,
 )
 from echelon.synthesis.certificates.lmi import robust_lqr
-from echelon.synthesis.certificates.sampling import sample_jacobians
 
 LINE = ech.Graph.path(4)
 DEG = np.pi / 180.0

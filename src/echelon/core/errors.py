@@ -64,7 +64,7 @@ class OutputError(EchelonError):
 
 
 class FlightError(EchelonError):
-    """A flight cannot begin, or the link to a vehicle failed."""
+    """A flight cannot be prepared."""
 
 
 class MissingExtraError(EchelonError):

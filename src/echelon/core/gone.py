@@ -13,13 +13,24 @@ KEYS: dict[str, str] = {
 
 VALUES: dict[str, str] = {
     "prediction: none": "use `packet`, by which the model carries the leader on",
+    "export --to json": "use `csv`, or `nc` with xarray; numbers are in `summary.json`",
+    "report --out .html": "use `.txt`, or `echelon view RUN --html FILE`, which shows it",
 }
 """Values of scenario keys, as in `prediction: none`, and of options, as in `export --to json`."""
 
-COMMANDS: dict[str, str] = {}
+COMMANDS: dict[str, str] = {
+    "tune": "minimize the cost by `ech.gradient` and SciPy, as in docs/recipes.md",
+}
 """Commands of the command line."""
 
-NAMES: dict[str, str] = {}
+NAMES: dict[str, str] = {
+    "load_run": "use `load`",
+    "open_run": "use `load`",
+    "network.recommend_edges": "compare `graph.with_edges([pair]).spectrum().low`; see recipes.md",
+    "network.recommend_leaders": "compare `graph.with_leaders([k]).spectrum().low`; see recipes.md",
+    "speedup": "use `-1 / gain.certificate.abscissa` of each graph; see recipes.md",
+    "tune": "minimize the cost by `ech.gradient` and SciPy, as in docs/recipes.md",
+}
 """Public names below `echelon`."""
 
 
@@ -28,6 +39,11 @@ def gone_key(*path: str | int) -> str:
     names = [key for key in path if isinstance(key, str)]
     tails = (".".join(names[start:]) for start in range(len(names)))
     return next((gone(KEYS, tail) for tail in tails if tail in KEYS), "")
+
+
+def no_name(name: str) -> AttributeError:
+    """Return the error of a name below `echelon` that is gone, or never was."""
+    return AttributeError(f"`echelon.{name}`{gone(NAMES, name) or ' does not exist.'}")
 
 
 def gone(table: dict[str, str], name: str) -> str:

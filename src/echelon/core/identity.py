@@ -2,7 +2,9 @@
 
 Values with equal bits are the same in every process; object identity is useless, since arrays can
 be changed in place. A foreign class may be redefined or read changing data while a process runs:
-a value that contains one has no digest, only a key for this process, which has what its code reads.
+a value that contains one has no digest, only a key for this process. That key also covers what the
+code reads beside its arguments, as far as Python shows it: globals, closures, defaults and class
+attributes.
 """
 
 import dataclasses
@@ -10,17 +12,31 @@ import enum
 import functools
 import hashlib
 import sys
-from collections.abc import Hashable, Sequence
+import sysconfig
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from fractions import Fraction
-from types import FunctionType
-from typing import Any, Final, final
-
-from echelon.core.reads import is_installed, reads
+from types import CodeType, FunctionType, ModuleType
+from typing import Any, Final, TypeAlias, final
 
 _LARGE: Final = 4096
 """Arrays of at least this many bytes are hashed in place and not copied."""
 _TRUSTED: Final = {"echelon", "builtins", "numpy", "jax", "jaxlib", "equinox", "scipy"}
 _PLAIN: Final = (bool, int, float, complex, str, bytes, Fraction, type(None))
+_SPECIAL: Final = {
+    *("__dict__", "__weakref__", "__doc__", "__module__", "__annotations__", "__slots__")
+}
+_LIBRARIES: Final = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "purelib", "platlib"))
+
+
+Foreign: TypeAlias = list[tuple[type, object]]
+"""The parts of foreign code in a value, each with its class."""
+
+
+def identify(value: object) -> tuple[bytes, Foreign]:
+    """Return a digest of what is known of a value, and its foreign parts, which it leaves out."""
+    walk = _Walk()
+    walk.visit(value)
+    return walk.digest(), walk.foreign
 
 
 def digest(value: object) -> bytes | None:
@@ -28,9 +44,8 @@ def digest(value: object) -> bytes | None:
 
     None if a part is of a class or function outside echelon and its dependencies.
     """
-    walk = _Walk()
-    walk.visit(value)
-    return None if walk.foreign else walk.digest()
+    bits, foreign = identify(value)
+    return None if foreign else bits
 
 
 def process_key(value: object) -> Hashable | None:
@@ -39,11 +54,8 @@ def process_key(value: object) -> Hashable | None:
     A user's class is compared by identity and by what its code reads, an object of unknown kind by
     its own equality. None if such an object has no hash.
     """
-    walk = _Walk()
-    walk.visit(value)
-    if not walk.foreign:
-        return walk.digest()
-    key = walk.digest(), *walk.foreign
+    bits, foreign = identify(value)
+    key = (bits, *foreign) if foreign else bits
     try:
         hash(key)
     except TypeError:
@@ -52,13 +64,17 @@ def process_key(value: object) -> Hashable | None:
 
 
 def foreign_key(value: object) -> Hashable:
-    """Return a key of all foreign code in a value and of what it reads; empty without any."""
-    walk = _Walk(code_alone=True)
-    walk.visit(value)
-    if not walk.foreign:
-        return ()
-    kinds = [part if isinstance(part[1], Hashable) else id(part[1]) for part in walk.foreign]
-    return walk.digest(), *kinds
+    """Return a key as `process_key` for values that contain foreign code, otherwise ().
+
+    What has no hash is compared by its address, so the value must exist as long as the key.
+    """
+    return key_of_foreign(*identify(value))
+
+
+def key_of_foreign(bits: bytes, foreign: Foreign) -> Hashable:
+    """Return what `foreign_key` returns of a value that was identified."""
+    kinds = [part if isinstance(part[1], Hashable) else id(part[1]) for part in foreign]
+    return (bits, *kinds) if kinds else ()
 
 
 def array_bits(array: object) -> bytes:
@@ -99,19 +115,19 @@ def _fields(kind: type) -> tuple[str, ...] | None:
     return tuple(field.name for field in dataclasses.fields(kind))
 
 
+@functools.lru_cache(1024)
+def _has_dict(kind: type) -> bool:
+    return any("__dict__" in vars(base) for base in kind.__mro__)
+
+
 @final
 class _Walk:
     """A walk through a tree of values that collects its bits and its foreign parts."""
 
-    def __init__(self, code_alone: bool = False) -> None:
+    def __init__(self) -> None:
         self.foreign: list[tuple[type, object]] = []
         self._bits: list[bytes] = []
-        self._collects, self._inside, self._seen = not code_alone, False, set[int]()
-
-    @property
-    def _counts(self) -> bool:
-        """Whether values count: all of them, or those that foreign code reads."""
-        return self._collects or self._inside
+        self._inside, self._seen = False, set[int]()
 
     def digest(self) -> bytes:
         """Return a digest of all bits."""
@@ -123,34 +139,22 @@ class _Walk:
         """Collect the parts of a value, each with its class."""
         kind = type(value)
         if kind in _PLAIN:
-            if not self._counts:
-                return
             # `repr` of a float keeps all digits and the sign of 0.
             self._bits.append(f"{kind.__name__} {value!r}".encode())
             return
         names = _fields(kind)
         if names is not None:
-            # By attribute: Equinox may store a field on the class only.
-            self._inner(kind, [getattr(value, name) for name in names])
+            # Equinox may store a field on the class only, and its own access is slow.
+            own = object.__getattribute__(value, "__dict__") if _has_dict(kind) else {}
+            self._inner(kind, [own[n] if n in own else getattr(value, n) for n in names])
         elif isinstance(value, tuple | list):
             self._inner(kind, value)
         elif isinstance(value, dict):
             self._inner(kind, [entry for pair in value.items() for entry in pair])
-        else:
-            self._leaf(value, kind)
-
-    def _inner(self, kind: type, parts: Sequence[object]) -> None:
-        self._name(kind)
-        self._bits.append(b"%d" % len(parts))
-        for part in parts:
-            self.visit(part)
-
-    def _leaf(self, value: object, kind: type) -> None:
-        if isinstance(value, type | FunctionType):
+        elif isinstance(value, type | FunctionType):
             self._name(value)
         elif hasattr(value, "dtype") and hasattr(value, "shape"):
-            if self._counts:
-                self._array(value)
+            self._array(value)
         elif isinstance(value, enum.Enum):
             self._name(kind)
             self._bits.append(value.name.encode())
@@ -159,15 +163,19 @@ class _Walk:
         else:
             self._object(value, kind)
 
+    def _inner(self, kind: type, parts: Sequence[object]) -> None:
+        self._name(kind)
+        self._bits.append(b"%d" % len(parts))
+        for part in parts:
+            self.visit(part)
+
     def _object(self, value: object, kind: type) -> None:
-        """Collect an object of unknown kind, and of a stranger's what its class reads."""
-        ours = kind.__module__.partition(".")[0] in _TRUSTED or is_installed(kind.__module__)
+        """Collect an object of unknown kind, and of a foreign one what it holds and reads."""
+        ours = kind.__module__.partition(".")[0] in _TRUSTED or _is_installed(kind.__module__)
         if not ours and id(value) not in self._seen:
             self._seen.add(id(value))
             self._name(kind)
-            before, self._inside = self._inside, True
-            self.visit(getattr(value, "__dict__", {}))
-            self._inside = before
+            self._read([getattr(value, "__dict__", {})])
         self._unknown(value)
 
     def _array(self, array: Any) -> None:
@@ -185,29 +193,104 @@ class _Walk:
         place: object = sys.modules.get(home)
         for part in name.split("."):
             place = getattr(place, part, None)
-        ours = home.partition(".")[0] in _TRUSTED
         # A class that cannot be found by its name (defined in a function) counts as foreign.
-        if ours and place is named:
+        if place is named and home.partition(".")[0] in _TRUSTED:
             self._bits.append(f"{home}.{name}".encode())
-        elif self._collects or not ours:
-            self.foreign.append((type(named), named))
-            self._bits.append(b"foreign")
-            self._code(named)
-
-    def _code(self, named: type | FunctionType) -> None:
-        """Collect what foreign code reads, once."""
-        # Of what a stranger's code reads, what is installed does not change.
-        if id(named) in self._seen or self._inside and is_installed(named.__module__):
             return
-        self._seen.add(id(named))
+        self._unknown(named)
+        # Installed code does not change, so what it reads does not count inside other code.
+        if id(named) not in self._seen and not (self._inside and _is_installed(home)):
+            self._seen.add(id(named))
+            self._read(_reads(named))
+
+    def _read(self, values: Iterable[object]) -> None:
         before, self._inside = self._inside, True
-        for value in reads(named):
+        for value in values:
             self.visit(value)
         self._inside = before
 
     def _unknown(self, value: object) -> None:
-        if not self._counts:
-            return
         # With the class, since numbers of different classes may compare equal.
         self.foreign.append((type(value), value))
         self._bits.append(b"foreign")
+
+
+# ---- what code reads beside its arguments --------------------------------------------------------
+
+
+def _is_installed(home: str) -> bool:
+    """Return whether a module is of Python or of an installed package, and so does not change."""
+    return _is_installed_package(home.partition(".")[0], id(sys.modules.get(home)))
+
+
+@functools.lru_cache(1024)
+def _is_installed_package(package: str, _: int) -> bool:
+    file = getattr(sys.modules.get(package), "__file__", None)
+    return package in sys.stdlib_module_names - {"__main__"} or bool(
+        file and file.startswith(_LIBRARIES)
+    )
+
+
+def _reads(named: type | FunctionType) -> Iterator[object]:
+    """Yield what the code of a class or function reads, each value with its name before it."""
+    if isinstance(named, type):
+        for base in named.__mro__:
+            if base is named or not (_is_installed(base.__module__) or base is object):
+                yield from _attributes(base)
+    else:
+        yield from _of_function(named)
+
+
+def _attributes(kind: type) -> Iterator[object]:
+    for name, value in vars(kind).items():
+        if name in _SPECIAL or name.startswith(("__dataclass", "_abc", "__abstract", "__jax")):
+            continue
+        functions = list(_functions(value))
+        for function in functions:
+            yield from _of_function(function)
+        # What calls nothing is a value that code may read.
+        if not functions and not callable(value):
+            yield name
+            yield value
+
+
+def _functions(value: object) -> Iterator[FunctionType]:
+    """Yield the functions behind a method, a property, or a wrapper of one."""
+    if isinstance(value, FunctionType):
+        yield value
+        value = getattr(value, "__wrapped__", None)
+    for name in ("__func__", "__wrapped__", "method", "fget", "func"):
+        inner = getattr(value, name, None)
+        if isinstance(inner, FunctionType):
+            yield inner
+
+
+def _of_function(function: FunctionType) -> Iterator[object]:
+    yield from (function.__qualname__, function.__defaults__, function.__kwdefaults__)
+    for cell in function.__closure__ or ():
+        try:
+            yield cell.cell_contents
+        except ValueError:
+            # Not yet filled.
+            continue
+    codes = [function.__code__]
+    while codes:
+        code = codes.pop()
+        yield code.co_code
+        codes += [const for const in code.co_consts if isinstance(const, CodeType)]
+        yield from (const for const in code.co_consts if not isinstance(const, CodeType))
+        for name in code.co_names:
+            if name in function.__globals__:
+                yield name
+                yield from _global(function.__globals__[name], code.co_names)
+
+
+def _global(value: object, names: tuple[str, ...]) -> Iterator[object]:
+    """Yield a global, or of somebody's own module what the code may read of it."""
+    if not isinstance(value, ModuleType):
+        yield value
+    elif not _is_installed(value.__name__) and not value.__name__.startswith("echelon"):
+        for name in names:
+            if name in vars(value):
+                yield name
+                yield vars(value)[name]

@@ -1,17 +1,78 @@
-"""Precision, integrators and time derivatives.
+"""JAX as echelon uses it: whether it can run, precision, integrators, derivatives, random draws.
 
-None of them depends on an agent model.
+None of them depends on an agent model. A draw depends only on a seed, a kind, and the numbers of a
+time and of agents: not on earlier draws, nor on the engine, the batch, the chunk or the precision.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator
+import enum
+import functools
+import os
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax._src import xla_bridge
 from jax.core import Tracer
+from jaxtyping import Float, UInt32
 
-from echelon.core.jax_state import require_jax
+from echelon.core.errors import EchelonError
+
+_ASKS = ("jax_platforms", "jax_platform_name", "jax_default_device")
+"""Settings of JAX that choose a device; their environment variables are the same in capitals."""
+_forked = False
+"""Whether this process is a fork of one in which JAX had started."""
+
+
+def require_jax() -> None:
+    """Check that JAX can run; cheap after the first call.
+
+    Raises:
+        EchelonError: it cannot, and would fail or hang later without saying why.
+    """
+    if _forked:
+        raise EchelonError(
+            "JAX had started before this process was forked, and would hang in it; start processes"
+            " with `multiprocessing.get_context('spawn')`, or use `echelon sweep`."
+        )
+    if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+        raise EchelonError(
+            "JAX's `jax_disable_jit` (`JAX_DISABLE_JIT`) is on, which echelon does not support;"
+            " turn it off, and debug a model by calling its functions alone."
+        )
+    _require_device()
+
+
+@functools.cache
+def _require_device() -> None:
+    try:
+        # An array, since JAX looks for its default device only when it makes one.
+        jax.device_put(np.float32(0.0))
+    # JAX raises errors of many types, an AssertionError without text among them.
+    except Exception as error:
+        for name in _ASKS:
+            asked = jax.config.values.get(name)
+            if asked:
+                own = name.upper() if name.upper() in os.environ else name
+                raise EchelonError(
+                    f"`{own}` asks JAX for `{asked}`, which this machine lacks; unset it, and JAX"
+                    " uses a device that exists, such as `cpu`."
+                ) from error
+        cause = (str(error) or type(error).__name__).splitlines()[0]
+        raise EchelonError(f"JAX finds no device on this machine ({cause}).") from error
+
+
+def _note_fork() -> None:
+    global _forked
+    _forked = _forked or bool(xla_bridge._backends)
+
+
+# Windows cannot fork.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note_fork)
+
 
 _R = TypeVar("_R")
 Precision: TypeAlias = Literal["float64", "float32"]
@@ -112,3 +173,45 @@ def derivatives(path: Callable[[jax.Array], jax.Array], t: jax.Array, order: int
         return append_rate
 
     return jnp.stack(up_to(order)(t))
+
+
+class Draw(enum.IntEnum):
+    """What is drawn: folded into the key, so that one seed draws each kind independently."""
+
+    WIND = 0
+    NOISE = 1
+    LOSS = 2
+    JITTER = 3
+    OUTAGE = 4
+    SENSING = 5
+    GUST = 6
+
+
+def key_of(seed: int) -> UInt32[np.ndarray, "2"]:
+    """Return the key of a seed."""
+    # The two halves of the seed: 32-bit integers would cut it to its lower one.
+    return np.array([seed >> 32 & 0xFFFFFFFF, seed & 0xFFFFFFFF], np.uint32)
+
+
+def _fold(key: np.ndarray, kind: Draw | jax.Array, numbers: tuple[jax.Array, ...]) -> jax.Array:
+    # By name, since the default generator of JAX is a setting of the user.
+    folded = jax.random.wrap_key_data(jnp.asarray(key), impl="threefry2x32")
+    for number in (kind, *numbers):
+        folded = jax.random.fold_in(folded, number)
+    return folded
+
+
+def normals(key: np.ndarray, kind: Draw, *numbers: jax.Array, size: int) -> Float[jax.Array, " k"]:
+    """Return draws (size,) from the standard normal distribution."""
+    # Drawn in float32, so that draws do not depend on the precision.
+    return jax.random.normal(_fold(key, kind, numbers), (size,), jnp.float32).astype(float)
+
+
+def uniforms(key: np.ndarray, kinds: Sequence[Draw], *numbers: jax.Array) -> Float[jax.Array, " k"]:
+    """Return a draw from [0, 1) of each kind."""
+
+    # The code of a draw is long to compile: there is one for all kinds.
+    def one(kind: jax.Array) -> jax.Array:
+        return jax.random.uniform(_fold(key, kind, numbers), (), jnp.float32).astype(float)
+
+    return jax.vmap(one)(jnp.array([int(kind) for kind in kinds]))

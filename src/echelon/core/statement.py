@@ -50,7 +50,6 @@ class Topic(Word):
     DRIFT_ALONG_Z = "Lemma 4, drift along z"
     LMI_AS_PRINTED = "LMI as printed"
     FINITE = "finite condition on P"
-    KILLING = "Killing residual of g"
     MARGINS = "margins"
     GAIN = "gain margin"
     DELAY = "delay margin"

@@ -7,7 +7,7 @@ import contextlib
 import hashlib
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextvars import ContextVar
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -21,20 +21,6 @@ from echelon.core.types import PyTree
 
 _R = TypeVar("_R")
 _TRACES = ContextVar[dict[Hashable, Callable[..., Any]] | None]("traces", default=None)
-
-
-class Trace(NamedTuple):
-    """A function as JAX sees it.
-
-    Attributes:
-        result: what it returns, each array as its shape and type.
-        rounds: whether it casts a float64 to fewer digits on its way.
-        frozen: whether a second trace differs, as a clock or a random number makes it.
-    """
-
-    result: PyTree
-    rounds: bool
-    frozen: bool
 
 
 @contextlib.contextmanager
@@ -61,25 +47,6 @@ def call_once_traced(function: Callable[..., _R], *arguments: PyTree) -> _R:
     if key not in traces:
         traces[key] = inlined(function)
     return traces[key](*arguments)
-
-
-def trace(function: Callable[..., PyTree], *arguments: PyTree) -> Trace:
-    """Trace a function twice at arguments of these shapes; nothing is compiled or computed.
-
-    Raises:
-        Exception: whatever the function raises.
-    """
-    first, result = jax.make_jaxpr(lambda *a: call_once_traced(function, *a), return_shape=True)(
-        *arguments
-    )
-    # Under a name of its own, since JAX would hand out the first trace of one function again.
-    second = jax.make_jaxpr(lambda *a: function(*a))(*arguments)
-    steps = list(_steps(first))
-    return Trace(
-        result,
-        any(rounds for _, _, rounds in steps),
-        [step[:2] for step in steps] != [step[:2] for step in _steps(second)],
-    )
 
 
 def trace_digest(function: Callable[..., PyTree], *arguments: PyTree) -> bytes:
@@ -127,31 +94,6 @@ def _shortens(equation: Any) -> bool:
     )
 
 
-def check_function(
-    fault: Callable[[str], Exception],
-    what: str,
-    function: Callable[..., PyTree],
-    *arguments: PyTree,
-    shape: tuple[int, ...],
-    advice: str,
-) -> None:
-    """Check that a function returns one float64 array of a shape, and the same each time.
-
-    Args:
-        fault: makes an error of a sentence.
-        what: the function, as the sentence begins.
-        function: somebody's own code.
-        arguments: what it is traced at.
-        shape: of what it must return.
-        advice: what it must be, for a function that raises.
-
-    Raises:
-        Exception: the one that `fault` makes, for the first fault found.
-    """
-    value = checked_trace(fault, what, function, *arguments, advice=advice)
-    check_array(fault, what, value.result, shape)
-
-
 def check_array(
     fault: Callable[[str], Exception], what: str, value: Any, shape: tuple[int, ...]
 ) -> None:
@@ -181,30 +123,51 @@ def checked_trace(
     function: Callable[..., PyTree],
     *arguments: PyTree,
     advice: str,
-) -> Trace:
-    """Return the trace of somebody's function, which must neither fail nor round nor change.
+    shape: tuple[int, ...] | None = None,
+) -> PyTree:
+    """Trace somebody's function twice, which must neither fail nor round nor change.
+
+    Nothing is compiled or computed.
+
+    Args:
+        fault: makes an error of a sentence.
+        what: the function, as the sentence begins.
+        function: somebody's own code.
+        arguments: what it is traced at.
+        advice: what it must be, for a function that raises.
+        shape: of the one array that it must return; None for another result.
+
+    Returns:
+        What it returns, each array as its shape and type.
 
     Raises:
         Exception: the one that `fault` makes, for the first fault found.
     """
     try:
-        result = trace(function, *arguments)
+        first, result = jax.make_jaxpr(
+            lambda *a: call_once_traced(function, *a), return_shape=True
+        )(*arguments)
+        # Under a name of its own, since JAX would hand out the first trace of one function again.
+        second = jax.make_jaxpr(lambda *a: function(*a))(*arguments)
     # A sentence of our own, which says more than its place would.
     except EchelonError:
         raise
     # It is anyone's code: whatever it raises is its own fault, and stays attached as the cause.
     except Exception as error:
         raise fault(f"{what} fails with {error_summary(error)}; {advice}.") from error
-    if result.rounds:
+    steps = list(_steps(first))
+    if any(rounds for _, _, rounds in steps):
         raise fault(
             f"{what} casts float64 numbers to fewer digits, and must keep the type of its "
             "argument, `x.dtype`."
         )
-    if result.frozen:
+    if [step[:2] for step in steps] != [step[:2] for step in _steps(second)]:
         raise fault(
             f"{what} differs from one call to the next, as a clock or a random number makes it, "
             "and must be a function of its arguments alone."
         )
+    if shape is not None:
+        check_array(fault, what, result, shape)
     return result
 
 

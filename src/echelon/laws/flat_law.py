@@ -25,8 +25,7 @@ from echelon.core.limits import LARGEST
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.flat_loop import FlatLoop, FlatMemory, Observer
 from echelon.laws.law import Law, LocalView
-from echelon.laws.nearest_point import MOST_POINTS
-from echelon.laws.safety import hull_points
+from echelon.laws.safety import MOST_POINTS, hull_points
 
 Speed: TypeAlias = float | tuple[float, ...]
 

@@ -214,9 +214,8 @@ class FlatLoop(eqx.Module):
         values = flatten(model, self.chains, x, memory.chain).values
         if not self.observer:
             return values
-        for order, more in zip(
-            (2, 3), (memory.push, self._push_rate(model, x, memory)), strict=True
-        ):
+        push_rate = self.observer.gains[1] * self._speed_error(model, x, memory)
+        for order, more in ((2, memory.push), (3, push_rate)):
             inside = np.array(self.chains.degrees) > order
             if inside.any():
                 values = values.at[order].add(jnp.where(inside, more, 0.0))
@@ -335,10 +334,6 @@ class FlatLoop(eqx.Module):
         error = speed - (memory.base + memory.half * pull)
         jumps = [k for k in self.angles if self.chains.degrees[k] == 1]
         return wrap_angles(error, *jumps) if jumps else error
-
-    def _push_rate(self, model: ControlAffine, x: State, memory: FlatMemory) -> jax.Array:
-        """Return the rate of the estimated push, (m,)."""
-        return self.observer.gains[1] * self._speed_error(model, x, memory)
 
     def _observed(self, model: ControlAffine, x: State, v: Input) -> tuple[jax.Array, jax.Array]:
         """Return what the observer measures of each output, and its rate under an input v, (m,).

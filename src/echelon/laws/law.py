@@ -13,14 +13,13 @@ from jaxtyping import Float
 
 from echelon.agents.models.heading_symmetry import heading_index, rest_heading
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.exchange import Near
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.near import Near
 from echelon.agents.references.reference import Guide
-from echelon.core.declared import Declared
 from echelon.core.errors import LawError
 from echelon.core.numerics import rk4
-from echelon.core.types import Array, Input, PyTree, Scalar, State
+from echelon.core.types import Array, Declared, Input, PyTree, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.laws.safety import Safety
 from echelon.synthesis.gains.gain import Gain
@@ -379,3 +378,17 @@ def without_certificates(law: Law) -> Law:
 
     # A user's own law may have a gain anywhere, under any name.
     return jax.tree.map(strip, law, is_leaf=lambda node: isinstance(node, Gain))
+
+
+# ---- the law that does nothing -------------------------------------------------------------------
+
+
+class TrimInput(Law):
+    """u = u* + S v_ff, where v_ff = 0 since the law uses no feed-forward.
+
+    The agent moves freely about its trim.
+    """
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return the trim input."""
+        return model.physical(view.feedforward), memory

@@ -15,8 +15,7 @@ from echelon.core.errors import LawError
 from echelon.core.types import Array, States
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law
-from echelon.laws.nearest_point import nearest_point
-from echelon.laws.safety import Safety
+from echelon.laws.safety import Safety, nearest_point
 
 _MOST_AGENTS = 1000
 """All pairs are compared in each step."""

@@ -1,12 +1,8 @@
-"""Stopping-point consensus: agents send each other where they would come to rest (T5).
-
-Each output of each agent is then one integrator, whatever the agent. So the formation converges
-from anywhere, over any graph in which the leader reaches everybody, and an agent's motion depends
-on its own start and on a speed alone.
-"""
+"""Stopping-point consensus: agents send each other where they would come to rest (T5)."""
 
 import dataclasses
 import functools
+import math
 from typing import final
 
 import equinox as eqx
@@ -15,27 +11,60 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine, FlatBound, wrap_angles
+from echelon.agents.network.exchange import Near
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.near import Near
-from echelon.agents.references.demand import first_state, followed_states
+from echelon.agents.references.flatness import first_state, followed_states
 from echelon.agents.references.reference import Guide, Reference, check_reference
+from echelon.core.cache import memoize
 from echelon.core.errors import LawError, check_kind, listing
-from echelon.core.memoize import memoize
 from echelon.core.numerics import greater, lesser, precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward, NeighbourChoice
-from echelon.laws.flat_law import (
-    CHAIN_SHARE,
-    LEAD_SHARE,
-    LEAD_SPEED,
-    SHARE,
-    SPEED,
-    FlatLaw,
-)
+from echelon.laws.flat_law import CHAIN_SHARE, LEAD_SHARE, LEAD_SPEED, SHARE, SPEED, FlatLaw
 from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Expected, Law, LocalView
 from echelon.laws.safety import Safety
-from echelon.laws.saturated_decay import saturated_decay
+
+# ---- the decay of a stopping point whose speed is bounded ----------------------------------------
+
+_LINEAR = 1e-8
+"""Of c |x| / s; below it sigma is linear to rounding."""
+_LN2 = math.log(2.0)
+
+
+def saturated_decay(
+    start: jax.Array, coupling: Scalar | float, inverse: jax.Array, age: Scalar
+) -> jax.Array:
+    """Return x after a time (s) of x' = -sigma(c x), sigma(x) = x / sqrt(1 + (x/s)^2), entrywise.
+
+    With v = c |x| / s the function F(v) = sqrt(1 + v^2) - arsinh(1/v) falls by c per second.
+
+    Args:
+        start: x at the beginning.
+        coupling: c, 1/s.
+        inverse: 1/s of each entry, 0 where sigma is linear.
+        age: the time, s.
+    """
+    v = coupling * jnp.abs(start) * inverse
+    linear = v < _LINEAR
+    v = jnp.where(linear, 1.0, v)
+    target = _fallen(v) - coupling * age
+    # F is above ln v and above v - 1 or so; from there Newton's method in ln v has all digits soon.
+    guess = jnp.where(target >= 1.0, jnp.log(jnp.maximum(target, 1.0)), target - 1.0 + _LN2)
+    for _ in range(4):
+        now = jnp.exp(guess)
+        guess = guess - (_fallen(now) - target) / jnp.sqrt(1.0 + now**2)
+    return start * jnp.where(linear, jnp.exp(-coupling * age), jnp.exp(guess) / v)
+
+
+def _fallen(v: jax.Array) -> jax.Array:
+    return jnp.sqrt(1.0 + v**2) - jnp.arcsinh(1.0 / v)
+
+
+# ---- the law -------------------------------------------------------------------------------------
+# Each output of each agent is then one integrator, whatever the agent. So the formation converges
+# from anywhere, over any graph in which the leader reaches everybody, and an agent's motion depends
+# on its own start and on a speed alone.
 
 _INSTANT = 1e-9
 """s; a shorter period is none."""

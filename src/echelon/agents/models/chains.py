@@ -19,8 +19,8 @@ from jaxtyping import Float
 
 from echelon.agents.models.declarations import is_by_user, undeclared
 from echelon.agents.models.model import ControlAffine, FlatBound, Flattened
+from echelon.core.cache import memoize
 from echelon.core.errors import ModelError, listing
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
 

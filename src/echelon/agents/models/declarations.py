@@ -58,7 +58,9 @@ def _is_about_another(model: ControlAffine, name: str) -> bool:
     place = next(k for k, level in enumerate(levels) if name in level)
     # The first level is of no class.
     owners = type(model).__mro__[max(place - 1, 0) :]
-    fields = {field.name for field in dataclasses.fields(next(filter(_is_dataclass, owners)))}
+    fields = {
+        field.name for field in dataclasses.fields(next(filter(dataclasses.is_dataclass, owners)))
+    }
     apart = (_APART | _LIMITS | {*_ABOUT}) - _ABOUT[name] | fields
     return any(
         any(key in vars(owner) for owner in owners)
@@ -73,10 +75,6 @@ def _is_data(name: str, value: object) -> bool:
     """Tell whether an attribute is plain data of a user's class, as parameters are."""
     plain = not callable(value) and not hasattr(type(value), "__get__")
     return plain and not hasattr(ControlAffine, name)
-
-
-def _is_dataclass(kind: type) -> bool:
-    return dataclasses.is_dataclass(kind)
 
 
 def _levels(model: ControlAffine) -> Iterator[Mapping[str, object]]:

@@ -11,11 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from echelon.agents.models.heading import Heading, Turn
-from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model import ControlAffine, Heading, Turn
+from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import ModelError, did_you_mean, listing
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Input, Scalar, State
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.secants import Gap, Sides, sides, stencil, units_at
+from echelon.core.cache import memoize
 from echelon.core.compiled import compiled_for_one_call
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.trace import call_once_traced
 from echelon.core.types import Array, Input, State, States

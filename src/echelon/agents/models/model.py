@@ -1,9 +1,4 @@
-"""The interface of an agent: a control-affine system xdot = f(x) + g(x) u, y = h(x).
-
-It is the agent of the paper's Definition 1. A user's model needs two methods and two tuples of
-names; everything else has a default, which a class attribute, a property or a method of the same
-name replaces.
-"""
+"""The interface of an agent: a control-affine system xdot = f(x) + g(x) u, y = h(x)."""
 
 import abc
 from collections.abc import Callable, Mapping
@@ -13,13 +8,92 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Float
 
-from echelon.agents.models.airframe import Airframe
-from echelon.agents.models.heading import Heading
-from echelon.core.declared import Declared
 from echelon.core.errors import ModelError, did_you_mean, is_number, listing
 from echelon.core.trace import call_once_traced
-from echelon.core.types import Input, InputMap, Output, State
+from echelon.core.types import Array, Declared, Input, InputMap, Output, Scalar, State
+
+# ---- what a model may state of its motors --------------------------------------------------------
+
+
+class Airframe(NamedTuple):
+    """A rigid body under four motors, whose thrusts and torques are all that moves it.
+
+    Attributes:
+        mass: kg.
+        inertia: principal moments, kg m^2.
+        gravity: m/s^2.
+        arm: of each motor along both horizontal body axes, m.
+        torque_per_thrust: yaw torque per thrust, N m / N.
+        motor_thrust: largest thrust of one motor, N; the smallest is 0.
+    """
+
+    mass: float
+    inertia: tuple[float, float, float]
+    gravity: float
+    arm: float
+    torque_per_thrust: float
+    motor_thrust: float
+
+
+# ---- what a model may state of its heading -------------------------------------------------------
+
+
+class Heading(NamedTuple):
+    """How a model turns: its heading grows by the angle, and vectors in the plane turn by it.
+
+    Attributes:
+        state: name of the state that is the heading, rad.
+        vectors: pairs of states that turn, such as ("x", "y"): from the first to the second.
+        inputs: pairs of normalized inputs that turn; none where inputs act along the body's axes.
+    """
+
+    state: str
+    vectors: tuple[tuple[str, str], ...] = ()
+    inputs: tuple[tuple[str, str], ...] = ()
+
+
+class Turn(NamedTuple):
+    """A rotation of pairs of entries of a vector (k,), exp(angle G).
+
+    Attributes:
+        partners: (k,) the entry with which each entry is mixed.
+        signs: (k,) its sign in the mixture; 0 where an entry does not turn.
+    """
+
+    partners: Array
+    signs: Array
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], pairs: tuple[tuple[str, str], ...]) -> "Turn":
+        """Return the rotation of pairs of named entries."""
+        partners, signs = np.arange(len(names)), np.zeros(len(names))
+        for first, second in pairs:
+            i, j = names.index(first), names.index(second)
+            partners[[i, j]], signs[[i, j]] = (j, i), (-1.0, 1.0)
+        return cls(partners, signs)
+
+    def __call__(self, values: Float[jax.Array, " k"], angle: Scalar) -> Float[jax.Array, " k"]:
+        """Return values (k,) turned by an angle (rad); entries that do not turn keep their bits."""
+        if not self.signs.any():
+            return values
+        signs = jnp.asarray(self.signs, values.dtype)
+        cosines = jnp.where(self.signs != 0.0, jnp.cos(angle), jnp.ones_like(values))
+        return cosines * values + jnp.sin(angle) * (signs * values[self.partners])
+
+    @property
+    def slope(self) -> Array:
+        """G (k, k)."""
+        slope = np.zeros((len(self.signs), len(self.signs)))
+        slope[np.arange(len(self.signs)), self.partners] = self.signs
+        return slope
+
+
+# ---- the interface -------------------------------------------------------------------------------
+# It is the agent of the paper's Definition 1. A user's model needs two methods and two tuples of
+# names; everything else has a default, which a class attribute, a property or a method of the same
+# name replaces.
 
 Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 Rows: TypeAlias = tuple[tuple[float, ...], ...]

@@ -10,11 +10,11 @@ from jaxtyping import Float
 from echelon.agents.models.heading_symmetry import check_heading
 from echelon.agents.models.linearization import AtTrim, at_trim
 from echelon.agents.models.model import ControlAffine, Limits
+from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import ModelError, did_you_mean, is_number, listing
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
-from echelon.core.trace import check_function, error_summary
+from echelon.core.trace import checked_trace, error_summary
 from echelon.core.types import Array
 from echelon.core.words import amount
 
@@ -93,18 +93,9 @@ _KINDS = (
     ("position", (tuple, list), "a tuple of states' names"),
     ("state_groups", Mapping, "a mapping of names to tuples of states' names"),
     ("chart", Mapping, "a mapping of states' names to bounds"),
+    ("difference", None, "a method"),
 )
-_NOT_DECLARED = "`{}` of `{}` is {!r}, and must be {}; a parameter needs another name."
-
-
-def _check_kinds(model: ControlAffine, name: str) -> None:
-    """Check what models declare, whose names a parameter may have by accident."""
-    for what, kind, text in _KINDS:
-        value = getattr(model, what)
-        if not isinstance(value, kind):
-            raise ModelError(_NOT_DECLARED.format(what, name, value, text))
-    if not callable(model.difference):
-        raise ModelError(_NOT_DECLARED.format("difference", name, model.difference, "a method"))
+"""What models declare, whose names a parameter may have by accident."""
 
 
 def _check_words(model: ControlAffine, name: str) -> None:
@@ -128,7 +119,13 @@ def _check_words(model: ControlAffine, name: str) -> None:
 def _check_names(model: ControlAffine, name: str) -> None:
     """Check the names, and that groups, position and units refer to states that exist."""
     _check_words(model, name)
-    _check_kinds(model, name)
+    for what, kind, text in _KINDS:
+        value = getattr(model, what)
+        if not (isinstance(value, kind) if kind else callable(value)):
+            raise ModelError(
+                f"`{what}` of `{name}` is {value!r}, and must be {text}; a parameter needs another "
+                "name."
+            )
     states = model.state_names
     if len(set(states)) < len(states):
         raise ModelError(f"`state_names` of `{name}` repeats a name: {listing(states)}.")
@@ -263,31 +260,26 @@ def _numbers(
     if len(shape) == 1:
         # The trim of a single state may be a plain number.
         array = np.atleast_1d(array)
-    _check_shape(name, what, array.shape, shape)
+    if array.shape != shape:
+        raise ModelError(
+            f"`{what}` of `{name}` has shape {array.shape}, and must have shape {shape}."
+        )
     if not (np.abs(array) <= most).all():
         allowed = "finite" if np.isfinite(most) else "numbers"
         raise ModelError(f"`{what}` of `{name}` is {value}, and must be {allowed}.")
     return array
 
 
-_ADVICE = "it must be written with `jax.numpy` and take one agent's state"
-
-
 def _check_functions(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -> None:
     """Check the shapes of f, g, h and limits, and that f, g and h are finite at the trim."""
     n, m, q = len(x), len(u), len(model.output_names)
-    functions = {"drift": model.drift, "input_map": model.input_map, "output": model.output}
-    shapes = ((n,), (n, m), (q,), (m,))
-    for (what, function), shape in zip(
-        (functions | {"limit": model.limit}).items(), shapes, strict=True
-    ):
-        at = u if what == "limit" else x
-        check_function(
-            ModelError, f"`{what}` of `{name}`", function, at, shape=shape, advice=_ADVICE
-        )
+    advice = "it must be written with `jax.numpy` and take one agent's state"
+    shapes = {"drift": (n,), "input_map": (n, m), "output": (q,), "limit": (m,)}
+    for what, shape in shapes.items():
+        at, function = (u if what == "limit" else x), getattr(model, what)
+        checked_trace(ModelError, f"`{what}` of `{name}`", function, at, advice=advice, shape=shape)
     trim = _differentiate(model, name)
-    slopes = (trim.drift_slope, trim.input_slope, trim.output_slope)
-    for what, value, slope in zip(functions, trim[:3], slopes, strict=True):
+    for what, value, slope in zip(shapes, trim[:3], trim[3:6], strict=False):
         for which, array in ((f"`{what}`", value), (f"the Jacobian of `{what}`", slope)):
             if not np.isfinite(array).all():
                 raise ModelError(f"{which} of `{name}` is not finite at the trim {x.tolist()}.")
@@ -318,11 +310,6 @@ def _differentiate(model: ControlAffine, name: str) -> AtTrim:
             "without `stop_gradient` and without derivatives of its own."
         )
     return trim
-
-
-def _check_shape(name: str, what: str, got: tuple[int, ...], shape: tuple[int, ...]) -> None:
-    if got != shape:
-        raise ModelError(f"`{what}` of `{name}` has shape {got}, and must have shape {shape}.")
 
 
 def _check_trim(model: ControlAffine, name: str, u: np.ndarray) -> None:
@@ -379,7 +366,6 @@ def at_limits(model: ControlAffine, u: Float[Array, " m"]) -> tuple[str, ...]:
 
 
 def _weak_actuators(model: ControlAffine, name: str) -> tuple[str, ...]:
-    """Warn of a trim that the actuators do not deliver."""
     # `limit` returns what fits unchanged, to the bit, so any difference is saturation.
     cut = trim_shortfall(model).items()
     parts = ", ".join(f"`{what}` {part:.4g} of {full:.4g}" for what, (part, full) in cut)

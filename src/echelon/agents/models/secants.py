@@ -159,10 +159,6 @@ def _oblique(n: int) -> Float[Array, "q n"]:
     return np.random.default_rng(0).choice([-1.0, -0.5, 0.5, 1.0], (_OBLIQUE, n))
 
 
-def _moves(units: Float[Array, " n"]) -> Float[Array, "q n"]:
-    return np.concatenate([np.eye(len(units)), _oblique(len(units))]) * units
-
-
 def units_at(point: Float[Array, " n"], units: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return the units of steps from a point: powers of two, so that x + h - x is h."""
     return 2.0 ** np.round(np.log2(np.maximum(units, np.abs(point))))
@@ -170,7 +166,8 @@ def units_at(point: Float[Array, " n"], units: Float[Array, " n"]) -> Float[Arra
 
 def stencil(point: Float[Array, " n"], units: Float[Array, " n"]) -> Float[Array, "K n"]:
     """Return a point and the points around it from which `sides` computes slopes."""
-    moves = _moves(units_at(point, units))
+    units = units_at(point, units)
+    moves = np.concatenate([np.eye(len(units)), _oblique(len(units))]) * units
     nearby = np.outer(_STEPS[1::2], _NEARBY).reshape(-1)
     steps = np.concatenate([_STEPS, -_STEPS, nearby, -nearby])
     around = point + steps[:, None, None] * moves

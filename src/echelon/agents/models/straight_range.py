@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine, wrap_angles
+from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
-from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.trace import trace_digest
 from echelon.core.types import Array, State

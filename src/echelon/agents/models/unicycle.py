@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 
-from echelon.agents.models.heading import Heading
 from echelon.agents.models.model import (
     ControlAffine,
     FlatBound,
     FlatChains,
+    Heading,
     check_positive,
     diagonal,
     wrap_angles,

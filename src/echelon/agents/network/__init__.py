@@ -1,11 +1,13 @@
 """The network: communication graphs and formations."""
 
+from typing import Any
+
 from echelon.agents.network.events import Cut, Join, Lose
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.spectrum import Spectrum
-from echelon.agents.network.topology import recommend_edges, recommend_leaders
+from echelon.core.gone import no_name
 
 __all__ = [
     "Cut",
@@ -18,6 +20,8 @@ __all__ = [
     "Rotate",
     "Scale",
     "Spectrum",
-    "recommend_edges",
-    "recommend_leaders",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    raise no_name(f"network.{name}")

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int
 
-from echelon.core.draws import Draw, key_of, uniforms
 from echelon.core.errors import SimulationError, check_kind, is_number
+from echelon.core.numerics import Draw, key_of, uniforms
 from echelon.core.types import Array, PyTree
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 

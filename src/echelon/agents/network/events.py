@@ -12,8 +12,7 @@ from typing import NamedTuple, TypeAlias, final
 import numpy as np
 
 from echelon.agents.network.edges import name_agents
-from echelon.agents.network.matrices import GraphMatrices
-from echelon.agents.network.reach import nearest_leaders, unreached
+from echelon.agents.network.matrices import GraphMatrices, nearest_leaders, unreached
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import GraphError, is_number
 from echelon.core.types import Array

@@ -1,8 +1,8 @@
-"""The exchange over the network: an agent's disagreement with the values of its neighbours."""
+"""The exchange between neighbours, and what an agent knows of others that may come near it."""
 
 import operator
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -73,3 +73,20 @@ class Exchange(eqx.Module):
         total = jax.ops.segment_sum(weights, self.receivers, num_segments=len(values))[:, None]
         z = chosen(values, received, difference)
         return jnp.where(total > 0.0, z / jnp.where(total > 0.0, total, 1.0), alone)
+
+
+# ---- others that may come near -------------------------------------------------------------------
+
+
+class Near(NamedTuple):
+    """K others as one agent knows them: of each the r points in whose hull its position stays.
+
+    Attributes:
+        gaps: own points less theirs, in d coordinates, m.
+        leads: which of them lead, and do not give way.
+        known: which of them are known; the gaps of the others mean nothing.
+    """
+
+    gaps: Float[jax.Array, "K r d"]
+    leads: Bool[jax.Array, " K"]
+    known: Bool[jax.Array, " K"]

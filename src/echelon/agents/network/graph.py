@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from echelon.agents.network.bound import Grounded
 from echelon.agents.network.edges import (
+    advising,
     check_edges,
     check_leaders,
     check_size,
@@ -20,20 +20,26 @@ from echelon.agents.network.edges import (
     edges_of_matrix,
     give_weights,
     links,
+    pairs_within,
     split_weights,
 )
-from echelon.agents.network.eigenvalues import (
+from echelon.agents.network.events import Event, check_heirs, event_faults, schedule_of
+from echelon.agents.network.matrices import (
+    GraphMatrices,
+    check_reached,
+    nearest_leaders,
+    ordered_outward,
+    outward_edges,
+    parents_of,
+)
+from echelon.agents.network.spectrum import (
+    Grounded,
+    Spectrum,
     directed_spectrum,
     switching_spectrum,
     symmetric_spectrum,
 )
-from echelon.agents.network.events import Event, check_heirs, event_faults, schedule_of
-from echelon.agents.network.matrices import GraphMatrices
-from echelon.agents.network.radius import advising, pairs_within
-from echelon.agents.network.reach import check_reached, nearest_leaders
-from echelon.agents.network.spectrum import Spectrum
 from echelon.agents.network.switching import Schedule, Stretch, unite
-from echelon.agents.network.tree import ordered_outward, outward_edges, parents_of
 from echelon.core.errors import GraphError
 from echelon.core.types import Array
 from echelon.core.words import amount

@@ -7,9 +7,9 @@ from typing import NamedTuple, final
 import numpy as np
 from jaxtyping import Float
 
-from echelon.core.packet import Packet
 from echelon.core.types import Array
 from echelon.core.words import Word
+from echelon_flight.wire import Packet
 
 LARGEST = 1e12
 """Of a value, in its own unit: a product of some of them is still finite."""

@@ -1,4 +1,4 @@
-"""Paths of polynomial pieces: through timed points, or as Crazyswarm2 and Crazyflies read them."""
+"""Paths of polynomial pieces: through timed points, and as Crazyswarm2 and firmware fly them."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +18,8 @@ from echelon.core.compiled import cached_jit
 from echelon.core.errors import ReferenceError, check_kind
 from echelon.core.numerics import precision
 from echelon.core.types import Array, PathLike, Scalar
+
+# ---- the common base -----------------------------------------------------------------------------
 
 
 class PolynomialPath(Reference):
@@ -75,6 +77,9 @@ def _horner(coefficients: Array | jax.Array, s: Scalar | float) -> Any:
     return value
 
 
+# ---- through timed points ------------------------------------------------------------------------
+
+
 class Waypoints(PolynomialPath):
     """The spline of degree 7 through `points` at `times`, at rest at both ends.
 
@@ -108,7 +113,7 @@ class Waypoints(PolynomialPath):
         degrees: bool = False,
     ) -> None:
         """Fit the spline."""
-        t, p = _timed_points(times, points)
+        t, p = _checked_points(times, points)
         self.degrees = degrees
         self.knots, self.coefficients = t, _fit(t, np.column_stack([p, _yaws(yaw, degrees, t)]))
 
@@ -151,7 +156,7 @@ class Waypoints(PolynomialPath):
         )
 
 
-def _timed_points(
+def _checked_points(
     times: Sequence[float] | Array, points: Sequence[Sequence[float]] | Array
 ) -> tuple[Array, Array]:
     """Return times (K,) and points (K, 3), after checking both."""
@@ -198,8 +203,7 @@ def _fit(times: Float[Array, " K"], points: Float[Array, "K 4"]) -> Float[Array,
     return coefficients
 
 
-# ---- pieces from a file, and any path as pieces --------------------------------------------------
-
+# ---- pieces and their files ----------------------------------------------------------------------
 
 _COLUMNS = ("duration", *(f"{name}^{k}" for name in COORDINATES for k in range(8)))
 _ORDERS = 4

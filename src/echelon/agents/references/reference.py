@@ -1,4 +1,4 @@
-"""The interface of a reference: a smooth path in space with a yaw, as functions of time."""
+"""What a leader follows: a motion of a model, or a smooth path in space with a yaw."""
 
 import abc
 import functools
@@ -11,13 +11,14 @@ import numpy as np
 
 from echelon.agents.models.heading_symmetry import heading_index, heading_of, rest_heading
 from echelon.agents.models.model import ControlAffine
-from echelon.core.declared import Declared
+from echelon.core.cache import memoize
 from echelon.core.enclosure.hull import Box, value_hull
 from echelon.core.errors import GainError, LawError, ReferenceError, check_kind, listing
-from echelon.core.memoize import memoize
 from echelon.core.numerics import derivatives, precision
-from echelon.core.trace import call_once_traced, check_array, check_function, checked_trace
-from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.trace import call_once_traced, check_array, checked_trace
+from echelon.core.types import Array, Declared, Input, Scalar, State
+
+# ---- a motion of a model -------------------------------------------------------------------------
 
 
 class Guide(Declared):
@@ -59,6 +60,8 @@ class Guide(Declared):
             LawError: it cannot; the message says why.
         """
 
+
+# ---- a path in space -----------------------------------------------------------------------------
 
 COORDINATES = ("x", "y", "z", "yaw")
 _MAX_TIME = 10**9
@@ -108,7 +111,7 @@ class Reference(Guide):
     def check(self) -> None:
         """Check that (x, y, z, yaw) is returned."""
         with precision("float64"):
-            check_function(
+            checked_trace(
                 ReferenceError,
                 f"the point of `{type(self).__name__}`",
                 self,
@@ -170,7 +173,7 @@ def _check_map(model: ControlAffine) -> None:
             model.flat,
             np.zeros((model.flat_order + 1, len(model.flat_outputs))),
             advice="it must be written with `jax.numpy` and take the outputs' derivatives",
-        ).result
+        )
     if not isinstance(returned, tuple | list) or len(returned) != 2:
         raise LawError(f"`flat` of `{name}` must return a pair, a state and an input.")
     for what, value, size in zip(("state", "input"), returned, shapes, strict=True):

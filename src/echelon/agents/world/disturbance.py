@@ -15,9 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.draws import Draw, key_of, normals
 from echelon.core.errors import ModelError, SimulationError, did_you_mean, is_number, listing
-from echelon.core.numerics import Field
+from echelon.core.numerics import Draw, Field, key_of, normals
 from echelon.core.types import Array, Input, State
 from echelon.core.words import amount
 

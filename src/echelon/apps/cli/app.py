@@ -9,40 +9,31 @@ import functools
 import gc
 import logging
 import os
+import signal
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Final
 
 import typer
 
 from echelon import __version__
-from echelon.apps.cli.cache import keep_compiled_code
-from echelon.apps.cli.check_command import check
-from echelon.apps.cli.compare_command import compare
-from echelon.apps.cli.crash import CRASHED, note_crash
-from echelon.apps.cli.design_command import design
-from echelon.apps.cli.doctor_command import doctor
-from echelon.apps.cli.explain_command import explain
 from echelon.apps.cli.export_command import export
 from echelon.apps.cli.fly_command import fly
-from echelon.apps.cli.init_command import init
-from echelon.apps.cli.list_command import list_, schema
-from echelon.apps.cli.live_command import live
+from echelon.apps.cli.list_command import doctor, explain, init, list_, schema
 from echelon.apps.cli.options import EchelonCommand, EchelonGroup
 from echelon.apps.cli.path_command import path
-from echelon.apps.cli.plot_command import plot
 from echelon.apps.cli.report_command import report
-from echelon.apps.cli.run_command import run
-from echelon.apps.cli.status import STATUS
-from echelon.apps.cli.stop import NOTHING, STOP, Ended
-from echelon.apps.cli.streams import outlive_readers
-from echelon.apps.cli.sweep_command import sweep
-from echelon.apps.cli.tune_command import tune
+from echelon.apps.cli.run_command import run, sweep
+from echelon.apps.cli.show_command import live, plot, video, view
+from echelon.apps.cli.study_command import check, compare, design
+from echelon.apps.cli.terminal import STATUS, on_signal, outlive_readers
 from echelon.apps.cli.verify_command import verify
-from echelon.apps.cli.video_command import video
-from echelon.apps.cli.view_command import view
-from echelon.core import disk_cache
+from echelon.core import cache
 from echelon.core.errors import EchelonError, ModelError
+from echelon_flight import FlightError
 
 _EPILOG = (
     "Exit codes: 0 success; 1 nothing is guaranteed, verify or doctor refused, or an agent left "
@@ -53,6 +44,9 @@ _EPILOG = (
     "ECHELON_CACHE names the folder for compiled code and proofs of bundled parts; "
     "`off` disables it."
 )
+
+CRASHED: Final = 70
+"""Exit code of an error in the program itself, as in BSD's `sysexits.h`."""
 
 app = typer.Typer(
     cls=EchelonGroup,
@@ -68,14 +62,6 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line; an error becomes one sentence and its exit code."""
-    try:
-        _main()
-    except SystemExit as end:
-        STOP.leave(end.code)
-        raise
-
-
-def _main() -> None:
     # Where the home folder is read-only, matplotlib prints two lines about its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     # Matrices are small here: more threads of linear algebra wait for each other, and no digit may
@@ -83,14 +69,16 @@ def _main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Traces are made of many objects that last: Python would look through all of them at each 700.
     gc.set_threshold(20_000)
-    folder = keep_compiled_code(os.environ)
-    with disk_cache.use_folder(folder), outlive_readers(), STOP.listen():
+    folder = cache.open_user_folder(os.environ)
+    with cache.use_folder(folder), on_signal(signal.SIG_DFL), outlive_readers():
         try:
-            _call()
-        except EchelonError as error:
+            try:
+                app()
+            finally:
+                # Here, since a failure after `main` would get an exit code of Python.
+                sys.stdout.flush()
+        except (EchelonError, FlightError) as error:
             _leave(str(error), error.exit_code)
-        except Ended:
-            _leave(NOTHING, STOP.exit_code)
         except Exception as error:
             if isinstance(error, OSError) and error.errno == errno.ENOSPC:
                 _leave(f"the output cannot be written: {error.strerror}.", EchelonError.exit_code)
@@ -100,12 +88,25 @@ def _main() -> None:
             _leave(note_crash(error), CRASHED)
 
 
-def _call() -> None:
+def note_crash(error: Exception) -> str:
+    """Write the details of an internal error to a file, and return the sentence that names it."""
+    kind = type(error).__name__
+    reason = (str(error).splitlines() or ["no message"])[0].rstrip(".")
+    sentence = f"internal error of echelon (your input may be correct): {kind}: {reason}"
+    details = "".join(traceback.format_exception(error))
     try:
-        app()
-    finally:
-        # Here, since a failure after `main` would get an exit code of Python.
-        sys.stdout.flush()
+        from echelon.core.files import versions
+
+        head = f"{' '.join(sys.argv)}\n{versions()}\n\n"
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="echelon-crash-", suffix=".txt", delete=False, encoding="utf-8"
+        ) as file:
+            file.write(head + details)
+        return f"{sentence}. Please report it with `{Path(file.name)}`."
+    except OSError:
+        # No file can be written, so the details go to the terminal.
+        print(details, file=sys.stderr)
+        return f"{sentence}. Please report it with the details above."
 
 
 def _leave(sentence: str, code: int) -> None:
@@ -145,9 +146,9 @@ def _guarded(command: Callable[..., None]) -> Callable[..., None]:
 
 
 # Listed here instead of decorated in their files, so that the order is that of `--help`.
-_COMMANDS: tuple[Callable[..., None], ...] = (
+COMMANDS: tuple[Callable[..., None], ...] = (
     *(init, run, sweep, view, live, fly, plot, video, report, export, path),
-    *(check, design, tune, compare, verify, list_, explain, doctor, schema),
+    *(check, design, compare, verify, list_, explain, doctor, schema),
 )
-for _command in _COMMANDS:
+for _command in COMMANDS:
     app.command(_command.__name__.rstrip("_"), cls=EchelonCommand)(_guarded(_command))

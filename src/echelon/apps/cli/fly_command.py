@@ -1,5 +1,6 @@
 """`echelon fly`: the processes of a flight, each by itself; this one only prepares them."""
 
+import contextlib
 import os
 import sys
 import tempfile
@@ -9,13 +10,13 @@ from typing import Annotated
 import typer
 
 from echelon.apps.cli import options
-from echelon.apps.cli.status import STATUS
+from echelon.apps.cli.terminal import STATUS
 from echelon.core.errors import FlightError
-from echelon.flight.key_files import read_key, require_key
-from echelon.flight.links.link import check_scheme
-from echelon.flight.mission import FACTS
 from echelon.output.archive.folder import check_empty
+from echelon_flight import __version__
 
+CONTAINED = "0.1.0"
+"""The version of the package `echelon_flight` that is installed with echelon."""
 _SCENARIO = "The name of a bundled scenario, a YAML file, or a folder that `--out` wrote."
 _Number = Annotated[int | None, typer.Option(help="Fly this agent.")]
 _All = Annotated[bool, typer.Option("--all", help="Fly all agents, with simulated vehicles.")]
@@ -58,9 +59,10 @@ def fly(
     out: _Out = None,
 ) -> None:
     """Fly a scenario: a process for each agent, which needs neither JAX nor NumPy."""
+    _check_version()
     _check(agent, every, ground, key, link, out)
     folder = Path(scenario)
-    if not (folder / FACTS).is_file():
+    if not (folder / "flight.json").is_file():
         folder = _prepare(scenario, set_ or [], out)
     if out is not None:
         print(f"- Written to {folder}; `echelon fly {folder} --all` flies it.")
@@ -75,7 +77,22 @@ def fly(
     STATUS.pause()
     sys.stdout.flush()
     # In place of this process, which holds JAX.
-    os.execv(sys.executable, [sys.executable, "-m", "echelon.flight", str(folder), *words])
+    os.execv(sys.executable, [sys.executable, "-m", "echelon_flight", str(folder), *words])
+
+
+def _check_version() -> None:
+    """Say where a distribution of another version may have replaced what echelon contains."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {__version__}
+    with contextlib.suppress(PackageNotFoundError):
+        found.add(version("echelon-flight"))
+    for other in found - {CONTAINED}:
+        print(
+            f"echelon: `echelon-flight` {other} is installed beside echelon, which contains "
+            f"{CONTAINED}; uninstall it, then install echelon again.",
+            file=sys.stderr,
+        )
 
 
 def _check(
@@ -84,14 +101,14 @@ def _check(
     """Check what can be, before the laws are written, which takes long.
 
     Raises:
-        FlightError: options do not fit each other, or the key cannot be used.
+        FlightError: options do not fit each other, or echelon_flight refuses the link or the key.
     """
+    from echelon_flight.mission import check_options
+
     tasks = [agent is not None, every, ground, out is not None]
     if sum(tasks) != 1:
         raise FlightError("give one of `--agent` with a number, `--all`, `--ground` and `--out`.")
-    check_scheme(link)
-    if agent is not None or ground:
-        read_key(require_key(key))
+    check_options(link, key, signs=agent is not None or ground)
 
 
 def _prepare(scenario: str, changes: list[str], out: Path | None) -> Path:

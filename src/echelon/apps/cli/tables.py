@@ -1,11 +1,15 @@
-"""Tables of checks, designs and facts on the terminal."""
+"""Output that commands share: tables, warnings, the files written."""
 
 import enum
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from echelon.apps.cli.terminal import STATUS
 from echelon.core.digits import about, at_least, at_most
+from echelon.core.files import write_atomic
+from echelon.output.archive.folder import write_errors
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -13,6 +17,7 @@ if TYPE_CHECKING:
 
     from echelon.core.statement import Statement
     from echelon.core.types import JsonObject
+    from echelon.experiments.scenario.build import Experiment
     from echelon.experiments.studies.design import Design
     from echelon.synthesis.gains.gain import Gain
 
@@ -57,7 +62,6 @@ _DESIGN: dict[str, tuple[str, Callable[[Any], Any]]] = {
         lambda design: getattr(design.promise.certified, "radius", None),
     ),
     "seconds": ("seconds", lambda design: design.seconds),
-    "advice": ("", lambda design: design.advice),
     "promised": ("", lambda design: design.promise.promised),
     "promise": ("", lambda design: design.promise.as_mapping()),
 }
@@ -115,8 +119,7 @@ def print_designs(rows: "list[JsonObject]", sentence: str) -> None:
     for part in _PARTS:
         out.print(_design_table(rows, ("method", *part)))
     notes = [*_FOOTNOTES] if any(row.get("coupling") for row in rows) else []
-    for row in rows:
-        notes += [f"- {row['method']}: {row[key]}" for key in ("reason", "advice") if row.get(key)]
+    notes += [f"- {row['method']}: {row['reason']}" for row in rows if row["reason"]]
     for text in (*notes, sentence):
         out.print(text, highlight=False, markup=False, soft_wrap=not out.is_terminal)
 
@@ -166,3 +169,45 @@ def plain_table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> "Table
     for row in rows:
         table.add_row(*(text.replace("[", "\\[") for text in row))
     return table
+
+
+def foretell(experiment: "Experiment", quiet: bool) -> None:
+    """Print the warnings of a run, and its guarantee on a terminal or if nothing is guaranteed."""
+    if quiet or STATUS.silent:
+        return
+    from echelon.experiments.studies.design import forecast
+    from echelon.guarantees.promises.promise import promise
+    from echelon.simulation.engine.prepare import prepare
+
+    warn(prepare(*experiment).warnings)
+    if sys.stderr.isatty() or not promise(*experiment).promised:
+        print(f"echelon: {forecast(*experiment)}", file=sys.stderr, flush=True)
+
+
+def warn(warnings: Iterable[str], quiet: bool = False) -> None:
+    """Print warnings before what they warn of is computed, each on a line of standard error."""
+    if not (quiet or STATUS.silent):
+        for text in warnings:
+            print(f"echelon: Warning: {text}", file=sys.stderr, flush=True)
+
+
+def print_folder(folder: Path) -> None:
+    """Print the names of all files in a folder."""
+    names = sorted(path.name + ("/" if path.is_dir() else "") for path in folder.iterdir())
+    print(f"- Written to {folder}: {', '.join(names)}.")
+
+
+def write_file(file: Path, content: bytes | str, remark: str = "{}") -> None:
+    """Write a file, and print its size as `print_file` does.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with write_errors(file):
+        write_atomic(file, content)
+    print_file(file, remark)
+
+
+def print_file(file: Path, remark: str) -> None:
+    """Print the size of a file, with a remark that goes before it or after it."""
+    print(f"- Written to {file}: {remark.format(f'{file.stat().st_size / 1e6:.2f} MB')}.")

@@ -16,11 +16,11 @@ from echelon.core.digits import at_least, at_most
 from echelon.core.errors import EchelonError, GraphError
 from echelon.core.rational import bisect
 from echelon.core.types import JsonObject
-from echelon.experiments.results.avoidance import ROUNDING
+from echelon.experiments.results.metrics import ROUNDING
 from echelon.experiments.scenario.build import build
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.promise import promise
-from echelon.output.reports.causes import beyond
+from echelon.output.reports.run_report import beyond
 from echelon.output.viewer.replay import promise_badge
 from echelon.simulation.step.meter import SETTLED, outside
 from echelon.simulation.step.settings import Settings

@@ -25,8 +25,7 @@ from echelon.experiments.scenario.scenario import Scenario, scenario_from_mappin
 from echelon.guarantees.promises.closed_loop import LinearLoop, loop_of
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
-from echelon.synthesis.gains.fixed import FixedGain
-from echelon.synthesis.gains.gain import Gain
+from echelon.synthesis.gains.gain import FixedGain, Gain
 from echelon.synthesis.gains.riccati import Riccati
 
 

@@ -25,8 +25,7 @@ from echelon.experiments.scenario.scenario import Scenario, scenario_from_mappin
 from echelon.experiments.scenario.sections import FollowerSpec
 from echelon.experiments.scenario.values import foreign_keys
 from echelon.experiments.scenario.yaml import dump_yaml, rename_files
-from echelon.synthesis.gains.inner_loop import InnerLoop
-from echelon.synthesis.gains.riccati import Riccati
+from echelon.synthesis.gains.riccati import InnerLoop, Riccati
 
 _METHODS = (Riccati.name, InnerLoop.name)
 """Gain methods that take less than a picture's time, and need no parameters."""

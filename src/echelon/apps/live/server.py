@@ -6,7 +6,6 @@ import copy
 import json
 import time
 from collections.abc import Callable
-from http.server import ThreadingHTTPServer
 from typing import Final
 
 import numpy as np
@@ -22,10 +21,9 @@ from echelon.core.words import amount
 from echelon.experiments.results.recording import Recording
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
-from echelon.output.viewer.pack import pack
-from echelon.output.viewer.page import page
-from echelon.output.viewer.serve import Handler, serve
+from echelon.output.viewer.page import pack, page
 from echelon.simulation.engine.law_drive import Laws
+from echelon_flight.page_server import Handler
 
 _LONGEST: Final = 100_000  # bytes of a request
 _SLOWEST: Final = 4.0
@@ -113,18 +111,14 @@ def _check_speed(swarm: LiveLoop) -> None:
         )
 
 
-def serve_live(session: Session, html: str, port: int | None) -> ThreadingHTTPServer:
-    """Return the server of a session and its page.
-
-    Raises:
-        OutputError: no port is free.
-    """
+def live_page(session: Session, html: str) -> type[Handler]:
+    """Return the handler of a session and its page."""
 
     class Live(_Live):
         """The handler of this session."""
 
     Live.page, Live.session = html.encode(), session
-    return serve(Live, port)
+    return Live
 
 
 class _Live(Handler, abc.ABC):

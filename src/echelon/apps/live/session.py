@@ -24,13 +24,12 @@ from echelon.core.errors import (
 )
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import amount
-from echelon.experiments.results.foreseen import foreseen
-from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.recording import Recording, foreseen
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.plots.space import Space, space_of
 from echelon.output.viewer.charts import distance_chart
 from echelon.output.viewer.replay import header, heard_by, motor_loads
-from echelon.simulation.engine.closest_pair import ClosestPair
+from echelon.simulation.engine.frame_numbers import ClosestPair
 
 
 @final

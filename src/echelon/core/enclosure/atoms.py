@@ -1,32 +1,311 @@
-"""Atoms of polynomials: box variables, angles, and unknowns given only by their range.
-
-An atom has a range, and its powers or waves lie in a polygon. An expression that is not polynomial
-becomes a new atom.
-"""
+"""Polynomials with rational coefficients in atoms: box variables, angles, unknowns with a range."""
 
 import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import NamedTuple
+from functools import lru_cache
+from math import comb, gcd, lcm
+from typing import NamedTuple, TypeAlias, final
 
 import numpy as np
 
-from echelon.core.enclosure.curve_polygons import common_unit, power_points, wave_points
-from echelon.core.enclosure.interval import ELEMENTARY, Interval, circle, point, wave
-from echelon.core.enclosure.polynomial import (
-    Exponent,
-    Monomial,
-    Polynomial,
-    Wave,
-    constant,
-    monomial_quotient,
-    order,
-)
+from echelon.core.enclosure.interval import ELEMENTARY, Interval, circle, pi, point, wave
 from echelon.core.errors import GainError, listing
 
+# ---- polynomials ---------------------------------------------------------------------------------
+# A monomial contains each variable once, as a power x^k, and each angle once, as cos(w theta) or
+# sin(w theta). Products of waves are expanded to sums of waves at once, so c^2 + s^2 is 1 and equal
+# terms cancel.
+
+Wave: TypeAlias = tuple[Fraction, int]
+"""Frequency w > 0 in units of the angle, and 0 for cos(w theta) or 1 for sin(w theta)."""
+
+Exponent: TypeAlias = int | Wave
+Monomial: TypeAlias = tuple[tuple[int, Exponent], ...]
+"""Indices of atoms, ascending, each with its power or its wave."""
+
 _HALF = Fraction(1, 2)
+_MOST_TERMS = 256  # of a quotient
+
+
+def _wave_product(a: Wave, b: Wave) -> list[tuple[Fraction, Wave | None]]:
+    """Return cos or sin of a times cos or sin of b as a sum of waves; None stands for 1."""
+    (p, i), (q, j) = a, b
+    # Two cosines or two sines make cosines, and one of each makes sines.
+    part = i ^ j
+    sum_sign = Fraction(-1 if i and j else 1)
+    difference_sign = Fraction(-1 if j and not i else 1)
+    terms: list[tuple[Fraction, Wave | None]] = [(_HALF * sum_sign, (p + q, part))]
+    if p != q:
+        # sin((p - q) x) is odd, and frequencies are kept positive.
+        if part and p < q:
+            difference_sign = -difference_sign
+        terms.append((_HALF * difference_sign, (abs(p - q), part)))
+    elif not part:
+        terms.append((_HALF * difference_sign, None))
+    return terms
+
+
+def _monomial_product(a: Monomial, b: Monomial) -> list[tuple[Fraction, Monomial]]:
+    """Return the product of two monomials as a sum of monomials."""
+    result: list[tuple[Fraction, dict[int, Exponent]]] = [(Fraction(1), dict(a))]
+    # A monomial contains each atom once: powers are merged, products of waves become two terms.
+    for atom, exponent in b:
+        present = dict(a).get(atom)
+        for _, factors in result:
+            factors.pop(atom, None)
+        if present is None:
+            options: list[tuple[Fraction, Exponent | None]] = [(Fraction(1), exponent)]
+        elif isinstance(present, int) and isinstance(exponent, int):
+            options = [(Fraction(1), present + exponent)]
+        else:
+            # Angles are atoms of their own (`_angle`), so no atom has both powers and waves.
+            assert isinstance(present, tuple) and isinstance(exponent, tuple)
+            options = [*_wave_product(present, exponent)]
+        result = [
+            (c * k, factors if new is None else {**factors, atom: new})
+            for c, factors in result
+            for k, new in options
+        ]
+    return [(c, tuple(sorted(factors.items()))) for c, factors in result]
+
+
+@final
+class Polynomial:
+    """An immutable sum of monomials with nonzero rational coefficients."""
+
+    __slots__ = ("terms",)
+
+    def __init__(self, terms: dict[Monomial, Fraction]) -> None:
+        self.terms = {monomial: c for monomial, c in terms.items() if c}
+
+    def __add__(self, other: "Polynomial") -> "Polynomial":
+        terms = dict(self.terms)
+        for monomial, c in other.terms.items():
+            terms[monomial] = terms.get(monomial, Fraction(0)) + c
+        return Polynomial(terms)
+
+    def __neg__(self) -> "Polynomial":
+        return Polynomial({monomial: -c for monomial, c in self.terms.items()})
+
+    def __sub__(self, other: "Polynomial") -> "Polynomial":
+        return self + (-other)
+
+    def __mul__(self, other: "Polynomial") -> "Polynomial":
+        terms: dict[Monomial, Fraction] = {}
+        for a, p in self.terms.items():
+            for b, q in other.terms.items():
+                for c, monomial in _monomial_product(a, b) if a and b else [(1, a or b)]:
+                    terms[monomial] = terms.get(monomial, Fraction(0)) + p * q * c
+        return Polynomial(terms)
+
+    def power(self, k: int) -> "Polynomial":
+        """Return the k-th power, k >= 0."""
+        result = constant(1)
+        for _ in range(k):
+            result = result * self
+        return result
+
+    def key(self) -> frozenset[tuple[Monomial, Fraction]]:
+        """Return a hashable key, equal only for equal polynomials."""
+        return frozenset(self.terms.items())
+
+    def value(self) -> Fraction | None:
+        """Return the value of a constant polynomial, otherwise None."""
+        return self.terms.get((), Fraction(0)) if set(self.terms) <= {()} else None
+
+    def exponents(self) -> dict[int, set[Exponent]]:
+        """Return which powers or waves of each atom occur."""
+        result: dict[int, set[Exponent]] = {}
+        for monomial in self.terms:
+            for atom, exponent in monomial:
+                result.setdefault(atom, set()).add(exponent)
+        return result
+
+
+def constant(x: Fraction | int | float) -> Polynomial:
+    """Return the constant polynomial x, exactly."""
+    return Polynomial({(): Fraction(x)})
+
+
+def divides(divisor: Polynomial, p: Polynomial) -> bool:
+    """Return whether p is a multiple of the divisor, and hence 0 wherever the divisor is 0."""
+    lead = max(divisor.terms, key=order)
+    quotient, rest = constant(0), p
+    # With one divisor, the remainder is 0 if and only if every leading term is divisible.
+    for _ in range(_MOST_TERMS):
+        if not rest.terms:
+            # A product of waves is not a monomial, so the result is verified by multiplication.
+            return (quotient * divisor - p).terms == {}
+        top = max(rest.terms, key=order)
+        factor = monomial_quotient(top, lead)
+        if factor is None:
+            return False
+        step = Polynomial({factor: rest.terms[top] / divisor.terms[lead]})
+        quotient, rest = quotient + step, rest - step * divisor
+    return False
+
+
+def order(monomial: Monomial) -> list[tuple[int, int, str]]:
+    """Return the key of the lexicographic order of monomials, low atom indices first."""
+    # An atom that is missing has the power 0, which sorts below any other: hence the minus.
+    return [(-atom, e, "") if isinstance(e, int) else (-atom, 1, repr(e)) for atom, e in monomial]
+
+
+def monomial_quotient(top: Monomial, lead: Monomial) -> Monomial | None:
+    """Return the monomial top / lead, or None if `lead` does not divide `top`."""
+    left = dict(top)
+    for atom, e in lead:
+        power = left.pop(atom, None)
+        if isinstance(power, int) and isinstance(e, int) and power >= e:
+            if power > e:
+                left[atom] = power - e
+        elif power != e:
+            return None
+    return tuple(sorted(left.items()))
+
+
+# ---- polygons around curves ----------------------------------------------------------------------
+# A polynomial curve lies in the hull of its Bezier control points, and so does a curve of waves of
+# degree d on an arc below 180 degrees, written as a form of degree 2 d in the half-angle's
+# direction and divided by the form of the constant 1, whose coefficients are positive there. An
+# arc's ends are rational points of the circle just outside of its own, so that every control point
+# is an exact rational. Cut in two, an arc of degree 1 gives the trapezoid between chord and three
+# tangents.
+
+Gaussian: TypeAlias = tuple[int, int]
+"""A direction in the plane, as a complex integer."""
+
+# Ends of an arc are turned outward by 2^-60, more than the rounding of 2^-64 of a direction.
+_UNIT = 1 << 64
+_TILT = 1 << 60
+_FAR = 1 << 199  # rad; beyond it `circle` cannot locate an angle
+# At half the angles a full turn is half a turn, here in four pieces.
+_FULL: list[Gaussian] = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0)]
+
+
+def power_points(interval: Interval, powers: Iterable[int]) -> list[dict[int, Fraction]]:
+    """Return points whose hull contains (x^k for k in powers), x in the interval."""
+    exponents = sorted(powers)
+    if len(exponents) == 1:
+        # A single power has a range, which is tighter than the control points of its curve.
+        reached = interval.power(exponents[0])
+        return [{exponents[0]: end} for end in (reached.lo, reached.hi)]
+    degree = exponents[-1]
+    lo, hi = interval.lo, interval.hi
+    return [
+        {
+            k: sum(
+                (
+                    # The polar form of x^k at i times hi and degree - i times lo.
+                    Fraction(comb(i, m) * comb(degree - i, k - m), comb(degree, k))
+                    * hi**m
+                    * lo ** (k - m)
+                    for m in range(max(0, k - degree + i), min(i, k) + 1)
+                ),
+                Fraction(0),
+            )
+            for k in exponents
+        }
+        for i in range(degree + 1)
+    ]
+
+
+def common_unit(frequencies: Iterable[Fraction]) -> Fraction:
+    """Return the largest rational of which all frequencies are integer multiples."""
+    rationals = list(frequencies)
+    denominator = lcm(*(w.denominator for w in rationals))
+    return Fraction(gcd(*(int(w * denominator) for w in rationals)), denominator)
+
+
+def wave_points(arc: Interval, orders: Iterable[int]) -> list[dict[tuple[int, int], Fraction]]:
+    """Return points whose hull contains (cos k t, sin k t for k in orders), t in the arc (rad).
+
+    Keys are (k, 0) for cos and (k, 1) for sin.
+    """
+    degrees = sorted(orders)
+    degree = degrees[-1]
+    cuts = _cuts(arc)
+    closed = cuts == _FULL
+    result = []
+    for number, (a, b) in enumerate(zip(cuts, cuts[1:], strict=False)):
+        first = 0 if number == 0 and not closed else 1
+        last = 2 * degree if number == len(cuts) - 2 and not closed else 2 * degree - 1
+        # Where two pieces meet, the curve's tangent runs between the neighbouring control points.
+        result += [_control_point(a, b, degree, i, degrees) for i in range(first, last + 1)]
+    return result
+
+
+def _cuts(arc: Interval) -> list[Gaussian]:
+    """Return directions at half the angles of the start, the cuts and the end of an arc.
+
+    Two pieces below 180 degrees, four above; the full circle if the ends nearly meet.
+    """
+    start, end = arc.lo / 2, arc.hi / 2
+    if end - start >= pi().lo - Fraction(1, 1 << 40) or max(abs(start), abs(end)) > _FAR:
+        return _FULL
+    # Each piece is below 90 degrees: towards 180 the end tangents intersect ever farther away.
+    pieces = 2 if end - start < pi().lo / 2 else 4
+    between = [start + (end - start) * Fraction(k, pieces) for k in range(1, pieces)]
+    return [_direction(start, -1), *(_direction(a, 0) for a in between), _direction(end, 1)]
+
+
+def _direction(angle: Fraction, turn: int) -> Gaussian:
+    """Return a direction at most 2^-59 rad below (-1), near (0) or above (1) an angle.
+
+    Rounding moves the direction by less than 2^-63, the turn by arctan 2^-60.
+    """
+    # Exact, with short fractions.
+    if angle == 0:
+        return 1, 0
+    cosine, sine = circle(angle)
+    c, s = round(cosine.lo * _UNIT), round(sine.lo * _UNIT)
+    return c * _TILT - turn * s, s * _TILT + turn * c
+
+
+def _times(a: Gaussian, b: Gaussian) -> Gaussian:
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+# Every control point of an arc takes powers of the same few directions.
+@lru_cache(maxsize=4096)
+def _power(a: Gaussian, k: int) -> Gaussian:
+    return (1, 0) if k == 0 else _times(a, _power(a, k - 1))
+
+
+def _form(a: Gaussian, b: Gaussian, degree: int, i: int, k: int) -> tuple[Fraction, Fraction]:
+    """Return the polar form of z^(d + k) conj(z)^(d - k) at 2 d - i times a and i times b."""
+    real, imaginary = Fraction(0), Fraction(0)
+    bar_a, bar_b, plain = (a[0], -a[1]), (b[0], -b[1]), degree + k
+    for m in range(max(0, plain - 2 * degree + i), min(i, plain) + 1):
+        # The polar form averages over which of the arguments go to z, m of them b.
+        weight = Fraction(comb(i, m) * comb(2 * degree - i, plain - m), comb(2 * degree, plain))
+        one = _times(_power(b, m), _power(a, plain - m))
+        other = _times(_power(bar_b, i - m), _power(bar_a, 2 * degree - i - plain + m))
+        product = _times(one, other)
+        real, imaginary = real + weight * product[0], imaginary + weight * product[1]
+    return real, imaginary
+
+
+def _control_point(
+    a: Gaussian, b: Gaussian, degree: int, i: int, orders: list[int]
+) -> dict[tuple[int, int], Fraction]:
+    """Return control point i of the waves on the arc from twice the angle of a to that of b."""
+    weight = _form(a, b, degree, i, 0)[0]
+    assert weight > 0, "an arc's piece must be shorter than 180 degrees"
+    result = {}
+    for k in orders:
+        real, imaginary = _form(a, b, degree, i, k)
+        result[k, 0], result[k, 1] = real / weight, imaginary / weight
+    return result
+
+
+# ---- atoms ---------------------------------------------------------------------------------------
+# An atom has a range, and its powers or waves lie in a polygon. An expression that is not
+# polynomial becomes a new atom.
+
 MOST_VERTICES = 16384
 """Largest number of vertices of a hull; no solver could use more."""
 

@@ -14,11 +14,18 @@ from typing import NamedTuple, TypeAlias
 import jax
 import numpy as np
 
-from echelon.core.enclosure.atoms import Atoms, Corners, CornerValues, check_count, corner_values
+from echelon.core.enclosure.atoms import (
+    Atoms,
+    Corners,
+    CornerValues,
+    Exponent,
+    Polynomial,
+    check_count,
+    constant,
+    corner_values,
+)
 from echelon.core.enclosure.interval import Interval
-from echelon.core.enclosure.polynomial import Exponent, Polynomial, constant
-from echelon.core.enclosure.sloped import Sloped, number, variable
-from echelon.core.enclosure.slopes import slopes_in
+from echelon.core.enclosure.slopes import Sloped, number, slopes_in, variable
 from echelon.core.errors import GainError
 from echelon.core.jaxpr import evaluate, map_entries
 from echelon.core.rational import float_above

@@ -5,9 +5,8 @@ from fractions import Fraction
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from echelon.core.enclosure.atoms import Atoms
+from echelon.core.enclosure.atoms import Atoms, Polynomial, constant
 from echelon.core.enclosure.interval import Interval
-from echelon.core.enclosure.polynomial import Polynomial, constant
 from echelon.core.errors import GainError
 from echelon.core.jaxpr import compute, map_entries
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 
 from echelon.core.types import JsonObject
-from echelon.guarantees.promises.event_lines import events_in_words
+from echelon.guarantees.promises.hypotheses import events_in_words
 from echelon.guarantees.promises.promise import promise
 from echelon.simulation.engine.result import Result, finite_or_none
 from echelon.simulation.step.meter import SETTLED

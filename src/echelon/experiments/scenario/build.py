@@ -16,9 +16,8 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.references.reference import Guide, Reference, check_reference
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
-from echelon.agents.world.plant import check_plant, vary_parameters
 from echelon.agents.world.sensing import Sensing
-from echelon.agents.world.world import World
+from echelon.agents.world.world import World, check_plant, vary_parameters
 from echelon.core.errors import (
     EchelonError,
     FormationError,
@@ -28,8 +27,8 @@ from echelon.core.errors import (
     did_you_mean,
     listing,
 )
+from echelon.core.files import versions
 from echelon.core.numerics import precision
-from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.named_class import (
     NOTHING,
@@ -67,9 +66,8 @@ from echelon.experiments.scenario.yaml import joined, quoted
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
 from echelon.laws.safety import Safety
-from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.prepare import check_engine, check_memory
 from echelon.simulation.engine.record import Stretch
 from echelon.simulation.engine.result import Result

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
-from echelon.core import disk_cache
+from echelon.core import cache
 from echelon.core.errors import EchelonError, ScenarioError, did_you_mean, listing
 from echelon.core.trace import error_summary
 from echelon.experiments.scenario import registry
@@ -129,7 +129,7 @@ def _imported(file: Path) -> Any:
     # Before it is executed, as `import` does: dataclasses look up their module there.
     sys.modules[spec.name] = module
     # The file may change anything, and its text does not identify the values that it computes.
-    disk_cache.close()
+    cache.close()
     with as_scenario_error(f"the file `{file}` does not import"):
         spec.loader.exec_module(module)
     return module

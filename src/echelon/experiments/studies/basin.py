@@ -17,7 +17,7 @@ from echelon.core.errors import GainError, check_name
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.guarantees.promises.promise import promise
-from echelon.laws.trim_input import TrimInput
+from echelon.laws.law import TrimInput
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare

@@ -9,25 +9,21 @@ import equinox as eqx
 from echelon.core.errors import EchelonError, LawError, check_name
 from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
-from echelon.experiments.results.metrics import metrics
-from echelon.experiments.results.run_numbers import RunNumbers
+from echelon.experiments.results.metrics import RunNumbers, metrics
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
 from echelon.guarantees.promises.promise import promise
 from echelon.laws.consensus import Consensus
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
-from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.simulate import RunSoFar, simulate
 from echelon.simulation.optimal.drives import Plans, RecedingHorizon
 from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.settings import Settings
-from echelon.synthesis.gains.fixed import FixedGain
-from echelon.synthesis.gains.gain import Gain, Method, synthesize
-from echelon.synthesis.gains.inner_loop import InnerLoop
-from echelon.synthesis.gains.riccati import Riccati
+from echelon.synthesis.gains.gain import FixedGain, Gain, Method, synthesize
+from echelon.synthesis.gains.riccati import InnerLoop, Riccati
 
 OWN = "own"
 """Label of the scenario's drive."""
@@ -173,9 +169,9 @@ def compare(
     own = _own_label(parts, rows) if OWN in only else None
     if own is not None:
         fly(own, lambda parts: parts.drive)
-    return Comparison(
-        scenario.name, tuple(rows), settings.horizon, settings.window, _conditions(parts)
-    )
+    described = parts.world.describe(parts.model)
+    conditions = tuple(f"{name}: {text}" for name, text in described.items() if text)
+    return Comparison(scenario.name, tuple(rows), settings.horizon, settings.window, conditions)
 
 
 def _row(
@@ -194,12 +190,6 @@ def _with_starts(parts: Parts, settings: Settings) -> Parts:
         states = initial_states(parts.replace(drive=drive), settings.seed)
     # The states contain the leader's error already.
     return parts.replace(initial=states, start_error={})
-
-
-def _conditions(parts: Parts) -> tuple[str, ...]:
-    """Return what differs from the model in all runs, in words."""
-    described = parts.world.describe(parts.model)
-    return tuple(f"{name}: {text}" for name, text in described.items() if text)
 
 
 def _fly(parts: Parts, settings: Settings, part: Callable[[float], None]) -> RunNumbers:

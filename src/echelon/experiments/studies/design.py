@@ -1,7 +1,8 @@
-"""Compares all gain methods on a scenario, and recommends one of them."""
+"""Compares all gain methods on a scenario, recommends one of them, or changes of a run."""
 
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -19,20 +20,16 @@ from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.sections import GainSpec
 from echelon.experiments.scenario.yaml import ScenarioFault
-from echelon.experiments.studies.speedup import speedup
-from echelon.guarantees.promises.promise import LawDesign, Promise, promise, prover_of
+from echelon.guarantees.promises.promise import Promise, promise
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates import margins
-from echelon.synthesis.certificates.delays import delay_margin
 from echelon.synthesis.certificates.domain import Domain
-from echelon.synthesis.gains.fixed import FixedGain
-from echelon.synthesis.gains.gain import Gain, Method, synthesize
-
-_ADVISED = 100
-"""Most followers for which a change of the graph is recommended; more would take minutes."""
+from echelon.synthesis.certificates.margins import delay_margin
+from echelon.synthesis.gains.gain import FixedGain, Gain, Method, synthesize
+from echelon.synthesis.gains.riccati import InnerLoop
 
 
 class Design(NamedTuple):
@@ -48,7 +45,6 @@ class Design(NamedTuple):
         step: the longest sampling period (s) for which all checked modes remain stable.
         factors: the interval of stable factors on the coupling; None if unstable.
         delay: the largest stable delay of all disagreements, s; None if unstable.
-        advice: a recommendation for users of the method.
         seconds: computing time of the synthesis.
     """
 
@@ -61,7 +57,6 @@ class Design(NamedTuple):
     step: float = 0.0
     factors: margins.GainMargin | None = None
     delay: float | None = None
-    advice: str = ""
     seconds: float = 0.0
 
     @property
@@ -88,17 +83,12 @@ _RANK = {Theorem.T1: 3, Theorem.T2: 2, Theorem.A5: 1}
 
 
 class Designs(NamedTuple):
-    """The designs of all methods, the recommended one if any, and the reason.
-
-    `settings` are those of all designs. `law_design` is a guaranteed design of the scenario's law,
-    if that law computes one.
-    """
+    """The designs of all methods, the recommended one if any, the reason, and their settings."""
 
     designs: tuple[Design, ...]
     recommended: Design | None
     because: str
     settings: Settings
-    law_design: LawDesign | None = None
 
 
 def design(
@@ -133,8 +123,7 @@ def design(
     designs = tuple(designs)
     best, dt = recommended(designs, built.settings.dt), built.settings.dt
     reason = "No method gives a stable loop here." if best is None else because(best, designs, dt)
-    law_design = prover_of(built.parts.drive).design(*built) if method is None else None
-    return Designs(designs, best, reason, built.settings, law_design)
+    return Designs(designs, best, reason, built.settings)
 
 
 _SIMPLE_GAIN = GainSpec(method=FixedGain.name, P="identity")
@@ -270,23 +259,7 @@ def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Promise) 
         step=guarantee.longest_step(settings),
         factors=margins.gain_margin(closed),
         delay=delay_margin(closed).delay,
-        advice=_advice(gain, parts),
     )
-
-
-def _advice(gain: Gain, parts: Parts) -> str:
-    """Return a recommendation for an inner loop: an edge or a leader that makes it faster.
-
-    It is stable on any graph, so its rate depends only on the graph.
-    """
-    graph = parts.graph
-    followers, pairs = len(graph.followers), graph.agents * (graph.agents - 1) // 2
-    fixed = not graph.directed and graph.schedule is None
-    if gain.inner is None or followers > _ADVISED or not fixed:
-        return ""
-    # One follower must remain, and a complete graph has no pair left to link.
-    more = int(followers > 1), int(len(graph.edges) < pairs)
-    return speedup(parts.model, graph, gain, *more).sentence()
 
 
 def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dict[str, Any]:
@@ -300,3 +273,47 @@ def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dic
     if domain is None or "domain" not in method.needs:
         return {**method.defaults}
     return {**method.defaults, "domain": domain}
+
+
+# ---- the forecast of a run -----------------------------------------------------------------------
+
+_SHARE = 0.9
+"""Share of the longest stable step for the checked modes, since further modes lie between them."""
+
+
+def forecast(parts: Parts, settings: Settings) -> str:
+    """Return the guarantee of a run; without one, with options under which there is one.
+
+    Raises:
+        EchelonError: a part is malformed or does not fit the others.
+    """
+    guarantee = promise(parts, settings)
+    hypotheses = Hypothesis.DISAGREEMENT_DECAY, Hypothesis.SAMPLING
+    # A step that is too long for a short time only has no reason.
+    grows = any(guarantee.hypotheses[hypothesis].reason for hypothesis in hypotheses)
+    changes = " or ".join(f"`--set {change}`" for change in _changes(parts, settings) if grows)
+    if not changes:
+        return guarantee.sentence()
+    return f"{guarantee.sentence()} There is a guarantee with {changes}."
+
+
+def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
+    """Yield the changes of a scenario, quickly computed, under which something is guaranteed."""
+    step = promise(parts, settings).hypotheses[Hypothesis.SAMPLING]
+    if step.fails:
+        longest = _SHARE * promise(parts, settings).longest_step(settings)
+        # With an integer fraction of the step, the horizon remains a whole number of steps.
+        shorter = settings.dt / math.ceil(settings.dt / longest) if longest > 0.0 else settings.dt
+        if promise(parts, settings._replace(dt=shorter)).promised:
+            yield f"simulation.dt={at_most(shorter, 6)}"
+    law = parts.drive.follower if isinstance(parts.drive, Laws) else None
+    if not isinstance(law, Consensus):
+        return
+    try:
+        # An inner loop is stable with any coupling on any graph.
+        gain = synthesize(parts.model, parts.graph, InnerLoop())
+    except EchelonError:
+        return
+    drive = parts.drive.with_follower(Consensus(gain, law.feedforward, law.trim, law.frame))
+    if promise(parts.replace(drive=drive), settings).promised:
+        yield '"follower.gain={method: inner-loop}"'

@@ -15,15 +15,15 @@ from echelon.agents.models.model_check import check_model
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references import Lemniscate
-from echelon.core import disk_cache, numerics
+from echelon.core import cache, numerics
 from echelon.core.errors import EchelonError, ModelError
-from echelon.core.jax_state import require_jax
-from echelon.core.provenance import versions
+from echelon.core.files import versions
+from echelon.core.numerics import require_jax
 from echelon.core.words import amount
 from echelon.experiments.results.metrics import metrics
 from echelon.experiments.scenario import registry
 from echelon.laws.consensus import Consensus
-from echelon.laws.tracking import Tracking
+from echelon.laws.path_leader import Tracking
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.simulate import simulate
@@ -63,7 +63,7 @@ def checks() -> Iterator[Check]:
         return
     for test in CHECKS:
         # Results on disk may come from another machine or an earlier state of this one.
-        with numerics.precision("float64"), disk_cache.use_folder(None):
+        with numerics.precision("float64"), cache.use_folder(None):
             check = test()
         yield check
 

@@ -1,42 +1,103 @@
-"""The guarantee of a run, computed again from its scenario and compared with the run's files.
-
-This is not an independent check: the code is that which made the files. It shows that a file states
-what its scenario gives, word for word; the verifier checks by code of its own what it can.
-"""
+"""The guarantee of a run, computed again from its scenario and compared with the run's files."""
 
 import contextlib
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
 
 from echelon.core.errors import GainError
 from echelon.core.types import JsonObject
-from echelon.experiments.results.dataset import OBSERVED, leader_gain_of, statement
-from echelon.experiments.results.labelled import Labelled
-from echelon.experiments.results.labelled_parts import labelled_parts
-from echelon.experiments.results.recording import FORMAT, Recording, recording_with_data
+from echelon.experiments.results.dataset import labelled_parts
+from echelon.experiments.results.labelled import Labelled, groups_of
+from echelon.experiments.results.recording import Recording, read_recording
+from echelon.experiments.results.summary import OBSERVED, leader_gain_of, statement
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.self_contained import without_folders
 from echelon.experiments.scenario.yaml import read_yaml
 from echelon.experiments.studies.check import check
-from echelon.experiments.studies.data_structure import compare_attributes
 from echelon.experiments.studies.design import with_gain
-from echelon.experiments.studies.older_rounding import as_rounded_now
 from echelon.guarantees.promises.promise import promise
 from echelon.guarantees.verifier.findings import Finding, decide
+from echelon.guarantees.verifier.saved_gain import parse_json, read_json
 from echelon.guarantees.verifier.stored_values import Digits, compare_values
-from echelon.guarantees.verifier.strict_json import parse_json, read_json
 from echelon.laws.consensus import Consensus
-from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.prepare import prepare
 from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.gain_file import gain_as_mapping, load_gain
+
+if TYPE_CHECKING:
+    import h5netcdf
+
+# ---- the structure of a run's dataset ------------------------------------------------------------
+# Readers such as xarray change numbers by attributes (`scale_factor`), mask them (`_FillValue`) and
+# show groups and names beside them, so a file states more than its arrays.
+
+_WRITTEN = {"units": ("s", "m"), "_FillValue": ("nan",)}
+"""Attributes of variables and their values in every format, beside the names of coordinates."""
+
+
+def compare_attributes(file: Path) -> Iterator[Finding]:
+    """Yield a refused finding for each attribute of a group or variable that echelon never writes.
+
+    Those of the root are compared with the run, one by one.
+    """
+    for place, part in _structure(file).items():
+        for name, value in part["attributes"].items():
+            known = name == "coordinates" or ("type" in part and value in _WRITTEN.get(name, ()))
+            if not known:
+                claim, text = f"{file.name}: {place}.{name}", "echelon does not write it"
+                yield decide(ascii(claim)[1:-1], False, value, text=text)._replace(by_scenario=True)
+
+
+def compare_structure(file: Path, again: bytes) -> Iterator[Finding]:
+    """Compare groups, dimensions, variables, types and attributes with those of a file in memory.
+
+    Sizes and numbers are compared with the arrays.
+    """
+    claim, stored, value = f"{file.name}: structure", _structure(file), _structure(again)
+    findings = [*compare_values(claim, stored, value)]
+    refused = [each for each in findings if each.verdict == "refused"]
+    same = Finding(claim, f"{len(stored)} parts", f"{len(value)} parts", "recomputed", "", True)
+    yield from refused or [same]
+
+
+def _structure(file: Path | bytes) -> dict[str, JsonObject]:
+    """Return dimensions, type and attributes of each group and variable as text, by its path."""
+    # Here, since it is slow to load.
+    import h5netcdf
+
+    parts = dict[str, JsonObject]()
+    with h5netcdf.File(io.BytesIO(file) if isinstance(file, bytes) else file, "r") as stored:
+        for group in groups_of(stored):
+            root = group.name == "/"
+            parts[group.name] = {
+                "dimensions": " ".join(sorted(group.dimensions)),
+                "attributes": {} if root else _attributes(group),
+            }
+            for name, variable in group.variables.items():
+                parts[f"{group.name.rstrip('/')}/{name}"] = {
+                    "dimensions": " ".join(variable.dimensions),
+                    "type": str(variable.dtype),
+                    "attributes": _attributes(variable),
+                }
+    return parts
+
+
+def _attributes(place: "h5netcdf.Group | h5netcdf.Variable") -> dict[str, str]:
+    return {str(name): str(value) for name, value in place.attrs.items()}
+
+
+# ---- guarantees ----------------------------------------------------------------------------------
+# This is not an independent check: the code is that which made the files. It shows that a file
+# states what its scenario gives, word for word; the verifier checks by code of its own what it can.
 
 SOLVED = Digits(1e-3)
 """Relative. On another machine a semidefinite program ends at another P, 1e-4 apart."""
@@ -127,8 +188,6 @@ def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Ite
     """Compare a summary, or the output of a check, with what a scenario of a name gives."""
     if "lines" in stored:
         value = check(*experiment).as_mapping()
-        # An earlier version states no warnings.
-        stored = {"warnings": value["warnings"], **stored}
     else:
         value = statement(*experiment, name)
         stored = {key: stored[key] for key in stored if key not in OBSERVED}
@@ -166,11 +225,9 @@ def _led_by(parts: Parts, gain: Gain) -> Parts:
 
 def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
     """Compare the guarantee, the scenario, the parts and the starts in a dataset."""
-    (run, data), (parts, settings), name = recording_with_data(file), experiment, file.name
+    (run, data), (parts, settings), name = read_recording(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
     value = _as_json(promise(parts, settings).as_mapping())
-    older = run.attributes["format"] != FORMAT
-    stored = as_rounded_now(stored, value) if older else stored
     yield from compare_values(f"{name}: promise", stored, value)
     text = read_yaml(str(run.attributes.get("scenario_text", "")), str(file))
     # A key twice is a fault; readers differ in which one they use.
@@ -184,9 +241,6 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
     yield from _compare_frames(run, data, experiment, name)
     yield from compare_values(f"{name}: scenario", run.attributes.get("scenario"), scenario.name)
     for key, part in {**fixed.attributes, **fixed.arrays()}.items():
-        # A file of an earlier format states less.
-        if older and (key == "format" or key not in stated):
-            continue
         theirs, ours = (np.asarray(each).tolist() for each in (stated.get(key), part))
         yield from compare_values(f"{name}: parts.{key}", theirs, ours)
 

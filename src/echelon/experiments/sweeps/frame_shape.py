@@ -8,7 +8,7 @@ import numpy as np
 from echelon.core.errors import ScenarioError
 from echelon.core.types import Array
 from echelon.experiments.scenario.build import Experiment
-from echelon.simulation.engine.grid import ChunkGrid
+from echelon.simulation.engine.chunk_grid import ChunkGrid
 from echelon.simulation.engine.result import Result
 
 StoredFrames: TypeAlias = Mapping[str, Array]

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from echelon.core.types import JsonObject
+from echelon.experiments.results.dataset import labelled_parts
 from echelon.experiments.results.labelled import Labelled, Variables
-from echelon.experiments.results.labelled_parts import labelled_parts
 from echelon.experiments.sweeps.frame_shape import NAMES, StoredFrames
 from echelon.experiments.sweeps.plan import Sweep
 

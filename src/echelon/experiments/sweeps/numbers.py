@@ -6,9 +6,8 @@ import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.types import Array, JsonObject
-from echelon.experiments.results.metrics import metrics
-from echelon.experiments.results.quantity import Shown
-from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
+from echelon.experiments.results.metrics import RunNumbers, metrics
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, Shown, shown_in
 from echelon.guarantees.promises.promise import Promise
 from echelon.simulation.engine.result import Result
 

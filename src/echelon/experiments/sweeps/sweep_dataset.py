@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from echelon.core.errors import Outcome
-from echelon.core.provenance import versions
+from echelon.core.files import versions
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.labelled import Labelled, Variables
-from echelon.experiments.results.quantity import ERROR, Quantity
-from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, ERROR, RUN_NUMBERS, Quantity
 from echelon.experiments.scenario.scenario import key_label
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps.axes import Axis

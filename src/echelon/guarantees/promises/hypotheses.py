@@ -1,4 +1,4 @@
-"""Hypotheses of a guarantee about agents, leaders and offsets, a line of `check` each.
+"""Hypotheses of a guarantee about agents, leaders, offsets, events and limits, as lines of `check`.
 
 A failed line with a `reason` rules out any guarantee; without one it weakens or explains it.
 """
@@ -13,19 +13,22 @@ import numpy as np
 from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine, position_unit
 from echelon.agents.models.model_check import Shortfall, at_limits, is_limited, trim_shortfall
+from echelon.agents.network.events import Cut, Event, Join, agents_of
+from echelon.agents.network.graph import Graph
 from echelon.agents.world.actuator import Actuator
 from echelon.core.compiled import compiled_for_one_call
 from echelon.core.digits import about, at_least
 from echelon.core.errors import listing
+from echelon.core.identity import digest
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
-from echelon.core.types import Array, States
+from echelon.core.types import Array, JsonObject, States
 from echelon.core.words import Kind
-from echelon.guarantees.messages.network_lines import bias_line
+from echelon.guarantees.messages.late_messages import bias_line
 from echelon.guarantees.promises.case import Case
-from echelon.guarantees.promises.event_lines import events_line
 from echelon.guarantees.promises.leaders import apart
 from echelon.guarantees.promises.modes import modes
+from echelon.guarantees.promises.promise import Promise
 from echelon.laws.law import Law
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Drive
@@ -252,3 +255,133 @@ def _matched(case: Case) -> Statement:
             "every follower receives the leader's input, which the paper's network does not provide"
         )
     return holds(name, Kind.PROOF, text)
+
+
+# ---- events of a run -----------------------------------------------------------------------------
+
+_SEVERED = "cover", "it, as that of a graph that switches"
+_BEREFT = "hold", "for all others, who do not hear it any more"
+_WITHOUT_EVENT = "remove the event to see what is guaranteed without it"
+
+
+def events_line(parts: Parts) -> Iterator[Statement]:
+    """Yield whether a guarantee covers all events of a run; nothing without any."""
+    graph, name = parts.graph, Hypothesis.EVENTS
+    if graph.heirs and parts.world.network is not None:
+        text = "an heir may take the lead whenever messages of the leader are lost for long"
+        remedy = "remove `leadership` to see what is guaranteed without it"
+        yield fails(name, Kind.PROOF, text, remedy=remedy, reason=text)
+        return
+    if not graph.events:
+        return
+    for event in graph.events:
+        text = uncovered(graph, event)
+        if text:
+            shown = f"{event.at:g} s"
+            yield fails(name, Kind.PROOF, text, event.at, shown, remedy=_WITHOUT_EVENT, reason=text)
+            return
+    text = "a cut link, and an agent that nobody hears any more, are those of a graph that switches"
+    yield holds(name, Kind.PROOF, text, len(graph.events), f"{len(graph.events)} covered")
+
+
+def uncovered(graph: Graph, event: Event) -> str:
+    """Return why no guarantee covers an event; empty if one may."""
+    if isinstance(event, Join):
+        return f"{event} at {event.at:g} s, and nothing bounds how far from its goal it is then"
+    if not isinstance(event, Cut) and _leads(graph, event):
+        return f"{event} at {event.at:g} s while it leads, and until an heir takes over nobody does"
+    return ""
+
+
+def _leads(graph: Graph, event: Event) -> bool:
+    """Tell whether an agent that is lost was followed until then."""
+    schedule = graph.schedule
+    assert schedule is not None and schedule.nearest is not None
+    row = schedule.row(event.at)
+    return bool((schedule.nearest[max(row - 1, 0)] == agents_of(event)[0]).any())
+
+
+def events_in_words(parts: Parts, guarantee: Promise) -> list[JsonObject]:
+    """Return each event of a run, by time, and what is guaranteed through it, ready for JSON."""
+    prefix = guarantee.prefix
+    return [
+        {**as_mapping(event), "guarantee": _through(parts.graph, event, holding)}
+        for event in parts.graph.events
+        for holding in (prefix.promise if prefix and event.at < prefix.at else guarantee,)
+    ]
+
+
+def as_mapping(event: Event) -> JsonObject:
+    """Return an event ready for JSON."""
+    return {
+        "at": event.at,
+        "what": type(event).__name__.lower(),
+        "agents": list(agents_of(event)),
+        "until": event.end if isinstance(event, Cut) and event.duration is not None else None,
+        "text": str(event),
+    }
+
+
+def _through(graph: Graph, event: Event, guarantee: Promise) -> JsonObject:
+    """Return what is guaranteed through an event: of which kind, and in words."""
+    why = uncovered(graph, event)
+    if why or not guarantee.promised:
+        text = f"Nothing is guaranteed through it: {why}." if why else "Nothing is guaranteed."
+        if not why and guarantee.conditions:
+            conditions = " and ".join(guarantee.conditions)
+            text = f"Not guaranteed: the claim covers it while {conditions}. {guarantee.ignored()}"
+            text = text.rstrip()
+        return {"promised": False, "kind": None, "sentence": text}
+    verb, what = _SEVERED if isinstance(event, Cut) else _BEREFT
+    if guarantee.without:
+        # It is of another flight, and covers nothing of this one.
+        text = f"The guarantee would {verb} {what}. {guarantee.ignored()}"
+        return {"promised": False, "kind": None, "sentence": text}
+    text = f"The guarantee {verb}s {what}."
+    return {"promised": True, "kind": str(guarantee.kind), "sentence": text}
+
+
+# ---- limits of the inputs ------------------------------------------------------------------------
+
+UNBOUNDED = "nothing bounds the inputs of this law within their limits"
+_CONDITION = "no input of any agent is at a limit"
+_WITHOUT_LIMITS = "see whether a run is covered, or set `simulation.limits: false`"
+
+
+def limits_act(parts: Parts, settings: Settings) -> bool:
+    """Tell whether an input of an agent may be at a limit, or at the least thrust of a motor."""
+    world, model, actuator = parts.world, parts.model, parts.world.actuator
+    if actuator is not None and actuator.minimum is not None:
+        return True
+    plants = model, world.plant_for(model), *world.plants.values()
+    return settings.limits and any(map(is_limited, plants))
+
+
+def other_limits(parts: Parts) -> bool:
+    """Tell whether an agent has other limits than the model, or motors with a minimum."""
+    world, model = parts.world, parts.model
+    actuator = world.actuator
+    if actuator is not None and (actuator.levels or actuator.minimum is not None):
+        return True
+    plants = {id(x): x for x in (world.plant_for(model), *world.plants.values())}
+    own = type(model).limit, digest(model.input_limits)
+    return any((type(x).limit, digest(x.input_limits)) != own for x in plants.values())
+
+
+def limits_line(parts: Parts, settings: Settings) -> Iterator[Statement]:
+    """Yield that nothing bounds the inputs, where they have limits."""
+    if limits_act(parts, settings):
+        yield left_to_run(UNBOUNDED)
+
+
+def left_to_run(
+    text: str,
+    number: float | None = None,
+    number_text: str = "",
+    remedy: str = _WITHOUT_LIMITS,
+    kind: Kind = Kind.PROOF,
+) -> Statement:
+    """Return the line of a claim that holds only while no input is at a limit, and why."""
+    shown = number, number_text
+    line = fails(Hypothesis.LIMITS, kind, text, *shown, remedy=remedy)
+    return dataclasses.replace(line, condition=_CONDITION)

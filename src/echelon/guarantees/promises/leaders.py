@@ -13,8 +13,7 @@ from echelon.agents.network.graph import Graph
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, States
 from echelon.guarantees.promises.closed_loop import all_alike
-from echelon.laws.law import Law, gain_of
-from echelon.laws.trim_input import TrimInput
+from echelon.laws.law import Law, TrimInput, gain_of
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import simulate

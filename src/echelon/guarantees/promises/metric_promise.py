@@ -9,37 +9,93 @@ from typing import cast, final
 import numpy as np
 
 from echelon.agents.models.linearization import at_trim
-from echelon.core.digits import at_most
+from echelon.core.digits import about, at_most
 from echelon.core.numerics import precision
-from echelon.core.statement import Hypothesis
+from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
-from echelon.core.words import Theorem, Verdict
+from echelon.core.words import Kind, Theorem, Verdict
 from echelon.guarantees.promises.case import Case
-from echelon.guarantees.promises.certified_set import certified_set, set_line, starts_line
-from echelon.guarantees.promises.claims import claims_line
-from echelon.guarantees.promises.closed_loop import loop_of
+from echelon.guarantees.promises.closed_loop import LinearLoop, grounded_slowest, loop_of
 from echelon.guarantees.promises.frozen_laws import (
     ModeMatrices,
     frozen_of,
     frozen_starts,
     longest_step,
 )
-from echelon.guarantees.promises.hypotheses import hypotheses
+from echelon.guarantees.promises.hypotheses import hypotheses, limits_line
 from echelon.guarantees.promises.leaders import leaders_of
-from echelon.guarantees.promises.limits_line import limits_line
-from echelon.guarantees.promises.modes import sampling_line
+from echelon.guarantees.promises.modes import sampling_line, slowest_in_turns, turns_in_words
 from echelon.guarantees.promises.promise import Promise, Promises
 from echelon.guarantees.promises.region import (
     adjacent_slopes,
+    certified_set,
     domain_in_words,
     region_of,
+    set_line,
+    starts_line,
     weaken,
 )
-from echelon.guarantees.promises.turning import slowest_in_turns, turns_in_words
-from echelon.simulation.engine.initial import Starts
+from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate
+from echelon.synthesis.gains.gain import Gain
+
+# ---- what a gain claims of itself, compared ------------------------------------------------------
+
+_SAME = 1e-6
+"""Relative; less than that is rounding, or another library's eigenvalues."""
+_ROUNDING = 1e-9  # of the fastest mode, in the slowest
+
+
+def claims_line(parts: Parts, loop: LinearLoop, region: RegionCertificate | None) -> Statement:
+    """Return whether the certificate that a gain carries is of what runs.
+
+    Args:
+        parts: what runs.
+        loop: near the trim.
+        region: what the gain's metric promises here where the leader's input is relayed.
+    """
+    gain, name, kind = parts.drive.gain, Hypothesis.CLAIMS, Kind.LINEARIZATION
+    if gain is None:
+        return unneeded(name, kind, "there is no gain")
+    text = _difference(parts, gain, loop, region)
+    if text:
+        return fails(name, kind, text, remedy="the guarantee here is computed from what runs")
+    return holds(name, kind, "they agree with this model, graph and coupling")
+
+
+def _difference(
+    parts: Parts, gain: Gain, loop: LinearLoop, region: RegionCertificate | None
+) -> str:
+    """Return the first difference in words; empty without any."""
+    claim, low = gain.certificate, parts.graph.spectrum().low
+    if abs(claim.lambda_min - low) > _SAME * low:
+        ours, theirs = about(low, 4), about(claim.lambda_min, 4)
+        return f"the gain was made for lambda_min {theirs}, and this graph has {ours}"
+    slowest = grounded_slowest(gain, loop.linear, parts.graph)
+    fastest = float(np.abs(np.linalg.eigvals(loop.linear.A - loop.linear.B @ loop.gains[-1])).max())
+    bends = at_trim(parts.model).bends.any()
+    if not bends and abs(claim.abscissa - slowest) > _SAME * abs(slowest) + _ROUNDING * fastest:
+        text = f"the gain says that its slowest mode is {about(claim.abscissa, 4)} 1/s, and this "
+        text += f"model at coupling {about(gain.coupling, 4)} has {about(slowest, 4)} 1/s"
+        return text
+    if claim.edge is not None and loop.certificate.edge is None:
+        text = f"the gain says that every mode decays from coupling {about(claim.edge, 4)} on"
+        return f"{text}, and here its argument does not hold"
+    ours, theirs = _rate(region), _rate(claim.region)
+    return "" if ours == theirs else f"the gain says {theirs} on its domain, and here it is {ours}"
+
+
+def _rate(region: RegionCertificate | None) -> str:
+    """Return a promise on a domain in words, with the digits that are compared."""
+    if region is None:
+        return "nothing"
+    kind, theorem = region.kind, region.theorem
+    return f"{about(region.rate, 5)} 1/s ({kind}, {theorem})"
+
+
+# ---- the guarantee -------------------------------------------------------------------------------
 
 
 @final
@@ -111,8 +167,9 @@ class MetricPromise(Promise):
         for k, each in enumerate(settings):
             there = case._replace(settings=each)
             if case.frozen is not None and starts is not None:
-                frozen = case.frozen._replace(starts=_share(starts, k, len(states)))
-                there = there._replace(frozen=frozen)
+                size = len(starts.A) // len(states)
+                own = ModeMatrices(*(part[k * size : (k + 1) * size] for part in starts))
+                there = there._replace(frozen=case.frozen._replace(starts=own))
             yield self._from(there, states[k], bool(decays[k].all()))
 
     def _from(self, case: Case, states: Array, decays: bool) -> "MetricPromise":
@@ -201,9 +258,3 @@ class MetricPromise(Promise):
             return f"{text}agents stayed in the domain at every stored frame"
         text = f"the starts lie in the certified set ({starts.number_text}), and all agents stayed "
         return f"{text}in the domain"
-
-
-def _share(starts: ModeMatrices, k: int, runs: int) -> ModeMatrices:
-    """Return what is of one of so many runs."""
-    size = len(starts.A) // runs
-    return ModeMatrices(*(part[k * size : (k + 1) * size] for part in starts))

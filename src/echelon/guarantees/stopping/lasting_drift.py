@@ -14,7 +14,7 @@ import numpy as np
 
 from echelon.agents.models.chains import flat_output
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.demand import follow_at
+from echelon.agents.references.flatness import follow_at
 from echelon.agents.references.reference import Reference
 from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_least

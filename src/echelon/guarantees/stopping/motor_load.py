@@ -7,31 +7,171 @@ from typing import NamedTuple
 
 import numpy as np
 
-from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.declarations import is_by_user, undeclared
-from echelon.agents.models.model import ControlAffine, in_metres
+from echelon.agents.models.model import Airframe, ControlAffine, in_metres
+from echelon.core.cache import memoize
 from echelon.core.digits import at_least, at_most
-from echelon.core.enclosure.interval import Interval
-from echelon.core.memoize import memoize
-from echelon.core.rational import bisect, float_above, float_below, norm_above
+from echelon.core.enclosure.interval import ELEMENTARY, point
+from echelon.core.rational import (
+    bisect,
+    float_above,
+    float_below,
+    norm_above,
+    root_bounds,
+    round_up,
+)
 from echelon.core.statement import Hypothesis, Statement, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind
-from echelon.guarantees.promises.limits_line import left_to_run, limits_act, other_limits
-from echelon.guarantees.stopping.chain_response import Chain
-from echelon.guarantees.stopping.declared_borders import airframe_fault
-from echelon.guarantees.stopping.motor_bounds import (
-    MotorDemand,
-    Motors,
-    Pushed,
-    add_pushes,
-    motors_of,
-    motors_suffice,
-)
+from echelon.guarantees.promises.hypotheses import left_to_run, limits_act, other_limits
+from echelon.guarantees.stopping.chain_response import Chain, TimeSlice, slices_of
+from echelon.guarantees.stopping.flat_everywhere import airframe_fault
 from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
-from echelon.guarantees.stopping.time_slices import slices_of
 from echelon.laws.stopping_point import StoppingLeader
+
+# ---- bounds on the thrust of four motors ---------------------------------------------------------
+# With F = p'' + g e3 the thrust is m |F| along F, and the derivatives of F turn it: R'F' and R'F''
+# give the body rates and, with the yaw, all three torques (theory page). Only sizes are used, so
+# that any heading will do.
+
+_HALF = Fraction(1, 2)
+
+
+class MotorDemand(NamedTuple):
+    """Bounds of a path's derivatives, sizes all: horizontal (norm), vertical, and of the yaw.
+
+    Attributes:
+        sideways: of p'', p''' and p'''', the norm of the horizontal part; m/s^2 and so on.
+        low, high: between which z'' is.
+        upward: of z''' and z''''.
+        turn: of yaw' and yaw''.
+    """
+
+    sideways: tuple[Fraction, Fraction, Fraction]
+    low: Fraction
+    high: Fraction
+    upward: tuple[Fraction, Fraction]
+    turn: tuple[Fraction, Fraction]
+
+
+class Pushed(NamedTuple):
+    """How an agent is moved off what it follows: sizes of its start, and bounds of |w|.
+
+    Attributes:
+        sideways: norms of the horizontal v, v', v''.
+        upward: of the vertical ones.
+        turn: of yaw'.
+        speeds: s, horizontal (norm), vertical, of the yaw.
+    """
+
+    sideways: tuple[Fraction, ...]
+    upward: tuple[Fraction, ...]
+    turn: tuple[Fraction, ...]
+    speeds: tuple[Fraction, Fraction, Fraction]
+
+
+class Motors(NamedTuple):
+    """Between what each motor's thrust (N) stays, and the tangent of the steepest tilt.
+
+    `slope` is None where the thrust is not shown to stay positive, and then nothing is known.
+    """
+
+    least: Fraction
+    largest: Fraction
+    slope: Fraction | None
+
+    @property
+    def tilt(self) -> Fraction:
+        """The steepest tilt, rad."""
+        assert self.slope is not None
+        return ELEMENTARY["atan"].range(point(self.slope)).hi
+
+    def within(self, most: Fraction) -> bool:
+        """Tell whether motors that give between 0 and `most` suffice."""
+        return self.slope is not None and self.least > 0 and self.largest < most
+
+
+def motors_of(
+    frame: Airframe,
+    slices: Sequence[TimeSlice],
+    path: Sequence[MotorDemand],
+    pushes: Sequence[Pushed],
+) -> Motors:
+    """Return what the motors of an agent give on a path, pushed off it.
+
+    Args:
+        frame: of the agent.
+        slices: of time.
+        path: what is followed asks on each slice.
+        pushes: the leader's off its path, and the agent's off the leader; all add up.
+    """
+    least, largest, slope = None, Fraction(0), Fraction(0)
+    for piece, demand in zip(slices, path, strict=True):
+        motors = motors_for(frame, add_pushes(piece, demand, pushes))
+        if motors.slope is None:
+            return motors
+        least = motors.least if least is None else min(least, motors.least)
+        largest, slope = max(largest, motors.largest), max(slope, motors.slope)
+    assert least is not None
+    return Motors(least, largest, slope)
+
+
+def motors_suffice(
+    frame: Airframe, slices: Sequence[TimeSlice], path: Sequence[MotorDemand], push: Pushed
+) -> bool:
+    """Tell whether the motors give all that is asked of an agent on a path, pushed off it."""
+    most, pairs = Fraction(frame.motor_thrust), zip(slices, path, strict=True)
+    return all(motors_for(frame, add_pushes(*pair, (push,))).within(most) for pair in pairs)
+
+
+def add_pushes(piece: TimeSlice, demand: MotorDemand, pushes: Sequence[Pushed]) -> MotorDemand:
+    """Return what is asked on a slice of agents that are pushed off the path."""
+    aside, up, turn = list(demand.sideways), [Fraction(0)] * 3, list(demand.turn)
+    for push in pushes:
+        along, upward, around = push.speeds
+        for k in range(3):
+            aside[k] += piece.whole.of(k + 1, push.sideways, along)
+            up[k] += piece.whole.of(k + 1, push.upward, upward)
+        for k in range(2):
+            turn[k] += piece.first.of(k, push.turn, around)
+    return MotorDemand(
+        (aside[0], aside[1], aside[2]),
+        demand.low - up[0],
+        demand.high + up[0],
+        (demand.upward[0] + up[1], demand.upward[1] + up[2]),
+        (turn[0], turn[1]),
+    )
+
+
+def motors_for(frame: Airframe, demand: MotorDemand) -> Motors:
+    """Return what the motors give while a path's derivatives are within bounds."""
+    low = demand.low + Fraction(frame.gravity)
+    if low <= 0:
+        return Motors(Fraction(-1), Fraction(-1), None)
+    Jx, Jy, Jz = map(Fraction, frame.inertia)
+    tan = round_up(demand.sideways[0] / low)
+    sec2 = 1 + tan * tan
+    low_sec, high_sec = root_bounds(sec2)
+    sec, sine = round_up(high_sec), round_up(tan / low_sec)
+    jerk, snap = (norm_above(demand.sideways[k + 1], demand.upward[k]) for k in range(2))
+    turn, turning = demand.turn
+    # Of roll and pitch, rad/s, and what turns them but for what the yaw does, rad/s^2.
+    rate = round_up(jerk / low)
+    bend = round_up((snap + jerk * jerk / low) / low)
+    spin = round_up(sec * turn + tan * rate)
+    spinning = sec * turning + 2 * turn * sec2 * (sine * rate + (1 - 1 / sec) * turn)
+    spinning += (2 * sec2 - 1) * _HALF * rate * rate + tan * bend
+    tilting = max(Jx, Jy) * bend + max(Jx + Jz - Jy, Jy + Jz - Jx) * rate * spin
+    yawing = Jz * spinning + abs(Jy - Jx) * _HALF * rate * rate
+    root = root_bounds(2)[1]
+    more = root * tilting / Fraction(frame.arm) + yawing / Fraction(frame.torque_per_thrust)
+    mass, more = Fraction(frame.mass), round_up(more) / 4
+    high = norm_above(demand.high + Fraction(frame.gravity), demand.sideways[0])
+    return Motors(mass * low / 4 - more, mass * high / 4 + more, tan)
+
+
+# ---- the motors of a run -------------------------------------------------------------------------
 
 _OUTPUTS, _DEGREES = ("x", "y", "z", "yaw"), (4, 4, 4, 2)
 """Of the body that the motors move, as its flat coordinates."""
@@ -146,15 +286,6 @@ class _MotorCase(NamedTuple):
         return cls(frame, chain, demands, leader, speeds, base, starts)
 
 
-def motors_suffice_for(run: StoppingRun) -> bool:
-    """Tell whether the motors are certified from the starts of a run."""
-    frame, _ = _airframe(run)
-    if frame is None:
-        return False
-    case = _MotorCase.of(run, frame)
-    return _from(case)[0].within(Fraction(frame.motor_thrust))
-
-
 def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | None, Statement]:
     """Return the load of the motors of a run's agents, if they suffice, and its line.
 
@@ -177,7 +308,7 @@ def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | No
         text = "the motors are not proved to suffice from these starts"
         text += f": {number[1]}" if number[1] else ", and the thrust is not proved to stay positive"
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
-        remedy += "to the leader's velocity and attitude; `echelon design` finds some"
+        remedy += "to the leader's velocity and attitude"
         return None, left_to_run(text, *number, remedy, kind)
     ahead = _ahead(frame, run.ahead)
     load = MotorLoad(
@@ -249,16 +380,13 @@ def _demand(pieces: Pieces, begin: Fraction, end: Fraction | None) -> MotorDeman
     rows = pieces.between(begin, end)
 
     def most(order: int, *outputs: int) -> Fraction:
-        return max(norm_above(*(_size(row[order][k]) for k in outputs)) for row in rows)
+        ends = ([(row[order][k].lo, row[order][k].hi) for k in outputs] for row in rows)
+        return max(norm_above(*(max(abs(low), abs(high)) for low, high in row)) for row in ends)
 
     low = min(row[2][2].lo for row in rows)
     high = max(row[2][2].hi for row in rows)
     sideways = (most(2, 0, 1), most(3, 0, 1), most(4, 0, 1))
     return MotorDemand(sideways, low, high, (most(3, 2), most(4, 2)), (most(1, 3), most(2, 3)))
-
-
-def _size(x: Interval) -> Fraction:
-    return max(abs(x.lo), abs(x.hi))
 
 
 # ---- agents --------------------------------------------------------------------------------------

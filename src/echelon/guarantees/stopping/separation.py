@@ -9,8 +9,7 @@ from echelon.core.digits import at_least, at_most
 from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
-from echelon.guarantees.stopping.flat_states import flat_states_of
-from echelon.guarantees.stopping.stopping_run import StoppingRun
+from echelon.guarantees.stopping.stopping_run import StoppingRun, flat_states_of
 from echelon.guarantees.stopping.tube import Tube
 from echelon.laws.safety import AXES, Safety
 from echelon.laws.safety_check import hulls_at, separations

@@ -8,7 +8,7 @@ import numpy as np
 
 from echelon.core.statement import Hypothesis, Statement, Topic, holds, unneeded
 from echelon.core.words import Kind
-from echelon.guarantees.messages.network_lines import messages_line
+from echelon.guarantees.messages.late_messages import messages_line
 from echelon.guarantees.messages.own_delay import OwnCase, own_delay_line
 from echelon.guarantees.promises.case import Case
 from echelon.guarantees.promises.closed_loop import loop_of
@@ -16,7 +16,6 @@ from echelon.guarantees.promises.hypotheses import agent_lines
 from echelon.guarantees.promises.leaders import leaders_of
 from echelon.guarantees.promises.promise import AgreementModes, Promise
 from echelon.guarantees.stopping.lasting_drift import drift_line
-from echelon.guarantees.stopping.motor_design import MotorDesign, design_with_motors
 from echelon.guarantees.stopping.separation import Separation, separation_of
 from echelon.guarantees.stopping.stopping_run import (
     StoppingRun,
@@ -25,7 +24,6 @@ from echelon.guarantees.stopping.stopping_run import (
     stopping_run_of,
 )
 from echelon.guarantees.stopping.tube import Tube, tube_of
-from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.settings import Settings
@@ -85,11 +83,6 @@ class StoppingPromise(Promise):
             tube=tube,
             separation=separation,
         )
-
-    @classmethod
-    def design(cls, parts: Parts, settings: Settings) -> MotorDesign | None:
-        """Return the roots and speeds with which these starts are soonest there, with motors."""
-        return design_with_motors(parts, settings)
 
     @property
     def governed(self) -> bool:

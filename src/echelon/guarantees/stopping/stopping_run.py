@@ -1,15 +1,24 @@
 """A run in flat coordinates, and the hypotheses of theorem T5 beside its tube."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+from jaxtyping import Float
 
+from echelon.agents.models.chains import Chains, flat_output, flatten
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.edges import name_agents
 from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.network.graph import Graph
+from echelon.agents.network.matrices import unreached
+from echelon.core.cache import memoize
+from echelon.core.compiled import cached_jit
 from echelon.core.digits import about, at_least, at_most
 from echelon.core.enclosure.interval import point
 from echelon.core.errors import GraphError
@@ -25,16 +34,163 @@ from echelon.guarantees.messages.late_messages import (
     late_messages_of,
 )
 from echelon.guarantees.stopping.chain_response import Chain
-from echelon.guarantees.stopping.flat_starts import flat_starts
-from echelon.guarantees.stopping.flat_states import flat_states_of
 from echelon.guarantees.stopping.moving_offsets import size_beside
 from echelon.guarantees.stopping.path_bounds import pieces_of
-from echelon.guarantees.stopping.switching_line import switching_line
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
+from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
 from echelon.simulation.step.settings import Settings
+
+# ---- states that are flat outputs ----------------------------------------------------------------
+
+
+class FlatStates(NamedTuple):
+    """States by name, as traces of the equations show them; what has no trace is left out.
+
+    Attributes:
+        outputs: states that are flat outputs themselves, in the same unit.
+        free: those of them on which no derivative of an output depends, nor another output: agents
+            that differ in these alone have all other states in common.
+    """
+
+    outputs: tuple[str, ...]
+    free: tuple[str, ...]
+
+
+@memoize
+def flat_states_of(model: ControlAffine, chains: Chains) -> FlatStates:
+    """Return which states of a model are flat outputs."""
+    graph, n = ScalarGraph(), len(model.state_names)
+    leaves = [graph.leaf("row", place) for place in range(n + chains.size)]
+    x, e = (np.array(part, object) for part in (leaves[:n], leaves[n:]))
+
+    def above(x: jax.Array, e: jax.Array) -> jax.Array:
+        return flatten(model, chains, x, e).values[1:]
+
+    try:
+        [found] = lower(lambda x: flat_output(model, chains.outputs, x), graph, [x])
+        place = nodes(graph, found)
+    except Unsupported:
+        return FlatStates((), ())
+    pairs = zip(chains.outputs, place, strict=True)
+    same = tuple(
+        name
+        for name, node in pairs
+        if name in model.state_names and node is leaves[model.state_names.index(name)]
+    )
+    try:
+        [higher] = lower(above, graph, [x, e])
+    except Unsupported:
+        return FlatStates(same, ())
+    others = [node for name, node in zip(chains.outputs, place, strict=True) if name not in same]
+    used = _leaves_of([*nodes(graph, higher), *others])
+    free = (name for name in same if leaves[model.state_names.index(name)].number not in used)
+    return FlatStates(same, tuple(free))
+
+
+def _leaves_of(results: Iterable[Node]) -> set[int]:
+    """Return the numbers of the nodes that results depend on, but for products with 0."""
+    reached, todo = set[int](), list(results)
+    while todo:
+        node = todo.pop()
+        zero = node.op == "mul" and any(a.op == "constant" and a.value == 0.0 for a in node.args)
+        if node.number not in reached and not zero:
+            reached.add(node.number)
+            todo += node.args
+    return reached
+
+
+# ---- starts in flat coordinates ------------------------------------------------------------------
+
+_TURN = 2.0 * np.pi
+
+
+def flat_starts(
+    parts: Parts, law: StoppingPoint, states: Float[Array, "N n"]
+) -> Float[Array, "N r m"]:
+    """Return states in flat coordinates, less the offsets.
+
+    Without `safety` they are less the offsets' derivatives too, which the law adds by itself.
+    """
+    motion = parts.formation.motion
+    offsets = jnp.asarray(parts.formation.offsets_at([0.0])[0])
+    flat = np.array(_flat(parts.model, law, jnp.asarray(states), offsets))
+    if motion is not None and law.safety is None:
+        rates = np.asarray(_offset_rates(motion, flat.shape[1] - 1))
+        flat[:, 1:, np.array(law.ready.places_of(parts.model))] -= rates[:, 1:]
+    return flat
+
+
+@cached_jit
+def _flat(
+    model: ControlAffine, law: StoppingPoint, states: jax.Array, offsets: jax.Array
+) -> jax.Array:
+    chains = law.ready.chains
+
+    def one(x: jax.Array, offset: jax.Array) -> jax.Array:
+        memory = law.begin(model, x)
+        values = flatten(model, chains, x, memory.chain).values
+        shift = flat_output(model, chains.outputs, offset)
+        values = values.at[0].add(flat_output(model, chains.outputs, 0.0 * offset) - shift)
+        # The law takes the turn of a heading that is next to the beginning of the leader's path.
+        turns = jnp.round((law.signal(model, x, offset, memory) - law.ready.stop(values)) / _TURN)
+        return values.at[0].add(_TURN * turns) if law.ready.angles else values
+
+    return jax.vmap(one)(states, offsets)
+
+
+@cached_jit
+def _offset_rates(motion: FormationMotion, order: int) -> jax.Array:
+    start, rows = jnp.zeros(()), jnp.asarray(motion.places)
+    return jax.vmap(lambda row: motion.derivatives(row, start, order))(rows)
+
+
+# ---- a graph that switches -----------------------------------------------------------------------
+
+
+def switching_line(graph: Graph, leaderward: bool, left_out: str, rate: float) -> Statement:
+    """Say along which edges the leader reaches everybody, of a graph as it runs in steps.
+
+    `left_out` says why nothing is known of that, and `rate` is that of errors in the end, 1/s.
+    """
+    schedule, name = graph.schedule, Hypothesis.SWITCHING
+    assert schedule is not None
+    against = left_out or _left_behind(graph, leaderward)
+    if against:
+        remedy = "set `hears: all`, or add links" if leaderward else "add links"
+        remedy = "switch at multiples of `simulation.dt`" if left_out else remedy
+        return fails(name, Kind.PROOF, against, remedy=remedy, reason=against)
+    since = at_least(schedule.starts[-1], 6)
+    text = f"the leader reaches every agent along the edges from {since} s on"
+    if schedule.period is not None:
+        text = "the leader reaches every agent along the edges of any "
+        text += f"{at_least(schedule.period, 6)} s together"
+    text += ", and zeta' is received whatever edges are present"
+    return holds(name, Kind.PROOF, text, rate)
+
+
+def _left_behind(graph: Graph, leaderward: bool) -> str:
+    """Return whom the leader does not reach along the edges that are heard; empty for nobody.
+
+    Laws are made for a graph without its events, and nobody has asked this of a part of them yet.
+    """
+    schedule = graph.schedule
+    assert schedule is not None
+    since, lost = "in a period", np.array([], int)
+    if schedule.period is None:
+        since = f"from {schedule.starts[-1]:g} s on"
+        lost = unreached(graph, schedule, -1)
+    if leaderward:
+        whole = graph.stretches(True)[-1 if schedule.period is None else 0 :]
+        # Who is heard is nearer, and so on: the one of these that is nearest hears nobody.
+        lost = np.array(graph.followers)[sum(L.diagonal() for L in whole) <= 0.0]
+    along = " along neighbours that are nearer to it" if leaderward else ""
+    return f"{name_agents(lost)} no path to the leader{along} {since}" if len(lost) else ""
+
+
+# ---- the run -------------------------------------------------------------------------------------
 
 _PROOF = Kind.PROOF
 _BELOW = 1.0 - 1e-9

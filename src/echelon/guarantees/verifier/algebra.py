@@ -1,5 +1,6 @@
-"""Linear algebra of the verifier: spectra, ranks and growth rates with bounds of their rounding."""
+"""Linear algebra of the verifier: in floats with bounds of their rounding, and exactly."""
 
+import math
 from collections.abc import Callable
 from fractions import Fraction
 from typing import Any, NamedTuple, TypeAlias
@@ -9,6 +10,8 @@ import scipy.linalg
 
 from echelon.core.types import Array
 from echelon.guarantees.verifier.saved_gain import SavedGraph
+
+# ---- spectra, ranks and growth rates -------------------------------------------------------------
 
 ALL_MODES = 400
 """Followers up to which all eigenvalues are checked; beyond, the two extreme ones."""
@@ -176,3 +179,226 @@ def growth(P: Array, As: Array, Ws: Array, strength: float) -> tuple[float, floa
     sizes = np.abs(root) @ (parts + parts.swapaxes(1, 2)) @ np.abs(root.T)
     whole = float(np.linalg.norm(sizes, axis=(1, 2)).max())
     return float(values.max()), 4.0 * _EPS * len(P) * whole
+
+
+# ---- exact leading minors ------------------------------------------------------------------------
+# By Sylvester's criterion a symmetric matrix is positive definite exactly when its leading minors
+# are positive. Every float is a fraction; rows are multiplied by their denominators, and the minors
+# of integer matrices are computed without fractions (Bareiss).
+
+Rows: TypeAlias = list[list[Fraction]]
+
+
+def rows_of(matrix: Array) -> Rows:
+    """Return a matrix of floats as the fractions that they are."""
+    return [[Fraction(float(x)) for x in row] for row in matrix]
+
+
+def is_positive_definite(matrix: Rows) -> bool:
+    """Tell exactly whether a symmetric matrix is positive definite."""
+    # Sylvester's criterion speaks of symmetric matrices alone.
+    if any(matrix[i][j] != matrix[j][i] for i in range(len(matrix)) for j in range(i)):
+        return False
+    # A positive factor on a row changes the sign of no minor.
+    rest, last = [_whole(row) for row in matrix], 1
+    while rest:
+        (pivot, *tail), *below = rest
+        if pivot <= 0:
+            return False
+        # Bareiss: the remaining entries are minors, divisible by the previous pivot.
+        rest = [
+            [(pivot * x - row[0] * y) // last for x, y in zip(row[1:], tail, strict=True)]
+            for row in below
+        ]
+        last = pivot
+    return True
+
+
+def _whole(row: list[Fraction]) -> list[int]:
+    shared = math.lcm(*(x.denominator for x in row))
+    return [x.numerator * (shared // x.denominator) for x in row]
+
+
+def product(left: Rows, right: Rows) -> Rows:
+    """Return the matrix product, exactly."""
+    columns = list(zip(*right, strict=True))
+    # Fractions are slow, and most entries of these matrices are zero.
+    return [
+        [sum((x * y for x, y in zip(a, b, strict=True) if x and y), Fraction(0)) for b in columns]
+        for a in left
+    ]
+
+
+def transpose(matrix: Rows) -> Rows:
+    """Return the transpose."""
+    return [list(column) for column in zip(*matrix, strict=True)]
+
+
+def inverse(matrix: Rows) -> Rows:
+    """Return the inverse of a positive definite matrix, exactly (Gauss and Jordan)."""
+    size = len(matrix)
+    work = [[*row, *(Fraction(i == j) for j in range(size))] for i, row in enumerate(matrix)]
+    for k in range(size):
+        # The pivots of a positive definite matrix are positive, so no rows are exchanged.
+        work[k] = [x / work[k][k] for x in work[k]]
+        for i in range(size):
+            if i != k and work[i][k]:
+                work[i] = [x - work[i][k] * y for x, y in zip(work[i], work[k], strict=True)]
+    return [row[size:] for row in work]
+
+
+def weighted(B: Array, R: Array, P: Array) -> tuple[Array, Array, Array]:
+    """Return R^-1 B' (m, n), B R^-1 B' (n, n) and B R^-1 B'P (n, n), each rounded once."""
+    pull = product(inverse(rows_of(R)), transpose(rows_of(B)))
+    both = product(rows_of(B), pull)
+    return _to_floats(pull), _to_floats(both), _to_floats(product(both, rows_of(P)))
+
+
+def _to_floats(matrix: Rows) -> Array:
+    return np.array([[float(x) for x in row] for row in matrix])
+
+
+def first_unproved(
+    P: Array,
+    B: Array,
+    R: Array,
+    hull: Array,
+    error: Array,
+    strength: Fraction,
+    rate: float,
+) -> int | None:
+    """Return the first vertex A at which the rate is not proved, or None if all are.
+
+    The inequality is P A + A'P - strength P B R^-1 B'P + 2 rate P < 0, also for every matrix
+    within +- error of A. Such a change adds at most |P| error + its transpose, entry by entry; its
+    row sums on the diagonal dominate it for any signs (Gershgorin).
+
+    Args:
+        P: (n, n), symmetric to the bit and positive definite.
+        B: (n, m).
+        R: (m, m), symmetric positive definite.
+        hull: (K, n, n).
+        error: (n, n).
+        strength: a lower bound of 2 c lambda_min.
+        rate: 1/s.
+    """
+    metric, change = rows_of(P), rows_of(abs(error))
+    pull = product(metric, rows_of(B))
+    feedback = product(product(pull, inverse(rows_of(R))), transpose(pull))
+    # |P dA| <= |P| error for every dA within +- error.
+    spread = product(rows_of(abs(P)), change)
+    fixed = [
+        [strength * feedback[i][j] - 2 * Fraction(rate) * metric[i][j] for j in range(len(metric))]
+        for i in range(len(metric))
+    ]
+    for i, row in enumerate(spread):
+        fixed[i][i] -= sum(row) + sum(other[i] for other in spread)
+    for number, corner in enumerate(hull):
+        PA = product(metric, rows_of(corner))
+        slope = [
+            [fixed[i][j] - PA[i][j] - PA[j][i] for j in range(len(fixed))]
+            for i in range(len(fixed))
+        ]
+        if not is_positive_definite(slope):
+            return number
+    return None
+
+
+# ---- spectra of directed graphs ------------------------------------------------------------------
+
+_DIRECTED_ITERATIONS = 400
+_EXACT = 60
+"""Followers up to which a bound is proved in exact arithmetic."""
+
+
+def directed_spectrum(graph: SavedGraph, edges: Array) -> tuple[Array, float, float]:
+    """Return eigenvalues of the grounded Laplacian (n,), the smallest, and the bound of the sum.
+
+    The smallest is 0 if an agent is cut off; the bound is 0 if the file has no weights of a sum.
+    """
+    W, selection = np.zeros((graph.agents, graph.agents)), followers(graph)
+    # On an edge (i, j), j receives from i.
+    W[edges[:, 1].astype(int), edges[:, 0].astype(int)] = edges[:, 2]
+    inner_weights, leader_weights = (
+        W[np.ix_(selection, selection)],
+        W[np.ix_(selection, graph.leaders)].sum(axis=1),
+    )
+    L = np.diag(inner_weights.sum(axis=1) + leader_weights) - inner_weights
+    if not _reachable(inner_weights > 0.0, leader_weights > 0.0).all():
+        return np.zeros(len(L), complex), 0.0, 0.0
+    values, low = list[Array](), np.inf
+    for component in _strong_components(inner_weights > 0.0):
+        values.append(np.linalg.eigvals(L[np.ix_(component, component)]).astype(complex))
+        others = np.setdiff1d(np.arange(len(L)), component)
+        inside = inner_weights[np.ix_(component, component)]
+        outside = leader_weights[component] + inner_weights[np.ix_(component, others)].sum(axis=1)
+        low = min(low, _least_of_block(inside, outside))
+    return np.concatenate(values), low, _sum_bound(graph, edges, L)
+
+
+def _reachable(is_neighbour: Array, leader_weights: Array) -> Array:
+    """Return which agents a leader reaches, directly or through others, (n,)."""
+    reached = leader_weights.copy()
+    for _ in range(len(leader_weights)):
+        reached = reached | (is_neighbour & reached).any(axis=1)
+    return reached
+
+
+def _strong_components(is_neighbour: Array) -> list[Array]:
+    """Return the strongly connected components, by powers of the adjacency matrix."""
+    ways = np.eye(len(is_neighbour), dtype=bool) | is_neighbour
+    for _ in range(max(1, int(np.ceil(np.log2(max(2, len(is_neighbour))))))):
+        ways = (ways.astype(np.float32) @ ways.astype(np.float32)) > 0.0
+    both, visited, result = ways & ways.T, np.zeros(len(is_neighbour), bool), list[Array]()
+    for k in range(len(is_neighbour)):
+        if not visited[k]:
+            result.append(np.flatnonzero(both[k]))
+            visited[result[-1]] = True
+    return result
+
+
+def _least_of_block(inside: Array, outside: Array) -> float:
+    """Return the smallest eigenvalue of diag(inside 1 + outside) - inside, of one component.
+
+    Inverse iteration by an elimination without subtractions; the eigenvalue lies between the least
+    and the largest x / L^-1 x (Collatz, Wielandt).
+    """
+    steps = eliminate(inside, outside)
+    if steps is None:
+        return 0.0
+    x, ends = np.ones(len(outside)), (0.0, 0.0)
+    for _ in range(_DIRECTED_ITERATIONS):
+        y = solve_by_elimination(*steps, x)
+        ends = float((x / y).min()), float((x / y).max())
+        x = np.maximum(y / y.max(), 1e-150)
+        if ends[1] <= (1.0 + 1e-14 * len(x)) * ends[0]:
+            break
+    return 0.5 * (ends[0] + ends[1])
+
+
+def _sum_bound(graph: SavedGraph, edges: Array, L: Array) -> float:
+    """Return s with W L + L'W >= 2 s W for the weights W of the file; 0 if there are none."""
+    if graph.sums is None:
+        return 0.0
+    root = np.sqrt(graph.sums)
+    scaled = root[:, None] * L / root
+    symmetric = 0.5 * (scaled + scaled.T)
+    bound = float(np.linalg.eigvalsh(symmetric)[0])
+    lost = 8.0 * len(L) * _EPS * float(np.abs(symmetric).sum(axis=1).max())
+    bound = max(0.0, bound - lost) * (1.0 - 1e-10)
+    return bound if len(L) > _EXACT or _is_bound_proved(graph, edges, bound) else 0.0
+
+
+def _is_bound_proved(graph: SavedGraph, edges: Array, bound: float) -> bool:
+    """Tell whether W L + L'W - 2 s W is positive definite, by exact minors."""
+    assert graph.sums is not None
+    size, selection = graph.agents, followers(graph)
+    L = [[Fraction(0)] * size for _ in range(size)]
+    for i, j, weight in edges:
+        L[int(j)][int(j)] += Fraction(float(weight))
+        L[int(j)][int(i)] -= Fraction(float(weight))
+    w = {agent: Fraction(float(x)) for agent, x in zip(selection, graph.sums, strict=True)}
+    rows = [[w[i] * L[i][j] + w[j] * L[j][i] for j in selection] for i in selection]
+    for k, agent in enumerate(selection):
+        rows[k][k] -= 2 * Fraction(bound) * w[agent]
+    return is_positive_definite(rows)

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.guarantees.verifier import algebra, exact_minors
-from echelon.guarantees.verifier.directed_spectra import directed_spectrum
+from echelon.guarantees.verifier import algebra
+from echelon.guarantees.verifier.algebra import directed_spectrum
 from echelon.guarantees.verifier.saved_gain import SavedGain
 
 TIGHT = 1e-9
@@ -128,7 +128,7 @@ def facts(saved: SavedGain) -> Facts:
         saved,
         values,
         bound,
-        *exact_minors.weighted(B, saved.R, saved.P),
+        *algebra.weighted(B, saved.R, saved.P),
         closed,
         algebra.size(closed),
         low,

@@ -9,7 +9,7 @@ import scipy.linalg
 from echelon.core.digits import at_least
 from echelon.core.types import Array
 from echelon.core.words import amount
-from echelon.guarantees.verifier import algebra, exact_minors
+from echelon.guarantees.verifier import algebra
 from echelon.guarantees.verifier.findings import (
     DECIDED,
     ROUNDING,
@@ -62,12 +62,6 @@ def _check_strength(facts: Facts, region: SavedRegion) -> Finding:
     return decide("strength", fine, region.strength, most, "at most the bound of the weighted sum")
 
 
-def _weight_ratio(facts: Facts) -> float:
-    """Return the square root of the ratio of the largest to the smallest weight of the sum."""
-    sums = facts.saved.graph.sums
-    return 1.0 if sums is None else float(np.sqrt(sums.max() / sums.min()))
-
-
 def needs_constant(facts: Facts, region: SavedRegion) -> bool:
     """Return whether the guarantee requires a constant g."""
     if facts.saved.graph.directed and region.theorem == "A5":
@@ -96,7 +90,8 @@ def _spread(facts: Facts) -> float:
 
 def _check_radius(facts: Facts, region: SavedRegion) -> Finding:
     """Compare with the largest r for which {x'P x <= r^2} lies inside the bounds."""
-    widest = _widest(facts.saved.P, region) / _weight_ratio(facts)
+    widest, sums = _widest(facts.saved.P, region), facts.saved.graph.sums
+    widest = widest if sums is None else widest / float(np.sqrt(sums.max() / sums.min()))
     if region.theorem == "T2":
         text = "a local guarantee certifies no set"
         return decide("radius", region.radius is None, str(region.radius), text=text)
@@ -163,12 +158,12 @@ def _proof(facts: Facts, region: SavedRegion) -> Iterator[Finding]:
         for k in range(len(rows)):
             # lambda_min > low exactly when L_g - low I is positive definite.
             rows[k][k] -= low
-        fine = exact_minors.is_positive_definite(rows)
+        fine = algebra.is_positive_definite(rows)
         yield decide("lambda_min, proved", fine, facts.low, float(low), "exact minors")
     strength = 0 * low if region.theorem == "A5" else 2 * Fraction(saved.coupling) * low
     numbers = (saved.P, saved.model.B, saved.R, region.hull, region.error, strength, region.rate)
     # A negative error would relax the inequality instead of tightening it.
     failed = None if (region.error >= 0.0).all() else 0
-    failed = exact_minors.first_unproved(*numbers) if failed is None else failed
+    failed = algebra.first_unproved(*numbers) if failed is None else failed
     text = "exact minors" if failed is None else f"vertex {failed} is not negative definite"
     yield decide(claim, failed is None, region.rate, text=text)

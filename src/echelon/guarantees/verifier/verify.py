@@ -13,15 +13,13 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import about
 from echelon.core.types import JsonObject, PathLike
-from echelon.guarantees.verifier import exact_minors
+from echelon.guarantees.verifier import algebra
 from echelon.guarantees.verifier.agent_claims import MODEL as MODEL
 from echelon.guarantees.verifier.agent_claims import check_equations
 from echelon.guarantees.verifier.findings import VERDICTS, Finding, decide, facts, unchecked
-from echelon.guarantees.verifier.graph_claims import check_graph, check_spectrum
-from echelon.guarantees.verifier.mode_claims import check_linearization
+from echelon.guarantees.verifier.mode_claims import check_graph, check_linearization, check_spectrum
 from echelon.guarantees.verifier.region_claims import check_region
-from echelon.guarantees.verifier.saved_gain import FORMAT, SavedGain, read
-from echelon.guarantees.verifier.strict_json import read_json
+from echelon.guarantees.verifier.saved_gain import FORMAT, SavedGain, read, read_json
 from echelon.guarantees.verifier.tube_claims import tube_findings, tube_of
 
 # Allowed asymmetry of P after scaling its diagonal to one: rounding of its last digits.
@@ -149,8 +147,8 @@ def _check_definite(saved: SavedGain) -> Iterator[Finding]:
     for name, matrix in (("P", saved.P), ("R", saved.R)):
         units = np.sqrt(np.abs(np.diag(matrix)))
         even = (np.abs(matrix - matrix.T) <= _SKEW * np.outer(units, units)).all()
-        fine = bool(even) and exact_minors.is_positive_definite(
-            exact_minors.rows_of(0.5 * (matrix + matrix.T))
+        fine = bool(even) and algebra.is_positive_definite(
+            algebra.rows_of(0.5 * (matrix + matrix.T))
         )
         yield decide(f"{name} is symmetric and positive definite", fine, text="exact minors")
     yield decide("the coupling is positive", saved.coupling > 0.0, saved.coupling)

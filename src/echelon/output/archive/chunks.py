@@ -14,8 +14,7 @@ from typing import Any, final
 import numpy as np
 
 from echelon.core.errors import OutputError
-from echelon.core.files import INPUTS, write_atomic
-from echelon.core.provenance import versions
+from echelon.core.files import INPUTS, versions, write_atomic
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario.scenario import SCENARIO_FILE, Scenario
 from echelon.experiments.scenario.self_contained import self_contained

@@ -1,7 +1,7 @@
 """Figures of the communication graph and of the closed-loop poles."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,8 +10,7 @@ from echelon.core.digits import at_least
 from echelon.core.types import Array
 from echelon.experiments.results.recording import LoopPoles, Recording
 from echelon.output.plots import style as draw
-from echelon.output.plots.agent_style import MOST, count_title, pen_of
-from echelon.output.plots.canvas import canvas
+from echelon.output.plots.style import MOST, count_title, pen_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,37 +30,31 @@ def modes(run: Recording) -> "Figure | None":
 def poles(loop: LoopPoles) -> "Figure":
     """Return poles in the complex plane, coloured by the eigenvalue of the graph."""
     from matplotlib.colors import LogNorm
+    from matplotlib.ticker import NullLocator
 
     # The real part of complex eigenvalues, by which couplings are chosen.
     values = np.real(loop.eigenvalues)
     real, imaginary = np.real(loop.poles), np.imag(loop.poles)
-    figure, ax = canvas(["real part (1/s)", "imaginary part (rad/s)"])
+    figure, ax = draw.canvas(["real part (1/s)", "imaginary part (rad/s)"])
     colour = np.repeat(values, real.shape[1])
     norm = LogNorm(values[0], values[-1] if values[-1] > values[0] else 1.01 * values[0])
-    look = {"norm": norm, "cmap": "viridis", "edgecolors": "white", "linewidths": 0.4, "zorder": 3}
+    look = {"norm": norm, "cmap": "viridis", "edgecolors": "white", "zorder": 3}
     dots = ax.scatter(real.ravel(), imaginary.ravel(), 34, colour, **look)
-    ax.axvline(0.0, color=draw.EDGE, linewidth=0.9, zorder=2)
+    ax.axvline(0.0, color=draw.EDGE)
     slowest = float(real.max())
-    ax.axvline(slowest, color=draw.COLOURS[1], linewidth=0.9, linestyle=(0, (4, 2)), zorder=2)
+    mark: draw.Style = draw.LIMIT | {"color": draw.COLOURS[1]}
+    ax.axvline(slowest, **mark)
     _wide_axis(ax, real, imaginary)
-    _name_slowest(ax, slowest)
+    text = f"slowest: {at_least(slowest)} 1/s".replace("-", "\u2212")
+    ax.set_title(text, color=draw.COLOURS[1], loc="right")
     # A single eigenvalue needs no colour scale.
     if len(np.unique(values)) > 1:
         bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
         bar.set_label("eigenvalue \u03bb of the graph")
-        _label_bar(bar, values)
-    return figure
-
-
-def _name_slowest(ax: "Axes", slowest: float) -> None:
-    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8}
-    near: draw.Style = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
-    look: draw.Style = {"va": "bottom", "size": draw.page().letters - 1.0, "bbox": box}
-    # Above the axes, on the side with more room.
-    place = float(ax.transAxes.inverted().transform(ax.transData.transform((slowest, 0.0)))[0])
-    look |= {"color": draw.COLOURS[1], "ha": "right" if place > 0.5 else "left"}
-    text = f"slowest: {at_least(slowest)} 1/s".replace("-", "\u2212")
-    ax.annotate(text, (slowest, 1.0), (0, 2), **look, **near)
+        if len(values) <= 8:
+            bar.set_ticks(values.tolist(), labels=[f"{value:.3g}" for value in values])
+            bar.ax.yaxis.set_minor_locator(NullLocator())
+    return draw.finish(figure)
 
 
 def _wide_axis(ax: "Axes", real: Array, imaginary: Array) -> None:
@@ -93,15 +86,6 @@ def _wide_axis(ax: "Axes", real: Array, imaginary: Array) -> None:
         ax.set_ylim(-1.0, 1.0)
 
 
-def _label_bar(bar: Any, values: Array) -> None:
-    """Label up to eight eigenvalues on the colour bar, else powers of ten."""
-    from matplotlib.ticker import NullLocator
-
-    if len(values) <= 8:
-        bar.set_ticks(values, labels=[f"{value:.3g}" for value in values])
-        bar.ax.yaxis.set_minor_locator(NullLocator())
-
-
 # ---- the graph --------------------------------------------------------------------------------
 
 
@@ -131,10 +115,10 @@ def network(run: Recording) -> "Figure":
         _agents_and_links(ax, run, places, lines, weights, columns)
         _finish_network(ax, np.concatenate([places, *lines]), units)
         parts = [title, count_title(whole, run.agents)]
-        ax.set_title(", ".join(filter(None, parts)), size=draw.page().letters)
+        ax.set_title(", ".join(filter(None, parts)))
     for ax in panels[len(stretches) :]:
         ax.axis("off")
-    return figure
+    return draw.finish(figure)
 
 
 def _near_leaders(run: Recording) -> Recording:
@@ -187,10 +171,10 @@ def _agents_and_links(
 ) -> None:
     small = _dot(run, columns) / 12.0
     _links(ax, run, places, lines, weights, small)
-    for agent in range(run.agents):
-        leads = agent in run.leaders
-        look = draw.dots("s" if leads else "o", pen_of(run, agent)["color"], 12.0 * small)
-        draw.plot(ax, places[agent][None], **look)
+    looks = [(a in run.leaders, pen_of(run, a)["color"]) for a in range(run.agents)]
+    for look in dict.fromkeys(looks):
+        alike = np.array([other == look for other in looks])
+        draw.plot(ax, places[alike], **draw.dots("s" if look[0] else "o", look[1], 12.0 * small))
     for agent in range(run.agents if run.agents <= _NUMBERED else 0):
         text = {"color": "white", "size": 7.0 * small**0.5, "zorder": 5}
         ax.annotate(str(agent), tuple(places[agent]), ha="center", va="center", **text)

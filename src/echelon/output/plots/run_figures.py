@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from echelon.core.errors import OutputError
-from echelon.experiments.results.dataset import recording_of
-from echelon.experiments.results.recording import Recording
-from echelon.output.plots import curves, input_figure, network, trajectories
+from echelon.experiments.results.recording import Recording, recording_of
+from echelon.output.plots import network, over_time, trajectories
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import NAMES, check_names, save
 from echelon.simulation.engine.result import Result
@@ -21,9 +20,9 @@ _MAKERS: "dict[str, Callable[[Recording], Figure | None]]" = dict(
         NAMES,
         (
             *(trajectories.leader, trajectories.trajectories, trajectories.top_view),
-            *(curves.tracking, curves.formation, input_figure.inputs),
-            *(curves.states, curves.distances, curves.lyapunov),
-            *(network.modes, network.network, curves.ages, curves.avoidance),
+            *(over_time.tracking, over_time.formation, over_time.inputs),
+            *(over_time.states, over_time.distances, over_time.lyapunov),
+            *(network.modes, network.network, over_time.ages, over_time.avoidance),
         ),
         strict=True,
     )

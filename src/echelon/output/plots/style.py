@@ -1,10 +1,12 @@
-"""The style of figures, and their canvases, axes and lines; without pyplot and its state."""
+"""The style of figures: settings of matplotlib, pens of agents, axes, legends; without pyplot."""
 
+import bisect
 import contextlib
 import importlib
+import itertools
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
@@ -13,6 +15,7 @@ import numpy as np
 
 from echelon.core.errors import OutputError
 from echelon.core.types import Array
+from echelon.experiments.results.recording import Recording
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,22 +24,53 @@ if TYPE_CHECKING:
 # Okabe and Ito's palette, which colour-blind readers can distinguish; without black, which is the
 # leader's, and yellow, which is too pale on white.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-LEADER, REFERENCE, EDGE = "black", "0.7", "0.3"
+LEADER, EDGE = "black", "0.3"
 
 FLOOR = 1e-17
 """Below the rounding error of a metre in float64."""
 
 NAMED = 10
 """With more agents than this, followers have one colour, and no name in the legend."""
-
-_TOP = 1e9  # of a logarithmic axis; above it the interesting part would be flat
+MOST = 2000
+"""Agents that a figure draws one by one; more would hide each other and take minutes."""
 HIGHEST = 9.0
 """Inches: a page of a journal, less a caption."""
+_TOP = 1e9  # of a logarithmic axis; above it the interesting part would be flat
 _POINTS = 2000  # of a line, more than the pixels that it covers
 _ALL_POINTS = 200_000  # of all lines of one figure
 
 Style: TypeAlias = dict[str, Any]
 """Keywords of matplotlib."""
+
+STYLE: Style = {
+    "font.family": "STIXGeneral",
+    "mathtext.fontset": "stix",
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.titlesize": "small",
+    "figure.titlesize": "small",
+    "figure.constrained_layout.h_pad": 0.07,
+    "figure.constrained_layout.w_pad": 0.07,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.5,
+    "legend.frameon": False,
+    "legend.fontsize": "small",
+    "legend.handlelength": 1.8,
+    "lines.linewidth": 1.1,
+    "lines.markersize": 5.0,
+    "xtick.labelsize": "small",
+    "ytick.labelsize": "small",
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "pdf.fonttype": 42,  # Journals refuse fonts of type 3.
+    "svg.fonttype": "none",  # so that text can be searched and takes the font of a page
+    "svg.hashsalt": "echelon",  # so that the same figure gives the same file
+    "savefig.dpi": 150,
+}
+"""Settings of matplotlib for figures; those that the user has changed remain the user's."""
 
 
 class FigureSize(NamedTuple):
@@ -58,25 +92,6 @@ ONE_COLUMN, TWO_COLUMNS = FigureSize(3.5, 2.6, 8.0), FigureSize(7.16, 4.4, 8.0)
 
 _page: ContextVar[FigureSize] = ContextVar("page", default=SCREEN)
 _target: "ContextVar[Axes | None]" = ContextVar("target", default=None)
-_STYLE: dict[Any, Any] = {
-    "font.family": "STIXGeneral",
-    "mathtext.fontset": "stix",
-    "legend.frameon": False,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "0.9",
-    "grid.linewidth": 0.5,
-    "lines.linewidth": 1.1,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "pdf.fonttype": 42,  # Journals refuse fonts of type 3.
-    "svg.fonttype": "none",  # so that text can be searched and takes the font of a page
-    "svg.hashsalt": "echelon",  # so that the same figure gives the same file
-    "savefig.dpi": 150,
-}
 
 
 @contextmanager
@@ -86,13 +101,14 @@ def style(page: FigureSize = SCREEN, ax: "Axes | None" = None) -> Iterator[None]
     With axes `ax`, figures are drawn into these and not into figures of their own.
     """
     matplotlib = _matplotlib()
-    large, small = ("font.size", "axes.labelsize"), ("xtick", "ytick")
-    letters: dict[Any, Any] = dict.fromkeys(large, page.letters)
-    letters |= {f"{axis}.labelsize": page.letters - 1.0 for axis in small}
-    letters["legend.fontsize"] = page.letters - 1.0
+    ours, usual = matplotlib.rcParams, matplotlib.rcParamsDefault
+    settings = {key: value for key, value in STYLE.items() if ours[key] == usual[key]}
     token, into = _page.set(page), _target.set(ax)
     try:
-        with matplotlib.rc_context(_STYLE | letters), np.errstate(over="ignore", invalid="ignore"):
+        with (
+            matplotlib.rc_context(settings | {"font.size": page.letters}),
+            np.errstate(over="ignore", invalid="ignore"),
+        ):
             yield
     finally:
         _page.reset(token)
@@ -127,7 +143,16 @@ def target() -> "Axes | None":
     return _target.get()
 
 
-# ---- lines ------------------------------------------------------------------------------------
+# ---- pens -------------------------------------------------------------------------------------
+
+# In grey print colours of the palette are alike, so that neighbours in it differ in their dashes.
+_DASHES = ("-", (0, (5.0, 1.5)), (0, (1.2, 1.2)), (0, (5.0, 1.5, 1.2, 1.5)), (0, (9.0, 2.0)))
+# Broad and pale, so that it stays visible under the thin line of its leader.
+REFERENCE: Style = {"color": "0.7", "linestyle": (0, (1.6, 0.9)), "linewidth": 3.0, "zorder": 2}
+MARK: Style = {"color": "0.5", "linestyle": ":", "zorder": 1}
+"""A value that others are compared with."""
+LIMIT: Style = {"color": EDGE, "linestyle": (0, (5.0, 2.0)), "zorder": 2.2}
+"""A limit or a guarantee."""
 
 
 def crowding(agents: int) -> float:
@@ -135,24 +160,59 @@ def crowding(agents: int) -> float:
     return min(1.0, NAMED / agents)
 
 
-# In grey print colours of the palette are alike, so that neighbours in it differ in their dashes.
-_DASHES = ("-", (0, (5.0, 1.5)), (0, (1.2, 1.2)), (0, (5.0, 1.5, 1.2, 1.5)), (0, (9.0, 2.0)))
-
-
 def leader_pen(place: int, agents: int) -> Style:
     """Return the line style of a leader, by its place among the leaders."""
     order = 2.5 if crowding(agents) == 1.0 else 5.0
-    dash = _DASHES[place % len(_DASHES)]
-    return {"color": LEADER, "linewidth": 1.4, "zorder": order, "linestyle": dash}
+    return {"color": LEADER, "zorder": order, "linestyle": _DASHES[place % len(_DASHES)]}
 
 
 def pen(place: int, agents: int) -> Style:
     """Return the line style of a follower, by its place among the followers."""
     if (crowd := crowding(agents)) < 1.0:
-        look = {"linewidth": 1.1 * crowd**0.22, "alpha": crowd**0.35, "rasterized": agents > 100}
-        return {"color": COLOURS[0]} | look
+        return {"color": COLOURS[0], "alpha": crowd**0.5, "rasterized": agents > 100}
     again, hue = divmod(place, len(COLOURS))
     return {"color": COLOURS[hue], "linestyle": _DASHES[(hue + 3 * again) % len(_DASHES)]}
+
+
+def pen_of(run: Recording, agent: int) -> Style:
+    """Return the line style of an agent."""
+    leads = agent in run.leaders
+    place = bisect.bisect_left(run.leaders if leads else run.followers, agent)
+    return (leader_pen if leads else pen)(place, run.agents)
+
+
+def name_of(run: Recording, agent: int, short: bool = False) -> str | None:
+    """Return an agent's name; with `short`, None for all of a large swarm but its first leader."""
+    leaders, few = run.leaders, run.agents <= NAMED
+    if agent in leaders:
+        if not short or few or len(leaders) <= NAMED:
+            return f"leader {agent}"
+        return f"{len(leaders)} leaders" if agent == leaders[0] else None
+    if few or not short:
+        return f"follower {agent}"
+    return f"{len(run.followers)} followers" if agent == run.followers[0] else None
+
+
+def leaders_first(run: Recording, agents: Iterable[int]) -> list[int]:
+    """Return agents in the order in which they are drawn."""
+    # The order of drawing is that of the legend; `zorder` decides which line is on top.
+    return sorted(agents, key=lambda agent: agent not in run.leaders)
+
+
+def drawn(run: Recording) -> list[int]:
+    """Return the agents that are drawn: all, or evenly spread ones of a huge swarm."""
+    step = -(-run.agents // MOST)
+    return leaders_first(run, sorted({*range(0, run.agents, step), *run.leaders[:MOST]}))
+
+
+def count_title(run: Recording, count: int) -> str:
+    """Return the number of agents that are drawn, if that is not all of them."""
+    return "" if count == run.agents else f"{count:,} of {run.agents:,} agents"
+
+
+def reference_of(run: Recording, leader: int) -> Array | None:
+    """Return the desired states (T, n) of a leader; None without a reference."""
+    return None if run.reference is None else run.reference + run.offsets_in()[..., leader, :]
 
 
 def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> Style:
@@ -201,7 +261,7 @@ def drop_runaways(values: Array, *anchors: Array) -> tuple[Array, bool]:
     return np.where(away[..., None] > 10.0 * reach, np.nan, values), True
 
 
-# ---- canvases ---------------------------------------------------------------------------------
+# ---- axes -------------------------------------------------------------------------------------
 
 
 def label(name: str, unit: str) -> str:
@@ -235,6 +295,84 @@ def sheet(
     return cast("Figure", ax.figure), [[ax]]
 
 
+def canvas(labels: Sequence[str]) -> "tuple[Figure, Axes]":
+    """Return axes in the plane or in space, for two or three labels."""
+    from matplotlib.figure import Figure
+
+    if len(labels) == 2:
+        figure, ((ax,),) = sheet(0.6 * page().width)
+    elif target() is not None:
+        raise OutputError("this figure is in space and sets its own box; leave `ax` out.")
+    else:
+        figure = Figure((page().width, page().width))
+        ax = space_axes(figure)
+    for name, text in zip("xyz", labels, strict=False):
+        getattr(ax, f"set_{name}label")(text)
+    return figure, ax
+
+
+def space_axes(figure: "Figure") -> Any:
+    """Return axes in space, seen from 30 degrees above, at -60 degrees."""
+    ax: Any = figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d", computed_zorder=False)
+    ax.view_init(elev=30.0, azim=-60.0)
+    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+        axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
+        axis.line.set_color("0.5")
+    return ax
+
+
+def frame(ax: "Axes", points: Array, alike: bool = True) -> None:
+    """Fit axes around points (..., 2 or 3), with one scale for all directions if `alike`."""
+    points = points.reshape(-1, points.shape[-1])
+    points = points[np.isfinite(points).all(axis=1)]
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = high - low
+    # A flat path needs a box of some height, a single point one of any size.
+    least = np.full_like(size, 0.25 * size.max()) if alike else 0.05 * np.abs(high)
+    half = 0.54 * np.maximum(size, np.where(least > 0.0, least, 1.0))
+    for name, middle, reach in zip("xyz", 0.5 * low + 0.5 * high, half, strict=False):
+        getattr(ax, f"set_{name}lim")(middle - reach, middle + reach)
+    if len(half) == 2 and alike:
+        ax.set_aspect("equal")
+        wide, figure = page().width / 1.4, cast("Figure", ax.figure)
+        if target() is None:
+            figure.set_figheight(np.clip(0.7 + wide * half[1] / half[0], 2.0, 1.04 * wide))
+
+
+def fit_box(ax: Any, room: tuple[float, float, float, float]) -> tuple[Array, Array]:
+    """Scale the box of a space until it fits into a part of its figure, and label its axes.
+
+    Args:
+        ax: in space, with its limits.
+        room: left, bottom, width and height of the part, inches.
+
+    Returns:
+        The lower left and the upper right corner of the drawn box, inches.
+    """
+    zoom, ends = 1.0, np.array([ax.get_xlim(), ax.get_ylim(), ax.get_zlim()])
+    corners = np.array([*itertools.product(*ends, [1.0])])
+    size = np.ptp(ends, axis=1)
+    low = high = np.zeros(2)
+    # Under perspective the size is not quite proportional to the zoom.
+    for _ in range(3):
+        ax.set_box_aspect(size / size.max(), zoom=zoom)
+        ax.apply_aspect()
+        x, y, _, scale = ax.get_proj() @ corners.T
+        inches = ax.transData.transform(np.column_stack([x, y]) / scale[:, None]) / ax.figure.dpi
+        low, high = inches.min(axis=0), inches.max(axis=0)
+        zoom *= (room[2:] / (high - low)).min()
+    shift = np.array(room[:2]) + 0.5 * np.array(room[2:]) - 0.5 * (low + high)
+    place = ax.get_position(original=True)
+    ax.set_position(place.translated(*(shift / ax.figure.get_size_inches())))
+    for k, name in enumerate("xyz"):
+        # Matplotlib measures these distances in widths of the box.
+        wide = size.max() / np.delete(size, k).max()
+        getattr(ax, f"{name}axis").labelpad = 18.5 * wide - 21.0
+        ax.tick_params(axis=name, pad=8.0 * wide - 8.0)
+        ax.locator_params(axis=name, nbins=5 if size[k] > 0.4 * size.max() else 3)
+    return low + shift, high + shift
+
+
 def above_zero(values: Array) -> Array:
     """Return values with NaN where they are 0, which a logarithmic axis cannot show."""
     return np.where(values > 0.0, values, np.nan)
@@ -263,15 +401,8 @@ def logarithmic(ax: "Axes", *values: Array) -> None:
     ax.yaxis.set_minor_locator(NullLocator())
 
 
-def finish(
-    figure: "Figure",
-    cut: bool = False,
-    legends: "Sequence[Axes] | None" = None,
-    once: bool = False,
-) -> "Figure":
-    """Add legends beside all axes, or some, and a note on missing parts.
-
-    On a narrow page, where legends are above the axes, the only one (`once`) is on top.
+def finish(figure: "Figure", cut: bool = False) -> "Figure":
+    """Add a legend of all axes beside them, or above on a narrow page, and a note on missing parts.
 
     The layout is computed here, once for all file formats. In the caller's `ax` it is the caller's.
     """
@@ -279,86 +410,36 @@ def finish(
         if ax.get_legend_handles_labels()[1]:
             ax.legend()
         return figure
-    if once and page().narrow:
-        legends = figure.axes[:1]
-    for ax in figure.axes if legends is None else legends:
-        if ax.get_legend_handles_labels()[1]:
-            _add_legend(figure, ax, once)
-    for each in (*figure.legends, *(ax.get_legend() for ax in figure.axes)):
-        if each is not None:
-            _widen_swarm(each)
+    pairs = [zip(*ax.get_legend_handles_labels(), strict=True) for ax in figure.axes]
+    lines = {text: line for line, text in itertools.chain(*pairs)}
+    solid, narrow, above = figure.axes[0].name == "3d", page().narrow, 0.0
+    if lines:
+        where: Any = "upper left" if narrow else "upper right" if solid else "right upper"
+        columns = max(1, min(4, int(78 / (max(map(len, lines)) + 6)))) if narrow else 1
+        where = where if solid else f"outside {where}"
+        legend = figure.legend([*lines.values()], [*lines], ncols=columns, loc=where)
+        for line in legend.get_lines():
+            line.set_alpha(1.0)
+        above = 0.17 * -(-len(lines) // columns) * narrow
     if cut:
-        text = "The run diverged beyond these axes; the rest is not drawn."
-        figure.suptitle(text, size=page().letters - 1.0, wrap=True)
+        figure.suptitle("The run diverged beyond these axes; the rest is not drawn.", wrap=True)
+    if narrow and not solid:
+        figure.set_figheight(min(HIGHEST, figure.get_figheight() + above))
+    if solid:
+        room = 0.07 * page().width, 0.45, page().side, page().side
+        low, high = fit_box(figure.axes[0], room)
+        figure.set_figheight(high[1] - low[1] + 0.75 + above)
+        fit_box(figure.axes[0], (*room[:3], high[1] - low[1]))
+        return figure
+    import matplotlib
+
     for ax in figure.axes:
         # Ticks are chosen by the font size, which a later style must not change.
-        ax.tick_params(labelsize=page().letters - 1.0)
-        _label_power(ax)
+        ax.tick_params(labelsize=matplotlib.rcParams["xtick.labelsize"])
+    figure.align_ylabels()
+    # Axes of equal scales change their shape, and so the places of labels, with each pass.
     engine: Any = figure.get_layout_engine()
-    if engine is not None:
-        figure.align_ylabels()
-        engine.set(w_pad=0.07, h_pad=0.07)
-        # Axes of equal scales change their shape, and so the places of labels, with each pass.
-        for _ in range(1 if figure.axes[0].get_aspect() == "auto" else 4):
-            engine.execute(figure)
-        figure.set_layout_engine("none")
+    for _ in range(1 if figure.axes[0].get_aspect() == "auto" else 4):
+        engine.execute(figure)
+    figure.set_layout_engine("none")
     return figure
-
-
-def _label_power(ax: "Axes") -> None:
-    """Put the power of ten of a value axis into its label, since the legend is above the axis."""
-    from matplotlib.ticker import ScalarFormatter
-
-    formatter = ax.yaxis.get_major_formatter()
-    if ax.name == "3d" or not isinstance(formatter, ScalarFormatter):
-        return
-    formatter.set_useOffset(False)
-    formatter.set_locs(list(ax.get_yticks()))
-    offset = formatter.get_offset().replace("\u2212", "-")
-    if offset:
-        ax.yaxis.get_offset_text().set_visible(False)
-        name, _, unit = ax.get_ylabel().partition(" (")
-        power = f"$10^{{{int(offset.removeprefix('1e'))}}}$"
-        ax.set_ylabel(f"{name} ({power} {unit}" if unit else f"{name} ({power})")
-
-
-def _add_legend(figure: "Figure", ax: "Axes", once: bool) -> None:
-    """Add a legend beside the axes, or above them on a narrow page."""
-    narrow = page().narrow
-    if once and not narrow:
-        # Beside all rows, which would otherwise be as high as it.
-        figure.legend(*ax.get_legend_handles_labels(), loc="outside right upper")
-    elif not narrow and ax.name == "3d":
-        figure.legend(loc="upper right", bbox_to_anchor=(0.995, 0.97))
-    elif not narrow:
-        ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0)
-    elif ax.name == "3d":
-        _legend_above_space(figure, ax)
-    else:
-        look = {"handlelength": 1.4, "columnspacing": 1.0, "handletextpad": 0.5}
-        ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=_columns(ax), **look)
-
-
-def _widen_swarm(legend: Any) -> None:
-    """Show the many lines of a swarm as a band."""
-    for line, text in zip(legend.get_lines(), legend.get_texts(), strict=False):
-        if text.get_text().endswith(" followers"):
-            line.set(linewidth=6.0, alpha=0.35)
-
-
-def _columns(ax: "Axes") -> int:
-    """Return how many entries of a legend fit side by side in one column of a page."""
-    longest = max(len(text) for text in ax.get_legend_handles_labels()[1])
-    return max(1, min(4, int(66 / (longest + 6))))
-
-
-def _legend_above_space(figure: "Figure", ax: "Axes") -> None:
-    """Add a legend above a space, in a higher figure."""
-    columns = _columns(ax)
-    rows = -(-len(ax.get_legend_handles_labels()[1]) // columns)
-    old, more = figure.get_figheight(), 0.17 * rows
-    box = ax.get_position()
-    scale = old / (old + more)
-    figure.set_figheight(old + more)
-    ax.set_position((box.x0, box.y0 * scale, box.width, box.height * scale))
-    figure.legend(loc="upper left", ncols=columns, handlelength=1.4, columnspacing=1.0)

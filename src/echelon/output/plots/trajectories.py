@@ -1,17 +1,14 @@
 """Figures of paths: in space, from above, in a phase plane."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from echelon.core.types import Array
 from echelon.experiments.results.recording import Recording
-from echelon.output.plots import agent_style
 from echelon.output.plots import style as draw
-from echelon.output.plots.agent_style import label, name_of, pen_of, reference_of
-from echelon.output.plots.canvas import canvas, frame
-from echelon.output.plots.curves import states_over_time
+from echelon.output.plots.over_time import states_over_time
+from echelon.output.plots.style import name_of, pen_of, reference_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,23 +37,23 @@ def leader(run: Recording) -> "Figure | None":
     moves = any(np.ptp(line, axis=0).max() > _STILL * np.abs(line).max() for line in lines)
     if len(keep) > 1 and not moves:
         return None
-    figure, ax = _canvas(run, axes)
+    figure, ax = draw.canvas([draw.label(run.state_names[k], run.state_units[k]) for k in axes])
     for name, path in zip(["reference", *[None] * len(references)], references):
-        draw.plot(ax, path, label=name, **agent_style.REFERENCE)
+        draw.plot(ax, path, label=name, **draw.REFERENCE)
     for agent, path in zip(leaders, paths, strict=True):
         draw.plot(ax, path, label=name_of(run, agent, short=True), **pen_of(run, agent))
     for path, first in zip(paths, [True, *[False] * len(leaders)]):
         for name, place, shape in (("start", path[:1], "o"), ("end", path[-1:], "s")):
             look = draw.dots(shape, draw.LEADER, hollow=name == "start")
             draw.plot(ax, place, label=name if first else None, **look)
-    frame(ax, np.concatenate([*paths, *references]), alike=len(run.position) > 1)
+    draw.frame(ax, np.concatenate([*paths, *references]), alike=len(run.position) > 1)
     return draw.finish(figure, cut)
 
 
 def trajectories(run: Recording) -> "Figure":
     """Return the paths of all agents, with the graph drawn at a few times."""
     axes = _space(run)
-    return _paths(run, axes) if axes else states_over_time(run, agent_style.drawn(run))
+    return _paths(run, axes) if axes else states_over_time(run, draw.drawn(run))
 
 
 def top_view(run: Recording) -> "Figure | None":
@@ -66,18 +63,18 @@ def top_view(run: Recording) -> "Figure | None":
 
 
 def _paths(run: Recording, axes: list[int]) -> "Figure":
-    agents, reference = agent_style.drawn(run), reference_of(run, run.leaders[0])
+    agents, reference = draw.drawn(run), reference_of(run, run.leaders[0])
     paths = run.states[:, agents][:, :, axes]
     anchors = [] if reference is None else [reference[:, axes]]
     paths, cut = draw.drop_runaways(paths, paths[0], *anchors)
-    figure, ax = _canvas(run, axes)
+    figure, ax = draw.canvas([draw.label(run.state_names[k], run.state_units[k]) for k in axes])
     keep = draw.thin(len(paths), len(agents))
     for agent, path in zip(agents, paths[keep].swapaxes(0, 1), strict=True):
         look = pen_of(run, agent)
         draw.plot(ax, path, label=name_of(run, agent, short=True), **look)
     _snapshots(ax, run, agents, paths)
-    frame(ax, paths, alike=bool(run.position))
-    ax.set_title(agent_style.count_title(run, len(agents)), size=draw.page().letters)
+    draw.frame(ax, paths, alike=bool(run.position))
+    ax.set_title(draw.count_title(run, len(agents)))
     return draw.finish(figure, cut)
 
 
@@ -90,9 +87,13 @@ def _snapshots(ax: "Axes", run: Recording, agents: list[int], paths: Array) -> N
     if len(run.edges) <= _EDGES and crowd == run.agents:
         _graph(ax, run, paths[frames][:, np.argsort(agents)], run.times[frames])
     size = 4.5 * draw.crowding(crowd) ** 0.25
-    for colour, group in _colours(run, agents).items():
+    groups: dict[str, list[int]] = {}
+    for place, agent in enumerate(agents):
+        groups.setdefault(pen_of(run, agent)["color"], []).append(place)
+    for colour, group in groups.items():
         places = paths[:, group]
-        draw.plot(ax, _flatten(places[frames[1:-1]]), **draw.dots(".", colour, size))
+        between = places[frames[1:-1]].reshape(-1, places.shape[-1])
+        draw.plot(ax, between, **draw.dots(".", colour, size))
         draw.plot(ax, places[0], **draw.dots("o", colour, size, hollow=True))
         draw.plot(ax, places[-1], **draw.dots("s", colour, size))
     # The legend explains the markers once, in a colour of no agent.
@@ -110,24 +111,17 @@ def _graph(ax: "Axes", run: Recording, places: Array, times: Array) -> None:
     links = np.concatenate([ends, gaps], axis=2)
     links[~np.stack([run.linked(t) for t in times])] = np.nan
     text = "graph" if len(times) < 3 else f"graph, every {times[1] - times[0]:.3g} s"
-    crowd = draw.crowding(run.agents)
-    look = {"linewidth": 0.9 * crowd**0.18, "rasterized": run.agents > 100, "zorder": 3}
-    look |= {"alpha": min(1.0, (_DENSE / len(run.edges)) ** 0.5)}
+    look = {"rasterized": run.agents > 100, "alpha": min(1.0, (_DENSE / len(run.edges)) ** 0.5)}
     for k, shade in enumerate(np.linspace(0.65, float(draw.EDGE), len(times))):
         name = text if k == len(times) - 1 else None
-        draw.plot(ax, _flatten(links[k]), label=name, color=str(shade), **look)
-
-
-def _flatten(points: Array) -> Array:
-    return points.reshape(-1, points.shape[-1])
-
-
-def _colours(run: Recording, agents: list[int]) -> dict[str, list[int]]:
-    """Return the indices of the agents of each colour."""
-    groups: dict[str, list[int]] = {}
-    for place, agent in enumerate(agents):
-        groups.setdefault(pen_of(run, agent)["color"], []).append(place)
-    return groups
+        draw.plot(
+            ax,
+            links[k].reshape(-1, links.shape[-1]),
+            label=name,
+            color=str(shade),
+            zorder=3,
+            **look,
+        )
 
 
 def _space(run: Recording) -> list[int]:
@@ -136,7 +130,3 @@ def _space(run: Recording) -> list[int]:
     if len(position) > 1:
         return position
     return [0, 1] if len(run.state_names) == 2 else []
-
-
-def _canvas(run: Recording, axes: Sequence[int]) -> "tuple[Figure, Axes]":
-    return canvas([label(run, k) for k in axes])

@@ -8,11 +8,11 @@ from jaxtyping import Float
 from echelon.core.digits import at_most
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.metrics import SETTLED
-from echelon.experiments.results.quantity import settling_bound
 from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.run_numbers import settling_bound
 from echelon.output.plots import style as draw
 from echelon.output.plots.style import FLOOR
-from echelon.output.viewer.pack import Group
+from echelon.output.viewer.page import Group
 
 NAMED = 6
 """With more followers than this, a chart shows the worst and the median."""
@@ -31,7 +31,11 @@ class _Sheet:
     """Collects curves as columns."""
 
     def __init__(self, run: Recording) -> None:
-        self.frames = _frames(run)
+        # Denser at the start, where inputs change quickly.
+        last = len(run.times) - 1
+        even = np.linspace(0.0, last, _POINTS * 2 // 3)
+        early = np.linspace(0.0, 0.1 * last, _POINTS // 3)
+        self.frames = np.unique(np.concatenate([even, early]).round().astype(int))
         self.columns: list[Array] = []
 
     def line(
@@ -70,14 +74,6 @@ def charts_of(run: Recording) -> Charts:
     descriptions += [*_distances(run, sheet), _inputs(run, sheet)]
     times = [float(f"{t:.6g}") for t in run.times[sheet.frames]]
     return Charts(descriptions, times, Group(np.stack(sheet.columns, axis=1), gaps=True))
-
-
-def _frames(run: Recording) -> Array:
-    """Return the frames of curves: denser at the start, where inputs change quickly."""
-    last = len(run.times) - 1
-    even = np.linspace(0.0, last, _POINTS * 2 // 3)
-    early = np.linspace(0.0, 0.1 * last, _POINTS // 3)
-    return np.unique(np.concatenate([even, early]).round().astype(int))
 
 
 def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
@@ -188,19 +184,13 @@ def _inputs(run: Recording, sheet: _Sheet) -> JsonObject:
         title = "motors" if loads.shape[2] in (2, 4) else "inputs"
         return _chart(title, "% of limit", False, lines, marks)
     sizes = np.abs(run.inputs).max(axis=1)
-    units = {*run.input_units}
+    units, names = {*run.input_units}, [*zip(run.input_names, run.input_units, strict=True)]
     lines = [
-        sheet.line(_input_name(run, k, len(units) > 1), sizes[:, k], place, False)
-        for place, k in enumerate(range(min(NAMED, sizes.shape[1])))
+        sheet.line(draw.label(name, unit if len(units) > 1 else ""), sizes[:, k], k, False)
+        for k, (name, unit) in enumerate(names[:NAMED])
     ]
-    return _chart(
-        "largest |input|", draw.raised(units.pop()) if len(units) == 1 else "", False, lines, []
-    )
-
-
-def _input_name(run: Recording, k: int, mixed: bool) -> str:
-    name, unit = run.input_names[k].replace("_", " "), run.input_units[k]
-    return draw.label(name, unit) if mixed else name
+    unit = draw.raised(units.pop()) if len(units) == 1 else ""
+    return _chart("largest |input|", unit, False, lines, [])
 
 
 def _chart(

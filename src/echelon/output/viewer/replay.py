@@ -1,7 +1,10 @@
-"""The data of a replay page: places, angles and motors at each frame, charts, and texts."""
+"""The page of a run: places, angles and motors at each frame, charts, texts; or as it grows."""
 
-from collections.abc import Mapping
-from typing import Any
+import contextlib
+import dataclasses
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, final
 
 import numpy as np
 
@@ -10,12 +13,12 @@ from echelon.core.errors import OutputError
 from echelon.core.statement import Hypothesis
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import Verdict
-from echelon.experiments.results.recording import MessageAges, Recording
+from echelon.experiments.results.recording import Recording
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
 from echelon.output.plots.style import raised
 from echelon.output.viewer.charts import charts_of
-from echelon.output.viewer.pack import BYTE, COARSE, Group, pack
-from echelon.output.viewer.page import page
+from echelon.output.viewer.page import BYTE, COARSE, Group, pack, page
+from echelon_flight.page_server import Handler
 
 FLOCK = 200
 """With more agents than this, bodies are flat, and a motor load takes one byte."""
@@ -23,20 +26,27 @@ _RATE, _FLOCK_RATE = 50.0, 25.0
 """Stored frames per second; the page interpolates."""
 _MOST = 20_000_000
 """Numbers in one file, which take some 25 MB."""
+_PATIENCE: Final = 10.0
+"""Seconds after which a page that waits for a part of a run gets an empty answer."""
 
 
-def replay_page(*runs: Recording) -> str:
+def replay_page(*runs: Recording, reports: Sequence[str] = ()) -> str:
     """Return one run, or two beside each other with the same clock, as a self-contained HTML page.
+
+    Args:
+        runs: to show.
+        reports: the text of each, which the page shows on demand; none by default.
 
     Raises:
         OutputError: a run has no frame or is too large.
         MissingExtraError: the page's three.js is not built.
     """
-    return page(" and ".join(run.name for run in runs), *map(replay_data, runs))
+    texts = reports or [""] * len(runs)
+    return page(" and ".join(run.name for run in runs), *map(replay_data, runs, texts))
 
 
-def replay_data(run: Recording) -> bytes:
-    """Return a run packed for the page.
+def replay_data(run: Recording, report: str = "") -> bytes:
+    """Return a run packed for the page, with its report.
 
     Raises:
         OutputError: it has no frame, or is too large.
@@ -60,24 +70,36 @@ def replay_data(run: Recording) -> bytes:
     if loads is not None:
         groups["motors"] = Group(_flat(loads[frames]), BYTE if many else COARSE, (0.0, 1.0))
     if run.messages is not None:
-        groups["shades"] = Group(_shades(run, run.messages, frames), BYTE, (0.0, 2.0))
-    _check_size(run, groups, len(frames))
+        sent = run.messages
+        lost = np.diff(sent.lost.cumsum(axis=0)[frames], axis=0, prepend=0)
+        shades = link_shades(sent.edges[frames], lost, sent.forget, run.heard)
+        groups["shades"] = Group(shades, BYTE, (0.0, 2.0))
+    numbers = sum(group.values.size for group in groups.values())
+    if numbers > _MOST:
+        fits = max(1, int(len(frames) * _MOST / numbers))
+        raise OutputError(
+            f"{run.agents} agents at {len(frames)} times are too many for one page; store at most "
+            f"about {fits} times with `simulation.store_every`."
+        )
+    # Evenly spaced except for the last.
+    times = run.times[frames].tolist()
+    step = times[1] - times[0] if len(times) > 1 else 1.0
+    pairs = run.approaches(run.scales)
     description = {
         **header(run, space),
+        "report": report,
         "frames": len(frames),
-        "clock": _clock(run, frames),
-        "closest": _closest(run),
+        "clock": {"start": times[0], "step": step, "last": times[-1]},
+        # Each time at which two agents were closer than any before, how close, and who.
+        "closest": [
+            [*(float(f"{x:.6g}") for x in (pair.time, pair.distance)), *pair.agents]
+            for pair in pairs
+        ],
         "thrust": loads is not None,
         "charts": charts.descriptions,
         "chartTimes": charts.times,
     }
     return pack(description, {**groups, "series": charts.group})
-
-
-def _shades(run: Recording, messages: MessageAges, frames: Array) -> Array:
-    """Return how each link is drawn at some frames, (F, E)."""
-    lost = np.diff(messages.lost.cumsum(axis=0)[frames], axis=0, prepend=0)
-    return link_shades(messages.edges[frames], lost, messages.forget, run.heard)
 
 
 def link_shades(ages: Array, lost: Array, forget: float, heard: Array) -> Array:
@@ -106,23 +128,6 @@ def frames_of(run: Recording) -> Array:
     return np.unique([*range(0, last, stride), last])
 
 
-def _clock(run: Recording, frames: Array) -> dict[str, float]:
-    """Return the times of frames: evenly spaced except for the last."""
-    times = run.times[frames]
-    step = float(times[1] - times[0]) if len(times) > 1 else 1.0
-    return {"start": float(times[0]), "step": step, "last": float(times[-1])}
-
-
-def _closest(run: Recording) -> list[list[float]]:
-    """Return each time at which two agents were closer than any before, how close, and who."""
-    pairs = run.approaches(run.scales)
-    return [[*map(_rounded, (pair.time, pair.distance)), *pair.agents] for pair in pairs]
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.6g}")
-
-
 def motor_loads(run: Recording, space: Space) -> Array | None:
     """Return motor loads as fractions of their limits, (T, N, k), of bodies with k motors."""
     motors = {"quadrotor": 4, "birotor": 2}.get(space.shape)
@@ -134,34 +139,44 @@ def _flat(values: Array) -> Array:
     return values.reshape(len(values), -1)
 
 
-def _check_size(run: Recording, groups: Mapping[str, Group], frames: int) -> None:
-    numbers = sum(group.values.size for group in groups.values())
-    if numbers > _MOST:
-        fits = max(1, int(frames * _MOST / numbers))
-        raise OutputError(
-            f"{run.agents} agents at {frames} times are too many for one page; store at most about "
-            f"{fits} times with `simulation.store_every`."
-        )
-
-
 # ---- texts and space ----------------------------------------------------------------------------
 
 
 def header(run: Recording, space: Space) -> JsonObject:
     """Return the header of the replay and live pages: all of a run but its frames."""
-    size, note = _size(run, space)
+    width, attributes, sizes = body_width(run, space), run.attributes, run.ellipsoid
+    spans = {"quadrotor": 1.15, "birotor": 1.35, "car": 0.9, "ball": 0.52, "dot": 0.5}
+    solid = space.kind in ("space", "plane")
+    notes = [] if attributes.get("outcome") == "completed" else [str(attributes["message"])]
+    if space.clipped:
+        notes.append("Agents farther away than ten times the formation are drawn at that border.")
+    schedule = ellipsoid = None
+    if run.schedule is not None:
+        starts, weights, period = run.schedule[:3]
+        # Each graph as a text of 1 and 0.
+        rows = ["".join("1" if weight else "0" for weight in row) for row in weights]
+        nearest = run.schedule.nearest
+        follow = {} if nearest is None else {"nearest": nearest.tolist()}
+        schedule = {"starts": starts.tolist(), "rows": rows, "period": period, **follow}
+    if sizes is not None and run.position:
+        ellipsoid = {
+            "radii": sizes.radii(space.names).tolist(),
+            "touching": sizes.touching,
+            "limit": sizes.limit,
+            "kept": run.avoidance is not None,
+        }
     return {
         "title": run.name,
         "facts": facts(run),
-        "notes": _notes(run, space),
+        "notes": notes,
         "promise": _badge_of_run(run),
         "agents": run.agents,
         "leaders": list(run.leaders),
         "nearest": run.nearest.tolist(),
         "edges": run.edges.tolist(),
         "heard": heard_by(run.heard),
-        "schedule": _schedule(run),
-        "ellipsoid": ellipsoid_of(run, space),
+        "schedule": schedule,
+        "ellipsoid": ellipsoid,
         "moments": [[event["at"], event["text"]] for event in run.events],
         "referenced": run.reference is not None,
         "offsets": [[float(f"{x:.7g}") for x in row] for row in run.offsets[:, list(space.axes)]],
@@ -173,23 +188,10 @@ def header(run: Recording, space: Space) -> JsonObject:
         },
         "box": {"low": space.low.tolist(), "high": space.high.tolist()},
         "shape": space.shape,
-        "size": size,
-        "drawn": note,
+        "size": width / spans[space.shape if solid else "dot"],
+        "drawn": f"vehicles drawn {width:.2g} m wide, not to scale" if solid else "",
         "thrust": False,
         "duration": float(run.times[-1]) if len(run.times) else run.horizon,
-    }
-
-
-def ellipsoid_of(run: Recording, space: Space) -> JsonObject | None:
-    """Return the ellipsoid about each agent along the axes of a picture; None of a point."""
-    sizes = run.ellipsoid
-    if sizes is None or not run.position:
-        return None
-    return {
-        "radii": sizes.radii(space.names).tolist(),
-        "touching": sizes.touching,
-        "limit": sizes.limit,
-        "kept": run.avoidance is not None,
     }
 
 
@@ -198,38 +200,16 @@ def heard_by(heard: Array) -> list[int]:
     return (heard @ (2, 1)).tolist()
 
 
-def _schedule(run: Recording) -> JsonObject | None:
-    """Return the schedule of edges, each graph as a text of 1 and 0."""
-    if run.schedule is None:
-        return None
-    starts, weights, period = run.schedule[:3]
-    rows = ["".join("1" if weight else "0" for weight in row) for row in weights]
-    nearest = run.schedule.nearest
-    follow = {} if nearest is None else {"nearest": nearest.tolist()}
-    return {"starts": starts.tolist(), "rows": rows, "period": period, **follow}
-
-
 def facts(run: Recording) -> list[str]:
     """Return the texts beside the title."""
     leaders = len(run.leaders)
-    texts = [f"{run.agents} agents", _spaced(run.model)]
+    # `PlanarQuadrotor` is `planar quadrotor`.
+    words = "".join(f" {x.lower()}" if x.isupper() else x for x in run.model)
+    texts = [f"{run.agents} agents", words.strip()]
     texts += [f"{leaders} leaders"] if leaders > 1 else []
     if "coupling" in run.promise and run.promise["coupling"] is not None:
         texts.append(f"coupling {run.promise['coupling']:.3g}")
     return texts
-
-
-def _spaced(name: str) -> str:
-    """Return `PlanarQuadrotor` as `planar quadrotor`."""
-    words = "".join(f" {letter.lower()}" if letter.isupper() else letter for letter in name)
-    return words.strip()
-
-
-def _notes(run: Recording, space: Space) -> list[str]:
-    notes = [] if run.attributes.get("outcome") == "completed" else [str(run.attributes["message"])]
-    if space.clipped:
-        notes.append("Agents farther away than ten times the formation are drawn at that border.")
-    return notes
 
 
 def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
@@ -241,19 +221,16 @@ def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
         return {"state": "edge", "short": short, "whole": promise["sentence"]}
     apart = (promise.get("anywhere") or {}).get("separation")
     if apart is not None:
-        return _badge_of_distances(apart["ideal"], promise)
+        # In the world of the theorem, or in another.
+        ideal = apart["ideal"]
+        short = f"guaranteed: agents stay apart, {promise['theorem']}"
+        short = short if ideal else "distances observed, not proved"
+        return {"state": "holds" if ideal else "edge", "short": short, "whole": promise["sentence"]}
     rate, kind = promise["rate"], promise["kind"]
     source = promise["theorem"] or kind
     short = f"guaranteed: {f'{at_most(rate)} 1/s' if rate else 'V does not rise'}, {source}"
     whole = f"{promise['sentence']} {_rate_in_words(promise)}".rstrip()
     return {"state": "holds", "short": short, "whole": whole}
-
-
-def _badge_of_distances(ideal: bool, promise: Mapping[str, Any]) -> dict[str, str]:
-    """Return the badge of agents that keep apart, in the world of the theorem or in another."""
-    short = f"guaranteed: agents stay apart, {promise['theorem']}"
-    short = short if ideal else "distances observed, not proved"
-    return {"state": "holds" if ideal else "edge", "short": short, "whole": promise["sentence"]}
 
 
 _WIDER = {
@@ -295,10 +272,93 @@ def _badge_of_run(run: Recording) -> dict[str, str] | None:
     return {"state": "lost", "short": short, "whole": f"{run.attributes['message']} {whole}"}
 
 
-def _size(run: Recording, space: Space) -> tuple[float, str]:
-    """Return the scale of bodies, and a note on it."""
-    width = body_width(run, space)
-    spans = {"quadrotor": 1.15, "birotor": 1.35, "car": 0.9, "ball": 0.52, "dot": 0.5}
-    if space.kind in ("phase", "time"):
-        return width / spans["dot"], ""
-    return width / spans[space.shape], f"vehicles drawn {width:.2g} m wide, not to scale"
+# ---- a run that is still being computed --------------------------------------------------------
+
+
+@final
+class Growing:
+    """The parts of a run so far, for any number of pages.
+
+    Args:
+        run: its recording before the first frame.
+    """
+
+    def __init__(self, run: Recording) -> None:
+        """Create the page without frames."""
+        more = {"growing": True, "horizon": run.horizon}
+        self.html = page(run.name, pack(header(run, space_of(run)) | more, {})).encode()
+        self.blocks, self.done = list[bytes](), False
+        self.changed = threading.Condition()
+        self.last: Recording | None = None
+
+    def add(self, stretch: Recording) -> None:
+        """Add a part, which begins where the previous one ended.
+
+        Raises:
+            OutputError: it is too large for a page.
+        """
+        if not len(stretch.times):
+            return
+        block = replay_data(stretch if self.last is None else _joined(self.last, stretch))
+        with self.changed:
+            self.blocks.append(block)
+            self.last = stretch
+            self.changed.notify_all()
+
+    def finish(self, run: Recording, report: str) -> None:
+        """Replace the parts by the complete run with its report, which all pages then load.
+
+        Raises:
+            OutputError: it is too large for a page.
+        """
+        html = replay_page(run, reports=[report]).encode()
+        with self.changed:
+            self.html, self.done = html, True
+            self.changed.notify_all()
+
+    def block(self, number: int) -> bytes | None:
+        """Return a part; b"" if it is not there in time, None once the run is complete."""
+        with self.changed:
+            self.changed.wait_for(lambda: self.done or len(self.blocks) > number, _PATIENCE)
+            if self.done:
+                return None
+            return self.blocks[number] if len(self.blocks) > number else b""
+
+
+def _joined(before: Recording, stretch: Recording) -> Recording:
+    """Return a part with the last frame of the previous one, for interpolation."""
+    names = ("times", "states", "inputs", "lyapunov", "reference")
+    parts = {
+        name: np.concatenate([getattr(before, name)[-1:], getattr(stretch, name)])
+        for name in names
+        if getattr(stretch, name) is not None
+    }
+    return dataclasses.replace(stretch, **parts)
+
+
+def growing_page(run: Growing) -> type[Handler]:
+    """Return the handler of a run that is being computed."""
+
+    class GrowingRun(Handler):
+        """The handler of this run: its page, and its parts by number."""
+
+        def do_GET(self) -> None:
+            """Send the page or a part."""
+            # The page changes when the run is complete.
+            type(self).page = run.html
+            if not self.path.startswith("/stretch/"):
+                super().do_GET()
+            elif self.allowed():
+                self._send_stretch(self.path.rpartition("/")[2])
+
+        def _send_stretch(self, number: str) -> None:
+            if not (number.isascii() and number.isdigit()) or len(number) > 9:
+                self.send(b"not found\n", "text/plain", 404)
+                return
+            block = run.block(int(number))
+            with contextlib.suppress(ConnectionError):
+                # 205: reload the page; 204: no part yet.
+                code = 205 if block is None else 200 if block else 204
+                self.send(block or b"", "application/octet-stream", code)
+
+    return GrowingRun

@@ -1,6 +1,5 @@
 """Machine code of a step: from a graph of scalars to vectors, to the loops around them."""
 
-from echelon.simulation.codegen.angle_differences import has_flag
 from echelon.simulation.codegen.block_copy import copy_rows
 from echelon.simulation.codegen.factoring import factored
 from echelon.simulation.codegen.kernel_plan import SHIFTED, SLOTS, TASK, Body, Plan, stride
@@ -9,11 +8,10 @@ from echelon.simulation.codegen.machine_code import (
     Code,
     aligned,
     is_installed,
-    object_code,
     vectors,
 )
+from echelon.simulation.codegen.neighbours import has_flag
 from echelon.simulation.codegen.scheduling import shared
-from echelon.simulation.codegen.tape import contribution_widths, from_tape
 
 __all__ = [
     "SHIFTED",
@@ -23,13 +21,10 @@ __all__ = [
     "Code",
     "Plan",
     "aligned",
-    "contribution_widths",
     "copy_rows",
     "factored",
-    "from_tape",
     "has_flag",
     "is_installed",
-    "object_code",
     "program",
     "shared",
     "stride",

@@ -5,10 +5,8 @@ from threading import Lock
 
 import numpy as np
 
-from echelon.core import disk_cache
-from echelon.simulation.codegen.ir_blocks import loop
 from echelon.simulation.codegen.machine_code import Code
-from echelon.simulation.codegen.vector_ir import Writer
+from echelon.simulation.codegen.vector_ir import Writer, loop
 
 _LOCK = Lock()
 """Threads ask for the same code at once, and a cache alone would compile it for each."""
@@ -67,7 +65,7 @@ def _copy(w: Writer, source: tuple[str, str], target: tuple[str, str]) -> None:
 @cache
 def _copier(bits: int, lanes: int) -> Code:
     """Return the code of `copy_text`, compiled once."""
-    return Code(copy_text(bits, lanes), disk_cache.jax_folder())
+    return Code(copy_text(bits, lanes))
 
 
 def copy_rows(

@@ -2,15 +2,129 @@
 
 What is the same for all agents is computed once, as a scalar. A large computation that only one
 side of a choice needs is behind a branch, taken if any lane takes that side.
+
+Much of a step is written for unlikely cases: an angle beyond 45 degrees, a motor at its limit. A
+truth marked as `unlikely` may always be assumed to hold, because what it then selects is correct
+for every number; while it does not hold, it may be assumed not to hold. So a step is written twice:
+without the unlikely cases, the fast path, and in full. The first is tried, and left for the second
+if a lane needs it. Both compute the same bits.
 """
 
+import graphlib
+import heapq
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import final
+from typing import NamedTuple, final
 
-from echelon.simulation.codegen.branches import Branch, find_branches
 from echelon.simulation.codegen.scheduling import depth_first, lateness
 from echelon.simulation.codegen.vector_ir import Writer
-from echelon.simulation.scalars import Node, needed
+from echelon.simulation.scalars import Node, needed, rewritten
+
+_MANY = 40
+"""Operations on one side of a choice from which on a branch is worth its cost."""
+
+
+@final
+class Branch:
+    """What only one side of the choices by one truth needs.
+
+    Attributes:
+        which: the truth.
+        side: whether the branch is taken where it holds, or where it does not.
+        nodes: of the branch, in order.
+        outputs: those of them that the choices read.
+    """
+
+    def __init__(self, which: Node, side: bool, nodes: list[Node], outputs: list[Node]) -> None:
+        self.which, self.side, self.nodes, self.outputs = which, side, nodes, outputs
+
+
+def large_choices(results: Sequence[Node]) -> list[tuple[Node, bool]]:
+    """Return the truths with many nodes on one side of the choice, and that side."""
+    nodes = [node for node in needed(results) if not node.uniform]
+    return [(branch.which, branch.side) for branch in find_branches(nodes, results)]
+
+
+def find_branches(nodes: list[Node], results: Sequence[Node]) -> list[Branch]:
+    """Return the branches that are worth their cost; none within another."""
+    users: dict[Node, list[Node]] = {node: [] for node in nodes}
+    for node in nodes:
+        for operand in set(node.args):
+            if operand in users:
+                users[operand].append(node)
+    outside = set(results)
+    choices: dict[tuple[Node, bool], list[Node]] = {}
+    for node in nodes:
+        if node.op == "select" and not node.args[0].uniform:
+            for side in (True, False):
+                choices.setdefault((node.args[0], side), []).append(node)
+    branches, owned = list[Branch](), set[Node]()
+    # Those of the later choices contain those of the earlier ones, and are worth more.
+    for (which, side), selects in sorted(choices.items(), key=lambda c: -c[1][0].number):
+        inner = _exclusive(users, outside, which, side, selects)
+        inner = [node for node in inner if node.op != "leaf"]
+        # A branch within another would save little more, and complicate the order.
+        if len(inner) >= _MANY and not owned.intersection([*inner, *selects, which]):
+            inside = set(inner)
+            outputs = [n for n in inner if any(u not in inside for u in users[n])]
+            branches.append(Branch(which, side, inner, outputs))
+            owned.update(inner)
+    return _without_cycles(nodes, branches)
+
+
+def _without_cycles(nodes: list[Node], branches: list[Branch]) -> list[Branch]:
+    """Return the branches that can be written in one piece each.
+
+    One that needs the result of a choice which itself reads the branch cannot; its nodes are then
+    written among the others.
+    """
+    while branches:
+        owner: dict[Node, Node | Branch] = {node: b for b in branches for node in b.nodes}
+        needs: dict[Node | Branch, set[Node | Branch]] = {
+            branch: {owner.get(branch.which, branch.which)} for branch in branches
+        }
+        for node in nodes:
+            piece = owner.get(node, node)
+            needs.setdefault(piece, set()).update(owner.get(a, a) for a in node.args)
+            needs[piece].discard(piece)
+        try:
+            graphlib.TopologicalSorter(needs).prepare()
+        except graphlib.CycleError as error:
+            branches = [branch for branch in branches if branch not in error.args[1]]
+        else:
+            break
+    return branches
+
+
+def _exclusive(
+    users: dict[Node, list[Node]],
+    outside: set[Node],
+    which: Node,
+    side: bool,
+    selects: list[Node],
+) -> list[Node]:
+    """Return the nodes that nothing needs but one side of some choices."""
+    chosen, inside = set(selects), set[Node]()
+
+    def is_inside(node: Node, user: Node) -> bool:
+        # The choice itself may read it at that side only, and not as its truth.
+        if user not in chosen or user in inside:
+            return user in inside
+        return node is not user.args[2 if side else 1] and node is not user.args[0]
+
+    # Backwards from the choices: all that read a number come before it.
+    candidates = {a.number: a for select in selects for a in select.args if a in users}
+    order = [-number for number in candidates]
+    heapq.heapify(order)
+    while order:
+        node = candidates[-heapq.heappop(order)]
+        if node in outside or node is which or not all(is_inside(node, u) for u in users[node]):
+            continue
+        inside.add(node)
+        for a in node.args:
+            if a in users and a.number not in candidates:
+                candidates[a.number] = a
+                heapq.heappush(order, -a.number)
+    return sorted(inside, key=lambda node: node.number)
 
 
 @final
@@ -32,7 +146,9 @@ class Emitter:
         nodes = needed(results)
         # Uniform values first: they come before every branch, and are outside of all.
         self._write([n for n in nodes if n.uniform])
-        self._write_with_branches([n for n in nodes if not n.uniform], results)
+        nodes = [n for n in nodes if not n.uniform]
+        branches = find_branches(nodes, results)
+        self._write_in_order(nodes, {node: b for b in branches for node in b.nodes})
 
     def emit_fast(
         self, results: Sequence[Node], levels: Sequence[Sequence[Node]], otherwise: str
@@ -126,11 +242,6 @@ class Emitter:
 
     # ---- branches ----
 
-    def _write_with_branches(self, nodes: list[Node], results: Sequence[Node]) -> None:
-        """Write nodes in order; those that only one side of a choice needs, behind a branch."""
-        owner = {node: b for b in find_branches(nodes, results) for node in b.nodes}
-        self._write_in_order(nodes, owner)
-
     def _write_in_order(self, nodes: Iterable[Node], owner: Mapping[Node, Branch]) -> None:
         """Write nodes outside of branches; each branch before the first node that reads it."""
         for node in nodes:
@@ -167,3 +278,55 @@ class Emitter:
         for node in branch.outputs:
             values = f"[ {self.values[node]}, %{end} ], [ zeroinitializer, %{before} ]"
             self.values[node] = w.put(f"phi {w.kind(node.truth, False)} {values}")
+
+
+# ---- the fast path -------------------------------------------------------------------------------
+
+
+class FastPath(NamedTuple):
+    """A step without its unlikely cases.
+
+    Attributes:
+        nodes: a node of the full step -> its node in the fast path.
+        levels: truths of which none may hold; each level depends on the assumptions of those
+            before.
+    """
+
+    nodes: Mapping[Node, Node]
+    levels: Sequence[Sequence[Node]]
+
+
+def general_case(results: Sequence[Node]) -> Mapping[Node, Node]:
+    """Return each node with every unlikely truth assumed to hold, which is always correct."""
+    return rewritten(results, lambda node, args: True if node.op == "unlikely" else None)
+
+
+def find_fast_path(results: Sequence[Node], choices: Iterable[tuple[Node, bool]]) -> FastPath:
+    """Return each node with every unlikely truth assumed not to hold.
+
+    Args:
+        results: of the step.
+        choices: further truths, and for each whether it is unlikely to hold, or not to hold.
+    """
+    sides, depths, excluded = dict(choices), dict[Node, int](), list[tuple[int, Node]]()
+
+    def assume(node: Node, args: Sequence[Node]) -> Node | bool | None:
+        # What is the same for all agents costs almost nothing, and is computed in full.
+        depth = max((depths[a] for a in node.args), default=0)
+        depths[node] = depth
+        if node.op == "unlikely":
+            if node.uniform:
+                return True
+            excluded.append((depth, args[0]))
+            depths[node] = depth + 1
+            return False
+        if node not in sides:
+            return None
+        truth = node.graph.make(node.op, *args)
+        excluded.append((depth, truth if sides[node] else node.graph.make("not", truth)))
+        depths[node] = depth + 1
+        return not sides[node]
+
+    nodes = rewritten(results, assume)
+    levels = [[n for d, n in excluded if d == depth] for depth in sorted({d for d, _ in excluded})]
+    return FastPath(nodes, [list(dict.fromkeys(level)) for level in levels])

@@ -17,8 +17,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias, final
 
-from echelon.simulation.codegen.scheduling import inverses_shared
-from echelon.simulation.scalars.scalar_graph import Node, needed
+from echelon.simulation.scalars import Node, needed, rewritten
 
 _OPEN = {"add", "sub", "mul", "neg"}
 _LARGEST = 1e30
@@ -56,7 +55,7 @@ Common: TypeAlias = Node | float
 
 def factored(results: Sequence[Node]) -> Mapping[Node, Node]:
     """Return results with fewer quotients and products, equal except for rounding."""
-    first = inverses_shared(results)
+    first = _inverses_shared(results)
     after = _Sums([first[node] for node in results]).after
     return {node: after[first[node]] for node in results}
 
@@ -276,3 +275,27 @@ def _size_of(like: Node, term: Term) -> tuple[float, Node]:
     for factor in term.factors:
         product = product * factor
     return math.copysign(1.0, term.number), product
+
+
+# ---- quotients -----------------------------------------------------------------------------------
+
+_CONTINUOUS = {"add", "sub", "mul", "neg"}
+"""Operations that may read a quotient with another rounding; if it is truncated or compared, 49/49
+must be 1."""
+
+
+def _inverses_shared(results: Sequence[Node]) -> Mapping[Node, Node]:
+    """Return each node with quotients by one number replaced by products with its inverse.
+
+    A division is the slowest operation. The results may differ by one unit in the last place.
+    """
+    nodes = needed(results)
+    exact = {a for node in nodes if node.op not in _CONTINUOUS for a in node.args}
+    quotients = [n for n in nodes if n.op == "div" and not n.uniform and n not in exact]
+    uses = Counter(node.args[1] for node in quotients)
+    shared = {node for node in quotients if uses[node.args[1]] > 1 or node.args[1].uniform}
+
+    def product(node: Node, args: Sequence[Node]) -> Node | None:
+        return args[0] * node.graph.make("div", 1.0, args[1]) if node in shared else None
+
+    return rewritten(results, product)

@@ -17,9 +17,8 @@ _NONE: Mapping[int, Node] = MappingProxyType({})
 class Body(NamedTuple):
     """What some of the agents compute in a step; the same code for all of them.
 
-    A leaf is ("row", r), ("z", k), ("message", k), ("leader", k), ("self", k), ("neighbour", k), in
-    the backward pass ("tape", r) and ("contribution", k), or, the same for all agents, ("time",),
-    ("step",), ("steady",), ("table", c), ("uniform", k).
+    A leaf is ("row", r), ("z", k), ("message", k), ("leader", k), ("self", k), ("neighbour", k) or,
+    the same for all agents, ("time",), ("step",), ("steady",), ("table", c), ("uniform", k).
 
     Attributes:
         stores: row -> its new value.
@@ -28,11 +27,7 @@ class Body(NamedTuple):
         on_request: row -> its new value at the step `input_step` only, since every store costs
             time.
         mirror: what neighbours read after the step, entry by entry.
-        to_sources: what is added to the contributions of the agent that sent the message, from 0
-            on.
-        to_leaders: what is added to the contributions of the leader, behind the former.
         tape: row of the tape -> what is recorded there at each step, if a tape is given.
-        totals: place -> what is added up there over all agents and steps.
         exceptions: truths; where one holds, the agent's numbers are not what JAX computes.
         mirror_before: what neighbours read at the step, entry by entry.
         difference: of the leaves `self` and `neighbour`, entry by entry; z_k is the weighted sum of
@@ -44,10 +39,7 @@ class Body(NamedTuple):
     minima: Mapping[int, Node] = _NONE
     on_request: Mapping[int, Node] = _NONE
     mirror: Sequence[Node] = ()
-    to_sources: Sequence[Node] = ()
-    to_leaders: Sequence[Node] = ()
     tape: Mapping[int, Node] = _NONE
-    totals: Mapping[int, Node] = _NONE
     exceptions: Sequence[Node] = ()
     # Not written; what is written reads them.
     mirror_before: Sequence[Node] = ()
@@ -94,7 +86,7 @@ class Plan(NamedTuple):
             vectors of neighbours are agents that follow each other: rings, paths, grids.
         rows: of a block.
         width: numbers that neighbours read of an agent, stored in whole vectors; with the flag of
-            `angle_differences.has_flag`, if there is one.
+            `neighbours.has_flag`, if there is one.
         first: the body of the agents that act first.
         others: the body of all others, level by level.
         message_start: the first row of what an agent sends besides its state.
@@ -114,8 +106,6 @@ class Plan(NamedTuple):
         leaders_ahead: whether the leaders may take many steps before the others take the first,
             because they receive nothing: what they send is stored for each step.
         tape_rows: rows per block and step on the tape.
-        backward: whether the steps run from the last to the first, the followers before the
-            leaders, the deepest level first: for derivatives.
     """
 
     bits: int
@@ -140,13 +130,44 @@ class Plan(NamedTuple):
     edge_shifts: tuple[int, ...] = ()
     leaders_ahead: bool = False
     tape_rows: int = 0
-    backward: bool = False
 
     @property
     def mirror(self) -> int:
         """How many numbers neighbours read of a block."""
         in_rows = self.batched or self.row_major
         return self.lanes * (self.width if in_rows else stride(self.width, self.lanes))
+
+
+class Context(NamedTuple):
+    """The plan of a kernel, and names of addresses and numbers in its text.
+
+    Attributes:
+        plan: of the kernel.
+        slots: name of a slot -> its value.
+        mirror: what neighbours read at this step.
+        next_mirror: what they read after it.
+        step: the number of the step.
+        table: this step's numbers in the table.
+        uniform_values: this step's numbers that are the same for all agents.
+        leader_mirror: what leaders ahead showed at this step.
+        leader_messages: what they sent at this step.
+        leader_count: the positions of leaders.
+        tape: this step's part of the tape.
+        at_hand: place of a number that is the same for all agents -> the number, loaded before.
+    """
+
+    plan: Plan
+    slots: dict[str, str]
+    mirror: str
+    next_mirror: str
+    step: str
+    table: str
+    uniform_values: str
+    leader_mirror: str = ""
+    leader_messages: str = ""
+    leader_count: str = ""
+    tape: str = ""
+    at_hand: Mapping[int, str] = MappingProxyType({})
 
 
 SLOTS = (
@@ -170,8 +191,6 @@ SLOTS = (
     "progress",
     "yield_processor",
     "tape",
-    "totals",
-    "contributions",
     "first_step",
     "steps",
     "count",
@@ -186,7 +205,7 @@ SLOTS = (
     "thread",
     "tape_step",
 )
-"""The arguments of a kernel: 22 addresses and 13 whole numbers of 64 bits.
+"""The arguments of a kernel: 20 addresses and 13 whole numbers of 64 bits.
 
 Formations are stored in groups of as many as a vector has lanes; `rows`, the mirrors and `edges`
 are those of the first of some groups, which have `blocks` and `edge_blocks` each. A swarm is one
@@ -203,12 +222,11 @@ as `before` says, and each thread behind it as many as `after`. `progress` count
 each has finished, one cache line apart, and `yield_processor` is a function that yields the
 processor.
 
-`tape` is 0 if nothing is recorded, and `tape_step` is how many numbers lie between its steps;
-`totals` has a vector for each total, and `contributions` what was added for each agent.
+`tape` is 0 if nothing is recorded, and `tape_step` is how many numbers lie between its steps.
 """
 TASK = ("passed", "level", "start", "end", "first_edge", "last_edge", "before", "after")
 """Of a task: the steps before it in this call, the level, and where its blocks begin and end."""
-ADDRESSES = 22
+ADDRESSES = 20
 
 
 def stride(width: int, lanes: int) -> int:

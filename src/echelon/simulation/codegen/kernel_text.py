@@ -9,22 +9,19 @@ steps before the next one, so that it stays in the nearest cache.
 """
 
 import contextlib
+import platform
 from collections.abc import Iterator, Sequence
 
-from echelon.simulation.codegen import denormals
-from echelon.simulation.codegen.barriers import announce, wait
-from echelon.simulation.codegen.branches import large_choices
-from echelon.simulation.codegen.emitter import Emitter
-from echelon.simulation.codegen.fast_path import find_fast_path, general_case
-from echelon.simulation.codegen.ir_blocks import (
+from echelon.simulation.codegen.emitter import Emitter, find_fast_path, general_case, large_choices
+from echelon.simulation.codegen.kernel_plan import (
+    ADDRESSES,
+    NO_MINIMUM,
+    SLOTS,
+    TASK,
+    Body,
     Context,
-    gather,
-    listed_block,
-    load_places,
-    loop,
-    only_if,
+    Plan,
 )
-from echelon.simulation.codegen.kernel_plan import ADDRESSES, NO_MINIMUM, SLOTS, TASK, Body, Plan
 from echelon.simulation.codegen.neighbours import (
     exchange,
     leader_row,
@@ -33,9 +30,15 @@ from echelon.simulation.codegen.neighbours import (
     write_mirror,
 )
 from echelon.simulation.codegen.scheduling import fuse, separate_uniform, shared
-from echelon.simulation.codegen.tape import record, take_contributions, tape_block
-from echelon.simulation.codegen.vector_ir import Writer
-from echelon.simulation.scalars.scalar_graph import Node, needed
+from echelon.simulation.codegen.vector_ir import (
+    Writer,
+    gather,
+    listed_block,
+    load_places,
+    loop,
+    only_if,
+)
+from echelon.simulation.scalars import Node, needed
 
 
 def program(plan: Plan) -> str:
@@ -56,10 +59,10 @@ def program(plan: Plan) -> str:
     head = "define internal void @steps(ptr noalias %slots) #0 {"
     # 512 bits also where a processor prefers halves: the vector types are chosen on purpose.
     width = '"prefer-vector-width"="512"'
-    attributes = f"attributes #0 = {{ nounwind noinline {width} {denormals.ATTRIBUTES} }}"
+    attributes = f"attributes #0 = {{ nounwind noinline {width} {_ATTRIBUTES} }}"
     # The weights of a branch that is hardly ever taken.
     unlikely = '!0 = !{!"branch_weights", i32 1, i32 1000}'
-    parts = [*sorted(w.declared), "", head, *w.lines, "}", "", denormals.entry()]
+    parts = [*sorted(w.declared), "", head, *w.lines, "}", "", _entry()]
     return "\n".join([*parts, "", attributes, unlikely, ""])
 
 
@@ -124,11 +127,7 @@ def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
 def _context(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers: int) -> Context:
     """Write where the numbers are that change from step to step."""
     step = w.put(f"add i64 {slots['first_step']}, {passed}")
-    parity = passed
-    if plan.backward:
-        last = w.put(f"sub i64 {slots['steps']}, 1")
-        parity = w.put(f"sub i64 {last}, {passed}")
-    odd = w.put(f"trunc i64 {parity} to i1")
+    odd = w.put(f"trunc i64 {passed} to i1")
     mirror, next_mirror = (
         w.put(f"select i1 {odd}, ptr {slots[a]}, ptr {slots[b]}")
         for a, b in (("next_mirror", "mirror"), ("mirror", "next_mirror"))
@@ -195,12 +194,11 @@ def _act(w: Writer, context: Context, body: Body, block: str) -> None:
         return w.load_row(base, leaf.value[1])
 
     z = exchange(w, context, general, block, entries, load_row) if entries else {}
-    contributions = take_contributions(w, context, general, block)
 
     def load(leaf: Node) -> str:
         kind, *rest = leaf.value
-        if kind in ("z", "contribution"):
-            return (z if kind == "z" else contributions)[rest[0]]
+        if kind == "z":
+            return z[rest[0]]
         return _load(w, context, block, base, kind, rest)
 
     # Without the differences, whose sums are computed before.
@@ -246,8 +244,6 @@ def _load(
         if plan.leaders_ahead:
             start, row = context.leader_messages, rest[0]
         return _look_up(w, context, "sources", start, row, block, plan.one_source)
-    if kind == "tape":
-        return w.load_row(tape_block(w, context, block), rest[0])
     if kind == "leader":
         return _look_up(w, context, "leaders", context.mirror, rest[0], block, plan.one_leader)
     return _load_uniform(w, context, kind, *rest)
@@ -270,7 +266,11 @@ def _write(
                 w.store_row(w.operation(op, [w.load_row(base, row), value]), base, row)
     _note_exceptions(w, context.plan.exception_row, body, emitter, base)
     write_mirror(w, context, [emitter.value(node) for node in body.mirror], block)
-    record(w, context, body, emitter, block)
+    if body.tape:
+        with only_if(w, w.put(f"ptrtoint ptr {context.slots['tape']} to i64")):
+            start = w.part(context.tape, block, context.plan.tape_rows * w.lanes)
+            for row, node in body.tape.items():
+                w.store_row(emitter.value(node), start, row)
 
 
 def _note_exceptions(w: Writer, row: int, body: Body, emitter: Emitter, base: str) -> None:
@@ -338,3 +338,111 @@ def _look_up(
         return gather(w, start, load_places(w, places, first), offset)
     far = w.put(f"add i64 {w.load_place(places)}, {offset}")
     return w.splat(w.load(w.scalar, start, far))
+
+
+# ---- how threads that share the steps wait for each other ----------------------------------------
+
+_SPINS = 1_000
+"""Rounds that a thread waits before it yields the processor, which the other may need."""
+_APART = 8
+"""Numbers between two counts: each has its own cache line, because another thread writes it."""
+
+
+def wait(w: Writer, slots: dict[str, str], before: str, after: str) -> None:
+    """Write that a thread waits until the others have finished so many tasks."""
+    several = w.put(f"icmp sgt i64 {slots['threads']}, 1")
+    with only_if(w, w.put(f"zext i1 {several} to i64")):
+        with loop(w, "0", slots["threads"]) as (other, _, _):
+            lower = w.put(f"icmp slt i64 {other}, {slots['thread']}")
+            count = w.put(f"select i1 {lower}, i64 {before}, i64 {after}")
+            itself = w.put(f"icmp eq i64 {other}, {slots['thread']}")
+            # It need not wait for itself.
+            _wait_for(w, slots, other, w.put(f"select i1 {itself}, i64 0, i64 {count}"))
+
+
+def _wait_for(w: Writer, slots: dict[str, str], other: str, count: str) -> None:
+    """Write that a thread waits for another."""
+    at = w.part(slots["progress"], other, _APART, "i64")
+    start, turn, here = (w.fresh(stem) for stem in ("start", "turn", "here"))
+    w.do(f"br label %{start}")
+    w.label(start)
+    w.do(f"br label %{turn}")
+    spins, more = "%" + w.fresh("t"), "%" + w.fresh("t")
+    w.label(turn)
+    rested = w.fresh("rested")
+    w.do(f"{spins} = phi i64 [ 0, %{start} ], [ {more}, %{rested} ]")
+    w.do(f"{more} = add i64 {spins}, 1")
+    finished = w.put(f"load atomic i64, ptr {at} acquire, align 8")
+    enough = w.put(f"icmp sge i64 {finished}, {count}")
+    again, rest = w.fresh("wait"), w.fresh("rest")
+    w.do(f"br i1 {enough}, label %{here}, label %{again}")
+    w.label(again)
+    long = w.put(f"icmp sgt i64 {spins}, {_SPINS}")
+    w.do(f"br i1 {long}, label %{rest}, label %{rested}")
+    w.label(rest)
+    w.put(f"call i32 {slots['yield_processor']}()")
+    w.do(f"br label %{rested}")
+    w.label(rested)
+    w.do(f"br label %{turn}")
+    w.label(here)
+
+
+def announce(w: Writer, slots: dict[str, str], task: str) -> None:
+    """Write that a thread lets the others know that it has finished a task."""
+    several = w.put(f"icmp sgt i64 {slots['threads']}, 1")
+    with only_if(w, w.put(f"zext i1 {several} to i64")):
+        at = w.part(slots["progress"], slots["thread"], _APART, "i64")
+        count = w.put(f"add i64 {task}, 1")
+        w.do(f"store atomic i64 {count}, ptr {at} release, align 8")
+
+
+# ---- denormal numbers ----------------------------------------------------------------------------
+
+_X86 = """\
+declare void @llvm.x86.sse.stmxcsr(ptr)
+declare void @llvm.x86.sse.ldmxcsr(ptr)
+define void @run(ptr noalias %slots) nounwind {
+  %old = alloca i32
+  %new = alloca i32
+  call void @llvm.x86.sse.stmxcsr(ptr %old)
+  %before = load i32, ptr %old
+  %within = or i32 %before, 32832 ; flush to zero, denormals are zero
+  store i32 %within, ptr %new
+  call void @llvm.x86.sse.ldmxcsr(ptr %new)
+  call void @steps(ptr %slots)
+  call void @llvm.x86.sse.ldmxcsr(ptr %old)
+  ret void
+}"""
+_ARM = """\
+declare i64 @llvm.aarch64.get.fpcr()
+declare void @llvm.aarch64.set.fpcr(i64)
+define void @run(ptr noalias %slots) nounwind {
+  %before = call i64 @llvm.aarch64.get.fpcr()
+  %within = or i64 %before, 16777216 ; flush to zero
+  call void @llvm.aarch64.set.fpcr(i64 %within)
+  call void @steps(ptr %slots)
+  call void @llvm.aarch64.set.fpcr(i64 %before)
+  ret void
+}"""
+_OTHER = """\
+define void @run(ptr noalias %slots) nounwind {
+  call void @steps(ptr %slots)
+  ret void
+}"""
+_ENTRIES = {"x86_64": _X86, "AMD64": _X86, "aarch64": _ARM, "arm64": _ARM}
+
+_ATTRIBUTES = " ".join(
+    f'"denormal-fp-math{suffix}"="preserve-sign,preserve-sign"' for suffix in ("", "-f32")
+)
+"""What LLVM must know to fold constants as the processor would."""
+
+
+def _entry() -> str:
+    """Return the function `run` as text for LLVM, which calls `steps` and is all that is called.
+
+    It treats denormal numbers as 0, in operands and in results, as JAX does: an operation with one
+    takes a hundred times as long. Each thread sets the bits of its processor's register that say so
+    when it enters a kernel, and puts them back when it leaves.
+    """
+    # A function of its own, because LLVM moves arithmetic over neither end of a call.
+    return _ENTRIES.get(platform.machine(), _OTHER)

@@ -9,11 +9,10 @@ from typing import Any, final
 
 import numpy as np
 
-from echelon.core import disk_cache
+from echelon.core.cache import load_or_compile
 from echelon.core.errors import MissingExtraError
-from echelon.core.private_folder import PrivateFolder
 from echelon.core.trace import error_summary
-from echelon.simulation.scalars.traced_entries import Unsupported
+from echelon.simulation.scalars import Unsupported
 
 
 @cache
@@ -72,9 +71,11 @@ def features() -> str:
 class Code:
     """A kernel as machine code, which exists as long as this object."""
 
-    def __init__(self, text: str, folder: PrivateFolder | None = None) -> None:
+    def __init__(self, text: str) -> None:
         """Compile a text, or load its code from the cache."""
         binding = llvm()
+        import llvmlite
+
         target = binding.Target.from_default_triple()
         # In the small model a constant is an operand; no address is loaded first.
         self._machine = target.create_target_machine(
@@ -84,12 +85,10 @@ class Code:
             codemodel=_MODEL,
             reloc="pic" if _LINKED else "default",
         )
-        stored = _cache_file(text, binding, folder)
-        image = None if stored is None else disk_cache.read(stored)
-        if image is None:
-            image = _compiled(binding, self._machine, text)
-            if stored is not None:
-                disk_cache.write(stored, image)
+        # All that the code depends on: another processor or LLVM compiles anew.
+        parts = [text, _MODEL, features(), binding.get_host_cpu_name(), llvmlite.__version__]
+        parts += [platform.system(), platform.machine()]
+        image = load_or_compile(lambda: _compiled(binding, self._machine, text), *parts)
         self._jit = binding.create_lljit_compiler(self._machine, use_jit_link=_LINKED)
         name = f"kernel_{hashlib.sha256(text.encode()).hexdigest()[:12]}"
         builder = binding.JITLibraryBuilder().add_object_img(image).export_symbol("run")
@@ -99,21 +98,6 @@ class Code:
     def call(self, slots: np.ndarray) -> None:
         """Run the kernel with the arguments in 64-bit slots: addresses and whole numbers."""
         self._run(slots.ctypes.data)
-
-
-def object_code(text: str, triple: str, cpu: str) -> bytes:
-    """Return the object file of a text for another processor.
-
-    Raises:
-        MissingExtraError: llvmlite is not installed.
-        Unsupported: LLVM rejects the text.
-    """
-    binding = llvm()
-    binding.initialize_all_targets()
-    binding.initialize_all_asmprinters()
-    target = binding.Target.from_triple(triple)
-    machine = target.create_target_machine(cpu=cpu, opt=2, reloc="static")
-    return _compiled(binding, machine, f'target triple = "{triple}"\n{text}')
 
 
 def _compiled(binding: ModuleType, machine: Any, text: str) -> bytes:
@@ -128,21 +112,6 @@ def _compiled(binding: ModuleType, machine: Any, text: str) -> bytes:
     passes = binding.create_pass_builder(machine, options)
     passes.getModulePassManager().run(module, passes)
     return machine.emit_object(module)
-
-
-def _cache_file(
-    text: str, binding: ModuleType, folder: PrivateFolder | None
-) -> disk_cache.CacheFile | None:
-    """Return the file of the code of a text on this machine."""
-    if folder is None:
-        return None
-    import llvmlite
-
-    # All that the code depends on: another processor or LLVM compiles anew.
-    parts = [text, _MODEL, features(), binding.get_host_cpu_name(), llvmlite.__version__]
-    parts += [platform.system(), platform.machine()]
-    name = f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}-native-cache"
-    return disk_cache.CacheFile(folder, name)
 
 
 def aligned(shape: tuple[int, ...], dtype: np.dtype | type) -> np.ndarray:

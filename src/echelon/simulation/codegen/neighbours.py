@@ -1,16 +1,17 @@
-"""What neighbours read of an agent, and what each computes from it: sums over the edges."""
+"""What neighbours read of an agent, and what each computes from it: sums over the edges.
 
+A difference of angles is the shorter way round, and plain for small angles. Where neighbours read
+whole vectors of an agent, the last entry is a flag: 0 if all angles of the agent are small, NaN if
+one is not. The sum of its differences then tells whether the sums of plain differences are correct.
+"""
+
+import math
 from collections.abc import Callable, Sequence
 
-from echelon.simulation.codegen.angle_differences import (
-    angle_flag,
-    has_flag,
-    is_zero,
-    plain_limits,
-)
 from echelon.simulation.codegen.emitter import Emitter
-from echelon.simulation.codegen.ir_blocks import (
-    Context,
+from echelon.simulation.codegen.kernel_plan import SHIFTED, Body, Context, Plan, stride
+from echelon.simulation.codegen.vector_ir import (
+    Writer,
     either,
     flag,
     gather,
@@ -18,9 +19,7 @@ from echelon.simulation.codegen.ir_blocks import (
     load_places,
     loop,
 )
-from echelon.simulation.codegen.kernel_plan import SHIFTED, Body, stride
-from echelon.simulation.codegen.vector_ir import Writer
-from echelon.simulation.scalars.scalar_graph import Node, needed
+from echelon.simulation.scalars import Node, needed, rewritten
 
 
 def exchange(
@@ -69,7 +68,10 @@ def exchange(
     else:
         last = [plan.width - 1] * has_flag(plan)
         sums = _subtract(w, context, ends, first, [*entries, *last])
-        small = is_zero(w, sums.pop()) if last else "true"
+        small = "true"
+        if last:
+            large = w.put(f"fcmp une {w.vector} {sums.pop()}, zeroinitializer")
+            small = w.put(f"xor i1 {w.any_lane(large)}, true")
         if plan.leaders_ahead:
             small = w.put(f"and i1 {small}, {flag(w, slots['contiguous'], block)}")
         totals = either(w, small, lambda small: sums if small else add_up(False))
@@ -396,3 +398,53 @@ def measure_edges(w: Writer, context: Context, start: str, end: str) -> None:
             squares = w.operation("mul", [error, error])
         total = w.load_row(base, len(axes) + 1)
         w.store_row(w.operation("add", [total, squares]), base, len(axes) + 1)
+
+
+# ---- differences of angles -----------------------------------------------------------------------
+
+
+def plain_limits(plan: Plan) -> dict[int, float]:
+    """Return for each entry up to which size of both numbers its difference is plain."""
+    return {k: _limit(k, node) for k, node in enumerate(plan.others.difference)}
+
+
+def _limit(k: int, node: Node) -> float:
+    bounds = [math.inf]
+
+    def without_turns(node: Node, args: Sequence[Node]) -> float | None:
+        if node.op != "rint" or args[0].op != "mul":
+            return None
+        one, other = args[0].args
+        size, rest = (one, other) if one.op == "constant" else (other, one)
+        if size.op != "constant" or not _is_plain(k, rest):
+            return None
+        # Rounded to the nearest whole number: below a half there are no turns to subtract.
+        bounds.append(0.249 / abs(size.value))
+        return 0.0
+
+    result = rewritten([node], without_turns)[node]
+    return min(bounds) if _is_plain(k, result) else 0.0
+
+
+def _is_plain(k: int, node: Node) -> bool:
+    """Tell whether an entry of the difference is that of two numbers."""
+    leaves = [a.value for a in node.args if a.op == "leaf"]
+    return node.op == "sub" and leaves == [("self", k), ("neighbour", k)]
+
+
+def has_flag(plan: Plan) -> bool:
+    """Tell whether agents show a flag for large angles."""
+    limits = [] if plan.batched or plan.row_major else [*plain_limits(plan).values()]
+    return any(map(math.isfinite, limits)) and 0.0 not in limits
+
+
+def angle_flag(w: Writer, plan: Plan, values: Sequence[str]) -> str:
+    """Write what is 0 if all angles are small, and NaN if one is not."""
+    truths, large = w.kind(True, False), ""
+    for k, limit in plain_limits(plan).items():
+        if math.isfinite(limit):
+            size = w.operation("abs", [values[k]])
+            beyond = w.put(f"fcmp ugt {w.vector} {size}, {w.number(limit)}")
+            large = w.put(f"or {truths} {large}, {beyond}") if large else beyond
+    nan = w.number(math.nan)
+    return w.put(f"select {truths} {large}, {w.vector} {nan}, {w.vector} zeroinitializer")

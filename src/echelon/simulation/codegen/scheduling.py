@@ -4,31 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
 from echelon.simulation.codegen.kernel_plan import Body, Plan
-from echelon.simulation.scalars.scalar_graph import Node, needed, rewritten
-
-# ---- quotients -----------------------------------------------------------------------------------
-
-_CONTINUOUS = {"add", "sub", "mul", "neg"}
-"""Operations that may read a quotient with another rounding; if it is truncated or compared, 49/49
-must be 1."""
-
-
-def inverses_shared(results: Sequence[Node]) -> Mapping[Node, Node]:
-    """Return each node with quotients by one number replaced by products with its inverse.
-
-    A division is the slowest operation. The results may differ by one unit in the last place.
-    """
-    nodes = needed(results)
-    exact = {a for node in nodes if node.op not in _CONTINUOUS for a in node.args}
-    quotients = [n for n in nodes if n.op == "div" and not n.uniform and n not in exact]
-    uses = Counter(node.args[1] for node in quotients)
-    shared = {node for node in quotients if uses[node.args[1]] > 1 or node.args[1].uniform}
-
-    def product(node: Node, args: Sequence[Node]) -> Node | None:
-        return args[0] * node.graph.make("div", 1.0, args[1]) if node in shared else None
-
-    return rewritten(results, product)
-
+from echelon.simulation.scalars import Node, needed, rewritten
 
 # ---- values that all agents share ----------------------------------------------------------------
 

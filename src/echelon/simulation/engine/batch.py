@@ -18,20 +18,17 @@ from jaxtyping import Bool
 from echelon.core.errors import EchelonError, Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.simulation.engine.divergence import advance_until_lost
-from echelon.simulation.engine.grid import ChunkGrid
-from echelon.simulation.engine.initial import Starts
+from echelon.simulation.engine.chunk_grid import ChunkGrid, advance_until_lost
 from echelon.simulation.engine.jax_stepper import JaxFormations
 from echelon.simulation.engine.law_drive import Laws, choose_engine, is_long, worth_native
-from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.prepare import Prepared, channel_of, prepare, sensors_of
 from echelon.simulation.engine.record import Recorder
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import result_of, sample_reference, simulate
-from echelon.simulation.native.kernel_cache import KERNELS
-from echelon.simulation.native.program_key import ProgramKeys
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.native.threads import processors
+from echelon.simulation.native.varying import ProgramKeys
 from echelon.simulation.step.drive import Stepper
 from echelon.simulation.step.loop import Loop, assemble
 from echelon.simulation.step.motion import Motion
@@ -132,14 +129,14 @@ class Batch:
         """Return the results of a group; none where its runs cannot be stepped together."""
         settings = jobs[0].prepared.problem.settings
         states = np.concatenate([job.prepared.problem.states for job in jobs])
-        bits, pool = int(settings.precision[5:]), (self.pool, KERNELS.of)
+        bits = int(settings.precision[5:])
         loops, began = [job.loop for job in jobs], time.perf_counter()
         with precision(settings.precision):
             try:
                 stepper = choose_engine(
                     settings,
                     len(states),
-                    lambda: NativeStepper(loops, states, bits, None, *pool),
+                    lambda: NativeStepper(loops, states, bits, None, self.pool),
                     lambda why: JaxFormations(loops, states, why),
                 )
                 problems = [job.prepared.problem for job in jobs]

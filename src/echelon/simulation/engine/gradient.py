@@ -1,42 +1,58 @@
-"""Gradients of a cost of a run by reverse-mode differentiation of the closed loop."""
+"""Gradients of a cost of a run by JAX's reverse-mode differentiation of the closed loop."""
 
-from collections.abc import Hashable, Sequence
-from typing import final
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import SimulationError
-from echelon.core.identity import digest
-from echelon.core.memoize import BoundedCache
+from echelon.core.compiled import cached_jit
+from echelon.core.errors import SimulationError, check_name
 from echelon.core.numerics import precision
-from echelon.simulation.engine.content import content_of, copied
-from echelon.simulation.engine.differentiable_run import (
-    Cost,
-    DifferentiableRun,
-    Gradient,
-    values_of,
-)
-from echelon.simulation.engine.jax_gradient import by_jax
-from echelon.simulation.engine.law_drive import Laws, choose_engine
-from echelon.simulation.engine.native_gradient import Native
+from echelon.core.trace import error_summary
+from echelon.core.types import Array
+from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.simulate import sample_reference
-from echelon.simulation.native.varying import alike
-from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.distances import distance_of
+from echelon.simulation.step.drive import Drive, Problem
+from echelon.simulation.step.loop import Loop, Moment, assemble
+from echelon.simulation.step.meter import Sums
+from echelon.simulation.step.sequence import begin, measured_step
 from echelon.simulation.step.settings import Settings
 
-_WORTH = 10_000
-"""Agent steps above which native code saves more time than generating it takes."""
+Cost: TypeAlias = Callable[[Sums], jax.Array]
+"""A scalar cost of the sums over all steps of a run, written with `jax.numpy`."""
+
+VARIABLES = ("P", "R", "coupling", "initial", "offsets")
+"""What a cost can be differentiated by.
+
+P, R and the coupling of the followers' gain; the initial states (N, n); the goals' offsets (N, n),
+at fixed initial states.
+"""
+
+
+class Gradient(NamedTuple):
+    """A cost, its derivative by each requested variable, and the sums of the run.
+
+    The derivatives by P and R are symmetric, for symmetric changes.
+    """
+
+    value: float
+    slopes: Mapping[str, Array]
+    sums: Sums
 
 
 def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -> Gradient:
     """Return a cost of a run and its derivatives by some of the run's parameters.
 
-    The steps are differentiated backwards in float64, by native code or JAX as `settings.engine`
-    says; both agree to rounding. States are stored at checkpoints and the steps between are
-    computed again, so that memory grows with the square root of the number of steps.
+    JAX differentiates the steps backwards in float64, whatever `settings.engine` is. States are
+    stored at checkpoints and the steps between are computed again, so that memory grows with the
+    square root of the number of steps.
 
     Args:
         parts: agents, graph, formation, laws, starts and world.
@@ -49,105 +65,139 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
     Raises:
         EchelonError: a part is malformed or does not fit the others; the agents are not driven by
             laws, or these have no gain; messages are late; a variable is unknown; the cost fails,
-            or is not one number; `settings.engine` is `native`, and native code is unavailable.
+            or is not one number.
     """
     if isinstance(wrt, str):
         raise SimulationError(f"`wrt` is the text {wrt!r}, and must be a list, such as [{wrt!r}].")
     if parts.formation.motion is not None:
         raise SimulationError(
             "got a formation that changes, but derivatives are of constant ones; leave out "
-            "`motion` to tune, and give it to the runs afterwards."
+            "`motion` here, and give it to the runs afterwards."
         )
     if parts.world.network is not None:
         raise SimulationError("got a network, but derivatives are of messages that are never late.")
     if parts.drive.safety is not None:
         raise SimulationError("got `safety`, but derivatives are of agents that do not keep apart.")
     with precision("float64"):
-        prepared = _take(parts, settings, tuple(wrt))
-        result = choose_engine(
-            settings,
-            len(prepared.run.states),
-            lambda: prepared.native_gradient(cost),
-            lambda reason: by_jax(prepared.run, settings.steps, cost, reason),
-            _WORTH,
-        )
-    _give_back(prepared)
-    return result
-
-
-# ---- runs prepared for later calls ---------------------------------------------------------------
-
-
-_MOST_RUNS, _MOST_BYTES = 4, 128 * 2**20
-"""Most runs cached for later calls, and the most bytes of them together."""
-_cache = BoundedCache["_PreparedRun"](_MOST_RUNS, lambda run: run.size, _MOST_BYTES)
-
-
-def _take(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> "_PreparedRun":
-    """Return a prepared run, taken from the cache if it is there."""
-    key = content_of(parts, settings, wrt)
-    # Out of the cache while in use: another thread must not change its gain meanwhile.
-    cached = _cache.pop(key)
-    if cached is None or not cached.update(parts):
-        return _PreparedRun(parts, settings, wrt, key)
-    return cached
-
-
-def _give_back(run: "_PreparedRun") -> None:
-    """Put a run into the cache for the next call."""
-    if run.key is not None:
-        _cache.put(run.key, run)
-
-
-@final
-class _PreparedRun:
-    """A checked run that can be differentiated many times, also with another gain."""
-
-    def __init__(
-        self, parts: Parts, settings: Settings, wrt: tuple[str, ...], key: Hashable | None
-    ) -> None:
         # No frame is stored, and no cost depends on who is closest.
-        self.key, self.wrt, prepared = key, wrt, prepare(parts, settings._replace(store_every=1))
-        self.problem, drive = copied((prepared.problem, prepared.parts.drive))
-        values = values_of(self.problem, drive, wrt)
-        assert isinstance(drive, Laws)  # `values_of` rejects all others
-        self.drive = drive
-        loop = assemble(self.problem, self.drive.leader, self.drive.follower)
-        reference = sample_reference(prepared, 0, settings.steps)
-        self.run = DifferentiableRun(loop, values, self.problem.states, reference)
-        self.gain, self._native = digest(parts.drive.gain), None
-
-    def update(self, parts: Parts) -> bool:
-        """Replace the gain; return False if the parts differ in more than its numbers.
-
-        A law of the same form is not checked again.
-        """
-        gain = digest(parts.drive.gain)
-        if gain is not None and gain == self.gain:
-            return True
-        problem, leader, new = self.problem, self.drive.leader, copied(parts.drive)
-        assert isinstance(new, Laws)  # the key of the cache contains the type
-        follower = new.follower.prepared(problem.model, problem.graph)
-        drive = Laws(leader, follower.following(leader, problem.model))
+        prepared = prepare(parts, settings._replace(store_every=1))
+        problem, drive = prepared.problem, prepared.parts.drive
+        values = _values_of(problem, drive, wrt)
+        assert isinstance(drive, Laws)  # `_values_of` rejects all others
         loop = assemble(problem, drive.leader, drive.follower)
-        if not alike(loop, self.run.loop):
-            return False
-        drive.accept(problem)
-        values = values_of(problem, drive, self.wrt)
-        self.run, self.gain = self.run._replace(loop=loop, values=values), gain
-        if self._native is not None and not self._native.update(self.run):
-            self._native = None
-        return True
+        reference = sample_reference(prepared, 0, settings.steps)
+        (value, sums), slopes = _differentiate(
+            loop, values, problem.states, reference, settings.steps, cost
+        )
+    by_variable = {name: np.asarray(slope) for name, slope in slopes.items()}
+    for name in {"P", "R"} & by_variable.keys():
+        by_variable[name] = 0.5 * (by_variable[name] + by_variable[name].T)
+    return Gradient(float(value), by_variable, jax.tree.map(np.asarray, sums))
 
-    def native_gradient(self, cost: Cost) -> Gradient:
-        """Return the gradient of a cost by native code."""
-        if self._native is None:
-            self._native = Native(self.run, self.problem.settings.steps)
-        return self._native.gradient(cost)
 
-    @property
-    def size(self) -> int:
-        """Bytes stored from one call to the next."""
-        arrays = jax.tree.leaves((self.run, self.problem.graph.edges, self.problem.graph.weights))
-        size = sum(np.asarray(array).nbytes for array in arrays)
-        return size + (0 if self._native is None else self._native.size)
+def _values_of(problem: Problem, drive: Drive, wrt: Sequence[str]) -> dict[str, Array]:
+    """Return the values of the variables by name.
+
+    Raises:
+        SimulationError: no laws drive the run, the law has no gain, or a variable is unknown.
+    """
+    gain = drive.gain
+    if not isinstance(drive, Laws):
+        raise SimulationError(
+            f"a run driven by `{type(drive).__name__}` cannot be differentiated; use `Laws`."
+        )
+    available = {"initial": np.asarray(problem.states), "offsets": problem.formation.offsets}
+    if gain is not None:
+        available |= {"P": gain.P, "R": gain.R, "coupling": np.asarray(gain.coupling)}
+    for name in wrt:
+        if name in VARIABLES and name not in available:
+            law = type(drive.follower).__name__
+            raise SimulationError(f"the followers' law `{law}` has no gain, and so no `{name}`.")
+        check_name("`wrt` names", name, VARIABLES, SimulationError)
+    return {name: available[name] for name in wrt}
+
+
+def _cost_number(cost: Cost, sums: Sums) -> jax.Array:
+    """Return the cost of sums.
+
+    Raises:
+        SimulationError: it fails, or is not one number.
+    """
+    try:
+        value = cost(sums)
+    # The cost is the user's code, which may raise whatever it likes.
+    except Exception as error:
+        raise SimulationError(
+            f"the cost of a run fails with {error_summary(error)}; it must be a function of the "
+            "run's sums, written with `jax.numpy`."
+        ) from error
+    if (shape := jnp.shape(value)) != ():
+        raise SimulationError(
+            f"the cost of a run has shape {shape}, and must be one number, such as a sum of it."
+        )
+    return value
+
+
+@cached_jit
+def _differentiate(
+    loop: Loop,
+    values: dict[str, Array],
+    states: Array,
+    reference: Array | None,
+    steps: int,
+    cost: Cost,
+) -> tuple[tuple[jax.Array, Sums], dict[str, jax.Array]]:
+    """Return the cost, the sums of the run, and the slopes."""
+
+    def whole(values: dict[str, jax.Array]) -> tuple[jax.Array, Sums]:
+        start = jnp.asarray(values.get("initial", states))
+        changed = _with_offsets(_with_gain(loop, values), values)
+        sums = _sums(changed, start, reference, steps)
+        return _cost_number(cost, sums), sums
+
+    return jax.value_and_grad(whole, has_aux=True)(jax.tree.map(jnp.asarray, values))
+
+
+def _with_gain(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
+    """Return the loop with other numbers in the followers' gain."""
+    numbers = {name: values[name] for name in ("P", "R", "coupling") if name in values}
+    if "R" in numbers:
+        numbers["R_inverse"] = jnp.linalg.inv(numbers["R"])
+
+    def places(loop: Loop) -> list[Array]:
+        law: Any = loop.follower
+        return [getattr(law.gain, name) for name in numbers]
+
+    return eqx.tree_at(places, loop, [*numbers.values()]) if numbers else loop
+
+
+def _with_offsets(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
+    """Return the loop with other offsets of the goals."""
+    if "offsets" not in values:
+        return loop
+    offsets, meter = values["offsets"], loop.meter
+    i, j = (offsets[ends][:, np.array(meter.measured)] for ends in meter.edges.T)
+    spacings = distance_of(((i - j) ** 2).sum(axis=1))
+
+    def places(loop: Loop) -> list[Array]:
+        return [loop.offsets, loop.meter.offsets, loop.meter.spacings]
+
+    return eqx.tree_at(places, loop, [offsets, offsets, spacings])
+
+
+def _sums(loop: Loop, states: jax.Array, reference: Array | None, steps: int) -> Sums:
+    """Return the sums over the steps of a run."""
+
+    def one(carry: tuple[Moment, Sums], _: None) -> tuple[tuple[Moment, Sums], None]:
+        now, sums = measured_step(loop, carry[0], reference, 0)
+        return (now, carry[1].plus(sums)), None
+
+    @jax.checkpoint
+    def several(carry: tuple[Moment, Sums], _: None) -> tuple[tuple[Moment, Sums], None]:
+        return jax.lax.scan(one, carry, None, length=few)
+
+    # Checkpoints and the steps after each are then equally many: the least memory.
+    few = max(1, math.isqrt(steps))
+    carry = begin(loop, states), loop.meter.zero_sums()
+    carry, _ = jax.lax.scan(several, carry, None, length=steps // few)
+    return jax.lax.scan(one, carry, None, length=steps % few)[0][1]

@@ -8,7 +8,7 @@ import jax
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.reach import lost_at_times
+from echelon.agents.network.matrices import lost_at_times
 from echelon.agents.world.world import World
 from echelon.core.errors import (
     EchelonError,
@@ -22,9 +22,8 @@ from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.flat_loop import FlatMemory
-from echelon.laws.known_law import information_of, unknown_class
 from echelon.laws.law import Law, gain_of
-from echelon.laws.law_check import leader_warnings, prepare_law
+from echelon.laws.law_check import information_of, leader_warnings, prepare_law, unknown_class
 from echelon.laws.safety import Safety
 from echelon.laws.safety_check import check_numbers, hulls_at, separations, too_near
 from echelon.simulation.engine.jax_stepper import JaxStepper
@@ -250,7 +249,7 @@ class Laws(Drive):
         """
         if problem.settings.engine == "native":
             loop = assemble(problem, self.leader, self.follower)
-            choose_engine(problem.settings, 0, lambda: BlockRows.of(loop), _no_rows)
+            choose_engine(problem.settings, 0, lambda: BlockRows.of(loop), lambda _: None)
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws, and of what they cannot follow or do not hear."""
@@ -308,11 +307,6 @@ class Laws(Drive):
         )
 
 
-def _no_rows(_: str) -> BlockRows | None:
-    """Return nothing, in place of what native code needs."""
-    return None
-
-
 _WORTH = 100_000
 """Agent steps above which native code saves more than its compilation takes, one second."""
 _R = TypeVar("_R")
@@ -323,7 +317,6 @@ def choose_engine(
     agents: int,
     native: Callable[[], _R],
     by_jax: Callable[[str], _R],
-    least: int = _WORTH,
 ) -> _R:
     """Return the result of one of the two engines for so many agents.
 
@@ -332,12 +325,11 @@ def choose_engine(
         agents: how many.
         native: computes it by native code.
         by_jax: computes it by JAX; takes why there is no native code, empty where none is needed.
-        least: from how many steps of one agent on native code pays.
 
     Raises:
         SimulationError: native code is requested, and there is none.
     """
-    if not worth_native(settings, agents, least):
+    if not worth_native(settings, agents):
         return by_jax("")
     try:
         return native()
@@ -347,21 +339,21 @@ def choose_engine(
         return by_jax(_in_words(error))
 
 
-def worth_native(settings: Settings, agents: int, least: int = _WORTH) -> bool:
+def worth_native(settings: Settings, agents: int) -> bool:
     """Tell whether native code steps the agents: if it is requested, or saves time.
 
-    It computes on processors alone, and `least` is from how many steps of one agent on it pays.
+    It computes on processors alone.
     """
     if settings.engine != "auto":
         return settings.engine == "native"
-    if settings.devices > 1 or not is_long(settings, agents, least):
+    if settings.devices > 1 or not is_long(settings, agents):
         return False
     return is_installed() and jax.default_backend() == "cpu"
 
 
-def is_long(settings: Settings, agents: int, least: int = _WORTH) -> bool:
+def is_long(settings: Settings, agents: int) -> bool:
     """Tell whether a run is long enough for more compilation than that of its JAX steps."""
-    return settings.engine == "native" or settings.steps * agents >= least
+    return settings.engine == "native" or settings.steps * agents >= _WORTH
 
 
 def _in_words(error: EchelonError) -> str:

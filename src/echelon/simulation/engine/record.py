@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float
 
 from echelon.core.errors import Outcome
 from echelon.core.types import Array
-from echelon.simulation.engine.divergence import finite_formations
-from echelon.simulation.engine.grid import ChunkGrid
+from echelon.simulation.engine.chunk_grid import ChunkGrid, finite_formations
 from echelon.simulation.step.drive import Chunk, Problem, numbers
 from echelon.simulation.step.meter import ALWAYS, Meter, Sums, on_host, outside
 

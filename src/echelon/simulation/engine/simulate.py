@@ -13,8 +13,7 @@ from echelon.core.errors import Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.trace import shared_traces
 from echelon.core.types import Array
-from echelon.simulation.engine.divergence import advance_until_lost
-from echelon.simulation.engine.grid import ChunkGrid
+from echelon.simulation.engine.chunk_grid import ChunkGrid, advance_until_lost
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared, prepare
 from echelon.simulation.engine.record import Record, Recorder, Stretch, join
@@ -101,7 +100,10 @@ def simulate(
         prepared.parts.drive.check_engine(prepared.problem)
         # Plans and solvers need float64, also in a float32 run.
         stepper = prepared.parts.drive.stepper(prepared.problem)
-    _check_devices(settings, stepper)
+    if settings.devices != stepper.devices:
+        raise SimulationError(
+            f"`devices` is {settings.devices}, and must be 1 where a solver drives the agents."
+        )
     with precision(settings.precision), _mixed_tables():
         recorder = _recorder(prepared, stepper, before)
         _ChunkLoop(stepper, prepared, recorder, began).run(progress, keep)
@@ -123,13 +125,6 @@ def _mixed_tables() -> Iterator[None]:
             "JAX keeps one precision of each NumPy array that a model or law passes to a function "
             "such as `jnp.interp`, and uses it in both; write `jnp.asarray(array)` there."
         ) from error
-
-
-def _check_devices(settings: Settings, stepper: Stepper) -> None:
-    if settings.devices != stepper.devices:
-        raise SimulationError(
-            f"`devices` is {settings.devices}, and must be 1 where a solver drives the agents."
-        )
 
 
 def reassemble(parts: Parts, settings: Settings, stretches: Sequence[Stretch]) -> Result:

@@ -4,7 +4,8 @@ It is traced from the same laws, model, integrator and meter that `step.loop` ru
 """
 
 import functools
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -14,9 +15,16 @@ import numpy as np
 from echelon.core.types import Array, PyTree
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.codegen import Body, factored
-from echelon.simulation.native.exceptions import exceptions_of
 from echelon.simulation.native.varying import VaryingNumbers
-from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
+from echelon.simulation.scalars import (
+    Node,
+    ScalarGraph,
+    Unsupported,
+    lower,
+    may_be_exception,
+    needed,
+    nodes,
+)
 from echelon.simulation.step.action import act, feedforward_of, limit_sides
 from echelon.simulation.step.loop import Loop
 
@@ -78,7 +86,8 @@ class BlockRows(NamedTuple):
         sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m]
         sizes += [message_size(loop), m, varying]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q, 1]
-        return cls(*row_ranges(sizes))
+        ends = np.cumsum([0, *sizes]).tolist()
+        return cls._make([*(range(a, b) for a, b in itertools.pairwise(ends)), ends[-1]])
 
 
 def check_information(loop: Loop) -> None:
@@ -131,12 +140,6 @@ def unflatten(like: PyTree, flat: Array | jax.Array) -> PyTree:
     return tree.unflatten(
         [flat[..., a:b].reshape((*flat.shape[:-1], *np.shape(leaf))) for leaf, a, b in parts]
     )
-
-
-def row_ranges(sizes: Sequence[int]) -> list[Any]:
-    """Return the ranges of rows of so many numbers each, one after the other, and the last row."""
-    ends = np.cumsum([0, *sizes]).tolist()
-    return [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
 
 
 def message_size(loop: Loop) -> int:
@@ -243,12 +246,7 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
 
 
 def body_of(
-    varying: VaryingNumbers,
-    bits: int,
-    rows: BlockRows,
-    leads: bool,
-    follows: bool,
-    in_table: bool = False,
+    varying: VaryingNumbers, bits: int, rows: BlockRows, leads: bool, follows: bool
 ) -> Body:
     """Return what the leaders or all others compute in a step.
 
@@ -258,19 +256,19 @@ def body_of(
         rows: where the numbers of an agent are.
         leads: whether it is the body of the leaders.
         follows: whether they follow a reference, which is in the table.
-        in_table: whether the varying numbers are the same for all agents, and in the table behind.
 
     Raises:
         Unsupported: the law or the model has no scalar operations.
     """
     graph, loop = ScalarGraph(bits), varying.loop
     law = loop.leader if leads else loop.follower
-    inputs = step_inputs(loop, graph, rows, law, leads, follows)
+    inputs = _step_inputs(loop, graph, rows, law, leads, follows)
 
     def step(leaves: list[jax.Array], inputs: StepInputs) -> StepOutputs:
         return agent_step(varying.filled(leaves), leads)(inputs)
 
-    results = lower(step, graph, [varying_leaves(varying, graph, rows, follows, in_table), inputs])
+    leaves = varying.leaves(leaves_of(graph, "row", rows.varying))
+    results = lower(step, graph, [leaves, inputs])
     shapes = jax.tree.structure(StepOutputs(*[0] * 15)._replace(memory=law.init()))
     outputs: StepOutputs = shapes.unflatten([nodes(graph, part) for part in results])
     memory = jax.tree.leaves(outputs.memory, is_leaf=lambda part: isinstance(part, list))
@@ -278,7 +276,11 @@ def body_of(
     # Where no limit is, nothing was ever cut.
     if any(node is not graph.constant(0.0) for node in outputs.cut):
         stores["cut"] = outputs.cut
-    stores["unsettled"] = _last_steps(graph, rows.unsettled, outputs.unsettled)
+    # Steps ascend, so that the later one replaces the earlier one; -1 is no step.
+    earlier = leaves_of(graph, "row", rows.unsettled)
+    none = [graph.make("lt", step, 0.0) for step in outputs.unsettled]
+    pairs = zip(none, earlier, outputs.unsettled, strict=True)
+    stores["unsettled"] = [graph.make("select", *each) for each in pairs]
     # Unless inputs are passed on from parents, nobody reads the message of a follower.
     if leads or loop.levels is not None:
         stores["message"] = outputs.message
@@ -302,16 +304,6 @@ def body_of(
     return body.map_nodes(factored(body.all()))
 
 
-def _last_steps(graph: ScalarGraph, rows: range, steps: list[Node]) -> list[Node]:
-    """Return the last steps of which rows are the earlier ones; -1 is no step.
-
-    Steps ascend, so that the later one replaces the earlier one.
-    """
-    before = leaves_of(graph, "row", rows)
-    none = [graph.make("lt", step, 0.0) for step in steps]
-    return [graph.make("select", *each) for each in zip(none, before, steps, strict=True)]
-
-
 def _before_and_in_window(inputs: StepInputs, sums: list[Node]) -> list[Node]:
     """Return a number for all steps and for the steady window as one before and one in the window.
 
@@ -319,15 +311,6 @@ def _before_and_in_window(inputs: StepInputs, sums: list[Node]) -> list[Node]:
     """
     all_, steady = sums
     return [all_.graph.make("select", inputs.steady[()], 0.0, all_), steady]
-
-
-def varying_leaves(
-    varying: VaryingNumbers, graph: ScalarGraph, rows: BlockRows, follows: bool, in_table: bool
-) -> list[np.ndarray]:
-    """Return the leaves of a loop that have varying numbers: in rows, or in the table."""
-    begin = len(rows.state) if follows else 0
-    places = range(begin, begin + varying.count) if in_table else rows.varying
-    return varying.leaves(leaves_of(graph, "table" if in_table else "row", places, in_table))
 
 
 def _difference(loop: Loop, graph: ScalarGraph, states: int, signals: int) -> list[Node]:
@@ -340,7 +323,7 @@ def _difference(loop: Loop, graph: ScalarGraph, states: int, signals: int) -> li
     return [*nodes(graph, difference), *(graph.make("sub", a, b) for a, b in plain)]
 
 
-def step_inputs(
+def _step_inputs(
     loop: Loop, graph: ScalarGraph, rows: BlockRows, law: Law, leads: bool, follows: bool
 ) -> StepInputs:
     """Return what a step depends on as leaves of a graph."""
@@ -396,3 +379,38 @@ def _placed(rows: BlockRows, named: dict[str, list[Node]]) -> dict[int, Node]:
         for name, entries in named.items()
         for row, node in zip(getattr(rows, name), entries, strict=name != "memory")
     }
+
+
+# ---- where the numbers of an agent are not what JAX computes -------------------------------------
+
+
+_SIZES = (1e9, 1e6, 1e3)
+"""Sizes of what neighbours read, of which the first is taken for which a difference is right."""
+
+
+def exceptions_of(graph: ScalarGraph, body: Body) -> list[Node]:
+    """Return where the numbers of an agent are not what JAX computes.
+
+    Raises:
+        Unsupported: nothing is known of the angles in a difference.
+    """
+    truths, false = graph.exceptions_of(body.results()), graph.constant(False)
+    truths += _between(graph, body)
+    uniform = [truth for truth in truths if truth.uniform]
+    truths = [truth for truth in truths if not truth.uniform]
+    # One truth of a step for all agents.
+    return [*truths, functools.reduce(functools.partial(graph.make, "or"), uniform, false)]
+
+
+def _between(graph: ScalarGraph, body: Body) -> Iterator[Node]:
+    """Yield where what neighbours read of an agent is too large for the differences of two."""
+    inside = [node for node in needed(body.difference) if node in graph.exceptions]
+    if not inside:
+        return
+    for size in _SIZES:
+        if not any(may_be_exception(graph, node, size) for node in inside):
+            break
+    else:
+        raise Unsupported("a `difference` with angles of which no bound is known")
+    for mine in body.mirror_before:
+        yield graph.make("lt", size, graph.make("abs", mine))

@@ -5,20 +5,11 @@ from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias, final
 
 import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
 
-from echelon.agents.network.exchange import Exchange
 from echelon.core.types import Array
-from echelon.simulation.codegen import Plan, aligned, stride
-from echelon.simulation.native.agent_order import (
-    first_places,
-    grouped,
-    is_large,
-    nearby,
-    ordered,
-    windows,
-)
-from echelon.simulation.native.contiguity import contiguous_blocks, follow, mark_shifted
-from echelon.simulation.native.schedule import BlockReach
+from echelon.simulation.codegen import SHIFTED, Plan, aligned, stride
 from echelon.simulation.step.loop import Loop
 
 
@@ -53,6 +44,20 @@ class Neighbourhood(NamedTuple):
 
 Shifts: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
 """How many positions neighbours, and the ends of edges, are away in most blocks."""
+
+
+class BlockReach(NamedTuple):
+    """How far apart blocks are that depend on each other.
+
+    Attributes:
+        reach: the most blocks between neighbours, or between the ends of a block of edges.
+        edges: (edge blocks,) the first block that each of them needs, ascending.
+        bytes: of a block with all arrays that belong to it.
+    """
+
+    reach: int
+    edges: Array
+    bytes: int
 
 
 class Places(abc.ABC):
@@ -121,7 +126,7 @@ _SAMPLE = 1_000
 """Blocks from which the share of contiguous ones is estimated."""
 
 
-def senders_of(loop: Loop) -> Array:
+def _senders_of(loop: Loop) -> Array:
     """Return the sender of each agent's message, (N,)."""
     if loop.parents is None:
         return np.asarray(loop.meter.nearest)
@@ -148,7 +153,9 @@ class SwarmBlocks(Places):
         contiguous, self.row_major = self._contiguous(self.slots)
         self.contiguous = contiguous.astype(np.int8)
         self._order_edges()
-        self.contiguous_edges = self._contiguous_edges()
+        ends = self.edge_ends().reshape(-1, 2, self.lanes)
+        leads = (ends < self.segments[1] * self.lanes).any(axis=(1, 2))
+        self.contiguous_edges = np.asarray(follow(ends).all(axis=1) & ~leads, np.int8)
         if self.row_major:
             starts = 2 * np.arange(self.edge_blocks + 1)
             self.shifts = (
@@ -185,12 +192,12 @@ class SwarmBlocks(Places):
         loop, lanes = self.loop, self.lanes
         far = 1 if self.row_major else stride(width, lanes)
         starts, positions, weights = self.slots
-        sources = self.position[senders_of(loop)[self.agents]]
+        sources = self.position[_senders_of(loop)[self.agents]]
         nearest = np.asarray(loop.meter.nearest)[self.agents]
         return Neighbourhood(
             starts,
             np.ascontiguousarray(positions * far, np.int32),
-            aligned_copy(weights, dtype),
+            _aligned_copy(weights, dtype),
             ((sources // lanes) * rows * lanes + sources % lanes).astype(np.int32),
             (self.position[nearest] * far).astype(np.int32),
             *edge_blocks(loop, self, dtype, far),
@@ -203,11 +210,6 @@ class SwarmBlocks(Places):
         edges = np.asarray(self.loop.meter.edges)[self.edge_order]
         ends = np.resize(self.position[edges], (self.edge_blocks * self.lanes, 2))
         return ends.reshape(-1, self.lanes, 2).swapaxes(1, 2).reshape(-1, self.lanes)
-
-    def _contiguous_edges(self) -> Array:
-        ends = self.edge_ends().reshape(-1, 2, self.lanes)
-        leads = (ends < self.segments[1] * self.lanes).any(axis=(1, 2))
-        return np.asarray(follow(ends).all(axis=1) & ~leads, np.int8)
 
     def measure_reach(self, neighbourhood: Neighbourhood, far: int, bytes_: int) -> None:
         """Measure the reach of blocks of so many bytes, with agents `far` numbers apart."""
@@ -260,8 +262,8 @@ class FormationBlocks(Places):
         return Neighbourhood(
             starts,
             (positions * far).astype(np.int32),
-            aligned_copy(np.broadcast_to(weights, (*weights.shape[:2], lanes)), dtype),
-            (place[senders_of(loop)[self.swarm.agents]] * rows * lanes).astype(np.int32),
+            _aligned_copy(np.broadcast_to(weights, (*weights.shape[:2], lanes)), dtype),
+            (place[_senders_of(loop)[self.swarm.agents]] * rows * lanes).astype(np.int32),
             (place[np.asarray(loop.meter.nearest)[self.swarm.agents]] * far).astype(np.int32),
             self._edges(dtype),
             np.ascontiguousarray(ends, np.int32),
@@ -291,7 +293,7 @@ class FormationBlocks(Places):
         return by_formation[: len(self.loops)].reshape(-1)
 
 
-def aligned_copy(values: Array, dtype: np.dtype | type) -> Array:
+def _aligned_copy(values: Array, dtype: np.dtype | type) -> Array:
     """Return numbers in memory that is aligned for whole vectors."""
     copy = aligned(values.shape, dtype)
     copy[:] = values
@@ -299,24 +301,20 @@ def aligned_copy(values: Array, dtype: np.dtype | type) -> Array:
 
 
 def neighbour_slots(
-    loop: Loop,
-    places: Places,
-    exchange: Exchange | None = None,
-    blocks: Array | slice = slice(None),
+    loop: Loop, places: Places, blocks: Array | slice = slice(None)
 ) -> tuple[Array, Array, Array]:
     """Return the neighbours of each agent, slot by slot: the k-th neighbour of each of a block.
 
     Args:
         loop: of the agents.
         places: of the agents.
-        exchange: edges; by default those of the loop.
         blocks: for which neighbours are returned.
 
     Returns:
         The first slot of each block (blocks + 1,), and of all slots the positions (slots, lanes)
         and weights (rows, slots, lanes).
     """
-    exchange, place = exchange or loop.exchange, places.position.astype(np.int32)
+    exchange, place = loop.exchange, places.position.astype(np.int32)
     # By position and not by number, so that memory is read from end to end.
     first, order = grouped(place[np.asarray(exchange.receivers)], len(places.agents))
     senders = place[np.asarray(exchange.senders)][order]
@@ -357,3 +355,145 @@ def edge_blocks(loop: Loop, places: SwarmBlocks, dtype: np.dtype, far: int) -> t
     rows[:, q] = np.resize(spacings, blocks * lanes).reshape(blocks, lanes)
     ends = places.edge_ends().reshape(blocks, 2, lanes) * far
     return rows, np.ascontiguousarray(ends, np.int32)
+
+
+# ---- the order of agents in memory ---------------------------------------------------------------
+
+
+_WINDOW = 256
+"""Agents among which those of one degree are grouped: so few stay near each other."""
+_LARGE = 10_000
+"""Agents from which on their numbers do not stay in a processor's cache."""
+
+
+def is_large(agents: int) -> bool:
+    """Tell whether the order of so many agents matters."""
+    return agents >= _LARGE
+
+
+def ordered(loop: Loop, lanes: int, near: Array, degrees: Array | None) -> tuple[Array, Array]:
+    """Return the agents in the order in which they act, and the first block of each level.
+
+    In a level they are in the order `near` of all agents, and within windows of it by their degrees
+    if these are given. A level fills its last block with copies of its last agent, which compute
+    the same and are not read.
+    """
+    levels = [loop.followers]
+    if loop.levels is not None:
+        levels = [loop.followers[np.unique(row)] for row in loop.levels]
+    levels = [_among(near, level) for level in levels]
+    if degrees is not None:
+        levels = [level[np.argsort(windows(degrees[level]), kind="stable")] for level in levels]
+    filled = [np.append(a, np.repeat(a[-1:], -len(a) % lanes)) for a in (loop.leaders, *levels)]
+    segments = np.cumsum([0, *(len(a) // lanes for a in filled)]).astype(np.int64)
+    return np.concatenate(filled), segments
+
+
+def _among(order: Array, some: Array) -> Array:
+    """Return some agents in an order of all."""
+    which = np.zeros(len(order), bool)
+    which[some] = True
+    return order[which[order]]
+
+
+def windows(degrees: Array) -> Array:
+    """Return sort keys of agents: window after window, in each by their degrees."""
+    return np.arange(len(degrees)) // _WINDOW * (degrees.max(initial=0) + 1) + degrees
+
+
+def nearby(loop: Loop) -> Array:
+    """Return the agents in an order in which neighbours are near each other.
+
+    It is their own order if that is as good, and for few agents. The numbers of a neighbour that
+    was stepped long ago come from main memory: a swarm in random order takes three times as long.
+    """
+    agents = len(loop.offsets)
+    original = np.arange(agents)
+    if not is_large(agents):
+        return original
+    i, j = np.asarray(loop.meter.edges, np.int32).T
+    # Both directions: the order needs a symmetric pattern.
+    starts, order = grouped(np.concatenate([i, j]), agents)
+    ends = np.concatenate([j, i])[order]
+    links = sp.csr_array((np.ones(len(ends)), ends, starts), shape=(agents, agents))
+    # By the distance from an agent at an end of the graph: neighbours are then at most about two
+    # layers apart, and layers are small if they begin at an end.
+    end = csgraph.breadth_first_order(links, 0, return_predecessors=False)[-1]
+    order = csgraph.breadth_first_order(links, end, return_predecessors=False)
+    rank = np.empty(agents, np.int32)
+    rank[order] = original
+    better = np.abs(rank[i] - rank[j]).sum(dtype=int) < np.abs(i - j).sum(dtype=int)
+    return np.asarray(order, int) if better else original
+
+
+def grouped(keys: Array, count: int) -> tuple[Array, Array]:
+    """Return where each number below `count` begins among the sorted keys, and the order of these.
+
+    The order is stable. It takes a fifth of the time of a sort.
+    """
+    # Conversion of a matrix with one entry a column counts its rows, and fills them in order.
+    entries = np.ones(len(keys), np.int8), keys.astype(np.int32), np.arange(len(keys) + 1)
+    rows = sp.csc_array(entries, shape=(count, len(keys))).tocsr()
+    return rows.indptr, rows.indices
+
+
+def first_places(agents: Array) -> Array:
+    """Return the position of each agent; of copies, that of the first."""
+    position = np.empty(agents.max() + 1, int)
+    # If a place is written twice, the last value stays.
+    position[agents[::-1]] = np.arange(len(agents))[::-1]
+    return position
+
+
+# ---- blocks whose neighbours follow each other in memory -----------------------------------------
+
+
+_MOSTLY = 0.75
+"""The share of blocks with contiguous neighbours from which on a row-major mirror is faster, and of
+blocks with the same shifts for which code is written."""
+_MOST_SHIFTS = 6
+"""Slots that are written one by one: an agent of a grid has four."""
+
+
+def contiguous_blocks(starts: Array, positions: Array, leaders: int = 0) -> tuple[Array, bool]:
+    """Return which blocks have contiguous neighbours in all slots, and whether row-major is faster.
+
+    If it is not, return which blocks have no leader among their neighbours, of so many positions.
+    """
+    block = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+
+    def all_(slots: Array) -> Array:
+        return np.bincount(block, ~slots, len(starts) - 1) == 0
+
+    contiguous = all_(np.logical_and(follow(positions), positions[:, 0] >= leaders))
+    # To gather a number lane by lane costs several times as much as to load contiguous ones.
+    if contiguous.mean() > _MOSTLY:
+        return contiguous, True
+    return all_(np.asarray((positions >= leaders).all(axis=1))), False
+
+
+def mark_shifted(starts: Array, positions: Array, contiguous: Array) -> tuple[int, ...]:
+    """Return how many positions the neighbours of most blocks are away; mark those `SHIFTED`.
+
+    There are none if blocks differ, or have many slots. The arguments are those of
+    `contiguous_blocks`, and its result as whole numbers.
+    """
+    sizes, lanes = np.diff(starts), positions.shape[1]
+    size = int(np.bincount(sizes[contiguous > 0]).argmax()) if contiguous.any() else 0
+    if not 0 < size <= _MOST_SHIFTS:
+        return ()
+    some = np.flatnonzero((contiguous > 0) & (sizes == size))
+    first = positions[starts[some][:, None] + np.arange(size), 0]
+    kinds, kind, counts = np.unique(
+        first - some[:, None] * lanes, axis=0, return_inverse=True, return_counts=True
+    )
+    most = counts.argmax()
+    if counts[most] < _MOSTLY * len(contiguous):
+        return ()
+    contiguous[some[kind.reshape(-1) == most]] = SHIFTED
+    return tuple(kinds[most].tolist())
+
+
+def follow(positions: Array) -> Array:
+    """Return which of some lists of positions (..., lanes) are consecutive numbers."""
+    return (np.diff(positions, axis=-1) == 1).all(axis=-1)

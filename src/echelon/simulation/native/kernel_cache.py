@@ -1,13 +1,11 @@
 """Compiled kernels, shared by loops that differ only in their numbers."""
 
-from collections.abc import Callable
-from typing import NamedTuple, TypeAlias, final
+from typing import NamedTuple, final
 
 import jax
 import numpy as np
 
-from echelon.core import disk_cache
-from echelon.core.memoize import BoundedCache
+from echelon.core.cache import BoundedCache
 from echelon.core.numerics import precision
 from echelon.simulation.codegen import Code, Plan, has_flag, program, shared
 from echelon.simulation.native.agent_step import BlockRows, body_of, signal_size
@@ -17,7 +15,7 @@ from echelon.simulation.step.loop import Loop
 
 LANES = {64: 8, 32: 16}
 """Vectors of 512 bits; where a processor's are shorter, LLVM takes two."""
-MOST = 8
+_MOST = 8
 """Kernels, and codes, that are cached."""
 
 
@@ -51,11 +49,10 @@ def plan_of(
     batched: bool,
     row_major: bool,
     weighted: bool,
-    in_table: bool,
     apart: bool = True,
     shifts: Shifts = ((), ()),
 ) -> Plan:
-    """Return the plan of some loops; their varying numbers may be in the table (`in_table`).
+    """Return the plan of some loops.
 
     `apart` is false if all agents of each loop have one goal; `shifts` are those of their places.
 
@@ -71,8 +68,8 @@ def plan_of(
         row_major=row_major,
         rows=rows.total,
         width=n + signal_size(loop),
-        first=body_of(varying, bits, rows, True, tracks, in_table),
-        others=body_of(varying, bits, rows, False, tracks, in_table),
+        first=body_of(varying, bits, rows, True, tracks),
+        others=body_of(varying, bits, rows, False, tracks),
         message_start=rows.message.start,
         message_size=len(rows.message),
         one_source=one_leader and loop.parents is None,
@@ -83,7 +80,7 @@ def plan_of(
         shifts=shifts[0],
         edge_shifts=shifts[1],
         exception_row=rows.exception.start,
-        table=(n if tracks else 0) + (varying.count if in_table else 0),
+        table=n if tracks else 0,
         dt=loop.motion.dt,
         tape_rows=len(loop.meter.paired),
     )
@@ -97,14 +94,9 @@ def compiled(rows: BlockRows, plan: Plan, codes: BoundedCache[Code]) -> Kernel:
 
     `codes` are those compiled before, by their texts: other graphs are other numbers in the same.
     """
-    # In the folder where JAX keeps compiled code, so that one setting applies to both.
     text = program(plan)
-    code = codes.get_or_make(text, lambda: Code(text, disk_cache.jax_folder()))
+    code = codes.get_or_make(text, lambda: Code(text))
     return Kernel(code, rows, plan, len(shared(plan)))
-
-
-Make: TypeAlias = Callable[[VaryingNumbers, int, bool, bool, bool, bool, Shifts], Kernel]
-"""Returns kernels, as `Kernels.of` does."""
 
 
 @final
@@ -121,7 +113,7 @@ class Kernels:
     def __init__(self) -> None:
         """Begin with an empty cache."""
         # A sweep over models has one after the other.
-        self.codes, self._kernels = BoundedCache[Code](MOST), BoundedCache[Kernel](MOST)
+        self.codes, self._kernels = BoundedCache[Code](_MOST), BoundedCache[Kernel](_MOST)
 
     def of(
         self,
@@ -146,7 +138,7 @@ class Kernels:
 
         def make() -> Kernel:
             rows = BlockRows.of(varying.loop, varying.count)
-            plan = plan_of(varying, rows, bits, batched, row_major, weighted, False, apart, shifts)
+            plan = plan_of(varying, rows, bits, batched, row_major, weighted, apart, shifts)
             return compiled(rows, plan, self.codes)
 
         return self._kernels.get_or_make(None if signature is None else key, make)

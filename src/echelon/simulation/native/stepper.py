@@ -1,5 +1,7 @@
 """Steps the closed loop by machine code, with agents in the lanes of vectors."""
 
+import math
+import sys
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from functools import cached_property
@@ -10,28 +12,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from echelon.agents.world.disturbance import Wind, draw
 from echelon.core.types import Array
 from echelon.simulation.codegen import aligned, stride
 from echelon.simulation.native.agent_step import signal_size, unflatten
 from echelon.simulation.native.blocks import FormationBlocks, Places, SwarmBlocks, neighbour_slots
-from echelon.simulation.native.buffers import BufferPool
-from echelon.simulation.native.kernel_cache import KERNELS, LANES, Make
+from echelon.simulation.native.kernel_cache import KERNELS, LANES
 from echelon.simulation.native.pair_watch import PairWatch
-from echelon.simulation.native.signals import mirror_values, offsets_of
 from echelon.simulation.native.threads import ThreadPool
 from echelon.simulation.native.varying import VaryingNumbers
-from echelon.simulation.native.wind_draws import draw_holds, holds_at_once
 from echelon.simulation.scalars import needed
 from echelon.simulation.step.drive import Chunk, Stepper
 from echelon.simulation.step.loop import Loop, Moment, begin_forgetful, stretch_at
 from echelon.simulation.step.meter import ALWAYS, Sums
-from echelon.simulation.step.sequence import begin
+from echelon.simulation.step.sequence import begin, signals
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Agent steps of a chunk, which take some hundredths of a second, and its fewest steps."""
 _OPERATIONS, _ENOUGH = {64: 3e10, 32: 6e10}, 1_000
 """Operations of a chunk with at most so many steps: about a second of one thread."""
-STEPS, _TASKS, _LEADER_NUMBERS = 2_048, 200_000, 10_000_000
+_STEPS, _TASKS, _LEADER_NUMBERS = 2_048, 200_000, 10_000_000
 """Limits of a call: steps, each with its uniform values; tasks; stored numbers of leaders ahead."""
 
 
@@ -46,11 +46,9 @@ class NativeStepper(Stepper):
         fallback: repeats a chunk whose numbers are not what JAX computes; None if the caller
             does, by `Chunk.inexact`.
         pool: threads that step formations; None for the caller's only.
-        make: returns the kernel; by default from the cache of all runs.
         variant: a loop of the same structure: `turn` may change the numbers in which it differs,
             and the weights of edges; None if `turn` is not called.
         threads: that share the steps of one formation; by default depending on its size.
-        places: of the agents, if they were computed before.
 
     Raises:
         Unsupported: a law or the model has no scalar operations.
@@ -63,17 +61,15 @@ class NativeStepper(Stepper):
         bits: int,
         fallback: Stepper | None,
         pool: Executor | None = None,
-        make: Make | None = None,
         variant: Loop | None = None,
         threads: int | None = None,
-        places: Places | None = None,
     ) -> None:
         """Generate and compile the step."""
         self.varying = VaryingNumbers(loops, variant)
         self.loop, self.loops, self.states, self.fallback = loops[0], loops, states, fallback
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
         batched, lanes = len(loops) > 1, LANES[bits]
-        self.places: Places = places or (
+        self.places: Places = (
             FormationBlocks(loops, lanes) if batched else SwarmBlocks(self.loop, lanes)
         )
         self.threads, self.buffers = ThreadPool(self.places, pool, threads), BufferPool()
@@ -83,7 +79,7 @@ class NativeStepper(Stepper):
         self.followers = (first + self.loop.followers).reshape(-1)
         row_major, weights_change = self.places.row_major, variant is not None
         apart = weights_change or any(np.any(loop.meter.spacings) for loop in loops)
-        self.code, self.rows, self.plan, self.uniform_count = (make or KERNELS.of)(
+        self.code, self.rows, self.plan, self.uniform_count = KERNELS.of(
             self.varying, bits, batched, row_major, weights_change, apart, self.places.shifts
         )
         self._signals = signal_size(self.loop)
@@ -94,10 +90,9 @@ class NativeStepper(Stepper):
         # The moment in the blocks: a chunk that continues from it need not be written there.
         self._moment: Moment | None = None
         self._hold, self._fallback_step = -1, -1
-        self._tape: Array | None = None
         axes, count = len(self.loop.meter.paired), len(loops)
-        self._pairs = PairWatch(self.places, axes, count, self.dtype, STEPS)
-        self._draws_ahead = holds_at_once(len(states))
+        self._pairs = PairWatch(self.places, axes, count, self.dtype, _STEPS)
+        self._draws_ahead = max(1, min(_AHEAD, _AT_ONCE // len(states)))
 
     # ---- memory ----
 
@@ -190,10 +185,6 @@ class NativeStepper(Stepper):
         # Offsets, numbers and the wind are written with a moment.
         self._moment = None
 
-    def record(self, tape: Array | None, first: int) -> None:
-        """Record the steps from `first` on for derivatives: (steps, blocks, rows, lanes)."""
-        self._tape, self._tape_start = tape, first
-
     def _advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         self._clear_sums()
         first = int(now.step)
@@ -263,7 +254,11 @@ class NativeStepper(Stepper):
         count = self._draws_ahead
         first, at = number - number % count, number % count
         if first != self._hold - self._hold % count or self._hold < 0:
-            self._draws = draw_holds(self.loops, first + np.arange(count), hold)
+            # Numbers beyond the end of the run may wrap: they are not used.
+            steps = ((first + np.arange(count)) * hold).astype(np.int32)
+            winds = [loop.motion.wind for loop in self.loops]
+            drawn = _drawn(winds, steps, np.arange(len(self.loop.offsets)))
+            self._draws = [part if part is None else np.asarray(part) for part in drawn]
         self._hold = number
         for rows, part in zip((self.rows.push, self.rows.noise), self._draws, strict=True):
             if part is not None:
@@ -286,7 +281,6 @@ class NativeStepper(Stepper):
         now, after = self.mirrors
         firsts = {"rows": self.blocks, "mirror": now, "next_mirror": after, "edges": self.edges}
         tape = self._pairs.room(step, steps)
-        tape = tape if self._tape is None else self._tape[step - self._tape_start]
         if tape.size:
             values["tape_step"], firsts["tape"] = tape.size, tape
         uniform_values = np.empty(steps * self.uniform_count, self.dtype)
@@ -398,3 +392,107 @@ class NativeStepper(Stepper):
 def _total_and_window(sums: Array) -> Array:
     """Return the sums of all steps and of the steady window (2, N) from those before and in it."""
     return np.stack([sums[:, 0] + sums[:, 1], sums[:, 1]])
+
+
+# ---- what neighbours read of agents at a moment --------------------------------------------------
+
+
+def offsets_of(loops: Sequence[Loop], dtype: np.dtype) -> Float[Array, "N n"]:
+    """Return the goals' offsets of all agents, loop by loop."""
+    # Runs that differ only in their initial states share one loop, and are often thousands.
+    distinct = {id(loop): loop for loop in loops}
+    offsets = {k: np.asarray(loop.offsets, dtype) for k, loop in distinct.items()}
+    if len(offsets) == 1:
+        return np.tile(offsets[id(loops[0])], (len(loops), 1))
+    return np.concatenate([offsets[id(loop)] for loop in loops])
+
+
+def mirror_values(
+    loops: Sequence[Loop],
+    now: Moment,
+    x: Float[Array, "N n"],
+    offsets: Float[Array, "N n"],
+    with_signals: bool,
+) -> Float[Array, "N k"]:
+    """Return what neighbours read of all agents.
+
+    Args:
+        loops: of formations one after the other, with the same number of agents each.
+        now: the moment.
+        x: the states at that moment.
+        offsets: of their goals.
+        with_signals: whether they also send signals.
+    """
+    relative = x - offsets
+    if not with_signals:
+        return relative
+    counts = [len(loops[0].offsets), len(loops[0].leaders), len(loops[0].followers)]
+    sent = list[Array]()
+    for k, loop in enumerate(loops):
+        all_, leaders, others = (slice(k * count, (k + 1) * count) for count in counts)
+        mine = now._replace(
+            states=now.states[all_],
+            leader_memory=jax.tree.map(lambda leaf, some=leaders: leaf[some], now.leader_memory),
+            follower_memory=jax.tree.map(lambda leaf, some=others: leaf[some], now.follower_memory),
+        )
+        sent.append(np.asarray(signals(loop, mine, jnp.asarray(offsets[all_]))))
+    return np.concatenate([relative, np.concatenate(sent)], axis=1)
+
+
+# ---- wind and noise ------------------------------------------------------------------------------
+
+
+_AHEAD, _AT_ONCE = 64, 50_000
+"""Holding intervals that are drawn in a call, and the most draws; a call takes 0.5 ms."""
+
+
+@jax.jit
+def _drawn(
+    winds: Sequence[Wind | None], steps: jax.Array, agents: jax.Array
+) -> tuple[jax.Array | None, jax.Array | None]:
+    """Return what each wind adds to the rates (T, F, N, n) and noise to the inputs at T steps."""
+    many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
+    one = jax.vmap(draw, (None, None, 0))
+    return jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, None))(many, steps, agents)
+
+
+# ---- reused memory -------------------------------------------------------------------------------
+
+
+_MOST, _LARGE = 16, 2**20
+"""The most arrays of a pool, and their least bytes: smaller ones the system's allocator reuses."""
+
+
+def _holders(owners: list[Array], k: int) -> int:
+    """Return the number of references to one of some arrays, or to views of it."""
+    return sys.getrefcount(owners[k])
+
+
+_UNUSED = _holders([np.empty(0, np.uint8)], 0)
+
+
+@final
+class BufferPool:
+    """Returns arrays, in the memory of earlier ones without references, if there are any.
+
+    A large array with new pages costs more time than writing to it: a virtual machine gets them
+    from its host, which clears them.
+    """
+
+    def __init__(self) -> None:
+        """Begin with no memory."""
+        self._owners = list[Array]()
+
+    def empty(self, shape: tuple[int, ...], dtype: np.dtype | type) -> Array:
+        """Return an array with arbitrary numbers."""
+        kind, owners = np.dtype(dtype), self._owners
+        size = math.prod(shape) * kind.itemsize
+        if size < _LARGE:
+            return np.empty(shape, kind)
+        free = [k for k in range(len(owners)) if _holders(owners, k) == _UNUSED]
+        fits = [k for k in free if len(owners[k]) == size]
+        if not fits:
+            # Free memory of other sizes is from earlier runs, and is released.
+            in_use = [owner for k, owner in enumerate(owners) if k not in free][1 - _MOST :]
+            self._owners, fits = [*in_use, np.empty(size, np.uint8)], [-1]
+        return self._owners[fits[0]].view(kind).reshape(shape)

@@ -4,17 +4,19 @@ Or between one formation now and later, if its parameters are changed during a r
 """
 
 import dataclasses
-import operator
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any, final
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.identity import digest
+from echelon.core.cache import BoundedCache
+from echelon.core.identity import digest, process_key
 from echelon.core.types import Array, PyTree
 from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.settings import Settings
 
 
 def _separate_parts(loop: Loop) -> list[PyTree]:
@@ -62,9 +64,8 @@ class VaryingNumbers:
         flat = [self._flat, *(jax.tree.leaves(bare(loop)) for loop in others)]
         self._masks = [_differing(leaves) for leaves in zip(*flat, strict=True)]
         # Now: somebody may write to an array later, and code is generated from its present numbers.
-        constant = self._constant(self._flat)
-        self._digest = digest(constant)
-        self.signature = digest((self._tree.unflatten(constant), self._masks))
+        constant = self._tree.unflatten(self._constant(self._flat))
+        self.signature = digest((constant, self._masks))
         values = np.stack([self._values(leaves) for leaves in flat[: len(distinct)]])
         self.values = values[[places[id(loop)] for loop in loops]]
 
@@ -85,13 +86,6 @@ class VaryingNumbers:
     def count(self) -> int:
         """How many numbers differ."""
         return self.values.shape[1]
-
-    def covers(self, loop: Loop) -> bool:
-        """Tell whether a loop differs from the first only in these numbers."""
-        leaves, tree = jax.tree.flatten(bare(loop))
-        same = _forms(leaves, tree) == _forms(self._flat, self._tree)
-        # Functions have no digest: their bits are addresses.
-        return same and self._digest is not None and digest(self._constant(leaves)) == self._digest
 
     def replace_loop(self, loop: Loop) -> None:
         """Replace the loop by one that differs from it only in these numbers."""
@@ -131,16 +125,6 @@ class VaryingNumbers:
         )
 
 
-def alike(loop: Loop, other: Loop) -> bool:
-    """Tell whether two loops are equal except for the numbers in their leaves."""
-    return operator.eq(*(_forms(*jax.tree.flatten(bare(one))) for one in (loop, other)))
-
-
-def _forms(leaves: Sequence[object], tree: Any) -> tuple[object, ...]:
-    arrays = [np.asarray(leaf) for leaf in leaves]
-    return tree, *((array.dtype, array.shape) for array in arrays)
-
-
 def _differing(leaves: Sequence[Any]) -> Array:
     """Return which entries of a leaf are not equal in all loops."""
     # All other leaves are equal already: they are in the key of the program.
@@ -148,3 +132,66 @@ def _differing(leaves: Sequence[Any]) -> Array:
         return np.zeros(np.shape(leaves[0]), bool)
     stacked = np.stack([np.asarray(leaf, float) for leaf in leaves])
     return (stacked != stacked[0]).any(axis=0)
+
+
+# ---- loops that one program steps ----------------------------------------------------------------
+
+_MOST = 256
+"""Kinds of loops for which it is cached which numbers they read."""
+
+
+@final
+class ProgramKeys:
+    """Returns the keys of loops; which numbers a kind of loop reads is traced once."""
+
+    def __init__(self) -> None:
+        """Begin with an empty cache."""
+        self._fixed = BoundedCache[list[bool]](_MOST)
+
+    def of(self, loop: Loop, settings: Settings) -> Hashable:
+        """Return what is equal for all loops that one program can step.
+
+        It has the tree, all leaves that are not numbers, the times of the draws, and the numbers
+        that a reference, an initial memory, the weights or the difference of two states depend on.
+        """
+        leaves, tree = jax.tree.flatten(bare(loop))
+        wind = loop.motion.wind
+        draws = None if wind is None else (jax.tree.structure(wind), int(wind.window))
+        shapes = [np.shape(leaf) if is_number(leaf) else leaf for leaf in leaves]
+        kind = process_key((tree.unflatten(shapes), draws, settings))
+        pairs = zip(
+            leaves, self._fixed.get_or_make(kind, lambda: _fixed(leaves, tree)), strict=True
+        )
+        numbers = process_key([leaf for leaf, fixed in pairs if fixed])
+        # A loop without a digest shares its program with no other one.
+        return id(loop) if kind is None or numbers is None else (kind, numbers)
+
+
+def _fixed(leaves: Sequence[object], tree: Any) -> list[bool]:
+    """Return which leaves must be equal in all loops."""
+    numbers = [k for k, leaf in enumerate(leaves) if is_number(leaf)]
+
+    def outside(values: list[jax.Array]) -> PyTree:
+        replaced = list(leaves)
+        for k, value in zip(numbers, values, strict=True):
+            replaced[k] = value
+        other: Loop = tree.unflatten(replaced)
+        n = len(other.model.state_names)
+        return (
+            other.leader.reference_states(other.model, jnp.zeros(1)),
+            other.model.difference(jnp.ones(n), jnp.zeros(n)),
+            other.leader.init(),
+            other.follower.init(),
+            other.exchange.weights,
+        )
+
+    try:
+        traced = jax.make_jaxpr(outside)([jnp.asarray(leaves[k], float) for k in numbers]).jaxpr
+    except Exception:
+        # A user's code may need concrete numbers: such loops share no program.
+        return [True] * len(leaves)
+    read = {id(v) for equation in traced.eqns for v in equation.invars} | {
+        id(v) for v in traced.outvars
+    }
+    free = {k for k, v in zip(numbers, traced.invars, strict=True) if id(v) not in read}
+    return [k not in free for k in range(len(leaves))]

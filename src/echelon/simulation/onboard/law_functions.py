@@ -4,6 +4,7 @@ They are traced from what `Agent` runs, as native code is. Rules about messages,
 is the newest, are no arithmetic, and are left to the program that receives them.
 """
 
+import dataclasses
 import functools
 import math
 import operator
@@ -13,13 +14,15 @@ from typing import NamedTuple, final
 import jax
 import jax.numpy as jnp
 
-from echelon.agents.world.estimator import Estimate, Estimator
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.world.sensing import Estimate, Estimator
 from echelon.core.numerics import rk4
 from echelon.core.types import PyTree
-from echelon.core.words import MessageContent, Prediction
+from echelon.core.words import Feedforward, MessageContent, Prediction
+from echelon.laws.consensus import Consensus
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law, carried_pieces
-from echelon.simulation.engine.own_step import (
+from echelon.simulation.engine.agent import (
     OwnLaw,
     OwnState,
     begin_alone,
@@ -35,7 +38,6 @@ from echelon.simulation.native.agent_step import (
     single,
     unflatten,
 )
-from echelon.simulation.onboard.message_meaning import message_meaning, normalized_equation
 from echelon.simulation.scalars import Node, ScalarGraph, lower, needed, nodes, rewritten
 from echelon.simulation.step.knowledge import (
     carried_time,
@@ -44,6 +46,7 @@ from echelon.simulation.step.knowledge import (
     packet_size,
     parts_of,
 )
+from echelon.simulation.step.motion import Motion, MotionState
 
 
 class LawFunction(NamedTuple):
@@ -343,3 +346,97 @@ def _fewer(truths: Sequence[Node]) -> list[Node]:
 def _flat(tree: PyTree) -> jax.Array:
     """Return the numbers of a tree, one after the other."""
     return jnp.concatenate([jnp.zeros(0), *map(jnp.ravel, jax.tree.leaves(tree))])
+
+
+# ---- what the numbers of a message are, in words -------------------------------------------------
+
+
+def normalized_equation(model: ControlAffine) -> str:
+    """Return how inputs u and normalized inputs v belong together, with the numbers of a model."""
+    scale = "; ".join(map(_row, model.input_scale))
+    return f"u = u* + S v, where u* is ({_row(model.trim[1])}) and S has the rows ({scale})"
+
+
+def _row(numbers: Sequence[float]) -> str:
+    return ", ".join(f"{float(number):.9g}" for number in numbers)
+
+
+def message_meaning(own: OwnLaw) -> str:
+    """Return what a message and a feed-forward are."""
+    follower, turning = own.loop.follower, own.loop.follower.turning
+    more = ", and the heading that the leader follows (rad)" if turning else ""
+    return _meaning(follower) + more
+
+
+def _meaning(follower: Law) -> str:
+    if follower.feedforward is Feedforward.NONE:
+        return "zeros, since no agent uses others' inputs"
+    if isinstance(follower, FlatLaw):
+        return "rates zeta' of the stopping point, in units of the outputs per second"
+    if _is_own(follower):
+        return f"as the law `{type(follower).__name__}` defines them"
+    if follower.feedforward is Feedforward.RELAY_VELOCITY:
+        return "rates of the states that the normalized inputs v of u = u* + S v make"
+    less = isinstance(follower, Consensus) and follower.gain.inner is not None
+    less = ", less those of the inner loop" if less else ""
+    return f"normalized inputs v of u = u* + S v{less}, and no physical inputs u"
+
+
+def _is_own(follower: Law) -> bool:
+    """Tell whether a law sends something that echelon does not know."""
+    kind = type(follower)
+    known = kind.message is Law.message and kind.broadcast in (Law.broadcast, Consensus.broadcast)
+    return not known
+
+
+def message_words(own: OwnLaw) -> list[str]:
+    """Return the names of the numbers of a message, none of which is that of a physical input."""
+    model, follower, names = own.loop.model, own.loop.follower, list(own.forward_names)
+    heading = names[len(names) - follower.turning :]
+    names = names[: len(names) - follower.turning]
+    if isinstance(follower, FlatLaw):
+        names = [f"rate of {name}" for name in names]
+    elif follower.feedforward is Feedforward.RELAY_VELOCITY:
+        names = [f"rate of {name}" for name in model.state_names]
+    elif names == [*model.input_names] and not _is_own(follower):
+        names = [f"normalized {name}" for name in names]
+    return [*names, *heading]
+
+
+# ---- the motion of a simulated vehicle -----------------------------------------------------------
+
+
+def move_function(motion: Motion) -> LawFunction:
+    """Return `move`: how one agent moves in a step of its own motion, under its actuators.
+
+    Raises:
+        Unsupported: the plant has no scalar operations; with the file and line of a user's code.
+    """
+    plant, lags = motion.plant, motion.motors is not None and motion.motors.lag is not None
+    n, m = len(plant.state_names), len(plant.input_names)
+
+    def move(
+        x: jax.Array, u: jax.Array, memory: jax.Array, push: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        u = motion.deliver(u)
+        if motion.motors is None:
+            return motion.move(x, u, push, None), memory
+        x, after = motion.follow(x, u, push, None, MotionState(memory if lags else None))
+        return x, memory if after.actuators is None else after.actuators
+
+    sizes = {"x": n, "u": m, "memory": m if lags else 0, "push": n}
+    graph = ScalarGraph()
+    leaves = [leaves_of(graph, name, range(size)) for name, size in sizes.items()]
+    x, memory = (nodes(graph, part) for part in lower(move, graph, leaves))
+    about = "the state and what the actuators remember, a step later"
+    return LawFunction("move", about, sizes, {"x": x, "memory": memory})
+
+
+def motions_of(motion: Motion, agents: int, substeps: int) -> list[Motion]:
+    """Return the motion of each agent in a part of a step."""
+    rows = [motion] * agents
+    if motion.rows is not None:
+        rows = [
+            motion.of_row(jax.tree.map(lambda a, k=k: a[k], motion.rows)) for k in range(agents)
+        ]
+    return [dataclasses.replace(each, dt=motion.dt / substeps) for each in rows]

@@ -9,8 +9,8 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.tree import shares
-from echelon.agents.references.demand import (
+from echelon.agents.network.matrices import shares
+from echelon.agents.references.flatness import (
     Targets,
     mean_targets,
     reference_targets,

@@ -13,17 +13,22 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.demand import followed_states, reference_targets, reference_warnings
+from echelon.agents.references.flatness import (
+    followed_states,
+    reference_targets,
+    reference_warnings,
+)
 from echelon.agents.references.reference import Guide
+from echelon.core.cache import BoundedCache
 from echelon.core.errors import LawError
 from echelon.core.identity import process_key
-from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.law import Law, LocalView, Memory
-from echelon.laws.tracking import tracking_gain
-from echelon.simulation.optimal.formation_plan import Trajectory, plan_tracking
+from echelon.laws.path_leader import tracking_gain
+from echelon.simulation.optimal.formation_plan import plan_tracking
 from echelon.simulation.optimal.objectives import TrackingOptions, grid
+from echelon.simulation.optimal.solver import Trajectory
 from echelon.synthesis.gains.gain import Gain
 
 _STEP = 0.005

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from echelon.agents.models.planar_quadrotor_linear import LinearPlanarQuadrotor
+from echelon.agents.models.planar_quadrotor import LinearPlanarQuadrotor
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import PlanError
 from echelon.core.types import Array, Input, Scalar, State

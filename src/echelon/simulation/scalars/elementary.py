@@ -1,29 +1,18 @@
 """Elementary functions as operations of a graph, so that no library's code runs lane by lane.
 
 Arguments are reduced to a short interval by the function's symmetries, where a polynomial
-approximates it. Tests measure the error of each, in units in the last place.
+approximates it: Taylor's, economized by Chebyshev's polynomials, so that the highest power is
+replaced by the best approximation by lower powers on the interval, with an error of 2^(1-2k) of it
+for degree k. Tests measure the error of each function, in units in the last place.
 """
 
+import functools
 import math
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 
-from echelon.simulation.scalars.approximations import (
-    EPS,
-    LN2,
-    PI,
-    TINY,
-    arctangent_series,
-    cosine_series,
-    economized,
-    error_function_fits,
-    even_series,
-    logarithm_series,
-    odd_series,
-    parts_of,
-    polynomial,
-    scaled_tail_fit,
-    sine_series,
-)
+import numpy as np
+
 from echelon.simulation.scalars.scalar_graph import Node
 
 
@@ -341,3 +330,234 @@ def round_half_away(x: Node) -> Node:
     low = x.graph.make("floor", size(x))
     up = x.graph.make("le", 0.5, size(x) - low)
     return signed(choose(up, low + 1.0, low), x)
+
+
+# ---- roots and powers ----------------------------------------------------------------------------
+
+
+def cbrt(x: Node) -> Node:
+    """Return the cube root of x."""
+    # What is left of the least numbers would be denormal: they are scaled by a cube first.
+    low = less(size(x), x.graph.constant(2.0**-900 if x.graph.bits == 64 else 2.0**-96))
+    a = choose(low, size(x) * 2.0**90, size(x))
+    root = exp(log(a) / 3.0)
+    # One step of Newton's method doubles the digits.
+    better = root - (root * root * root - a) / (3.0 * root * root)
+    regular = x.graph.make("and", less(0.0, a), less(a, x.graph.constant(math.inf)))
+    result = choose(regular, better, a)
+    return signed(choose(low, result * 2.0**-30, result), x)
+
+
+def rsqrt(x: Node) -> Node:
+    """Return 1 / sqrt(x), in a quarter of the time of a root and a quotient."""
+    g = x.graph
+    exact = 1.0 / g.make("sqrt", x)
+    if x.op == "constant":
+        return exact
+    half, y = 0.5 * x, g.make("root_guess", x)
+    # If x is 0, infinite or negative, the guess is wrong.
+    far = g.make("unlikely", less(0.05, size((half * y) * y - 0.5)))
+    # Each step maps the error e to 1.5 e^2: 0.034, 1.8e-3, 4.7e-6, 3e-11.
+    for _ in range(4 if g.bits == 64 else 3):
+        y = y * (1.5 - (half * y) * y)
+    return choose(far, exact, y)
+
+
+def integer_power(x: Node, exponent: int) -> Node:
+    """Return x^k by squaring."""
+    if exponent < 0:
+        return 1.0 / integer_power(x, -exponent)
+    result, square = x.graph.constant(1.0), x
+    while exponent:
+        result = result * square if exponent & 1 else result
+        square, exponent = square * square, exponent >> 1
+    return result
+
+
+def power(x: Node, y: Node) -> Node:
+    """Return x^y."""
+    g = x.graph
+    if y.op == "constant":
+        if y.value == 0.5:
+            return choose(g.make("eq", x, -math.inf), math.inf, g.make("sqrt", x))
+        if y.value == round(y.value) and abs(y.value) <= 64:
+            return integer_power(x, int(y.value))
+    positive = _positive_power(size(x), y)
+    whole = g.make("eq", g.make("floor", y), y)
+    odd = g.make("ne", 2.0 * g.make("floor", 0.5 * y), y)
+    minus = choose(whole, choose(odd, -positive, positive), math.nan)
+    # Of what is infinite, no power is less than none.
+    minus = choose(g.make("eq", x, -math.inf), choose(whole, minus, positive), minus)
+    result = choose(less(x, g.constant(0.0)), minus, positive)
+    one = g.make("or", g.make("eq", y, 0.0), g.make("eq", x, 1.0))
+    endless = g.make("and", g.make("eq", x, -1.0), g.make("eq", size(y), math.inf))
+    return choose(g.make("or", one, endless), 1.0, result)
+
+
+def _positive_power(x: Node, y: Node) -> Node:
+    """Return x^y for x >= 0: e^(y ln x), with the rounding error of the exponent."""
+    g = x.graph
+    high, low = _logarithm(x)
+    exponent = y * high
+    error = g.make("fms", y, high, exponent) + y * low
+    # Beyond, the result is 0 or infinite, and the error is no number.
+    near = less(size(exponent), g.constant(800.0 if g.bits == 64 else 110.0))
+    # Before it is scaled: the power itself may be infinite.
+    grown, first, second = scaled_exponential(exponent)
+    return (grown + 1.0) * choose(near, 1.0 + error, 1.0) * first * second
+
+
+def _logarithm(x: Node) -> tuple[Node, Node]:
+    """Return ln x for x >= 0 as the sum of two numbers, the second a rounding error of the first.
+
+    The logarithm of a large number is large, and a power needs as many digits behind its point.
+    """
+    g, bits = x.graph, x.graph.bits
+    e, f = g.make("exponent", x), g.make("mantissa", x) - 1.0
+    below = f + 2.0
+    s = f / below
+    rest = (g.make("fnma", s, below, f) - s * (f - (below - 2.0))) / below
+    first, *others = parts_of(LN2, bits)
+    # Errors of sums are exact where the first term is the larger one; e first is, or it is 0.
+    large = e * first + 2.0 * s
+    small = 2.0 * s - (large - e * first)
+    small = small + (2.0 * rest + s * logarithm_remainder(s) + e * sum(others))
+    high = large + small
+    low = small - (high - large)
+    special = g.make("or", less(x, g.constant(TINY[bits])), g.make("eq", x, math.inf))
+    special = g.make("or", special, g.make("ne", x, x))
+    return choose(special, log(x), high), choose(special, 0.0, low)
+
+
+# ---- polynomials, and constants for argument reduction -------------------------------------------
+
+EPS = {64: 2.0**-53, 32: 2.0**-24}
+TINY = {64: 2.0**-1022, 32: 2.0**-126}
+"""The least numbers that are not denormal."""
+_PARTS = {64: (33, 53), 32: (11, 11, 24)}
+"""Bits of the parts of pi/2 and ln 2: products with whole numbers of 20 or 13 bits are exact."""
+
+
+def _shifted_chebyshev(degree: int, width: Fraction) -> list[Fraction]:
+    """Return the coefficients of T_k(2 s / width - 1), lowest first."""
+    before, now = [Fraction(1)], [Fraction(-1), 2 / width]
+    for _ in range(degree - 1):
+        # T_k+1 = 2 y T_k - T_k-1 with y = 2 s / width - 1.
+        up = [Fraction(0), *(4 / width * c for c in now)]
+        same = [-2 * c for c in now] + [Fraction(0)]
+        old = [*before, *[Fraction(0)] * (len(up) - len(before))]
+        before, now = now, [a + b - c for a, b, c in zip(up, same, old, strict=True)]
+    return now if degree else before
+
+
+@functools.cache
+def economized(series: Callable[[int], Fraction], width: float, tolerance: float) -> list[float]:
+    """Return coefficients, lowest first, with an error below a tolerance for s in [0, width].
+
+    `series(k)` is the Taylor coefficient of s^k.
+    """
+    end, rest, count = Fraction(width), Fraction(tolerance), 1
+    while abs(series(count)) * end**count > rest / 8:
+        count += 1
+    coefficients = [series(k) for k in range(count + 1)]
+    while len(coefficients) > 2:
+        # Of all polynomials with this leading coefficient, Chebyshev's is smallest.
+        chebyshev = _shifted_chebyshev(len(coefficients) - 1, end)
+        share = coefficients[-1] / chebyshev[-1]
+        if abs(share) > rest / 2:
+            break
+        rest -= abs(share)
+        pairs = zip(coefficients[:-1], chebyshev[:-1], strict=True)
+        coefficients = [c - share * t for c, t in pairs]
+    return [float(c) for c in coefficients]
+
+
+def polynomial(s: Node, coefficients: Sequence[float]) -> Node:
+    """Return sum_k c_k s^k, by Horner's rule."""
+    result = s.graph.constant(coefficients[-1])
+    for c in coefficients[-2::-1]:
+        result = result * s + c
+    return result
+
+
+def parts_of(value: Fraction, bits: int) -> list[float]:
+    """Return numbers whose sum is a value, the first ones with few bits."""
+    parts, rest = list[float](), value
+    for width in _PARTS[bits]:
+        scale = Fraction(2) ** (width - math.frexp(float(rest))[1])
+        part = Fraction(round(rest * scale)) / scale
+        parts.append(float(part))
+        rest -= part
+    return parts
+
+
+# pi by Machin's formula and ln 2 by its own series, to 200 bits.
+def _arctan_inverse(x: int) -> Fraction:
+    return sum((Fraction((-1) ** k, (2 * k + 1) * x ** (2 * k + 1)) for k in range(50)), Fraction())
+
+
+PI = 4 * (4 * _arctan_inverse(5) - _arctan_inverse(239))
+LN2 = sum((Fraction(2, (2 * k + 1) * 3 ** (2 * k + 1)) for k in range(70)), Fraction())
+
+
+# Taylor coefficients of s^k, s the square of the argument, of remainders of functions after their
+# first terms.
+def sine_series(k: int) -> Fraction:
+    """Return the k-th coefficient of the remainder of sin x / x - 1."""
+    return Fraction((-1) ** (k + 1), math.factorial(2 * k + 3))
+
+
+def cosine_series(k: int) -> Fraction:
+    """Return the k-th coefficient of the remainder of cos x - 1 + x^2 / 2."""
+    return Fraction((-1) ** k, math.factorial(2 * k + 4))
+
+
+def even_series(k: int) -> Fraction:
+    """Return the k-th coefficient of the remainder of the even part of e^x - 1 - x."""
+    return Fraction(1, math.factorial(2 * k + 2))
+
+
+def odd_series(k: int) -> Fraction:
+    """Return the k-th coefficient of the remainder of the odd part of e^x - 1 - x."""
+    return Fraction(1, math.factorial(2 * k + 3))
+
+
+def arctangent_series(k: int) -> Fraction:
+    """Return the k-th coefficient of the remainder of arctan x / x - 1."""
+    return Fraction((-1) ** (k + 1), 2 * k + 3)
+
+
+def logarithm_series(k: int) -> Fraction:
+    """Return the k-th coefficient of the remainder of 2 artanh x / x - 2."""
+    return Fraction(2, 2 * k + 3)
+
+
+@functools.cache
+def error_function_fits() -> tuple[list[float], list[float]]:
+    """Return fits of erf(x) / x in x^2 for |x| <= 1, and of e^(x^2) erfc(x) for 1 <= x <= 6.5.
+
+    The second is a polynomial in (x - 3) / (x + 3), of which it is almost a linear function.
+    """
+    from scipy.special import erf, erfcx
+
+    nodes = np.cos(np.pi * (np.arange(200) + 0.5) / 200)
+    square = 0.5 * (nodes + 1.0)
+    root = np.sqrt(square)
+    near = np.polynomial.Chebyshev.fit(square, erf(root) / root, 12, domain=[0.0, 1.0])
+    first, last = (1.0 - 3.0) / (1.0 + 3.0), (6.5 - 3.0) / (6.5 + 3.0)
+    t = 0.5 * (last - first) * (nodes + 1.0) + first
+    far = np.polynomial.Chebyshev.fit(t, erfcx(3.0 * (1.0 + t) / (1.0 - t)), 22, [first, last])
+    power = np.polynomial.Polynomial
+    return near.convert(kind=power).coef.tolist(), far.convert(kind=power).coef.tolist()
+
+
+@functools.cache
+def scaled_tail_fit() -> list[float]:
+    """Return a fit of e^(x^2) erfc(x) for 1 <= x <= 28, in (x - 3) / (x + 3)."""
+    from scipy.special import erfcx
+
+    first, last = (1.0 - 3.0) / (1.0 + 3.0), (28.0 - 3.0) / (28.0 + 3.0)
+    nodes = np.cos(np.pi * (np.arange(200) + 0.5) / 200)
+    t = 0.5 * (last - first) * (nodes + 1.0) + first
+    fit = np.polynomial.Chebyshev.fit(t, erfcx(3.0 * (1.0 + t) / (1.0 - t)), 24, [first, last])
+    return fit.convert(kind=np.polynomial.Polynomial).coef.tolist()

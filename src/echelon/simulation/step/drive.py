@@ -17,9 +17,8 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.sensing import Sensors
 from echelon.agents.world.world import World
-from echelon.core.declared import Declared
 from echelon.core.errors import SimulationError
-from echelon.core.types import Array, PyTree, Scalar, State
+from echelon.core.types import Array, Declared, PyTree, Scalar, State
 from echelon.core.words import Feedforward, Frame
 from echelon.laws.law import Law
 from echelon.laws.safety import Safety

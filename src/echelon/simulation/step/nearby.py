@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from echelon.agents.network.channel import NEVER, Posts
-from echelon.agents.network.near import Near
+from echelon.agents.network.exchange import Near
 from echelon.core.types import Array, States
 from echelon.laws.law import Law, Memory
 from echelon.simulation.step.knowledge import Knowledge, Mail

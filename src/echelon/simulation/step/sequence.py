@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from echelon.agents.network.exchange import Difference
-from echelon.agents.network.near import Near
+from echelon.agents.network.exchange import Difference, Near
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.laws.law import Law, LocalView, Memory

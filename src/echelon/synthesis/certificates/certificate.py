@@ -91,18 +91,14 @@ def certify(
     page, T2).
     """
     feedback = linear.B @ np.linalg.solve(R, linear.B.T @ P)
+    modes = linear.A - coupling * spectrum.eigenvalues[:, None, None] * feedback
     return Certificate(
         kind=Kind.LINEARIZATION,
         lambda_min=spectrum.low,
         lambda_max=spectrum.high,
-        abscissa=_abscissa(linear.A - coupling * spectrum.eigenvalues[:, None, None] * feedback),
+        abscissa=float(np.linalg.eigvals(modes).real.max()),
         modes=len(spectrum.eigenvalues),
         edge=edge,
         observable=observability_rank(linear.A, linear.B.T @ P),
         region=region,
     )
-
-
-def _abscissa(matrices: Array) -> float:
-    """Return the largest real part of an eigenvalue of any of the matrices."""
-    return float(np.linalg.eigvals(matrices).real.max())

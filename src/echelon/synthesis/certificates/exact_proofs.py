@@ -10,8 +10,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from echelon.core.cache import memoize
 from echelon.core.errors import GainError
-from echelon.core.memoize import memoize
 from echelon.core.types import Array
 from echelon.core.words import amount
 

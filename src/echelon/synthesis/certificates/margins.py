@@ -1,23 +1,62 @@
-"""Robustness margins of a stable linear loop: gain, input scaling, string stability.
-
-The law u = -c R^-1 B'P z splits over the eigenvectors of the grounded Laplacian into the modes
-A - c lambda B K, K = R^-1 B'P, one for each of its eigenvalues lambda; those of a directed graph
-may be complex, and one of a pair stands for both, whose modes mirror each other. All that is said
-here is of these matrices (kind: linearization), with the same scale for every agent.
-"""
+"""Robustness margins of a stable linear loop: gain, scaling, strings, delays and disturbances."""
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
 
 from echelon.core.errors import GainError
-from echelon.core.linear import symmetric_basis
+from echelon.core.linear import matrix_exponential, symmetric_basis
 from echelon.core.rational import bisect
 from echelon.core.types import Array
-from echelon.synthesis.certificates.frequency import frequencies, peaks, resolvent
+
+# ---- sweeps over frequencies ---------------------------------------------------------------------
+
+
+def resolvent(A: Array, w: Array, B: Array) -> Array:
+    """Return (i w I - A)^-1 B for each frequency, (N, n, m)."""
+    return np.linalg.solve(1j * w[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex))
+
+
+def frequencies(matrices: list[Array]) -> Array:
+    """Return frequencies up to the largest norm of the matrices, denser about their resonances."""
+    # |w| <= |A - k B K z| for |z| = 1, which is at most twice the norm of A and that of A - k B K.
+    top = 3.0 * max(float(np.linalg.norm(M, 2)) for M in matrices) or 1.0
+    poles = np.concatenate([np.linalg.eigvals(M) for M in matrices])
+    width = np.maximum(np.abs(poles.real), 1e-6 * np.abs(poles))
+    steps = np.geomspace(0.05, 20.0, 12)
+    near = np.abs(poles.imag)[:, None] + width[:, None] * np.concatenate([-steps, steps])
+    # 400 frequencies a decade.
+    sweep = np.geomspace(1e-9 * top, top, 3600)
+    grid = np.union1d(sweep, near[near > sweep[0]])
+    # Between two points that differ by rounding, so does all that is computed there.
+    return grid[np.append(True, np.diff(grid) > 1e-9 * grid[1:])]
+
+
+def peaks(f: Callable[[float], float], grid: Array, values: Array) -> Array:
+    """Return the local maxima of f between the points of a grid where it has these values."""
+    middle, left, right = values[1:-1], values[:-2], values[2:]
+    # A flat stretch has maxima by rounding, which are no peaks, nor is what hardly exceeds them.
+    tops = (middle >= left) & (middle >= right) & (middle > (1.0 + 1e-7) * np.minimum(left, right))
+    around = [(grid[k - 1], grid[k + 1]) for k in np.flatnonzero(tops) + 1]
+    return np.array([lowest(lambda w: -f(w), *ends).x for ends in around])
+
+
+def lowest(f: Callable[[float], float], low: float, high: float) -> Any:
+    """Return SciPy's account of the least f between two points, where it has one minimum."""
+    from scipy.optimize import minimize_scalar
+
+    sharp = {"xatol": 1e-7 * (high - low)}
+    return minimize_scalar(f, None, (low, high), (), "bounded", options=sharp)
+
+
+# ---- gain, input scaling and strings -------------------------------------------------------------
+# The law u = -c R^-1 B'P z splits over the eigenvectors of the grounded Laplacian into the modes A
+# - c lambda B K, K = R^-1 B'P, one for each of its eigenvalues lambda; those of a directed graph
+# may be complex, and one of a pair stands for both, whose modes mirror each other. All that is said
+# here is of these matrices (kind: linearization), with the same scale for every agent.
 
 _FAR = 1e6  # factors on the coupling beyond this count as infinite
 _HALVINGS = 30  # of a rate
@@ -322,3 +361,224 @@ def _sparse(vectors: Array) -> Array:
     sparse = np.where(np.abs(sparse) > _HIDDEN, sparse, 0.0)
     sparse = sparse / np.linalg.norm(sparse, axis=0)
     return sparse if np.abs(sparse.imag).any() else sparse.real
+
+
+# ---- how old the disagreement z may be -----------------------------------------------------------
+# A root of det(s I - A + k B K e^{-s tau}), k = c lambda, is on the axis at s = i w only where an
+# eigenvalue mu of K (i w I - A)^-1 B has size 1 / |k|, and first at the delay that turns k mu to
+# -1. The loci mu(w) are those of every lambda, so they are swept once and crossed at each size.
+
+_FEW = 32  # modes about whose resonances the sweep is denser
+_SHARP = 1e-13  # relative, of a frequency
+_APART = 1e-6  # relative; loci that cross together differ by less
+_BEYOND = 1e3  # times all sizes that are sought; what lies farther out is not resolved
+
+
+class DelayMargin(NamedTuple):
+    """The least delay (s) that costs stability, or infinity, and where: w (rad/s) and lambda."""
+
+    delay: float
+    frequency: float
+    eigenvalue: complex
+
+
+def delay_margin(loop: ClosedLoop) -> DelayMargin:
+    """Return the largest delay tau of all z, u = -c R^-1 B'P z(t - tau), that every mode survives.
+
+    Of a pair of complex eigenvalues both are looked at, so that w > 0 suffices.
+
+    Raises:
+        GainError: a mode does not decay without delay.
+    """
+    closed, strengths = modes(loop), loop.strengths
+    few = np.unique(np.linspace(0, len(closed) - 1, _FEW).astype(int))
+    loci = _Loci(loop, strengths[len(strengths) // 2])
+    grid = loci.resolved(frequencies([loop.A, *closed[few]]))
+    at = _delay_crossings(loci, grid, strengths)
+    if loop.between:
+        # What lies between two eigenvalues may be worse than both.
+        at = np.concatenate([at, _turning_points(loci, grid)])
+    at = at[np.isfinite(np.real(at[:, 0]))]
+    if not len(at):
+        return DelayMargin(np.inf, 0.0, strengths[0] / loop.coupling)
+    delay, w, k = at[np.real(at[:, 0]).argmin()]
+    k = k if k.imag else k.real
+    return DelayMargin(float(delay.real), float(w.real), k / loop.coupling)
+
+
+class _Loci:
+    """The eigenvalues mu (m,) of K (i w I - A)^-1 B at each frequency, by ascending size."""
+
+    def __init__(self, loop: ClosedLoop, strength: complex) -> None:
+        self._B, self._K, self._strength = loop.B, strength * loop.K, strength
+        self._closed = loop.A - self._B @ self._K
+        sizes = np.abs(loop.strengths)
+        self.sought = 1.0 / sizes.max(), 1.0 / sizes.min()
+
+    def __call__(self, w: Array) -> Array:
+        # Of the closed loop, which has no pole near the axis: a chain of integrators would lose
+        # its small eigenvalue in the rounding of the large one.
+        M = self._K @ resolvent(self._closed, w, self._B)
+        one = np.eye(M.shape[-1])
+        # About their mean, since LAPACK's sweeps do not end on some multiples of the identity.
+        mean = np.trace(M, axis1=1, axis2=2)[:, None] / len(one)
+        nu = np.linalg.eigvals(M - mean[..., None] * one) + mean
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mu = nu / (self._strength * (1.0 - nu))
+        return np.take_along_axis(mu, np.abs(mu).argsort(-1), -1)
+
+    def sizes(self, w: Array) -> Array:
+        """Return |mu| (K, m), cut off far from what is sought."""
+        low, high = self.sought
+        # Beyond all numbers where 1 - nu is nothing.
+        sizes = np.nan_to_num(np.abs(self(w)), nan=np.inf)
+        return np.clip(sizes, low / _BEYOND, high * _BEYOND)
+
+    def resolved(self, grid: Array) -> Array:
+        """Return frequencies with those added at which a locus is largest or least between them."""
+        more, columns = list[Array](), self.sizes(grid).T
+        for i, column in enumerate(columns):
+            more.append(peaks(lambda w, i=i: self._size(w, i), grid, column))
+            more.append(peaks(lambda w, i=i: 1.0 / self._size(w, i), grid, 1.0 / column))
+        return np.union1d(grid, np.concatenate(more))
+
+    def _size(self, w: float, i: int) -> float:
+        return float(self.sizes(np.array([w]))[0, i])
+
+
+def _delay_crossings(loci: _Loci, grid: Array, strengths: Array) -> Array:
+    """Return delay, frequency and strength (K, 3) wherever a locus has the size of a strength."""
+    from scipy.optimize.elementwise import find_root  # which takes long to load
+
+    columns, places = loci.sizes(grid).T, list[Array]()
+    for i, column in enumerate(columns):
+        k, at = np.nonzero(np.diff(column > 1.0 / np.abs(strengths)[:, None], axis=1))
+        places.append(np.stack([k, at, np.full(len(k), i)]))
+    k, at, which = np.concatenate(places, axis=1)
+    if not len(k):
+        return np.zeros((0, 3), complex)
+
+    def excess(w: Array, level: Array, i: Array) -> Array:
+        sizes = np.take_along_axis(loci.sizes(w), i.astype(int)[:, None], 1)[:, 0]
+        return np.log(sizes * level)
+
+    levels, sharp = np.abs(strengths)[k], {"xrtol": _SHARP}
+    root = find_root(excess, (grid[at], grid[at + 1]), args=(levels, which), tolerances=sharp)
+    w, mu = root.x, loci(root.x)
+    away = np.abs(np.abs(mu) * levels[:, None] - 1.0)
+    # Loci that cross together share the size and differ in phase: the first one counts.
+    together = away <= np.maximum(_APART, away.min(axis=1, keepdims=True))
+    delays = np.minimum(*(_delays(s[:, None] * mu, w) for s in (strengths[k], strengths[k].conj())))
+    return np.stack([np.where(together, delays, np.inf).min(axis=1), w, strengths[k]], axis=1)
+
+
+def _turning_points(loci: _Loci, grid: Array) -> Array:
+    """Return the same where delays are least over all strengths from the least to the largest."""
+    low, high = loci.sought
+    mu = loci(grid)
+    inside = (np.abs(mu) >= low) & (np.abs(mu) <= high)
+    found = [np.zeros((0, 3), complex)]
+    for i, column in enumerate(np.where(inside, _delays(mu, grid), np.inf).T):
+        for k in np.flatnonzero((column[1:-1] <= column[:-2]) & (column[1:-1] <= column[2:])) + 1:
+            if not np.isfinite(column[k]):
+                continue
+
+            def delay(w: float, i: int = i) -> float:
+                return float(_delays(loci(np.array([w])), np.array([w]))[0, i])
+
+            w = float(lowest(delay, grid[k - 1], grid[k + 1]).x)
+            size = float(np.abs(loci(np.array([w]))[0, i]))
+            if low <= size <= high:
+                found.append(np.array([[delay(w), w, 1.0 / size]], complex))
+            found.append(np.array([[column[k], grid[k], 1.0 / np.abs(mu[k, i])]], complex))
+    return np.concatenate(found)
+
+
+def _delays(turned: Array, w: Array) -> Array:
+    """Return the least delays (s) that turn numbers (K, m) at frequencies (K,) to -1."""
+    return (np.angle(-turned) % (2.0 * np.pi)) / w[:, None]
+
+
+# ---- bounds on states under a disturbance --------------------------------------------------------
+# Kept apart from the other margins for its own numerics: an ellipsoid that cannot be left, and the
+# exact peak gain by quadrature of the impulse response.
+
+
+def invariant_ellipsoid(loop: ClosedLoop, E: Array, bound: float = 1.0) -> Array:
+    """Return for each state (n,) a bound that no disturbance of norm up to `bound` makes it leave.
+
+    From rest, delta obeys a mode plus E w, E (n, q). For each alpha the ellipsoid X with
+    (A + alpha/2 I) X + X (.)' + E E'/alpha = 0 cannot be left, so |delta_j| <= bound sqrt(X_jj);
+    each state takes its best alpha (X_jj is log-convex in alpha), and the worst mode at that alpha.
+    So it holds for each follower if the disturbances of all together have norm up to `bound`.
+
+    Raises:
+        GainError: a mode does not decay.
+    """
+    closed, n = modes(loop), len(loop.A)
+    # A + alpha/2 I has the Schur vectors of A, so each alpha costs a back substitution alone.
+    forms = [scipy.linalg.schur(mode)[:2] for mode in closed]
+    (solve,) = scipy.linalg.get_lapack_funcs(("trsyl",), (loop.A,))
+    # From there on A + alpha/2 I does not decay, and no ellipsoid exists.
+    limit = -2.0 * float(np.linalg.eigvals(closed).real.max())
+
+    def squares(alpha: float) -> Array:
+        largest = np.zeros(n)
+        for T, Q in forms:
+            S, F = T + 0.5 * alpha * np.eye(n), Q.T @ E
+            Y, scale, _ = solve(S, S, -(F @ F.T) / alpha, tranb="T")
+            largest = np.maximum(largest, np.einsum("ij,jk,ik->i", Q, Y / scale, Q))
+        return largest
+
+    ends = (1e-9 * limit, (1.0 - 1e-9) * limit)
+    return bound * np.sqrt([lowest(lambda a, j=j: squares(a)[j], *ends).fun for j in range(n)])
+
+
+def peak_gain(loop: ClosedLoop, E: Array, bound: float = 1.0) -> Array:
+    """Return for each state (n,) the largest value that a disturbance of norm `bound` gives it.
+
+    In one mode, from rest, this is exactly bound times the integral of |e_j' exp(A t) E|, to a
+    relative 1e-6; the worst mode is taken, so that it is what a disturbance shaped like one
+    eigenvector of the grounded Laplacian can do.
+
+    Raises:
+        GainError: a mode does not decay.
+    """
+    return bound * np.max([_impulse_norms(mode, E) for mode in modes(loop)], axis=0)
+
+
+def _impulse_norms(A: Array, E: Array) -> Array:
+    """Return the integrals over t >= 0 of the norms of the rows of exp(A t) E, (n,).
+
+    Gauss's rule of 8 nodes on panels that are halved until the halves agree with the whole, all
+    open panels of one length at a time; the first is halved until it resolves the fastest mode.
+    """
+    A, (d, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
+    h, fast = -1.0 / float(np.linalg.eigvals(A).real.max()), 0.1 / float(np.linalg.norm(A, 2))
+    flow = matrix_exponential(A * h)
+    # The tail beyond h is as small as exp(A h), so h grows by squaring until that is nothing.
+    while np.linalg.norm(flow, 1) > 1e-12:
+        flow, h = flow @ flow, 2.0 * h
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    times = np.append(0.5 * (nodes + 1.0), 1.0)[:, None, None]
+    starts, wholes = (E / d[:, None])[None], np.full((1, len(A)), np.inf)
+    closed, first = np.zeros(len(A)), True
+    for _ in range(40):
+        h *= 0.5
+        *steps, flow = matrix_exponential(A * (h * times))
+        starts = np.concatenate([starts, flow @ starts])
+        # In parts, since matrices of all panels and nodes at once need not fit into memory.
+        few = np.array_split(starts[:, None], 1 + len(starts) // 4096)
+        rows = np.concatenate([np.linalg.norm(np.array(steps) @ some, axis=-1) for some in few])
+        parts = 0.5 * h * np.einsum("pij,i->pj", rows, weights)
+        total, halves = closed + parts.sum(0), parts.reshape(2, -1, len(A)).sum(0)
+        still = (np.abs(halves - wholes) > 1e-8 * total + 1e-13 * total.max()).any(1)
+        if first:
+            still[0] |= h > fast
+            first = bool(still[0])
+        closed += halves[~still].sum(0)
+        both = np.tile(still, 2)
+        starts, wholes = starts[both], parts[both]
+        if not still.any():
+            break
+    return d * (closed + wholes.sum(0))

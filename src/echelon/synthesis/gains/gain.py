@@ -1,12 +1,8 @@
-"""The gain of the consensus law, the interface of synthesis methods, and `synthesize`.
-
-A method computes P and R from one agent; the graph enters only the coupling, by the smallest
-eigenvalue of its spectrum.
-"""
+"""The gain of the consensus law, the interface of synthesis methods, and `synthesize`."""
 
 import abc
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,15 +18,14 @@ from echelon.agents.models.linearization import Linearization, linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.graph import Graph
-from echelon.agents.network.reach import lost_at_times
+from echelon.agents.network.matrices import lost_at_times
 from echelon.agents.network.spectrum import Spectrum
-from echelon.core.declared import Declared
 from echelon.core.errors import GainError, GraphError, check_kind
 from echelon.core.limits import LARGEST
-from echelon.core.linear import check_definite
+from echelon.core.linear import Weight, as_matrix, check_definite
 from echelon.core.numerics import precision
 from echelon.core.trace import shared_traces
-from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.types import Array, Declared, Input, Scalar, State
 from echelon.core.words import amount
 from echelon.synthesis.certificates.certificate import Certificate, RegionCertificate, certify
 
@@ -279,3 +274,42 @@ def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
     with precision("float64"):
         check_model(model)
         return method.solve(model, graph.spectrum())
+
+
+# ---- a gain from the user's matrices -------------------------------------------------------------
+
+
+class FixedGain(Method):
+    """The user's P, with no guarantee beyond that of its linearization.
+
+    Args:
+        P: n numbers (a diagonal), (n, n), or "identity".
+        R: weight of the normalized input, m numbers or (m, m); the identity by default.
+        coupling: c > 0; 1 by default.
+    """
+
+    name = "given"
+    needs = ("P",)
+
+    P: Weight | Literal["identity"] = "identity"
+    R: Weight | None = None
+
+    def feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
+        """Return the user's P and R.
+
+        Raises:
+            GainError: P or R has another size, or P is a word other than `identity`.
+        """
+        m = len(model.input_names)
+        R = np.eye(m) if self.R is None else as_matrix("R", self.R, m)
+        # No inequality holds for this P in general, so no coupling is known to suffice.
+        return Feedback(self._matrix(len(model.state_names)), R, rho=None)
+
+    def _matrix(self, n: int) -> np.ndarray:
+        if isinstance(self.P, str):
+            if self.P != "identity":
+                raise GainError(
+                    f"`P` is `{self.P}`, and must be a matrix, a diagonal or `identity`."
+                )
+            return np.eye(n)
+        return as_matrix("P", self.P, n)

@@ -35,6 +35,7 @@ def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> JsonObjec
     These are the model, the graph with its eigenvalues, the domain and the corners of the hull of
     Jacobians; `verify` recomputes every guarantee from them. A bound that is infinite is None.
     """
+    sums = graph.spectrum().sums
     return {
         "format": FORMAT,
         "method": gain.method,
@@ -51,7 +52,7 @@ def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> JsonObjec
             "directed": graph.directed,
             "switches": graph.schedule is not None,
             "spectrum": _reals(graph.spectrum().eigenvalues),
-            "sums": _sums(graph),
+            "sums": None if sums is None else sums.tolist(),
         },
         "certificate": _certificate_as_mapping(gain.certificate),
     }
@@ -62,12 +63,6 @@ def _reals(values: Array) -> list[Any]:
     if not np.iscomplexobj(values):
         return values.tolist()
     return [[float(x.real), float(x.imag)] for x in values]
-
-
-def _sums(graph: Graph) -> list[float] | None:
-    """Return the weights of followers in the decreasing sum; None where all are 1."""
-    sums = graph.spectrum().sums
-    return None if sums is None else sums.tolist()
 
 
 def _model_as_mapping(model: ControlAffine) -> JsonObject:
@@ -134,14 +129,13 @@ def _region_as_mapping(region: RegionCertificate) -> JsonObject:
         "radius": region.radius,
         "strength": region.strength,
         # JSON has no infinity, which only Python would read.
-        "domain": {name: _finite(getattr(domain, name)) for name in _ENDS},
+        "domain": {
+            name: [x if np.isfinite(x) else None for x in getattr(domain, name).tolist()]
+            for name in _ENDS
+        },
         "hull": _pack(region.hull),
         "error": region.error.tolist(),
     }
-
-
-def _finite(bounds: Array) -> list[float | None]:
-    return [x if np.isfinite(x) else None for x in bounds.tolist()]
 
 
 def _pack(matrices: Array) -> JsonObject:

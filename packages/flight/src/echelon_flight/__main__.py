@@ -1,0 +1,202 @@
+"""`python -m echelon_flight FOLDER`: one process of a flight that was prepared in a folder."""
+
+import argparse
+import contextlib
+import math
+import signal
+import sys
+import time
+from pathlib import Path
+
+from echelon_flight import FlightError, __version__
+from echelon_flight.agent_process import AgentContext, AgentProcess, PlanClock
+from echelon_flight.datagram_socket import (
+    LOOPBACK,
+    PORT,
+    Address,
+    DatagramSocket,
+    ports_of,
+    read_address,
+    tell_once,
+)
+from echelon_flight.links import Link, open_link
+from echelon_flight.mission import Mission
+from echelon_flight.supervisor import Fault
+from echelon_flight.wire import GROUND
+
+_READY = 5.0  # s, within which a state of the vehicle must arrive
+
+
+def main() -> None:
+    """Run one process; an error is one sentence and exit code 2."""
+    options = _options()
+    try:
+        code = _run(Mission(options.folder), options)
+    except FlightError as error:
+        print(f"echelon-flight: {error}", file=sys.stderr)
+        code = error.exit_code
+    except KeyboardInterrupt:
+        code = 130
+    raise SystemExit(code)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser("python -m echelon_flight", description=__doc__)
+    say = parser.add_argument
+    say("--version", action="version", version=f"echelon-flight {__version__}")
+    say("folder", type=Path, help="a folder that `echelon fly --out` wrote")
+    say("--agent", type=int, help="fly this agent")
+    say("--all", action="store_true", help="fly all, with simulated vehicles")
+    say("--ground", action="store_true", help="serve the page of the ground station")
+    say("--dry-run", action="store_true", help="check everything, and send nothing to others")
+    say("--link", default="udp", help="to the vehicle: udp, cflib://.. or px4://..")
+    say("--key", type=Path, help="the key file of the formation")
+    say("--listen", help="address and port to hear others at")
+    say("--to", help="addresses and ports of others, separated by commas")
+    say("--interface", default=LOOPBACK, help="own address on the network of a multicast group")
+    say("--seconds", type=float, help="length of the flight (default: the scenario's horizon)")
+    say("--speed", type=float, default=1.0, help="below 1, simulated vehicles are slower")
+    say("--port", type=int, default=PORT, help="of agent 0 on this machine")
+    say("--vehicles", action="store_true", help=argparse.SUPPRESS)
+    say("--weather", nargs=3, type=float, help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def _run(mission: Mission, options: argparse.Namespace) -> int:
+    here = options.link.startswith("udp") or f":{LOOPBACK}:" in options.link.replace("/", ":")
+    if not (0.0 < options.speed < 1.0 and here or options.speed == 1.0):
+        raise FlightError(
+            f"`--speed` is {options.speed:g}, and must be above 0 and at most 1; 1 where "
+            "the vehicle is not on this machine."
+        )
+    if options.seconds is not None and not options.seconds > 0.0:
+        raise FlightError(f"`--seconds` is {options.seconds:g}, and must be above 0.")
+    # Imported where they are used: an agent's process stays small.
+    if options.vehicles:
+        from echelon_flight.simulated_vehicles import Vehicles, simulated
+
+        Vehicles(mission, simulated(mission), options.speed, options.port).run()
+    if options.weather:
+        from echelon_flight.simulated_vehicles import LinkImpairment, carry
+
+        ports, impairment = ports_of(mission.agents, options.port), LinkImpairment(*options.weather)
+        carry(options.port + mission.agents + 1, ports, impairment, options.speed)
+    if options.all:
+        return _fly_all(mission, options)
+    if options.ground:
+        return _watch(mission, options)
+    if options.agent is None:
+        raise FlightError("give `--agent` with a number, `--all` or `--ground`.")
+    return _fly(mission, options)
+
+
+def _ways(
+    mission: Mission, number: int, options: argparse.Namespace
+) -> tuple[Address, list[Address]]:
+    """Return where a process listens, and where it sends to: on this machine unless told."""
+    ports = ports_of(mission.agents, options.port)
+    own = ports[min(number, mission.agents)]
+    listen = read_address(options.listen, "--listen") if options.listen else own
+    if options.to is None:
+        return listen, [listen] if options.listen else [port for port in ports if port != own]
+    return listen, [read_address(text, "--to") for text in options.to.split(",")]
+
+
+def _fly(mission: Mission, options: argparse.Namespace) -> int:
+    """Fly one agent."""
+    wire = mission.wire(options.agent, options.key)
+    listen, to = _ways(mission, options.agent, options)
+    try:
+        law, facts = mission.law(options.agent)
+        socket = DatagramSocket(listen, to, options.interface)
+        link = open_link(options.link, facts)
+    except FlightError as error:
+        if not options.dry_run:
+            tell_once(wire.note(time.time(), str(error).rstrip(".")), to, options.interface)
+        raise
+    # The start may have been said often while the link was opened.
+    socket.skip()
+    if options.dry_run:
+        _wait_for_state(link, options.link)
+        print(f"agent {options.agent}: all checks passed; nothing was sent to other agents.")
+        return 0
+    seconds = mission.facts["horizon"] if options.seconds is None else options.seconds
+    clock = PlanClock(options.speed)
+    context = AgentContext(law, facts, mission.facts, link, socket, wire, clock)
+    fault = AgentProcess(context, seconds).run()
+    return 0 if fault in (Fault.END, Fault.SIGNAL) else 1
+
+
+def _wait_for_state(link: Link, address: str) -> None:
+    """Wait for a state of the vehicle.
+
+    Raises:
+        FlightError: none came.
+    """
+    deadline = time.monotonic() + _READY
+    while time.monotonic() < deadline:
+        reading = link.read(0.1)
+        if reading is not None and all(map(math.isfinite, reading.x)):
+            link.close()
+            return
+    raise FlightError(
+        f"no state of the vehicle arrived within {_READY:g} s over the link `{address}`; switch it "
+        "on, and check `--link`. To check the flight without vehicles, use `--all --dry-run`."
+    )
+
+
+def _watch(mission: Mission, options: argparse.Namespace) -> int:
+    """Serve the page of the ground station until Ctrl-C."""
+    from echelon_flight.ground import Ground, page_of
+
+    listen, to = _ways(mission, GROUND, options)
+    wire = mission.wire(GROUND, options.key)
+    ground = Ground(DatagramSocket(listen, to, options.interface), wire, mission.agents)
+    ground.listen()
+    with page_of(ground).serving() as address:
+        where = f"the ground station is at {address}"
+        print(f"echelon-flight: {where}. Ctrl-C quits.", file=sys.stderr, flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            while True:
+                time.sleep(1.0)
+    return 0
+
+
+def _fly_all(mission: Mission, options: argparse.Namespace) -> int:
+    """Fly all agents with simulated vehicles, and print their errors."""
+    from echelon_flight.ground import page_of
+    from echelon_flight.local_flight import LocalFlight
+
+    seconds = mission.facts["horizon"] if options.seconds is None else options.seconds
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for k in range(mission.agents):
+        mission.law(k)
+    flight = LocalFlight(mission, seconds, options.speed, options.port)
+    if options.dry_run:
+        print("All checks passed; nothing was started.")
+        return 0
+    with page_of(flight.ground).serving() as address, flight:
+        print(f"The ground station is at {address}.")
+        for k in range(mission.agents):
+            ready, size = flight.ready[k], flight.memory(k)
+            print(f"- agent {k}: ready after {ready:.2f} s, {size:.0f} MB", flush=True)
+        print(f"All are ready; the plan takes {seconds:g} s.", flush=True)
+        while flight.time() < seconds:
+            time.sleep(0.05)
+        errors, faults = flight.errors(), flight.ground.faults
+        if mission.facts["vehicles"]["height"] is not None:
+            flight.wait_until_down()
+    since = max(0.0, seconds - 4.0)
+    for k in set(range(mission.agents)) - {mission.facts["leader"]}:
+        worst = 1e3 * errors.worst(k, since)
+        print(f"- agent {k}: {worst:.1f} mm from its place at most, in the last 4 s")
+    early = [k for k, fault in faults.items() if fault not in (Fault.NONE, Fault.END)]
+    if early:
+        print(f"{len(early)} agents descended before the end.")
+    if errors.late or Fault.STALE in faults.values():
+        print("This machine did not keep up with the vehicles; with `--speed 0.2` it may.")
+    return int(bool(early))
+
+
+if __name__ == "__main__":
+    main()

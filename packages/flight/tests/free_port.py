@@ -1,0 +1,9 @@
+"""A port of UDP on this machine that nobody uses."""
+
+import socket
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]

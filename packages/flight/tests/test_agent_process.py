@@ -1,0 +1,248 @@
+"""One agent's process, with a vehicle and others that this test plays."""
+
+import math
+
+import pytest
+from agent_scene import DT, Scene
+
+from echelon_flight.links import Reading
+from echelon_flight.supervisor import Fault
+from echelon_flight.wire import GROUND, DatagramKind, Drop, Letter, Packet, Report
+
+
+@pytest.fixture
+def scene(monkeypatch):
+    return Scene(monkeypatch)
+
+
+def test_nothing_is_sent_before_the_start(scene):
+    scene.rounds(5)
+    assert not scene.link.sent and scene.fault is Fault.NONE
+    scene.start()
+    assert scene.link.sent and scene.fault is Fault.NONE
+
+
+def test_letters_are_heard_and_answered(scene):
+    scene.start()
+    t = scene.context.clock.now
+    packet = Packet(0, t, (0.0,))
+    scene.air.send(scene.leader.letter(Letter(0, t, 0, (0.0,), packet)))
+    scene.rounds(20)
+    # The leader is expected at t, and the vehicle is at 0.
+    assert scene.link.sent[-1][0] == pytest.approx(t, abs=1.0)
+    wire = scene.wire(0)
+    wire.begin(scene.ground.flight)
+    now = scene.context.clock.now, scene.clock.time()
+    letters = [wire.open(each, *now) for each in scene.air.receive()]
+    bodies = [x.body for x in letters if not isinstance(x, Drop) and isinstance(x.body, Letter)]
+    assert bodies and bodies[-1].packet == packet and bodies[-1].hops == 1
+    # At the network's rate: every other state.
+    assert len(bodies) <= 0.6 * len(scene.link.sent) + 2
+
+
+FAULTS = {
+    Fault.FENCE: lambda scene: setattr(scene.link, "x", [6.0, 0.0]),
+    Fault.SPEED: lambda scene: setattr(scene.link, "x", [0.0, 11.0]),
+    Fault.BATTERY: lambda scene: setattr(scene.link, "battery", 0.1),
+    Fault.LINK: lambda scene: setattr(scene.link, "fails", True),
+    Fault.INPUT: lambda scene: setattr(scene.law, "u", math.nan),
+    Fault.STALE: lambda scene: setattr(scene.link, "age", 0.2),
+    Fault.STOP: lambda scene: scene.air.send(scene.leader.stop(scene.clock.time())),
+    Fault.SIGNAL: lambda scene: scene.process.interrupt(),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_lets_the_vehicle_descend_and_stay_so(fault, scene, capsys):
+    scene.start()
+    sent = len(scene.link.sent)
+    FAULTS[fault](scene)
+    for _ in range(4):
+        scene.process.over()
+        scene.rounds(1)
+    assert scene.fault is fault
+    scene.link.fails, scene.link.x, scene.law.u, scene.link.age = False, [0.0, 1.0], 0.0, 0.0
+    before, sinks = len(scene.link.sent), scene.link.sinks
+    scene.rounds(5)
+    assert len(scene.link.sent) == before <= sent + 2 and scene.link.sinks == sinks + 5
+    said = capsys.readouterr().err
+    # The page has it in the report; what the link says is a note.
+    assert notes(scene) == ({"the link is gone"} if fault is Fault.LINK else set())
+    assert said.count("levels and descends.") == 1 and said.startswith("agent 1: ")
+
+
+def test_a_vehicle_that_says_nothing_is_not_taken_for_one_that_rests(scene, capsys):
+    scene.start()
+    scene.link.silent = True
+    scene.rounds(25)
+    assert scene.fault is Fault.STALE and scene.link.sinks
+    # Long ago it moved, and long ago it said so.
+    scene.rounds(1_000)
+    assert not scene.process.over()
+    scene.link.silent = False
+    scene.rounds(1)
+    scene.link.x = [0.0, 0.0]
+    scene.rounds(150)
+    assert not scene.process.over()
+    scene.rounds(60)
+    assert scene.process.over()
+
+
+def test_a_descent_that_does_not_end_is_left_after_20_s(scene):
+    scene.start()
+    scene.link.silent = True
+    scene.rounds(25)
+    assert not scene.process.over()
+    scene.rounds(3_900)
+    assert not scene.process.over()
+    scene.rounds(110)
+    assert scene.process.over()
+
+
+def report(scene, number=1, earlier=0):
+    """A report of another process of the same number, as it is sent, maybe in an earlier flight."""
+    nothing, wire = Report(*[0] * 12, dropped=(0,) * len(Drop)), scene.wire(number)
+    wire.begin(scene.context.wire.flight - earlier)
+    return wire.report(scene.clock.time(), nothing)
+
+
+def test_a_process_with_the_same_number_ends_the_flight(scene):
+    scene.start()
+    scene.clock.now += 0.01
+    # Another one that was killed just before may have sent it.
+    scene.air.send(report(scene))
+    scene.rounds(2)
+    assert scene.fault is Fault.NONE
+    scene.context.wire.boot -= 3000
+    scene.air.send(report(scene, earlier=1))
+    scene.rounds(2)
+    assert scene.fault is Fault.NONE
+    scene.air.send(report(scene))
+    scene.rounds(2)
+    assert scene.fault is Fault.TWIN
+    assert scene.process.supervisor.sentence == "two agents have the number 1"
+
+
+def test_who_descends_already_still_says_that_its_number_is_used_twice(scene):
+    """The ground believes the process that began last, and sees the fault of that one alone."""
+    scene.start()
+    scene.process.supervisor.trip(Fault.PERIOD, 0.02)
+    scene.context.wire.boot -= 3000
+    scene.air.send(report(scene))
+    scene.rounds(2)
+    scene.process.report(scene.clock.now)
+    assert "two agents have the number 1" in notes(scene)
+
+
+MISTAKES = {
+    "a datagram of agent 0 is signed with another key.": {"key": b"other" * 8},
+    "a datagram of agent 0 is of another formation.": {"formation": "cd" * 32},
+}
+
+
+@pytest.mark.parametrize("sentence", MISTAKES)
+def test_mistakes_on_the_ground_are_told_once(sentence, scene, capsys):
+    scene.start()
+    t, other = scene.context.clock.now, scene.wire(0, **MISTAKES[sentence])
+    for _ in range(3):
+        scene.air.send(other.letter(Letter(0, t, 0, (0.0,), Packet(0, t, (0.0,)))))
+        scene.rounds(1)
+    said = capsys.readouterr().err.splitlines()
+    assert said.count(f"agent 1: {sentence}") == 1 and scene.fault is Fault.NONE
+
+
+def notes(scene):
+    """What the process says to the ground, meanwhile."""
+    wire = scene.wire(GROUND)
+    opened = [wire.open(each, None, scene.clock.time()) for each in scene.air.receive()]
+    return {x.body for x in opened if not isinstance(x, Drop) and x.kind is DatagramKind.NOTE}
+
+
+CLOCKS = {
+    Drop.CLOCK.value: (-1.5, 1.5),
+    Drop.START.value: (-0.4, -0.2, 0.15, 0.9),
+}
+
+
+@pytest.mark.parametrize("why", CLOCKS)
+def test_a_clock_that_is_off_keeps_a_vehicle_on_the_ground(why, scene, capsys):
+    scene.introduce()
+    for off in CLOCKS[why]:
+        for _ in range(3):
+            now = scene.clock.time() + off
+            scene.air.send(scene.ground.start(now, now, 1))
+            scene.rounds(1)
+    scene.process.report(scene.clock.now)
+    sentence = f"a datagram of the ground {why}"
+    assert capsys.readouterr().err == f"agent 1: {sentence}.\n"
+    assert not scene.link.sent and notes(scene) == {sentence}
+    scene.start()
+    assert scene.link.sent
+
+
+def test_a_neighbour_whose_clock_is_ahead_is_told(scene, capsys):
+    scene.start()
+    for off, why in ((1.5, "that differs from this clock by"), (0.2, "ahead of this clock")):
+        t = scene.context.clock.now + off
+        scene.air.send(scene.leader.letter(Letter(0, t, 0, (0.0,), Packet(0, t, (0.0,)))))
+        scene.rounds(2)
+        assert f"a datagram of agent 0 has a time stamp {why}" in capsys.readouterr().err
+    # One that is late is none of them, and nobody is told.
+    t = scene.context.clock.now - 0.5
+    scene.air.send(scene.leader.letter(Letter(0, t, 0, (0.0,), Packet(0, t, (0.0,)))))
+    scene.rounds(2)
+    assert not capsys.readouterr().err
+
+
+def test_a_process_of_the_same_number_that_could_not_begin_changes_nothing(scene):
+    scene.start()
+    scene.rounds(600)
+    scene.air.send(scene.wire(1).note(scene.clock.time(), "the address is in use"))
+    scene.rounds(2)
+    assert scene.fault is Fault.NONE
+
+
+def test_the_first_start_counts(scene):
+    scene.start()
+    before = scene.context.clock.now
+    scene.air.send(scene.ground.start(scene.clock.time(), scene.clock.time() + 100.0, 1))
+    scene.rounds(2)
+    assert scene.context.clock.now >= before
+
+
+def test_states_that_come_unevenly_are_all_used(scene):
+    """States every period, each up to 4 ms late: the law counts its time by ticks."""
+    scene.start()
+    before = len(scene.link.sent)
+    arrive(scene, [k + 0.4 * (k * 37 % 11) / 10 for k in range(200)])
+    assert len(scene.link.sent) - before >= 199
+
+
+def arrive(scene, times):
+    """Let states arrive at times from now on, in periods."""
+    begin = scene.clock.now
+
+    def read(wait):
+        scene.clock.now = begin + times.pop(0) * DT
+        return Reading(scene.clock.now, [0.0, 1.0])
+
+    scene.link.read = read
+    scene.rounds(len(times))
+
+
+def count_ticks(scene, times):
+    """How often the law acts on states of times after the start, in periods."""
+    scene.start()
+    before = scene.law.ticks
+    arrive(scene, [*times])
+    return scene.law.ticks - before
+
+
+def test_the_law_counts_its_time_by_ticks(scene):
+    """States that come too often are skipped, and a few that were missed are made up for."""
+    often = [k / 2 for k in range(100)]
+    assert abs(count_ticks(scene, [*often, *(50 + 2 * k for k in range(25))]) - 99) <= 2
+
+
+def test_a_long_gap_is_not_made_up_for(scene):
+    assert abs(count_ticks(scene, [*range(50), *range(150, 200)]) - 100) <= 2

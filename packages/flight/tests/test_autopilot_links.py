@@ -1,0 +1,376 @@
+"""Links to autopilots without their libraries: what they send and read, and what they refuse."""
+
+import math
+import struct
+import sys
+import time
+from types import ModuleType, SimpleNamespace
+
+import pytest
+from fake_crazyflie import Crazyflie, packed
+
+from echelon_flight import FlightError, MissingLibraryError
+from echelon_flight import __main__ as process
+from echelon_flight.links import open_link
+from echelon_flight.links.crazyflie import CflibLink
+from echelon_flight.links.px4 import Px4Link
+
+STATES = dict.fromkeys(["x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw"], "")
+COMMANDS = ("roll_command", "pitch_command", "yaw_rate_command", "thrust")
+
+
+def facts(*inputs):
+    names = inputs or COMMANDS
+    return {
+        "agent": 0, "dt": 0.01, "states": STATES, "inputs": dict.fromkeys(names, ""),
+        "trim": dict.fromkeys(names, 0.0) | {"thrust": 0.3},
+    }  # fmt: skip
+
+
+# ---- the fake's packets ----
+
+
+def test_the_fake_tells_its_variables_and_parameters():
+    fake = Crazyflie()
+    [count] = fake.answer(b"\x5c\x03", 0.0)
+    assert struct.unpack("<BHI", count[1:])[:2] == (3, 11) and count[0] == 0x5C
+    [entry] = fake.answer(b"\x5c\x02" + struct.pack("<H", 6), 0.0)
+    assert entry[1:] == b"\x02\x06\x00\x03stateEstimateZ\0quat\0"
+    [value] = fake.answer(b"\x2d\x00\x00", 0.0)
+    assert value == b"\x2d\x00\x00\x00\x01"
+    assert fake.answer(b"\x2e\x00\x00\x02", 0.0) == [b"\x2e\x00\x00\x02"]
+    assert fake.parameters["stabilizer.controller"] == 2
+    assert fake.answer(b"\xfd\x00", 0.0)[0][1:].startswith(b"Bitcraze Crazyflie\0")
+    assert fake.answer(b"\xdd\x00", 0.0) == [b"\xdd\x00\x0c"]
+    assert fake.answer(b"\x4c\x01", 0.0) == [b"\x4c\x01\x00"]
+
+
+def test_the_fake_logs_at_the_period_that_was_asked_for():
+    fake = Crazyflie()
+    block = b"\x06\x07" + b"".join(struct.pack("<BH", 0x55, k) for k in (2, 8))
+    assert fake.answer(b"\x5d" + block, 0.0) == [b"\x5d\x06\x07\x00"]
+    assert fake.answer(b"\x5d\x03\x07\x01", 0.0) == [b"\x5d\x03\x07\x00"]
+    state = (0.0, 0.0, 1.25), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0), (0.0, 0.5, 0.0)
+    packets = [fake.logged(*state, 0.004 * k) for k in range(1, 26)]
+    assert sum(map(len, packets)) == 10
+    assert packets[2][0] == b"\x5e\x07\x0c\x00\x00" + struct.pack("<hh", 1250, -500)
+
+
+def test_the_fake_locks_thrust_turns_the_old_yaw_rate_and_levels_by_itself():
+    fake = Crazyflie()
+    fake.answer(b"\x3c" + struct.pack("<fffH", 10.0, -5.0, 20.0, 30000), 1.0)
+    assert fake.acting(1.0)[3] == 0.0
+    fake.answer(b"\x3c" + struct.pack("<fffH", 0.0, 0.0, 0.0, 0), 1.0)
+    fake.answer(b"\x3c" + struct.pack("<fffH", 10.0, -5.0, 20.0, 30000), 1.0)
+    tilt = [math.radians(angle) for angle in (10.0, 5.0, -20.0)]
+    assert fake.acting(1.4) == pytest.approx([*tilt, 30000 / 65535 * 0.48])
+    assert fake.acting(1.6) == pytest.approx([0.0, 0.0, 0.0, 30000 / 65535 * 0.48])
+    assert fake.acting(3.1) == [0.0] * 4
+
+
+# ---- a Crazyflie ----
+
+
+class Commander:
+    """Writes packets as cflib 0.1.34 does, for the fake."""
+
+    def __init__(self, fake):
+        self.fake, self.now = fake, 0.0
+
+    def send_setpoint(self, roll, pitch, rate, thrust):
+        self.fake.answer(b"\x3c" + struct.pack("<fffH", roll, -pitch, rate, thrust), self.now)
+
+    def send_setpoint_manual(self, roll, pitch, rate, percent, rates):
+        thrust = int(10001 + 0.01 * percent * (60000 - 10001))
+        data = struct.pack("<BfffHB", 11, roll, -pitch, rate, thrust, rates)
+        self.fake.answer(b"\x7c" + data, self.now)
+
+    def send_full_state_setpoint(self, place, speed, acceleration, q, *rates):
+        numbers = [int(1000 * number) for number in (*place, *speed, *acceleration)]
+        turn = [int(1000 * rate) for rate in rates]
+        data = struct.pack("<BhhhhhhhhhIhhh", 6, *numbers, packed(q), *turn)
+        self.fake.answer(b"\x7c" + data, self.now)
+
+    def send_stop_setpoint(self):
+        self.fake.answer(b"\x7c\x00", self.now)
+
+
+class Callbacks(list):
+    add_callback = list.append
+
+
+class LogConfig:
+    def __init__(self, name, period_in_ms):
+        assert period_in_ms == 10
+        self.variables, self.data_received_cb = {}, Callbacks()
+
+    def add_variable(self, name, kind):
+        self.variables[name] = kind
+
+    def start(self):
+        assert sum({"i": 2, "u": 4, "F": 2}[kind[0]] for kind in self.variables.values()) <= 26
+
+
+class Stub:
+    """What the link uses of cflib's `Crazyflie`, with the fake behind it."""
+
+    def __init__(self):
+        self.fake, self.configs, self.armed = Crazyflie(), [], []
+        self.commander, self.connection_lost = Commander(self.fake), Callbacks()
+        self.confirm = Callbacks()
+        self.param = SimpleNamespace(
+            set_value=self.set_value,
+            add_update_callback=lambda group, name, cb: self.confirm.append(cb),
+        )
+        self.log = SimpleNamespace(add_config=self.configs.append)
+        self.supervisor = SimpleNamespace(send_arming_request=self.armed.append)
+
+    def set_value(self, name, value):
+        self.fake.parameters[name] = value
+        for call in self.confirm:
+            call(name, str(value))
+
+    def arrive(self, **values):
+        names = self.configs[0].variables
+        packet = {name: values.get(name.partition(".")[2], 0) for name in names}
+        for call in self.configs[0].data_received_cb:
+            call(0, packet | {"stateEstimateZ.quat": 3 << 30}, None)
+
+
+@pytest.fixture
+def crazyflie(monkeypatch):
+    for name in ("cflib", "cflib.crazyflie", "cflib.crazyflie.log"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    sys.modules["cflib.crazyflie.log"].LogConfig = LogConfig
+    return Stub()
+
+
+def test_attitudes_reach_the_crazyflie_with_the_signs_of_echelon(crazyflie):
+    link = CflibLink("", facts(), crazyflie)
+    assert crazyflie.armed == [] and crazyflie.fake.locked and link.watchdog
+    link.send([0.1, 0.2, -0.3, 0.25])
+    assert crazyflie.armed == [True] and crazyflie.fake.parameters["stabilizer.controller"] == 2
+    assert not crazyflie.fake.locked
+    assert crazyflie.fake.command == pytest.approx([0.1, 0.2, -0.3, 0.25], abs=4e-6)
+    strong = CflibLink("radio://0/80/2M#0.72", facts(), crazyflie)
+    crazyflie.fake.full = 0.72
+    strong.send([0.0, 0.0, 0.0, 0.5])
+    assert crazyflie.fake.command[3] == pytest.approx(0.5, abs=6e-6)
+
+
+def test_a_crazyflie_that_keeps_another_controller_is_refused(crazyflie, monkeypatch):
+    monkeypatch.setattr("echelon_flight.links.crazyflie._PATIENCE", 0.01)
+    crazyflie.param.set_value = lambda *_: None
+    with pytest.raises(FlightError, match="does not confirm its parameter `stabilizer.controller`"):
+        CflibLink("", facts(), crazyflie)
+
+
+def test_the_newest_state_is_read_once(crazyflie):
+    link = CflibLink("", facts(), crazyflie)
+    assert link.read(0.0) is None
+    crazyflie.arrive(z=1000)
+    crazyflie.arrive(z=1200, vy=-300, vbat=3.55)
+    reading = link.read(1.0)
+    assert reading.x == pytest.approx([0.0, 0.0, 1.2, 0.0, -0.3, 0.0, 0.0, 0.0, 0.0])
+    assert reading.battery == pytest.approx(0.5) and link.read(0.0) is None
+    crazyflie.connection_lost[0]("", "Too many packets lost\nin the air.")
+    with pytest.raises(
+        FlightError, match="the link to the Crazyflie failed: Too many packets lost"
+    ):
+        link.read(1.0)
+
+
+def test_accelerations_go_as_full_states_from_the_measured_place(crazyflie):
+    link = CflibLink("", facts("ax", "ay", "az"), crazyflie)
+    link.send([0.1, 0.2, 0.3])
+    assert crazyflie.fake.acceleration is None
+    crazyflie.arrive(z=1000)
+    link.send([0.1, 0.2, -0.3])
+    assert crazyflie.fake.acceleration == pytest.approx([0.1, 0.2, -0.3], abs=1e-3)
+
+
+def test_a_descent_is_level_and_ends_with_the_motors_off_at_the_ground_or_in_time(
+    crazyflie, monkeypatch
+):
+    link, blind = (CflibLink("", facts(), crazyflie) for _ in range(2))
+    link.send([0.1, 0.2, -0.3, 0.25])
+    link.level_descend()
+    assert crazyflie.fake.command == pytest.approx([0.0, 0.0, 0.0, 0.93 * 0.3], abs=4e-6)
+    for call in crazyflie.configs[0].data_received_cb:
+        call(0, dict.fromkeys(crazyflie.configs[0].variables, 0), None)
+    link.level_descend()
+    assert crazyflie.fake.command == [0.0] * 4
+    now = time.monotonic()
+    for later, thrust in ((0.0, 0.93 * 0.3), (4.9, 0.93 * 0.3), (5.1, 0.0), (9.0, 0.0)):
+        monkeypatch.setattr(time, "monotonic", lambda later=later: now + later)
+        blind.level_descend()
+        assert crazyflie.fake.command[3] == pytest.approx(thrust, abs=4e-6)
+
+
+REFUSED = {
+    ("thrust", "torque_x", "torque_y", "torque_z"): "the law commands torques, which a Crazyflie "
+    "would keep when the law stops; use the model `crazyflie-attitude`",
+    ("vx", "vy"): "the law has the inputs `vx`, `vy`, and a Crazyflie takes `roll_command`, ",
+}
+
+
+@pytest.mark.parametrize("inputs", REFUSED)
+def test_a_crazyflie_refuses_torques_and_unknown_inputs_before_it_connects(inputs):
+    with pytest.raises(FlightError, match=REFUSED[inputs]):
+        open_link("cflib://udp://127.0.0.1:19850", facts(*inputs))
+
+
+def test_px4_refuses_torques_before_it_connects():
+    with pytest.raises(FlightError, match="the link `px4` sends `roll_command`, "):
+        open_link("px4://udpin:127.0.0.1:14540", facts("thrust", "torque_x"))
+
+
+def test_a_full_thrust_is_a_number():
+    for text in ("much", "-1", "nan", "inf"):
+        with pytest.raises(FlightError, match="must be the thrust of all motors, in N"):
+            CflibLink(f"radio://0/80/2M#{text}", facts(), Stub())
+
+
+@pytest.mark.parametrize(
+    ("link", "library"), [(CflibLink, "cflib"), (Px4Link, "pymavlink")], ids=["cflib", "px4"]
+)
+def test_a_missing_library_is_named(monkeypatch, link, library):
+    for name in ("cflib", "cflib.crtp", "pymavlink"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(MissingLibraryError, match=rf"pip install '{library}>="):
+        link("udp://127.0.0.1:19850", facts())
+
+
+# ---- PX4 ----
+
+
+class Mav:
+    """What was sent, by name."""
+
+    def __init__(self):
+        self.sent = []
+
+    def __getattr__(self, name):
+        return lambda *numbers: self.sent.append((name.removesuffix("_send"), numbers))
+
+
+class Wire:
+    """What the link uses of pymavlink's connection."""
+
+    target_system, target_component = 1, 1
+
+    def __init__(self, *messages):
+        self.queue, self.mav, self.closed = [*messages], Mav(), False
+
+    def recv_msg(self):
+        return self.queue.pop(0) if self.queue else None
+
+    def select(self, _):
+        pass
+
+    def wait_heartbeat(self, timeout):
+        return self.queue[0] if self.queue else None
+
+    def close(self):
+        self.closed = True
+
+
+def message(kind, **fields):
+    return SimpleNamespace(get_type=lambda: kind, **fields)
+
+
+def odometry(z):
+    half = math.sqrt(0.5)
+    return message(
+        "ODOMETRY", x=2.0, y=1.0, z=-z, q=(half, 0.0, 0.0, half), child_frame_id=1, vx=0.0, vy=0.0,
+        vz=-0.5, rollspeed=0.0, pitchspeed=0.0, yawspeed=0.0,
+    )  # fmt: skip
+
+
+HOVER = message("PARAM_VALUE", param_id="MPC_THR_HOVER", param_value=0.4)
+
+
+def beat(main, sub=0):
+    return message("HEARTBEAT", autopilot=12, custom_mode=main << 16 | sub << 24)
+
+
+@pytest.fixture
+def px4(monkeypatch):
+    """A link to a wire with messages, and the wire; time stands still until it is set."""
+
+    def connect(*messages):
+        wire = Wire(beat(4, 3), *messages)
+        for name in ("pymavlink", "pymavlink.mavutil"):
+            monkeypatch.setitem(sys.modules, name, ModuleType(name))
+        sys.modules["pymavlink"].mavutil = sys.modules["pymavlink.mavutil"]
+        sys.modules["pymavlink"].mavutil.mavlink_connection = lambda _, dialect: wire
+        return Px4Link("udpin:127.0.0.1:14540", facts()), wire
+
+    return connect
+
+
+def test_px4_is_read_and_commanded_in_its_own_frames(px4):
+    link, wire = px4(HOVER, odometry(0.9), odometry(1.1))
+    assert link.read(0.0).x == pytest.approx([1.0, 2.0, 1.1, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
+    assert link.read(0.0) is None and link.watchdog
+    link.send([0.0, 0.0, 0.2, 0.3])
+    _, numbers = next(each for each in wire.mav.sent if each[0] == "set_attitude_target")
+    assert numbers[1:4] == (1, 1, 3) and numbers[5:] == pytest.approx((0.0, 0.0, -0.2, 0.4))
+    assert numbers[4] == pytest.approx([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
+    assert ("heartbeat", (18, 8, 0, 0, 0)) in wire.mav.sent
+    link.close()
+    assert wire.closed
+
+
+@pytest.mark.parametrize("error", [ImportError("No module named 'serial'"), OSError("no port")])
+def test_an_address_that_cannot_be_opened_is_one_sentence(px4, monkeypatch, error):
+    px4(HOVER)
+
+    def refuse(_, dialect):
+        raise error
+
+    monkeypatch.setattr(sys.modules["pymavlink"].mavutil, "mavlink_connection", refuse)
+    with pytest.raises(FlightError, match=f"`px4://rubbish` cannot be opened: {error}"):
+        Px4Link("rubbish", facts())
+
+
+def test_a_missing_library_ends_a_process_with_a_sentence_and_its_code(monkeypatch, capsys):
+    def missing(*_):
+        raise MissingLibraryError("a Crazyflie needs cflib.")
+
+    monkeypatch.setattr(process, "_options", lambda: SimpleNamespace(folder=None))
+    monkeypatch.setattr(process, "Mission", missing)
+    with pytest.raises(SystemExit) as left:
+        process.main()
+    assert left.value.code == 4
+    assert capsys.readouterr().err == "echelon-flight: a Crazyflie needs cflib.\n"
+
+
+def modes(wire):
+    return [n[4:7] for name, n in wire.mav.sent if name == "command_long" and n[2] == 176]
+
+
+def test_offboard_is_asked_for_after_a_second_of_setpoints_until_it_is_there(px4, monkeypatch):
+    link, wire = px4(HOVER)
+    now = 100.0
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    for _ in range(200):
+        link.send([0.0, 0.0, 0.0, 0.3])
+        assert bool(modes(wire)) == (now > 101.0)
+        now += 0.01
+    assert modes(wire) == [(1, 6, 0)] * 2
+    wire.queue += [beat(6), odometry(1.0)]
+    link.read(0.0)
+    for _ in range(200):
+        link.send([0.0, 0.0, 0.0, 0.3])
+        now += 0.01
+    assert len(modes(wire)) == 2
+    link.level_descend()
+    assert modes(wire)[-1] == (1, 4, 6)
+
+
+def test_px4_that_does_not_tell_its_hover_thrust_is_refused(px4, monkeypatch):
+    clock = iter(range(100))
+    monkeypatch.setattr("time.monotonic", lambda: float(next(clock)))
+    with pytest.raises(FlightError, match="PX4 does not send its parameter `MPC_THR_HOVER`"):
+        px4()

@@ -1,0 +1,182 @@
+"""`echelon check`, `design` and `compare`: guarantees, gains and methods for a scenario."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from echelon.apps.cli import options, tables
+from echelon.apps.cli.options import JsonOption, ScenarioArgument, SetOption
+from echelon.apps.cli.terminal import STATUS, STOP
+from echelon.output.archive.folder import claim_design, write_errors
+
+if TYPE_CHECKING:
+    from echelon.core.types import JsonObject
+    from echelon.experiments.scenario.build import Experiment
+    from echelon.experiments.scenario.scenario import Scenario
+    from echelon.experiments.studies.compare import Comparison
+    from echelon.simulation.engine.parts import Parts
+    from echelon.simulation.step.settings import Settings
+
+
+def check(
+    scenario: ScenarioArgument,
+    set_: SetOption = None,
+    every: Annotated[
+        bool, typer.Option("--all", help="Print every line, with its reason, as a table.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """State what is guaranteed of a scenario, and why; exit code 0 if anything is."""
+    from echelon.experiments.scenario.scenario import load_scenario
+
+    loaded = load_scenario(scenario, set_ or [])
+    STATUS.begin(f"checking {loaded.name}", not as_json)
+    # Not above: an error in the file is reported without the wait for JAX.
+    from echelon.experiments.scenario.build import build
+    from echelon.experiments.studies.check import check as examine
+
+    checked = examine(*build(loaded))
+    if as_json:
+        print(json.dumps(checked.as_mapping(), indent=2))
+    else:
+        from echelon.output.reports.check_report import check_report, check_sentences, grouped
+
+        if every:
+            tables.print_statements(grouped(checked.lines), check_sentences(checked))
+        else:
+            print(check_report(checked))
+    raise typer.Exit(0 if checked.promised else 1)
+
+
+def design(
+    scenario: options.ScenarioArgument,
+    set_: options.SetOption = None,
+    method: Annotated[str | None, typer.Option(help="Only this method.")] = None,
+    out: options.GainFileOption = None,
+    figures: Annotated[
+        Path | None, typer.Option(help="Draw modes and certified set into this folder.")
+    ] = None,
+    force: options.OverwriteOption = False,
+    slice_: Annotated[
+        str | None,
+        typer.Option("--slice", metavar="STATE,STATE", help="Draw the set in these two states."),
+    ] = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Try all gain methods, recommend one, save its gain, and draw its guarantee."""
+    from echelon.experiments.scenario.scenario import load_scenario
+
+    loaded = load_scenario(scenario, set_ or [])
+    STATUS.begin(f"designing gains for {loaded.name}", not as_json)
+    from echelon.experiments.scenario.self_contained import files_of
+
+    # Before the study, which takes seconds.
+    claim_design(out, figures, force, files_of(loaded))
+    from echelon.experiments.studies.design import design as study
+    from echelon.synthesis.gains.gain_file import save_gain
+
+    report = study(loaded, method, STATUS.counter("methods"))
+    sentence, best = report.because, report.recommended
+    summary: JsonObject = {"recommended": None}
+    if best is not None and best.gain is not None and best.parts is not None:
+        summary = {"recommended": best.method, "because": sentence}
+        if out is not None:
+            save_gain(best.gain, best.parts.model, best.parts.graph, out)
+        if figures is not None:
+            radii = _draw(best.parts, report.settings, figures, slice_)
+            sentence += f"\n{radii}" if radii else ""
+            summary["radii"] = radii
+    summary["methods"] = [tables.design_row(row) for row in report.designs]
+    if as_json:
+        print(json.dumps(summary, indent=2))
+    else:
+        tables.print_designs(summary["methods"], sentence)
+    raise typer.Exit(1 if best is None else 0)
+
+
+def _draw(parts: "Parts", settings: "Settings", folder: Path, states: str | None) -> str | None:
+    """Draw a design's figures, and return a sentence on its radii if it has any."""
+    from echelon.output.plots.study_figures import save_design_figures
+
+    with write_errors(folder):
+        _, radii = save_design_figures(parts, settings, folder, states)
+    return None if radii is None else radii.sentence()
+
+
+def compare(
+    scenarios: Annotated[
+        list[str],
+        typer.Argument(help="Names of bundled scenarios, or YAML files.", metavar="SCENARIO..."),
+    ],
+    horizon: Annotated[float, typer.Option(help="Duration of every run, s.")] = 10.0,
+    method: Annotated[
+        list[str] | None, typer.Option(help="Only this method; repeat the option for several.")
+    ] = None,
+    set_: options.SetOption = None,
+    out: options.FolderOption = None,
+    force: options.ForceOption = False,
+    figures: options.FiguresOption = True,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Simulate the consensus laws and the optimization-based methods from the same starts."""
+    from echelon.experiments.scenario.scenario import load_scenario
+
+    # First, so that `--set simulation.horizon` wins over it.
+    changes = [f"simulation.horizon={horizon!r}", *(set_ or [])]
+    loaded = [load_scenario(name, changes) for name in scenarios]
+    names = ", ".join(scenario.name for scenario in loaded)
+    STATUS.begin(f"comparing methods on {names}, which takes minutes", not as_json)
+    from echelon.experiments.scenario.build import build
+    from echelon.experiments.studies.compare import known_labels
+    from echelon.output.archive.folder import claim_folders
+    from echelon.output.reports.comparison_report import comparison_mapping
+
+    labels = known_labels(method)
+    experiments = [build(scenario, to_run=True) for scenario in loaded]
+    folders = claim_folders([scenario.name for scenario in loaded], out, force)
+    with STOP.hold():
+        comparisons = [
+            _compare(*job, labels, figures, as_json)
+            for job in zip(loaded, experiments, folders, strict=True)
+        ]
+    if as_json:
+        rows = [comparison_mapping(comparison) for comparison in comparisons]
+        print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2))
+    raise typer.Exit(STOP.exit_code)
+
+
+def _compare(
+    scenario: "Scenario",
+    experiment: "Experiment",
+    folder: Path,
+    labels: tuple[str, ...],
+    figures: bool,
+    quiet: bool,
+) -> "Comparison":
+    """Simulate all methods on a scenario, print the results, and write them."""
+    from echelon.experiments.studies.compare import compare as simulate
+    from echelon.output.archive.study_folder import Flights, write_comparison
+    from echelon.output.reports.comparison_report import (
+        comparison_mapping,
+        comparison_report,
+        print_comparison,
+    )
+
+    def progress(label: str, done: float, methods: int) -> None:
+        STATUS.count(done, methods, f"methods, now {label}")
+        STOP.check()
+
+    flights = Flights(folder)
+    STATUS.begin(f"comparing on {scenario.name}", not quiet)
+    comparison = simulate(scenario, experiment, labels, progress, flights.write)
+    # Printed before anything more is written, so that a full disk loses nothing of it.
+    if not quiet:
+        print_comparison(tables.console(), comparison)
+    flights.check()
+    rows, text = comparison_mapping(comparison), comparison_report(comparison)
+    write_comparison(comparison, rows, text, folder, figures)
+    if not quiet:
+        tables.print_folder(folder)
+    return comparison

@@ -1,0 +1,185 @@
+"""The folders of sweeps and comparisons: runs as they are computed, then datasets and figures."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, final
+
+from echelon.core.errors import OutputError
+from echelon.core.files import INPUTS, make_atomic, write_atomic
+from echelon.core.types import JsonObject
+from echelon.experiments.results.dataset import save_dataset
+from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
+from echelon.experiments.studies.compare import Comparison, ComparisonRow
+from echelon.experiments.sweeps.axes import read_axes
+from echelon.experiments.sweeps.frames import write_frames
+from echelon.experiments.sweeps.plan import Sweep
+from echelon.experiments.sweeps.sweep_dataset import axis_values
+from echelon.experiments.sweeps.workers import SweepBatch
+from echelon.output.archive.chunks import Chunks
+from echelon.output.archive.folder import BATCHES, FRAMES, RUNS, write_errors
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_OVER = "over.json"
+
+
+@final
+class Batches:
+    """The batches of a sweep in its folder, each in a file named by its first run.
+
+    Args:
+        folder: of the sweep.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Use a folder, which may not exist yet."""
+        self.folder, self.chunks = folder, Chunks(folder, BATCHES)
+        self.frames = Chunks(folder, f"{BATCHES}/frames")
+
+    def begin(self, plan: Sweep) -> None:
+        """Write the scenario and the axes, before anything is computed.
+
+        Raises:
+            OutputError: a file cannot be written.
+        """
+        over = {"over": [axis.text for axis in plan.axes], "keep_states": plan.every}
+        self.chunks.begin(plan.scenario, {_OVER: json.dumps(over) + "\n"})
+        if plan.frames is not None:
+            with write_errors(self.folder):
+                self.frames.place.mkdir(exist_ok=True)
+            self._check_room(8 * plan.count * plan.frames.numbers)
+
+    def _check_room(self, size: int) -> None:
+        """Check that the disk has room for the frames, in batches and then in one file."""
+        free = shutil.disk_usage(self.folder).free
+        if 2 * size > free:
+            raise OutputError(
+                f"the states of all runs take {2 * size / 2**30:.3g} GiB, and {free / 2**30:.3g} "
+                f"GiB are free in `{self.folder}`; store fewer, with a larger `--keep-states`."
+            )
+
+    def plan(self) -> Sweep:
+        """Return the sweep that was begun here.
+
+        Raises:
+            OutputError: there is none, or its inputs or versions changed.
+        """
+        self.chunks.check()
+        begun = json.loads((self.folder / INPUTS / _OVER).read_text("utf-8"))
+        scenario = load_scenario(self.folder / SCENARIO_FILE)
+        return Sweep(scenario, read_axes(begun["over"]), begun["keep_states"])
+
+    def write(self, batch: SweepBatch) -> None:
+        """Write a batch completely or not at all.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        with write_errors(self.folder):
+            # Frames first: a batch whose numbers are stored is complete.
+            if batch.frames is not None:
+                self.frames.store(batch.first, batch.frames)
+            self.chunks.store(batch.first, batch.columns)
+
+    def read(self) -> list[SweepBatch]:
+        """Return the batches that are stored completely, without their frames."""
+        names = (file.stem for file in self.chunks.place.glob("*.npz"))
+        firsts = sorted(int(name) for name in names if name.isdigit())
+        stored = ((first, self.chunks.stored(first)) for first in firsts)
+        return [SweepBatch(first, columns) for first, columns in stored if columns is not None]
+
+    def write_frames(self, plan: Sweep) -> None:
+        """Write the frames of all runs into one file, if the sweep stores them.
+
+        Raises:
+            OutputError: it cannot be written, or the frames of a batch are damaged.
+        """
+        if plan.frames is None:
+            return
+        stored = ((batch.first, self._frames(batch.first)) for batch in self.read())
+        with write_errors(self.folder):
+            make_atomic(
+                self.folder / FRAMES,
+                lambda part: write_frames(plan, axis_values(plan), stored, part),
+            )
+
+    def _frames(self, first: int) -> JsonObject:
+        frames = self.frames.stored(first)
+        if frames is None:
+            numbers = f"{self.chunks.place}/{first}.npz"
+            raise OutputError(f"`{numbers}` has lost its states; delete it, and resume the sweep.")
+        return frames
+
+
+def write_sweep(data: "xr.Dataset", text: str, folder: Path, figures: bool = True) -> None:
+    """Write the dataset of a sweep, its report and the figures.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    with write_errors(folder):
+        # In memory first: on a full disk the HDF5 library would end the whole process.
+        write_atomic(folder / "sweep.nc", bytes(data.to_netcdf(None, engine="h5netcdf")))
+        write_atomic(folder / "sweep.txt", text + "\n")
+        if figures:
+            # Here, since matplotlib takes long to load and only figures need it.
+            from echelon.output.plots.study_figures import save_sweep_figures
+
+            save_sweep_figures(data, folder)
+
+
+@final
+class Flights:
+    """The datasets of a comparison, each written as soon as its run is complete.
+
+    Args:
+        folder: of the comparison.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Begin without an error."""
+        self.folder = folder
+        self.error: OSError | None = None
+
+    def write(self, row: ComparisonRow) -> None:
+        """Write the run of a method; the comparison continues if that fails."""
+        # A method that was refused or failed to start has a row without a run.
+        if row.flight is None:
+            return
+        try:
+            (self.folder / RUNS).mkdir(parents=True, exist_ok=True)
+            save_dataset(row.flight.result, self.folder / RUNS / f"{row.label}.nc")
+        except OSError as error:
+            # The first, since later errors mostly have the same cause.
+            self.error = self.error or error
+
+    def check(self) -> None:
+        """Check that all datasets were written.
+
+        Raises:
+            OutputError: one was not.
+        """
+        with write_errors(self.folder):
+            if self.error is not None:
+                raise self.error
+
+
+def write_comparison(
+    comparison: Comparison, summary: JsonObject, text: str, folder: Path, figures: bool = True
+) -> None:
+    """Write the numbers of a comparison, its text and the figures.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    with write_errors(folder):
+        content = json.dumps(summary, indent=2, allow_nan=False)
+        write_atomic(folder / "comparison.json", content + "\n")
+        write_atomic(folder / "comparison.txt", text + "\n")
+        if figures:
+            # Here, since matplotlib takes long to load and only figures need it.
+            from echelon.output.plots.study_figures import save_comparison_figures
+
+            save_comparison_figures(comparison, folder)

@@ -1,0 +1,417 @@
+"""Figures of studies: of a comparison, of a sweep, and of a design."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from echelon.core.digits import at_most
+from echelon.core.types import Array
+from echelon.experiments.results.metrics import SETTLED, output_errors
+from echelon.experiments.results.recording import LoopPoles
+from echelon.experiments.results.run_numbers import RUN_NUMBERS, settling_bound
+from echelon.experiments.studies.basin import (
+    Radii,
+    StateSlice,
+    Trial,
+    chosen_slice,
+    converged,
+    grid,
+    observed_radius,
+    side_of,
+    slice_of,
+    trial,
+)
+from echelon.experiments.studies.compare import Comparison
+from echelon.experiments.sweeps.axes import SEED
+from echelon.experiments.sweeps.numbers import SUMMARIZED
+from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
+from echelon.guarantees.promises.promise import promise
+from echelon.output.plots import style as draw
+from echelon.output.plots.figure_files import save
+from echelon.output.plots.network import poles
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.result import Result
+from echelon.simulation.step.settings import Settings
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_TICKS, _COUNTED = 9, 100
+"""Most values named at an axis of a map, and most cells with their counts."""
+_MOST = 500
+_LOST, _CONVERGED = "#F0C9A8", "#CFE3F1"  # pale, under the outlines of the sets
+_CERTIFIED, _OBSERVED = draw.COLOURS[2], draw.COLOURS[0]
+
+
+def comparison_figures(comparison: Comparison) -> "dict[str, Figure]":
+    """Return the figures of a comparison, by name.
+
+    `formation_error` is the worst follower's distance from its goal, `tracking_error` the leader's
+    from its reference, and `approach` the path of one follower to its goal.
+    """
+    runs = [
+        (k, row.label, row.flight.result)
+        for k, row in enumerate(comparison.rows)
+        if row.flight is not None and len(row.flight.result.times) > 1
+    ]
+    if not runs:
+        return {}
+    with draw.style():
+        drawings = {
+            "formation_error": _formation_error(runs),
+            "tracking_error": _tracking_error(runs),
+            "approach": _approach(runs),
+        }
+    return {name: figure for name, figure in drawings.items() if figure is not None}
+
+
+def save_comparison_figures(comparison: Comparison, folder: Path) -> None:
+    """Write each figure of a comparison as PNG and PDF under `folder`/figures.
+
+    Raises:
+        OSError: the folder or a file cannot be written.
+    """
+    save(comparison_figures(comparison), folder / "figures")
+
+
+_Runs = list[tuple[int, str, Result]]
+"""Place among the methods, label and result of each."""
+
+
+def _formation_error(runs: _Runs) -> "Figure":
+    lines = {k: run.formation_errors.max(axis=1) for k, _, run in runs}
+    return _over_time(runs, lines, draw.label("worst formation error", runs[0][2].length_unit))
+
+
+def _tracking_error(runs: _Runs) -> "Figure | None":
+    tracking = {k: output_errors(run) for k, _, run in runs}
+    # Only the position, with which the outputs begin, since a yaw is not in metres.
+    space = len(runs[0][2].measured)
+    lines = {
+        k: np.linalg.norm(errors[:, :space], axis=1)
+        for k, errors in tracking.items()
+        if errors is not None
+    }
+    if not lines:
+        return None
+    text = draw.label("leader's tracking error", runs[0][2].length_unit)
+    return _over_time([run for run in runs if run[0] in lines], lines, text)
+
+
+def _count_equal(runs: _Runs, lines: dict[int, Array]) -> dict[int, int]:
+    """Return the number of equal lines that each drawn line represents."""
+    counts: dict[int, int] = {}
+    for k, _, _ in runs:
+        # To the bit, as of laws with the same leader, which does not react to its followers.
+        same = [j for j in counts if np.array_equal(lines[j], lines[k])]
+        counts[same[0] if same else k] = counts.get(same[0], 0) + 1 if same else 1
+    return counts
+
+
+def _over_time(runs: _Runs, lines: dict[int, Array], text: str) -> "Figure":
+    """Return errors on a logarithmic axis, with gaps where they are 0."""
+    counts = _count_equal(runs, lines)
+    # The time axis of the longest run, since others may have ended early.
+    longest = max((run for _, _, run in runs), key=lambda run: run.times[-1])
+    figure, [[ax]] = draw.sheet(3.4)
+    ax.set(xlim=(0.0, max(longest.times[-1], 1e-9)), xlabel="time (s)")
+    curves = []
+    for k, label, run in runs:
+        if k not in counts:
+            continue
+        values = draw.above_zero(lines[k])
+        keep = draw.thin(len(values))
+        name = label if counts[k] == 1 else f"{label} and {counts[k] - 1} equal"
+        name = draw.say_zero(name, values)
+        draw.plot(ax, run.times[keep], values[keep], label=name, **draw.pen(k, draw.NAMED))
+        curves.append(values)
+    mark = settling_bound(runs[0][2].length_unit)
+    ax.axhline(SETTLED, label=mark, **draw.MARK)
+    ax.set_ylabel(text)
+    draw.logarithmic(ax, *curves, np.array([SETTLED]))
+    return draw.finish(figure)
+
+
+def _approach(runs: _Runs) -> "Figure | None":
+    """Return the path of the follower with the largest initial error, relative to its goal."""
+    first = runs[0][2]
+    axes = list(first.model.position_indices()[:2])
+    if len(axes) < 2:
+        return None
+    # All methods have the same starts, so that the first gives the follower.
+    follower = int(np.argmax(first.goal_distances([0])))
+    names, units = first.model.state_names, first.model.state_units
+    figure, ax = draw.canvas([draw.label(f"{names[k]} error", units[k]) for k in axes])
+    start, goal = first.errors[:1, follower][:, axes], np.zeros((1, 2))
+    drawn, cut = [start, goal], False
+    for k, label, run in runs:
+        path, over = draw.drop_runaways(run.errors[:, follower][:, axes], start, goal)
+        # A path that leaves would shrink the others to a dot.
+        inside = np.abs(path).max(axis=1) <= 1.3 * np.abs(start).max()
+        path, over = np.where(inside[:, None], path, np.nan), over or not inside.all()
+        draw.plot(ax, path[draw.thin(len(path))], label=label, **draw.pen(k, draw.NAMED))
+        drawn.append(path)
+        cut |= over
+    draw.plot(ax, start, label=f"start, F{follower}", **draw.dots("o", draw.LEADER, hollow=True))
+    draw.plot(ax, goal, label="goal", **draw.dots("s", draw.LEADER))
+    draw.frame(ax, np.concatenate(drawn))
+    return draw.finish(figure, cut)
+
+
+# ---- sweeps -----------------------------------------------------------------------------------
+
+
+def sweep_figures(data: "xr.Dataset") -> "dict[str, Figure]":
+    """Return the figures of a sweep, by name.
+
+    `errors` shows how errors and times are distributed, `success` the share of runs that settle
+    over each key of numbers but the seed, with intervals of 95 %, and `region` that share over the
+    first two of them.
+    """
+    keys = [key for key in map(str, data["outcome"].dims) if key != SEED and _is_line(data, key)]
+    with draw.style():
+        drawings = {"errors": _distributions(data)}
+        if keys:
+            drawings["success"] = _success(data, keys)
+        if len(keys) > 1:
+            drawings["region"] = _region(data, keys[0], keys[1])
+    return drawings
+
+
+def save_sweep_figures(data: "xr.Dataset", folder: Path) -> None:
+    """Write each figure of a sweep as PNG and PDF under `folder`/figures.
+
+    Raises:
+        OSError: the folder or a file cannot be written.
+    """
+    save(sweep_figures(data), folder / "figures")
+
+
+def _is_line(data: "xr.Dataset", key: str) -> bool:
+    """Return whether the values of a key are several numbers."""
+    return data.sizes[key] > 1 and np.issubdtype(data[key].dtype, np.number)
+
+
+def _distributions(data: "xr.Dataset") -> "Figure":
+    """Return the shares of runs below each value, as lines."""
+    figure, (axes,) = draw.sheet(2.8, 1, len(SUMMARIZED))
+    for ax, name in zip(axes, SUMMARIZED, strict=True):
+        values = np.sort(data[name].values.ravel())
+        values = values[np.isfinite(values)]
+        ax.set_xlabel(draw.label(RUN_NUMBERS[name].label, data[name].attrs.get("units", "")))
+        ax.set_ylim(0.0, 1.02)
+        if not values.size:
+            continue
+        # A share of all runs: those without the number count as above any value.
+        share = np.arange(1, len(values) + 1) / data["outcome"].size
+        keep = draw.thin(len(values))
+        ax.step(values[keep], share[keep], where="post", color=draw.COLOURS[0])
+        _scale(ax, "x", values)
+    axes[0].set_ylabel("share of runs below")
+    return draw.finish(figure)
+
+
+def _share(data: "xr.Dataset", keys: list[str]) -> "tuple[xr.DataArray, xr.DataArray]":
+    """Return the numbers of settled runs and of all runs over some keys."""
+    others = [dim for dim in data["outcome"].dims if dim not in keys]
+    present = data["outcome"] != data["outcome"].attrs["flag_values"][0]
+    return succeeded(data).sum(others), present.sum(others)
+
+
+def _success(data: "xr.Dataset", keys: list[str]) -> "Figure":
+    figure, (axes,) = draw.sheet(2.8, 1, len(keys[:3]))
+    for ax, key in zip(axes, keys, strict=False):
+        settled, runs = (part.sortby(key) for part in _share(data, [key]))
+        values, rate = settled[key].values, settled.values / np.maximum(1, runs.values)
+        low, high = share_bounds(settled.values, np.maximum(1, runs.values))
+        bars = np.abs(np.stack([rate - low, high - rate]))
+        ax.errorbar(values, rate, bars, color=draw.COLOURS[0], fmt="o:", markersize=3, capsize=2)
+        _name_values(ax, "x", values)
+        ax.set_xlabel(_label(data, key))
+        ax.set_ylim(-0.03, 1.03)
+    axes[0].set_ylabel("share of runs that settle")
+    return draw.finish(figure)
+
+
+def _region(data: "xr.Dataset", first: str, second: str) -> "Figure":
+    """Return the share of settled runs as colours over two keys."""
+    settled, runs = (part.sortby([first, second]) for part in _share(data, [first, second]))
+    rate = (settled / runs.clip(min=1)).transpose(second, first)
+    figure, ((ax,),) = draw.sheet(2.8)
+    ends = []
+    for which, key in (("x", first), ("y", second)):
+        values = rate[key].values
+        _name_values(ax, which, values)
+        ends.append(_cell_ends(values))
+        getattr(ax, f"set_{which}label")(_label(data, key))
+    x, y = ends
+    mesh = ax.pcolormesh(x, y, rate.values, vmin=0.0, vmax=1.0, cmap="viridis")
+    ax.grid(False)
+    if rate.size <= _COUNTED:
+        _count(ax, settled.transpose(second, first), runs.transpose(second, first))
+    figure.colorbar(mesh, ax=ax, label="share of runs that settle")
+    return draw.finish(figure)
+
+
+def _count(ax: "Axes", settled: "xr.DataArray", runs: "xr.DataArray") -> None:
+    """Write into each cell how many of its runs settle."""
+    second, first = map(str, settled.dims)
+    for (row, column), count in np.ndenumerate(settled.values):
+        total = int(runs.values[row, column])
+        # The upper end of the colours is bright.
+        colour = "black" if count > 0.6 * total else "white"
+        place = float(settled[first].values[column]), float(settled[second].values[row])
+        look: draw.Style = {"color": colour, "size": "x-small", "ha": "center", "va": "center"}
+        ax.text(*place, f"{int(count)}/{total}", **look)
+
+
+def _label(data: "xr.Dataset", key: str) -> str:
+    """Return the label of a key: its meaning and unit, or itself."""
+    attributes = data[key].attrs
+    return draw.label(str(attributes.get("long_name", key)), str(attributes.get("units", "")))
+
+
+def _is_geometric(values: Array) -> bool:
+    """Return whether values belong on a logarithmic axis: over decades, or by equal factors."""
+    values = np.unique(values)
+    if values[0] <= 0.0 or len(values) < 2:
+        return False
+    factors = values[1:] / values[:-1]
+    equal = len(values) > 2 and factors.min() > 1.2 and factors.max() < 1.3 * factors.min()
+    return bool(values[-1] >= 30.0 * values[0] or equal)
+
+
+def _scale(ax: "Axes", which: str, values: Array) -> None:
+    """Choose a logarithmic axis where values need one."""
+    if _is_geometric(values):
+        getattr(ax, f"set_{which}scale")("log")
+
+
+def _name_values(ax: "Axes", which: str, values: Array) -> None:
+    """Put ticks of an axis at values, or at some of many."""
+    _scale(ax, which, values)
+    ticks = values if len(values) <= _TICKS else values[:: -(-len(values) // _TICKS)]
+    getattr(ax, f"set_{which}ticks")(ticks, [f"{value:g}" for value in ticks])
+    getattr(ax, f"set_{which}ticks")([], minor=True)
+
+
+def _cell_ends(values: Array) -> Array:
+    """Return the ends of cells around ascending values, half way between them on their axis."""
+    places = np.log(values) if _is_geometric(values) else values.astype(float)
+    between = 0.5 * (places[1:] + places[:-1])
+    first, last = 1.5 * places[0] - 0.5 * places[1], 1.5 * places[-1] - 0.5 * places[-2]
+    ends = np.concatenate([[first], between, [last]])
+    return np.exp(ends) if _is_geometric(values) else ends
+
+
+# ---- designs ----------------------------------------------------------------------------------
+
+
+def save_design_figures(
+    parts: Parts, settings: Settings, folder: Path, axes: str | None = None
+) -> tuple[list[Path], Radii | None]:
+    """Write `modes` and `certified_set` of a gain as PNG and PDF; return paths and both radii.
+
+    The second figure and the radii are missing for a model of one state, for a loop that does not
+    decay, and for more than 500 followers.
+
+    Raises:
+        GainError: `axes` names no two states of the model.
+        OSError: the folder or a file cannot be written.
+    """
+    loop = promise(parts, settings).loop
+    figures, radii = {}, None
+    sliced = axes is not None or len(parts.model.state_names) > 1
+    states = chosen_slice(parts.model, axes) if sliced else None
+    with draw.style():
+        figures["modes"] = poles(LoopPoles(loop.poles, loop.eigenvalues))
+        if states is not None and loop.every and len(parts.graph.followers) <= _MOST:
+            figures["certified_set"], radii = _certified_set(parts, settings, states)
+    return save(figures, folder), radii
+
+
+def _certified_set(
+    parts: Parts, settings: Settings, states: tuple[int, int]
+) -> "tuple[Figure, Radii]":
+    """Return the starts in a slice that converge, with the certified ellipse over them.
+
+    A certified set much smaller than the observed one has a second panel.
+    """
+    run, plane = trial(parts, settings), slice_of(parts, states)
+    region = promise(run.parts, settings).certified
+    certified, observed = None if region is None else region.radius, observed_radius(run, plane)
+    names = (parts.model.state_names[states[0]], parts.model.state_names[states[1]])
+    radii = Radii(names, certified, observed, plane.largest, run.horizon)
+    wide = np.minimum(plane.limits, plane.extents(1.8 * max(observed, 1e-2 * plane.largest)))
+    panels = [wide]
+    if certified and certified < np.inf and (plane.extents(certified) < 0.3 * wide).all():
+        panels.append(plane.extents(1.5 * certified))
+    figure, (axes,) = draw.sheet(4.0, 1, len(panels))
+    for ax, half in zip(axes, panels, strict=True):
+        _starts(ax, run, plane, half)
+        _ellipses(ax, plane, radii, half)
+        for name, k in zip("xy", states, strict=True):
+            text = draw.label(f"{parts.model.state_names[k]} error", parts.model.state_units[k])
+            getattr(ax, f"set_{name}label")(text)
+    if len(panels) > 1:
+        axes[0].set_title("observed")
+        axes[1].set_title("certified")
+    _legend(figure, axes[0], radii, run)
+    return figure, radii
+
+
+def _starts(ax: "Axes", run: Trial, plane: StateSlice, half: Array) -> None:
+    """Colour a grid of starts by whether they converge."""
+    from matplotlib.colors import ListedColormap
+
+    side = side_of(run.followers)
+    x, y = grid(plane, half, side)
+    starts = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
+    inside = converged(run, plane, starts).reshape(side, side)
+    colours = ListedColormap([_LOST, _CONVERGED])
+    look = {"cmap": colours, "vmin": 0.0, "vmax": 1.0, "rasterized": True, "zorder": 0}
+    ax.pcolormesh(x, y, inside.astype(float), shading="nearest", **look)
+    ax.plot(0.0, 0.0, **draw.dots("+", draw.EDGE, 6.0))
+    ax.grid(False)
+    ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+
+
+def _ellipses(ax: "Axes", plane: StateSlice, radii: Radii, half: Array) -> None:
+    """Draw the certified and the observed set, if they fit into the axes."""
+    ellipses: list[Any] = [(radii.observed, _OBSERVED, (0, (5, 2)), "none")]
+    if radii.certified and radii.certified < np.inf:
+        ellipses.append((radii.certified, _CERTIFIED, "-", _CERTIFIED))
+    for radius, colour, dash, fill in ellipses:
+        if not radius or (plane.extents(radius) < 0.004 * half).any():
+            continue
+        points = plane.ellipse(radius, 400)
+        points = np.vstack([points, points[:1]])
+        ax.plot(*points.T, color=colour, linestyle=dash, zorder=3)
+        if fill != "none":
+            ax.fill(*points.T, color=fill, alpha=0.25, linewidth=0.0, zorder=2)
+
+
+def _legend(figure: "Figure", ax: "Axes", radii: Radii, run: Trial) -> None:
+    """Draw the legend above the panels."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    certified = "no certified set"
+    if radii.certified is not None:
+        certified = f"certified, r = {at_most(radii.certified)}"
+        certified = certified if radii.certified else "certified: empty"
+        certified = "certified everywhere" if radii.certified == np.inf else certified
+    observed = f"observed: all tested starts converge, r = {at_most(radii.observed)}"
+    lost = f"error not below {100.0 * run.decay:.2g} % after {run.horizon:.3g} s"
+    ink = _CERTIFIED if radii.certified else "none"
+    border: dict[str, Any] = {"edgecolor": "0.7"}
+    handles: list[Any] = [
+        Line2D([], [], color=ink, label=certified),
+        Line2D([], [], color=_OBSERVED, linestyle=(0, (5, 2)), label=observed),
+        Patch(facecolor=_CONVERGED, label="converges, leader at rest", **border),
+        Patch(facecolor=_LOST, label=lost, **border),
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=2)

@@ -1,0 +1,54 @@
+"""Whole flights of exported laws, in this process under a clock that tests move."""
+
+import pytest
+from virtual_flight import LinkImpairment, VirtualFlight
+
+import echelon as ech
+from echelon.agents.network.formation_motion import Rotate
+from echelon.output.archive.flight_folder import flight_files, save_flight
+from echelon_flight.local_flight import place_errors
+from echelon_flight.supervisor import Fault
+
+CARTS, DT, SECONDS = ech.models.DoubleIntegrator(), 0.02, 8.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A turning formation of three carts."""
+    graph = ech.Graph([(0, 1), (1, 2)], directed=True)
+    places = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.0), 2: (1.0, 0.8)})
+    places = places.moving(CARTS, graph, [Rotate(0.4)])
+    leader = ech.laws.StoppingLeader(reference=ech.references.Circle(rate=0.5))
+    drive = ech.Laws(leader, ech.laws.StoppingPoint())
+    world = ech.World(network=ech.Network(rate=25.0))
+    parts = ech.Parts(CARTS, graph, places, drive, initial={"position": 0.3}, world=world)
+    folder = tmp_path_factory.mktemp("flight")
+    save_flight(flight_files(parts, ech.Settings(horizon=SECONDS, dt=DT), "carts"), folder)
+    return folder
+
+
+def test_a_formation_is_kept_over_a_radio_and_by_who_comes_back(folder, tmp_path, monkeypatch):
+    radio = LinkImpairment(0.02, 0.02, 0.2)
+    flight = VirtualFlight(folder, tmp_path / "key", monkeypatch, radio)
+    for k in range(3):
+        flight.start_agent(k)
+    flight.take_off(0, 1, 2)
+    flight.fly(0.5)
+    errors, killed, back = [], None, None
+    while (t := flight.time) < SECONDS - 0.1:
+        if killed is None and t > 5.0:
+            killed = len(errors)
+            flight.kill(2)
+        if back is None and t > 5.3:
+            back = len(errors)
+            flight.start_agent(2)
+        flight.fly(DT)
+        places = [vehicle.x[:2] for vehicle in flight.vehicles]
+        errors.append(place_errors(flight.mission.facts, flight.time, places))
+    late = [max(row[k] for row in errors[-30:]) for k in (1, 2)]
+    assert max(late) < 0.01, late
+    # The one that was killed went astray meanwhile, and came back.
+    assert max(row[2] for row in errors[killed:]) > 10.0 * max(row[1] for row in errors[killed:])
+    assert max(row[1] for row in errors[killed:]) < 0.01
+    flight.wait(lambda state: len(flight.ended) == 3)
+    assert set(flight.ended.values()) == {Fault.END}
