@@ -367,7 +367,7 @@ def _new_sweep(
 ) -> "tuple[Sweep, Batches, Job]":
     """Return a sweep and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
-    from echelon.experiments.sweeps.axes import read_axes
+    from echelon.experiments.sweeps.plan import read_axes
 
     axes = read_axes(over)
     scenario = load_scenario(name, changes)

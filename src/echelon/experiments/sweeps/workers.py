@@ -7,9 +7,8 @@ from typing import NamedTuple, final
 from echelon.core.errors import EchelonError, Outcome
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import Experiment, build
-from echelon.experiments.sweeps.frame_shape import StoredFrames
-from echelon.experiments.sweeps.numbers import Columns, columns_of, numbers_of, refused
-from echelon.experiments.sweeps.plan import Sweep, SweepRun
+from echelon.experiments.sweeps.plan import StoredFrames, Sweep, SweepRun
+from echelon.experiments.sweeps.sweep_dataset import Columns, columns_of, numbers_of, refused
 from echelon.guarantees.promises.promise import Promise, promises
 from echelon.simulation.engine.batch import Batch, StepCount
 from echelon.simulation.engine.result import Result

@@ -11,10 +11,8 @@ from echelon.core.types import JsonObject
 from echelon.experiments.results.dataset import save_dataset
 from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
-from echelon.experiments.sweeps.axes import read_axes
-from echelon.experiments.sweeps.frames import write_frames
-from echelon.experiments.sweeps.plan import Sweep
-from echelon.experiments.sweeps.sweep_dataset import axis_values
+from echelon.experiments.sweeps.plan import Sweep, read_axes
+from echelon.experiments.sweeps.sweep_dataset import axis_values, write_frames
 from echelon.experiments.sweeps.workers import SweepBatch
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.folder import BATCHES, FRAMES, RUNS, write_errors

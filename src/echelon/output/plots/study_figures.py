@@ -23,8 +23,7 @@ from echelon.experiments.studies.basin import (
     trial,
 )
 from echelon.experiments.studies.compare import Comparison
-from echelon.experiments.sweeps.axes import SEED
-from echelon.experiments.sweeps.numbers import SUMMARIZED
+from echelon.experiments.sweeps.plan import SEED, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 from echelon.guarantees.promises.promise import promise
 from echelon.output.plots import style as draw
