@@ -254,7 +254,9 @@ def nearest_places(
 
     order = np.arange(len(before))
     others = np.setdiff1d(order, list(leaders))
-    ways = before[others][:, None] - after[others][None]
+    # In units of the largest place, whose rounding decides between ways that are equally long.
+    size = max(np.abs(before).max(), np.abs(after).max(), np.finfo(float).tiny)
+    ways = (before / size)[others][:, None] - (after / size)[others][None]
     order[others] = others[linear_sum_assignment((ways * ways).sum(axis=2))[1]]
     return order
 
