@@ -45,6 +45,7 @@ REFUSED = [
     ("export . --to mat --out run.csv", "`--to` is `mat`, and `run.csv` ends in `.csv`; leave"),
     ("view wrong.yaml", SCENARIO),
     ("export wrong.yaml", SCENARIO),
+    ("explain ringing", "the glossary has no term `ringing`"),
     ("plot . --what top_vieu", "the figure is `top_vieu`, allowed are"),
     (
         "sweep paper --over seed=0..3 --cluster tcp://127.0.0.1:1",

@@ -7,6 +7,7 @@ Tables, JSON, data sets, figures and the glossary take it from here.
 import enum
 from collections.abc import Callable, Mapping, Sequence
 from typing import (
+    TYPE_CHECKING,
     Annotated,
     Any,
     NamedTuple,
@@ -18,7 +19,9 @@ from typing import (
 
 import numpy as np
 
-from echelon.simulation.engine.frame_numbers import ClosestPair
+if TYPE_CHECKING:
+    # Loads JAX, without which `echelon explain` needs this table at once.
+    from echelon.simulation.engine.frame_numbers import ClosestPair
 
 ERROR = "error"
 """In place of a unit: that of the formation errors."""
@@ -160,7 +163,7 @@ class Metrics(NamedTuple):
     leaders: tuple[LeaderMetrics, ...]
     followers: tuple[FollowerMetrics, ...]
     edges: tuple[EdgeMetrics, ...]
-    closest: ClosestPair | None
+    closest: "ClosestPair | None"
     saturation_fraction: float
     steady_window: float
 
