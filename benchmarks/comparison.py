@@ -13,7 +13,7 @@ import echelon as ech
 from echelon.experiments.results.run_numbers import RUN_NUMBERS
 from echelon.experiments.studies.compare import ComparisonRow
 from echelon.output.reports.comparison_report import verdict
-from echelon.output.reports.printed import PRINTED
+from echelon.output.reports.run_report import PRINTED
 
 CONDITIONS = {
     "as in the paper: no wind, no error of mass": [],

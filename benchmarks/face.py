@@ -23,9 +23,9 @@ import numpy as np
 
 import echelon as ech
 from echelon.apps.live.server import live, live_page
-from echelon.experiments.results.dataset import recording_of
+from echelon.experiments.results.recording import recording_of
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
-from echelon.output.archive.load_folder import load
+from echelon.output.archive.run_folder import load
 from echelon.output.plots.video import save_video
 from echelon.output.viewer.replay import replay_page
 

@@ -719,7 +719,7 @@ def preload(cache: str) -> None:
     from typer.main import get_command
 
     import echelon.apps.cli.app
-    import echelon.experiments.results.dataset
+    import echelon.experiments.results.recording
     import echelon.experiments.studies.design
     import echelon.guarantees.verifier.verify  # noqa: F401
 

@@ -14,7 +14,7 @@ from typing import Any
 from PIL import Image
 
 import echelon as ech
-from echelon.experiments.results.dataset import recording_of
+from echelon.experiments.results.recording import recording_of
 from echelon.experiments.studies.compare import compare
 from echelon.output.plots import figure_files
 from echelon.output.plots.study_figures import comparison_figures, sweep_figures

@@ -13,7 +13,7 @@ from browser import chromium, opened, until  # noqa: E402 - of the tests
 
 import echelon as ech  # noqa: E402
 from echelon.apps.live.server import live, live_page  # noqa: E402
-from echelon.experiments.results.dataset import recording_of  # noqa: E402
+from echelon.experiments.results.recording import recording_of  # noqa: E402
 from echelon.output.viewer.replay import replay_page  # noqa: E402
 
 SHORT = ("simulation.horizon=20", "simulation.store_every=4")

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 import echelon as ech
-from echelon.output.archive.law_folder import network_facts
+from echelon.output.archive.flight_folder import network_facts
 from echelon.simulation.onboard.law_functions import law_functions
 from echelon.simulation.onboard.source_code import python_text
 from echelon_flight.wire import Packet

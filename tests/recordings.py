@@ -6,7 +6,8 @@ import json
 import numpy as np
 import xarray as xr
 
-from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
+from echelon.experiments.results.dataset import FORMAT
+from echelon.experiments.results.metrics import Avoidance, Ellipsoid
 from echelon.experiments.results.recording import InputBounds, LoopPoles, Recording, TrackingErrors
 
 PROMISE = {
@@ -124,7 +125,7 @@ def swinging(names, position, agents=3, n=2):
     )
 
 
-def as_file(run, version):
+def as_file(run):
     """A file of a recording, without V, limits and modes."""
     per_agent = ("time", "agent", "state")
     leads = np.isin(np.arange(run.agents), run.leaders).astype(np.int8)
@@ -151,7 +152,7 @@ def as_file(run, version):
         {
             "model": "Own",
             "position": " ".join(run.state_names[k] for k in run.position),
-            "format": version,
+            "format": FORMAT,
             "leader_needs": "nothing",
             "promise": json.dumps(run.promise),
             "horizon": run.horizon,
@@ -159,6 +160,8 @@ def as_file(run, version):
             "outcome": "completed",
             "message": "The run reached its horizon.",
             "warnings": "",
+            "computed_by": "jax",
+            "provenance": "",
             "settings": json.dumps({"horizon": run.horizon, "dt": run.dt}),
         },
     )

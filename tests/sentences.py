@@ -22,7 +22,7 @@ from runs import simulate
 import echelon as ech
 from echelon.core.errors import EchelonError, ScenarioError, listing
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.law_sections import GainSpec
+from echelon.experiments.scenario.sections import GainSpec
 
 FILE = Path(__file__).with_name("sentences.txt")
 INDENT = "    "
@@ -121,7 +121,7 @@ def of_scenario(text):
     changed = {text.partition(":")[0]: text}
     Path("s.yaml").write_text("\n".join(changed.get(key, LINES[key]) for key in LINES), "utf-8")
     try:
-        ech.load_scenario("s.yaml")
+        ech.build(ech.load_scenario("s.yaml"))
     except ScenarioError as error:
         answer = str(error)
         for name, table in TABLES.items():

@@ -21,7 +21,7 @@ import pytest
 import echelon as ech
 from echelon.apps.cli.app import main
 from echelon.experiments.scenario.registry import METHODS
-from echelon.output.reports.printed import PRINTED
+from echelon.output.reports.run_report import PRINTED
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -195,7 +195,7 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
     files = (
         "synthesis/gains/__init__.py",
         f"{scenario}/registry.py",
-        f"{scenario}/law_sections.py",
+        f"{scenario}/sections.py",
     )
     for file, (above, line) in zip(files, added, strict=True):
         text = (package / file).read_text("utf-8")

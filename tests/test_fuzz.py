@@ -88,28 +88,3 @@ def test_a_hundred_command_lines_of_nonsense_end_well(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
     assert "100 cases from seed 0 on, 0 of them faulty" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("base", "change"),
-    [
-        (0, "formation.offsets.2=[1e300,0]"),
-        (0, "reference.radius=1e200"),
-        (1, "initial.states.1=[1e155,0]"),
-        (1, "plant.scale.damping=1.7e308"),
-        (2, "formation.spacing=1.7e308"),
-    ],
-)
-def test_numbers_beyond_all_squares_are_no_fault(here, echelon, recwarn, base, change):
-    (here / "s.yaml").write_bytes(FUZZ.as_yaml(FUZZ.BASES[base]))
-    code, _, fault = echelon("check", "s.yaml", "--set", change)
-    assert code in (0, 1) or (code == 2 and fault.count("\n") == 1), fault
-    assert not [str(each.message) for each in recwarn if each.category is RuntimeWarning]
-
-
-def test_agents_beyond_all_squares_of_each_other_run_without_a_warning(here, echelon, recwarn):
-    (here / "s.yaml").write_bytes(FUZZ.as_yaml(FUZZ.BASES[2]))
-    change = ["--set", "formation.spacing=1e200", "--set", "simulation.precision=float64"]
-    code, _, fault = echelon("run", "s.yaml", "--no-figures", "--out", "o", *change)
-    assert code in (0, 3), fault
-    assert not [str(each.message) for each in recwarn if each.category is RuntimeWarning]

@@ -278,7 +278,7 @@ def test_every_class_is_abstract_or_final():
 
 def test_only_the_tables_and_the_verifier_name_laws_and_methods():
     """So that a new one needs its class, its entry in the registry and its keys, and no more."""
-    tables = ("experiments.scenario.registry", "experiments.scenario.law_sections")
+    tables = ("experiments.scenario.registry", "experiments.scenario.sections")
     names = {*registry.METHODS, *registry.FOLLOWER_LAWS, *registry.LEADER_LAWS}
     # These words have another meaning: a number of a run, and a column of the paper's table.
     others = {("tracking", ""), ("consensus", "output.reports")}
@@ -385,7 +385,7 @@ def test_every_advice_to_install_names_this_distribution():
     # Whoever reads how to install sees every extra.
     start = (ROOT / "docs" / "start.md").read_text("utf-8")
     assert all(f"`{extra}`" in start for extra in {*declared} - {"dev"})
-    everything = f"{project()['name']}[certify,cluster,fast,optimal,video,parquet]"
+    everything = f"{project()['name']}[certify,cluster,fast,optimal,video]"
     assert everything in project()["optional-dependencies"]["all"]
 
 

@@ -32,11 +32,9 @@ from .experiments.results.dataset import (
 from .experiments.results.dataset import (
     save_dataset as save_dataset,
 )
-from .experiments.results.dataset import (
-    summary as summary,
-)
 from .experiments.results.lyapunov import lyapunov as lyapunov
 from .experiments.results.metrics import metrics as metrics
+from .experiments.results.summary import summary as summary
 from .experiments.scenario.build import build as build
 from .experiments.scenario.build import run as run
 from .experiments.scenario.scenario import (
@@ -62,15 +60,7 @@ from .laws.law import Law as Law
 from .laws.safety import Safety as Safety
 from .output.archive.export import export as export
 from .output.archive.export import table as table
-from .output.archive.load_folder import (
-    load as load,
-)
-from .output.archive.load_folder import (
-    load_run as load_run,
-)
-from .output.archive.load_folder import (
-    open_run as open_run,
-)
+from .output.archive.run_folder import load as load
 from .output.archive.run_folder import save_run as save_run
 from .output.archive.verify_folder import verify as verify
 from .output.plots.run_figures import figures as figures

@@ -26,8 +26,9 @@ from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.world import differences, vary_parameters
 from echelon.core.errors import EchelonError, Outcome, ScenarioError
 from echelon.core.numerics import precision
-from echelon.experiments.results.dataset import dataset, summary
+from echelon.experiments.results.dataset import dataset
 from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.results.summary import summary
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.named_class import resolve
@@ -456,8 +457,8 @@ def test_a_plant_s_parameter_may_be_given_or_scaled():
         ),
         (
             {"plant": {"scale": {"mass": 2}, "parameters": {"mass": 2}}},
-            "plant.scale.mass",
-            "got a factor for a parameter that `plant.parameters` sets, allowed is one of them.",
+            "plant",
+            "`mass` of the plant has a value and a factor; give one of them.",
         ),
         (
             {"plant": {"parameters": {"mass": -1}}},

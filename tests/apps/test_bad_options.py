@@ -22,7 +22,7 @@ json.dump(said, sys.stdout)
 PORT = "`--port` is {}, and must be from 0 to 65535."
 GONE = "`gone` does not exist; give the folder of a run, or its `run.nc`."
 SCENARIO = "`wrong.yaml` is a scenario; run it first (`echelon run wrong.yaml --out FOLDER`), and"
-KINDS = "`csv`, `parquet`, `npz`, `mat`, `nc`, `json`, `html`"
+KINDS = "`csv`, `parquet`, `npz`, `mat`, `nc`, `html`"
 
 
 REFUSED = [
@@ -35,6 +35,12 @@ REFUSED = [
     ("video . out.avi", "`out.avi` ends in `.avi`, and must end in .mp4 or .gif."),
     ("export gone", GONE),
     ("export . --to xls", f"`--to` is `xls`, allowed are {KINDS}."),
+    (
+        "export . --to json",
+        "the format `json` is gone; use `csv`, or `nc` with xarray; numbers are",
+    ),
+    ("export . --out run.json", "the format `json` is gone; use `csv`, or `nc` with xarray;"),
+    ("report . --out a.html", "a report as `.html` is gone; use `.txt`, or `echelon view RUN"),
     ("export . --out run.xls", f"`run.xls` ends in `xls`, allowed are {KINDS}."),
     ("export . --to mat --out run.csv", "`--to` is `mat`, and `run.csv` ends in `.csv`; leave"),
     ("view wrong.yaml", SCENARIO),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.output.archive.law_folder import law_files
+from echelon.output.archive.flight_folder import law_files
 
 ALONE = """
 import law

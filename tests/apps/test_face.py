@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,12 @@ from recordings import as_file, flown, separated
 from runs import made_up
 
 import echelon as ech
+from echelon.apps.cli import list_command
 from echelon.apps.cli.list_command import names_and_keys
 from echelon.core.errors import MissingExtraError, OutputError
-from echelon.experiments.results.avoidance import Ellipsoid
-from echelon.experiments.results.dataset import recording_of
 from echelon.experiments.results.labelled import Labelled
-from echelon.experiments.results.recording import FORMAT, read_recording
+from echelon.experiments.results.metrics import Ellipsoid
+from echelon.experiments.results.recording import read_recording, recording_of
 from echelon.experiments.scenario.registry import families
 from echelon.experiments.scenario.scenario import key_meanings
 from echelon.output.archive.export import export, table
@@ -34,13 +35,13 @@ def file(tmp_path_factory):
     """A stored run of four quadrotors."""
     path = tmp_path_factory.mktemp("stored") / "run.nc"
     run = dataclasses.replace(flown(seconds=1.0, rate=25.0), bounds=None)
-    path.write_bytes(as_file(run, FORMAT))
+    path.write_bytes(as_file(run))
     return path
 
 
 @pytest.fixture(scope="module")
 def run(file):
-    return read_recording(file)
+    return read_recording(file)[0]
 
 
 @pytest.fixture(scope="module")
@@ -146,30 +147,51 @@ def test_a_run_without_frames_is_exported_to_no_file(here, run):
     assert not list(here.glob("run.*"))
 
 
+def test_parquet_names_the_extra_that_it_needs(echelon, file, monkeypatch):
+    for name in ("pyarrow", "fastparquet"):
+        monkeypatch.setitem(sys.modules, name, None)
+    code, _, fault = echelon("export", file, "--to", "parquet")
+    assert (code, fault) == (4, f"echelon: {NO_PARQUET}\n")
+
+
+NO_PARQUET = (
+    "Parquet needs pyarrow, which is not installed; `pip install '.[parquet]'` in echelon's clone, "
+    "or use `csv`."
+)
+
+
 def test_an_unknown_format_is_refused_with_those_there_are(echelon, file):
     code, _, fault = echelon("export", file, "--to", "xls")
     assert code == 2
     assert (
         fault
-        == "echelon: `--to` is `xls`, allowed are `csv`, `parquet`, `npz`, `mat`, `nc`, `json`, "
-        "`html`.\n"
+        == "echelon: `--to` is `xls`, allowed are `csv`, `parquet`, `npz`, `mat`, `nc`, `html`."
+        "\n"
     )
 
 
 # ---- pages and videos -------------------------------------------------------------------------
 
 
-def test_the_report_is_one_page_with_promise_figures_and_how_to_cite(echelon, here, file, run):
-    (here / "first").mkdir()
-    shutil.copy(file, here / "first" / "run.nc")
-    (here / "first" / "report.txt").write_text("a <table> & more\n")
-    (here / "first" / "scenario.yaml").write_text("name: mine\n")
-    assert echelon("report", "first")[0] == 0
-    page = (here / "report.html").read_text()
-    assert "a &lt;table&gt; &amp; more" in page and "name: mine" in page
-    assert run.promise["sentence"] in page and "@inproceedings" in page
-    assert page.count("data:image/png;base64,") >= 3
-    assert "http" not in page.replace("https://", "http") or 'src="http' not in page
+def test_the_report_has_numbers_conditions_scenario_versions_and_how_to_cite(echelon, here):
+    short = ("--set", "simulation.horizon=1", "--no-figures")
+    echelon("run", "integrators", "--out", "first", *short)
+    code, text, _ = echelon("report", "first")
+    assert code == 0 and (here / "first" / "report.txt").read_text() in text
+    assert "\n- leaders agree: not needed; there is one\n" in text
+    assert "\nname: integrators\n" in text and f"\nechelon {ech.__version__}" in text
+    assert "@inproceedings{enwerem2023consensus," in text
+    assert max(map(len, text.splitlines())) <= 100
+    told = echelon("report", "first", "--out", "whole.txt")[1]
+    assert told.startswith("- Written to whole.txt: ") and (here / "whole.txt").read_text() == text
+    code, _, fault = echelon("report", "first", "--out", "whole.txt")
+    assert code == 2 and "the file `whole.txt` exists; choose another" in fault
+
+
+def test_the_report_of_a_file_by_itself_has_what_the_file_has(echelon, file, run):
+    text = echelon("report", file)[1]
+    assert f"- The run reached its horizon.\n- {run.promise['sentence']}\n" in text
+    assert "Conditions" not in text and "Scenario" not in text and "@software{echelon," in text
 
 
 def test_a_video_has_the_size_rate_and_part_that_are_asked_for(echelon, here, file):
@@ -314,6 +336,12 @@ def test_a_video_that_cannot_be_is_refused(echelon, file, name, sentence):
 
 
 # ---- a folder to begin with -------------------------------------------------------------------
+
+
+def test_a_starter_names_the_extra_that_its_notebook_needs(echelon, monkeypatch):
+    monkeypatch.setattr(list_command, "find_spec", lambda name: None)
+    told = echelon("init", "my-swarm")[1]
+    assert "The notebook needs JupyterLab: in echelon's clone, pip install '.[notebook]'\n" in told
 
 
 @pytest.mark.slow

@@ -14,13 +14,12 @@ from browser import chromium, opened, until
 from recordings import recorded
 
 import echelon as ech
-from echelon.apps.live import promiser
+from echelon.apps.live import guarantee_status
 from echelon.apps.live import server as served
 from echelon.apps.live import swarm as looked
 from echelon.apps.live.attendance import as_changes
-from echelon.apps.live.guarantee_status import GuaranteeStatus
+from echelon.apps.live.guarantee_status import GuaranteeStatus, Promiser, badge_of, first_look
 from echelon.apps.live.panel import Panel
-from echelon.apps.live.promiser import Promiser, badge_of, first_look
 from echelon.apps.live.server import live, live_page
 from echelon.apps.live.session import Session
 from echelon.apps.live.swarm import LiveLoop, Picture
@@ -116,14 +115,12 @@ IMPERFECT = {
 }
 
 
-def test_radio_gusts_lag_and_noise_are_knobs():
+def test_radio_and_noise_are_knobs_in_gusts_and_with_motors_that_lag():
     own = scenario(**IMPERFECT)
     panel = Panel(own, build(own))
     swarm = LiveLoop(*panel.experiment, panel.live)
-    assert {"delay", "loss", "outages", "gusts", "lag", "noise"} <= {*panel.ranges}
-    knobs = panel.start._replace(
-        **{"delay": 0.06, "loss": 0.5, "outages": 0.2, "gusts": 2.0, "lag": 0.1, "noise": 3.0}
-    )
+    assert {"delay", "loss", "outages", "noise"} <= {*panel.ranges}
+    knobs = panel.start._replace(delay=0.06, loss=0.5, outages=0.2, noise=3.0)
     for each in (panel.start, knobs):
         parts, settings = build(panel.scenario_at(each))
         run = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
@@ -523,7 +520,7 @@ def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_co
             ended.wait(10.0)
         return {"state": "holds", "short": str(knobs.coupling)}
 
-    monkeypatch.setattr(promiser, "badge_of", slow)
+    monkeypatch.setattr(guarantee_status, "badge_of", slow)
     answers = Promiser(told.append)
     answers.ask(panel, panel.start)
     assert began.wait(10.0)
@@ -545,7 +542,7 @@ def test_a_gain_too_large_for_the_step_is_told_at_once_and_while_a_promise_is_co
 
 def test_the_slider_marks_from_where_on_errors_grow_in_held_steps(panel):
     cheap = panel.start._replace(weight=0.02)
-    end, radii = promiser._end(panel, cheap, 0.5 * cheap.coupling), []
+    end, radii = guarantee_status._end(panel, cheap, 0.5 * cheap.coupling), []
     for c in (0.99 * end, 1.01 * end):
         steps = [step_of(panel, cheap._replace(coupling=c), value) for value in eigenvalues(panel)]
         radii.append(np.abs(np.linalg.eigvals(np.array(steps))).max())

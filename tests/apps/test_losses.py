@@ -404,7 +404,7 @@ def test_design_overwrites_nothing(here, echelon):
 
 def test_a_comparison_that_is_interrupted_keeps_what_was_flown(here, echelon, monkeypatch):
     from echelon.apps.cli.terminal import STOP
-    from echelon.output.archive.comparison_folder import Flights
+    from echelon.output.archive.study_folder import Flights
 
     kept = Flights.write
 

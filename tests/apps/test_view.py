@@ -13,7 +13,7 @@ from recordings import flown, separated, swinging
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
-from echelon.experiments.results.dataset import recording_of
+from echelon.experiments.results.recording import recording_of
 from echelon.output.plots.space import space_of
 from echelon.output.viewer.page import Group, pack
 from echelon.output.viewer.replay import (
@@ -278,6 +278,7 @@ def test_keys_choose_an_agent_and_are_listed_and_the_address_is_a_link_to_the_ti
         for key, agent in (("n", 0), ("n", 1), ("p", 0), ("p", 3), ("Escape", -1)):
             page.keyboard.press(key)
             assert page.evaluate("echelon.player.view.selected") == agent
+        assert not page.locator(".report").is_visible()
         page.keyboard.press("?")
         told = page.locator("#help").inner_text()
         assert "select the next agent" in told and "play, pause" in told
@@ -434,10 +435,18 @@ def test_the_reference_is_drawn_and_the_leader_s_error_told(browser, run, tmp_pa
 def test_two_runs_have_one_clock_one_scale_and_one_camera(browser, run, tmp_path):
     other = flown(seconds=3.0, rate=25.0)
     path = tmp_path / "runs.html"
-    path.write_text(replay_page(other, dataclasses.replace(run, name="second")), "utf-8")
+    both = other, dataclasses.replace(run, name="second")
+    path.write_text(replay_page(*both, reports=["one\n---\n- <first>", "two"]), "utf-8")
     moments = "echelon.player.panes.map((pane) => pane.run.moment.time)"
     with opened(browser, path.as_uri()) as page:
         assert page.locator("header h1").inner_text() == "made up and second"
+        for k, text in enumerate(("one\n---\n- <first>", "two")):
+            page.locator(".report").nth(k).click()
+            assert page.locator("dialog pre").inner_text() == text
+            page.keyboard.press("End")
+            page.locator("dialog button").click()
+            until(lambda: not page.locator("dialog").count())
+        assert page.evaluate(moments) == [0.0, 0.0]
         for time, shown in ((2.0, [2.0, 2.0]), (5.0, [3.0, 5.0])):
             page.evaluate(f"echelon.player.seekTime({time})")
             assert page.evaluate(moments) == pytest.approx(shown)
@@ -542,10 +551,12 @@ def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_en
         chart = page.locator(".chart").nth(1).inner_text().replace("\n", " ")
         assert f"V {run.lyapunov[120]:.3g}" in chart and "guaranteed slope, −1 1/s" in chart
         with page.expect_event("load"):
-            growing.finish(run)
+            growing.finish(run, "all of it")
         # A time in between, so that the frame is rounded.
         shown = "Math.round(window.echelon?.frame) === 120 && !echelon.run.growing"
         until(lambda: page.evaluate(shown))
+        page.locator(".report").click()
+        assert page.locator("dialog pre").inner_text() == "all of it"
 
 
 # ---- other models -----------------------------------------------------------------------------
@@ -737,7 +748,7 @@ BAD = {
     "nothing": ("none", "`none` does not exist; give the folder of a run, or its `run.nc`."),
     "no run": (".", "the folder `.` holds no run: it has no `run.nc`."),
     "damaged": ("junk.nc", "`junk.nc` cannot be read as a run: it is damaged, or was not written"),
-    "older": ("old.nc", "`old.nc`: the run was written in format 1 by echelon "),
+    "older": ("old.nc", "`old.nc`: the run has format 1, of echelon "),
 }
 
 

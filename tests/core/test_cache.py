@@ -31,7 +31,7 @@ from echelon.core.cache import file_for, load_or_compute, private_folder, user_f
 from echelon.core.compiled import CompiledFunction
 from echelon.core.numerics import precision
 from echelon.core.words import Kind
-from echelon.experiments.scenario.user_code import user_class
+from echelon.experiments.scenario.named_class import user_class
 
 
 @pytest.fixture

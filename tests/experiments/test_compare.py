@@ -13,9 +13,14 @@ import pytest
 import echelon as ech
 from echelon.apps.cli.app import app
 from echelon.experiments.results import run_numbers
-from echelon.experiments.results.agent_metrics import FollowerMetrics, LeaderMetrics, Metrics
-from echelon.experiments.results.quantity import Quantity, Shown
-from echelon.experiments.results.run_numbers import RunNumbers
+from echelon.experiments.results.metrics import RunNumbers
+from echelon.experiments.results.run_numbers import (
+    FollowerMetrics,
+    LeaderMetrics,
+    Metrics,
+    Quantity,
+    Shown,
+)
 from echelon.experiments.studies.compare import LABELS, Comparison, ComparisonRow
 from echelon.output.reports.comparison_report import comparison_mapping, comparison_report, verdict
 from echelon.output.reports.glossary import glossary

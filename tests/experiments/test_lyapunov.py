@@ -5,8 +5,9 @@ import pytest
 from runs import simulate
 
 import echelon as ech
-from echelon.experiments.results.dataset import dataset, summary
+from echelon.experiments.results.dataset import dataset
 from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.results.summary import summary
 
 DRAG = 0.7
 

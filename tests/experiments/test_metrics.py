@@ -8,8 +8,9 @@ from runs import made_up, simulate
 
 import echelon as ech
 from echelon.core.errors import Outcome
-from echelon.experiments.results.dataset import recording_of, summary
 from echelon.experiments.results.metrics import metrics, output_errors
+from echelon.experiments.results.recording import recording_of
+from echelon.experiments.results.summary import summary
 
 
 @pytest.fixture

@@ -68,11 +68,11 @@ LINE = {"name": "line"}
 @pytest.mark.parametrize(
     ("motion", "message"),
     [
-        ([{}], "got none, allowed is one of"),
-        ([{"rotate": 1.0, "scale": 0.1}], "got `rotate` and `scale`, allowed is one of"),
-        ([{"scale": 0.1}], "`scale` needs the key `rate`"),
-        ([{"rotate": 0.1, "at": 1.0}], "got `at`, which `rotate` does not take"),
-        ([{"reshape": LINE, "at": 1.0}], "`reshape` needs the key `over`"),
+        ([{}], "got none of `rotate`, `scale`, `reshape`, `python`, one is required"),
+        ([{"rotate": 1.0, "scale": 0.1}], "got `rotate`, `scale`, allowed is one of"),
+        ([{"scale": 0.1}], "rate: got nothing, `scale` needs this key"),
+        ([{"rotate": 0.1, "at": 1.0}], "at: got a key that `rotate` does not take"),
+        ([{"reshape": LINE, "at": 1.0}], "over: got nothing, `reshape` needs this key"),
         ([{"reshape": LINE, "at": 1.0, "over": 0.0}], "over"),
         (
             [{"reshape": LINE, "at": 10.0, "over": 1.0}],
@@ -88,7 +88,7 @@ LINE = {"name": "line"}
         ),
         (
             [{"reshape": {"name": "line", "columns": 2}, "at": 1.0, "over": 3.0}],
-            "got `columns`, which the shape `line` does not take",
+            "columns: got a key that `line` does not take",
         ),
     ],
 )

@@ -10,10 +10,9 @@ import pytest
 from forgeries import at, forged, places, replaced
 
 import echelon as ech
-from echelon.experiments.results.dataset import OBSERVED, statement, summary
+from echelon.experiments.results.summary import OBSERVED, statement, summary
 from echelon.experiments.scenario.scenario import bundled_scenarios
 from echelon.experiments.studies.design import with_gain
-from echelon.experiments.studies.older_rounding import as_rounded_now
 from echelon.experiments.studies.recomputation import (
     compare_claims,
     compare_gain,
@@ -260,23 +259,6 @@ def test_which_values_agree(stored, value, agree):
     findings = list(compare_values("x", stored, value))
     assert (refused(findings) == []) is agree
     assert all(x.claim.startswith("x") and x.by_scenario for x in findings)
-
-
-@pytest.mark.parametrize(
-    ("stored", "agree"),
-    [
-        ("errors shrink at 0.209 1/s", True),
-        ("errors shrink at 0.208 1/s", True),
-        ("errors shrink at 0.21 1/s", False),
-        ("errors shrink at 0.2 1/s", False),
-        ("errors shrink at 0.219 1/s", False),
-        ("errors grow at 0.209 1/s", False),
-    ],
-)
-def test_only_nearest_roundings_of_numbers_agree_in_files_of_earlier_formats(stored, agree):
-    now = {"rate": 0.2089, "sentence": "errors shrink at 0.208 1/s"}
-    told = as_rounded_now({"rate": 0.2089, "sentence": stored}, now)
-    assert (refused(list(compare_values("x", told, now))) == []) is agree
 
 
 @pytest.mark.slow

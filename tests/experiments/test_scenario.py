@@ -16,9 +16,6 @@ import echelon.experiments.scenario.scenario
 from echelon.agents.models import DoubleIntegrator
 from echelon.core.errors import EchelonError, ScenarioError, listing
 from echelon.experiments.scenario import key_paths, registry
-from echelon.experiments.scenario.checks import ROLES
-from echelon.experiments.scenario.formation_sections import FormationSpec
-from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
 from echelon.experiments.scenario.named_class import accepted, resolve
 from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.experiments.scenario.scenario import (
@@ -28,7 +25,13 @@ from echelon.experiments.scenario.scenario import (
     load_scenario,
     scenario_from_mapping,
 )
-from echelon.experiments.scenario.sections import GraphSpec
+from echelon.experiments.scenario.sections import (
+    FollowerSpec,
+    FormationSpec,
+    GainSpec,
+    GraphSpec,
+    LeaderSpec,
+)
 from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.yaml import ScenarioFault, read_yaml
 
@@ -261,13 +264,15 @@ def test_a_method_takes_the_keys_that_its_class_takes(name):
     assert method.name == name and {*method.defaults} <= {*method.needs}
 
 
-@pytest.mark.parametrize("role", ["leader", "follower"])
-def test_a_law_takes_the_keys_that_its_class_takes(role):
-    section, laws = ROLES[role]
+@pytest.mark.parametrize(
+    ("section", "laws"),
+    [(LeaderSpec, registry.LEADER_LAWS), (FollowerSpec, registry.FOLLOWER_LAWS)],
+)
+def test_a_law_takes_the_keys_that_its_class_takes(section, laws):
     for name, entry in laws.items():
         taken = {key for key, mark in marked_keys(section).items() if name in mark.choices}
         assert taken == set(accepted(resolve(entry))) & marked_keys(section).keys(), name
-        if role == "leader":
+        if section is LeaderSpec:
             follows = "reference" in accepted(resolve(entry))
             assert follows == (name in registry.TRACKING_LAWS), name
 
@@ -307,7 +312,7 @@ def test_all_faults_of_a_file_are_told_at_once_by_line(refused):
         f"s.yaml:2: model.name: got `quadroto`, allowed are {listing(MODELS)} (did you mean"
         " `quadrotor`?).",
         "s.yaml:3: graph.edges.1: got `[1, 1]`, allowed is an edge between two different agents.",
-        "s.yaml:4: formation.offsets.1.2: got `.nan`, allowed is a finite number.",
+        "s.yaml:4: formation.offsets.1.2: got `.nan`, allowed is a number from -1e+75 to 1e+75.",
         "s.yaml:7: follower.feedforward: got `rely`, allowed are `none`, `relay`,"
         " `relay-velocity`, `parent` (did you mean `relay`?).",
         "s.yaml:11: simulation.dt: got `0`, allowed is a number above 0.",

@@ -22,11 +22,9 @@ import echelon as ech
 from echelon.apps.cli.app import app
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps import workers as sweeps
-from echelon.experiments.sweeps.axes import Axis, axes_of, read_axes
-from echelon.experiments.sweeps.numbers import columns_of
-from echelon.experiments.sweeps.plan import Sweep
+from echelon.experiments.sweeps.plan import Axis, Sweep, axes_of, read_axes
 from echelon.experiments.sweeps.sweep import _missing, compute
-from echelon.experiments.sweeps.sweep_dataset import dataset_of, share_bounds, succeeded
+from echelon.experiments.sweeps.sweep_dataset import columns_of, dataset_of, share_bounds, succeeded
 from echelon.experiments.sweeps.workers import SweepBatch
 from echelon.guarantees.promises.promise import promise, promises
 from echelon.output.plots import study_figures as sweep_plots

@@ -9,8 +9,7 @@ from processes import started, wait_for
 
 import echelon as ech
 from echelon.experiments.sweeps import workers
-from echelon.experiments.sweeps.axes import axes_of
-from echelon.experiments.sweeps.plan import Sweep
+from echelon.experiments.sweeps.plan import Sweep, axes_of
 
 SHORT = ["simulation.horizon=0.5", "simulation.dt=0.01", "report.steady_window=0.1"]
 OVER = {"seed": range(3), "follower.gain.coupling": [0.5, 1.0]}

@@ -214,7 +214,7 @@ def test_a_gain_file_or_a_method_of_ones_own_takes_the_place_of_a_method(folder,
     mine = ech.load_scenario("van-der-pol", ["follower.gain.python=mine.py:Heavy"])
     assert ech.build(mine).parts.drive.gain.method == "heavy"
     # Both from the command line, neither gives way.
-    with pytest.raises(ech.EchelonError, match="got `file` and `python`, allowed is one of them"):
+    with pytest.raises(ech.EchelonError, match="got `file`, `python`, allowed is one of them"):
         ech.load_scenario(
             "van-der-pol", ["follower.gain.file=g.json", "follower.gain.python=mine.py:Heavy"]
         )

@@ -19,8 +19,7 @@ from fake_vehicles import MELLINGER
 
 import echelon as ech
 from echelon.agents.models import CrazyflieAttitude
-from echelon.output.archive.flight_folder import flight_files, save_flight
-from echelon.output.archive.law_folder import law_files
+from echelon.output.archive.flight_folder import flight_files, law_files, save_flight
 from echelon_flight.datagram_socket import DatagramSocket, ports_of
 from echelon_flight.ground import Ground
 from echelon_flight.links.crazyflie import CflibLink

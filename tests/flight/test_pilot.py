@@ -8,7 +8,7 @@ import pytest
 
 import echelon as ech
 from echelon.agents.network.formation_motion import Rotate
-from echelon.output.archive.law_folder import network_facts
+from echelon.output.archive.flight_folder import network_facts
 from echelon.simulation.onboard.law_functions import law_functions
 from echelon.simulation.onboard.source_code import python_text
 from echelon_flight.pilot import NOBODY, Pilot

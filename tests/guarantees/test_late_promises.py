@@ -170,7 +170,7 @@ def test_the_network_is_no_longer_ignored_but_what_else_is_there_is():
     ("network", "options", "words"),
     [
         (dataclasses.replace(RADIO, messages="state"), {}, "messages contain states"),
-        (dataclasses.replace(RADIO, prediction="none"), {}, "followers lag behind it"),
+        (dataclasses.replace(RADIO, prediction="packet"), {}, "followers lag behind it"),
         (dataclasses.replace(RADIO, loss=1.0), {}, "no message arrives"),
         (dataclasses.replace(RADIO, hears="leaderward"), {"coupling": 101.0, "edges":
          [(0, 1, 0.3), (1, 2, 0.3)]}, "weights count as 1"),
@@ -199,7 +199,7 @@ def test_the_lag_behind_messages_of_states_is_that_of_a_run():
 
 
 def test_a_leader_that_stays_needs_no_plan():
-    network = dataclasses.replace(RADIO, prediction="none")
+    network = dataclasses.replace(RADIO, prediction="packet")
     assert said(parts_of(network, leader={"reference": None})).theorem is Theorem.T9
 
 

@@ -511,14 +511,9 @@ def test_stretches_that_no_step_reaches_are_not_counted_on():
     assert found.run.parts.graph.schedule.period == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(
-    ("period", "weight", "coupling"),
-    [(2.0, 1.0, 1e7), (2.0, 1.0, 1e308), (1e155, 1.0, 1.0), (1e308, 1e149, 1.0)],
-)
-def test_couplings_and_periods_beyond_all_numbers_have_a_rate_that_is_no_more(
-    period, weight, coupling
-):
-    chain, star = [(0, 1), (1, 2), (2, 3, weight)], [(0, 1), (0, 2), (2, 3)]
+@pytest.mark.parametrize(("period", "coupling"), [(2.0, 1e7), (2.0, 1e75), (1e75, 1e75)])
+def test_large_couplings_and_periods_have_a_rate_that_is_no_more(period, coupling):
+    chain, star = [(0, 1), (1, 2), (2, 3)], [(0, 1), (0, 2), (2, 3)]
     graph = ech.Graph.switching([(0.0, chain), (1.0, star)], period=period)
     # Warnings are errors here.
     found = promised(flight(graph, rate=3.0, coupling=coupling))
@@ -704,8 +699,8 @@ def test_speeds_that_are_left_out_are_what_the_thrust_bears(roots):
         ({"roots": (4.0, 4.0, 5.0)}, "different from each other"),
         ({"roots": (-4.0, 4.0, 5.0)}, "must be a list of positive numbers"),
         ({"roots": (4.0, 5.0), "rate": 2.0}, "allowed is one of them"),
-        ({"rate": 0.0}, "must be a positive finite number"),
-        ({"coupling": float("nan")}, "must be a positive finite number"),
+        ({"rate": 0.0}, "must be positive, at most"),
+        ({"coupling": float("nan")}, "must be positive, at most"),
         ({"speed": -1.0}, "must be positive"),
         ({"feedforward": "none"}, "a leader that moves is lost"),
     ],

@@ -13,7 +13,7 @@ from plain_agents import as_python
 import echelon as ech
 from echelon.agents.models.chains import angles_among
 from echelon.agents.models.model import wrap_angles
-from echelon.output.archive.law_folder import network_facts, python_law
+from echelon.output.archive.flight_folder import network_facts, python_law
 from echelon.simulation.onboard.law_functions import law_functions
 from echelon.simulation.onboard.source_code import python_text
 from echelon.synthesis.gains import FixedGain

@@ -27,7 +27,7 @@ from echelon.agents.references import Circle, Hover, Lemniscate, Line
 from echelon.core import numerics
 from echelon.core.errors import EchelonError, LawError
 from echelon.experiments.results.lyapunov import lyapunov
-from echelon.experiments.scenario.law_sections import FollowerSpec
+from echelon.experiments.scenario.sections import FollowerSpec
 from echelon.laws import Agreement, Consensus, Law, LocalView, Tracking, TrimInput
 from echelon.synthesis.certificates.domain import Domain
 from echelon.synthesis.gains import FixedGain, InnerLoop, Riccati

@@ -12,8 +12,8 @@ import echelon as ech
 from echelon.agents.network.exchange import Near
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
-from echelon.experiments.results.avoidance import avoidance
-from echelon.experiments.results.labelled_parts import labelled_parts
+from echelon.experiments.results.dataset import labelled_parts
+from echelon.experiments.results.metrics import avoidance
 from echelon.laws.safety import hull_points, nearest_point
 
 ROOTS = (4.0, 4.5, 5.0)

@@ -11,7 +11,7 @@ from recordings import PROMISE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
-from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
+from echelon.experiments.results.metrics import Avoidance, Ellipsoid
 from echelon.experiments.results.recording import MessageAges
 from echelon.output.plots.network import curves_of
 from echelon.output.plots.over_time import start_of
@@ -326,9 +326,7 @@ def test_a_figure_that_is_none_is_refused_with_a_guess(run):
 
 
 def test_plot_draws_png_pdf_and_svg_from_the_file_and_loses_no_other(echelon, here):
-    from echelon.experiments.results.recording import FORMAT
-
-    (here / "run.nc").write_bytes(as_file(swinging(("x", "y", "z"), (0, 1, 2), n=3), FORMAT))
+    (here / "run.nc").write_bytes(as_file(swinging(("x", "y", "z"), (0, 1, 2), n=3)))
     code, told, _ = echelon("plot", "run.nc", "--what", "formation,network,ages", "--dpi", "60")
     assert code == 0
     assert told == (

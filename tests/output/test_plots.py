@@ -15,8 +15,9 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references import Circle
 from echelon.core.errors import Outcome
-from echelon.experiments.results.dataset import recording_of, summary
 from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.results.recording import recording_of
+from echelon.experiments.results.summary import summary
 from echelon.laws import Consensus, Tracking, TrimInput
 from echelon.output.plots.run_figures import figures, save_figures
 from echelon.output.plots.style import COLOURS, thin

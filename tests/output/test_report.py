@@ -9,7 +9,7 @@ from runs import made_up, simulate
 import echelon as ech
 from echelon.core.statement import Cause, Hypothesis, Statement
 from echelon.core.words import Kind, Verdict
-from echelon.output.reports.causes import observations
+from echelon.output.reports.run_report import observations
 
 
 def run(scenario, *changes):

@@ -229,7 +229,6 @@ def late_parts(law, **network):
             "stopping-point", {"delay": 0.05, "hears": "leaderward"}, marks=pytest.mark.study
         ),
         pytest.param("consensus", {"delay": 0.05}, marks=pytest.mark.study),
-        ("consensus", {"delay": 0.03, "prediction": "none"}),
         ("consensus", {"delay": 0.03, "prediction": "packet"}),
         ("stopping-point", {"delay": 0.03, "messages": "state"}),
         ("safety", {"delay": 0.05}),

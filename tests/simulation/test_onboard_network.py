@@ -33,7 +33,6 @@ CASES = {
     "stopping-point-packet": ("stopping-point", 1, {"prediction": "packet"}),
     "consensus-packet": ("consensus", 1, {"prediction": "packet"}),
     "consensus-preview": ("consensus", 1, {}),
-    "none": ("consensus", 1, {"prediction": "none"}),
     "leaders-packet": ("consensus", 0, {"prediction": "packet"}),
 }
 

@@ -108,10 +108,12 @@ def _split(
 ) -> tuple[list[jax.Array], PyTree]:
     """Return the arrays of a tree, and the tree with placeholders for them."""
     leaves, structure = jax.tree.flatten(tree)
-    arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
-    places = iter([Placeholder(k, form(array)) for k, array in enumerate(arrays)])
-    filled = [next(places) if eqx.is_array(leaf) else leaf for leaf in leaves]
-    return arrays, jax.tree.unflatten(structure, filled)
+    arrays = list[jax.Array]()
+    for k, leaf in enumerate(leaves):
+        if eqx.is_array(leaf):
+            leaves[k] = Placeholder(len(arrays), form(leaf))
+            arrays.append(leaf)
+    return arrays, jax.tree.unflatten(structure, leaves)
 
 
 def _joined(tree: PyTree, arrays: Sequence[jax.Array]) -> PyTree:
@@ -126,7 +128,10 @@ def _joined(tree: PyTree, arrays: Sequence[jax.Array]) -> PyTree:
 def _form(array: jax.Array) -> tuple[tuple[int, ...], str, bool]:
     """Return the shape and type of an array as JAX reads it in the current precision."""
     kind = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
-    return array.shape, str(kind), getattr(array, "weak_type", False)
+    return array.shape, _name(kind), getattr(array, "weak_type", False)
+
+
+_name = functools.lru_cache(str)
 
 
 def compile_call(

@@ -4,10 +4,18 @@ Whoever uses one in a scenario, on the command line or in Python gets one senten
 echelon adds a line here, which stays for two minor versions.
 """
 
-KEYS: dict[str, str] = {}
+KEYS: dict[str, str] = {
+    "leadership.waits": "make the leader's path slower, as by a smaller `rate` of `reference`",
+    "live.gusts": "set `rms` of `disturbance` for the whole run",
+    "live.lag": "set `lag` of `actuator` for the whole run",
+}
 """Scenario keys; `section.key` is that key alone, and `key` is it in any section."""
 
-VALUES: dict[str, str] = {}
+VALUES: dict[str, str] = {
+    "prediction: none": "use `packet`, by which the model carries the leader on",
+    "export --to json": "use `csv`, or `nc` with xarray; numbers are in `summary.json`",
+    "report --out .html": "use `.txt`, or `echelon view RUN --html FILE`, which shows it",
+}
 """Values of scenario keys, as in `prediction: none`, and of options, as in `export --to json`."""
 
 COMMANDS: dict[str, str] = {
@@ -16,6 +24,8 @@ COMMANDS: dict[str, str] = {
 """Commands of the command line."""
 
 NAMES: dict[str, str] = {
+    "load_run": "use `load`",
+    "open_run": "use `load`",
     "network.recommend_edges": "compare `graph.with_edges([pair]).spectrum().low`; see recipes.md",
     "network.recommend_leaders": "compare `graph.with_leaders([k]).spectrum().low`; see recipes.md",
     "speedup": "use `-1 / gain.certificate.abscissa` of each graph; see recipes.md",

@@ -115,6 +115,11 @@ def _fields(kind: type) -> tuple[str, ...] | None:
     return tuple(field.name for field in dataclasses.fields(kind))
 
 
+@functools.lru_cache(1024)
+def _has_dict(kind: type) -> bool:
+    return any("__dict__" in vars(base) for base in kind.__mro__)
+
+
 @final
 class _Walk:
     """A walk through a tree of values that collects its bits and its foreign parts."""
@@ -139,8 +144,9 @@ class _Walk:
             return
         names = _fields(kind)
         if names is not None:
-            # By attribute: Equinox may store a field on the class only.
-            self._inner(kind, [getattr(value, name) for name in names])
+            # Equinox may store a field on the class only, and its own access is slow.
+            own = object.__getattribute__(value, "__dict__") if _has_dict(kind) else {}
+            self._inner(kind, [own[n] if n in own else getattr(value, n) for n in names])
         elif isinstance(value, tuple | list):
             self._inner(kind, value)
         elif isinstance(value, dict):

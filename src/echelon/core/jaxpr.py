@@ -418,10 +418,11 @@ def compute(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarr
     if result is not None:
         return [np.asarray(result)]
     key = process_key((name, equation.params, arrays))
-    return _COMPUTED.get_or_make(key, lambda: _by_jax(equation, arrays))
+    return _COMPUTED.get_or_make(key, lambda: by_jax(equation, arrays))
 
 
-def _by_jax(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
+def by_jax(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the results of an equation for plain numbers as JAX computes them."""
     results = equation.primitive.bind(*map(jnp.asarray, operands), **equation.params)
     return [np.asarray(r) for r in (results if equation.primitive.multiple_results else [results])]
 

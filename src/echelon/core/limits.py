@@ -9,6 +9,8 @@ import os
 from pathlib import Path
 from typing import Final
 
+LARGEST: Final = 1e75
+"""Of a number that is given: the square of a product of two is a float."""
 MOST_STEPS: Final = 2**31 - 1
 """The compiled loop counts steps in 32-bit integers."""
 MOST_AGENTS: Final = 1_000_000
@@ -60,8 +62,7 @@ def horizon_fault(horizon: float, dt: float) -> str | None:
     """
     if horizon < dt:
         return f"must be at least one step `dt` = {dt:g} s"
-    # The quotient may overflow.
-    steps = horizon / dt if horizon / 1e300 < dt else math.inf
+    steps = horizon / dt
     if steps > MOST_STEPS + _ROUNDING:
         size = math.log10(horizon) - math.log10(dt)
         shown = f"1e{size:+.0f}" if steps == math.inf else f"{steps:.3g}"

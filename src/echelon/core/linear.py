@@ -10,6 +10,7 @@ import scipy.linalg
 from scipy.sparse.csgraph import connected_components
 
 from echelon.core.errors import GainError
+from echelon.core.limits import LARGEST
 from echelon.core.numerics import INTEGRATORS
 from echelon.core.rational import bisect
 from echelon.core.types import Array
@@ -275,10 +276,6 @@ def _uncoupled(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> li
 Weight: TypeAlias = Sequence[float] | Sequence[Sequence[float]] | Array
 
 
-_MOST = 1e75
-"""Of a weight: products of two are squared in norms, and 1e300 is a number yet."""
-
-
 def check_definite(name: str, matrix: np.ndarray) -> None:
     """Check that a matrix is finite, symmetric (to 1e-9 of its size) and positive definite.
 
@@ -352,5 +349,5 @@ def as_matrix(name: str, value: Weight, size: int) -> Array:
 def _check_size(name: str, matrix: Array) -> None:
     """Check that the numbers of a weight can be computed with."""
     largest = np.abs(matrix).max(initial=0.0)
-    if _MOST <= largest < np.inf:
-        raise GainError(f"`{name}` goes up to {largest:.3g}, and must stay below {_MOST:g}.")
+    if LARGEST <= largest < np.inf:
+        raise GainError(f"`{name}` goes up to {largest:.3g}, and must stay below {LARGEST:g}.")

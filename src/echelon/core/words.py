@@ -78,7 +78,6 @@ class Prediction(Word):
 
     PREVIEW = "by its plan, which they know"
     PACKET = "by the motion that it was in when it sent it"
-    NONE = "as it was when it sent it"
 
 
 class Estimation(Word):

@@ -21,6 +21,7 @@ from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ModelError, listing
+from echelon.core.limits import LARGEST
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.flat_loop import FlatLoop, FlatMemory, Observer
 from echelon.laws.law import Law, LocalView
@@ -82,8 +83,8 @@ class FlatLaw(Law):
             raise LawError("got `roots` and `rate`, allowed is one of them.")
         for name in ("rate", "coupling"):
             value = getattr(self, name)
-            if isinstance(value, int | float) and not 0.0 < value < math.inf:
-                raise LawError(f"`{name}` is {value}, and must be a positive finite number.")
+            if isinstance(value, int | float) and not 0.0 < value <= LARGEST:
+                raise LawError(f"`{name}` is {value}, and must be positive, at most {LARGEST:g}.")
         roots = (1.0,) if self.roots is None else self.roots
         if not isinstance(roots, Sequence) or not all(map(_positive, roots)):
             raise LawError(

@@ -45,7 +45,6 @@ class LocalView(eqx.Module):
         period: how long the input will be held, s; 0 where it is not known.
         near: the others, where the law keeps away from them; None elsewhere.
         offset_rate: of `offset` (n,), per s; None of a constant one, or if the law uses none.
-        pace: at which the time `t` of a leader's plan passes, s per s; None for 1.
 
     Raises:
         LawError: it is made of numbers while JAX computes in float32.
@@ -59,7 +58,6 @@ class LocalView(eqx.Module):
     period: Scalar | float = 0.0
     near: Near | None = None
     offset_rate: State | None = None
-    pace: Scalar | None = None
 
     def __check_init__(self) -> None:
         """Refuse to lose digits silently."""

@@ -64,7 +64,7 @@ def _check_space(
             f"{at_least(least, 4)} m, so that agents at their `speed` regard each other in time."
         )
     goals = offsets[:, list(model.position_indices())] * scales
-    near = too_near(safety, _lengths(goals[:, None] - goals))
+    near = too_near(safety, np.linalg.norm(goals[:, None] - goals, axis=-1))
     if near is not None:
         raise LawError(
             f"the goal of agent {near.agent} is too near to that of {near.text}; move their goals "
@@ -113,14 +113,8 @@ def separations(hulls: Float[Array, "N r d"]) -> Float[Array, "N N"]:
     i, j = np.triu_indices(len(hulls), 1)
     apart = np.zeros((len(hulls),) * 2)
     nearest = np.asarray(_nearest(jnp.asarray(hulls[i] - hulls[j])))
-    apart[i, j] = apart[j, i] = _lengths(nearest)
+    apart[i, j] = apart[j, i] = np.linalg.norm(nearest, axis=-1)
     return apart
-
-
-def _lengths(vectors: Float[Array, "... d"]) -> Float[Array, "..."]:
-    # Those whose squares are beyond all numbers are long enough.
-    with np.errstate(over="ignore"):
-        return np.linalg.norm(vectors, axis=-1)
 
 
 _nearest = cached_jit(nearest_point)

@@ -370,20 +370,14 @@ class StoppingLeader(FlatLaw):
             # An heir that was held back when it took the lead gives way to nobody now.
             memory = memory._replace(active=0.0 * memory.half)
         away = self.deviation(model, view.t, view.x, view.offset, memory)
-        rate = self._rate(model, view.t, away, view.period, view.pace)
+        rate = self._rate(model, view.t, away, view.period)
         return self.ready.obey(model, view, rate, memory, view.offset_rate)
 
     def _rate(
-        self,
-        model: ControlAffine,
-        t: Scalar,
-        away: jax.Array,
-        period: Scalar | float,
-        pace: Scalar | None = None,
+        self, model: ControlAffine, t: Scalar, away: jax.Array, period: Scalar | float
     ) -> jax.Array:
         """Return zeta' (m,) that the leader commands at a deviation (m,) from its path."""
         ahead = self.ready.stop(self.path(model, t)[1:])
-        ahead = ahead if pace is None else pace * ahead
         return ahead - self.bounded(self.strength(period) * away)
 
     @property

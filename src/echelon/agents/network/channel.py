@@ -59,8 +59,7 @@ class Network:
         messages: `deviation`, the sender's deviation from where it expects the leader, which hardly
             changes while a message is under way; `state`, the signal itself.
         prediction: how agents predict the leader from what it last sent: `preview`, they know its
-            plan; `packet`, they carry on its last motion by the model; `none`, as it was. Only for
-            `deviation`.
+            plan; `packet`, they carry on its last motion by the model. Only for `deviation`.
         forget: age, s, beyond which what a neighbour sent is not used.
         hears: `all` neighbours, or `leaderward`, those alone with fewer hops to the leader, as
             counted by the messages that arrive.
@@ -170,7 +169,6 @@ class Network:
 _LEADERS: Mapping[Prediction, str] = {
     Prediction.PREVIEW: "the leader's plan, and its last deviation from it",
     Prediction.PACKET: "the leader's last state and input",
-    Prediction.NONE: "the leader as it last was",
 }
 _RANGES: Mapping[tuple[str, ...], tuple[str, Callable[[float], bool]]] = {
     ("rate", "forget", "bursts.length"): ("positive", lambda x: x > 0.0),

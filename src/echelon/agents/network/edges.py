@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from echelon.core.errors import GraphError
-from echelon.core.limits import excess_agents, excess_edges
+from echelon.core.limits import LARGEST, excess_agents, excess_edges
 from echelon.core.types import Array
 from echelon.core.words import amount
 
@@ -78,10 +78,11 @@ def check_edges(
     for i, j in edges[_repeated(edges, agents)][:1]:
         raise GraphError(f"edge [{i}, {j}] is given twice, and may be given once.")
     # Negated, so that NaN, for which every comparison is false, is wrong too.
-    wrong = ~((weights > 0.0) & (weights < np.inf))
+    wrong = ~((weights > 0.0) & (weights <= LARGEST))
     for (i, j), weight in zip(edges[wrong][:1], weights[wrong][:1], strict=True):
         raise GraphError(
-            f"the weight of edge [{i}, {j}] is {weight:g}, and must be positive and finite."
+            f"the weight of edge [{i}, {j}] is {weight:g}, and must be positive, at most "
+            f"{LARGEST:g}."
         )
     return edges, weights
 

@@ -20,6 +20,7 @@ from echelon.agents.network.formation_motion import (
 from echelon.agents.network.graph import Graph
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import FormationError, is_number
+from echelon.core.limits import LARGEST
 from echelon.core.numerics import precision
 from echelon.core.types import Array, States
 from echelon.core.words import amount
@@ -49,10 +50,10 @@ class Formation:
         """Store the offsets, read-only."""
         self.motion = motion
         self.offsets = np.array(offsets, dtype=np.float64)
-        if self.offsets.ndim != 2 or not np.isfinite(self.offsets).all():
+        if self.offsets.ndim != 2 or not (np.abs(self.offsets) <= LARGEST).all():
             raise FormationError(
-                f"formation offsets must be a matrix of finite numbers (agents, states), "
-                f"and have shape {self.offsets.shape}."
+                f"formation offsets must be a matrix (agents, states) of numbers up to "
+                f"{LARGEST:g}, and have shape {self.offsets.shape}."
             )
         self.offsets.setflags(write=False)
 

@@ -192,16 +192,14 @@ class FormationMotion(eqx.Module):
         if not 2 <= len(self.places) <= _MOST_PAIRS:
             return
         i, j = np.triu_indices(len(self.places), 1)
-        size = max(float(np.abs(self.places).max()), np.finfo(float).tiny)
-        places = self.places / size
         for k, begin in enumerate(self.begins):
-            first, last = (places[i, m] - places[j, m] for m in (k, k + 1))
+            first, last = (self.places[i, m] - self.places[j, m] for m in (k, k + 1))
             way = last - first
             square = (way * way).sum(axis=1)
             share = -(first * way).sum(axis=1) / np.where(square > 0.0, square, 1.0)
             apart = np.linalg.norm(first + np.clip(share, 0.0, 1.0)[:, None] * way, axis=1)
             least = int(apart.argmin())
-            distance = self.least_scale * float(apart[least]) * size
+            distance = self.least_scale * float(apart[least])
             yield float(begin), int(i[least]), int(j[least]), distance
 
 
@@ -256,7 +254,7 @@ def nearest_places(
 
     order = np.arange(len(before))
     others = np.setdiff1d(order, list(leaders))
-    # In units of the largest place, so that no square is beyond all numbers.
+    # In units of the largest place, whose rounding decides between ways that are equally long.
     size = max(np.abs(before).max(), np.abs(after).max(), np.finfo(float).tiny)
     ways = (before / size)[others][:, None] - (after / size)[others][None]
     order[others] = others[linear_sum_assignment((ways * ways).sum(axis=2))[1]]

@@ -38,6 +38,8 @@ def vary_parameters(
                 f"`{parameter}` is no parameter of `{name}`; {has}{did_you_mean(parameter, names)}."
             )
     changes = dict(parameters)
+    if both := [parameter for parameter in scale if parameter in changes]:
+        raise ModelError(f"`{both[0]}` of the plant has a value and a factor; give one of them.")
     for parameter, factor in scale.items():
         scaled = _scale_value(getattr(model, parameter), factor)
         if scaled is None:

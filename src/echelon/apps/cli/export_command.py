@@ -25,8 +25,7 @@ def export(
         str | None,
         typer.Option(
             "--to",
-            help="csv, parquet, npz, mat, nc, json, html (default: the ending of --out, else csv); "
-            "law.",
+            help="csv, parquet, npz, mat, nc, html (default: the ending of --out, else csv); law.",
         ),
     ] = None,
     agent: Annotated[
@@ -68,7 +67,7 @@ def _write_run(run: Path, to: str | None, out: Path | None, force: bool) -> None
         raise OutputError(f"`--to` is `{to}`, and `{file}` ends in `.{ending}`; leave out `--to`.")
     claim_file(file, force)
     STATUS.begin(f"reading {run}")
-    from echelon.output.archive.load_folder import load
+    from echelon.output.archive.run_folder import load
 
     write_file(file, content(load(run)))
 
@@ -81,7 +80,7 @@ def _write_law(scenario: str, agent: int, changes: list[str], folder: Path) -> N
     check_empty(folder)
     from echelon.experiments.scenario.build import build
     from echelon.experiments.scenario.self_contained import content_of_files
-    from echelon.output.archive.law_folder import law_files, save_law
+    from echelon.output.archive.flight_folder import law_files, save_law
 
     files = law_files(*build(loaded), agent, content_of_files(loaded))
     save_law(files, folder)

@@ -8,7 +8,7 @@ import typer
 from echelon.apps.cli import options
 from echelon.apps.cli.terminal import STATUS
 from echelon.core.files import write_atomic
-from echelon.output.archive.crazyswarm_file import swarm_text
+from echelon.output.archive.export import swarm_text
 from echelon.output.archive.folder import check_empty, claim_file, write_errors
 
 if TYPE_CHECKING:

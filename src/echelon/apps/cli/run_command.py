@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from echelon.experiments.sweeps.plan import Sweep
     from echelon.experiments.sweeps.workers import SweepBatch
     from echelon.output.archive.chunks import Chunks
-    from echelon.output.archive.sweep_folder import Batches
+    from echelon.output.archive.study_folder import Batches
     from echelon.simulation.engine.record import Stretch
     from echelon.simulation.engine.result import Result
     from echelon.simulation.engine.simulate import RunSoFar
@@ -212,7 +212,7 @@ def _simulate(
 def _print(result: "Result", as_json: bool) -> None:
     """Print the report before files are written, so that a full disk loses nothing of it."""
     if as_json:
-        from echelon.experiments.results.dataset import summary
+        from echelon.experiments.results.summary import summary
 
         print(json.dumps(summary(result), indent=2), flush=True)
         return
@@ -251,8 +251,8 @@ class WatchedRun:
 
     def __init__(self, scenario: "Scenario", experiment: "Experiment") -> None:
         """Prepare the page, as far as it is known before the run."""
-        from echelon.experiments.results.foreseen import foreseen
         from echelon.experiments.results.lyapunov import fixed_metric, potential
+        from echelon.experiments.results.recording import foreseen
         from echelon.guarantees.promises.promise import promise
         from echelon.output.viewer.replay import Growing
         from echelon.simulation.engine.prepare import prepare
@@ -269,7 +269,7 @@ class WatchedRun:
 
     def add(self, stretch: "Stretch") -> None:
         """Show a part that was computed."""
-        from echelon.experiments.results.foreseen import so_far
+        from echelon.experiments.results.recording import so_far
 
         # An agent without finite numbers cannot be drawn; the page says so at the end.
         if stretch.finite:
@@ -278,11 +278,13 @@ class WatchedRun:
 
     def show_all(self, folder: Path) -> None:
         """Show the complete run until Ctrl-C."""
-        from echelon.experiments.results.dataset import recording_of
-        from echelon.output.archive.load_folder import load
+        from echelon.experiments.results.recording import recording_of
+        from echelon.output.archive.run_folder import load, report_beside
+        from echelon.output.reports.run_report import whole_report
 
         with STOP.hold():
-            self.page.finish(recording_of(load(folder)))
+            run = recording_of(load(folder))
+            self.page.finish(run, whole_report(run, report_beside(folder)))
             text = "echelon: complete; the page is still served. Ctrl-C quits."
             print(text, file=sys.stderr)
             wait()
@@ -365,14 +367,14 @@ def _new_sweep(
 ) -> "tuple[Sweep, Batches, Job]":
     """Return a sweep and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
-    from echelon.experiments.sweeps.axes import read_axes
+    from echelon.experiments.sweeps.plan import read_axes
 
     axes = read_axes(over)
     scenario = load_scenario(name, changes)
     STATUS.begin(f"preparing {scenario.name}", not quiet)
     from echelon.experiments.sweeps.plan import Sweep
     from echelon.output.archive.folder import BATCHES, claim_folder
-    from echelon.output.archive.sweep_folder import Batches
+    from echelon.output.archive.study_folder import Batches
     from echelon.simulation.engine.prepare import prepare
 
     plan = Sweep(scenario, axes, keep_states)
@@ -387,7 +389,7 @@ def _new_sweep(
 
 def _unfinished_sweep(folder: Path) -> "tuple[Sweep, Batches, Job]":
     """Return the sweep and the job in a folder."""
-    from echelon.output.archive.sweep_folder import Batches
+    from echelon.output.archive.study_folder import Batches
 
     batches = Batches(folder)
     job = Job("sweep", batches.chunks)
@@ -434,7 +436,7 @@ def _write_sweep(
 ) -> None:
     """Write and print the results; the batches stay until all runs are in the dataset."""
     from echelon.experiments.sweeps.sweep_dataset import dataset_of
-    from echelon.output.archive.sweep_folder import write_sweep
+    from echelon.output.archive.study_folder import write_sweep
     from echelon.output.reports.sweep_report import sweep_mapping, sweep_report
 
     data = dataset_of(plan, results)

@@ -77,17 +77,19 @@ def view(
         paths = [newest_run()]
         print(f"echelon: showing `{paths[0]}`, the newest run.", file=sys.stderr)
     STATUS.begin(f"reading {' and '.join(map(str, paths))}")
-    from echelon.experiments.results.dataset import recording_of
-    from echelon.output.archive.load_folder import load
+    from echelon.experiments.results.recording import recording_of
+    from echelon.output.archive.run_folder import load, report_beside
+    from echelon.output.reports.run_report import whole_report
     from echelon.output.viewer.replay import replay_page
 
     opened = [recording_of(load(path)) for path in paths]
+    reports = [whole_report(*each) for each in zip(opened, map(report_beside, paths), strict=True)]
     if len(paths) > 1:
         # Both may be of one scenario.
         folders = [path.resolve().parent if path.name == DATA else path.resolve() for path in paths]
         pairs = zip(opened, folders, strict=True)
         opened = [replace(run, name=folder.name) for run, folder in pairs]
-    page = replay_page(*opened).encode()
+    page = replay_page(*opened, reports=reports).encode()
     if html is None:
         from echelon_flight.page_server import Handler
 
@@ -153,8 +155,8 @@ def live(
     STATUS.begin(f"preparing {loaded.name} for the browser, which takes up to a minute")
     from echelon.apps.live.server import live as make_ready
     from echelon.apps.live.server import live_page
-    from echelon.experiments.results.dataset import recording_of
-    from echelon.output.archive.load_folder import load
+    from echelon.experiments.results.recording import recording_of
+    from echelon.output.archive.run_folder import load
 
     # A bundled scenario wins over a folder of its name, and a folder may hold no run yet.
     folder = Path(scenario) if loaded.folder == Path(scenario) else None
@@ -209,7 +211,7 @@ def plot(
 
 def _drawings(run: Path, names: Sequence[str], paper: bool) -> "dict[str, Figure]":
     """Return the figures of a run in all sizes, by the names of their files."""
-    from echelon.output.archive.load_folder import load
+    from echelon.output.archive.run_folder import load
     from echelon.output.plots.run_figures import figures
     from echelon.output.plots.style import ONE_COLUMN, SCREEN, TWO_COLUMNS
 
@@ -249,7 +251,7 @@ def video(
     pixels = None if size is None else _pixels(size)
     claim_file(file, force, endings=(".mp4", ".gif"))
     STATUS.begin(f"reading {run}")
-    from echelon.output.archive.load_folder import load
+    from echelon.output.archive.run_folder import load
     from echelon.output.plots.video import encoder, save_video
 
     if file.suffix.lower() == ".mp4":

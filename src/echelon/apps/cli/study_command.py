@@ -157,7 +157,7 @@ def _compare(
 ) -> "Comparison":
     """Simulate all methods on a scenario, print the results, and write them."""
     from echelon.experiments.studies.compare import compare as simulate
-    from echelon.output.archive.comparison_folder import Flights, write_comparison
+    from echelon.output.archive.study_folder import Flights, write_comparison
     from echelon.output.reports.comparison_report import (
         comparison_mapping,
         comparison_report,

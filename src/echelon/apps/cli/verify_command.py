@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from echelon.core.types import JsonObject
     from echelon.guarantees.verifier.findings import Finding
     from echelon.guarantees.verifier.verify import Verification
-    from echelon.output.archive.open_folder import ClaimFiles
+    from echelon.output.archive.verify_folder import ClaimFiles
 
 _EXIT_CODES = {"verified": 0, "refused": 1, "incomplete": 5}
 _WIDTH = 80
@@ -49,7 +49,7 @@ def verify(
     Exit code 0 if all claims hold, 1 if one does not, 5 if one could not be checked.
     """
     STATUS.begin(f"verifying {file}", not as_json)
-    from echelon.output.archive.open_folder import claim_files
+    from echelon.output.archive.verify_folder import claim_files
 
     # Before what takes long to load.
     files = claim_files(file)

@@ -1,4 +1,4 @@
-"""The knobs of a live loop, and the gain, formation, graph and wind that they stand for."""
+"""The knobs of a live loop: what they stand for, their sliders on the page, and scenario keys."""
 
 import copy
 import dataclasses
@@ -11,18 +11,21 @@ from jaxtyping import Float
 from echelon.agents.models.linearization import linearize
 from echelon.agents.network.channel import Network
 from echelon.agents.network.events import Event
+from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import FormationMotion
 from echelon.agents.network.graph import Graph
 from echelon.apps.live.attendance import RESHAPE
-from echelon.apps.live.choices import shapes_of
+from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import Feedforward
+from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.guarantees.promises.closed_loop import LinearLoop, loop_of
 from echelon.simulation.engine.law_drive import Laws
-from echelon.synthesis.gains.gain import Gain
+from echelon.simulation.engine.parts import Parts
+from echelon.synthesis.gains.gain import FixedGain, Gain
 from echelon.synthesis.gains.riccati import Riccati
 
 
@@ -51,8 +54,6 @@ class Knobs(NamedTuple):
         delay: of messages, s.
         loss: share of messages lost.
         outages: share of the time that a link is out.
-        gusts: factor on the random wind.
-        lag: of the actuators, s; None without one.
         noise: factor on the noise of measurements.
         cut: indices of the cut edges.
         method: of the gain; None for the scenario's own.
@@ -70,8 +71,6 @@ class Knobs(NamedTuple):
     delay: float = 0.0
     loss: float = 0.0
     outages: float = 0.0
-    gusts: float = 1.0
-    lag: float | None = None
     noise: float = 1.0
     cut: frozenset[int] = frozenset()
     method: str | None = None
@@ -258,12 +257,9 @@ class LiveParts:
 
 def _start(experiment: Experiment) -> Knobs:
     """Return the positions at which the knobs have no effect."""
-    world, knobs = experiment.parts.world, Knobs(_coupling(experiment))
-    if world.actuator is not None and world.actuator.lag:
-        knobs = knobs._replace(lag=world.actuator.lag)
-    if world.network is None:
+    network, knobs = experiment.parts.world.network, Knobs(_coupling(experiment))
+    if network is None:
         return knobs
-    network = world.network
     return knobs._replace(delay=network.delay, loss=network.loss, outages=network.bursts.share)
 
 
@@ -274,3 +270,125 @@ def _coupling(experiment: Experiment) -> float | None:
         return drive.gain.coupling
     coupling = drive.follower.strength(dt) if isinstance(drive, Laws) else None
     return None if coupling is None else float(coupling)
+
+
+def shapes_of(parts: Parts) -> dict[str, Array]:
+    """Return the offsets (N, n) of each shape that these agents can take, by its name."""
+    spacing, shapes = _spacing(parts), dict[str, Array]()
+    for name in registry.FORMATIONS:
+        try:
+            shapes[name] = getattr(Formation, name)(parts.model, parts.graph, spacing).offsets
+        except EchelonError:
+            continue
+    return shapes
+
+
+def _spacing(parts: Parts) -> float:
+    """Return the median distance of neighbours' goals; 1 if all goals coincide."""
+    axes = list(parts.model.position_indices())
+    i, j = parts.graph.edges.T
+    goals = parts.formation.offsets[:, axes]
+    apart = np.linalg.norm(goals[i] - goals[j], axis=1)
+    return float(np.median(apart[apart > 0.0])) if (apart > 0.0).any() else 1.0
+
+
+# ---- sliders -------------------------------------------------------------------------------------
+
+
+class Range(NamedTuple):
+    """The values of a slider, whose scale may be logarithmic."""
+
+    low: float
+    high: float
+    logarithmic: bool = False
+
+
+SLIDERS = {
+    "coupling": ("coupling c", ""),
+    "weight": ("input weight R", "\u00d7"),
+    "feedforward": ("feed-forward", ""),
+    "size": ("formation size", "\u00d7"),
+    "turn": ("formation turn", "\u00b0"),
+    "wind": ("wind", "{rate}"),
+    "delay": ("delay", "s"),
+    "loss": ("messages lost", ""),
+    "outages": ("links out", ""),
+    "noise": ("noise", "\u00d7"),
+}
+"""The label and the unit of each slider; `{rate}` is that of the rate of the wind's state."""
+
+
+def ranges_of(live: LiveParts) -> dict[str, Range]:
+    """Return the ranges of the sliders that parts have, in the order of `SLIDERS`."""
+    parts, ranges = live.parts, dict[str, Range]()
+    gain, c, most = parts.drive.gain, live.start.coupling, live.longest_delay
+    section = (live.data().get("follower") or {}).get("gain") or {}
+    if c is not None:
+        ranges["coupling"] = Range(0.02 * c, 8.0 * c, True)
+    if gain is not None and gain.method == Riccati.name and "file" not in section:
+        ranges["weight"] = Range(0.02, 50.0, True)
+    if str(parts.drive.feedforward.name) != "NONE":
+        ranges["feedforward"] = Range(0.0, 1.0)
+    apart = bool(live.axes) and parts.formation.offsets[:, live.axes].any()
+    if parts.formation.motion is None and (live.shapes or apart):
+        ranges["size"] = Range(0.3, 3.0, True)
+        if len(live.axes) > 1:
+            ranges["turn"] = Range(-180.0, 180.0)
+    if live.wind_state is not None:
+        ranges["wind"] = Range(-3.0, 3.0)
+    if most is not None:
+        ranges |= {"delay": Range(0.0, most), "loss": Range(0.0, 1.0), "outages": Range(0.0, 0.9)}
+    if parts.world.sensing is not None and any(parts.world.sensing.noise.values()):
+        ranges["noise"] = Range(0.0, 10.0)
+    return ranges
+
+
+def write_keys(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
+    """Write the scenario keys that have the effect of the knobs, the graph and events excepted."""
+    _write_gain(live, knobs, data)
+    if not knobs.feedforward:
+        data.setdefault("follower", {})["feedforward"] = "none"
+    _write_formation(live, knobs, data)
+    if knobs.wind and live.wind_state is not None:
+        name = live.parts.model.state_names[live.wind_state]
+        constant = data.setdefault("disturbance", {}).setdefault("constant", {})
+        constant[name] = constant.get(name, 0.0) + knobs.wind
+    now, start = ((x.delay, x.loss, x.outages) for x in (knobs, live.start))
+    if live.parts.world.network is not None and now != start:
+        length = live.parts.world.network.bursts.length
+        data["network"] |= {"delay": knobs.delay, "loss": knobs.loss}
+        data["network"]["bursts"] = {"share": knobs.outages, "length": length}
+    if knobs.noise != 1.0:
+        noise = data["sensing"]["noise"]
+        data["sensing"]["noise"] = {name: knobs.noise * x for name, x in noise.items()}
+
+
+def _write_gain(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
+    own = live.parts.drive.gain
+    # On another graph a method would choose another coupling, so it is written there too.
+    if knobs.coupling is not None and (knobs.cut or knobs.coupling != live.start.coupling):
+        follower = data.setdefault("follower", {})
+        if own is None:
+            follower["coupling"] = knobs.coupling
+        else:
+            section = follower.setdefault("gain", {})
+            if "file" in section:
+                section = {"method": FixedGain.name, "P": own.P.tolist(), "R": own.R.tolist()}
+            follower["gain"] = section | {"coupling": knobs.coupling}
+    gain = live.unweighted_gain(knobs)
+    if knobs.weight != 1.0 and gain is not None:
+        section = data.setdefault("follower", {}).setdefault("gain", {})
+        section |= {"method": Riccati.name, "R": (knobs.weight * gain.R).tolist()}
+
+
+def _write_formation(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
+    def places(knobs: Knobs) -> JsonObject:
+        offsets = live.offsets(knobs)
+        agents = np.flatnonzero(offsets.any(axis=1))
+        return {"offsets": {i: offsets[i, live.axes].tolist() for i in agents}}
+
+    if knobs.reshaping is not None:
+        change = {"reshape": places(knobs), "at": knobs.reshaping.at, "over": RESHAPE}
+        data["formation"] = {**places(knobs.before), "motion": [change]}
+    elif (knobs.size, knobs.turn, knobs.shape) != (1.0, 0.0, None):
+        data["formation"] = places(knobs)

@@ -1,5 +1,6 @@
-"""The controls of the live page, each with its range, label, unit and scenario keys."""
+"""The controls of the live page, and the scenario at any position of them."""
 
+import copy
 from collections.abc import Iterable, Sequence
 from typing import Any, final
 
@@ -8,16 +9,22 @@ import numpy as np
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import Reshape
 from echelon.apps.live.attendance import KINDS, RESHAPE, as_entries, happened
-from echelon.apps.live.choices import AS_GIVEN
-from echelon.apps.live.knobs import Knobs, LiveParts, Reshaping
-from echelon.apps.live.sliders import SLIDERS
-from echelon.core.errors import SimulationError, did_you_mean, listing
+from echelon.apps.live.knobs import (
+    SLIDERS,
+    Knobs,
+    LiveParts,
+    Reshaping,
+    ranges_of,
+    write_keys,
+)
+from echelon.core.errors import ScenarioError, SimulationError, did_you_mean, listing
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.build import Experiment
-from echelon.experiments.scenario.override import rename_files
+from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
-from echelon.experiments.scenario.yaml import dump_yaml
+from echelon.experiments.scenario.sections import FollowerSpec
+from echelon.experiments.scenario.values import foreign_keys
+from echelon.experiments.scenario.yaml import dump_yaml, rename_files
 from echelon.synthesis.gains.riccati import InnerLoop, Riccati
 
 _METHODS = (Riccati.name, InnerLoop.name)
@@ -38,8 +45,7 @@ class Panel:
         self.scenario, self.experiment = scenario, experiment
         self.live = LiveParts(scenario, experiment)
         self.start = self.live.start
-        ranges = {name: slider.range(self.live) for name, slider in SLIDERS.items()}
-        self.ranges = {name: span for name, span in ranges.items() if span is not None}
+        self.ranges = ranges_of(self.live)
         self.options = {
             "method": _METHODS if experiment.parts.drive.gain is not None else (),
             "shape": tuple(self.live.shapes),
@@ -69,8 +75,8 @@ class Panel:
         return [
             {
                 "name": name,
-                "text": SLIDERS[name].label,
-                "unit": SLIDERS[name].unit.format(rate=rate),
+                "text": SLIDERS[name][0],
+                "unit": SLIDERS[name][1].format(rate=rate),
                 "low": span.low,
                 "high": span.high,
                 "log": span.logarithmic,
@@ -176,8 +182,7 @@ class Panel:
         data = self.live.data()
         if knobs.method is not None:
             data.setdefault("follower", {})["gain"] = {"method": knobs.method}
-        for slider in SLIDERS.values():
-            slider.write(self.live, knobs, data)
+        write_keys(self.live, knobs, data)
         if knobs.cut:
             data["graph"] = self._graph(knobs)
         if knobs.events:
@@ -221,3 +226,48 @@ def check_choice(control: str, value: object, options: Iterable[str]) -> None:
     if value not in names:
         allowed = f"there are {listing(names)}" if names else "none can be chosen"
         raise SimulationError(f"there is no {control} `{value}` here; {allowed}.")
+
+
+# ---- laws to choose from -------------------------------------------------------------------------
+
+
+AS_GIVEN = "scenario"
+"""The choice that stands for the scenario's own."""
+
+
+def under(scenario: Scenario, law: str) -> tuple[Scenario, Experiment]:
+    """Return a scenario with another follower law, and its experiment.
+
+    Leaders keep their law if it fits the followers', and have the default law otherwise.
+
+    Raises:
+        ScenarioError: the law does not fit these agents.
+    """
+    # A leader law that goes with the followers' law replaces the scenario's.
+    ways = (True, False) if registry.FOLLOWER_LAWS[law].leader is None else (False,)
+    for keep_leader in ways:
+        try:
+            changed = _with_law(scenario, law, keep_leader)
+            return changed, build(changed)
+        except ScenarioError:
+            if keep_leader == ways[-1]:
+                raise
+    raise AssertionError
+
+
+def _with_law(scenario: Scenario, law: str, keep_leader: bool) -> Scenario:
+    """Return a scenario with another follower law and those of its keys that the law takes."""
+    data = copy.deepcopy(scenario.data)
+    data.pop("live", None)
+    surplus = foreign_keys(FollowerSpec, law)
+    # A feed-forward of another law may be none of a law whose agents exchange more.
+    dropped = {"law", *surplus, *(["feedforward"] if registry.FOLLOWER_LAWS[law].leader else [])}
+    follower = data.get("follower") or {}
+    data["follower"] = {"law": law} | {k: v for k, v in follower.items() if k not in dropped}
+    leader = data.get("leader") or {}
+    if not keep_leader:
+        leader = {key: leader[key] for key in ("start_error",) if key in leader}
+    if "gain" in surplus:
+        # Only a gain makes a leader react.
+        leader = {key: value for key, value in leader.items() if key != "reacts"}
+    return scenario_from_mapping(data | ({"leader": leader} if leader else {}), scenario.folder)

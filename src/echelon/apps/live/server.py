@@ -11,10 +11,9 @@ from typing import Final
 import numpy as np
 
 from echelon.apps.live.attendance import as_changes
-from echelon.apps.live.header import live_header
+from echelon.apps.live.guarantee_status import pending_badge
 from echelon.apps.live.panel import Panel
-from echelon.apps.live.promiser import pending_badge
-from echelon.apps.live.session import Session
+from echelon.apps.live.session import Session, live_header
 from echelon.apps.live.swarm import LiveLoop
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.core.types import JsonObject

@@ -1,4 +1,4 @@
-"""A live loop: it runs in real time, applies the changes of its pages, and streams its pictures."""
+"""A live session: the loops of its laws, what pages ask for, and what they are sent."""
 
 import json
 import struct
@@ -11,12 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.apps.live.attendance import ROOMY, moments_of
-from echelon.apps.live.guarantee_status import GuaranteeStatus, lost
-from echelon.apps.live.header import foreseen_of
+from echelon.apps.live.guarantee_status import GuaranteeStatus, Promiser, lost
 from echelon.apps.live.knobs import Knobs
-from echelon.apps.live.loops_by_law import LoopsByLaw
-from echelon.apps.live.panel import Panel
-from echelon.apps.live.promiser import Promiser
+from echelon.apps.live.panel import Panel, check_choice, under
 from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import (
     EchelonError,
@@ -27,10 +24,111 @@ from echelon.core.errors import (
 )
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import amount
+from echelon.experiments.results.recording import Recording, foreseen
 from echelon.experiments.scenario.scenario import Scenario
-from echelon.output.plots.space import space_of
-from echelon.output.viewer.replay import heard_by
+from echelon.output.plots.space import Space, space_of
+from echelon.output.viewer.charts import distance_chart
+from echelon.output.viewer.replay import header, heard_by, motor_loads
 from echelon.simulation.engine.frame_numbers import ClosestPair
+
+
+@final
+class LoopsByLaw:
+    """Loops by the followers' law, each also with agents that can be lost and join.
+
+    Args:
+        panel: of the first law.
+        swarm: its loop.
+        send: called with messages to the pages.
+    """
+
+    def __init__(self, panel: Panel, swarm: LiveLoop, send: Callable[[JsonObject], None]) -> None:
+        """Begin with one loop."""
+        self.first, self.send = panel, send
+        self.ready = {(panel.law, swarm.eventful): (panel, swarm)}
+
+    def prepare(self, law: str, eventful: bool) -> tuple[Panel, LiveLoop]:
+        """Return the loop under a law with its panel, compiled if it is not yet.
+
+        Args:
+            law: of the followers.
+            eventful: whether agents can be lost and join.
+
+        Raises:
+            EchelonError: the law is unknown, or does not fit these agents.
+        """
+        key = law, eventful
+        for usable in (key, (law, True)):
+            if usable in self.ready:
+                return self.ready[usable]
+        check_choice("law", law, self.first.laws)
+        what = "room for events" if eventful else f"the law `{law}`"
+        self.send({"note": f"Compiling {what}; the loop continues meanwhile."})
+        try:
+            panel = self._panel(law)
+            loop = LiveLoop(*panel.experiment, panel.live, eventful)
+            # The first step compiles the rest.
+            loop.advance()
+            self.ready[key] = panel, loop
+        finally:
+            self.send({"note": ""})
+        return self.ready[key]
+
+    def _panel(self, law: str) -> Panel:
+        for (name, _), (panel, _) in self.ready.items():
+            if name == law:
+                return panel
+        return Panel(*under(self.first.scenario, law))
+
+
+_AHEAD, _APART = 60.0, 0.1
+"""Seconds of the reference that are drawn, and seconds between two places of it."""
+
+
+def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: JsonObject) -> JsonObject:
+    """Return the header of a loop's page."""
+    run = foreseen_of(swarm, name)
+    space = space_of(run)
+    loads = motor_loads(run, space)
+    return {
+        **header(run, space),
+        "promise": badge,
+        "stream": True,
+        "knobs": panel.sliders(),
+        "choices": panel.choices(),
+        "lyapunov": swarm.potential is not None,
+        "clock": {"start": 0.0, "step": swarm.span, "last": run.times[-1]},
+        "axes": len(space.axes),
+        "turns": len(space.angles),
+        "loads": 0 if loads is None else loads.shape[2],
+        "thrust": loads is not None,
+        "path": _path(swarm, space),
+        "unit": run.length_unit,
+        "limited": run.loads is not None,
+        "near": distance_chart(run, []) if run.ellipsoid and run.agents > 1 else None,
+        "messages": swarm.parts.world.network is not None,
+    }
+
+
+def _path(swarm: LiveLoop, space: Space) -> list[list[float]]:
+    """Return places along the reference as they are drawn; none without a reference."""
+    times = swarm.first * swarm.settings.dt + np.arange(0.0, _AHEAD, _APART)
+    states = swarm.reference_at(times)
+    if states is None:
+        return []
+    places = np.zeros((len(times), 3))
+    if space.kind == "time":
+        places[:, :2] = np.column_stack([times, states[:, space.axes[0]]])
+    else:
+        places[:, : len(space.axes)] = states[:, list(space.axes)]
+    places[:, :2] *= space.stretch
+    return np.round(places, 4).tolist()
+
+
+def foreseen_of(swarm: LiveLoop, name: str) -> Recording:
+    """Return a recording with all of a loop but its frames."""
+    return foreseen(swarm.parts, swarm.settings, np.asarray(swarm.states), name)
+
 
 _PICTURE, _MESSAGE = 0, 1
 _EMPTY = struct.pack("<I", _MESSAGE) + b"{}"

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Hashable
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, TypeAlias, final
 
 import equinox as eqx
 import jax
@@ -18,23 +18,63 @@ from echelon.agents.network.hearing import edges_of
 from echelon.agents.world.disturbance import Disturbance
 from echelon.apps.live.attendance import attendance, room_for_events
 from echelon.apps.live.knobs import Knobs, LiveParts
-from echelon.apps.live.live_stepper import choose_stepper
 from echelon.core.compiled import cached_jit
-from echelon.core.errors import GraphError
+from echelon.core.errors import GraphError, MissingExtraError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, PyTree
 from echelon.experiments.results.lyapunov import fixed_metric, potential
 from echelon.laws.law import Law
 from echelon.laws.safety_check import separations
 from echelon.output.viewer.replay import link_shades
+from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.native import is_installed
+from echelon.simulation.native.stepper import NativeStepper
+from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.loop import Loop, Moment, Switches, assemble
 from echelon.simulation.step.nearby import all_hulls
 from echelon.simulation.step.sequence import begin
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain
+
+_MANY = 200
+"""With more agents than this JAX steps them in float32, which takes half the time."""
+
+TurnableStepper: TypeAlias = JaxStepper | NativeStepper
+"""Steps agents; a loop that is like the first but for its numbers compiles nothing again."""
+
+
+class LiveEngine(NamedTuple):
+    """A stepper, and the precision in which it computes."""
+
+    stepper: TurnableStepper
+    precision: Precision
+
+
+def choose_stepper(loop: Loop, unlike: Loop, states: Array, settings: Settings) -> LiveEngine:
+    """Return what steps a loop: native code wherever it can be made.
+
+    Args:
+        loop: to begin with.
+        unlike: one that differs from it in all numbers that will change.
+        states: (N, n) at the beginning.
+        settings: of the scenario.
+    """
+    by_jax = LiveEngine(
+        JaxStepper(loop, states), settings.precision if len(states) <= _MANY else "float32"
+    )
+    if settings.engine == "jax" or not is_installed() or jax.default_backend() != "cpu":
+        return by_jax
+    try:
+        # In float64: even so it takes a tenth of a picture's time.
+        with precision("float64"):
+            return LiveEngine(NativeStepper([loop], states, 64, None, variant=unlike), "float64")
+    except (Unsupported, MissingExtraError, TypeError):
+        # A law that needs its numbers as numbers is traced by JAX as it stands.
+        return by_jax
+
 
 PICTURE = 0.04
 """Seconds between two pictures."""
@@ -108,8 +148,6 @@ class LiveLoop:
         self.eventful = eventful
         if loop.channel is not None:
             self.loop = dataclasses.replace(self.loop, channel=self._roomy(loop.channel))
-        assert loop.motion.wind is not None
-        self.rms = loop.motion.wind.rms
         self.std = None if loop.sensors is None else loop.sensors.std
         self.potentials: dict[Hashable, Callable[[Array], Array]] = {}
         self.states, self.first = problem.states, 0
@@ -124,15 +162,13 @@ class LiveLoop:
         self.ahead = range(0)
         self._look_ahead(0)
         self._count(panel.start)
-        engine = choose_stepper(self.loop, self._variant(), self.states, settings)
+        # Other in all numbers that knobs change, except for weights.
+        other = (np.full(np.shape(leaf), np.nan) for leaf in self._adjustable(self.loop))
+        unlike = eqx.tree_at(self._adjustable, self.loop, tuple(other))
+        engine = choose_stepper(self.loop, unlike, self.states, settings)
         self.stepper = engine.stepper
         self.precision: Precision = engine.precision
         self.restart()
-
-    def _variant(self) -> Loop:
-        """Return a loop that differs in all numbers that knobs change, except for weights."""
-        other = [np.full(np.shape(leaf), np.nan) for leaf in self._adjustable(self.loop)]
-        return eqx.tree_at(self._adjustable, self.loop, tuple(other))
 
     def _adjustable(self, loop: Loop) -> tuple[PyTree, ...]:
         """Return the numbers that knobs change: the feed-forward's share, and those of the law."""
@@ -256,17 +292,11 @@ class LiveLoop:
         return dataclasses.replace(channel, slots=steps // int(channel.every) + 2, bursty=True)
 
     def _in_world(self, loop: Loop, knobs: Knobs) -> Loop:
-        """Return the loop with the network, the gusts, the lag and the noise of the knobs."""
-        network, motors, settings = self.panel.network(knobs), loop.motion.motors, self.settings
+        """Return the loop with the network and the noise of the knobs."""
+        network, settings = self.panel.network(knobs), self.settings
         if network is not None:
             channel = network.prepared(settings.dt, math.inf, settings.seed)
             loop = dataclasses.replace(loop, channel=self._roomy(channel))
-        if self.rms is not None:
-            rms = knobs.gusts * self.rms
-            loop = eqx.tree_at(lambda loop: loop.motion.wind.rms, loop, rms)
-        if motors is not None and motors.lag is not None:
-            lag = np.asarray(knobs.lag)
-            loop = eqx.tree_at(lambda loop: loop.motion.motors.lag, loop, lag)
         if self.std is not None:
             loop = eqx.tree_at(lambda loop: loop.sensors.std, loop, knobs.noise * self.std)
         return loop
@@ -327,8 +357,6 @@ class LiveLoop:
         valid &= not np.any(chunk.inexact)
         V = float(self.potential(y[None])[0]) if valid.all() and self.potential else np.nan
         desired = None if reference is None else reference[counts[0]]
-        if chunk.followed is not None and chunk.followed.reference is not None:
-            desired = chunk.followed.reference[-1]
         beyond = np.logical_not(valid)
         shades = self._shades(int(counts[0]))
         rows = time, states, inputs, errors, offsets, desired, V, beyond, shades

@@ -1,50 +1,55 @@
-"""The dataset of a run with units and provenance (netCDF), and its summary (JSON)."""
+"""A run as labelled arrays with units and provenance, as `run.nc` has them."""
 
 import hashlib
 import json
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from echelon.core.errors import check_kind
 from echelon.core.files import write_atomic
-from echelon.core.types import Array, JsonObject, PathLike
-from echelon.experiments.results.agent_metrics import (
-    EdgeMetrics,
-    Metrics,
-    representatives,
-    steady_error,
-)
-from echelon.experiments.results.avoidance import avoidance
-from echelon.experiments.results.event_outcomes import event_outcomes
+from echelon.core.types import JsonObject, PathLike
 from echelon.experiments.results.labelled import Labelled, Variables
-from echelon.experiments.results.labelled_parts import labelled_parts
 from echelon.experiments.results.lyapunov import lyapunov
-from echelon.experiments.results.metrics import metrics, output_errors
-from echelon.experiments.results.quantity import Shown
-from echelon.experiments.results.recording import Recording, recording
-from echelon.experiments.results.run_groups import SUM, group_of
-from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
-from echelon.guarantees.promises.hypotheses import events_in_words
+from echelon.experiments.results.metrics import avoidance, output_errors
+from echelon.guarantees.promises.hypotheses import as_mapping
 from echelon.guarantees.promises.promise import promise
-from echelon.laws.law import gain_of
-from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
-from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.settings import Settings
-from echelon.synthesis.gains.gain import Gain
 
 if TYPE_CHECKING:
     import xarray as xr
 
-_LISTED = 5_000
-"""Most rows of a list in the summary; the dataset contains the numbers of all agents."""
-_Row = TypeVar("_Row")
+FORMAT = 4
+"""Version of the format of `run.nc`; files of others are refused."""
+SUM = "sum_"
+"""So begin the names of the sums over all steps, from which `load` computes the metrics."""
+STORED: "WeakKeyDictionary[Result, Labelled]" = WeakKeyDictionary()
+"""The labelled arrays of runs from disk."""
+_SECONDS, _METERS = {"units": "s"}, {"units": "m"}
+_GROUPS = {
+    "": {"time", "agent", "state"},
+    "inputs": {"time", "agent", "input"},
+    "tracking": {"time", "leader", "output"},
+    "graph": {"edge", "end"},
+    "links": {"time", "edge", "end"},
+    "schedule": {"stretch", "edge"},
+    "agents": {"stretch", "agent"},
+    "gain": {"state", "state_column"},
+    "input_weight": {"input", "input_column"},
+    "limits": {"limit", "input"},
+    "modes": {"mode", "pole"},
+    "avoidance": {"slice"},
+}
+"""The groups of `run.nc` with the dimensions of their variables.
+
+The dimensions of one variable contain those of all others in its group. So no program that reads a
+whole group multiplies dimensions that no variable has together.
+"""
 
 
 def dataset(result: Result) -> "xr.Dataset":
@@ -65,15 +70,53 @@ def dataset(result: Result) -> "xr.Dataset":
     imaginary part `mode_eigenvalue_imaginary`), and the limits of the inputs u, `limit_low` <=
     `limit_matrix` u <= `limit_high`. Over a network that is late also `age` (of the oldest message
     that an agent has of a neighbour, NaN before the first), `edge_age` (of the newest one at each
-    end of an edge), `edge_lost` (messages lost since the frame before) and `forget`; of leaders
-    that wait for stragglers `late`, how late their plan is. The attribute
+    end of an edge), `edge_lost` (messages lost since the frame before) and `forget`. The attribute
     `promise` is JSON, and `format` the version of this list.
     """
     return labelled(result).dataset()
 
 
-STORED: "WeakKeyDictionary[Result, Labelled]" = WeakKeyDictionary()
-"""The labelled arrays of runs from disk."""
+def save_dataset(run: "Result | xr.Dataset", path: PathLike) -> None:
+    """Write the dataset of a run as netCDF, atomically, in the groups of `run.nc`.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    # In memory first: on a full disk the netCDF library ends the whole process.
+    if isinstance(run, Result):
+        write_atomic(Path(path), run_file(run))
+    else:
+        write_atomic(Path(path), bytes(run.to_netcdf(None, engine="h5netcdf")))
+
+
+def run_file(result: Result, data: Labelled | None = None) -> bytes:
+    """Return `run.nc`: the dataset in groups, and the sums over all steps.
+
+    Args:
+        result: the run.
+        data: its labelled arrays, computed if None.
+    """
+    return with_sums(result, data).netcdf(_group_of)
+
+
+def _group_of(name: str, dimensions: tuple[str, ...]) -> str:
+    """Return the group of a variable: the first that has its dimensions, else one of its own."""
+    if name.startswith(SUM):
+        return f"sums/{name.removeprefix(SUM)}"
+    groups = (group for group, whole in _GROUPS.items() if whole.issuperset(dimensions))
+    return next(groups, name)
+
+
+def with_sums(result: Result, data: Labelled | None = None) -> Labelled:
+    """Return the labelled arrays of `run.nc`, with the sums over all steps."""
+    data = labelled(result) if data is None else data
+    sums = {SUM + name: np.asarray(total) for name, total in result.sums._asdict().items()}
+    # Each with dimensions of its own.
+    own = {
+        name: (tuple(f"{name}_{axis}" for axis in range(total.ndim)), total)
+        for name, total in sums.items()
+    }
+    return data._replace(variables=data.variables | own)
 
 
 def labelled(result: Result) -> Labelled:
@@ -92,41 +135,24 @@ def _labelled(result: Result) -> Labelled:
         "inputs": (("time", "agent", "input"), result.inputs),
         "saturated": ("agent", result.saturated),
         **fixed.variables,
-        **_presence(result),
-        **_followed(result),
-        **_moving(result),
-        **_poles(result),
-        **_messages(result),
-        **_avoidance(result),
     }
+    if result.presence is not None:
+        variables["presence"] = (("time", "agent"), result.presence.astype(np.int8))
+    variables |= _followed(result)
+    if result.formation.motion is not None:
+        variables["moving_offset"] = (per_agent, result.offsets_in())
+    variables |= {**_poles(result), **_messages(result)}
+    kept = avoidance(result)
+    if kept is not None:
+        variables["slice_start"] = ("slice", kept.times, _SECONDS)
+        variables["scaled_distance"] = ("slice", kept.distance, _METERS)
+        variables["active_rows"] = ("slice", kept.active)
     v = lyapunov(result)
     if v is not None:
         variables |= {"lyapunov": ("time", v.value), "lyapunov_rate": ("time", v.rate)}
         variables["lyapunov_drift"] = ("time", v.drift)
-    coordinates = {"time": ("time", result.times, {"units": "s"}), **fixed.coordinates}
+    coordinates = {"time": ("time", result.times, _SECONDS), **fixed.coordinates}
     return Labelled(variables, coordinates, {**_attributes(result), **fixed.attributes})
-
-
-def recording_of(run: Result | Recording) -> Recording:
-    """Return a run as figures draw it; of a run from disk no part is built."""
-    if isinstance(run, Recording):
-        return run
-    data = labelled(run)
-    return recording(data.arrays(), data.attributes)
-
-
-def _moving(result: Result) -> Variables:
-    """Return offsets that change with time; nothing of constant ones."""
-    if result.formation.motion is None:
-        return {}
-    return {"moving_offset": (("time", "agent", "state"), result.offsets_in())}
-
-
-def _presence(result: Result) -> Variables:
-    """Return which agents are there; nothing where all always are."""
-    if result.presence is None:
-        return {}
-    return {"presence": (("time", "agent"), result.presence.astype(np.int8))}
 
 
 def _followed(result: Result) -> Variables:
@@ -134,8 +160,6 @@ def _followed(result: Result) -> Variables:
     if result.reference is None:
         return {}
     variables: Variables = {"reference": (("time", "state"), result.reference)}
-    if result.late is not None:
-        variables["late"] = ("time", result.late, {"units": "s"})
     errors = [output_errors(result, leader) for leader in result.graph.leaders]
     errors = [error for error in errors if error is not None]
     if errors:
@@ -148,25 +172,13 @@ def _messages(result: Result) -> Variables:
     network, traffic = result.world.network, result.traffic
     if network is None or traffic is None:
         return {}
-    link, seconds = ("time", "edge", "end"), {"units": "s"}
+    link = ("time", "edge", "end")
     ages = traffic.of_agents(result.graph.edges, result.graph.agents, result.presence)
     return {
-        "age": (("time", "agent"), ages, seconds),
-        "edge_age": (link, traffic.ages, seconds),
+        "age": (("time", "agent"), ages, _SECONDS),
+        "edge_age": (link, traffic.ages, _SECONDS),
         "edge_lost": (link, traffic.losses),
-        "forget": ((), network.forget, seconds),
-    }
-
-
-def _avoidance(result: Result) -> Variables:
-    """Return how agents kept apart; nothing where they do not."""
-    numbers, meters = avoidance(result), {"units": "m"}
-    if numbers is None:
-        return {}
-    return {
-        "slice_start": ("slice", numbers.times, {"units": "s"}),
-        "scaled_distance": ("slice", numbers.distance, meters),
-        "active_rows": ("slice", numbers.active),
+        "forget": ((), network.forget, _SECONDS),
     }
 
 
@@ -180,12 +192,11 @@ def _poles(result: Result) -> Variables:
         return {}
     poles, values = guarantee.loop.poles, guarantee.loop.eigenvalues
     imaginary = {"mode_eigenvalue_imaginary": ("mode", np.imag(values))}
-    imaginary = imaginary if np.iscomplexobj(values) else {}
     return {
         "pole_real": (("mode", "pole"), np.real(poles)),
         "pole_imaginary": (("mode", "pole"), np.imag(poles)),
         "mode_eigenvalue": ("mode", np.real(values)),
-        **imaginary,
+        **(imaginary if np.iscomplexobj(values) else {}),
     }
 
 
@@ -211,124 +222,85 @@ def digest_of(files: Mapping[str, bytes]) -> str:
     return " ".join(digests)
 
 
-def save_dataset(run: "Result | xr.Dataset", path: PathLike) -> None:
-    """Write the dataset of a run as netCDF, atomically, in the groups of `run.nc`.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    # In memory first: on a full disk the netCDF library ends the whole process.
-    if isinstance(run, Result):
-        write_atomic(Path(path), run_file(run))
-    else:
-        write_atomic(Path(path), bytes(run.to_netcdf(None, engine="h5netcdf")))
-
-
-def run_file(result: Result, data: Labelled | None = None) -> bytes:
-    """Return `run.nc`: the dataset in groups, and the sums over all steps.
+def labelled_parts(parts: Parts, settings: Settings) -> Labelled:
+    """Return the arrays of `dataset` that do not depend on how a run went.
 
     Args:
-        result: the run.
-        data: its labelled arrays, computed if None.
+        parts: of the run, with its drive completed.
+        settings: of the run.
     """
-    return with_sums(result, data).netcdf(group_of)
-
-
-def with_sums(result: Result, data: Labelled | None = None) -> Labelled:
-    """Return the labelled arrays of `run.nc`, with the sums over all steps."""
-    data = labelled(result) if data is None else data
-    sums = {
-        SUM + name: _numbered(SUM + name, total) for name, total in result.sums._asdict().items()
+    model, graph = parts.model, parts.graph
+    agents, units = np.arange(graph.agents), dict(zip(model.state_names, model.state_units))
+    variables: Variables = {
+        "offset": (("agent", "state"), parts.formation.offsets),
+        "is_leader": ("agent", np.isin(agents, graph.leaders).astype(np.int8)),
+        "nearest_leader": ("agent", np.array(graph.nearest_leader())),
+        **_edges(parts),
     }
-    return data._replace(variables=data.variables | sums)
-
-
-def _numbered(name: str, values: Array) -> tuple[tuple[str, ...], Array]:
-    """Return an array with dimensions of its own."""
-    return tuple(f"{name}_{axis}" for axis in range(np.ndim(values))), np.asarray(values)
-
-
-def statement(parts: Parts, settings: Settings, name: str) -> JsonObject:
-    """Return the entries of a summary that follow from the parts of a run, without running it."""
-    gain, spectrum = parts.drive.gain, parts.graph.spectrum()
-    return {
-        "scenario": name,
-        "agents": parts.graph.agents,
-        "unit": "m" if parts.model.position else "state",
-        "horizon_s": settings.horizon,
-        "dt_s": settings.dt,
-        "seed": settings.seed,
-        **parts.world.describe(parts.model),
-        "gain": _gain_numbers(gain),
-        "leader_gain": _gain_numbers(leader_gain_of(parts.drive)),
-        "promise": promise(parts, settings).as_mapping(),
-        **({"events": events_in_words(parts, promise(parts, settings))} if parts.events else {}),
-        "lambda_min": spectrum.low,
-        "lambda_max": spectrum.high,
+    gain, safety = parts.drive.gain, parts.drive.safety
+    if gain is not None:
+        # A variable cannot have the same dimension twice, so columns have another one.
+        variables["P"] = (("state", "state_column"), gain.P)
+        variables["R"] = (("input", "input_column"), gain.R)
+        variables["coupling"] = ((), gain.coupling)
+    # What is not prepared may have no size yet.
+    if safety is not None and (safety.radii or safety.of_model):
+        variables["ellipsoid_radius"] = ((), safety.size[0], _METERS)
+        variables["ellipsoid_height"] = ((), safety.size[2], _METERS)
+        variables["kept_distance"] = ((), safety.distance, _METERS)
+    if settings.limits and model.input_limits is not None:
+        matrix, low, high = (np.asarray(part, np.float64) for part in model.input_limits)
+        variables["limit_matrix"] = (("limit", "input"), matrix)
+        variables |= {"limit_low": ("limit", low), "limit_high": ("limit", high)}
+    coordinates = {
+        "agent": agents,
+        "state": list(model.state_names),
+        "state_unit": ("state", list(model.state_units)),
+        "input": list(model.input_names),
+        "input_unit": ("input", list(model.input_units)),
+        "output": list(model.output_names),
+        # Known of outputs that are states.
+        "output_unit": ("output", [units.get(name, "") for name in model.output_names]),
     }
+    return Labelled(variables, coordinates, _attributes_of_parts(parts, settings))
 
 
-def _gain_numbers(gain: Gain | None) -> JsonObject | None:
-    if gain is None:
-        return None
-    numbers = {"P": gain.P.tolist(), "R": gain.R.tolist()}
-    return {"method": gain.method, "coupling": gain.coupling, **numbers}
-
-
-def leader_gain_of(drive: Drive) -> Gain | None:
-    """Return the leaders' own gain; None without one."""
-    return gain_of(drive.leader) if isinstance(drive, Laws) else None
-
-
-_NUMBERS = tuple(x.key or name for name, x in shown_in(RUN_NUMBERS, Shown.SUMMARY).items())
-OBSERVED = ("outcome", "leader", "leaders", "followers", "edges", *_NUMBERS)
-OBSERVED += ("event_outcomes", "steady_window_s", "warnings", "engine", "wall_time_s", "versions")
-"""The other entries of a summary, which only the run itself gives."""
-
-
-def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
-    """Return the run's summary as JSON data; numbers that do not exist are None."""
-    numbers = metrics(result) if numbers is None else numbers
-    name = result.provenance.get("scenario", "")
-    guarantee = promise(result.parts, result.settings)
+def _attributes_of_parts(parts: Parts, settings: Settings) -> JsonObject:
+    """Return parts and settings as attributes that netCDF can hold."""
+    numbers, model = {**settings._asdict(), "steady_window": settings.window}, parts.model
+    radius = model.radius if model.position else None
     return {
-        **statement(result.parts, result.settings, name),
-        "outcome": {"name": result.outcome.name.lower(), "message": result.message},
-        "leader": numbers.leader._asdict(),
-        "leaders": [leader._asdict() for leader in numbers.leaders],
-        "followers": [_follower(row._asdict()) for row in _listed(numbers.followers, steady_error)],
-        "edges": [
-            {"edge": list(row.edge), "distance_rmse": row.distance_rmse}
-            for row in _listed(numbers.edges, _distance_error)
-        ],
-        **RunNumbers(result, numbers, guarantee).json(Shown.SUMMARY),
-        **_outcomes(result),
-        "steady_window_s": numbers.steady_window,
-        "warnings": list(result.warnings),
-        "engine": result.engine,
-        "wall_time_s": result.wall_time if math.isfinite(result.wall_time) else None,
-        "versions": {
-            key[8:]: text for key, text in result.provenance.items() if key.startswith("version_")
+        **({} if radius is None else {"radius": float(radius)}),
+        **{key: text for key, text in parts.world.describe(model).items() if text is not None},
+        **{key: int(v) if isinstance(v, bool) else v for key, v in numbers.items()},
+        "settings": json.dumps(settings._asdict(), default=lambda number: number.item()),
+        **{
+            f"{role}_needs": "; ".join(received) or "nothing"
+            for role, received in parts.information._asdict().items()
         },
+        "model": type(model).__name__,
+        "position": " ".join(model.position),
+        "directed": int(parts.graph.directed),
+        "format": FORMAT,
+        **({"events": json.dumps([*map(as_mapping, parts.events)])} if parts.events else {}),
     }
 
 
-def _outcomes(result: Result) -> JsonObject:
-    """Return what followed the events; nothing without any."""
-    if not result.parts.events:
-        return {}
-    return {"event_outcomes": [outcome.as_mapping() for outcome in event_outcomes(result)]}
-
-
-def _listed(rows: Sequence[_Row], error: Callable[[_Row], float]) -> Sequence[_Row]:
-    """Return all rows; if they are too many for JSON tools, the best, the median and the worst."""
-    return rows if len(rows) <= _LISTED else representatives(rows, error)
-
-
-def _distance_error(edge: EdgeMetrics) -> float:
-    return np.inf if edge.distance_rmse is None else edge.distance_rmse
-
-
-def _follower(entry: JsonObject) -> JsonObject:
-    keys = {name: quantity.key or name for name, quantity in AGENT_NUMBERS.items()}
-    return {keys.get(name, name): value for name, value in entry.items()}
+def _edges(parts: Parts) -> Variables:
+    """Return the edges of the graph, who receives along them, and their weights over time."""
+    graph, schedule = parts.graph, parts.graph.schedule
+    variables: Variables = {
+        "edge_agents": (("edge", "end"), graph.edges),
+        "edge_weight": ("edge", graph.weights),
+        "edge_heard": (("edge", "end"), parts.receives.astype(np.int8)),
+    }
+    if schedule is not None:
+        variables["stretch_start"] = ("stretch", schedule.starts, _SECONDS)
+        variables["edge_weight_then"] = (("stretch", "edge"), schedule.weights)
+        period = np.inf if schedule.period is None else schedule.period
+        variables["graph_period"] = ((), period, _SECONDS)
+    if schedule is not None and schedule.present is not None:
+        over = ("stretch", "agent")
+        variables["present_then"] = (over, schedule.present.astype(np.int8))
+        variables["nearest_leader_then"] = (over, schedule.nearest)
+    return variables

@@ -122,7 +122,9 @@ def read_labelled(file: Path) -> Labelled:
                 if name in place and values.tolist() != _whole(name, place[name])[1].tolist():
                     raise ValueError(f"its groups have different values of `{name}`")
                 place[name] = (variable.dimensions, values, attributes)
-        result.attributes.update((k, _plain(v)) for k, v in stored.attrs.items())
+        for name, value in stored.attrs.items():
+            plain = value.item() if isinstance(value, np.generic) else value
+            result.attributes[name] = plain
     result.attributes.pop("coordinates", None)
     return result
 
@@ -147,19 +149,6 @@ def _values(stored: Array) -> Array:
     return np.array([*texts], str).reshape(values.shape)
 
 
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
-
-
-def labelled(data: "xr.Dataset") -> Labelled:
-    """Return the arrays of a dataset."""
-    variables, coordinates = (
-        {str(name): (each.dims, each.values, each.attrs) for name, each in some.items()}
-        for some in (data.data_vars, data.coords)
-    )
-    return Labelled(variables, coordinates, data.attrs)
-
-
 def _whole(name: str, part: Any) -> tuple[tuple[str, ...], Array, JsonObject]:
     dimensions, values, *attributes = part if isinstance(part, tuple) else (name, part)
     names = (dimensions,) if isinstance(dimensions, str) else tuple(dimensions)
@@ -174,12 +163,14 @@ def _write(
     attributes: JsonObject,
 ) -> None:
     """Write one variable."""
+    import h5py
+
     for dimension, size in zip(dimensions, values.shape, strict=True):
         if dimension not in file.dimensions:
             file.dimensions[dimension] = size
     # Text has variable length, and NaN marks a missing float.
     text = values.dtype.kind in "UO"
-    kind: Any = _text() if text else _numeric(name, values).dtype
+    kind: Any = h5py.string_dtype() if text else _numeric(name, values).dtype
     missing = values.dtype.type(np.nan) if values.dtype.kind == "f" else None
     variable = file.create_variable(name, dimensions, kind, fillvalue=missing)
     variable[...] = values.astype(object) if text else values
@@ -191,9 +182,3 @@ def _numeric(name: str, values: Array) -> Array:
     """Return numbers of a type that netCDF stores unchanged."""
     assert values.dtype.kind in "iuf", f"`{name}` has type {values.dtype}, which netCDF lacks"
     return values
-
-
-def _text() -> Any:
-    import h5py
-
-    return h5py.string_dtype()

@@ -1,4 +1,12 @@
-"""The numbers of a run: the errors of the paper's Table II, settling times, effort and more."""
+"""The numbers of a run: the errors of the paper's Table II, settling times, effort and more.
+
+Of agents that keep apart also how near they came, and when they held each other back.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple, final
 
 import jax
 import numpy as np
@@ -6,17 +14,26 @@ from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
+from echelon.core.digits import about, at_most
 from echelon.core.errors import Outcome, check_kind
 from echelon.core.numerics import precision
-from echelon.core.types import Array
-from echelon.experiments.results.agent_metrics import (
+from echelon.core.statement import Hypothesis
+from echelon.core.types import Array, JsonObject
+from echelon.experiments.results.run_numbers import (
+    AGENT_NUMBERS,
+    RUN_NUMBERS,
     EdgeMetrics,
     FollowerMetrics,
     LeaderMetrics,
     Metrics,
+    Shown,
 )
+from echelon.guarantees.promises.promise import Promise, covered
 from echelon.simulation.engine.result import Result, finite_or_none
-from echelon.simulation.step.meter import SETTLED, output_error
+from echelon.simulation.step.meter import SETTLED, output_error, steps_per_slice
+
+ROUNDING = 1e-4
+"""Below its limit by this a distance still counts as kept, m: pages round places."""
 
 
 def metrics(result: Result) -> Metrics:
@@ -126,3 +143,181 @@ def _edges(result: Result, exists: bool) -> tuple[EdgeMetrics, ...]:
         EdgeMetrics(pair, _root_mean(total, count))
         for pair, total, count in zip(pairs, result.sums.spacing, steps, strict=True)
     )
+
+
+class Ellipsoid(NamedTuple):
+    """An upright ellipsoid about each agent, in which distances between agents are scaled.
+
+    Attributes:
+        radius: horizontal, m.
+        height: from its middle to its top, m.
+        limit: the scaled distance that agents should keep, m: that of their hulls, or of touching.
+    """
+
+    radius: float
+    height: float
+    limit: float
+
+    @property
+    def touching(self) -> float:
+        """The scaled distance at which two touch, m."""
+        return 2.0 * self.radius
+
+    def radii(self, coordinates: Sequence[str]) -> Float[Array, " d"]:
+        """Return the radii along a position's coordinates, m."""
+        return np.array([self.height if x == "z" else self.radius for x in coordinates])
+
+    def too_near(
+        self, places: Float[Array, "N d"], coordinates: Sequence[str]
+    ) -> Float[Array, " N"]:
+        """Return 2 for agents whose ellipsoid overlaps another, 1 below the limit, else 0."""
+        scaled = places * self.radius / self.radii(coordinates)
+        apart = np.linalg.norm(scaled[:, None] - scaled, axis=2)
+        np.fill_diagonal(apart, np.inf)
+        # Absent agents are nowhere.
+        least = np.where(np.isfinite(apart), apart, np.inf).min(axis=1)
+        return (least < self.limit - ROUNDING) * 1.0 + (least < self.touching)
+
+
+class Avoidance(NamedTuple):
+    """Numbers of B slices of a run, none before it runs; distances are scaled.
+
+    Attributes:
+        times: at which each slice begins, s.
+        distance: the least distance between two agents in it, m.
+        active: pairs of agents of which one changed the other's rate, each way, on average.
+        ellipsoid: about each agent.
+    """
+
+    times: Float[np.ndarray, " B"]
+    distance: Float[np.ndarray, " B"]
+    active: Float[np.ndarray, " B"]
+    ellipsoid: Ellipsoid
+
+    @property
+    def least(self) -> float:
+        """The least distance, m."""
+        return float(self.distance.min())
+
+    @property
+    def last(self) -> float | None:
+        """The beginning of the last slice in which an agent was held back, s; None if none was."""
+        held = np.flatnonzero(self.active)
+        return float(self.times[held[-1]]) if len(held) else None
+
+    def over(self, times: Float[Array, " T"], values: Float[Array, " B"]) -> Float[Array, " T"]:
+        """Return values of slices at times (s)."""
+        return values[np.searchsorted(self.times, times, side="right") - 1]
+
+    def sentence(self) -> str:
+        """Return them in a sentence."""
+        text = f"Smallest scaled distance: {about(self.least, 4)} m; agents touch at "
+        text += f"{about(self.ellipsoid.touching, 4)} m, and their hulls keep "
+        text += f"{at_most(self.ellipsoid.limit, 4)} m. "
+        if self.last is None:
+            return f"{text}No agent was held back."
+        first, last = (about(float(t)) for t in self.times[np.flatnonzero(self.active)][[0, -1]])
+        return f"{text}Agents held each other back between {first} s and {last} s."
+
+
+def avoidance(result: Result) -> Avoidance | None:
+    """Return how agents of a run kept apart; None where they do not."""
+    safety, sums, settings = result.drive.safety, result.sums, result.settings
+    if safety is None or not sums.steps[0]:
+        return None
+    each = steps_per_slice(settings)
+    count = -(-int(sums.steps[0]) // each)
+    begins = each * np.arange(count)
+    steps = np.minimum(each, sums.steps[0] - begins)
+    return Avoidance(
+        begins * settings.dt,
+        sums.separation[:, :count].min(axis=0),
+        sums.avoidance[:, :count].sum(axis=0) / steps,
+        Ellipsoid(safety.size[0], safety.size[2], safety.distance),
+    )
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
+class RunNumbers:
+    """A run with what its numbers are computed from.
+
+    Attributes:
+        result: the run.
+        metrics: of the run.
+        promise: of its parts.
+        computing: computing time (s) for one agent and one second of the run, without compilation;
+            None if it was not measured.
+    """
+
+    result: Result
+    metrics: Metrics
+    promise: Promise
+    computing: float | None = None
+
+    def number(self, name: str) -> float | None:
+        """Return a number of `RUN_NUMBERS`; None if it does not exist or is more than one."""
+        value = self._value(name)
+        return None if isinstance(value, tuple) else value
+
+    def _value(self, name: str) -> float | tuple[int, ...] | None:
+        compute = RUN_NUMBERS[name].of
+        value = None if compute is None else compute(self)
+        return None if value is None or np.isnan(value).any() else value
+
+    def json(self, where: Shown) -> JsonObject:
+        """Return the numbers that appear somewhere, under their names in JSON."""
+        return {
+            quantity.key or name: self._value(name)
+            for name, quantity in RUN_NUMBERS.items()
+            if where in quantity.shown
+        }
+
+    def followers(self, name: str) -> Float[np.ndarray, " F"]:
+        """Return a number of `AGENT_NUMBERS` of all followers; NaN where it does not exist."""
+        compute = AGENT_NUMBERS[name].of
+        if compute is not None:
+            return compute(self)
+        return np.array([getattr(follower, name) for follower in self.metrics.followers], float)
+
+    def worst(self, name: str) -> float:
+        """Return the largest number of a follower; NaN if one does not exist."""
+        return float(self.followers(name).max())
+
+    def root_mean(self, name: str) -> float:
+        """Return the root mean square of a number of the followers."""
+        return float(np.sqrt(np.mean(self.followers(name) ** 2)))
+
+    def of_network(self, name: str) -> float | None:
+        """Return a number of the messages; None in the ideal network."""
+        return None if self.result.traffic is None else getattr(self.result.traffic, name)
+
+    @functools.cached_property
+    def avoidance(self) -> Avoidance | None:
+        """How agents kept apart; None where they do not."""
+        return avoidance(self.result)
+
+    @functools.cached_property
+    def first_and_last(self) -> Float[np.ndarray, "2 F"]:
+        """The followers' formation errors in the first and the last frame."""
+        followers = list(self.result.graph.followers)
+        if self.result.outcome is Outcome.DIVERGED or not len(self.result.times):
+            return np.full((2, len(followers)), np.nan)
+        return self.result.goal_distances([0, -1])[:, followers]
+
+    @property
+    def covered(self) -> bool | None:
+        """Whether the run kept to the conditions of its claim; None where no theorem claims any."""
+        return covered(self.result, self.promise)
+
+    @property
+    def certified_radius(self) -> float | None:
+        """The radius of the certified set; None where nothing is guaranteed on one."""
+        certified = self.promise.certified if self.promise.promised else None
+        return None if certified is None else certified.radius
+
+    @property
+    def start_size(self) -> float | None:
+        """The radius of the starts; None without a certified set."""
+        starts = self.promise.hypotheses[Hypothesis.STARTS]
+        return None if self.certified_radius is None else starts.number

@@ -1,29 +1,48 @@
 """A run as plain arrays and names, from its dataset or from `run.nc`, without the model's code.
 
-All figures draw a recording, so that a stored run gives the same figures as the run itself.
+All figures draw a recording, so that a stored run gives the same figures as the run itself, and a
+run that is still computed shows the same as one that is complete.
 """
 
 import dataclasses
 import functools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, final
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from echelon.agents.network.formation import Formation
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
+from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
-from echelon.core.types import JsonObject
+from echelon.core.types import Array, JsonObject
 from echelon.core.words import Verdict, amount
-from echelon.experiments.results.avoidance import Avoidance, Ellipsoid
+from echelon.experiments.results.dataset import FORMAT, labelled, labelled_parts
 from echelon.experiments.results.labelled import Labelled, read_labelled
+from echelon.experiments.results.metrics import Avoidance, Ellipsoid
 from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.record import Stretch
+from echelon.simulation.engine.result import Result
+from echelon.simulation.step.settings import Settings
 
-FORMAT, READ = 4, (3, 4)
-"""Version of the format of `run.nc`, and those that are read; others are refused."""
+_AHEAD, _PLACES = 60.0, 121
+"""Seconds of the reference by which the scene is sized, and the number of times in them."""
+_BLOCK = 32
+"""Frames for which V is computed at once: a constant, so that it is compiled once."""
+_NO_PROMISE: JsonObject = {
+    "promised": False,
+    "rate": None,
+    "theorem": None,
+    "sentence": "",
+    "kind": "",
+    "hypotheses": (),
+}
 
 
 class InputBounds(NamedTuple):
@@ -249,16 +268,15 @@ class Recording(FrameNumbers):
         return np.where(here.reshape(*here.shape, *[1] * (values.ndim - 2)), values, np.nan)
 
 
-def read_recording(file: Path) -> Recording:
-    """Return the run in a netCDF file.
+def recording_of(run: Result | Recording) -> Recording:
+    """Return a run as figures draw it; of a run from disk no part is built."""
+    if isinstance(run, Recording):
+        return run
+    data = labelled(run)
+    return recording(data.arrays(), data.attributes)
 
-    Raises:
-        OutputError: the file cannot be read, is damaged, or has another format.
-    """
-    return recording_with_data(file)[0]
 
-
-def recording_with_data(file: Path) -> tuple[Recording, Labelled]:
+def read_recording(file: Path) -> tuple[Recording, Labelled]:
     """Return the run in a netCDF file, and all that the file contains.
 
     Raises:
@@ -283,7 +301,15 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         OutputError: the dataset has another format.
         KeyError: it is not a dataset of a run.
     """
-    _check_format(arrays, attributes)
+    if "states" not in arrays or "model" not in attributes:
+        raise KeyError("it has no states of agents")
+    version = int(attributes.get("format", 1))
+    if version != FORMAT:
+        by = attributes.get("version_echelon", "?")
+        raise OutputError(
+            f"the run has format {version}, of echelon {by}, and this version reads format "
+            f"{FORMAT}; run it again by `echelon run FOLDER --out OTHER`."
+        )
     names = _texts(arrays, "state")
     return Recording(
         name=str(attributes.get("scenario") or attributes["model"]),
@@ -322,19 +348,6 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recor
         attributes=dict(attributes),
         radius=float(attributes["radius"]) if "radius" in attributes else None,
     )
-
-
-def _check_format(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> None:
-    if "states" not in arrays or "model" not in attributes:
-        raise KeyError("it has no states of agents")
-    version = int(attributes.get("format", 1))
-    if version not in READ:
-        by = attributes.get("version_echelon", "an unknown version")
-        raise OutputError(
-            f"the run was written in format {version} by echelon {by}, but this version reads "
-            f"formats {READ[0]} and {READ[1]}; `echelon run FOLDER --out OTHER` computes it again "
-            "from its scenario."
-        )
 
 
 def _texts(arrays: Mapping[str, np.ndarray], name: str) -> tuple[str, ...]:
@@ -390,3 +403,85 @@ def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:
         return None
     rows = values["age"], values["edge_age"], values["edge_lost"].astype(int)
     return MessageAges(*rows, float(values["forget"]))
+
+
+def foreseen(
+    parts: Parts,
+    settings: Settings,
+    states: Float[Array, "N n"],
+    name: str,
+    promise: JsonObject = _NO_PROMISE,
+) -> Recording:
+    """Return a recording of agents that stay at their goals, by which the scene is sized.
+
+    Args:
+        parts: of the run, with its drive completed.
+        settings: of the run.
+        states: at the beginning.
+        name: of the scenario.
+        promise: as `Promise.as_mapping` returns it; none by default.
+    """
+    model, fixed = parts.model, labelled_parts(parts, settings)
+    times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)
+    ahead, reference = _ahead(parts, states, times)
+    trim, agents = np.asarray(model.trim[1], float), parts.graph.agents
+    frames = {
+        "time": times,
+        "states": ahead,
+        "inputs": np.broadcast_to(trim, (_PLACES, agents, len(trim))),
+        "saturated": np.zeros(agents),
+    }
+    frames |= {} if reference is None else {"reference": reference}
+    if parts.formation.motion is not None:
+        frames["moving_offset"] = parts.formation.offsets_at(times)
+    attributes = {"scenario": name, "outcome": "completed", "message": ""}
+    attributes["promise"] = json.dumps(promise)
+    return recording(fixed.arrays() | frames, fixed.attributes | attributes)
+
+
+def _ahead(
+    parts: Parts, start: Float[Array, "N n"], times: Float[Array, " T"]
+) -> tuple[Float[Array, "T N n"], Float[Array, "T n"] | None]:
+    """Return the states at the start and the goals from then on, and the reference if any."""
+    with precision("float64"):
+        path = parts.drive.reference_states(parts.model, jnp.asarray(times))
+    if path is None:
+        return np.broadcast_to(start, (len(times), *np.shape(start))).copy(), None
+    reference = np.asarray(path, float)
+    states = reference[:, None] + parts.formation.offsets_at(times)
+    states[0] = start
+    return states, reference
+
+
+def so_far(
+    run: Recording,
+    stretch: Stretch,
+    potential: Callable[[Array], Array] | None,
+    formation: Formation,
+) -> Recording:
+    """Return a part of a run as a recording.
+
+    Args:
+        run: as returned by `foreseen`.
+        stretch: the part, with finite numbers.
+        potential: V (T,) of states minus offsets (T, N, n); None where there is none.
+        formation: of the run.
+    """
+    moving = None if formation.motion is None else formation.offsets_at(stretch.times)
+    lyapunov, count = None, len(stretch.times)
+    if potential is not None:
+        # Block by block, the last one padded with copies.
+        y = stretch.states - run.offsets
+        whole = -(-count // _BLOCK) * _BLOCK
+        padded = np.concatenate([y, np.repeat(y[-1:], whole - count, axis=0)])
+        blocks = map(potential, np.split(padded, whole // _BLOCK))
+        lyapunov = np.concatenate([*blocks])[:count]
+    return dataclasses.replace(
+        run,
+        times=stretch.times,
+        states=stretch.states,
+        inputs=stretch.inputs,
+        reference=stretch.reference,
+        moving=moving,
+        lyapunov=lyapunov,
+    )

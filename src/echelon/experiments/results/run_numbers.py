@@ -4,115 +4,196 @@ A further number is one more entry of `RUN_NUMBERS`, or of `AGENT_NUMBERS` for o
 Tables, JSON, data sets, figures and the glossary take it from here.
 """
 
-import dataclasses
-import functools
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, final
+import enum
+from collections.abc import Callable, Mapping, Sequence
+from typing import (
+    Annotated,
+    Any,
+    NamedTuple,
+    TypeVar,
+    final,
+    get_args,
+    get_type_hints,
+)
 
 import numpy as np
-from jaxtyping import Float
 
-from echelon.core.errors import Outcome
-from echelon.core.statement import Hypothesis
-from echelon.experiments.results.agent_metrics import FollowerMetrics, Metrics
-from echelon.experiments.results.quantity import ERROR, Quantity, Shown, quantities
+from echelon.simulation.engine.frame_numbers import ClosestPair
 
-if TYPE_CHECKING:
-    from echelon.core.types import JsonObject
-    from echelon.experiments.results.avoidance import Avoidance
-    from echelon.guarantees.promises.promise import Promise
-    from echelon.simulation.engine.result import Result
+ERROR = "error"
+"""In place of a unit: that of the formation errors."""
+
+
+def settling_bound(unit: str) -> str:
+    """Return the error below which a follower has settled, for errors in m or without a unit."""
+    return "1 cm" if unit else "0.01"
 
 
 @final
-@dataclasses.dataclass(frozen=True, eq=False)
-class RunNumbers:
-    """A run with what its numbers are computed from.
+class Shown(enum.Flag):
+    """Where a number of a run appears, besides the glossary."""
+
+    SWEEP = enum.auto()
+    """In the dataset of a sweep."""
+    DISTRIBUTION = enum.auto()
+    """In the report and the figures of a sweep, as a distribution over its runs."""
+    COMPARISON = enum.auto()
+    """In the JSON of a comparison, and in its table of costs if the number has a column."""
+    SUMMARY = enum.auto()
+    """In the summary of a run."""
+
+
+class Quantity(NamedTuple):
+    """A number of a run or of an agent.
 
     Attributes:
-        result: the run.
-        metrics: of the run.
-        promise: of its parts.
-        computing: computing time (s) for one agent and one second of the run, without compilation;
-            None if it was not measured.
+        meaning: in data sets and the glossary.
+        unit: `ERROR` for the unit of formation errors; empty without one.
+        label: of an axis.
+        column: of a table; `{unit}`, `{window}` (s) and `{settled}` stand for those of the run.
+        of: computes it from the `RunNumbers` of a run, for an agent's number those of all
+            followers, (F,); None for what `metrics` computes of each agent.
+        shown: where it appears.
+        key: in JSON; its name by default.
+        scale: of the number in tables: 100 for a percentage.
+        digits: most digits in tables.
+        absent: in tables, if the number does not exist.
     """
 
-    result: "Result"
-    metrics: Metrics
-    promise: "Promise"
-    computing: float | None = None
+    meaning: str
+    unit: str = ""
+    label: str = ""
+    column: str = ""
+    of: Callable[[Any], Any] | None = None
+    shown: Shown = Shown.SWEEP
+    key: str = ""
+    scale: float = 1.0
+    digits: int = 4
+    absent: str = "-"
 
-    def number(self, name: str) -> float | None:
-        """Return a number of `RUN_NUMBERS`; None if it does not exist or is more than one."""
-        value = self._value(name)
-        return None if isinstance(value, tuple) else value
+    def cell(self, value: float | None, digits: int = 4) -> str:
+        """Return the number as a cell of a table."""
+        if value is None:
+            return self.absent
+        return f"{self.scale * value:.{min(digits, self.digits)}g}"
 
-    def _value(self, name: str) -> float | tuple[int, ...] | None:
-        compute = RUN_NUMBERS[name].of
-        value = None if compute is None else compute(self)
-        return None if value is None or np.isnan(value).any() else value
 
-    def json(self, where: Shown) -> "JsonObject":
-        """Return the numbers that appear somewhere, under their names in JSON."""
-        return {
-            quantity.key or name: self._value(name)
-            for name, quantity in RUN_NUMBERS.items()
-            if where in quantity.shown
-        }
+def quantities(numbers: type) -> dict[str, Quantity]:
+    """Return the quantities among the fields of a tuple of numbers, by name."""
+    hints = get_type_hints(numbers, include_extras=True)
+    marks = ((name, mark) for name, hint in hints.items() for mark in get_args(hint)[1:])
+    return {name: mark for name, mark in marks if isinstance(mark, Quantity)}
 
-    def followers(self, name: str) -> Float[np.ndarray, " F"]:
-        """Return a number of `AGENT_NUMBERS` of all followers; NaN where it does not exist."""
-        compute = AGENT_NUMBERS[name].of
-        if compute is not None:
-            return compute(self)
-        return np.array([getattr(follower, name) for follower in self.metrics.followers], float)
 
-    def worst(self, name: str) -> float:
-        """Return the largest number of a follower; NaN if one does not exist."""
-        return float(self.followers(name).max())
+class LeaderMetrics(NamedTuple):
+    """Root-mean-square deviation of a leader from its reference; None without a reference.
 
-    def root_mean(self, name: str) -> float:
-        """Return the root mean square of a number of the followers."""
-        return float(np.sqrt(np.mean(self.followers(name) ** 2)))
+    `saturated` is the fraction of steps in which a limit changed the input.
+    """
 
-    def of_network(self, name: str) -> float | None:
-        """Return a number of the messages; None in the ideal network."""
-        return None if self.result.traffic is None else getattr(self.result.traffic, name)
+    rmse: float | None
+    steady_rmse: float | None
+    rmse_by_output: dict[str, float | None]
+    agent: int = 0
+    saturated: float = 0.0
 
-    @functools.cached_property
-    def avoidance(self) -> "Avoidance | None":
-        """How agents kept apart; None where they do not."""
-        # Not above: `echelon explain` needs the table below at once, and not what computes it.
-        from echelon.experiments.results.avoidance import avoidance
 
-        return avoidance(self.result)
+class FollowerMetrics(NamedTuple):
+    """One follower's formation error: the length of the vector to its goal relative to its leader.
 
-    @functools.cached_property
-    def first_and_last(self) -> Float[np.ndarray, "2 F"]:
-        """The followers' formation errors in the first and the last frame."""
-        followers = list(self.result.graph.followers)
-        if self.result.outcome is Outcome.DIVERGED or not len(self.result.times):
-            return np.full((2, len(followers)), np.nan)
-        return self.result.goal_distances([0, -1])[:, followers]
+    `settling_time` (s) is the time after which the error stays below 1 cm. `effort` is the
+    root-mean-square of the normalized input about the trim. `saturated` is the fraction of steps in
+    which a limit changed the input. A further number is one more field with its `Quantity`.
+    """
+
+    agent: int
+    rmse: Annotated[
+        float | None,
+        Quantity("root mean square of the formation error", ERROR, column="RMSE{unit}\n(all)"),
+    ]
+    steady_rmse: Annotated[
+        float | None,
+        Quantity(
+            "root mean square of the formation error in the steady window",
+            ERROR,
+            column="steady{unit}\n(last {window:.3g} s)",
+        ),
+    ]
+    settling_time: Annotated[
+        float | None,
+        Quantity(
+            "time after which the error stays below 1 cm, or 0.01 without a position",
+            "s",
+            column="within {settled}\nfrom, s",
+            key="settling_time_s",
+            absent="never",
+        ),
+    ]
+    effort: Annotated[
+        float | None, Quantity("root mean square of the normalized input", column="effort")
+    ]
+    saturated: Annotated[
+        float,
+        Quantity(
+            "fraction of steps in which a limit changed the input",
+            column="saturated,\n% steps",
+            scale=100.0,
+            digits=3,
+        ),
+    ]
+
+
+class EdgeMetrics(NamedTuple):
+    """Root-mean-square of (actual minus desired distance) on one edge."""
+
+    edge: tuple[int, int]
+    distance_rmse: float | None
+
+
+class Metrics(NamedTuple):
+    """All numbers of a run; what does not exist is None, never NaN.
+
+    Errors are of the position (m) where the model has one, else of the whole state. A run that
+    diverged has no errors. The closest pair is that of all steps, or of the stored `frames`.
+    """
+
+    leaders: tuple[LeaderMetrics, ...]
+    followers: tuple[FollowerMetrics, ...]
+    edges: tuple[EdgeMetrics, ...]
+    closest: ClosestPair | None
+    saturation_fraction: float
+    steady_window: float
 
     @property
-    def covered(self) -> bool | None:
-        """Whether the run kept to the conditions of its claim; None where no theorem claims any."""
-        from echelon.guarantees.promises.promise import covered
-
-        return covered(self.result, self.promise)
+    def leader(self) -> LeaderMetrics:
+        """The numbers of the first leader."""
+        return self.leaders[0]
 
     @property
-    def certified_radius(self) -> float | None:
-        """The radius of the certified set; None where nothing is guaranteed on one."""
-        certified = self.promise.certified if self.promise.promised else None
-        return None if certified is None else certified.radius
+    def minimum_distance(self) -> float | None:
+        """The smallest distance between two agents, m; `closest` says over what."""
+        return None if self.closest is None else self.closest.distance
 
     @property
-    def start_size(self) -> float | None:
-        """The radius of the starts; None without a certified set."""
-        starts = self.promise.hypotheses[Hypothesis.STARTS]
-        return None if self.certified_radius is None else starts.number
+    def worst_steady(self) -> float | None:
+        """The largest steady error of a follower."""
+        values = [f.steady_rmse for f in self.followers if f.steady_rmse is not None]
+        return max(values) if values else None
+
+
+_Row = TypeVar("_Row")
+
+
+def representatives(rows: Sequence[_Row], error: Callable[[_Row], float]) -> list[_Row]:
+    """Return the best, the median and the worst of some rows, which have errors."""
+    ordered = sorted(rows, key=error)
+    return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]
+
+
+def steady_error(row: LeaderMetrics | FollowerMetrics) -> float:
+    """Return the steady error of an agent."""
+    # An agent without one did not reach the steady window, and counts as the worst.
+    return np.inf if row.steady_rmse is None else row.steady_rmse
 
 
 AGENT_NUMBERS: Mapping[str, Quantity] = quantities(FollowerMetrics) | {

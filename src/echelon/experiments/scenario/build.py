@@ -1,46 +1,68 @@
 """Builds the parts of a checked scenario, and runs them."""
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast, final
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
+from echelon.agents.network.channel import Bursts, Network
+from echelon.agents.network.events import Cut, Event, Join, Lose, check_heirs, event_faults
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.reference import Guide, Reference, check_reference
-from echelon.agents.world.world import World
-from echelon.core.errors import ModelError, ScenarioError, did_you_mean, listing
+from echelon.agents.world.actuator import Actuator
+from echelon.agents.world.disturbance import Disturbance
+from echelon.agents.world.sensing import Sensing
+from echelon.agents.world.world import World, check_plant, vary_parameters
+from echelon.core.errors import (
+    EchelonError,
+    FormationError,
+    MissingExtraError,
+    ModelError,
+    ScenarioError,
+    did_you_mean,
+    listing,
+)
 from echelon.core.files import versions
 from echelon.core.numerics import precision
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.checks import ROLES, section
-from echelon.experiments.scenario.fault_list import FaultList
-from echelon.experiments.scenario.formation_parts import formation_of
-from echelon.experiments.scenario.law_sections import GainSpec, law_arguments
 from echelon.experiments.scenario.named_class import (
+    NOTHING,
     NamedClass,
     accepted,
+    as_scenario_error,
     check_names,
-    law_class,
-    named_class,
     offered,
+    resolve,
+    user_class,
 )
-from echelon.experiments.scenario.scenario import Scenario, ScenarioLike, as_scenario
+from echelon.experiments.scenario.scenario import (
+    Scenario,
+    ScenarioFault,
+    ScenarioLike,
+    as_scenario,
+    refuse,
+)
+from echelon.experiments.scenario.sections import (
+    EventSpec,
+    FollowerSpec,
+    GainSpec,
+    GraphSpec,
+    LeaderSpec,
+    MotionSpec,
+    PlantSpec,
+    ShapeKeys,
+    UserClass,
+    VariationSpec,
+    law_arguments,
+)
 from echelon.experiments.scenario.self_contained import self_contained
-from echelon.experiments.scenario.user_code import as_scenario_error
 from echelon.experiments.scenario.values import marked_keys
-from echelon.experiments.scenario.world_parts import (
-    actuator_of,
-    check_world,
-    disturbance_of,
-    events_of,
-    leadership_of,
-    network_of,
-    plants_of,
-    sensing_of,
-)
-from echelon.experiments.scenario.yaml import quoted
+from echelon.experiments.scenario.yaml import joined, quoted
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
 from echelon.laws.safety import Safety
@@ -50,9 +72,12 @@ from echelon.simulation.engine.prepare import check_engine, check_memory
 from echelon.simulation.engine.record import Stretch
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import Keep, Progress, simulate
+from echelon.simulation.step.leadership import Leadership
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain, Method, synthesize
 from echelon.synthesis.gains.gain_file import load_gain
+
+_Part = TypeVar("_Part")
 
 
 class Experiment(NamedTuple):
@@ -75,91 +100,16 @@ def build(scenario: ScenarioLike, to_run: bool = False) -> Experiment:
         EchelonError: the engine cannot step a run of it.
     """
     scenario = as_scenario(scenario)
-    faults = FaultList(scenario)
     # Gains are computed here, and would have 7 digits under float32.
     with precision("float64"):
-        settings = faults.part(lambda: _settings(scenario), "simulation")
-        model = faults.part(lambda: _model(scenario), "model")
-        graph = faults.part(lambda: _graph(scenario), "graph")
-        reference = faults.part(lambda: _reference(scenario, model), "reference")
-        # Before the laws: they need the model and the graph, and would report these faults again.
-        faults.settle()
+        builder = _Builder(scenario)
         if to_run:
-            # And before a gain is computed, which takes long for many agents.
-            _check_run(scenario, faults, model, graph, settings)
-        parts = _parts(scenario, faults, model, graph, reference)
+            # Before a gain is computed, which takes long for many agents.
+            builder.check_run()
+        parts = builder.parts()
     if to_run:
-        check_engine(parts, settings)
-    return Experiment(parts, settings)
-
-
-def _check_run(
-    scenario: Scenario, faults: FaultList, model: ControlAffine, graph: Graph, settings: Settings
-) -> None:
-    """Check that a scenario has no live events, and that its run fits in memory."""
-    with faults.at("live"):
-        if scenario.live:
-            raise ScenarioError(
-                f"got {len(scenario.live)} events, which only `echelon live` repeats; remove "
-                "`live` to run the scenario without them."
-            )
-    with faults.at("simulation"):
-        check_memory(model, graph.agents, settings)
-    faults.settle()
-
-
-def _parts(
-    scenario: Scenario,
-    faults: FaultList,
-    model: ControlAffine,
-    graph: Graph,
-    reference: Guide | None,
-) -> Parts:
-    """Return all parts, from the model, the graph and the reference."""
-    plant, plants = plants_of(scenario, faults, model)
-    disturbance = disturbance_of(scenario, faults, model)
-    leadership = leadership_of(scenario, faults, graph)
-    events = events_of(scenario, faults, graph, leadership)
-    formation = faults.part(lambda: formation_of(scenario, faults, model, graph), "formation")
-    follower = faults.part(lambda: _follower(scenario, faults, model, graph), "follower")
-    reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
-    leader = faults.part(
-        lambda: _leader(scenario, faults, model, graph, reference, reaction), "leader"
-    )
-    for place, named in (
-        (("initial", "spread"), scenario.initial.spread or {}),
-        (("leader", "start_error"), scenario.leader.start_error),
-    ):
-        for name in named:
-            with faults.at(*place, name):
-                model.states_called(name)
-    faults.settle()
-    # Spreads by state or group, and states by agent: these are different keys.
-    initial: Any = dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
-    parts = Parts(
-        model,
-        graph,
-        formation,
-        Laws(cast(Law, leader), cast(Law, follower)),
-        initial=initial,
-        start_error=scenario.leader.start_error,
-        world=World(
-            plant,
-            disturbance,
-            network_of(scenario, faults),
-            actuator_of(scenario, faults, model),
-            sensing_of(scenario, faults, model),
-            plants,
-        ),
-        events=events,
-        leadership=leadership,
-    )
-    faults.settle()
-    check_world(faults, parts, scenario.simulation.dt)
-    with faults.at("initial"):
-        initial_states(parts, scenario.seed)
-    faults.settle()
-    return parts
+        check_engine(parts, builder.settings)
+    return Experiment(parts, builder.settings)
 
 
 def run(
@@ -198,24 +148,361 @@ def origin_of(scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def _model(scenario: Scenario) -> ControlAffine:
-    spec = scenario.model
-    part = named_class(scenario, ControlAffine, registry.MODELS, spec.name, spec.python)
-    extra = {"allow_unphysical": True} if spec.allow_unphysical else {}
-    if extra and "allow_unphysical" not in accepted(part.cls):
-        raise ModelError(f"`allow_unphysical` is not a parameter of `{part.name}`; leave it out.")
-    parameters = spec.parameters or {}
-    arguments = {"set": parameters} if isinstance(parameters, str) else {**parameters}
-    if spec.file is not None:
-        model = _read(part._replace(arguments={**arguments, **extra}), scenario.folder / spec.file)
+@final
+class _Builder:
+    """Builds the parts of a scenario, and collects their faults with the places of their keys."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Build what all other parts need, whose faults they would report again."""
+        self.scenario, self.faults = scenario, list[ScenarioFault]()
+        numbers, window = scenario.simulation.model_dump(), scenario.report.steady_window
+        self.settings = self.part(
+            lambda: Settings(**numbers, seed=scenario.seed, steady_window=window), "simulation"
+        )
+        self.model = self.part(self._model, "model")
+        self.graph = self.part(lambda: _graph(scenario.graph), "graph")
+        self.reference = self.part(self._reference, "reference")
+        self.settle()
+
+    @contextlib.contextmanager
+    def at(self, *path: str | int) -> Iterator[None]:
+        """Record an error that is raised inside, and continue."""
+        try:
+            yield
+        except MissingExtraError:
+            raise
+        except EchelonError as error:
+            # Of a part that is checked key by key, and then whole, each fault once.
+            if str(error) not in {fault.message for fault in self.faults}:
+                place = self.scenario.place(*path)
+                self.faults.append(ScenarioFault(place, joined(path), str(error)))
+
+    def part(self, make: Callable[[], _Part], *path: str | int) -> _Part:
+        """Return a part; in place of one with a fault None, until `settle` raises the fault."""
+        with self.at(*path):
+            return make()
+        return cast(_Part, None)
+
+    def settle(self) -> None:
+        """Raise all recorded faults, a line each."""
+        if self.faults:
+            refuse(self.faults)
+
+    def check_run(self) -> None:
+        """Check that a scenario has no live events, and that its run fits in memory."""
+        with self.at("live"):
+            if self.scenario.live:
+                raise ScenarioError(
+                    f"got {len(self.scenario.live)} events, which only `echelon live` repeats; "
+                    "remove `live` to run the scenario without them."
+                )
+        with self.at("simulation"):
+            check_memory(self.model, self.graph.agents, self.settings)
+        self.settle()
+
+    def parts(self) -> Parts:
+        """Return all parts."""
+        scenario, model = self.scenario, self.model
+        world, leadership = self._world(), self._leadership()
+        events = self._events(leadership)
+        formation = self.part(self._formation, "formation")
+        follower = self.part(self._follower, "follower")
+        reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
+        leader = self.part(lambda: self._leader(reaction), "leader")
+        spread, start_error = scenario.initial.spread or {}, scenario.leader.start_error
+        places = (("initial", "spread"), spread), (("leader", "start_error"), start_error)
+        for place, named in places:
+            for name in named:
+                with self.at(*place, name):
+                    model.states_called(name)
+        self.settle()
+        # Spreads by state or group, and states by agent: these are different keys.
+        initial: Any = dict(spread) | dict(scenario.initial.states or {})
+        laws = Laws(cast(Law, leader), cast(Law, follower))
+        parts = Parts(
+            *(model, self.graph, formation, laws),
+            initial=initial,
+            start_error=start_error,
+            world=world,
+            events=events,
+            leadership=leadership,
+        )
+        with self.at("plant", "agents"):
+            world.check_agents(model, self.graph.agents)
+        with self.at("leadership"):
+            laws.check_heirs(parts.graph)
+            if leadership is not None:
+                leadership.check_network(world.network)
+        with self.at("network"):
+            laws.check_world(world, parts.graph, scenario.simulation.dt)
+        with self.at("initial"):
+            initial_states(parts, scenario.seed)
+        self.settle()
+        return parts
+
+    # ---- agents and formation ----
+
+    def _class(
+        self,
+        kind: type,
+        table: Mapping[str, registry.Entry],
+        name: str | None,
+        python: str | None,
+        arguments: Mapping[str, object] = NOTHING,
+    ) -> NamedClass:
+        """Return a member of a table, or a class in a file of the user."""
+        if python is not None:
+            cls = user_class(self.scenario.folder, python, kind)
+            return NamedClass(cls, python, arguments, by_user=True)
+        return NamedClass(resolve(table[str(name)]), str(name), arguments, by_user=False)
+
+    def _model(self) -> ControlAffine:
+        spec = self.scenario.model
+        part = self._class(ControlAffine, registry.MODELS, spec.name, spec.python)
+        extra = {"allow_unphysical": True} if spec.allow_unphysical else {}
+        if extra and "allow_unphysical" not in accepted(part.cls):
+            raise ModelError(
+                f"`allow_unphysical` is not a parameter of `{part.name}`; leave it out."
+            )
+        parameters = spec.parameters or {}
+        arguments = {"set": parameters} if isinstance(parameters, str) else {**parameters}
+        part = part._replace(arguments={**arguments, **extra})
+        if spec.file is not None:
+            model = _read(part, self.scenario.folder / spec.file)
+        elif "set" in arguments and "set" not in accepted(part.cls):
+            model = _named_set(part, arguments.pop("set"), {**arguments, **extra})
+        else:
+            model = part.create()
         check_model(model)
         return model
-    if "set" in arguments and "set" not in accepted(part.cls):
-        model = _named_set(part, arguments.pop("set"), {**arguments, **extra})
-    else:
-        model = part._replace(arguments={**arguments, **extra}).create()
-    check_model(model)
-    return model
+
+    def _reference(self) -> Guide | None:
+        spec = self.scenario.reference
+        # Files use the model's names, and a model that fails is reported by itself.
+        if spec is None or self.model is None:
+            return None
+        part = self._class(Reference, registry.REFERENCES, spec.name, spec.python, spec.parameters)
+        file = None if spec.file is None else self.scenario.folder / spec.file
+        reference = part.create() if file is None else _read(part, file, model=self.model)
+        check_reference(reference)
+        return reference
+
+    def _formation(self) -> Formation:
+        """Return the formation, with its motion; its faults are noted."""
+        spec, starts = self.scenario.formation, self.scenario.initial.states
+        formation = self._shape(spec)
+        if spec.assign == "nearest":
+            if not starts:
+                raise FormationError(
+                    "`assign: nearest` needs `initial.states`: without them agents start about "
+                    "their own places."
+                )
+            n = len(self.model.state_names)
+            whole = {agent: state for agent, state in starts.items() if len(state) == n}
+            formation = formation.nearest(self.model, self.graph, whole)
+        changes = list[OffsetMotion | Reshape]()
+        for k, change in enumerate(spec.motion):
+            with self.at("formation", "motion", k):
+                changes.append(self._change(change))
+        # Of a motion with faults, which are noted, nothing else is said.
+        complete = changes and len(changes) == len(spec.motion)
+        return formation.moving(self.model, self.graph, changes) if complete else formation
+
+    def _change(self, spec: MotionSpec) -> OffsetMotion | Reshape:
+        if spec.rotate is not None:
+            return Rotate(spec.rotate)
+        if spec.scale is not None:
+            return Scale(spec.scale, cast(float, spec.rate))
+        if spec.reshape is None:
+            return self._class(OffsetMotion, {}, None, spec.python, spec.parameters).create()
+        horizon, at = self.scenario.simulation.horizon, cast(float, spec.at)
+        if at >= horizon:
+            raise FormationError(
+                f"got a reshape at {at:g} s, allowed is a time before the horizon, {horizon:g} s."
+            )
+        offsets = self._shape(spec.reshape).offsets
+        return Reshape(offsets, at, cast(float, spec.over), spec.assign == "nearest")
+
+    def _shape(self, spec: ShapeKeys) -> Formation:
+        if spec.name is None:
+            return Formation.from_offsets(self.model, self.graph, spec.offsets or {})
+        make, sizes = getattr(Formation, spec.name), {"spacing": spec.spacing}
+        return make(self.model, self.graph, **offered(make, {**sizes, "columns": spec.columns}))
+
+    # ---- laws and gains ----
+
+    def _gain(self, spec: GainSpec) -> Gain:
+        if spec.file is not None:
+            return load_gain(self.scenario.folder / spec.file, self.model, self.graph)
+        part = self._class(Method, registry.METHODS, spec.method, spec.python, spec.arguments)
+        method = part.create()
+        with part.guard():
+            return synthesize(self.model, self.graph, method)
+
+    def _law_class(
+        self, role: str, table: Mapping[str, registry.Entry], spec: LeaderSpec | FollowerSpec
+    ) -> NamedClass:
+        """Return the law of a role; keys that a class of the user does not take are noted."""
+        law = spec.law
+        if not isinstance(law, UserClass):
+            return self._class(Law, table, law, None)
+        part = self._class(Law, table, None, law.python, law.parameters)
+        taken = accepted(part.cls)
+        keys = (key for key in marked_keys(type(spec)) if key in spec.model_fields_set)
+        for key in (key for key in keys if key not in taken):
+            with self.at(role, key):
+                raise ScenarioError(
+                    f"got a key that the law `{part.name}` does not take, allowed are the "
+                    "arguments of its class."
+                )
+        return part
+
+    def _law(
+        self, role: str, part: NamedClass, offers: dict[str, object], spec: GainSpec | None
+    ) -> Law | None:
+        """Return a law, completed and checked; None where its gain is noted as a fault."""
+        if spec is not None and "gain" in accepted(part.cls):
+            with self.at(role, "gain"):
+                offers["gain"] = self._gain(spec)
+            if "gain" not in offers:
+                return None
+        law = part.create(offers)
+        with part.guard():
+            return prepare_law(law, self.model, self.graph)
+
+    def _follower(self) -> Law | None:
+        spec, safety = self.scenario.follower, self.scenario.safety
+        part = self._law_class("follower", registry.FOLLOWER_LAWS, spec)
+        offers = law_arguments(spec)
+        if safety is not None:
+            with self.at("safety"):
+                if "safety" not in accepted(part.cls):
+                    raise ScenarioError(
+                        f"got `safety`, but the law `{part.name}` moves agents by their states, "
+                        "for which there is no proof; use `stopping-point`."
+                    )
+                offers["safety"] = Safety(**safety.model_dump())
+        return self._law("follower", part, offers, spec.gain)
+
+    def _leader(self, reaction: Gain | None) -> Law | None:
+        spec, simulation = self.scenario.leader, self.scenario.simulation
+        part = self._law_class("leader", registry.LEADER_LAWS, spec)
+        if spec.reacts and "reaction" not in accepted(part.cls):
+            raise ScenarioError(
+                f"`reacts` is true, but the law `{part.name}` cannot react to neighbours; use "
+                "`tracking`."
+            )
+        if spec.reacts and reaction is None:
+            raise ScenarioError("`reacts` needs a follower law with a gain, but this law has none.")
+        if self.reference is not None and "reference" not in accepted(part.cls):
+            raise ScenarioError(f"got a `reference`, but the law `{part.name}` takes none.")
+        offers = {
+            "reference": self.reference,
+            "reaction": reaction,
+            "start_error": spec.start_error,
+            "horizon": simulation.horizon,
+            "limits": simulation.limits,
+            **law_arguments(spec),
+            # All agents have the same inner loop, unless the file says otherwise.
+            **spec.inner_loop(self.scenario.follower),
+        }
+        return self._law("leader", part, offers, spec.gain)
+
+    # ---- the world, and what happens ----
+
+    def _world(self) -> World:
+        scenario, model, simulation = self.scenario, self.model, self.scenario.simulation
+        dt, horizon = simulation.dt, simulation.horizon
+        plant, plants = self._plants()
+        if (wind := scenario.disturbance) is not None:
+            for key in ("constant", "rms", "input_rms"):
+                with self.at("disturbance", key):
+                    # Each alone, so that its fault is reported at its own line.
+                    Disturbance(**{key: getattr(wind, key)}).prepared(model, dt, 0)
+        if scenario.sensing is not None:
+            with self.at("sensing", "noise"):
+                model.per_state(scenario.sensing.noise)
+
+        def checked(name: str, kind: type, *given: object, **changes: object) -> Any:
+            """Return a part of the world whose numbers suit the run; None without its section."""
+
+            def make() -> Any:
+                part = kind(**spec.model_dump() | changes)
+                part.prepared(*given)
+                return part
+
+            spec = getattr(scenario, name)
+            return None if spec is None else self.part(make, name)
+
+        network = scenario.network
+        bursts = {} if network is None else {"bursts": Bursts(**network.bursts.model_dump())}
+        air = {} if wind is None else {"air": wind.air or ()}
+        return World(
+            plant,
+            checked("disturbance", Disturbance, model, dt, 0, **air),
+            checked("network", Network, dt, horizon, scenario.seed, **bursts),
+            checked("actuator", Actuator, model),
+            checked("sensing", Sensing, model, dt, horizon, 0),
+            plants,
+        )
+
+    def _plants(self) -> tuple[ControlAffine | None, dict[int, ControlAffine]]:
+        """Return the agents that move, where they differ from the model: all, and single ones."""
+        spec = self.scenario.plant
+        if spec is None:
+            return None, {}
+
+        def varied(part: VariationSpec | PlantSpec) -> ControlAffine:
+            plant = vary_parameters(self.model, part.parameters, part.scale)
+            check_model(plant)
+            check_plant(self.model, plant)
+            return plant
+
+        plants = {
+            k: self.part(lambda part=part: varied(part), "plant", "agents", k)
+            for k, part in spec.agents.items()
+        }
+        alike = spec.agents and not (spec.parameters or spec.scale)
+        return (None if alike else self.part(lambda: varied(spec), "plant")), plants
+
+    def _leadership(self) -> Leadership | None:
+        spec, leadership = self.scenario.leadership, None
+        if spec is not None:
+            with self.at("leadership", "heirs"):
+                check_heirs(self.graph, spec.heirs)
+                leadership = Leadership(**spec.model_dump())
+            self.settle()
+        return leadership
+
+    def _events(self, leadership: Leadership | None) -> list[Event]:
+        """Return what happens during the run; a fault is noted at its event."""
+        events = [_event(spec) for spec in self.scenario.events]
+        heirs = () if leadership is None else leadership.heirs
+        for k, text in event_faults(self.graph, events, heirs, self.scenario.simulation.horizon):
+            with self.at("events", k):
+                raise ScenarioError(f"{text}.")
+        self.settle()
+        return events
+
+
+def _graph(spec: GraphSpec) -> Graph:
+    if spec.edges is not None:
+        rest = spec.leaders, spec.agents, spec.directed
+        if spec.schedule:
+            return Graph.switching(spec.stretches, *rest, spec.period)
+        return Graph.from_edges(spec.stretches[0][1], *rest)
+    make = getattr(Graph, str(spec.name))
+    graph = make(**offered(make, spec.model_dump(exclude_none=True)))
+    return graph.one_way() if spec.directed and not graph.directed else graph
+
+
+def _event(spec: EventSpec) -> Event:
+    if spec.cut is not None:
+        return Cut(spec.cut, spec.at, spec.duration)
+    if spec.join is not None:
+        return Join(spec.join, spec.at)
+    assert spec.lose is not None, "the schema holds that there is one of three"
+    return Lose(spec.lose, spec.at)
 
 
 def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) -> ControlAffine:
@@ -230,35 +517,6 @@ def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) ->
         return named(name, **changes)
 
 
-def _graph(scenario: Scenario) -> Graph:
-    spec = scenario.graph
-    if spec.edges is not None:
-        rest = spec.leaders, spec.agents, spec.directed
-        if spec.schedule:
-            return Graph.switching(spec.stretches, *rest, spec.period)
-        return Graph.from_edges(spec.stretches[0][1], *rest)
-    make = getattr(Graph, str(spec.name))
-    graph = make(**offered(make, spec.model_dump(exclude_none=True)))
-    return graph.one_way() if spec.directed and not graph.directed else graph
-
-
-def _reference(scenario: Scenario, model: ControlAffine | None) -> Guide | None:
-    spec = scenario.reference
-    # Files use the model's names, and a model that fails is reported by itself.
-    if spec is None or model is None:
-        return None
-    part = named_class(
-        scenario, Reference, registry.REFERENCES, spec.name, spec.python, spec.parameters
-    )
-    reference = (
-        part.create()
-        if spec.file is None
-        else _read(part, scenario.folder / spec.file, model=model)
-    )
-    check_reference(reference)
-    return reference
-
-
 def _read(part: NamedClass, file: Path, **offers: object) -> Any:
     """Return a part from its file, with those of the offers that its class takes."""
     read = getattr(part.cls, "read", None)
@@ -271,103 +529,3 @@ def _read(part: NamedClass, file: Path, **offers: object) -> Any:
             f"{did_you_mean(surplus[0], accepted(read))}."
         )
     return read(file, **offered(read, offers), **part.arguments)
-
-
-def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, scenario: Scenario) -> Gain:
-    if spec.file is not None:
-        return load_gain(scenario.folder / spec.file, model, graph)
-    part = named_class(scenario, Method, registry.METHODS, spec.method, spec.python, spec.arguments)
-    method = part.create()
-    with part.guard():
-        return synthesize(model, graph, method)
-
-
-def _follower(
-    scenario: Scenario, faults: FaultList, model: ControlAffine, graph: Graph
-) -> Law | None:
-    spec = scenario.follower
-    part = law_class(scenario, registry.FOLLOWER_LAWS, spec.law)
-    _check_keys(scenario, faults, "follower", part)
-    offers = law_arguments(spec) | _safety(scenario, faults, part)
-    if "gain" in accepted(part.cls):
-        with faults.at("follower", "gain"):
-            offers["gain"] = _gain(model, graph, spec.gain, scenario)
-        if "gain" not in offers:
-            return None
-    return _law(part, offers, model, graph)
-
-
-def _safety(scenario: Scenario, faults: FaultList, part: NamedClass) -> dict[str, Safety]:
-    """Return how followers keep apart; nothing where they do not."""
-    if scenario.safety is None:
-        return {}
-    with faults.at("safety"):
-        if "safety" not in accepted(part.cls):
-            raise ScenarioError(
-                f"got `safety`, but the law `{part.name}` moves agents by their states, for which "
-                "there is no proof; use `stopping-point`."
-            )
-        return {"safety": Safety(**scenario.safety.model_dump())}
-    return {}
-
-
-def _check_keys(scenario: Scenario, faults: FaultList, role: str, part: NamedClass) -> None:
-    """Note the keys of a role that its law, a class of the user, does not take."""
-    taken = accepted(part.cls)
-    for key in marked_keys(ROLES[role][0]):
-        if key in section(scenario.data, role) and key not in taken:
-            with faults.at(role, key):
-                raise ScenarioError(
-                    f"got a key that the law `{part.name}` does not take, allowed are the "
-                    "arguments of its class."
-                )
-
-
-def _law(part: NamedClass, offers: Mapping[str, object], model: ControlAffine, graph: Graph) -> Law:
-    """Return the law of a scenario, completed and checked."""
-    law = part.create(offers)
-    with part.guard():
-        return prepare_law(law, model, graph)
-
-
-def _leader(
-    scenario: Scenario,
-    faults: FaultList,
-    model: ControlAffine,
-    graph: Graph,
-    reference: Guide | None,
-    reaction: Gain | None,
-) -> Law | None:
-    spec = scenario.leader
-    part = law_class(scenario, registry.LEADER_LAWS, spec.law)
-    _check_keys(scenario, faults, "leader", part)
-    if spec.reacts and "reaction" not in accepted(part.cls):
-        raise ScenarioError(
-            f"`reacts` is true, but the law `{part.name}` cannot react to neighbours; use "
-            "`tracking`."
-        )
-    if spec.reacts and reaction is None:
-        raise ScenarioError("`reacts` needs a follower law with a gain, but this law has none.")
-    if reference is not None and "reference" not in accepted(part.cls):
-        raise ScenarioError(f"got a `reference`, but the law `{part.name}` takes none.")
-    offers = {
-        "reference": reference,
-        "reaction": reaction,
-        "start_error": spec.start_error,
-        "horizon": scenario.simulation.horizon,
-        "limits": scenario.simulation.limits,
-        **law_arguments(spec),
-        # All agents have the same inner loop, unless the file says otherwise.
-        **spec.inner_loop(scenario.follower),
-    }
-    if spec.gain is not None:
-        with faults.at("leader", "gain"):
-            offers["gain"] = _gain(model, graph, spec.gain, scenario)
-        if "gain" not in offers:
-            return None
-    return _law(part, offers, model, graph)
-
-
-def _settings(scenario: Scenario) -> Settings:
-    numbers, window = scenario.simulation.model_dump(), scenario.report.steady_window
-    return Settings(**numbers, seed=scenario.seed, steady_window=window)

@@ -2,19 +2,21 @@
 
 import contextlib
 import importlib
+import importlib.util
 import inspect
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from echelon.core.errors import ScenarioError, did_you_mean, listing
+from echelon.core import cache
+from echelon.core.errors import EchelonError, ScenarioError, did_you_mean, listing
+from echelon.core.trace import error_summary
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.law_sections import UserClass
-from echelon.experiments.scenario.scenario import Scenario
-from echelon.experiments.scenario.user_code import as_scenario_error, user_class
-from echelon.laws.law import Law
 
-_NOTHING: Mapping[str, object] = MappingProxyType({})
+_T = TypeVar("_T")
+NOTHING: Mapping[str, object] = MappingProxyType({})
 
 
 def resolve(entry: registry.Entry) -> Any:
@@ -60,7 +62,7 @@ class NamedClass(NamedTuple):
     arguments: Mapping[str, object]
     by_user: bool
 
-    def create(self, offers: Mapping[str, object] = _NOTHING) -> Any:
+    def create(self, offers: Mapping[str, object] = NOTHING) -> Any:
         """Return an instance, from the arguments and from those of the offers that it takes.
 
         Raises:
@@ -83,25 +85,67 @@ class NamedClass(NamedTuple):
         return contextlib.nullcontext()
 
 
-def named_class(
-    scenario: Scenario,
-    kind: type,
-    table: Mapping[str, registry.Entry],
-    name: str | None,
-    python: str | None,
-    arguments: Mapping[str, object] = _NOTHING,
-) -> NamedClass:
-    """Return what a scenario names: a member of a table, or a class in a file of the user."""
-    if python is not None:
-        cls = user_class(scenario.folder, python, kind)
-        return NamedClass(cls, python, arguments, by_user=True)
-    return NamedClass(resolve(table[str(name)]), str(name), arguments, by_user=False)
+# ---- files of the user ---------------------------------------------------------------------------
 
 
-def law_class(
-    scenario: Scenario, table: Mapping[str, registry.Entry], law: str | UserClass
-) -> NamedClass:
-    """Return the law that a scenario names, a member of a table or a class of the user."""
-    if isinstance(law, UserClass):
-        return named_class(scenario, Law, table, None, law.python, law.parameters)
-    return named_class(scenario, Law, table, law, None)
+def user_class(folder: Path, target: str, kind: type[_T]) -> type[_T]:
+    """Return a class of a kind from a user's file.
+
+    Args:
+        folder: to which the file is relative.
+        target: `file.py:Class`.
+        kind: the base class, such as `Law`.
+
+    Raises:
+        ScenarioError: there is no such file, it does not import, or it has no such class.
+    """
+    path, _, name = target.rpartition(":")
+    file = (folder / path).resolve()
+    if not file.is_file():
+        raise ScenarioError(
+            f"the file `{file}` does not exist; a `python` path is relative to the scenario file, "
+            "and on the command line to the working folder."
+        )
+    module = _imported(file)
+    own = ((key, value) for key, value in vars(module).items() if isinstance(value, type))
+    classes = {key: cls for key, cls in own if issubclass(cls, kind) and cls is not kind}
+    if name not in classes:
+        has = f"it has {listing(classes)}" if classes else "it has none"
+        raise ScenarioError(
+            f"`{name}` in `{file}` is not a `{kind.__name__}` class; {has}"
+            f"{did_you_mean(name, classes)}."
+        )
+    return classes[name]
+
+
+def _imported(file: Path) -> Any:
+    """Return the module in a file, executed anew."""
+    # By its path and not by `import`: the folder need not be on `sys.path`, and a file that was
+    # changed since must be read again.
+    spec = importlib.util.spec_from_file_location(f"echelon_user_{file.stem}", file)
+    if spec is None or spec.loader is None:
+        raise ScenarioError(f"the file `{file}` is not a Python file.")
+    module = importlib.util.module_from_spec(spec)
+    # Before it is executed, as `import` does: dataclasses look up their module there.
+    sys.modules[spec.name] = module
+    # The file may change anything, and its text does not identify the values that it computes.
+    cache.close()
+    with as_scenario_error(f"the file `{file}` does not import"):
+        spec.loader.exec_module(module)
+    return module
+
+
+@contextlib.contextmanager
+def as_scenario_error(what: str) -> Iterator[None]:
+    """Raise whatever the user's code raises as a `ScenarioError` that begins with `what`.
+
+    Raises:
+        ScenarioError: the user's code raised an error; the message has its class and first line.
+    """
+    try:
+        yield
+    except EchelonError:
+        raise
+    # A file that exits is faulty too, and must not end echelon with exit code 0.
+    except (Exception, SystemExit) as error:
+        raise ScenarioError(f"{what}: {error_summary(error)}.") from error

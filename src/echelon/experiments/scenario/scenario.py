@@ -3,23 +3,21 @@
 All faults of a file are reported at once, a line each: `file:line: field: got ..., allowed ...`.
 """
 
-import math
+import copy
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeAlias, final
 
-from pydantic import BaseModel, Field, PrivateAttr, ValidationError
+from pydantic import Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
 
-from echelon.core.errors import ScenarioError, did_you_mean, listing
+from echelon.core.errors import ScenarioError, did_you_mean, is_number, listing
 from echelon.core.gone import VALUES, gone, gone_key
-from echelon.experiments.scenario import event_sections, law_sections, sections
-from echelon.experiments.scenario.checks import cross_faults, law_of, number_of, section
-from echelon.experiments.scenario.formation_sections import FormationSpec
+from echelon.core.limits import LARGEST
+from echelon.experiments.scenario import registry, sections
 from echelon.experiments.scenario.key_paths import key_paths, meant, sections_in
-from echelon.experiments.scenario.override import settle_overrides
-from echelon.experiments.scenario.values import STRICT, FolderName, Seed
+from echelon.experiments.scenario.values import Finding, FolderName, Section, Seed, foreign_keys
 from echelon.experiments.scenario.yaml import (
     Document,
     KeyPath,
@@ -29,8 +27,10 @@ from echelon.experiments.scenario.yaml import (
     inline_yaml,
     is_or_are,
     joined,
+    part_at,
     quoted,
     read_yaml,
+    rename_files,
 )
 
 _BUNDLED = Path(__file__).parent / "bundled"
@@ -39,7 +39,7 @@ SCENARIO_FILE = "scenario.yaml"
 
 
 @final
-class Scenario(BaseModel, **STRICT):
+class Scenario(Section):
     """One experiment, checked and with its defaults; `load_scenario` returns one."""
 
     name: FolderName
@@ -47,23 +47,23 @@ class Scenario(BaseModel, **STRICT):
     model: sections.ModelSpec
     plant: sections.PlantSpec | None = None
     graph: sections.GraphSpec
-    formation: FormationSpec = Field(default_factory=FormationSpec)
+    formation: sections.FormationSpec = Field(default_factory=sections.FormationSpec)
     reference: sections.ReferenceSpec | None = None
-    leader: law_sections.LeaderSpec = Field(default_factory=law_sections.LeaderSpec)
-    follower: law_sections.FollowerSpec = Field(default_factory=law_sections.FollowerSpec)
+    leader: sections.LeaderSpec = Field(default_factory=sections.LeaderSpec)
+    follower: sections.FollowerSpec = Field(default_factory=sections.FollowerSpec)
     safety: sections.SafetySpec | None = None
     initial: sections.InitialSpec = Field(default_factory=sections.InitialSpec)
     disturbance: sections.DisturbanceSpec | None = None
     actuator: sections.ActuatorSpec | None = None
     sensing: sections.SensingSpec | None = None
     network: sections.NetworkSpec | None = None
-    events: Annotated[tuple[event_sections.EventSpec, ...], Field(strict=False)] = ()
+    events: Annotated[tuple[sections.EventSpec, ...], Field(strict=False)] = ()
     """What happens during the run, as in `[{at: 8.0, lose: 3}, {at: 12.0, join: 3}]`: agents are
     lost or join, and links are cut, as in `[{at: 8.0, cut: [1, 2], for: 3.0}]`."""
-    leadership: event_sections.LeadershipSpec | None = None
+    leadership: sections.LeadershipSpec | None = None
     simulation: sections.SimulationSpec
     report: sections.ReportSpec = Field(default_factory=sections.ReportSpec)
-    live: Annotated[tuple[event_sections.LiveSpec, ...], Field(strict=False)] = ()
+    live: Annotated[tuple[sections.LiveSpec, ...], Field(strict=False)] = ()
     """Changes made during `echelon live`, which repeats them; no other command can."""
     seed: Seed = 0
     """Seed of everything random in the run."""
@@ -71,6 +71,16 @@ class Scenario(BaseModel, **STRICT):
     _document: Document = PrivateAttr(Document({}, {(): "scenario"}))
     _text: str = PrivateAttr("")
     _file: Path = PrivateAttr(Path())
+
+    def faults(self) -> Iterator[Finding]:
+        """Yield a leader's law that lacks its reference, and a reference that it does not take."""
+        law, reference = self.leader.law, self.reference
+        entry = registry.LEADER_LAWS.get(law) if isinstance(law, str) else None
+        if entry is not None and entry.reference == "needed" and reference is None:
+            yield ("leader", "law"), f"got `{law}` without a `reference`, this law needs one."
+        if entry is not None and entry.reference == "none" and reference is not None:
+            message = f"got a reference, but the leader's law `{law}` takes none"
+            yield ("reference",), f"{message}; {listing(registry.TRACKING_LAWS)} take one."
 
     @property
     def text(self) -> str:
@@ -135,20 +145,29 @@ _ALLOWED = {
 }
 
 
-def _keys(path: KeyPath) -> list[str]:
-    """Return the keys that the section at `path` takes."""
-    part: type[BaseModel] = Scenario
+def _section(path: KeyPath) -> type[Section] | None:
+    """Return the section at a path; None where there is none."""
+    part: Any = Scenario
     for key in path:
         # The place in a list of sections has the keys of any other.
         if isinstance(key, str):
-            part = next(sections_in(part.model_fields[key].annotation))
-    return [field.alias or key for key, field in part.model_fields.items()]
+            fields = {field.alias or name: field for name, field in part.model_fields.items()}
+            part = next(sections_in(fields[key].annotation), None) if key in fields else None
+        if part is None:
+            return None
+    return part
+
+
+def _keys(path: KeyPath) -> list[str]:
+    """Return the keys that the section at a path takes; none where there is no section."""
+    part = _section(path)
+    return [] if part is None else [f.alias or key for key, f in part.model_fields.items()]
 
 
 def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
     """Return the path and the sentence of a fault of the schema."""
     # Of a value that may also be a section, the path has the name of the section's class.
-    path = tuple(key for key in error["loc"] if key != law_sections.ObserverSpec.__name__)
+    path = tuple(k for k in error["loc"] if sections.ObserverSpec.__name__ not in str(k))
     kind, context = error["type"], error.get("ctx", {})
     if path and path[-1] == "[key]":
         kind = "the number of an agent" if kind == "int_type" else "a name"
@@ -161,6 +180,8 @@ def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
         keys = _keys(path[:-1])
         hint = meant(path, keys, Scenario)
         return path, f"got an unknown key, allowed {is_or_are(keys)}{hint}."
+    if kind == "fault":
+        return path, context["text"]
     got = context.get("got", error["input"])
     if path and (ended := gone(VALUES, f"{path[-1]}: {got}")):
         return path, f"the value `{got}`{ended}"
@@ -171,12 +192,10 @@ def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
 
 def _like_key(path: KeyPath) -> str:
     """Return what a key that its section does not name, but its class may take, may mean."""
-    try:
-        keys = _keys(path[:-1])
-        hint = "" if path[-1] in keys else did_you_mean(path[-1], keys)
-    except (StopIteration, LookupError):  # the value is within a key
+    keys = _keys(path[:-1])
+    if not path or path[-1] in keys:
         return ""
-    return hint.replace("mean ", "mean the key ")
+    return did_you_mean(path[-1], keys).replace("mean ", "mean the key ")
 
 
 def _with_defaults(data: Mapping[Any, Any]) -> dict[Any, Any]:
@@ -184,13 +203,24 @@ def _with_defaults(data: Mapping[Any, Any]) -> dict[Any, Any]:
     filled = {key: value for key, value in data.items() if value is not None}
     leader, report = filled.get("leader", {}), filled.get("report", {})
     if isinstance(leader, dict):
-        filled["leader"] = {**leader, "law": law_of(filled, "leader")}
-    horizon = number_of(section(data, "simulation").get("horizon")) or 0.0
-    window = number_of(section(data, "report").get("steady_window", math.inf))
-    # A window as long as the run would count its transient as steady.
-    if isinstance(report, dict) and window is not None and window >= horizon > 0:
-        filled["report"] = {**report, "steady_window": horizon / 5}
+        follower = part_at(data, ("follower", "law")) or registry.DEFAULT_FOLLOWER_LAW
+        law = registry.default_leader_law(follower, "reference" in filled)
+        filled["leader"] = {"law": law, **leader}
+    horizon = part_at(data, ("simulation", "horizon"))
+    if isinstance(report, dict) and is_number(horizon) and 0.0 < horizon <= LARGEST:
+        window = report.get("steady_window", horizon)
+        # A window as long as the run would count its transient as steady.
+        if is_number(window) and window >= horizon:
+            filled["report"] = {**report, "steady_window": horizon / 5}
     return filled
+
+
+def _too_large(value: object, path: KeyPath = ()) -> Iterator[Finding]:
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _too_large(item, (*path, key))
+    elif is_number(value) and not abs(value) <= LARGEST:
+        yield path, f"got {quoted(value)}, allowed is a number from -{LARGEST:g} to {LARGEST:g}."
 
 
 def _by_line(fault: ScenarioFault) -> tuple[bool, int]:
@@ -223,9 +253,9 @@ def _scenario(document: Document, text: str, file: Path) -> Scenario:
         scenario = Scenario.model_validate(_with_defaults(data))
     except ValidationError as error:
         errors = error.errors(include_url=False)
-    # One for each path: the sentence of a check replaces that of the schema.
+    # One for each path.
     sentences: dict[KeyPath, str] = {}
-    for path, sentence in (*cross_faults(document), *map(_describe, errors)):
+    for path, sentence in (*_too_large(data), *map(_describe, errors)):
         sentences.setdefault(path, sentence)
     faults = [ScenarioFault(document.place(path), joined(path), s) for path, s in sentences.items()]
     if scenario is None or faults or document.faults:
@@ -281,9 +311,44 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
         raise ScenarioError(f"{name}: this file cannot be read as UTF-8 text: {error}.") from error
     document = read_yaml(text, name)
     if overrides:
-        document = settle_overrides(apply_overrides(document, overrides))
+        document = _settled(apply_overrides(document, overrides))
         text = dump_yaml(document.data)
     return _scenario(document, text, file)
+
+
+def _settled(document: Document) -> Document:
+    """Return a document without the keys that its overrides exclude.
+
+    A path on the command line is relative to the working folder, and becomes absolute.
+    """
+    # The document that was read is not changed.
+    data = copy.deepcopy(document.data)
+    set_ = [path for path, _ in document.overrides]
+    for path in set_:
+        rename_files(data, lambda name: str(Path(name).resolve()), path)
+        part = part_at(data, path[:-1])
+        for rival in _rivals(path, part):
+            other = (*path[:-1], rival)
+            # Two overrides that exclude each other are refused by the checks.
+            if not any(path[: len(other)] == other for path in set_):
+                del part[rival]
+    return document._replace(data=data)
+
+
+def _rivals(path: KeyPath, part: Any) -> list[Any]:
+    """Return the keys of the same section that the one at `path` excludes."""
+    section, key = _section(path[:-1]), path[-1]
+    if section is None or not isinstance(part, dict) or part.get(key) is None:
+        return []
+    if key == "law":
+        law = part[key]
+        known = isinstance(law, str) and law in {*registry.FOLLOWER_LAWS, *registry.LEADER_LAWS}
+        return [other for other in foreign_keys(section, law) if other in part] if known else []
+    if key not in section.one_of:
+        return []
+    # A gain file contains what the other keys would say.
+    excluded = part if key == "file" else section.one_of
+    return [other for other in excluded if other in part and other != key]
 
 
 def scenario_from_text(text: str, file: Path) -> Scenario:
@@ -301,7 +366,7 @@ def with_overrides(scenario: Scenario, overrides: Sequence[str]) -> Scenario:
     Raises:
         ScenarioError: It has faults, as in `load_scenario`.
     """
-    document = settle_overrides(apply_overrides(scenario._document, overrides))
+    document = _settled(apply_overrides(scenario._document, overrides))
     return _scenario(document, dump_yaml(document.data), scenario.file)
 
 

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from echelon.core.files import INPUTS
-from echelon.experiments.scenario.override import named_files, rename_files
 from echelon.experiments.scenario.scenario import Scenario
-from echelon.experiments.scenario.yaml import dump_yaml
+from echelon.experiments.scenario.yaml import dump_yaml, named_files, rename_files
 
 
 def self_contained(scenario: Scenario, place: str = INPUTS) -> tuple[str, dict[str, Path]]:

@@ -1,12 +1,13 @@
-"""The kinds of value in a scenario file, each with its check, its sentence and its JSON schema.
+"""Sections of a scenario file, and kinds of value: each with its check, sentence and JSON schema.
 
 A number is neither a truth value nor text that looks like a number. Values that are not finite pass
 here; they are refused for the whole file at once.
 """
 
+import abc
 import math
-from collections.abc import Iterable, Sequence
-from typing import Annotated, Any, Literal, final
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self, final
 
 from pydantic import (
     AfterValidator,
@@ -16,20 +17,17 @@ from pydantic import (
     Field,
     GetCoreSchemaHandler,
     PlainValidator,
+    ValidationError,
     WithJsonSchema,
+    model_validator,
 )
-from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
 
-from echelon.experiments.scenario.yaml import is_or_are
+from echelon.core.errors import listing
+from echelon.experiments.scenario.yaml import KeyPath, is_or_are
 
 STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, use_attribute_docstrings=True)
 """The configuration of every section."""
-
-
-def either(*keys: str) -> ConfigDict:
-    """Return the configuration of a section that has exactly one of the keys."""
-    extra: Any = {"oneOf": [{"required": [key]} for key in keys]}
-    return STRICT | ConfigDict(json_schema_extra=extra)
 
 
 @final
@@ -83,6 +81,62 @@ def marked_keys(section: type[BaseModel]) -> dict[str, TakenBy]:
 def foreign_keys(section: type[BaseModel], choice: str) -> list[str]:
     """Return the keys of a section that a choice does not take."""
     return [key for key, mark in marked_keys(section).items() if choice not in mark.choices]
+
+
+Finding = tuple[KeyPath, str]
+"""The path of a fault within its section, and its sentence."""
+
+
+class Section(BaseModel, abc.ABC, **STRICT):
+    """A section of the file, whose keys are checked one by one and then together."""
+
+    one_of: ClassVar[tuple[str, ...]] = ()
+    """Keys of which at most one is allowed; the first one counts where none is given."""
+
+    def choice(self, key: str) -> object:
+        """Return what the marks of keys mean by a choice, where this key of `one_of` makes it."""
+        return getattr(self, key) if key in ("name", "method", "law") else key
+
+    def faults(self) -> Iterator[Finding]:
+        """Yield what is wrong between keys of the section; of an unknown key no sentence."""
+        set_ = (key for key in self.one_of if key in self.model_fields_set)
+        given = [key for key in set_ if getattr(self, key) is not None]
+        if len(given) > 1:
+            yield (), f"got {listing(given)}, allowed is one of them."
+            return
+        extra = self.model_config.get("json_schema_extra")
+        if not given and isinstance(extra, dict) and "oneOf" in extra:
+            yield (), f"got none of {listing(self.one_of)}, one is required."
+            return
+        choice = next((self.choice(key) for key in (*given, *self.one_of)), None)
+        if not isinstance(choice, str):
+            return
+        fields = type(self).model_fields
+        for key, mark in marked_keys(type(self)).items():
+            if choice in mark.needed_by and getattr(self, key) is None:
+                yield (key,), f"got nothing, `{choice}` needs this key."
+        foreign = foreign_keys(type(self), choice)
+        allowed = [key for key in fields if key not in {*self.one_of, *foreign}]
+        takes = f"allowed {is_or_are(allowed)}" if allowed else "it takes no keys"
+        for key in (key for key in foreign if key in self.model_fields_set):
+            name = fields[key].alias or key
+            yield (name,), f"got a key that `{choice}` does not take, {takes}."
+
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        found = list[InitErrorDetails]()
+        for path, text in self.faults():
+            kind = PydanticCustomError("fault", "{text}", {"text": text})
+            found.append({"type": kind if text else "extra_forbidden", "loc": path, "input": None})
+        if found:
+            raise ValidationError.from_exception_data(type(self).__name__, found)
+        return self
+
+
+def either(*keys: str) -> ConfigDict:
+    """Return the configuration of a section that has exactly one of the keys."""
+    extra: Any = {"oneOf": [{"required": [key]} for key in keys]}
+    return ConfigDict(json_schema_extra=extra)
 
 
 def OneOf(names: Iterable[str]) -> Allowed:

@@ -10,7 +10,7 @@ import io
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, final
 
 from ruamel.yaml import YAML
@@ -277,6 +277,35 @@ def inline_yaml(value: object) -> str:
 def dump_yaml(data: object) -> str:
     """Write plain data as YAML 1.2, the innermost lists and mappings on one line each."""
     return _written(data, None)
+
+
+def rename_files(data: object, rename: Callable[[str], str], path: KeyPath = ()) -> None:
+    """Replace the name of every file in a part of plain data."""
+    for place, name, rest in list(named_files(part_at(data, path), path)):
+        part_at(data, place[:-1])[place[-1]] = rename(name) + rest
+
+
+def named_files(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str, str]]:
+    """Yield the path of every file name in plain data, the name, and the text after it."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from named_files(item, (*path, key))
+    elif isinstance(value, str) and path and path[-1] == "file":
+        yield path, value, ""
+    elif isinstance(value, str) and path and path[-1] == "python" and ":" in value:
+        file, colon, name = value.rpartition(":")
+        yield path, file, colon + name
+
+
+def part_at(data: Any, path: KeyPath) -> Any:
+    """Return what is at a path of plain data; None where there is nothing."""
+    for key in path:
+        try:
+            data = data[key]
+        except (LookupError, TypeError):
+            # A path through a number or a text leads nowhere; the checks report it.
+            return None
+    return data
 
 
 def quoted(value: object) -> str:

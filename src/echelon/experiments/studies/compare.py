@@ -9,8 +9,7 @@ import equinox as eqx
 from echelon.core.errors import EchelonError, LawError, check_name
 from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
-from echelon.experiments.results.metrics import metrics
-from echelon.experiments.results.run_numbers import RunNumbers
+from echelon.experiments.results.metrics import RunNumbers, metrics
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario

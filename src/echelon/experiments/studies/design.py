@@ -16,9 +16,9 @@ from echelon.core.statement import Hypothesis
 from echelon.core.words import Theorem
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
-from echelon.experiments.scenario.law_sections import GainSpec
 from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.sections import GainSpec
 from echelon.experiments.scenario.yaml import ScenarioFault
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.laws.consensus import Consensus

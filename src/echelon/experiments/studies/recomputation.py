@@ -12,17 +12,16 @@ import numpy as np
 
 from echelon.core.errors import GainError
 from echelon.core.types import JsonObject
-from echelon.experiments.results.dataset import OBSERVED, leader_gain_of, statement
+from echelon.experiments.results.dataset import labelled_parts
 from echelon.experiments.results.labelled import Labelled, groups_of
-from echelon.experiments.results.labelled_parts import labelled_parts
-from echelon.experiments.results.recording import FORMAT, Recording, recording_with_data
+from echelon.experiments.results.recording import Recording, read_recording
+from echelon.experiments.results.summary import OBSERVED, leader_gain_of, statement
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.self_contained import without_folders
 from echelon.experiments.scenario.yaml import read_yaml
 from echelon.experiments.studies.check import check
 from echelon.experiments.studies.design import with_gain
-from echelon.experiments.studies.older_rounding import as_rounded_now
 from echelon.guarantees.promises.promise import promise
 from echelon.guarantees.verifier.findings import Finding, decide
 from echelon.guarantees.verifier.saved_gain import parse_json, read_json
@@ -189,8 +188,6 @@ def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Ite
     """Compare a summary, or the output of a check, with what a scenario of a name gives."""
     if "lines" in stored:
         value = check(*experiment).as_mapping()
-        # An earlier version states no warnings.
-        stored = {"warnings": value["warnings"], **stored}
     else:
         value = statement(*experiment, name)
         stored = {key: stored[key] for key in stored if key not in OBSERVED}
@@ -228,11 +225,9 @@ def _led_by(parts: Parts, gain: Gain) -> Parts:
 
 def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
     """Compare the guarantee, the scenario, the parts and the starts in a dataset."""
-    (run, data), (parts, settings), name = recording_with_data(file), experiment, file.name
+    (run, data), (parts, settings), name = read_recording(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
     value = _as_json(promise(parts, settings).as_mapping())
-    older = run.attributes["format"] != FORMAT
-    stored = as_rounded_now(stored, value) if older else stored
     yield from compare_values(f"{name}: promise", stored, value)
     text = read_yaml(str(run.attributes.get("scenario_text", "")), str(file))
     # A key twice is a fault; readers differ in which one they use.
@@ -246,9 +241,6 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
     yield from _compare_frames(run, data, experiment, name)
     yield from compare_values(f"{name}: scenario", run.attributes.get("scenario"), scenario.name)
     for key, part in {**fixed.attributes, **fixed.arrays()}.items():
-        # A file of an earlier format states less.
-        if older and (key == "format" or key not in stated):
-            continue
         theirs, ours = (np.asarray(each).tolist() for each in (stated.get(key), part))
         yield from compare_values(f"{name}: parts.{key}", theirs, ours)
 

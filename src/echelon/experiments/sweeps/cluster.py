@@ -11,7 +11,8 @@ from echelon.core.errors import EchelonError, MissingExtraError, OutputError
 
 if TYPE_CHECKING:
     from echelon.experiments.sweeps.plan import Sweep
-    from echelon.experiments.sweeps.workers import SweepBatch, Workers
+    from echelon.experiments.sweeps.sweep_dataset import SweepBatch
+    from echelon.experiments.sweeps.workers import Workers
 
 _PATIENCE = 10.0
 """Seconds in which a scheduler must answer."""

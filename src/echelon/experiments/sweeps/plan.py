@@ -1,22 +1,194 @@
-"""The plan of a sweep: its runs, and the order in which they are computed."""
+"""The plan of a sweep: its axes, its runs in the order of computing, and what is stored of each."""
 
-from collections.abc import Iterator
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, final
+from itertools import chain, combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, final
 
 import numpy as np
 
 from echelon.core.errors import ScenarioError
 from echelon.core.limits import excess_runs
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, Shown, shown_in
 from echelon.experiments.scenario.scenario import Scenario, with_overrides
-from echelon.experiments.sweeps.axes import SEED, Axis
+from echelon.experiments.scenario.yaml import inline_yaml, read_yaml
 
 if TYPE_CHECKING:
+    from echelon.core.types import Array
     from echelon.experiments.scenario.build import Experiment
-    from echelon.experiments.sweeps.frame_shape import FrameShape
+    from echelon.simulation.engine.result import Result
 
+RUN_COLUMNS = tuple(shown_in(RUN_NUMBERS, Shown.SWEEP))
+AGENT_COLUMNS = tuple(shown_in(AGENT_NUMBERS, Shown.SWEEP))
+SUMMARIZED = tuple(shown_in(RUN_NUMBERS, Shown.DISTRIBUTION))
+"""The numbers that reports and figures show the distribution of."""
+UNIT = "error_unit"
+WORDS = (
+    *("message", "promise_verdict", "promise_kind", "promise_theorem", "promise_against"),
+    *("engine", "warnings", UNIT),
+)
+"""The columns of each run: numbers of it, numbers of its agents, and texts."""
 _SHAPING = ("model", "graph", "simulation")
 """The sections on which agents, states and times of a run depend."""
+StoredFrames: TypeAlias = "Mapping[str, Array]"
+"""`states` (runs, T, N, n) and `inputs` (runs, T, N, m); NaN where a run has none."""
+NAMES = ("states", "inputs")
+SEED = "seed"
+"""The key that changes only random draws."""
+_RANGE = re.compile(r"(-?[0-9]{1,18})\.\.(-?[0-9]{1,18})")
+
+
+class Axis(NamedTuple):
+    """A key of a scenario, its parts joined by dots, and its values in their order."""
+
+    key: str
+    values: Sequence[Any]
+
+    def override(self, k: int) -> str:
+        """Return the override that sets value k."""
+        return f"{self.key}={inline_yaml(self.values[k])}"
+
+    @property
+    def text(self) -> str:
+        """The axis as an argument of the command line."""
+        if isinstance(self.values, range) and self.values.step == 1 and len(self.values) > 1:
+            return f"{self.key}={self.values[0]}..{self.values[-1]}"
+        return f"{self.key}={inline_yaml(list(self.values))[1:-1]}"
+
+
+def read_axes(texts: Iterable[str]) -> tuple[Axis, ...]:
+    """Return axes from texts such as `seed=0..9999` and `follower.gain.coupling=1,2,4`.
+
+    Raises:
+        ScenarioError: an axis is malformed, or a key has two.
+    """
+    return _checked([_read(text) for text in texts])
+
+
+def axes_of(values: Mapping[str, Iterable[Any]]) -> tuple[Axis, ...]:
+    """Return axes from values by key.
+
+    Raises:
+        ScenarioError: a key has no list of values, or a value twice; or one key is inside another.
+    """
+    for key, v in values.items():
+        if isinstance(v, str) or not isinstance(v, Iterable):
+            raise ScenarioError(f"--over {key}: got {v!r}, allowed is a list of values, as [1, 2].")
+    return _checked(
+        [Axis(key, v if isinstance(v, range) else tuple(v)) for key, v in values.items()]
+    )
+
+
+def _checked(axes: list[Axis]) -> tuple[Axis, ...]:
+    if not axes:
+        raise ScenarioError("got nothing to vary; give a key and its values, as in `seed=0..9`.")
+    for axis in axes:
+        place = f"--over {axis.key}"
+        if not len(axis.values):
+            raise ScenarioError(f"{place}: got no values, allowed are one or more.")
+        texts = [] if isinstance(axis.values, range) else list(map(inline_yaml, axis.values))
+        twice = next((text for text, count in Counter(texts).items() if count > 1), None)
+        if twice is not None:
+            raise ScenarioError(f"{place}: got `{twice}` twice, give each value once.")
+    for one, other in combinations(sorted(axis.key.split(".") for axis in axes), 2):
+        if other[: len(one)] == one:
+            text = f"this key is inside `{'.'.join(one)}`, which varies too"
+            text = "got this key twice" if one == other else text
+            raise ScenarioError(f"--over {'.'.join(other)}: {text}; vary one of them.")
+    return tuple(axes)
+
+
+def _read(text: str) -> Axis:
+    """Return the axis of a text."""
+    place = "--over " + " ".join(text.split())
+    key, equals, values = text.partition("=")
+    if not equals or not all(part.strip() for part in key.split(".")):
+        raise ScenarioError(f"{place}: got no `key=values`, give them as in `seed=0..9`.")
+    document = read_yaml(f"[{values}]", place)
+    if document.faults or not isinstance(document.data, list):
+        text = document.faults[0].message if document.faults else "got no list of values."
+        raise ScenarioError(f"{place}: {text}")
+    parts = [_range(item, place) for item in document.data]
+    excess = excess_runs(sum(map(len, parts)))
+    if excess is not None:
+        raise ScenarioError(f"{place}: {excess}.")
+    key = ".".join(part.strip() for part in key.split("."))
+    values = parts[0] if len(parts) == 1 else tuple(chain(*parts))
+    if key.endswith(".file"):
+        # A sweep may be continued from another working folder.
+        values = tuple(str(Path(str(value)).resolve()) for value in values)
+    return Axis(key, values)
+
+
+def _range(item: object, place: str) -> Sequence[object]:
+    """Return the values of an item: whole numbers for `2..5`, otherwise the item."""
+    match = _RANGE.fullmatch(item) if isinstance(item, str) else None
+    if match is None:
+        return (item,)
+    first, last = map(int, match.groups())
+    if last < first:
+        raise ScenarioError(f"{place}: got `{item}`, a range must ascend.")
+    return range(first, last + 1)
+
+
+class FrameShape(NamedTuple):
+    """What the runs of a sweep that stores states have in common.
+
+    Attributes:
+        times: (T,) s.
+        states, inputs: names.
+        agents: their number N.
+    """
+
+    times: tuple[float, ...]
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    agents: int
+
+    @classmethod
+    def of(cls, experiment: "Experiment", every: int) -> "FrameShape":
+        """Return the shape of a run that stores every so-manieth step."""
+        from echelon.simulation.engine.chunk_grid import ChunkGrid
+
+        parts, settings = experiment
+        grid = ChunkGrid(settings._replace(store_every=every), 1)
+        steps = np.arange(settings.steps + 1)
+        times = settings.dt * steps[grid.stored(steps)]
+        model = parts.model
+        return cls(tuple(times), model.state_names, model.input_names, parts.graph.agents)
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers are stored of each run."""
+        return len(self.times) * self.agents * (len(self.states) + len(self.inputs))
+
+    def check(self, other: "FrameShape", key: str) -> None:
+        """Check that a value of a key leaves the shape as it is.
+
+        Raises:
+            ScenarioError: it does not.
+        """
+        if self != other:
+            raise ScenarioError(
+                f"--over {key}: its values change the agents, states or times of a run, and runs "
+                "whose states are stored must have them in common; leave `--keep-states` out."
+            )
+
+    def stored(self, results: "Sequence[Result | None]") -> StoredFrames:
+        """Return the frames of some runs; None of those that could not be built."""
+        sizes = (len(self.states), len(self.inputs))
+        frames = {
+            name: np.full((len(results), len(self.times), self.agents, size), np.nan)
+            for name, size in zip(NAMES, sizes, strict=True)
+        }
+        for k, result in enumerate(results):
+            if result is not None:
+                for name, whole in frames.items():
+                    whole[k, : len(result.times)] = getattr(result, name)
+        return frames
 
 
 class SweepRun(NamedTuple):
@@ -135,10 +307,8 @@ class Sweep:
         return first
 
     @cached_property
-    def frames(self) -> "FrameShape | None":
+    def frames(self) -> FrameShape | None:
         """The frames that are stored of each run; None if none are."""
-        from echelon.experiments.sweeps.frame_shape import FrameShape
-
         return None if self.every is None else FrameShape.of(self.first_built, self.every)
 
     def _check_frames(self) -> None:
@@ -152,11 +322,9 @@ class Sweep:
                 continue
             for k in range(1, len(axis.values)):
                 case = self.case(tuple(k if at == place else 0 for at in range(len(self.axes))))
-                self.frames.check(type(self.frames).of(build(case), self.every), axis.key)
+                self.frames.check(FrameShape.of(build(case), self.every), axis.key)
 
     def _columns(self) -> int:
         """Return how many values are stored of a run, without its frames."""
-        from echelon.experiments.sweeps.numbers import AGENT_COLUMNS, RUN_COLUMNS, WORDS
-
         agents = self.first_built.parts.graph.agents
         return len(RUN_COLUMNS) + len(WORDS) + len(AGENT_COLUMNS) * agents

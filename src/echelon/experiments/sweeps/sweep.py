@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from echelon.core.errors import ScenarioError
 from echelon.core.limits import excess_runs
 from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
-from echelon.experiments.sweeps.axes import axes_of
-from echelon.experiments.sweeps.plan import Sweep
-from echelon.experiments.sweeps.sweep_dataset import dataset_of
-from echelon.experiments.sweeps.workers import SweepBatch, Workers
+from echelon.experiments.sweeps.plan import Sweep, axes_of
+from echelon.experiments.sweeps.sweep_dataset import SweepBatch, dataset_of
+from echelon.experiments.sweeps.workers import Workers
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -1,36 +1,117 @@
-"""A sweep as one labelled dataset."""
+"""A sweep as one labelled dataset: the columns of its runs, and stored states and inputs."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.files import versions
 from echelon.core.types import Array, JsonObject
+from echelon.experiments.results.dataset import labelled_parts
 from echelon.experiments.results.labelled import Labelled, Variables
-from echelon.experiments.results.quantity import ERROR, Quantity
-from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS
+from echelon.experiments.results.metrics import RunNumbers, metrics
+from echelon.experiments.results.run_numbers import (
+    AGENT_NUMBERS,
+    ERROR,
+    RUN_NUMBERS,
+    Quantity,
+)
 from echelon.experiments.scenario.scenario import key_label
 from echelon.experiments.scenario.yaml import inline_yaml
-from echelon.experiments.sweeps.axes import Axis
-from echelon.experiments.sweeps.frame_shape import FrameShape
-from echelon.experiments.sweeps.frames import labelled_frames
-from echelon.experiments.sweeps.numbers import (
+from echelon.experiments.sweeps.plan import (
     AGENT_COLUMNS,
-    MISSING,
-    OUTCOMES,
-    REFUSED,
+    NAMES,
     RUN_COLUMNS,
     UNIT,
     WORDS,
+    Axis,
+    FrameShape,
+    StoredFrames,
+    Sweep,
 )
-from echelon.experiments.sweeps.plan import Sweep
+from echelon.guarantees.promises.promise import Promise
+from echelon.simulation.engine.result import Result
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from echelon.experiments.sweeps.workers import SweepBatch
+REFUSED, MISSING = -1, -2
+"""In place of an outcome: of a run whose parts cannot be built, and of one that is still to do."""
+OUTCOMES = {outcome: code for code, outcome in enumerate(Outcome)}
+
+
+Columns = Mapping[str, Array]
+"""Of some runs: an array (runs,) for each number, and (runs, agents) for those of an agent."""
+
+
+class SweepBatch(NamedTuple):
+    """Consecutive runs of a sweep: the number of the first one, their numbers and their frames.
+
+    `frames` is None if none are stored, or if they are in a file.
+    """
+
+    first: int
+    columns: Columns
+    frames: "StoredFrames | None" = None
+
+    @property
+    def runs(self) -> int:
+        """The number of runs."""
+        return len(self.columns["outcome"])
+
+
+def numbers_of(result: Result, promise: Promise) -> JsonObject:
+    """Return the numbers of a run; what does not exist is NaN."""
+    run = RunNumbers(result, metrics(result), promise)
+    agents = {name: np.full(result.graph.agents, np.nan) for name in AGENT_COLUMNS}
+    for name, values in agents.items():
+        values[list(result.graph.followers)] = run.followers(name)
+    return {
+        **agents,
+        **{name: _number(run.number(name)) for name in RUN_COLUMNS},
+        "saturated": result.saturated,
+        "outcome": OUTCOMES[result.outcome],
+        "message": "" if result.outcome is Outcome.COMPLETED else result.message,
+        "engine": result.engine,
+        "warnings": "\n".join(result.warnings),
+        UNIT: result.unit,
+        "promised": int(promise.promised),
+        "promise_verdict": str(promise.verdict),
+        "promise_kind": str(promise.kind) if promise.promised else "",
+        "promise_theorem": "" if promise.theorem is None else str(promise.theorem),
+        "promise_against": "; ".join(promise.reasons + promise.conditions),
+    }
+
+
+def refused(why: str) -> JsonObject:
+    """Return the columns of a run whose parts cannot be built."""
+    return {"outcome": REFUSED, "message": why}
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else float(value)
+
+
+def columns_of(rows: Sequence[JsonObject]) -> dict[str, Array]:
+    """Return the columns of some runs, each with all names."""
+    agents = max([0, *(len(row["saturated"]) for row in rows if "saturated" in row)])
+    columns: dict[str, Array] = {
+        "outcome": np.array([row["outcome"] for row in rows], np.int8),
+        "promised": np.array([row.get("promised", 0) for row in rows], np.int8),
+    }
+    columns |= {
+        name: np.array([row.get(name, np.nan) for row in rows], float) for name in RUN_COLUMNS
+    }
+    columns |= {name: np.array([row.get(name, "") for row in rows], str) for name in WORDS}
+    for name in AGENT_COLUMNS:
+        columns[name] = np.full((len(rows), agents), np.nan)
+        for k, row in enumerate(rows):
+            if name in row:
+                columns[name][k, : len(row[name])] = row[name]
+    return columns
+
 
 _Z = 1.96
 """Standard deviations within which 95 % of a normal distribution lie."""
@@ -44,7 +125,7 @@ _MEANINGS = {
 _QUANTITIES = {**AGENT_NUMBERS, **RUN_NUMBERS}
 
 
-def dataset_of(plan: Sweep, batches: "Sequence[SweepBatch]") -> "xr.Dataset":
+def dataset_of(plan: Sweep, batches: Sequence[SweepBatch]) -> "xr.Dataset":
     """Return the batches of a sweep as a dataset; runs that are in no batch are `missing`.
 
     Dimensions are the keys that vary, in their order, and `agent`. `outcome` is a code whose
@@ -88,7 +169,7 @@ def _key_attributes(key: str) -> JsonObject:
     return {"long_name": words} | ({"units": unit} if unit else {})
 
 
-def _all_frames(plan: Sweep, shape: FrameShape, batches: "Sequence[SweepBatch]") -> Labelled:
+def _all_frames(plan: Sweep, shape: FrameShape, batches: Sequence[SweepBatch]) -> Labelled:
     """Return the frames of all batches in the order of the axes; NaN of runs in no batch."""
     whole = dict[str, Array]()
     for name, empty in shape.stored([]).items():
@@ -164,3 +245,60 @@ def share_bounds(count: Any, total: Any) -> tuple[Any, Any]:
     middle = (share + spread / 2) / (1 + spread)
     half = _Z * np.sqrt(share * (1 - share) / total + spread / (4 * total)) / (1 + spread)
     return np.clip(middle - half, 0.0, 1.0), np.clip(middle + half, 0.0, 1.0)
+
+
+_CHUNK = 500_000
+"""Numbers of a run that are read together from its file, 4 MB."""
+
+
+def labelled_frames(plan: Sweep, axes: Variables, values: StoredFrames) -> Labelled:
+    """Return arrays of all runs, with a dimension for each key, as a dataset.
+
+    Args:
+        plan: of the sweep.
+        axes: the values of each key.
+        values: `states` and `inputs` (key, .., time, agent, state / input).
+    """
+    assert plan.frames is not None
+    fixed = labelled_parts(*plan.first_built).coordinates
+    labels = ("agent", "state", "state_unit", "input", "input_unit")
+    keys = tuple(axis.key for axis in plan.axes)
+    variables = {
+        name: ((*keys, "time", "agent", name.removesuffix("s")), values[name]) for name in NAMES
+    }
+    time = ("time", np.array(plan.frames.times), {"units": "s"})
+    coordinates = {**axes, "time": time, **{name: fixed[name] for name in labels}}
+    attributes: JsonObject = {"scenario": plan.scenario.name, "scenario_text": plan.scenario.text}
+    return Labelled(variables, coordinates, attributes)
+
+
+def write_frames(
+    plan: Sweep, axes: Variables, batches: Iterable[tuple[int, StoredFrames]], file: Path
+) -> None:
+    """Write the frames of a sweep run by run, each a chunk of its own, which few of fit in memory.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    import h5netcdf
+
+    assert plan.frames is not None
+    shape = (len(plan.frames.times), plan.frames.agents)
+    sizes = zip(NAMES, (len(plan.frames.states), len(plan.frames.inputs)), strict=True)
+    # A number for each place, which takes no memory.
+    nothing = {name: np.broadcast_to(np.nan, (*plan.shape, *shape, n)) for name, n in sizes}
+    labelled = labelled_frames(plan, axes, nothing)
+    with h5netcdf.File(file, "w") as stored:
+        for name in NAMES:
+            over, whole = labelled.variables[name]
+            for dimension, size in zip(over, whole.shape, strict=True):
+                if dimension not in stored.dimensions:
+                    stored.dimensions[dimension] = size
+            times = max(1, min(whole.shape[-3], _CHUNK // (whole.shape[-2] * whole.shape[-1])))
+            chunk = (*[1] * len(plan.shape), times, *whole.shape[-2:])
+            stored.create_variable(name, over, float, fillvalue=np.nan, chunks=chunk)
+        for first, frames in batches:
+            for k, run in enumerate(plan.runs(first, len(frames[NAMES[0]]))):
+                for name in NAMES:
+                    stored.variables[name][run.place] = frames[name][k]
+        labelled._replace(variables={}).write(stored)

@@ -2,14 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
-from typing import NamedTuple, final
+from typing import final
 
 from echelon.core.errors import EchelonError, Outcome
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import Experiment, build
-from echelon.experiments.sweeps.frame_shape import StoredFrames
-from echelon.experiments.sweeps.numbers import Columns, columns_of, numbers_of, refused
 from echelon.experiments.sweeps.plan import Sweep, SweepRun
+from echelon.experiments.sweeps.sweep_dataset import SweepBatch, columns_of, numbers_of, refused
 from echelon.guarantees.promises.promise import Promise, promises
 from echelon.simulation.engine.batch import Batch, StepCount
 from echelon.simulation.engine.result import Result
@@ -23,22 +22,6 @@ _NUMBERS = 32 * 2**20
 """Most numbers of the frames in a batch, where frames are stored."""
 _FRAMES = 20
 """Frames of a run checked for numbers that are not finite or exceed native code's range."""
-
-
-class SweepBatch(NamedTuple):
-    """Consecutive runs of a sweep: the number of the first one, their numbers and their frames.
-
-    `frames` is None if none are stored, or if they are in a file.
-    """
-
-    first: int
-    columns: Columns
-    frames: StoredFrames | None = None
-
-    @property
-    def runs(self) -> int:
-        """The number of runs."""
-        return len(self.columns["outcome"])
 
 
 @final

@@ -272,16 +272,6 @@ def events_line(parts: Parts) -> Iterator[Statement]:
         remedy = "remove `leadership` to see what is guaranteed without it"
         yield fails(name, Kind.PROOF, text, remedy=remedy, reason=text)
         return
-    waits = parts.leadership is not None and parts.leadership.waits is not None
-    if waits and (parts.model.flat_bounds or is_limited(parts.model)):
-        text = "the leaders' plan waits for stragglers, and how much a path that stands still at "
-        text += "times asks of the actuators is not bounded"
-        remedy = "remove `waits` to see what is guaranteed without it"
-        yield fails(name, Kind.PROOF, text, remedy=remedy, reason=text)
-        return
-    if waits and not graph.events:
-        text = "the leaders' plan may wait, since agreement does not depend on how leaders move"
-        yield holds(name, Kind.PROOF, text)
     if not graph.events:
         return
     for event in graph.events:

@@ -43,8 +43,6 @@ _FEW = 100
 """Followers that are told by parents, or whose graph switches: each is followed by itself."""
 _TURNS = 200
 """How often such a graph switches at most, until all are there."""
-_FASTEST = 1e100
-"""1/s; of larger couplings squares are beyond all numbers."""
 _SOLVED = 1e-6
 """Relative; what a solver may leave of L w = 1."""
 _SLACK = 1e-9
@@ -61,8 +59,7 @@ def arrival_of(run: StoppingRun, position: Sequence[int]) -> float | None:
     graph, law = run.parts.graph, run.law
     by_parents = law.feedforward is Feedforward.PARENT
     alone = by_parents or graph.schedule is not None
-    unknown = run.apart or run.coupling > _FASTEST
-    if not position or unknown or alone and len(graph.followers) > _FEW:
+    if not position or run.apart or alone and len(graph.followers) > _FEW:
         return None
     moved = _all_together if graph.schedule is None else _in_turns
     moved = _along_links if by_parents else moved

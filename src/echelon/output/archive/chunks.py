@@ -190,7 +190,7 @@ def _arrays(stretch: Stretch) -> JsonObject:
     plain = {name: getattr(stretch, name) for name in _PLAIN}
     sums = {f"sums_{name}": value for name, value in stretch.sums._asdict().items()}
     moment = {f"moment_{k}": value for k, value in enumerate(stretch.moment)}
-    optional = {name: getattr(stretch, name) for name in ("reference", "stopped", "late")}
+    optional = {name: getattr(stretch, name) for name in ("reference", "stopped")}
     return {**plain, **sums, **moment, **{k: v for k, v in optional.items() if v is not None}}
 
 
@@ -212,5 +212,4 @@ def _stretch(first: int, stored: JsonObject) -> Stretch:
         moment=tuple(stored[f"moment_{k}"] for k in range(count)),
         stopped=None if stopped is None else str(stopped),
         seconds=float(stored["seconds"]),
-        late=stored.get("late"),
     )

@@ -1,8 +1,7 @@
 """A run's numbers for other programs: as a table, and as files of their formats."""
 
 import io
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from echelon.core.errors import MissingExtraError, OutputError, check_kind, check_name
 from echelon.core.files import write_atomic
+from echelon.core.gone import VALUES, gone
 from echelon.core.limits import excess_rows
 
 if TYPE_CHECKING:
@@ -37,8 +37,7 @@ def table(run: "Result | Recording", every: int = 1) -> "pd.DataFrame":
     """
     import pandas as pd
 
-    from echelon.experiments.results.dataset import recording_of
-    from echelon.experiments.results.recording import Recording
+    from echelon.experiments.results.recording import Recording, recording_of
     from echelon.simulation.engine.result import Result
 
     if not isinstance(run, Recording):
@@ -76,9 +75,9 @@ def table(run: "Result | Recording", every: int = 1) -> "pd.DataFrame":
 def export(run: "Result", path: "PathLike", force: bool = False) -> Path:
     """Write a run as a file for other programs, and return its path.
 
-    The ending chooses the format: `.csv`, `.parquet` and `.json` have the columns of `table`,
-    `.npz` and `.mat` (MATLAB) arrays (times, agents, states), `.nc` is the `run.nc` of a folder,
-    and `.html` the page that `echelon view` shows. Videos are written by `save_video`.
+    The ending chooses the format: `.csv` and `.parquet` have the columns of `table`, `.npz` and
+    `.mat` (MATLAB) arrays (times, agents, states), `.nc` is the `run.nc` of a folder, and `.html`
+    the page that `echelon view` shows. Videos are written by `save_video`.
 
     Args:
         run: a result.
@@ -110,6 +109,8 @@ def content_of(kind: str, what: str = "`--to` is") -> "Callable[[Result], bytes]
     Raises:
         OutputError: there is no such format.
     """
+    if ended := gone(VALUES, f"export --to {kind}"):
+        raise OutputError(f"the format `{kind}`{ended}")
     check_name(what, kind, _WRITERS, OutputError)
 
     def content(run: "Result") -> bytes:
@@ -136,19 +137,9 @@ def _parquet(run: "Result") -> bytes:
     return content.getvalue()
 
 
-def _json(run: "Result") -> bytes:
-    columns = table(run)
-    # What is not finite has no number in JSON.
-    finite = {
-        name: [x if np.isfinite(x) else None for x in values.tolist()]
-        for name, values in columns.items()
-    }
-    return json.dumps({"units": columns.attrs["units"], "columns": finite}).encode()
-
-
 def _arrays(run: "Result") -> "JsonObject":
     """Return the arrays of a run by name."""
-    from echelon.experiments.results.dataset import recording_of
+    from echelon.experiments.results.recording import recording_of
 
     data = recording_of(run)
     arrays: JsonObject = {
@@ -196,12 +187,17 @@ def _netcdf(run: "Result") -> bytes:
 
 
 def _page(run: "Result") -> bytes:
-    from echelon.experiments.results.dataset import recording_of
+    from echelon.experiments.results.dataset import STORED
+    from echelon.experiments.results.recording import recording_of
+    from echelon.output.reports.run_report import report, whole_report
     from echelon.output.viewer.page import check_page
     from echelon.output.viewer.replay import replay_page
 
     check_page()
-    return replay_page(recording_of(run)).encode()
+    data = recording_of(run)
+    # The parts of a run from disk are not built, which executes code, only to show it.
+    text = whole_report(data, "" if run in STORED else report(run))
+    return replay_page(data, reports=[text]).encode()
 
 
 _WRITERS: "dict[str, Callable[[Result], bytes]]" = {
@@ -210,6 +206,38 @@ _WRITERS: "dict[str, Callable[[Result], bytes]]" = {
     "npz": _npz,
     "mat": _mat,
     "nc": _netcdf,
-    "json": _json,
     "html": _page,
 }
+
+
+_HEAD = """# For Crazyswarm2, by echelon. Edit the addresses. Before the start each vehicle
+# stands at its `initial_position`, below the first point of its CSV file.
+robots:
+"""
+_TAIL = """robot_types:
+  crazyflie:
+    motion_capture:
+      enabled: true
+      tracking: librigidbodytracker
+      marker: default_single_marker
+      dynamics: default
+    big_quad: false
+    battery:
+      voltage_warning: 3.8 # V
+      voltage_critical: 3.7 # V
+all:
+  firmware_params:
+    stabilizer:
+      estimator: 2 # Kalman
+      controller: 2 # Mellinger
+"""
+
+
+def swarm_text(begins: Sequence[Sequence[float]]) -> str:
+    """Return the file for agents whose paths begin at points (x, y, z, ...), m."""
+    robots = [
+        f"  agent{k}:\n    enabled: true\n    uri: radio://0/80/2M/E7E7E7E7{k + 1:02X}\n"
+        f"    initial_position: [{x:.4f}, {y:.4f}, 0.0]\n    type: crazyflie\n"
+        for k, (x, y, *_) in enumerate(begins)
+    ]
+    return _HEAD + "".join(robots) + _TAIL

@@ -15,7 +15,8 @@ from echelon.core.files import INPUTS
 
 CHUNKS, RUNS, BATCHES = "chunks", "runs", "batches"
 DATA, GAIN, SUMMARY, FRAMES = "run.nc", "gain.json", "summary.json", "states.nc"
-_RUN = (SUMMARY, DATA, GAIN, "scenario.yaml", "report.txt", "figures", INPUTS, CHUNKS)
+REPORT = "report.txt"
+_RUN = (SUMMARY, DATA, GAIN, "scenario.yaml", REPORT, "figures", INPUTS, CHUNKS)
 _COMPARISON = ("comparison.json", "comparison.txt", RUNS, "figures")
 _SWEEP = ("sweep.nc", FRAMES, "scenario.yaml", "sweep.txt", "figures", INPUTS, BATCHES)
 _MARKS = {SUMMARY: _RUN, CHUNKS: _RUN, "comparison.json": _COMPARISON}

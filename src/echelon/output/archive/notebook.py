@@ -5,17 +5,15 @@ import html
 from collections.abc import Iterator
 
 from echelon.core.errors import OutputError
-from echelon.experiments.results.dataset import STORED, recording_of
-from echelon.experiments.results.foreseen import foreseen
+from echelon.experiments.results.dataset import STORED
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import metrics
-from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.recording import Recording, foreseen, recording_of
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS
 from echelon.guarantees.promises.promise import promise
 from echelon.output.plots.figure_files import html_image
 from echelon.output.plots.run_figures import figures
-from echelon.output.reports.causes import ends_farther, grows, observations
-from echelon.output.reports.run_report import labelled
+from echelon.output.reports.run_report import ends_farther, grows, labelled, observations
 from echelon.output.viewer.replay import replay_page
 from echelon.simulation.engine.result import Result
 

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from echelon.core.errors import OutputError
-from echelon.experiments.results.dataset import recording_of
-from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.recording import Recording, recording_of
 from echelon.output.plots import network, over_time, trajectories
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import NAMES, check_names, save

@@ -8,9 +8,8 @@ import numpy as np
 from echelon.core.digits import at_most
 from echelon.core.types import Array
 from echelon.experiments.results.metrics import SETTLED, output_errors
-from echelon.experiments.results.quantity import settling_bound
 from echelon.experiments.results.recording import LoopPoles
-from echelon.experiments.results.run_numbers import RUN_NUMBERS
+from echelon.experiments.results.run_numbers import RUN_NUMBERS, settling_bound
 from echelon.experiments.studies.basin import (
     Radii,
     StateSlice,
@@ -24,8 +23,7 @@ from echelon.experiments.studies.basin import (
     trial,
 )
 from echelon.experiments.studies.compare import Comparison
-from echelon.experiments.sweeps.axes import SEED
-from echelon.experiments.sweeps.numbers import SUMMARIZED
+from echelon.experiments.sweeps.plan import SEED, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 from echelon.guarantees.promises.promise import promise
 from echelon.output.plots import style as draw

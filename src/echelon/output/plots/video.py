@@ -12,8 +12,7 @@ import numpy as np
 from echelon.core.errors import MissingExtraError, OutputError
 from echelon.core.files import make_atomic
 from echelon.core.types import Array
-from echelon.experiments.results.dataset import recording_of
-from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.recording import Recording, recording_of
 from echelon.output.plots import style as draw
 from echelon.output.plots.over_time import above, error_rounding, mark_events, shade_rounding
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of

@@ -8,12 +8,18 @@ from echelon.core.digits import at_most
 from echelon.core.errors import Outcome
 from echelon.core.types import JsonObject
 from echelon.core.words import amount
-from echelon.experiments.results.quantity import ERROR, Shown, settling_bound
-from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, RunNumbers, shown_in
+from echelon.experiments.results.metrics import RunNumbers
+from echelon.experiments.results.run_numbers import (
+    AGENT_NUMBERS,
+    ERROR,
+    RUN_NUMBERS,
+    Shown,
+    settling_bound,
+    shown_in,
+)
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.guarantees.promises.promise import Promise
-from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
-from echelon.output.reports.run_report import say
+from echelon.output.reports.run_report import PRINTED, ROUNDING, is_papers_experiment, say
 from echelon.simulation.step.solver_stats import SolverStats
 
 if TYPE_CHECKING:

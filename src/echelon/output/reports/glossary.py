@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from echelon.core.errors import OutputError, did_you_mean
-from echelon.experiments.results.quantity import ERROR
-from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, ERROR, RUN_NUMBERS
 
 _PLACES: Final = (
     Path(__file__).with_name("glossary.md"),  # in a wheel

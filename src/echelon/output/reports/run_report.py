@@ -1,26 +1,85 @@
-"""The report of a run: a table like the paper's Table II, and sentences that explain it."""
+"""The report of a run: a table like the paper's Table II, and sentences that explain it.
+
+The whole report adds the conditions of the guarantee, the scenario, versions, and how to cite.
+"""
 
 import io
-from collections.abc import Iterator, Sequence
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
-from echelon.experiments.results.agent_metrics import (
+import numpy as np
+from jaxtyping import Bool
+
+from echelon import __version__
+from echelon.agents.network.hearing import who_hears_whom
+from echelon.core.digits import at_least, at_most
+from echelon.core.errors import Outcome
+from echelon.core.statement import Hypothesis
+from echelon.core.types import JsonObject
+from echelon.core.words import amount
+from echelon.experiments.results.event_outcomes import event_outcomes
+from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.results.metrics import avoidance, metrics
+from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.run_numbers import (
     FollowerMetrics,
     LeaderMetrics,
     Metrics,
+    quantities,
     representatives,
+    settling_bound,
     steady_error,
 )
-from echelon.experiments.results.metrics import metrics
-from echelon.experiments.results.quantity import quantities, settling_bound
-from echelon.output.reports.explanation import explain
-from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
+from echelon.guarantees.promises.promise import Promise, coverage, promise
 from echelon.simulation.engine.result import Result
+from echelon.simulation.step.meter import SETTLED
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+PRINTED: Mapping[str, tuple[float, ...]] = {
+    "consensus": (0.186, 9.289e-17, 7.692e-17, 5.207e-17),
+    "optimization": (0.186, 0.0302, 7.692e-17, 0.018),
+}
+"""RMSE in m of leader and followers 1, 2, 3, per method, over 10 s."""
+
+ROUNDING = (
+    "The printed values are the paper's Table II (10 s). Its followers' errors of 1e-17 m are "
+    "rounding errors of constant offsets (all its samples are multiples of 2^-53), not errors of a "
+    "closed loop; compare them with the steady RMSE from random starts above."
+)
+
+
+def is_papers_experiment(scenario: str, model: str, agents: int) -> bool:
+    """Return whether a scenario is comparable: `paper` or a variant, with 4 quadrotors."""
+    return (
+        model == "Quadrotor"
+        and agents == 4
+        and (scenario == "paper" or scenario.startswith("paper-"))
+    )
+
+
+_WIDTH = 100
+_CITATION = f"""@software{{echelon,
+  title = {{echelon: leader-follower formation tracking for control-affine nonlinear agents}},
+  author = {{{{The echelon developers}}}},
+  version = {{{__version__}}}
+}}
+@inproceedings{{enwerem2023consensus,
+  title = {{Consensus-Based Leader-Follower Formation Tracking for Control-Affine Nonlinear
+    Multiagent Systems}},
+  author = {{Enwerem, Clinton and Baras, John S.}},
+  booktitle = {{9th International Conference on Control, Decision and Information Technologies
+    (CoDIT)}},
+  year = {{2023}},
+  note = {{arXiv:2309.09156}}
+}}"""
+_SETTLES = float(np.log(100.0))
+"""Time constants in which an error of 1 m decays to 1 cm."""
+_CHATTERS = 20
+"""Alternations of an input between its limits that are reported; a start has a few."""
 # With more agents of a role the table shows the best, the median and the worst.
 _MANY = 12
 _COLUMNS = quantities(FollowerMetrics)
@@ -32,9 +91,44 @@ def report(result: Result) -> str:
 
     text = io.StringIO()
     # A forced terminal, so that sentences wrap; without colours the text stays plain.
-    console = Console(file=text, width=100, color_system=None, force_terminal=True)
+    console = Console(file=text, width=_WIDTH, color_system=None, force_terminal=True)
     print_report(console, result, metrics(result))
     return text.getvalue().rstrip("\n")
+
+
+def whole_report(run: Recording, numbers: str) -> str:
+    """Return the numbers of a run, its guarantee with all conditions, and where it is from.
+
+    Args:
+        run: as it is stored.
+        numbers: its `report`; empty where there is none.
+    """
+    message, promise = str(run.attributes["message"]), run.promise
+    facts = f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s"
+    versions = {k[8:]: v for k, v in run.attributes.items() if k.startswith("version_")}
+    sections = {
+        f"{run.name}: {facts}": numbers.rstrip() or _wrapped(message, promise["sentence"]),
+        "Conditions of the guarantee": _wrapped(*map(_condition, promise["hypotheses"])),
+        "Scenario": str(run.attributes.get("scenario_text", "")).rstrip(),
+        "Versions": "\n".join(f"{name} {version}" for name, version in versions.items()),
+        "Citation": _CITATION,
+    }
+    some = (f"{title}\n{'-' * len(title)}\n{text}" for title, text in sections.items() if text)
+    return "\n\n".join(some)
+
+
+def _wrapped(*sentences: str) -> str:
+    """Return sentences as the items of a list."""
+    fill = textwrap.TextWrapper(_WIDTH, initial_indent="- ", subsequent_indent="  ").fill
+    return "\n".join(map(fill, filter(None, sentences)))
+
+
+def _condition(line: JsonObject) -> str:
+    """Return a condition with its verdict, number, reason, and remedy if it fails."""
+    text = f"{line['statement']}: {line['verdict']}"
+    text += f" ({line['shown']})" if line["shown"] else ""
+    text += f"; {line['text']}" if line["text"] else ""
+    return text + (f"; to change: {line['remedy']}" if line["remedy"] else "")
 
 
 def print_report(console: "Console", result: Result, numbers: Metrics) -> None:
@@ -118,3 +212,305 @@ def _cell(agent: LeaderMetrics | FollowerMetrics, name: str) -> str:
         return ""
     value: float | None = getattr(agent, name)
     return "-" if value is None and agent.rmse is None else _COLUMNS[name].cell(value)
+
+
+# ---- sentences ----------------------------------------------------------------------------------
+
+
+def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
+    """Return the sentences of a report: outcome, what was observed, world, guarantee, V."""
+    guarantee = promise(result.parts, result.settings)
+    return (
+        *_outcome(result, numbers, guarantee),
+        *_closest(result, numbers),
+        *(outcome.sentence() for outcome in event_outcomes(result)),
+        *_lag(result),
+        *observations(result, numbers, guarantee),
+        *_world(result),
+        *_guarantee(result, guarantee),
+        *_lyapunov_trend(result, guarantee),
+    )
+
+
+def _outcome(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[str]:
+    yield result.message
+    if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
+        return
+    unit = f" {result.length_unit}".rstrip()
+    if grows(result, guarantee):
+        first, last = sizes(result)
+        yield (
+            f"The formation error grows: {first:.3g}{unit} at the start, "
+            f"{last:.4g}{unit} at {result.times[-1]:g} s."
+        )
+        return
+    here = np.ones(result.graph.agents, bool) if result.presence is None else result.presence[-1]
+    there = " that are there" * (not here.all())
+    times = [follower.settling_time for follower in numbers.followers if here[follower.agent]]
+    settled = [time for time in times if time is not None]
+    count, late = len(times), len(times) - len(settled)
+    if not count:
+        yield "No follower is there at the end."
+    elif not late:
+        who = "The follower stays" if count == 1 else f"All {count} followers{there} stay"
+        goals = "its goal" if count == 1 else "their goals"
+        yield f"{who} within 0.01{unit} of {goals} from {max(settled):.3g} s on."
+    else:
+        who = "The follower" if count == 1 else f"{late} of {count} followers{there}"
+        verb = "has" if late == 1 else "have"
+        yield f"{who} {verb} not settled to 0.01{unit} by {result.times[-1]:g} s."
+
+
+def _closest(result: Result, numbers: Metrics) -> Iterator[str]:
+    """Yield which agents came closest to each other, and whether vehicles would have touched."""
+    if numbers.closest is not None and result.outcome is not Outcome.DIVERGED:
+        yield numbers.closest.sentence(result.radius, result.length_unit)
+    kept = avoidance(result)
+    yield from () if kept is None else (kept.sentence(),)
+
+
+def _lag(result: Result) -> Iterator[str]:
+    """Yield by how much followers lag behind places that change with time, under laws that do."""
+    late = np.flatnonzero(result.times >= result.settings.horizon - result.settings.window)
+    if result.formation.motion is None or not result.drive.lags or not len(late):
+        return
+    largest = float(result.goal_distances(late)[:, list(result.graph.followers)].max())
+    frames = "in the stored frames " * (result.settings.store_every > 1)
+    yield (
+        f"Followers lag behind places that change with time: observed {largest:.3g} "
+        f"{result.unit} at most {frames}from {result.times[late[0]]:.4g} s on; under "
+        "`stopping-point` they do not."
+    )
+
+
+def _world(result: Result) -> Iterator[str]:
+    """Yield what the laws and gains do not know."""
+    world = result.world.describe(result.model)
+    if world["plant"]:
+        yield f"Plant: {world['plant']}; laws and gains use the model's values."
+    if world["disturbance"]:
+        yield f"Disturbance: {world['disturbance']}; unknown to the laws."
+    if world["network"]:
+        yield f"Network: {world['network']}."
+        yield from _messages(result)
+    if world["actuator"]:
+        yield f"Actuators: {world['actuator']}; unknown to the laws."
+    if world["sensing"]:
+        yield f"Sensing of own states: {world['sensing']}."
+
+
+def _messages(result: Result) -> Iterator[str]:
+    """Yield what became of the messages, if there were any."""
+    traffic = result.traffic
+    if traffic is None or not traffic.sent:
+        return
+    late = f", {traffic.late} arrived after a newer one" * (traffic.late > 0)
+    ages = ""
+    if np.isfinite(traffic.mean):
+        ages = (
+            f"; those in use were {1e3 * traffic.mean:.3g} ms old on average and "
+            f"{1e3 * traffic.largest:.4g} ms at most"
+        )
+    yield f"Messages: {traffic.sent} sent, {traffic.lost} lost{late}{ages}."
+
+
+def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
+    """Yield the guarantee, whether it covers this run, and the information that the law uses."""
+    yield guarantee.sentence()
+    slowest, coupling = guarantee.slowest, guarantee.coupling
+    if result.drive.gain is not None and guarantee.governed and slowest is not None:
+        mode = "the slowest mode decays" if slowest < 0.0 else "a mode grows"
+        text = f"{mode} at {at_most(abs(slowest))} 1/s"
+        # Rounding of a mode at 0 is no growth.
+        text = "a mode does not decay" if 0.0 <= slowest < 1e-9 else text
+        text = f"{text} (coupling {coupling:.4g})"
+        if guarantee.edge is not None:
+            text += f". Couplings above {at_least(guarantee.edge, 4)} are sufficient for stability"
+        yield f"Linearized at the trim, {text}."
+    yield from coverage(result, guarantee)
+    if len(result.graph.leaders) > 1:
+        yield f"Leaders: {who_hears_whom(result.graph)}; goals are relative to the nearest leader."
+    information = "; ".join(result.parts.information.follower) or "nothing from others"
+    yield f"Information used by each follower: {information}."
+
+
+def _lyapunov_trend(result: Result, guarantee: Promise) -> Iterator[str]:
+    """Yield whether V decreased, with a warning where theory forbids its increase."""
+    v = lyapunov(result)
+    if v is None or len(v.value) < 2 or not np.isfinite(v.value).all():
+        return
+    increases, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
+    # V' <= 0 is proved for the undisturbed loop that decays only.
+    unstable = guarantee.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails
+    if forbidden and not (unstable or not result.world.ideal):
+        when = result.times[int(np.argmax(v.forbidden()))]
+        yield (
+            f"Warning: V increased at {forbidden} of {len(v.value)} stored steps (first at "
+            f"{when:.4g} s) although V' <= 0 there."
+        )
+    elif increases:
+        yield f"V increased in {increases} of {amount(len(v.value) - 1, 'frame')}."
+    else:
+        every = "V never increased"
+        if result.settings.store_every > 1:
+            every = f"V did not increase between the {len(v.value)} stored times"
+        yield f"{every}: {v.value[0]:.3g} at the start, {v.value[-1]:.3g} at the end."
+
+
+# ---- what was observed in a poor run -------------------------------------------------------------
+
+
+def observations(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[str]:
+    """Yield what was observed of large errors, in sentences; no cause, since none was tried."""
+    alone, text = _alone(result)
+    yield from (text,) if text else ()
+    if len(result.times):
+        settled = all(follower.settling_time is not None for follower in numbers.followers)
+        if grows(result, guarantee):
+            yield from beyond(float(result.saturated.max()), guarantee)
+        else:
+            yield from () if settled else _slow(result, guarantee)
+    yield from _offset(result, numbers)
+    yield from _chatter(result, alone)
+
+
+def _alone(result: Result) -> tuple[tuple[int, ...], str]:
+    """Return which followers lost their way while nobody was linked to them, and that in words."""
+    away = result.formation_errors
+    spans: dict[int, tuple[float, float]] = {}
+    for agent, start, end in _silences(result):
+        frames = np.flatnonzero((result.times >= start) & (result.times <= end))
+        errors = away[frames, agent]
+        lost = len(frames) and not errors[-1] <= max(SETTLED, errors[0])
+        before = spans.get(agent, (0.0, 0.0))
+        if lost and end - start > before[1] - before[0]:
+            spans[agent] = start, end
+    if not spans:
+        return (), ""
+    worst = max(spans, key=lambda agent: spans[agent][1] - spans[agent][0])
+    more = f"; so did {amount(len(spans) - 1, 'other agent')} at some time" * (len(spans) > 1)
+    start, end = spans[worst]
+    text = f"Agent {worst} received nothing from {start:g} s to {end:g} s, since no link led to it"
+    return tuple(spans), f"{text}, and its error grew{more}."
+
+
+def _silences(result: Result) -> Iterator[tuple[int, float, float]]:
+    """Yield each follower that was there without a link to receive from, from when until when (s).
+
+    Nothing of a graph that never switches, in which everybody has a path from a leader.
+    """
+    schedule, dt = result.schedule, result.settings.dt
+    if schedule is None or not len(result.times):
+        return
+    last = float(result.times[-1])
+    steps, rows = schedule.switches(dt, last)
+    within = steps * dt < last
+    starts, ends = steps[within] * dt, np.append(steps[within][1:] * dt, last)
+    silent = _silent(result)[rows[within]]
+    for agent in np.flatnonzero(silent.any(axis=0)).tolist():
+        edges = np.diff(np.concatenate([[0], silent[:, agent].astype(np.int8), [0]]))
+        for first, beyond in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+            yield agent, float(starts[first]), float(ends[beyond - 1])
+
+
+def _silent(result: Result) -> Bool[np.ndarray, "S N"]:
+    """Return which followers have no link to receive from in each row of the schedule."""
+    schedule, agents = result.schedule, result.graph.agents
+    assert schedule is not None
+    heard = np.zeros((len(schedule.weights), agents), bool)
+    row, edge = np.nonzero(schedule.weights > 0.0)
+    for end in (0, 1):
+        receives = result.parts.receives[edge, end]
+        heard[row[receives], result.graph.edges[edge[receives], end]] = True
+    here = True if schedule.present is None else np.asarray(schedule.present)
+    leads = np.isin(np.arange(agents), result.graph.leaders)
+    if schedule.nearest is not None:
+        leads = schedule.nearest == np.arange(agents)
+    return ~heard & here & ~leads
+
+
+def beyond(saturated: float, guarantee: Promise) -> Iterator[str]:
+    """Yield that a guarantee does not cover a run whose errors grow.
+
+    `saturated` is the largest fraction of steps in which an agent's input was at a limit.
+    """
+    # With a theorem, `coverage` says more.
+    acts = guarantee.without or saturated
+    if not guarantee.promised or guarantee.theorem is not None or not acts:
+        return
+    text = "The guarantee does not cover this run"
+    text += f": {guarantee.without}" if guarantee.without else ""
+    limited = f"; inputs were at a limit in {100.0 * saturated:.3g} % of the steps"
+    yield f"{text}{limited if saturated else ''}."
+
+
+def _slow(result: Result, guarantee: Promise) -> Iterator[str]:
+    """Yield that the horizon is too short for the slowest mode."""
+    by_mode = guarantee.slowest is not None
+    rate = -guarantee.slowest if guarantee.slowest is not None else guarantee.rate
+    if guarantee.promised and rate and result.settings.horizon * rate < _SETTLES:
+        span = "1 m to 1 cm" if result.length_unit else "1 to 0.01"
+        yield (
+            f"{'The slowest mode' if by_mode else 'The guaranteed rate'} takes "
+            f"{at_least(_SETTLES / rate)} s from {span}, and the horizon is "
+            f"{result.settings.horizon:g} s."
+        )
+
+
+def _offset(result: Result, numbers: Metrics) -> Iterator[str]:
+    """Yield that a leader keeps an error from its reference."""
+    steady = numbers.leader.steady_rmse
+    if steady is None or steady <= SETTLED or _falls(result, steady):
+        return
+    unit = f" {result.length_unit}".rstrip()
+    text = f"The leader has a steady error of {steady:.3g}{unit} from its reference"
+    saturated = 100.0 * result.saturated[result.graph.leaders[0]]
+    limited = f", with its inputs at a limit in {saturated:.3g} % of the steps"
+    yield f"{text}{limited if saturated else ''}."
+
+
+def _falls(result: Result, steady: float) -> bool:
+    """Return whether the first leader was still approaching its reference at the end."""
+    assert result.reference is not None
+    first = result.graph.leaders[0]
+    away = result.states[-1, first] - result.offsets_in([-1])[..., first, :] - result.reference[-1]
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.linalg.norm(away[..., list(result.measured)])) < 0.5 * steady
+
+
+def _chatter(result: Result, alone: Sequence[int]) -> Iterator[str]:
+    """Yield that inputs alternate between their limits, but of agents that tumbled `alone`."""
+    agent = int(result.chatter.argmax())
+    if agent not in alone and result.chatter[agent] > _CHATTERS:
+        yield (
+            f"The inputs of agent {agent} jumped from one limit to the opposite one "
+            f"{result.chatter[agent]:.0f} times between two steps of {result.settings.dt:g} s."
+        )
+
+
+def sizes(result: Result) -> tuple[float, float]:
+    """Return the root-mean-square error of the followers in the first and the last frame."""
+    error = result.goal_distances([0, -1])[:, list(result.graph.followers)]
+    with np.errstate(over="ignore"):
+        first, last = (float(np.sqrt((row**2).mean())) for row in (error[0], error[-1]))
+    return first, last
+
+
+def grows(result: Result, guarantee: Promise) -> bool:
+    """Return whether a run diverged, or its errors grew beyond what a guarantee allows for.
+
+    Under one, errors that end below 1 cm are those of rounding and of inputs that are held.
+    """
+    if result.outcome is Outcome.DIVERGED or not guarantee.promised:
+        return ends_farther(result)
+    return ends_farther(result) and sizes(result)[1] >= SETTLED
+
+
+def ends_farther(result: Result) -> bool:
+    """Return whether a run diverged, or ends farther from its goals than it began."""
+    if result.outcome is Outcome.DIVERGED:
+        return True
+    first, last = sizes(result)
+    # Twice, since the last frame may be an overshoot; and after a start at the goals rounding
+    # errors grow.
+    return last > 2.0 * first + 1e-9

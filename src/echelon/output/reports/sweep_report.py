@@ -7,9 +7,8 @@ import numpy as np
 
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import GuaranteeVerdict, amount
-from echelon.experiments.results.quantity import settling_bound
-from echelon.experiments.sweeps.axes import SEED
-from echelon.experiments.sweeps.numbers import SUMMARIZED
+from echelon.experiments.results.run_numbers import settling_bound
+from echelon.experiments.sweeps.plan import SEED, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from echelon.core.digits import at_most
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.metrics import SETTLED
-from echelon.experiments.results.quantity import settling_bound
 from echelon.experiments.results.recording import Recording
+from echelon.experiments.results.run_numbers import settling_bound
 from echelon.output.plots import style as draw
 from echelon.output.plots.style import FLOOR
 from echelon.output.viewer.page import Group

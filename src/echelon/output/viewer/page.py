@@ -11,12 +11,15 @@ import zlib
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from echelon.core.errors import MissingExtraError
-from echelon.core.types import Array, JsonObject
+
+if TYPE_CHECKING:
+    # It loads JAX, and the command line looks for the page before that.
+    from echelon.core.types import Array, JsonObject
 
 _HERE: Final = Path(__file__).resolve().parent / "page"
 _BUNDLE = "three.min.js"
@@ -84,13 +87,13 @@ class Group(NamedTuple):
         gaps: whether numbers may be missing: NaN, or -inf for what is below the axis.
     """
 
-    values: Array
+    values: "Array"
     levels: int = FINE
     limits: tuple[float, float] | None = None
     gaps: bool = False
 
 
-def pack(header: JsonObject, groups: dict[str, Group]) -> bytes:
+def pack(header: "JsonObject", groups: dict[str, Group]) -> bytes:
     """Return a compressed block: the header's length, its JSON, and the numbers.
 
     The header gets the key `groups`: by name, extremes, steps, frames and bytes per number.
@@ -105,7 +108,7 @@ def pack(header: JsonObject, groups: dict[str, Group]) -> bytes:
     return zlib.compress(b"".join([struct.pack("<I", len(text)), text, *blocks]), 9)
 
 
-def _pack_group(group: Group) -> tuple[bytes, JsonObject]:
+def _pack_group(group: Group) -> "tuple[bytes, JsonObject]":
     values = np.asarray(group.values, np.float64)
     low, high = _extremes(values, group.limits)
     levels = group.levels - 2 if group.gaps else group.levels
@@ -129,7 +132,7 @@ def _pack_group(group: Group) -> tuple[bytes, JsonObject]:
     return block, ranges | numbers
 
 
-def _extremes(values: Array, limits: tuple[float, float] | None) -> tuple[Array, Array]:
+def _extremes(values: "Array", limits: tuple[float, float] | None) -> "tuple[Array, Array]":
     channels = values.shape[1]
     if limits is not None:
         return np.full(channels, limits[0]), np.full(channels, limits[1])

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, final
 
 import numpy as np
@@ -30,18 +30,23 @@ _PATIENCE: Final = 10.0
 """Seconds after which a page that waits for a part of a run gets an empty answer."""
 
 
-def replay_page(*runs: Recording) -> str:
+def replay_page(*runs: Recording, reports: Sequence[str] = ()) -> str:
     """Return one run, or two beside each other with the same clock, as a self-contained HTML page.
+
+    Args:
+        runs: to show.
+        reports: the text of each, which the page shows on demand; none by default.
 
     Raises:
         OutputError: a run has no frame or is too large.
         MissingExtraError: the page's three.js is not built.
     """
-    return page(" and ".join(run.name for run in runs), *map(replay_data, runs))
+    texts = reports or [""] * len(runs)
+    return page(" and ".join(run.name for run in runs), *map(replay_data, runs, texts))
 
 
-def replay_data(run: Recording) -> bytes:
-    """Return a run packed for the page.
+def replay_data(run: Recording, report: str = "") -> bytes:
+    """Return a run packed for the page, with its report.
 
     Raises:
         OutputError: it has no frame, or is too large.
@@ -82,6 +87,7 @@ def replay_data(run: Recording) -> bytes:
     pairs = run.approaches(run.scales)
     description = {
         **header(run, space),
+        "report": report,
         "frames": len(frames),
         "clock": {"start": times[0], "step": step, "last": times[-1]},
         # Each time at which two agents were closer than any before, how close, and who.
@@ -299,13 +305,13 @@ class Growing:
             self.last = stretch
             self.changed.notify_all()
 
-    def finish(self, run: Recording) -> None:
-        """Replace the parts by the complete run, which all pages then load.
+    def finish(self, run: Recording, report: str) -> None:
+        """Replace the parts by the complete run with its report, which all pages then load.
 
         Raises:
             OutputError: it is too large for a page.
         """
-        html = replay_page(run).encode()
+        html = replay_page(run, reports=[report]).encode()
         with self.changed:
             self.html, self.done = html, True
             self.changed.notify_all()

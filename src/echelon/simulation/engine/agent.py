@@ -310,11 +310,6 @@ class Agent:
         assert isinstance(drive, Laws)
         with precision("float64"):
             self._loop = assemble(prepared.problem, drive.leader, drive.follower)
-        if self._loop.patience is not None:
-            raise SimulationError(
-                "got `waits` of the leadership, and a single agent does not know how far others "
-                "are off their places; remove it."
-            )
         if self._loop.succession is not None and network is None:
             raise SimulationError(
                 "got `leadership` without a network, in which single agents know at once who "

@@ -115,8 +115,7 @@ class Batch:
             drive = prepared.parts.drive
             with precision("float64"):
                 loop = group = None
-                leadership = parts.leadership
-                if isinstance(drive, Laws) and (leadership is None or leadership.waits is None):
+                if isinstance(drive, Laws):
                     loop = assemble(prepared.problem, drive.leader, drive.follower)
                     group = self.kinds.of(loop, unseeded)
                 shared[unseeded] = _SharedRun(prepared, Starts(prepared.parts), loop, group)

@@ -78,10 +78,7 @@ def advance_until_lost(
     order = sorted(frames)
     states, inputs = (np.stack([frames[point][k] for point in order]) for k in (0, 1))
     # Points that end the run, without steps after them, are in `frames` once.
-    # Of added points what leaders follow is not known.
-    return chunk._replace(states=states, inputs=inputs, followed=None), np.diff(
-        [*order, int(counts.sum())]
-    )
+    return chunk._replace(states=states, inputs=inputs), np.diff([*order, int(counts.sum())])
 
 
 def _first_lost(

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -72,68 +72,34 @@ FrameChoice: TypeAlias = slice | Sequence[int] | Int[Array, " F"]
 """Which frames."""
 
 
-class _Frames(Protocol):
-    """What the numbers are computed from."""
-
-    @property
-    def times(self) -> Float[Array, " T"]: ...
-
-    @property
-    def states(self) -> Float[Array, "T N n"]: ...
-
-    @property
-    def offsets(self) -> Float[Array, "N n"]: ...
-
-    @property
-    def nearest(self) -> Int[Array, " N"]: ...
-
-    @property
-    def schedule(self) -> Schedule | None: ...
-
-    @property
-    def presence(self) -> Bool[Array, "T N"] | None: ...
-
-    @property
-    def nearest_then(self) -> Int[Array, "T N"]: ...
-
-    @property
-    def position(self) -> tuple[int, ...]: ...
-
-    @property
-    def state_units(self) -> Sequence[str]: ...
-
-    @property
-    def measured(self) -> tuple[int, ...]: ...
-
-    def offsets_in(self, frames: FrameChoice) -> Float[Array, "*F N n"]: ...
-
-    def deviations(self, frames: FrameChoice = slice(None)) -> Float[Array, "F N n"]: ...
-
-    def goal_distances(self, frames: FrameChoice = slice(None)) -> Float[Array, "F N"]: ...
-
-    def least_distances(
-        self, frames: FrameChoice = slice(None), scales: Float[Array, " d"] | float = 1.0
-    ) -> Float[Array, " F"] | None: ...
-
-    def approaches(self, scales: Float[Array, " d"] | float = 1.0) -> list[ClosestPair]: ...
-
-
 class FrameNumbers(abc.ABC):
     """Numbers of T frames of N agents with n states, of a `Result` and of a `Recording`."""
 
+    times: Float[Array, " T"]
+    states: Float[Array, "T N n"]
+    offsets: Float[Array, "N n"]
+    nearest: Int[Array, " N"]
+    schedule: Schedule | None
+    position: tuple[int, ...]
+    state_units: tuple[str, ...]
+
+    @abc.abstractmethod
+    def offsets_in(self, frames: FrameChoice = slice(None)) -> Float[Array, "*F N n"]:
+        """Return the goal offsets in some frames, (F, N, n), or constant ones, (N, n)."""
+
     @property
-    def measured(self: _Frames) -> tuple[int, ...]:
+    def measured(self) -> tuple[int, ...]:
         """Indices of the states that errors are measured on: the position if any, else all."""
         return self.position or tuple(range(self.offsets.shape[1]))
 
     @property
-    def length_unit(self: _Frames) -> str:
+    def length_unit(self) -> str:
         """The unit of errors: m for a position in m, nothing for other units and states."""
         metres = all(self.state_units[k] in ("", "m") for k in self.position)
         return "m" if self.position and metres else ""
 
     @property
-    def errors(self: _Frames) -> Float[Array, "T N n"]:
+    def errors(self) -> Float[Array, "T N n"]:
         """Deviation of each agent from its goal relative to its nearest leader.
 
         The leaders' rows are zero.
@@ -141,12 +107,12 @@ class FrameNumbers(abc.ABC):
         return self.deviations()
 
     @property
-    def formation_errors(self: _Frames) -> Float[Array, "T N"]:
+    def formation_errors(self) -> Float[Array, "T N"]:
         """Each agent's distance from its goal."""
         return self.goal_distances()
 
     @property
-    def presence(self: _Frames) -> Bool[Array, "T N"] | None:
+    def presence(self) -> Bool[Array, "T N"] | None:
         """Which agents are there in each frame; None where all always are."""
         schedule = self.schedule
         if schedule is None or schedule.present is None:
@@ -154,14 +120,14 @@ class FrameNumbers(abc.ABC):
         return schedule.present[schedule.rows(self.times)]
 
     @property
-    def nearest_then(self: _Frames) -> Int[Array, "T N"]:
+    def nearest_then(self) -> Int[Array, "T N"]:
         """The leader that each agent follows in each frame."""
         schedule = self.schedule
         if schedule is None or schedule.nearest is None:
             return np.tile(self.nearest, (len(self.times), 1))
         return schedule.nearest[schedule.rows(self.times)]
 
-    def deviations(self: _Frames, frames: FrameChoice = slice(None)) -> Float[Array, "F N n"]:
+    def deviations(self, frames: FrameChoice = slice(None)) -> Float[Array, "F N n"]:
         """Return `errors` in some frames; those of absent agents are zero."""
         # delta_i = y_i - y_0 (theory page), which V and the certified set are written in.
         y = self.states[frames] - self.offsets_in(frames)
@@ -170,18 +136,18 @@ class FrameNumbers(abc.ABC):
         away = y - np.take_along_axis(y, self.nearest_then[frames][:, :, None], axis=1)
         return np.where(self.presence[frames][:, :, None], away, 0.0)
 
-    def goals(self: _Frames, frames: FrameChoice = slice(None)) -> Float[Array, "F N n"]:
+    def goals(self, frames: FrameChoice = slice(None)) -> Float[Array, "F N n"]:
         """Return the states that the agents would have without errors, in some frames."""
         return self.states[frames] - self.deviations(frames)
 
-    def goal_distances(self: _Frames, frames: FrameChoice = slice(None)) -> Float[Array, "F N"]:
+    def goal_distances(self, frames: FrameChoice = slice(None)) -> Float[Array, "F N"]:
         """Return `formation_errors` in some frames."""
         # Where a square overflows, the length is infinite.
         with np.errstate(over="ignore", invalid="ignore"):
             return np.linalg.norm(self.deviations(frames)[:, :, list(self.measured)], axis=2)
 
     def least_distances(
-        self: _Frames, frames: FrameChoice = slice(None), scales: Float[Array, " d"] | float = 1.0
+        self, frames: FrameChoice = slice(None), scales: Float[Array, " d"] | float = 1.0
     ) -> Float[Array, " F"] | None:
         """Return the smallest distance between two agents in frames, NaN if one is not finite.
 
@@ -200,7 +166,7 @@ class FrameNumbers(abc.ABC):
         least[finite] = _least(places[finite])
         return least
 
-    def closest_pair(self: _Frames, scales: Float[Array, " d"] | float = 1.0) -> ClosestPair | None:
+    def closest_pair(self, scales: Float[Array, " d"] | float = 1.0) -> ClosestPair | None:
         """Return which agents were closest to each other in the stored frames, and when.
 
         None without a position, a second agent or a frame of finite numbers.
@@ -208,7 +174,7 @@ class FrameNumbers(abc.ABC):
         pairs = self.approaches(scales)
         return pairs[-1] if pairs else None
 
-    def approaches(self: _Frames, scales: Float[Array, " d"] | float = 1.0) -> list[ClosestPair]:
+    def approaches(self, scales: Float[Array, " d"] | float = 1.0) -> list[ClosestPair]:
         """Return the pairs that were closer than any in a frame before, in the order of time."""
         if not self.position or self.states.shape[1] < 2 or not len(self.times):
             return []

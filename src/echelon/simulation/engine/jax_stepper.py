@@ -86,8 +86,8 @@ class JaxStepper(Stepper):
         """Store frames and take steps; a divergence is noticed afterwards."""
         step = advance if self.mesh is None else partial(advance_parted, self.mesh)
         now, frames, sums = step(self.loop, now, counts, reference, now.step)
-        (states, inputs, followed), sums = on_host((frames, sums))
-        return Chunk(now, states, inputs, sums.split(1), followed=followed)
+        (states, inputs), sums = on_host((frames, sums))
+        return Chunk(now, states, inputs, sums.split(1))
 
 
 # ---- many formations -----------------------------------------------------------------------------
@@ -126,9 +126,7 @@ class JaxFormations(Stepper):
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; formations follow each other in what is returned."""
         now, frames, sums = _advance_all(self.loop, self.axes, now, counts, reference)
-        states, inputs = (
-            part.reshape(len(part), -1, part.shape[3]) for part in on_host(frames[:2])
-        )
+        states, inputs = (part.reshape(len(part), -1, part.shape[3]) for part in on_host(frames))
         return Chunk(now, states, inputs, on_host(sums))
 
 

@@ -26,7 +26,6 @@ from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import information_of, leader_warnings, prepare_law, unknown_class
 from echelon.laws.safety import Safety
 from echelon.laws.safety_check import check_numbers, hulls_at, separations, too_near
-from echelon.laws.stopping_point import StoppingLeader
 from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.native import is_installed
 from echelon.simulation.native.agent_step import BlockRows
@@ -146,7 +145,7 @@ class Laws(Drive):
                 f"`{type(self.leader).__name__}` has no plan; use `packet`."
             )
         states, leader = (type(x).signal is Law.signal for x in (self.follower, self.leader))
-        if network.messages is MessageContent.DEVIATION and preview and states is not leader:
+        if deviations and preview and states is not leader:
             raise SimulationError(
                 f"`prediction` of the network is `preview`, and followers under the law "
                 f"`{type(self.follower).__name__}` do not send what the plan of a leader under "
@@ -209,11 +208,6 @@ class Laws(Drive):
                 f"things than a leader under {name}, and could not take over; give both the same "
                 "kind of law, with the same `observer`."
             )
-
-    def check_patience(self) -> None:
-        """Check that the leader follows a path by stopping points."""
-        if not isinstance(self.leader, StoppingLeader) or self.leader.reference is None:
-            super().check_patience()
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of leaders and followers by their laws.

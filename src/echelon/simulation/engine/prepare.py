@@ -95,8 +95,6 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         drive.check_heirs(graph)
         if parts.leadership is not None:
             parts.leadership.check_network(parts.world.network)
-            if parts.leadership.waits is not None:
-                drive.check_patience()
         drive.check_world(parts.world, graph, settings.dt)
         problem = Problem(
             model,

@@ -12,7 +12,7 @@ from echelon.simulation.engine.chunk_grid import ChunkGrid, finite_formations
 from echelon.simulation.step.drive import Chunk, Problem, numbers
 from echelon.simulation.step.meter import ALWAYS, Meter, Sums, on_host, outside
 
-_BY_FRAME = ("times", "states", "inputs", "reference", "late")
+_BY_FRAME = ("times", "states", "inputs", "reference")
 """What a stretch has of each frame."""
 _VERBS = {Outcome.INTERRUPTED: "interrupted", Outcome.STOPPED: "ended from outside"}
 
@@ -31,7 +31,6 @@ class Stretch(NamedTuple):
         moment: the numbers of the moment at its end.
         stopped: why no further step can be taken, in words; None where one can.
         seconds: of computing, since the run began.
-        late: (T,) how late the plan is that leaders follow, s; None where it does not wait.
     """
 
     first: int
@@ -44,7 +43,6 @@ class Stretch(NamedTuple):
     moment: tuple[Array, ...]
     stopped: str | None
     seconds: float
-    late: Array | None = None
 
     @property
     def finite(self) -> bool:
@@ -59,7 +57,7 @@ class Stretch(NamedTuple):
     def record(self, outcome: Outcome, message: str) -> "Record":
         """Return the stretch as the record of a run with this outcome."""
         frames = self.times, self.states, self.inputs, self.reference
-        return Record(*frames, self.sums, outcome, message, self.seconds, self.late)
+        return Record(*frames, self.sums, outcome, message, self.seconds)
 
 
 class Record(NamedTuple):
@@ -74,7 +72,6 @@ class Record(NamedTuple):
         outcome: how it ended.
         message: the same with time and agent.
         seconds: of computing.
-        late: (T,) how late the plan is that leaders follow, s; None where it does not wait.
     """
 
     times: Array
@@ -85,7 +82,6 @@ class Record(NamedTuple):
     outcome: Outcome
     message: str
     seconds: float
-    late: Array | None = None
 
 
 @final
@@ -143,10 +139,7 @@ class Recorder:
         self._finite &= finite.all(axis=0)
         self.frames += int(frames.sum())
         alone = len(self.problems) == 1
-        late, rows = None, None if reference is None else reference[points - first]
-        if chunk.followed is not None:
-            late, rows = chunk.followed
-            late = late[stored]
+        rows = None if reference is None else reference[points[stored] - first]
         if self.stretches:
             # Only the last one's are read, and those of all stretches would fill the memory.
             self.stretches[-1] = self.stretches[-1]._replace(moment=(), sums=self.sums)
@@ -157,12 +150,11 @@ class Recorder:
                 self.problems[0].settings.dt * points[stored],
                 chunk.states[stored],
                 chunk.inputs[stored],
-                None if rows is None else rows[stored],
+                rows,
                 self.sums.of(0) if alone else self.sums,
                 numbers(chunk.now) if alone else (),
                 chunk.stopped,
                 seconds,
-                late,
             )
         )
 

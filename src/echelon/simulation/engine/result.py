@@ -2,8 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping
-from typing import final
+from collections.abc import Callable, Mapping
+from typing import Any, Generic, NamedTuple, TypeVar, final
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,7 +15,6 @@ from echelon.agents.network.switching import Schedule
 from echelon.agents.world.world import World
 from echelon.core.errors import Outcome
 from echelon.core.files import CellPage, notebook_page
-from echelon.core.lazy_field import LazyField
 from echelon.core.types import Array
 from echelon.core.words import amount
 from echelon.simulation.engine.frame_numbers import ClosestPair, FrameChoice, FrameNumbers
@@ -25,6 +24,33 @@ from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats
+
+_T = TypeVar("_T")
+
+
+class Later(NamedTuple, Generic[_T]):
+    """A field that `compute` returns when it is first read."""
+
+    compute: Callable[[], _T]
+
+
+class _Lazy(Generic[_T]):
+    """A field of a dataclass, without a default, that takes its value or a `Later`."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, instance: object | None, owner: type) -> _T:
+        if instance is None:
+            # A dataclass takes what its class holds under the name of a field for its default.
+            raise AttributeError(f"`{self.name}` is a field of the instances.")
+        value: Any = vars(instance)[self.name]
+        if isinstance(value, Later):
+            value = vars(instance)[self.name] = value.compute()
+        return value
+
+    def __set__(self, instance: object, value: "_T | Later[_T]") -> None:
+        vars(instance)[self.name] = value
 
 
 @final
@@ -48,11 +74,10 @@ class Result(FrameNumbers):
         engine: what computed the steps, `jax` or `native`.
         provenance: scenario text, versions and the like, as text.
         files: the files that the scenario text names, by the names that it gives them.
-        late: (T,) how late the plan is that the leaders follow, s; None where it does not wait.
 
     Raises:
         OutputError: when `parts` of a run from disk are first read, its scenario is missing or was
-            changed; when `sums` are, the file is of an earlier format without them.
+            changed; when `sums` are, the file was written from a dataset, without them.
         ScenarioError: when `parts` are first read, its scenario cannot be built.
     """
 
@@ -65,13 +90,12 @@ class Result(FrameNumbers):
     warnings: tuple[str, ...]
     settings: Settings
     wall_time: float
-    sums: LazyField[Sums] = LazyField()
-    parts: LazyField[Parts] = LazyField()
+    sums: _Lazy[Sums] = _Lazy()
+    parts: _Lazy[Parts] = _Lazy()
     work: SolverStats | None = None
     engine: str = "jax"
     provenance: Mapping[str, str] = dataclasses.field(default_factory=dict)
     files: Mapping[str, bytes] = dataclasses.field(default_factory=dict)
-    late: Array | None = None
 
     @property
     def model(self) -> ControlAffine:

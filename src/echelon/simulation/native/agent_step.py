@@ -98,8 +98,6 @@ def check_information(loop: Loop) -> None:
     """
     if loop.moving is not None:
         raise Unsupported("formations that change with time")
-    if loop.patience is not None:
-        raise Unsupported("leaders that wait for stragglers")
     if loop.channel is not None:
         raise Unsupported("a network that is not ideal")
     if loop.sensors is not None:

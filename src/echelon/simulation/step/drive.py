@@ -25,7 +25,6 @@ from echelon.laws.safety import Safety
 from echelon.simulation.step.leadership import Leadership
 from echelon.simulation.step.meter import Meter, Sums
 from echelon.simulation.step.motion import Motion
-from echelon.simulation.step.plan_phase import Followed
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats
 
@@ -74,7 +73,6 @@ class Chunk(NamedTuple):
         sums: over its steps, with an axis F in front; F is 1 for a run alone.
         stopped: why no further step can be taken, in words; None where one can.
         inexact: (F,) the formations whose numbers are not those that JAX would compute.
-        followed: what leaders that wait follow in the stored frames; None of others.
     """
 
     now: Moment
@@ -83,7 +81,6 @@ class Chunk(NamedTuple):
     sums: Sums
     stopped: str | None = None
     inexact: Array | bool = False
-    followed: Followed | None = None
 
 
 def numbers(now: Moment) -> tuple[Array, ...]:
@@ -281,17 +278,6 @@ class Drive(Declared):
                 f"agents are lost or join, or have heirs, but `{type(self).__name__}` optimizes "
                 "inputs of agents that are all there; use control laws."
             )
-
-    def check_patience(self) -> None:
-        """Check that leaders can wait for stragglers.
-
-        Raises:
-            SimulationError: they cannot.
-        """
-        raise SimulationError(
-            "got `waits`, and only leaders under the law `stopping-point` with a `reference` have "
-            "a plan that can wait; remove it, or give the leader that law."
-        )
 
     def accept(self, problem: Problem) -> None:
         """Check the starts of a run under a drive that is prepared.

@@ -141,12 +141,8 @@ def packet_size(channel: Channel, s: int, forward: int, m: int, heirs: bool = Fa
     """
     if channel.messages is MessageContent.STATE:
         return forward
-    more = {
-        Prediction.PREVIEW: 0,
-        Prediction.NONE: forward,
-        Prediction.PACKET: forward + m + heirs * forward,
-    }
-    return s + more[channel.prediction]
+    carried = channel.prediction is Prediction.PACKET
+    return s + carried * (forward + m + heirs * forward)
 
 
 def understand(
@@ -248,8 +244,6 @@ def content_of(
     assert channel is not None
     if channel.messages is MessageContent.STATE:
         return forward
-    if channel.prediction is Prediction.NONE:
-        return jnp.concatenate([signal, forward])
     if channel.prediction is Prediction.PACKET:
         parts = jnp.concatenate([signal, forward, u])
         if loop.succession is None:
@@ -303,11 +297,8 @@ def expected_of(
 ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
     """Return the signal (s,) and the feed-forward of a leader, by its packet of an age (s)."""
     assert loop.channel is not None
-    prediction = loop.channel.prediction
-    if prediction is Prediction.PREVIEW:
+    if loop.channel.prediction is Prediction.PREVIEW:
         return _expected(loop, t, content, age)
-    if prediction is Prediction.NONE:
-        return content[:s], content[s:]
     time, slope = carried_time(age), None
     if loop.succession is not None:
         k = (len(content) - s - len(loop.model.input_names)) // 2

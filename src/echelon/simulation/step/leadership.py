@@ -1,4 +1,4 @@
-"""Who takes the lead when nobody hears of the leader any more, and whether a leader waits.
+"""Who takes the lead when nobody hears of the leader any more.
 
 Each packet of a leader has an epoch. An heir that hears of no leader for long raises the epoch by
 one and leads along the plan, at its own offset; everybody, an old leader too, follows the packet of
@@ -29,47 +29,36 @@ _ROUNDED = 1e-9
 @final
 @dataclasses.dataclass(frozen=True)
 class Leadership:
-    """Who takes the lead when nobody hears of the leader any more, and whether leaders wait.
+    """Who takes the lead when nobody hears of the leader any more.
 
     Args:
         heirs: the numbers of followers, in the order in which they take over.
         timeout: s without news of a leader after which the first of them does, the second after
             twice that, and so on.
-        waits: the distance (m) of a follower from its place at which the leaders' plan stands
-            still until it is nearer; None where it never waits.
 
     Raises:
-        SimulationError: there is no heir and nobody waits, or a number is not positive.
+        SimulationError: there is no heir, or the timeout is not positive and finite.
     """
 
-    heirs: Sequence[int] = ()
+    heirs: Sequence[int]
     timeout: float = 0.3
-    waits: float | None = None
 
     def __post_init__(self) -> None:
         """Check all."""
         object.__setattr__(self, "heirs", tuple(self.heirs))
-        if not self.heirs and self.waits is None:
+        if not self.heirs:
             raise SimulationError("`heirs` is empty, and must name at least one follower.")
-        for name in ("timeout", "waits"):
-            value = getattr(self, name)
-            fine = is_number(value) and 0.0 < float(value) < math.inf
-            if not (fine or (name == "waits" and value is None)):
-                raise SimulationError(f"`{name}` is {value}, and must be positive and finite.")
+        if not (is_number(self.timeout) and 0.0 < float(self.timeout) < math.inf):
+            raise SimulationError(f"`timeout` is {self.timeout}, and must be positive and finite.")
 
     def check_network(self, network: Network | None) -> None:
         """Check that heirs wait longer than messages of a network that is not disturbed take.
 
         Raises:
-            SimulationError: they do not, or leaders wait over a network.
+            SimulationError: they do not.
         """
-        if network is not None and self.waits is not None:
-            raise SimulationError(
-                "got `waits` and a `network`, whose messages do not say how far followers are off "
-                "their places; remove one of them."
-            )
         least = 0.0 if network is None else 2.0 / network.rate + network.delay + network.jitter
-        if self.heirs and self.timeout < least:
+        if self.timeout < least:
             raise SimulationError(
                 f"`timeout` of the leadership is {self.timeout:g} s, and must be at least two "
                 f"periods of the network, its delay and its jitter together, {least:g} s."
@@ -92,7 +81,7 @@ class Succession(NamedTuple):
     @classmethod
     def of(cls, graph: Graph, leadership: Leadership | None) -> "Succession | None":
         """Return the heirs of a run; None without any."""
-        if leadership is None or not leadership.heirs:
+        if leadership is None:
             return None
         rank = np.full(graph.agents, _NO_HEIR, np.int32)
         rank[list(leadership.heirs)] = np.arange(len(leadership.heirs))

@@ -53,8 +53,6 @@ class Loop(eqx.Module):
         sensors: of the agents' own states; None for exact ones.
         share: of the feed-forward that followers use; None for all of it.
         moving: how the offsets change with time; None for constant ones.
-        patience: the distance of a follower from its place at which the leaders' plan stands still,
-            m; None where it never waits.
     """
 
     model: ControlAffine
@@ -77,7 +75,6 @@ class Loop(eqx.Module):
     sensors: Sensors | None = None
     share: Array | None = None
     moving: FormationMotion | None = None
-    patience: Array | None = None
 
     def with_motion(self, row: PyTree) -> "Loop":
         """Return the loop of one agent whose plant has the parameters of a row; None for no row."""
@@ -228,7 +225,6 @@ class WorldState(NamedTuple):
         starts: (N, n) the initial states, where agents are lost and join again.
         led: what each agent last received of its leader, as `Packets`, in the ideal network with
             heirs.
-        plan: where leaders that wait are on their plan, as `PlanPhase`.
     """
 
     in_flight: PyTree = None
@@ -239,7 +235,6 @@ class WorldState(NamedTuple):
     estimates: PyTree = None
     starts: PyTree = None
     led: PyTree = None
-    plan: PyTree = None
 
 
 class Moment(NamedTuple):
@@ -269,7 +264,6 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
     followers = np.array([k for k in graph.followers if k not in graph.heirs], int)
     by_depth = follower.feedforward is Feedforward.PARENT
     nearest = np.array(graph.nearest_leader())
-    waits = None if problem.leadership is None else problem.leadership.waits
     return Loop(
         model=problem.model,
         motion=problem.motion,
@@ -292,7 +286,6 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         channel=problem.channel,
         sensors=problem.sensors,
         moving=problem.formation.motion,
-        patience=None if waits is None else np.asarray(float(waits)),
     )
 
 

@@ -175,15 +175,13 @@ class Meter(eqx.Module):
         measured = measured_states(model)
         i, j = graph.edges.T
         goals = formation.offsets[:, list(measured)]
-        with np.errstate(over="ignore"):
-            spacings = np.linalg.norm(goals[i] - goals[j], axis=1)
         return cls(
             model=model,
             offsets=np.asarray(formation.offsets),
             nearest=np.array(graph.nearest_leader()),
             leaders=np.array(graph.leaders),
             edges=graph.edges,
-            spacings=spacings,
+            spacings=np.linalg.norm(goals[i] - goals[j], axis=1),
             # An array and not a constant: another window compiles nothing again.
             first_steady=np.asarray(settings.first_steady, np.int32),
             charted=np.array([model.state_names.index(name) for name in model.chart], int),

@@ -41,8 +41,6 @@ from echelon.simulation.step.messages import (
 from echelon.simulation.step.meter import Sums, reference_at
 from echelon.simulation.step.motion import MotionState
 from echelon.simulation.step.nearby import begin_sightings, look_around
-from echelon.simulation.step.patience import followed_at, next_plan, plan_time
-from echelon.simulation.step.plan_phase import Followed, PlanPhase
 
 
 @cached_jit
@@ -80,8 +78,6 @@ def begin(loop: Loop, states: States) -> Moment:
         world = world._replace(led=no_packets(first_readers(loop), content, True))
     if loop.presence is not None and loop.presence.returns:
         world = world._replace(starts=moment.states)
-    if loop.patience is not None:
-        world = world._replace(plan=PlanPhase.begin(moment.states.dtype))
     return moment._replace(world=world)
 
 
@@ -142,7 +138,6 @@ def control(loop: Loop, now: Moment) -> Control:
         rows = sent, difference, said.message, said.input
         world = send_messages(loop, exchange, now, mail, knowledge, *rows)
         world = world._replace(seen=seen)
-    world = world._replace(plan=next_plan(loop, now))
     u = jnp.concatenate([led.input, followed.input])[loop.order]
     u = u if here is None else jnp.where(here[:, None], u, 0.0)
     if loop.sensors is not None and loop.sensors.estimator is not None:
@@ -185,7 +180,6 @@ def _act_all(
     """Return what some agents do, with what they are sent (K, k), remember and know of others."""
     x, t = now.states, time_of(loop, now)
     offsets, rates = offsets_at(loop, law, t, agents)
-    t, pace = plan_time(now, t) if leads else (t, None)
 
     # One time for all; of everything else, an agent sees its own row and no other.
     def one(
@@ -198,7 +192,7 @@ def _act_all(
         near: Near | None,
         rate: State | None,
     ) -> Action:
-        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near, rate, pace)
+        view = LocalView(t, x, offset, z, forward, loop.motion.dt, near, rate)
         return act(loop.with_motion(row), law, view, memory, leads)
 
     rows, near = jax.tree.map(lambda leaf: leaf[agents], (loop.motion.rows, near))
@@ -338,8 +332,6 @@ def measured_step(
     now = _with_arrivals(loop, now)
     acted = control(loop, now)
     followed = reference_at(reference, now.step - first, now.states)
-    if followed is not None and now.world.plan is not None:
-        followed = followed_at(loop, now).reference
     chatter = (acted.cut * now.cut < 0).any(axis=1)
     moment, here = (now.step, now.states, acted.inputs), present_at(loop, now.step)
     meter = loop.meter if here is None else loop.meter.following(nearest_at(loop, now.step))
@@ -357,8 +349,8 @@ def measured_step(
     return _move(loop, now, acted), read
 
 
-Frames: TypeAlias = tuple[Float[jax.Array, "T N n"], Float[jax.Array, "T N m"], Followed | None]
-"""States and inputs at T times, and what leaders follow that wait."""
+Frames: TypeAlias = tuple[Float[jax.Array, "T N n"], Float[jax.Array, "T N m"]]
+"""States and inputs at T times."""
 
 
 @cached_jit
@@ -377,11 +369,10 @@ def advance(
 
     def frame(
         carry: tuple[Moment, Sums], count: jax.Array
-    ) -> tuple[tuple[Moment, Sums], tuple[States, Inputs, Followed | None]]:
+    ) -> tuple[tuple[Moment, Sums], tuple[States, Inputs]]:
         # The first step computes these inputs again, but after the last frame there is none.
         now = _with_arrivals(loop, carry[0])
-        followed = None if now.world.plan is None else followed_at(loop, now)
-        stored = (now.states, control(loop, now).inputs, followed)
+        stored = (now.states, control(loop, now).inputs)
         return jax.lax.fori_loop(0, count, one, carry), stored
 
     (now, sums), stored = jax.lax.scan(frame, (now, loop.meter.zero_sums()), counts)

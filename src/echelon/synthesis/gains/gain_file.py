@@ -17,7 +17,7 @@ from echelon.core.types import Array, JsonObject, PathLike
 from echelon.core.words import Kind, Theorem
 from echelon.synthesis.certificates.certificate import Certificate, RegionCertificate
 from echelon.synthesis.certificates.domain import Domain
-from echelon.synthesis.gains.gain import Gain, check_strength
+from echelon.synthesis.gains.gain import Gain
 
 FORMAT = "echelon gain 2"
 _SAME = 1e-9
@@ -185,7 +185,6 @@ def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
     # An edited file fails here with one of these errors.
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
         raise GainError(f"`{path}` is no gain file of echelon: {error}.") from error
-    check_strength(gain.coupling * graph.spectrum().high, linearize(model), gain.P, gain.R)
     return gain
 
 

@@ -38,12 +38,25 @@ function showHeader(run, part, title) {
   part.querySelector(".notes").replaceChildren(...prose(run.notes.join(" ")));
   if (run.promise) showGuarantee(run.promise, title);
   else title.querySelector(".promise").hidden = true;
+  const report = title.querySelector(".report");
+  report.hidden = !run.report;
+  report.addEventListener("click", () => showDialog({ class: "whole-report", "aria-label": "report" }, make("pre", { tabindex: 0 }, run.report)));
   const key = part.querySelector(".key"), add = (look, words) => key.append(make("span", {}, look, words));
   if (run.thrust) add(make("i"), ""), key.lastChild.append("motor thrust 0", make("i", { class: "thrust" }), "limit");
   if (run.agents > run.leaders.length || run.referenced) add(make("i", { class: "ring" }), run.referenced ? "goal, and reference of a leader" : "goal");
   if (run.heard.some((who) => who === 1 || who === 2)) add(make("i", { class: run.agents > 200 ? "taper" : "arrow" }), "from sender to receiver");
   if (run.ellipsoid?.kept) add(make("i", { class: "ellipsoid" }), "ellipsoid: amber below the kept distance, red where two overlap");
   key.append(make("span", {}, run.drawn));
+}
+
+// Opens a dialog with a button that closes it.
+function showDialog(attributes, content) {
+  const dialog = make("dialog", attributes, content), close = make("button", { "aria-label": "close" }, "close");
+  close.addEventListener("click", () => dialog.close());
+  dialog.addEventListener("close", () => dialog.remove());
+  dialog.append(close);
+  document.body.append(dialog);
+  dialog.showModal();
 }
 
 // Shows which agents were closest to each other so far, beside the size of the vehicles.

@@ -11,23 +11,19 @@ const GESTURES = [
 // Each key has its name, what it does in words, and the action, which is called with the state of shift.
 function listenKeys(keys) {
   const named = { " ": "space", ArrowLeft: "\u2190", ArrowRight: "\u2192", Escape: "esc" };
-  const dialog = make("dialog", { id: "help", "aria-label": "keys" }), table = make("table");
+  const table = make("table"), opened = () => document.querySelector("dialog[open]");
   const row = (name, words) => table.append(make("tr", {}, make("th", {}, name), make("td", {}, words)));
   for (const [key, [words]] of Object.entries(keys)) row(named[key] ?? key, words);
   row("?", "this list");
   for (const [name, words] of GESTURES) row(name, words);
-  const close = make("button", { "aria-label": "close" }, "close");
-  close.addEventListener("click", () => dialog.close());
-  dialog.append(table, close);
-  document.body.append(dialog);
-  const help = () => (dialog.open ? dialog.close() : dialog.showModal());
+  const help = () => (opened() ? opened().close() : showDialog({ id: "help", "aria-label": "keys" }, table));
   $("#keys").addEventListener("click", help);
   addEventListener("keydown", (event) => {
     if (event.target.matches("select, input:not([type=range])") || event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.key === "?") return void help();
     const action = keys[event.key];
     // A slider and a button have keys of their own; the button of a closed list may still have the focus.
-    if (!action || dialog.open || (event.target.matches("input, body button:not(dialog *)") && !/^[a-z]$|Escape/.test(event.key))) return;
+    if (!action || opened() || (event.target.matches("input, body button:not(dialog *)") && !/^[a-z]$|Escape/.test(event.key))) return;
     event.preventDefault();
     action[1](event.shiftKey);
   });

@@ -1,4 +1,4 @@
-"""The folder of a sweep: batches while it is computed, then the dataset and figures."""
+"""The folders of sweeps and comparisons: runs as they are computed, then datasets and figures."""
 
 import json
 import shutil
@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING, final
 from echelon.core.errors import OutputError
 from echelon.core.files import INPUTS, make_atomic, write_atomic
 from echelon.core.types import JsonObject
-from echelon.experiments.results.labelled import labelled
+from echelon.experiments.results.dataset import save_dataset
 from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
-from echelon.experiments.sweeps.axes import read_axes
-from echelon.experiments.sweeps.frames import write_frames
-from echelon.experiments.sweeps.plan import Sweep
-from echelon.experiments.sweeps.sweep_dataset import axis_values
-from echelon.experiments.sweeps.workers import SweepBatch
+from echelon.experiments.studies.compare import Comparison, ComparisonRow
+from echelon.experiments.sweeps.plan import Sweep, read_axes
+from echelon.experiments.sweeps.sweep_dataset import SweepBatch, axis_values, write_frames
 from echelon.output.archive.chunks import Chunks
-from echelon.output.archive.folder import BATCHES, FRAMES, write_errors
+from echelon.output.archive.folder import BATCHES, FRAMES, RUNS, write_errors
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -66,10 +64,8 @@ class Batches:
             OutputError: there is none, or its inputs or versions changed.
         """
         self.chunks.check()
-        over = json.loads((self.folder / INPUTS / _OVER).read_text("utf-8"))
+        begun = json.loads((self.folder / INPUTS / _OVER).read_text("utf-8"))
         scenario = load_scenario(self.folder / SCENARIO_FILE)
-        # A list of axes, where an earlier version began it.
-        begun = {"over": over, "keep_states": None} if isinstance(over, list) else over
         return Sweep(scenario, read_axes(begun["over"]), begun["keep_states"])
 
     def write(self, batch: SweepBatch) -> None:
@@ -122,10 +118,65 @@ def write_sweep(data: "xr.Dataset", text: str, folder: Path, figures: bool = Tru
     """
     with write_errors(folder):
         # In memory first: on a full disk the HDF5 library would end the whole process.
-        write_atomic(folder / "sweep.nc", labelled(data).netcdf())
+        write_atomic(folder / "sweep.nc", bytes(data.to_netcdf(None, engine="h5netcdf")))
         write_atomic(folder / "sweep.txt", text + "\n")
         if figures:
             # Here, since matplotlib takes long to load and only figures need it.
             from echelon.output.plots.study_figures import save_sweep_figures
 
             save_sweep_figures(data, folder)
+
+
+@final
+class Flights:
+    """The datasets of a comparison, each written as soon as its run is complete.
+
+    Args:
+        folder: of the comparison.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Begin without an error."""
+        self.folder = folder
+        self.error: OSError | None = None
+
+    def write(self, row: ComparisonRow) -> None:
+        """Write the run of a method; the comparison continues if that fails."""
+        # A method that was refused or failed to start has a row without a run.
+        if row.flight is None:
+            return
+        try:
+            (self.folder / RUNS).mkdir(parents=True, exist_ok=True)
+            save_dataset(row.flight.result, self.folder / RUNS / f"{row.label}.nc")
+        except OSError as error:
+            # The first, since later errors mostly have the same cause.
+            self.error = self.error or error
+
+    def check(self) -> None:
+        """Check that all datasets were written.
+
+        Raises:
+            OutputError: one was not.
+        """
+        with write_errors(self.folder):
+            if self.error is not None:
+                raise self.error
+
+
+def write_comparison(
+    comparison: Comparison, summary: JsonObject, text: str, folder: Path, figures: bool = True
+) -> None:
+    """Write the numbers of a comparison, its text and the figures.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    with write_errors(folder):
+        content = json.dumps(summary, indent=2, allow_nan=False)
+        write_atomic(folder / "comparison.json", content + "\n")
+        write_atomic(folder / "comparison.txt", text + "\n")
+        if figures:
+            # Here, since matplotlib takes long to load and only figures need it.
+            from echelon.output.plots.study_figures import save_comparison_figures
+
+            save_comparison_figures(comparison, folder)
