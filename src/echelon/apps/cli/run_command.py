@@ -367,17 +367,15 @@ def _new_sweep(
 ) -> "tuple[Sweep, Batches, Job]":
     """Return a sweep and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
-    from echelon.experiments.sweeps.plan import read_axes
 
-    axes = read_axes(over)
     scenario = load_scenario(name, changes)
     STATUS.begin(f"preparing {scenario.name}", not quiet)
-    from echelon.experiments.sweeps.plan import Sweep
+    from echelon.experiments.sweeps.plan import Sweep, read_axes
     from echelon.output.archive.folder import BATCHES, claim_folder
     from echelon.output.archive.study_folder import Batches
     from echelon.simulation.engine.prepare import prepare
 
-    plan = Sweep(scenario, axes, keep_states)
+    plan = Sweep(scenario, read_axes(over), keep_states)
     batches = Batches(claim_folder(f"sweep-{scenario.name}", out, force, BATCHES))
     job = Job("sweep", batches.chunks)
     with job.cleanup():
