@@ -111,7 +111,8 @@ def _lyapunov(result: Result) -> Lyapunov | None:
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
         x, u = result.states, result.inputs
         steps = np.rint(result.times / result.settings.dt).astype(np.int32)
-        fields = _fields(result.drive, result.model, _motion(result), graph.leaders[0], x, u, steps)
+        motion = Motion.of(result.model, result.world, result.settings, graph.agents)
+        fields = _fields(result.drive, result.model, motion, graph.leaders[0], x, u, steps)
         now, after = (
             _in_metric_axes(result.model, field, np.asarray(field.states) - offsets)
             for field in fields
@@ -166,10 +167,6 @@ def _rounding(result: Result, P: Array, value: Array) -> float:
     ulp = _ULPS * size
     states = 0.5 * float(result.graph.weights.sum()) * float(ulp @ np.abs(P) @ ulp)
     return max(_ROUNDING * float(value.max(initial=0.0)), states)
-
-
-def _motion(result: Result) -> Motion:
-    return Motion.of(result.model, result.world, result.settings, result.graph.agents)
 
 
 class _Fields(NamedTuple):

@@ -74,19 +74,27 @@ OBSERVED += ("event_outcomes", "steady_window_s", "warnings", "engine", "wall_ti
 
 def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
     """Return the run's summary as JSON data; numbers that do not exist are None."""
+
+    def distance_error(edge: EdgeMetrics) -> float:
+        return np.inf if edge.distance_rmse is None else edge.distance_rmse
+
     numbers = metrics(result) if numbers is None else numbers
     name = result.provenance.get("scenario", "")
     guarantee = promise(result.parts, result.settings)
+    keys = {name: quantity.key or name for name, quantity in AGENT_NUMBERS.items()}
     outcomes = [outcome.as_mapping() for outcome in event_outcomes(result)]
     return {
         **statement(result.parts, result.settings, name),
         "outcome": {"name": result.outcome.name.lower(), "message": result.message},
         "leader": numbers.leader._asdict(),
         "leaders": [leader._asdict() for leader in numbers.leaders],
-        "followers": [_follower(row._asdict()) for row in _listed(numbers.followers, steady_error)],
+        "followers": [
+            {keys.get(name, name): value for name, value in row._asdict().items()}
+            for row in _listed(numbers.followers, steady_error)
+        ],
         "edges": [
             {"edge": list(row.edge), "distance_rmse": row.distance_rmse}
-            for row in _listed(numbers.edges, _distance_error)
+            for row in _listed(numbers.edges, distance_error)
         ],
         **RunNumbers(result, numbers, guarantee).json(Shown.SUMMARY),
         **({"event_outcomes": outcomes} if result.parts.events else {}),
@@ -103,12 +111,3 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
 def _listed(rows: Sequence[_Row], error: Callable[[_Row], float]) -> Sequence[_Row]:
     """Return all rows; if they are too many for JSON tools, the best, the median and the worst."""
     return rows if len(rows) <= _LISTED else representatives(rows, error)
-
-
-def _distance_error(edge: EdgeMetrics) -> float:
-    return np.inf if edge.distance_rmse is None else edge.distance_rmse
-
-
-def _follower(entry: JsonObject) -> JsonObject:
-    keys = {name: quantity.key or name for name, quantity in AGENT_NUMBERS.items()}
-    return {keys.get(name, name): value for name, value in entry.items()}

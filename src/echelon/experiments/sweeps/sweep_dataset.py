@@ -68,9 +68,10 @@ def numbers_of(result: Result, promise: Promise) -> JsonObject:
     agents = {name: np.full(result.graph.agents, np.nan) for name in AGENT_COLUMNS}
     for name, values in agents.items():
         values[list(result.graph.followers)] = run.followers(name)
+    numbers = ((name, run.number(name)) for name in RUN_COLUMNS)
     return {
         **agents,
-        **{name: _number(run.number(name)) for name in RUN_COLUMNS},
+        **{name: np.nan if number is None else float(number) for name, number in numbers},
         "saturated": result.saturated,
         "outcome": OUTCOMES[result.outcome],
         "message": "" if result.outcome is Outcome.COMPLETED else result.message,
@@ -88,10 +89,6 @@ def numbers_of(result: Result, promise: Promise) -> JsonObject:
 def refused(why: str) -> JsonObject:
     """Return the columns of a run whose parts cannot be built."""
     return {"outcome": REFUSED, "message": why}
-
-
-def _number(value: float | None) -> float:
-    return np.nan if value is None else float(value)
 
 
 def columns_of(rows: Sequence[JsonObject]) -> dict[str, Array]:
@@ -159,14 +156,13 @@ def dataset_of(plan: Sweep, batches: Sequence[SweepBatch]) -> "xr.Dataset":
 
 
 def axis_values(plan: Sweep) -> Variables:
-    """Return the values of each key."""
-    return {axis.key: (axis.key, _values(axis), _key_attributes(axis.key)) for axis in plan.axes}
-
-
-def _key_attributes(key: str) -> JsonObject:
-    """Return what a key is, in words, with its unit."""
-    words, unit = key_label(key)
-    return {"long_name": words} | ({"units": unit} if unit else {})
+    """Return the values of each key, and what it is, in words, with its unit."""
+    values: Variables = {}
+    for axis in plan.axes:
+        words, unit = key_label(axis.key)
+        attributes = {"long_name": words} | ({"units": unit} if unit else {})
+        values[axis.key] = (axis.key, _values(axis), attributes)
+    return values
 
 
 def _all_frames(plan: Sweep, shape: FrameShape, batches: Sequence[SweepBatch]) -> Labelled:

@@ -121,10 +121,6 @@ def content_of(kind: str, what: str = "`--to` is") -> "Callable[[Result], bytes]
     return content
 
 
-def _csv(run: "Result") -> bytes:
-    return table(run).to_csv(index=False).encode()
-
-
 def _parquet(run: "Result") -> bytes:
     content = io.BytesIO()
     try:
@@ -201,7 +197,7 @@ def _page(run: "Result") -> bytes:
 
 
 _WRITERS: "dict[str, Callable[[Result], bytes]]" = {
-    "csv": _csv,
+    "csv": lambda run: table(run).to_csv(index=False).encode(),
     "parquet": _parquet,
     "npz": _npz,
     "mat": _mat,

@@ -221,7 +221,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         EchelonError: the parts do not fit each other.
     """
     network = _network(parts)
-    agents = parts.graph.agents
+    agents, rule = parts.graph.agents, parts.leadership
     files, sentence = dict[str, str](), guaranteed(parts, settings)
     for k in range(agents):
         law = python_law(parts.replace(leadership=None), settings, k, formation, sentence)
@@ -235,7 +235,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         "horizon": settings.horizon,
         "sizes": [len(facts["signal"]), facts["network"]["content"]],
         "leader": min(parts.graph.leaders),
-        "leadership": _leadership(parts),
+        "leadership": rule and {"heirs": list(rule.heirs), "timeout": rule.timeout},
         "weather": {"delay": network.delay, "jitter": network.jitter, "loss": network.loss},
         **_places(parts.model),
         "fence": _fence(parts, settings),
@@ -243,12 +243,6 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         "vehicles": vehicles[0],
     }
     return {**files, **vehicles[1], "flight.json": json.dumps(described, indent=2) + "\n"}
-
-
-def _leadership(parts: Parts) -> JsonObject | None:
-    """Return who takes the lead after the leader; None for nobody."""
-    rule = parts.leadership
-    return None if rule is None else {"heirs": list(rule.heirs), "timeout": rule.timeout}
 
 
 def _network(parts: Parts) -> Network:

@@ -28,7 +28,9 @@ def result_page(result: Result) -> str:
     """
     head = f"<b>{html.escape(_name(result))}</b>: {html.escape(result.message)}"
     numbers = "" if result in STORED else f"{_observed(result)}{_table(result)}"
-    return f"<p>{head}</p>{numbers}{_pictures(result)}"
+    drawings = figures(_recorded(result), _PICTURES) if len(result.times) else {}
+    images = "".join(html_image(figure, name, 80) for name, figure in drawings.items())
+    return f"<p>{head}</p>{numbers}{images}"
 
 
 def _name(result: Result) -> str:
@@ -106,8 +108,3 @@ def _recorded(result: Result) -> Recording:
         inputs=result.inputs,
         reference=result.reference,
     )
-
-
-def _pictures(result: Result) -> str:
-    drawings = figures(_recorded(result), _PICTURES) if len(result.times) else {}
-    return "".join(html_image(figure, name, 80) for name, figure in drawings.items())

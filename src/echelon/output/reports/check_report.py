@@ -72,7 +72,7 @@ def _text(check: CheckResult, detail: _Detail) -> Iterator[str]:
 def _group(lines: list[Statement], width: int, detail: _Detail, brief: bool) -> Iterator[str]:
     """Yield the rows of a group, and the names of its other lines."""
     rows = detail is _Detail.ROWS
-    shown = [x for x in lines if x.fails or (rows and _holds(x) and x.number_text)]
+    shown = [x for x in lines if x.fails or (rows and x.verdict is Verdict.HOLDS and x.number_text)]
     for line in shown:
         yield from _row(line, width, detail is _Detail.COUNTS, brief)
     for verdict in (Verdict.HOLDS, Verdict.NOT_NEEDED, Verdict.VACUOUS):
@@ -88,10 +88,6 @@ def _listed(lines: list[Statement], detail: _Detail) -> Iterator[str]:
     names = [f"{x.name} ({x.number_text})" if numbers and x.number_text else x.name for x in lines]
     text = amount(len(lines), "line") if detail is _Detail.COUNTS else "; ".join(names)
     yield from _wrapped(f"{verdict}: {text}", " ", "   ")
-
-
-def _holds(line: Statement) -> bool:
-    return line.verdict is Verdict.HOLDS
 
 
 def _row(line: Statement, width: int, short: bool, brief: bool) -> Iterator[str]:

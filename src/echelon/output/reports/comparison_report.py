@@ -70,7 +70,8 @@ def _is_papers(comparison: Comparison) -> bool:
 
 def _errors_table(comparison: Comparison, printed: bool) -> "Table":
     """Return the errors, one row per method: the paper's Table II and the steady errors."""
-    followers = _followers(comparison)
+    graphs = [row.flight.result.graph for row in comparison.rows if row.flight is not None]
+    followers = graphs[0].followers if graphs and len(graphs[0].followers) <= _NAMED else ()
     whole, last = f"{comparison.horizon:.3g} s", f"last {comparison.steady_window:.3g} s"
     heads = ["leader", *(f"F{k}" for k in followers)] if followers else ["leader", "worst F"]
     title = f"{comparison.scenario}, {whole}: RMSE" + "".join(
@@ -97,11 +98,6 @@ def _unit(rows: Sequence[ComparisonRow]) -> str:
     return next(units, "")
 
 
-def _followers(comparison: Comparison) -> Sequence[int]:
-    graphs = [row.flight.result.graph for row in comparison.rows if row.flight is not None]
-    return graphs[0].followers if graphs and len(graphs[0].followers) <= _NAMED else ()
-
-
 def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
     """Yield the cells of one method: whole-run errors, steady errors, settling time."""
     if row.flight is None:
@@ -118,10 +114,12 @@ def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
 def _costs_table(comparison: Comparison) -> "Table":
     """Return the costs, one row per method: effort, computing, information."""
     runs = [row.flight for row in comparison.rows if row.flight is not None]
+    # In the ideal network no run has ages of messages.
     costs = {
         name: quantity.column
         for name, quantity in shown_in(RUN_NUMBERS, Shown.COMPARISON).items()
-        if quantity.column and (quantity.absent != "-" or _in_some(runs, name))
+        if quantity.column
+        and (quantity.absent != "-" or any(run.number(name) is not None for run in runs))
     }
     heads = [*costs.values(), RUN_NUMBERS["promise_rate"].column, "information"]
     table = _table("costs", heads)
@@ -138,11 +136,6 @@ def _costs_table(comparison: Comparison) -> "Table":
             ", ".join(row.flight.result.parts.information.follower) or "none",
         )
     return table
-
-
-def _in_some(runs: Sequence[RunNumbers], name: str) -> bool:
-    """Tell whether a run has a number, as none in the ideal network has ages of messages."""
-    return any(run.number(name) is not None for run in runs)
 
 
 def _cell(run: RunNumbers, name: str) -> str:
