@@ -184,6 +184,9 @@ def test_the_report_has_numbers_conditions_scenario_versions_and_how_to_cite(ech
     assert max(map(len, text.splitlines())) <= 100
     told = echelon("report", "first", "--out", "whole.txt")[1]
     assert told.startswith("- Written to whole.txt: ") and (here / "whole.txt").read_text() == text
+    pages = ("export", "first", "--out", "a.html"), ("view", "first", "--html", "b.html")
+    assert [echelon(*words)[0] for words in pages] == [0, 0]
+    assert (here / "a.html").read_bytes() == (here / "b.html").read_bytes()
     code, _, fault = echelon("report", "first", "--out", "whole.txt")
     assert code == 2 and "the file `whole.txt` exists; choose another" in fault
 

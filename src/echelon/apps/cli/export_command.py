@@ -67,9 +67,9 @@ def _write_run(run: Path, to: str | None, out: Path | None, force: bool) -> None
         raise OutputError(f"`--to` is `{to}`, and `{file}` ends in `.{ending}`; leave out `--to`.")
     claim_file(file, force)
     STATUS.begin(f"reading {run}")
-    from echelon.output.archive.run_folder import load
+    from echelon.output.archive.run_folder import load, report_beside
 
-    write_file(file, content(load(run)))
+    write_file(file, content(load(run), report_beside(run)))
 
 
 def _write_law(scenario: str, agent: int, changes: list[str], folder: Path) -> None:

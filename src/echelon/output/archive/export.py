@@ -101,10 +101,10 @@ def export(run: "Result", path: "PathLike", force: bool = False) -> Path:
     return file
 
 
-def content_of(kind: str, what: str = "`--to` is") -> "Callable[[Result], bytes]":
+def content_of(kind: str, what: str = "`--to` is") -> "Callable[..., bytes]":
     """Return the writer of a format; `what` begins the message if there is none.
 
-    The writer refuses a run without a stored frame.
+    The writer takes a run, which it refuses without a stored frame, and the report beside it.
 
     Raises:
         OutputError: there is no such format.
@@ -113,10 +113,10 @@ def content_of(kind: str, what: str = "`--to` is") -> "Callable[[Result], bytes]
         raise OutputError(f"the format `{kind}`{ended}")
     check_name(what, kind, _WRITERS, OutputError)
 
-    def content(run: "Result") -> bytes:
+    def content(run: "Result", numbers: str = "") -> bytes:
         if not len(run.times):
             raise OutputError("the run has no stored frame; an export needs at least one.")
-        return _WRITERS[kind](run)
+        return _page(run, numbers) if kind == "html" else _WRITERS[kind](run)
 
     return content
 
@@ -182,7 +182,7 @@ def _netcdf(run: "Result") -> bytes:
     return run_file(run)
 
 
-def _page(run: "Result") -> bytes:
+def _page(run: "Result", numbers: str = "") -> bytes:
     from echelon.experiments.results.dataset import STORED
     from echelon.experiments.results.recording import recording_of
     from echelon.output.reports.run_report import report, whole_report
@@ -192,7 +192,7 @@ def _page(run: "Result") -> bytes:
     check_page()
     data = recording_of(run)
     # The parts of a run from disk are not built, which executes code, only to show it.
-    text = whole_report(data, "" if run in STORED else report(run))
+    text = whole_report(data, numbers if run in STORED else report(run))
     return replay_page(data, reports=[text]).encode()
 
 
