@@ -351,6 +351,25 @@ def test_heavy_edges_beside_light_ones_take_nothing_from_the_bound(weights):
     assert graph.spectrum().low == pytest.approx(proved, rel=2e-9)
 
 
+def test_weights_that_sums_round_away_have_a_bound_or_are_refused():
+    rng = np.random.default_rng(5)
+    proved = 0
+    for _ in range(40):
+        agents = int(rng.integers(3, 12))
+        edges = {tuple(sorted((int(rng.integers(0, i)), i))) for i in range(1, agents)}
+        edges |= {tuple(sorted(map(int, rng.choice(agents, 2, False)))) for _ in range(agents)}
+        weights = 10.0 ** rng.uniform(-18.0, 18.0, len(edges))
+        graph = Graph([(*edge, w) for edge, w in zip(edges, weights, strict=True)])
+        try:
+            bound = graph.spectrum().proved
+        except errors.GraphError as error:
+            assert "too far apart" in str(error)
+            continue
+        proved += 1
+        assert exceeds(graph, bound * (1 - 1e-15))
+    assert proved > 20
+
+
 def test_the_bound_of_a_long_line_is_that_of_its_closed_form():
     n = 460
     exact = 2.0 - 2.0 * np.cos(np.pi / (2 * (n - 1) + 1))

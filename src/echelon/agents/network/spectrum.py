@@ -1,5 +1,6 @@
 """The spectrum of a network: the eigenvalues that gains and proofs need, with a proved bound."""
 
+import contextlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -380,10 +381,14 @@ def _spread(L: sp.csr_array, vector: Array) -> Array:
     np.maximum.at(size, piece, np.abs(vector))
     if (size > _LEFT_OUT).all():
         return vector
-    inverse, other = factor_inverse(L), np.ones(len(vector))
-    for _ in range(_ITERATIONS):
-        other = inverse.matvec(other)
-        largest = np.zeros_like(size)
-        np.maximum.at(largest, piece, other)
-        other = other / largest[piece]
+    other = np.ones(len(vector))
+    # Where weights are far apart, sums round the lightest away: the matrix is singular or nearly so.
+    with contextlib.suppress(RuntimeError), np.errstate(all="ignore"):
+        inverse = factor_inverse(L)
+        for _ in range(_ITERATIONS):
+            other = inverse.matvec(other)
+            largest = np.zeros_like(size)
+            np.maximum.at(largest, piece, other)
+            other = other / largest[piece]
+    other = np.where(np.isfinite(other) & (other > 0.0), other, 1.0)
     return np.where(size[piece] > _LEFT_OUT, vector, other)
