@@ -382,7 +382,7 @@ def _spread(L: sp.csr_array, vector: Array) -> Array:
     if (size > _LEFT_OUT).all():
         return vector
     other = np.ones(len(vector))
-    # Where weights are far apart, sums round the lightest away: the matrix is singular or nearly so.
+    # Sums round the lightest of weights far apart away, and the matrix is nearly singular.
     with contextlib.suppress(RuntimeError), np.errstate(all="ignore"):
         inverse = factor_inverse(L)
         for _ in range(_ITERATIONS):
