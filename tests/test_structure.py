@@ -263,7 +263,8 @@ def test_functions_are_short():
     sizes = sorted(size for _, size in functions())
     assert not [name for name, size in functions() if size > 56]
     assert statistics.median(sizes) <= 6
-    assert sizes[int(len(sizes) * 0.95)] <= 25
+    # A number, since a share would grow with every one-line helper that is inlined.
+    assert sum(size > 22 for size in sizes) <= 239
 
 
 def test_every_class_is_abstract_or_final():
