@@ -386,7 +386,7 @@ def test_every_advice_to_install_names_this_distribution():
     # Whoever reads how to install sees every extra.
     start = (ROOT / "docs" / "start.md").read_text("utf-8")
     assert all(f"`{extra}`" in start for extra in {*declared} - {"dev"})
-    everything = f"{project()['name']}[certify,cluster,fast,optimal,video]"
+    everything = f"{project()['name']}[certify,cluster,fast,optimal]"
     assert everything in project()["optional-dependencies"]["all"]
 
 
