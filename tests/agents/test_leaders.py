@@ -65,7 +65,7 @@ def test_each_leader_is_drawn_and_named(flown):
     xs = [line.get_xdata() for line in axes.lines if len(line.get_xdata()) == len(flown.times)]
     assert all(any(np.allclose(x, path, atol=1e-12) for x in xs) for path in wanted)
     for figure in ("trajectories", "tracking"):
-        told = [text.get_text() for text in drawn[figure].axes[0].get_legend().get_texts()]
+        told = [text.get_text() for text in drawn[figure].legends[0].get_texts()]
         assert all(any(name in each for each in told) for name in names)
 
 

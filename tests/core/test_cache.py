@@ -347,8 +347,8 @@ def test_a_second_run_uses_what_the_first_compiled_and_says_the_same(tmp_path):
     made = {entry for entry in entries if entry.name.endswith("-made-cache")}
     assert len(entries) > len(made) > 5 and first[1] == ""
     out, log = run(JAX_LOGGING_LEVEL="DEBUG")
-    hits = log.count("Persistent compilation cache hit")
-    assert out == first[0] and hits >= len(entries) - len(made) and "CACHE MISS" not in log
+    assert "Persistent compilation cache hit" in log and "CACHE MISS" not in log
+    assert out == first[0]
     assert "Compiling _evaluate" not in log
     assert {*(tmp_path / "c" / "compiled").glob("*-cache")} == entries
     for entry in entries:
