@@ -101,14 +101,11 @@ def test_a_law_a_reference_and_a_leader_of_ones_own_run(folder):
     assert run.inputs[0, 2] == pytest.approx([0.0, 0.2])
 
 
-def test_a_method_of_ones_own_makes_the_gain(folder):
+def test_a_method_of_ones_own_makes_the_gain_and_a_reference_leads_the_law_that_tracks(folder):
     follower = {"gain": {"python": "mine.py:Heavy", "weight": 3.0, "coupling": 0.5}}
     gain = ech.build(own(folder, follower=follower)).parts.drive.gain
     assert np.array_equal(gain.P, 3.0 * np.eye(2)) and gain.coupling == 0.5
     assert gain.method == "heavy"
-
-
-def test_a_reference_of_ones_own_leads_the_law_that_tracks(folder):
     run = ech.run(own(folder, leader=None, follower=None))
     assert run.states[-1, 0] == pytest.approx([0.5, 0.25])
 
@@ -166,28 +163,23 @@ SENTENCES = {
 }
 
 
-@pytest.mark.parametrize("name", SENTENCES)
-def test_each_fault_of_ones_own_code_has_its_sentence(folder, name):
-    sections, field, sentence = SENTENCES[name]
-    with pytest.raises(ech.EchelonError) as caught:
-        ech.build(own(folder, **sections))
-    said = sentence.replace("{folder}", str(folder))
-    assert str(caught.value) == f"mapping: {field}: {said}"
+def test_each_fault_of_ones_own_code_has_its_sentence(folder):
+    for sections, field, sentence in SENTENCES.values():
+        with pytest.raises(ech.EchelonError) as caught:
+            ech.build(own(folder, **sections))
+        said = sentence.replace("{folder}", str(folder))
+        assert str(caught.value) == f"mapping: {field}: {said}"
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("import sys; sys.exit()", "SystemExit: no message"),
-        ("1 / 0", "ZeroDivisionError: division by zero"),
-        ("def", "SyntaxError: invalid syntax"),
-    ],
-)
-def test_a_file_that_does_not_import_is_told(folder, text, said):
-    (folder / "mine.py").write_text(text)
-    with pytest.raises(ech.EchelonError) as caught:
-        ech.build(own(folder, reference=None, leader=None))
-    assert f"does not import: {said}" in str(caught.value)
+def test_a_file_that_does_not_import_is_told(folder):
+    for text, said in {
+        "import sys; sys.exit()": "SystemExit: no message",
+        "1 / 0": "ZeroDivisionError: division by zero",
+        "def": "SyntaxError: invalid syntax",
+    }.items():
+        (folder / "mine.py").write_text(text)
+        with pytest.raises(ech.EchelonError, match=f"does not import: {said}"):
+            ech.build(own(folder, reference=None, leader=None))
 
 
 # ---- paths and keys that the command line sets ----
@@ -202,32 +194,27 @@ def test_a_path_on_the_command_line_is_relative_to_the_working_folder(folder, mo
     # Without a class it is no path, and stays as it was written.
     with pytest.raises(ech.EchelonError, match='got `"?mine.py"?`, allowed is a file and a class'):
         ech.load_scenario("paper", ["model.python=mine.py"])
-
-
-def test_a_gain_file_or_a_method_of_ones_own_takes_the_place_of_a_method(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    built = ech.build(ech.load_scenario("van-der-pol"))
-    ech.save_gain(built.parts.drive.gain, built.parts.model, built.parts.graph, folder / "g.json")
-    again = ech.load_scenario("van-der-pol", ["follower.gain.file=g.json"])
-    gain = ech.build(again).parts.drive.gain
-    assert np.array_equal(gain.P, built.parts.drive.gain.P)
-    mine = ech.load_scenario("van-der-pol", ["follower.gain.python=mine.py:Heavy"])
-    assert ech.build(mine).parts.drive.gain.method == "heavy"
-    # Both from the command line, neither gives way.
-    with pytest.raises(ech.EchelonError, match="got `file`, `python`, allowed is one of them"):
-        ech.load_scenario(
-            "van-der-pol", ["follower.gain.file=g.json", "follower.gain.python=mine.py:Heavy"]
-        )
-
-
-def test_a_model_of_ones_own_takes_the_place_of_a_named_one(folder, monkeypatch):
-    monkeypatch.chdir(folder)
+    # A model takes the place of a named one.
     (folder / "line.py").write_text(
         "import echelon as ech\n\n\nclass Line(ech.models.SingleIntegrator):\n    pass\n"
     )
     scenario = ech.load_scenario("integrators", ["model.python=line.py:Line"])
     assert scenario.model.name is None
     assert type(ech.build(scenario).parts.model).__name__ == "Line"
+
+
+def test_a_gain_file_or_a_method_of_ones_own_takes_the_place_of_a_method(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    parts = ech.build(ech.load_scenario("van-der-pol")).parts
+    ech.save_gain(parts.drive.gain, parts.model, parts.graph, folder / "g.json")
+    file, mine = "follower.gain.file=g.json", "follower.gain.python=mine.py:Heavy"
+    gain = ech.build(ech.load_scenario("van-der-pol", [file])).parts.drive.gain
+    assert np.array_equal(gain.P, parts.drive.gain.P)
+    gain = ech.build(ech.load_scenario("van-der-pol", [mine])).parts.drive.gain
+    assert gain.method == "heavy"
+    # Both from the command line, neither gives way.
+    with pytest.raises(ech.EchelonError, match="got `file`, `python`, allowed is one of them"):
+        ech.load_scenario("van-der-pol", [file, mine])
 
 
 def test_keys_that_only_another_law_takes_give_way_to_a_law_on_the_command_line():
