@@ -401,13 +401,9 @@ def test_bad_axes_are_one_sentence_before_anything_runs(echelon, here):
 
 
 def test_too_many_runs_of_several_axes_and_of_many_agents_are_refused():
-    seeds = {"seed": range(10**6)}
+    many = {"seed": range(10**6)}
     for changes, over, said in (
-        (
-            [],
-            {**seeds, "simulation.horizon": range(1, 100)},
-            "^the sweep is too large: .* are",
-        ),
+        ([], {**many, "simulation.horizon": range(1, 100)}, "^the sweep is too large: .* are"),
         (["graph.agents=2000"], many, "need .* of memory, and .* fit: .* runs"),
         ([], {"initial": [{}], "initial.spread": [{}]}, "is inside `initial`, which varies too"),
     ):

@@ -1,23 +1,19 @@
 """Guarantees for random agents, attacked by code that shares nothing with echelon."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from attack import attack, promise_of, study
+from attack_systems import random_system
+from zoo import study as try_specimen
 
 import echelon as ech
 from echelon.core.numerics import precision
 from echelon.core.words import Theorem
 from echelon.synthesis.certificates.jacobians import model_jacobian
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-from attack import attack, promise_of, study  # noqa: E402
-from attack_systems import random_system  # noqa: E402
-from zoo import study as try_specimen  # noqa: E402
 
 
 @pytest.mark.parametrize("number", [1, 2, 5])

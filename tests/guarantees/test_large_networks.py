@@ -1,19 +1,14 @@
 """Steps and margins of networks: true for every eigenvalue, by NumPy on drawn loops."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import scipy.linalg
+from held_loops import delayed_growth, growth, radii
 
 import echelon as ech
 from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Verdict
 from echelon.synthesis.certificates.margins import ClosedLoop, delay_margin
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-from held_loops import delayed_growth, growth, radii  # noqa: E402
 
 STRENGTHS = np.geomspace(0.5, 5.0, 60)
 DT = 0.2

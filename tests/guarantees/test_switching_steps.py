@@ -1,17 +1,12 @@
 """Graphs that take turns in held steps: what is guaranteed holds for every order, by NumPy."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from held_loops import drawn_graphs, whole_steps, worst_growth
 
 import echelon as ech
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Verdict
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-from held_loops import drawn_graphs, whole_steps, worst_growth  # noqa: E402
 
 
 def switching(graphs, dt, directed):

@@ -1,12 +1,7 @@
 """Unusual agents: families that aim at one rule each, judged by NumPy."""
 
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-from zoo import FAMILIES, judge  # noqa: E402
+from zoo import FAMILIES, judge
 
 FEW = {"plants": 1, "paths": 1, "differences": 1, "subclasses": 1, "units": 1, "leaders' inputs": 1}
 
