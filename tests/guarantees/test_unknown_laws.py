@@ -1,7 +1,5 @@
 """Laws of users' own: echelon does not know them, and every reader of a guarantee says so."""
 
-import json
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -73,6 +71,8 @@ LAWS = {
     "alone": Alone(),
     "told": Told(),
 }
+NEIGHBOURS = "neighbours' states"
+USED = {"alone": (), "told": (NEIGHBOURS, "the leader's input of the same step")}
 
 
 def parts_of(law, leader=None):
@@ -96,23 +96,10 @@ def test_nothing_is_said_of_a_law_that_echelon_does_not_know(name):
     assert ("nothing from others" in report) is (name == "alone")
     assert ech.summary(result)["covered"] is None
     assert "pole_real" not in ech.dataset(result)
-    lines = {line.name: line for line in ech.check(parts, SETTINGS).lines}
-    assert {x.name for x in lines.values() if x.fails} <= {
-        *("disagreement decays", "Lemma 3, sum over edges"),
-    }
-
-
-@pytest.mark.parametrize(
-    ("name", "information"),
-    [
-        ("pushes apart", ("neighbours' states",)),
-        ("wrong integral", ("neighbours' states",)),
-        ("alone", ()),
-        ("told", ("neighbours' states", "the leader's input of the same step")),
-    ],
-)
-def test_what_a_law_uses_of_others_is_read_off_its_trace(name, information):
-    assert parts_of(LAWS[name]).information.follower == information
+    fails = {line.name for line in ech.check(parts, SETTINGS).lines if line.fails}
+    assert fails <= {"disagreement decays", "Lemma 3, sum over edges"}
+    # What it uses of others is read off its trace.
+    assert parts.information.follower == USED.get(name, (NEIGHBOURS,))
 
 
 class Late(Alone):
@@ -125,12 +112,10 @@ class Late(Alone):
         return memory + view.disagreement
 
 
-def test_what_a_law_reads_after_a_step_is_information_too():
-    assert parts_of(Late()).information.follower == ("neighbours' states",)
-
-
 def test_a_leader_with_a_path_beside_an_unknown_law_has_a_reference():
-    parts = parts_of(Alone(), ech.laws.Tracking(ech.references.Circle(rate=0.1)))
+    parts = parts_of(Late(), ech.laws.Tracking(ech.references.Circle(rate=0.1)))
+    # What is read after the step alone is information too.
+    assert parts.information.follower == (NEIGHBOURS,)
     lines = {line.name: line for line in ech.check(parts, SETTINGS).lines}
     assert lines["Assumption 4, leader tracks"].text == "no mode of the leader is known"
 
@@ -158,21 +143,29 @@ CODE = sorted(
 )
 
 
-@pytest.mark.parametrize("name", sorted({*CODE}))
-def test_a_subclass_that_replaces_a_method_is_unknown(name):
-    def own(self, *arguments):
-        return getattr(super(ech.laws.Consensus, self), name)(*arguments)
+def test_a_subclass_that_replaces_a_method_is_unknown():
+    for name in {*CODE}:
 
-    value = property(own) if isinstance(getattr(Law, name, None), property) else own
-    law = type("Own", (ech.laws.Consensus,), {name: value, "__module__": __name__})(GAIN)
-    words = {"information", "warnings", "refusals"}
-    assert unknown_class(law) == ("" if name in words else "Own")
+        def own(self, *arguments, name=name):
+            return getattr(super(ech.laws.Consensus, self), name)(*arguments)
+
+        value = property(own) if isinstance(getattr(Law, name, None), property) else own
+        law = type("Own", (ech.laws.Consensus,), {name: value, "__module__": __name__})(GAIN)
+        words = {"information", "warnings", "refusals"}
+        assert unknown_class(law) == ("" if name in words else "Own"), name
 
 
 class Renamed(ech.laws.Consensus):
     """Another name, and a number of its own."""
 
     extra: float = 1.0
+
+
+class Still(ech.references.Hover):
+    """A path of one's own."""
+
+    def place(self, t):
+        return super().place(t)
 
 
 class Mixin:
@@ -199,66 +192,16 @@ class Reversed(Gain):
 
 def test_code_counts_wherever_it_stands_and_numbers_do_not():
     own = Reversed(GAIN.P, GAIN.R, GAIN.coupling, GAIN.method, GAIN.certificate)
-    names = [
+    hover = ech.references.Hover()
+    for law, name in (
         (ech.laws.Consensus(GAIN), ""),
         (Renamed(GAIN), ""),
         (Behind(GAIN), ""),
         (Mixed(GAIN), "Mixed"),
         (ech.laws.Consensus(own), "Reversed"),
-        (ech.laws.Tracking(ech.references.Hover(), reaction=own), "Reversed"),
-    ]
-    assert [unknown_class(law) for law, _ in names] == [name for _, name in names]
-    assert all(not unknown_class(law) for law in (ech.laws.TrimInput(), ech.laws.StoppingPoint()))
-
-
-def test_a_reference_of_ones_own_is_no_unknown_law():
-    class Still(ech.references.Hover):
-        """A path of one's own."""
-
-        def place(self, t):
-            return super().place(t)
-
-    assert not unknown_class(ech.laws.Tracking(Still()))
-
-
-# ---- every reader --------------------------------------------------------------------------------
-
-FILE = """
-import numpy as np
-import echelon as ech
-
-class Anti(ech.Law):
-    weak: float = 1.0
-    gain: ech.Gain | None = None
-    def metric(self, model):
-        return np.asarray(self.gain.P)
-    def update(self, model, view, memory):
-        K = self.gain.K(model) / self.gain.coupling
-        return model.physical(-self.weak * (K @ view.disagreement)), memory
-"""
-SCENARIO = """
-name: anti
-model: {name: pendulum}
-graph: {name: path, agents: 4}
-follower: {law: {python: "anti.py:Anti", weak: -2.0}, gain: {method: riccati}}
-initial: {spread: {angle: 0.05}}
-simulation: {horizon: 2.0, dt: 0.01}
-"""
-
-
-@pytest.mark.slow
-def test_check_run_sweep_verify_and_page_agree(echelon, tmp_path):
-    (tmp_path / "anti.py").write_text(FILE)
-    (tmp_path / "anti.yaml").write_text(SCENARIO)
-    code, out, _ = echelon("check", "anti.yaml")
-    assert code == 1 and UNKNOWN in " ".join(out.split())
-    code, out, _ = echelon("check", "anti.yaml", "--json")
-    assert code == 1 and json.loads(out)["promise"]["verdict"] == "none"
-    code, out, _ = echelon("run", "anti.yaml", "--no-figures", "--out", "o")
-    assert code == 0 and UNKNOWN in " ".join(out.split()) and "Linearized" not in out
-    told = json.loads((tmp_path / "o" / "summary.json").read_text())
-    assert told["promise"]["verdict"] == "none" and UNKNOWN in told["promise"]["sentence"]
-    code, out, _ = echelon("verify", "o", "--scenario", "o")
-    assert code in (0, 5), out
-    _, out, _ = echelon("sweep", "anti.yaml", "--over", "seed=0..1", "--out", "s")
-    assert "With a guarantee: 0 of 2." in out
+        (ech.laws.Tracking(hover, reaction=own), "Reversed"),
+        (ech.laws.Tracking(Still()), ""),
+        (ech.laws.TrimInput(), ""),
+        (ech.laws.StoppingPoint(), ""),
+    ):
+        assert unknown_class(law) == name
