@@ -2,14 +2,11 @@
 
 import dataclasses
 import json
-import math
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from sentences import LINES
 
 import echelon.experiments.scenario.scenario
@@ -214,33 +211,6 @@ def test_one_fault_does_not_make_others_up(refused):
     """An edge that cannot be read leaves the number of agents open, so offsets are not blamed."""
     lines = refused(graph="graph: {edges: [[0, 1], [1, 2], [1, x]]}")
     assert len(lines) == 1 and lines[0].startswith("s.yaml:3: graph.edges.2.1: got `x`")
-
-
-def spoiled(data, random):
-    """Plain data with junk in some places."""
-    if random.random() < 0.05:
-        return random.choice(SAMPLES)
-    if isinstance(data, dict):
-        return {key: spoiled(item, random) for key, item in data.items()}
-    return [spoiled(item, random) for item in data] if isinstance(data, list) else data
-
-
-SAMPLES = [
-    None, True, 0, -1, 3, 10**400, 0.5, math.nan, -math.inf, "", "x", "1", [], [[]], [0, "1"],
-    [0, 1], [[0, 1], [1]], {}, {1: 2}, {"name": None}, {"x": {}}, {0: [1.0]},
-]  # fmt: skip
-
-
-@given(st.randoms(use_true_random=False))
-def test_whatever_stands_anywhere_is_accepted_or_told(random):
-    data = read_yaml("\n".join(LINES.values()), "s.yaml").data
-    scenario = {key: spoiled(item, random) for key, item in data.items()}
-    try:
-        assert scenario_from_mapping(scenario).simulation.dt > 0
-    except ScenarioError as error:
-        lines = str(error).splitlines()
-        assert lines and all(re.fullmatch(r"mapping: [\w.-]+: .+\.", line) for line in lines)
-        assert len({fault.field for fault in error.faults}) == len(lines)
 
 
 def test_the_error_carries_its_faults(load):

@@ -68,23 +68,6 @@ def test_a_run_among_many_has_the_bits_that_it_has_alone(name, precision):
             check_same(found[k], ech.simulate(*runs[k]))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        "paper",
-        pytest.param("planar-quadrotor", marks=pytest.mark.study),
-        "paper-literal",
-        pytest.param("paper-line", marks=pytest.mark.study),
-    ],
-)
-def test_every_run_among_many_has_the_bits_that_it_has_alone(name):
-    runs = seeds(built(name), 20, engine="native", store_every=200)
-    found = list(Batch().fly(runs))
-    for k in (0, 19):
-        check_same(found[k], ech.simulate(*runs[k]))
-
-
 def parted(graph, feedforward="relay", world=None, gains=()):
     """Yield parts of double integrators, one for each coupling and weight of its gain."""
     model = ech.models.DoubleIntegrator(dimension=2)
