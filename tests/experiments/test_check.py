@@ -278,9 +278,6 @@ def test_a_linear_agent_is_certified_everywhere():
     )
 
 
-# ---- the step ----
-
-
 def test_a_held_integrator_bears_two_time_constants():
     one = np.eye(1)
     for k in (0.5, 3.0):
@@ -373,9 +370,6 @@ def test_a_parents_input_fed_forward_leaves_one_mode_on_any_tree():
     assert "disturbance, network" not in lines
     lines, found = checked({**follower, "feedforward": "relay"}, **chain)
     assert lines["coupling"].verdict is Verdict.FAILS
-
-
-# ---- bad input ----
 
 
 def written(gain, model="planar-quadrotor", agents=3):

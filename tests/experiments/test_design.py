@@ -210,9 +210,6 @@ def test_the_pair_is_the_one_asked_for_or_a_telling_one():
         assert "`--slice`" in str(caught.value)
 
 
-# ---- pictures ----
-
-
 @pytest.mark.slow
 def test_both_pictures_are_written_and_both_radii_are_said(echelon, tmp_path):
     call = ("design", "mine.yaml", "--method", "robust-lqr", "--figures", "figs")

@@ -127,22 +127,6 @@ def test_what_does_not_exist_is_none():
     assert "interrupted" in ech.report(nothing)
 
 
-@pytest.mark.slow
-def test_the_relay_is_a_fixed_point_of_the_formation():
-    """Started on their goals, followers told the leader's input stay there to rounding."""
-    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(3)
-    formation = ech.Formation.from_offsets(model, graph, {1: (1, 0, 0), 2: (2, 0, 0)})
-    gain = ech.synthesize(model, graph, ech.gains.Riccati())
-    laws = ech.Laws(ech.laws.Tracking(ech.references.Lemniscate()), ech.laws.Consensus(gain))
-    parts = ech.Parts(model, graph, formation, laws, start_error={"x": -6.0, "y": 3.0})
-    result = ech.simulate(parts, ech.Settings(horizon=2.0, dt=0.01))
-    assert result.formation_errors.max() < 1e-13
-    assert result.saturated[0] > 0.0
-
-
-# ---- the smallest distance --------------------------------------------------------------------
-
-
 def passing(agents=12, offset=1e3):
     """Agents in a row far apart; the second and the fifth pass each other in the sixth frame."""
     model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(agents)

@@ -193,9 +193,6 @@ def test_a_gain_of_other_parts_or_another_method_is_refused(tmp_path):
     assert false(ech.synthesize(other, graph, ech.gains.Riccati()), model=other) == ["gain.json"]
 
 
-# ---- what two machines may differ by ----
-
-
 def moved(document, size):
     """A document whose numbers are changed by a fraction, and whose residuals are other ones."""
     draw = np.random.default_rng(0)

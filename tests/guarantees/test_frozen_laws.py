@@ -35,9 +35,6 @@ def test_no_bundled_scenario_that_flies_is_taken_its_promise(scenario):
     assert not line_of(ech.promise(*built(scenario))).fails
 
 
-# ---- how fast the laws are where the path tilts the agents ----
-
-
 def poles_at_the_steepest(parts, settings):
     """The poles of the stiffest mode about the state of the path that is tilted most."""
     model, gain = parts.model, parts.drive.gain

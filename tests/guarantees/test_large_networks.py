@@ -9,7 +9,6 @@ import echelon as ech
 from echelon.core.linear import discretize
 from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Verdict
-from echelon.synthesis.certificates.margins import ClosedLoop, delay_margin
 
 STRENGTHS = np.geomspace(0.5, 5.0, 60)
 DT = 0.2
@@ -111,24 +110,6 @@ def test_margins_hold_inside_and_not_outside_for_every_follower(seed, count, hig
     for factor, decays in ((0.99, True), (1.01, False)):
         worst = max(delayed_growth(A, k * B @ K, factor * delay) for k in some)
         assert (worst < 0.0) == decays or count > 150 and not decays
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_chains_of_integrators_with_two_inputs_have_a_delay_margin(seed):
-    rng = np.random.default_rng(seed)
-    orders = rng.integers(1, 5, 2)
-    A = scipy.linalg.block_diag(*(np.eye(order, k=1) for order in orders))
-    B = np.zeros((len(A), 2))
-    B[np.cumsum(orders) - 1, [0, 1]] = 1.0
-    B = B @ rng.normal(size=(2, 2))
-    Q = np.diag(rng.uniform(0.1, 10.0, len(A)))
-    P = scipy.linalg.solve_continuous_are(A, B, Q, np.eye(2))
-    lam = 2.0 - 2.0 * np.cos(np.pi * np.array([1.0, 3.0, 5.0]) / 7.0)
-    margin = delay_margin(ClosedLoop(A, B, P, np.eye(2), 0.6 / lam[0], lam))
-    G = 0.6 / lam[0] * B @ B.T @ P
-    for factor, decays in ((0.99, True), (1.01, False)):
-        worst = max(delayed_growth(A, k * G, factor * margin.delay, 12) for k in lam)
-        assert (worst < 0.0) == decays
 
 
 @pytest.mark.parametrize("shift", [0.3, 0.0])

@@ -361,9 +361,6 @@ def test_beyond_the_margin_a_run_swings_and_is_warned_of():
         assert ("the linearized loop does not decay" in guarantee.sentence()) == (more > 0)
 
 
-# ---- verification --------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_no_forged_number_of_a_network_is_verified(echelon, tmp_path):
     stored, file = json.loads(echelon("check", "paper-radio", "--json")[1]), tmp_path / "check.json"

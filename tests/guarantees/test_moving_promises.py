@@ -11,6 +11,7 @@ import pytest
 import echelon as ech
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.core.statement import Hypothesis
+from echelon.experiments.scenario.build import Experiment
 from echelon.experiments.studies.check import check
 from echelon.experiments.studies.recomputation import compare_claims
 from echelon.guarantees.promises.promise import promise
@@ -136,7 +137,7 @@ def test_claims_of_offsets_are_checked_by_code_of_its_own(tmp_path):
 
 def test_a_moving_run_is_not_accepted_under_the_promise_of_constant_offsets():
     stored = json.loads(json.dumps([check(parts(x), SETTINGS).as_mapping() for x in ([], TURN)]))
-    moving = parts(TURN), SETTINGS
+    moving = Experiment(parts(TURN), SETTINGS)
     still, own = ({x.verdict for x in compare_claims(x, moving, "moves")} for x in stored)
     assert "refused" in still and own == {"recomputed"}
 

@@ -335,9 +335,6 @@ def test_agents_that_are_all_alike_agree_at_the_rate_of_the_whole_graph():
     assert seen == pytest.approx(-np.log1p(-0.01 * found.rate) / 0.01, rel=1e-5)
 
 
-# ---- whether a run is covered ----
-
-
 @pytest.fixture(scope="module")
 def swinging():
     """Pendulums with a certified set, the last one swinging with so many of its radii."""
@@ -688,9 +685,6 @@ def test_no_remedy_asks_for_a_step_of_zero_or_less(dt):
             assert 0.0 < float(number) < np.inf, line.remedy
     assert not promise.promised and "no one P is known" in promise.sentence()
     assert "grows" not in promise.sentence()
-
-
-# ---- models of one's own ----
 
 
 class Reversed(ech.models.DoubleIntegrator):

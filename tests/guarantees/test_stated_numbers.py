@@ -171,8 +171,6 @@ def robust():
     return found
 
 
-# ---- the lines of a check ----
-
 LINES = {
     Hypothesis.DISAGREEMENT_DECAY: (ABOVE, r"(\S+) 1/s", 1.0),
     Hypothesis.ALONG_PATH: (ABOVE, r"(\S+) 1/s", 1.0),

@@ -31,23 +31,6 @@ class Push(ech.Law):
         return model.physical(-self.weak * (K @ view.disagreement)), memory
 
 
-class Slow(ech.Law):
-    """u = -z - rate * integral of z: unstable where the rate is negative."""
-
-    rate: float = 0.5
-
-    def metric(self, model):
-        return np.eye(len(model.state_names))
-
-    def init(self):
-        return jnp.zeros(()), jnp.zeros(2)
-
-    def update(self, model, view, memory):
-        then, area = memory
-        area = area + (view.t - then) * view.disagreement
-        return model.physical(-view.disagreement - self.rate * area), (view.t, area)
-
-
 class Alone(ech.Law):
     """u = -x: it reads nothing of others."""
 
@@ -64,13 +47,25 @@ class Told(ech.Law):
         return model.physical(view.feedforward - view.disagreement), memory
 
 
+class Late(Alone):
+    """It reads its neighbours after the step alone, into a memory."""
+
+    def init(self):
+        return jnp.zeros(2)
+
+    def settle(self, model, view, desired, delivered, memory):
+        return memory + view.disagreement
+
+
 LAWS = {
     "pushes apart": Push(-2.0, GAIN),
     "comes together": Push(2.0, GAIN),
-    "wrong integral": Slow(-0.5),
     "alone": Alone(),
     "told": Told(),
+    "late": Late(),
 }
+
+
 NEIGHBOURS = "neighbours' states"
 USED = {"alone": (), "told": (NEIGHBOURS, "the leader's input of the same step")}
 
@@ -102,20 +97,8 @@ def test_nothing_is_said_of_a_law_that_echelon_does_not_know(name):
     assert parts.information.follower == USED.get(name, (NEIGHBOURS,))
 
 
-class Late(Alone):
-    """It reads its neighbours after the step alone, into a memory."""
-
-    def init(self):
-        return jnp.zeros(2)
-
-    def settle(self, model, view, desired, delivered, memory):
-        return memory + view.disagreement
-
-
 def test_a_leader_with_a_path_beside_an_unknown_law_has_a_reference():
-    parts = parts_of(Late(), ech.laws.Tracking(ech.references.Circle(rate=0.1)))
-    # What is read after the step alone is information too.
-    assert parts.information.follower == (NEIGHBOURS,)
+    parts = parts_of(Alone(), ech.laws.Tracking(ech.references.Circle(rate=0.1)))
     lines = {line.name: line for line in ech.check(parts, SETTINGS).lines}
     assert lines["Assumption 4, leader tracks"].text == "no mode of the leader is known"
 
@@ -132,8 +115,6 @@ def test_a_leader_that_echelon_does_not_know_leaves_nothing_guaranteed():
     found = ech.promise(parts_of(law, Away()), SETTINGS)
     assert UNKNOWN in found.sentence() and not found.promised
 
-
-# ---- what is known -------------------------------------------------------------------------------
 
 CODE = sorted(
     name
