@@ -69,17 +69,17 @@ def test_the_file_is_read_as_written(load):
     assert scenario.graph.leaders == (0,)
     assert scenario.formation.offsets == {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)}
     assert scenario.reference.name == "lemniscate"
-    assert scenario.reference.parameters == {
-        "center": (0.25, 0.25, 1.0),
-        "amplitude": (1.25, 3.54),
-        "rate": 0.646,
-    }
+    numbers = {"center": (0.25, 0.25, 1.0), "amplitude": (1.25, 3.54), "rate": 0.646}
+    assert scenario.reference.parameters == numbers
     assert scenario.leader.start_error == {"x": -1.344, "y": 0.53}
     assert scenario.initial.spread == {"position": 1.0, "attitude": 0.3}
     assert (scenario.simulation.horizon, scenario.simulation.dt) == (60.0, 0.005)
     assert scenario.report.steady_window == 10.0
-    assert scenario.text == Path("s.yaml").read_text("utf-8")
-    assert scenario.folder == Path()
+    assert scenario.text == Path("s.yaml").read_text("utf-8") and scenario.folder == Path()
+    # Places are there for later faults.
+    assert scenario.place("graph", "edges", 2) == "s.yaml:3"
+    assert scenario.place("follower", "gain", "coupling") == "s.yaml:7"
+    assert scenario.place("nothing") == "s.yaml:1"
 
 
 def test_what_is_left_out_is_as_the_schema_says_but_for_the_steady_window():
@@ -95,18 +95,14 @@ def test_what_is_left_out_is_as_the_schema_says_but_for_the_steady_window():
     assert (scenario.leader.law, scenario.follower.gain.method) == ("passive", "riccati")
 
 
-def test_a_leader_with_a_reference_tracks_it_by_default(load):
-    assert load(leader="leader: {reacts: true}").leader.law == "tracking"
-    assert load(leader="leader:").leader.law == "tracking"
-
-
 def test_sections_that_are_empty_take_their_defaults(load):
     scenario = load(formation="formation:", report="report:", initial="initial:")
     assert scenario.formation.offsets is None and scenario.initial.spread is None
     assert scenario.report.steady_window == 12.0
-
-
-def test_a_steady_window_not_shorter_than_the_run_is_a_fifth_of_it(load):
+    # A leader with a reference tracks it.
+    for leader in ("leader: {reacts: true}", "leader:"):
+        assert load(leader=leader).leader.law == "tracking"
+    # A steady window that is not shorter than the run is a fifth of it.
     assert load("simulation.horizon=10").report.steady_window == 2.0
     assert load("simulation.horizon=10.5").report.steady_window == 10.0
     assert load("simulation.horizon=600", report="report: {}").report.steady_window == 120.0
@@ -183,10 +179,6 @@ def test_a_law_takes_the_keys_that_its_class_takes(section, laws):
             assert follows == (name in registry.TRACKING_LAWS), name
 
 
-def test_yaml_1_2_decides_what_a_word_is(load):
-    assert load("simulation.dt=1e-3").simulation.dt == 0.001
-
-
 def test_all_faults_of_a_file_are_told_at_once_by_line(refused):
     lines = refused(
         model="model: {name: quadroto}",
@@ -240,13 +232,6 @@ def test_overrides_are_part_of_the_text_that_is_kept(load):
     assert scenario.place("formation", "offsets", 2) == "s.yaml:4"
     again = scenario_from_mapping(read_yaml(scenario.text, "kept").data)
     assert again.model_dump() == scenario.model_dump()
-
-
-def test_places_are_there_for_later_faults(load):
-    scenario = load()
-    assert scenario.place("graph", "edges", 2) == "s.yaml:3"
-    assert scenario.place("follower", "gain", "coupling") == "s.yaml:7"
-    assert scenario.place("nothing") == "s.yaml:1"
 
 
 @pytest.fixture
@@ -316,30 +301,27 @@ def test_a_scenario_cannot_be_changed(load):
         load().seed = 3
 
 
-@pytest.mark.parametrize(
-    ("change", "meant"),
-    [
-        ("radio={delay: 1}", "`network`"),
-        ("graph.delay=1", "`network.delay` or `sensing.delay`"),
-        ("disturbance.loss=0.1", "`network.loss`"),
-        ("network.latency=1", "`network.delay`"),
-        ("graph.offsets={}", "`formation.offsets`"),
-        ("wind=1", "`disturbance`"),
-        ("formation.shape=line", "`formation.name`"),
-        ("shape=line", "`formation.name`"),
-        ("graph.edge=[[0, 1]]", "`edges`"),
-        ("graph.links=[[0, 1]]", "`graph.edges`"),
-        ("follower.control=consensus", "`follower.law`"),
-        ("simulation.duration=1", "`simulation.horizon`"),
-        ("simulation.hroizon=1", "`horizon`"),
-    ],
-)
-def test_a_key_of_another_section_is_named(change, meant):
-    with pytest.raises(ScenarioError, match=re.escape(f"(did you mean {meant}?).")):
-        load_scenario("paper", [change])
+MEANT = {
+    "radio={delay: 1}": "`network`",
+    "graph.delay=1": "`network.delay` or `sensing.delay`",
+    "disturbance.loss=0.1": "`network.loss`",
+    "network.latency=1": "`network.delay`",
+    "graph.offsets={}": "`formation.offsets`",
+    "wind=1": "`disturbance`",
+    "formation.shape=line": "`formation.name`",
+    "shape=line": "`formation.name`",
+    "graph.edge=[[0, 1]]": "`edges`",
+    "graph.links=[[0, 1]]": "`graph.edges`",
+    "follower.control=consensus": "`follower.law`",
+    "simulation.duration=1": "`simulation.horizon`",
+    "simulation.hroizon=1": "`horizon`",
+}
 
 
-def test_what_unknown_keys_may_mean_exists():
+def test_a_key_of_another_section_is_named():
+    for change, meant in MEANT.items():
+        with pytest.raises(ScenarioError, match=re.escape(f"(did you mean {meant}?).")):
+            load_scenario("paper", [change])
     assert set(key_paths._COMMON_NAMES) <= set(key_meanings())
 
 

@@ -111,7 +111,9 @@ SENTENCES = {
         "reference": {"python": "mine.py:Pull"}
     },
     "follower.gain: got a key that the law `mine.py:Pull` does not take, allowed are the "
-    "arguments of its class.": {"follower": law("Pull")["follower"] | {"gain": {}}},
+    "arguments of its class.": {
+        "follower": law("Pull")["follower"] | {"gain": {"method": "riccati"}}
+    },
     "follower.gain: the file `{folder}/yours.py` does not exist; a `python` path is relative to "
     "the scenario file, and on the command line to the working folder.": gain("yours.py:Heavy"),
     "follower: got the parameter `strenght` of `mine.py:Pull`, allowed is `strength` (did you "

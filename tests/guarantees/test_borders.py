@@ -323,23 +323,12 @@ Quickened = own("Quickened", ech.models.Unicycle, input_map=quicker)
 OWN = (Lost(), Quickened(), own("Stated", Lost, **STATED)())
 OWN += (own("Damped", ech.models.Pendulum, drift=damped)(),)
 OWN += (own("Renamed", ech.models.Unicycle, input_names=("v", "w"))(),)
-
-
 BUNDLED = ("Unicycle", "Pendulum", "VanDerPol", "SingleIntegrator", "DoubleIntegrator", "Quadrotor")
 BUNDLED += ("PlanarQuadrotor", "QuadrotorEuler", "QuadrotorThrust")
 
 
 @pytest.mark.parametrize(
-    "model",
-    [
-        Lost(),
-        Stated(),
-        Quickened(),
-        Damped(),
-        Renamed(),
-        *(getattr(ech.models, x)() for x in BUNDLED),
-    ],
-    ids=name_of,
+    "model", [*OWN, *(getattr(ech.models, name)() for name in BUNDLED)], ids=name_of
 )
 def test_a_word_on_borders_is_of_the_motion_that_it_was_given_with(model):
     assert knows_borders(model) != isinstance(model, Lost | Quickened)
