@@ -119,9 +119,15 @@ def test_the_sign_is_that_of_goals_that_pull_together():
 def test_goals_that_f_does_not_tell_apart_make_it_empty():
     agent = ech.models.Quadrotor()
     formation = ech.Formation.from_offsets(agent, PATH, {1: (1, 0, 0), 2: (0, 3, 0)})
-    assert ech.finite_condition(np.eye(12), agent, formation).verdict is Verdict.VACUOUS
     # Smaller than I it is refused even then, and a multiple of it is not.
-    assert ech.finite_condition(0.5 * np.eye(12), agent, formation).verdict is Verdict.FAILS
+    for size, verdict in ((1.0, Verdict.VACUOUS), (0.5, Verdict.FAILS)):
+        assert ech.finite_condition(size * np.eye(12), agent, formation).verdict is verdict
+    # Of a swarm a thousand agents are compared.
+    found = ech.finite_condition(np.eye(1), Line1(-1.0), goals(*np.linspace(0.0, 1.0, 5000)))
+    assert (found.verdict, found.agents) == (Verdict.HOLDS, 1000)
+    for P, said in ((np.eye(2), r"has shape \(2, 2\), but `Line1`"), (-np.eye(1), "definite")):
+        with pytest.raises(ech.EchelonError, match=said):
+            ech.finite_condition(P, Line1(), goals(0.0, 1.0))
 
 
 @given(st.integers(0, 10**6), st.floats(0.1, 10.0))
@@ -151,15 +157,6 @@ def test_the_largest_pair_is_the_largest(seed):
     assert found.largest == pytest.approx(max(pairs.values()), rel=1e-9)
     at = max(found.pair), min(found.pair)
     assert pairs[at] == pytest.approx(max(pairs.values()), rel=1e-9)
-
-
-def test_a_swarm_is_compared_by_a_thousand_of_its_agents_and_by_a_p_of_its_size():
-    found = ech.finite_condition(np.eye(1), Line1(-1.0), goals(*np.linspace(0.0, 1.0, 5000)))
-    assert (found.verdict, found.agents) == (Verdict.HOLDS, 1000)
-    with pytest.raises(ech.EchelonError, match=r"^`P` has shape \(2, 2\), but `Line1` needs"):
-        ech.finite_condition(np.eye(2), Line1(), goals(0.0, 1.0))
-    with pytest.raises(ech.EchelonError, match="not positive definite"):
-        ech.finite_condition(-np.eye(1), Line1(), goals(0.0, 1.0))
 
 
 # ---- the region and the set ----
@@ -231,12 +228,6 @@ def test_the_promise_is_as_strong_as_its_argument(robust, model, method, told, u
     if isinstance(model, Yielding):  # why a proof became samples is said
         why = lines["region of the gain"].text.partition("no more than samples, since ")[2]
         assert "erf" in why and "erf" in gain.certificate.region.why
-
-
-def test_margins_are_not_asked_for_where_rounding_hides_the_slowest_mode():
-    strong = {"gain": {"method": "riccati", "coupling": 1e11}}
-    lines, _ = checked(strong, model={"name": "double-integrator"})
-    assert "lost in rounding" in lines["margins"].text and "gain margin" not in lines
 
 
 @pytest.mark.parametrize(
@@ -336,6 +327,10 @@ def test_a_long_path_says_which_eigenvalues_it_looked_at():
     assert lines["disagreement decays"].text == "at lambda_min and lambda_max; all between decay"
     assert lines["delay margin"].text.endswith("lambda_min, lambda_max and 30 values between them")
     assert found.promised
+    # Margins are not asked for where rounding hides the slowest mode.
+    strong = {"gain": {"method": "riccati", "coupling": 1e11}}
+    lines, _ = checked(strong, model={"name": "double-integrator"})
+    assert "lost in rounding" in lines["margins"].text and "gain margin" not in lines
 
 
 def test_a_pushed_integrator_lags_by_its_slowest_mode_and_a_chain_passes_on_what_it_gets():

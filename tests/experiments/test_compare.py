@@ -10,13 +10,6 @@ import pytest
 import echelon as ech
 from echelon.experiments.results import run_numbers
 from echelon.experiments.results.metrics import RunNumbers
-from echelon.experiments.results.run_numbers import (
-    FollowerMetrics,
-    LeaderMetrics,
-    Metrics,
-    Quantity,
-    Shown,
-)
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.output.reports.comparison_report import comparison_mapping, comparison_report, verdict
 from echelon.output.reports.glossary import glossary
@@ -75,8 +68,9 @@ def test_the_paragraph_names_the_row_with_the_least_number(planar):
 
 def row_of(label, settles, effort, computing, unit="m"):
     """A method of one follower, with the numbers that the paragraph reads."""
-    follower = FollowerMetrics(1, 0.1, 0.1, settles, effort, 0.0)
-    numbers = Metrics((LeaderMetrics(None, None, {}),), (follower,), (), None, 0.0, 1.0)
+    follower = run_numbers.FollowerMetrics(1, 0.1, 0.1, settles, effort, 0.0)
+    leader = run_numbers.LeaderMetrics(None, None, {})
+    numbers = run_numbers.Metrics((leader,), (follower,), (), None, 0.0, 1.0)
     run = SimpleNamespace(length_unit=unit)
     return ComparisonRow(label, RunNumbers(run, numbers, None, computing))
 
@@ -114,8 +108,8 @@ def test_a_number_of_the_table_is_in_every_table_that_it_names(planar, monkeypat
     def largest(run):
         return float(np.abs(run.result.states).max())
 
-    column = {"column": "largest\nstate", "of": largest, "shown": Shown.COMPARISON}
-    number = Quantity("largest state", "m", **column)
+    column = {"column": "largest\nstate", "of": largest, "shown": run_numbers.Shown.COMPARISON}
+    number = run_numbers.Quantity("largest state", "m", **column)
     monkeypatch.setitem(run_numbers.RUN_NUMBERS, "largest_state", number)
     rows = comparison_mapping(planar)["methods"]
     for label, result in flown(planar).items():

@@ -10,14 +10,7 @@ import scipy.linalg
 
 import echelon as ech
 from echelon.core.digits import at_most
-from echelon.experiments.studies.basin import (
-    chosen_slice,
-    converged,
-    observed_radius,
-    side_of,
-    slice_of,
-    trial,
-)
+from echelon.experiments.studies import basin
 from echelon.experiments.studies.design import because, recommended
 from echelon.output.plots.study_figures import save_design_figures
 
@@ -147,7 +140,7 @@ def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to():
 @pytest.fixture(scope="module")
 def cubic():
     parts = resting(Cubic(), ech.gains.FixedGain(P=[1.0, 1.0]))
-    return trial(parts, ech.Settings(horizon=1.0, dt=0.01)), slice_of(parts, (0, 1))
+    return basin.trial(parts, ech.Settings(horizon=1.0, dt=0.01)), basin.slice_of(parts, (0, 1))
 
 
 def resting(model, method, graph=PATH):
@@ -159,12 +152,12 @@ def resting(model, method, graph=PATH):
 
 def test_a_known_basin_is_observed_and_not_overstated(cubic):
     run, plane = cubic
-    radius = observed_radius(run, plane)
+    radius = basin.observed_radius(run, plane)
     # Three followers alike: r^2 = 3 (x^2 + y^2), and only |x| < 1 returns.
-    ratio = 10.0 ** (3.0 / (side_of(3) - 1))
+    ratio = 10.0 ** (3.0 / (basin.side_of(3) - 1))
     assert 1.0 / ratio < plane.extents(radius)[0] < 1.0
     starts = np.array([[0.9, 0.0], [-0.9, 5.0], [1.1, 0.0], [0.0, 20.0], [-3.0, 0.0], [0.0, 0.0]])
-    assert converged(run, plane, starts).tolist() == [True, True, False, True, False, True]
+    assert basin.converged(run, plane, starts).tolist() == [True, True, False, True, False, True]
     points = plane.ellipse(2.0, 90)
     assert np.einsum("si,ij,sj->s", points, plane.form, points) == pytest.approx(4.0)
     assert np.abs(points).max(axis=0) == pytest.approx(plane.extents(2.0), rel=2e-3)
@@ -172,14 +165,16 @@ def test_a_known_basin_is_observed_and_not_overstated(cubic):
 
 def test_a_slice_stays_inside_the_chart():
     agent = ech.models.Quadrotor()
-    plane = slice_of(resting(agent, ech.gains.Riccati()), (0, agent.state_names.index("pitch")))
+    plane = basin.slice_of(
+        resting(agent, ech.gains.Riccati()), (0, agent.state_names.index("pitch"))
+    )
     assert plane.limits[1] < np.pi / 2 and plane.limits[0] == 30.0
 
 
 def test_a_slice_runs_the_loop_that_simulate_runs():
     parts, settings = ech.build(ech.load_scenario("planar-quadrotor"))
     gain, followers = parts.drive.gain, list(parts.graph.followers)
-    run, pair = trial(parts, settings), chosen_slice(parts.model, "y,roll")
+    run, pair = basin.trial(parts, settings), basin.chosen_slice(parts.model, "y,roll")
     still = resting(parts.model, ech.gains.Riccati(), graph=parts.graph)
     still = still.replace(drive=ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain)))
     trim = np.array(parts.model.trim[0])
@@ -190,23 +185,23 @@ def test_a_slice_runs_the_loop_that_simulate_runs():
         result = ech.simulate(still.replace(initial=states), chosen)
         y = result.states[[0, -1]][:, followers] - trim
         first, last = np.sqrt(np.einsum("tfi,ij,tfj->t", y, gain.P, y))
-        found = converged(run, slice_of(parts, pair), np.array([start]))[0]
+        found = basin.converged(run, basin.slice_of(parts, pair), np.array([start]))[0]
         assert found == (last <= run.decay * first)
 
 
 def test_the_pair_is_the_one_asked_for_or_a_telling_one():
     quad, cart = ech.models.Quadrotor(), ech.models.VanDerPol()
-    assert chosen_slice(quad, " roll , y ") == (6, 1)
-    velocity, angle = (quad.state_names[k] for k in chosen_slice(quad, None))
+    assert basin.chosen_slice(quad, " roll , y ") == (6, 1)
+    velocity, angle = (quad.state_names[k] for k in basin.chosen_slice(quad, None))
     assert (velocity, angle) in {("vx", "pitch"), ("vy", "roll")}
-    assert chosen_slice(cart, None) == (0, 1)
+    assert basin.chosen_slice(cart, None) == (0, 1)
     different = "allowed are two different states such as `y,roll`."
     for asked, sentence in (
         ("y,rol", "did you mean `roll`?"), ("y", different), ("y,y", different),
         ("y,z,roll", different),
     ):  # fmt: skip
         with pytest.raises(ech.EchelonError, match=re.escape(sentence)) as caught:
-            chosen_slice(quad, asked)
+            basin.chosen_slice(quad, asked)
         assert "`--slice`" in str(caught.value)
 
 

@@ -143,12 +143,3 @@ def test_check_states_that_a_reshape_passes_through_itself(echelon, here):
     safe = ["--set", "safety={radii: [0.1, 0.1, 0.1]}"]
     code, out, err = echelon("check", "through.yaml", *safe)
     assert code == 0 and err == "" and "in the reshape" not in out
-
-
-def test_errors_of_held_inputs_from_starts_at_the_goals_are_no_growth(tmp_path):
-    (tmp_path / "through.yaml").write_text(THROUGH)
-    run = ech.simulate(*ech.build(tmp_path / "through.yaml"))
-    assert 0.0 < run.formation_errors[-1].max() < 1e-2
-    text = " ".join(ech.report(run).split())
-    assert "All 2 followers stay within 0.01 m of their goals from " in text
-    assert "grows" not in text and "Cause" not in text

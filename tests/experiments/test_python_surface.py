@@ -78,12 +78,6 @@ def test_the_feedback_of_a_gain_is_that_of_its_law():
         gain.K(ech.models.Pendulum())
 
 
-def test_a_formation_says_its_size():
-    model = ech.models.SingleIntegrator(dimension=2)
-    formation = ech.Formation.from_offsets(model, ech.Graph.path(3), {1: (1.5, 0.0)})
-    assert repr(formation) == "Formation(3 agents, 2 states, offsets up to 1.5)"
-
-
 def test_settings_are_checked_when_they_are_made():
     for changes, sentence in (
         ({"dt": 0.3}, "must be a whole number of steps"),

@@ -1,6 +1,7 @@
 """The scenario file: accepted input, defaults, and errors with their lines."""
 
 import dataclasses
+import itertools
 import json
 import re
 from pathlib import Path
@@ -12,7 +13,7 @@ from sentences import LINES
 import echelon.experiments.scenario.scenario
 from echelon.agents.models import DoubleIntegrator
 from echelon.core.errors import EchelonError, ScenarioError, listing
-from echelon.experiments.scenario import key_paths, registry
+from echelon.experiments.scenario import key_paths, registry, sections
 from echelon.experiments.scenario.named_class import accepted, resolve
 from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.experiments.scenario.scenario import (
@@ -21,13 +22,6 @@ from echelon.experiments.scenario.scenario import (
     key_meanings,
     load_scenario,
     scenario_from_mapping,
-)
-from echelon.experiments.scenario.sections import (
-    FollowerSpec,
-    FormationSpec,
-    GainSpec,
-    GraphSpec,
-    LeaderSpec,
 )
 from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.yaml import ScenarioFault, read_yaml
@@ -80,6 +74,8 @@ def test_the_file_is_read_as_written(load):
     assert scenario.place("graph", "edges", 2) == "s.yaml:3"
     assert scenario.place("follower", "gain", "coupling") == "s.yaml:7"
     assert scenario.place("nothing") == "s.yaml:1"
+    with pytest.raises(ValueError, match="frozen"):
+        scenario.seed = 3
 
 
 def test_what_is_left_out_is_as_the_schema_says_but_for_the_steady_window():
@@ -145,38 +141,35 @@ def test_sections_that_are_accepted(load, override):
     assert load(override).place(*key.split(".")).startswith(f"--set {key}=")
 
 
-@pytest.mark.parametrize("section", [GraphSpec, FormationSpec, GainSpec, LeaderSpec, FollowerSpec])
-def test_keys_belong_to_choices_that_exist(section):
-    choices = {
-        GraphSpec: {"edges", *GRAPHS},
-        FormationSpec: {"offsets", *FORMATIONS},
-        GainSpec: {*METHODS},
-        LeaderSpec: {*registry.LEADER_LAWS},
-        FollowerSpec: {*registry.FOLLOWER_LAWS},
-    }[section]
-    assert {name for mark in marked_keys(section).values() for name in mark.choices} <= choices
+def test_keys_belong_to_choices_that_exist():
+    for section, choices in (
+        (sections.GraphSpec, {"edges", *GRAPHS}),
+        (sections.FormationSpec, {"offsets", *FORMATIONS}),
+        (sections.GainSpec, {*METHODS}),
+        (sections.LeaderSpec, {*registry.LEADER_LAWS}),
+        (sections.FollowerSpec, {*registry.FOLLOWER_LAWS}),
+    ):
+        assert {name for mark in marked_keys(section).values() for name in mark.choices} <= choices
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_a_method_takes_the_keys_that_its_class_takes(name):
-    method, marks = resolve(METHODS[name]), marked_keys(GainSpec)
+    method, marks = resolve(METHODS[name]), marked_keys(sections.GainSpec)
     arguments = [field.name for field in dataclasses.fields(method)]
     assert sorted(key for key, mark in marks.items() if name in mark.choices) == sorted(arguments)
     assert {key for key, mark in marks.items() if name in mark.needed_by} == {*method.needs}
     assert method.name == name and {*method.defaults} <= {*method.needs}
 
 
-@pytest.mark.parametrize(
-    ("section", "laws"),
-    [(LeaderSpec, registry.LEADER_LAWS), (FollowerSpec, registry.FOLLOWER_LAWS)],
-)
-def test_a_law_takes_the_keys_that_its_class_takes(section, laws):
-    for name, entry in laws.items():
-        taken = {key for key, mark in marked_keys(section).items() if name in mark.choices}
-        assert taken == set(accepted(resolve(entry))) & marked_keys(section).keys(), name
-        if section is LeaderSpec:
-            follows = "reference" in accepted(resolve(entry))
-            assert follows == (name in registry.TRACKING_LAWS), name
+def test_a_law_takes_the_keys_that_its_class_takes():
+    leads, follows = sections.LeaderSpec, sections.FollowerSpec
+    for section, laws in ((leads, registry.LEADER_LAWS), (follows, registry.FOLLOWER_LAWS)):
+        for name, entry in laws.items():
+            taken = {key for key, mark in marked_keys(section).items() if name in mark.choices}
+            arguments = set(accepted(resolve(entry)))
+            assert taken == arguments & marked_keys(section).keys(), name
+            tracks = section is leads and name in registry.TRACKING_LAWS
+            assert section is follows or ("reference" in arguments) == tracks, name
 
 
 def test_all_faults_of_a_file_are_told_at_once_by_line(refused):
@@ -197,12 +190,9 @@ def test_all_faults_of_a_file_are_told_at_once_by_line(refused):
         "s.yaml:11: simulation.dt: got `0`, allowed is a number above 0.",
         "s.yaml:14: seed: got this key twice, the first is at s.yaml:12.",
     ]
-
-
-def test_one_fault_does_not_make_others_up(refused):
-    """An edge that cannot be read leaves the number of agents open, so offsets are not blamed."""
-    lines = refused(graph="graph: {edges: [[0, 1], [1, 2], [1, x]]}")
-    assert len(lines) == 1 and lines[0].startswith("s.yaml:3: graph.edges.2.1: got `x`")
+    # An edge that cannot be read leaves the number of agents open, so offsets are not blamed.
+    [line] = refused(graph="graph: {edges: [[0, 1], [1, 2], [1, x]]}")
+    assert line.startswith("s.yaml:3: graph.edges.2.1: got `x`")
 
 
 def test_the_error_carries_its_faults(load):
@@ -296,11 +286,6 @@ def test_a_mapping_is_checked_like_a_file():
     assert str(caught.value) == "mapping: seed: got `-1`, allowed is a number of at least 0."
 
 
-def test_a_scenario_cannot_be_changed(load):
-    with pytest.raises(ValueError, match="frozen"):
-        load().seed = 3
-
-
 MEANT = {
     "radio={delay: 1}": "`network`",
     "graph.delay=1": "`network.delay` or `sensing.delay`",
@@ -388,8 +373,7 @@ def conforms(value, schema, whole):
     kinds = [kinds] if isinstance(kinds, str) else kinds
     checks = [
         not kinds or any(is_kind(value, kind) for kind in kinds),
-        "enum" not in schema or value in schema["enum"],
-        "const" not in schema or value == schema["const"],
+        value in schema.get("enum", [value]) and value == schema.get("const", value),
         "pattern" not in schema or bool(re.search(schema["pattern"], value)),
     ]
     for keyword, wanted in (("anyOf", any), ("oneOf", lambda found: sum(found) == 1)):
@@ -401,21 +385,20 @@ def conforms(value, schema, whole):
 def contents_conform(value, schema, whole):
     if isinstance(value, dict):
         fields, other = schema.get("properties", {}), schema.get("additionalProperties", {})
-        value = {str(key): item for key, item in value.items()}
-        parts = [(item, fields.get(key, other)) for key, item in value.items()]
-        return set(schema.get("required", [])) <= set(value) and all(
-            one is True or one is not False and conforms(item, one, whole) for item, one in parts
-        )
-    if isinstance(value, list):
-        first = schema.get("prefixItems", [])
-        rest = [schema.get("items", {})] * len(value)
-        size = schema.get("minItems", 0) <= len(value) <= schema.get("maxItems", len(value))
-        pairs = zip(value, [*first, *rest[len(first) :]], strict=False)
-        return size and all(conforms(item, one, whole) for item, one in pairs)
-    if is_kind(value, "number"):
+        missing = set(schema.get("required", [])) - {*map(str, value)}
+        parts = [(item, fields.get(str(key), other)) for key, item in value.items()]
+    elif isinstance(value, list):
+        first, rest = schema.get("prefixItems", []), schema.get("items", {})
+        missing = len(value) < schema.get("minItems", 0)
+        parts = itertools.zip_longest(value, first[: len(value)], fillvalue=rest)
+    elif is_kind(value, "number"):
         above = value > schema.get("exclusiveMinimum", -float("inf"))
         return above and value >= schema.get("minimum", value)
-    return True
+    else:
+        return True
+    return not missing and all(
+        one is True or one is not False and conforms(item, one, whole) for item, one in parts
+    )
 
 
 def test_a_named_set_of_parameters_may_be_changed(load):
@@ -436,8 +419,6 @@ def test_a_misspelt_key_of_a_value_that_may_be_a_section_is_told_at_its_place(re
     follower = "follower={law: stopping-point, observer: {x: 1}}"
     text = "\n".join(refused(follower, "leader={law: stopping-point}"))
     assert "follower.observer.x: got an unknown key, allowed are `push`, `scale`" in text
-
-
-def test_text_of_several_lines_is_told_in_one():
+    # Text of several lines is told in one.
     with pytest.raises(EchelonError, match="is 'a.nb', and must be a whole number"):
         DoubleIntegrator("a\nb")

@@ -25,7 +25,6 @@ from echelon.experiments.sweeps.sweep import _missing, compute
 from echelon.experiments.sweeps.sweep_dataset import columns_of, dataset_of, share_bounds, succeeded
 from echelon.experiments.sweeps.workers import SweepBatch
 from echelon.guarantees.promises.promise import promise, promises
-from echelon.output.plots import study_figures as sweep_plots
 from echelon.output.plots.study_figures import sweep_figures
 from echelon.simulation.engine import batch, law_drive
 from echelon.simulation.engine.batch import Batch
@@ -413,18 +412,11 @@ def test_figures_show_the_shares_that_the_batches_hold():
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "linear")
     assert sorted(text.get_text() for text in ax.texts) == ["0/2"] * 2 + ["2/2"] * 4
     assert ax.collections[0].get_array().tolist() == [[0.0, 1.0, 1.0], [0.0, 1.0, 1.0]]
+    # Cells end half way between values on their axis.
+    ends = ax.collections[0].get_coordinates()
+    np.testing.assert_allclose(ends[0, :, 0], [0.5**0.5, 2**0.5, 128**0.5, 64 * 32**0.5])
+    np.testing.assert_allclose(ends[:, 0, 1], [0.005, 0.015, 0.025])
     assert found["success"].axes[0].get_lines()[0].get_ydata().tolist() == [0.0, 1.0, 1.0]
-
-
-def test_cells_of_a_map_end_half_way_between_values_on_their_axis():
-    for values, scale, ends in (
-        ([1.0, 2.0, 4.0, 8.0], "log", [0.5**0.5, 2**0.5, 8**0.5, 32**0.5, 128**0.5]),
-        ([1.0, 2.0, 3.0], "linear", [0.5, 1.5, 2.5, 3.5]),
-        ([0.0, 10.0, 100.0], "linear", [-5.0, 5.0, 55.0, 145.0]),
-        ([1.0, 100.0], "log", [0.1, 10.0, 1000.0]),
-    ):
-        assert sweep_plots._is_geometric(np.array(values)) == (scale == "log")
-        np.testing.assert_allclose(sweep_plots._cell_ends(np.array(values)), ends)
 
 
 # ---- nothing is lost ----

@@ -8,12 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from echelon.core.errors import ScenarioError
-from echelon.experiments.scenario.yaml import (
-    apply_overrides,
-    dump_yaml,
-    inline_yaml,
-    read_yaml,
-)
+from echelon.experiments.scenario.yaml import apply_overrides, dump_yaml, inline_yaml, read_yaml
 
 WORDS = st.sampled_from(
     ["no", "null", "1e-3", "0x1F", ".5e3", "~", "- a", "a: b", "#", "é\x85\u2028"]

@@ -78,6 +78,10 @@ def test_what_fits_the_equations_is_a_guarantee_of_samples_and_else_none(model, 
     assert (found.bounds is None) == bool(fault) and fault in found.fault
     if not fault:
         assert found.kind is Kind.SAMPLES and not found.fault
+    # Bounds that nothing needs leave a proof a proof.
+    bounds = (FlatBound(("angle",), 1, -9.0, "a rate above -9"),)
+    model = own("Bounded", ech.models.Pendulum, flat_bounds=bounds)()
+    assert bounds_of(model, chains_of(model)).kind is Kind.PROOF
 
 
 @pytest.mark.slow
@@ -90,12 +94,6 @@ def test_a_guarantee_says_that_it_rests_on_what_a_class_states():
         assert "if its borders are those that `Slower` states" in line.text
     without = promised(Faster())
     assert not without.promised and "leave out where its inputs" in without.reasons[0]
-
-
-def test_bounds_that_nothing_needs_leave_a_proof_a_proof():
-    bounds = (FlatBound(("angle",), 1, -9.0, "a rate above -9"),)
-    model = own("Bounded", ech.models.Pendulum, flat_bounds=bounds)()
-    assert bounds_of(model, chains_of(model)).kind is Kind.PROOF
 
 
 def body(**changes):

@@ -16,15 +16,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon.guarantees.verifier import algebra
-from echelon.guarantees.verifier.agent_claims import (
-    farthest_from_all,
-    farthest_outside,
-    pairs,
-    points,
-    steepest,
-    support,
-)
+from echelon.guarantees.verifier import agent_claims, algebra
 from echelon.guarantees.verifier.saved_gain import SavedGraph, SavedRegion
 
 LINE = ech.Graph.path(4)
@@ -170,21 +162,16 @@ def test_a_rate_that_is_a_little_too_fast_is_refused_at_the_corners(files, said)
         told = edited(files[name], f"{REGION}.rate", lambda x: 1.05 * x)
         vertices = [claim for claim in said(told) if "vertices" in claim]
         assert vertices == ["rate at 2 vertices, 1/s", *proofs]
-
-
-def test_a_proof_for_the_drift_alone_may_not_need_the_coupling(files, said):
+    # A proof for the drift alone may not need the coupling.
     told = edited(files["proof"], {f"{REGION}.theorem": "A5", f"{REGION}.rate": 0.0})
     assert UNPROVED in said(edited(told, f"{REGION}.strength", 0.0))
     # With the strength left standing, the corners hold by eigenvalues and the proof does not.
     assert {UNPROVED, "strength"} <= set(said(told))
-
-
-def test_an_error_in_one_column_of_the_corners_is_carried_by_a_proof(files, said):
-    told = files["proof"]
-    assert said(edited(told, f"{REGION}.error.0.1", 1e-9)) == []
+    # A small error in one column of the corners is carried by a proof.
+    assert said(edited(files["proof"], f"{REGION}.error.0.1", 1e-9)) == []
     for place in ("0.0", "0.1", "1.0", "1.1"):
-        assert said(edited(told, f"{REGION}.error.{place}", 10.0)) == [UNPROVED]
-        assert UNPROVED in said(edited(told, f"{REGION}.error.{place}", -1e-9))
+        assert said(edited(files["proof"], f"{REGION}.error.{place}", 10.0)) == [UNPROVED]
+        assert UNPROVED in said(edited(files["proof"], f"{REGION}.error.{place}", -1e-9))
 
 
 # ---- what could not be checked is not verified ----
@@ -541,7 +528,7 @@ def domain(bounded, lower=-1.0):
 
 def test_all_corners_are_looked_at_while_they_are_few():
     for bounded in (0, 1, 4, 7, 8, 10):
-        found = points(*domain(bounded))
+        found = agent_claims.points(*domain(bounded))
         x = np.hstack([found.states, found.inputs])
         # As many random points and points of the lattice as of random corners.
         assert len(x) == (2**bounded if bounded <= 7 else 128) + 256
@@ -555,8 +542,8 @@ def test_all_corners_are_looked_at_while_they_are_few():
 
 def test_a_quarter_of_the_pairs_is_about_the_trim_and_a_quarter_about_other_points():
     gain, region = domain(6)
-    known = points(gain, region)
-    ones, others, _ = pairs(gain, region, known)
+    known = agent_claims.points(gain, region)
+    ones, others, _ = agent_claims.pairs(gain, region, known)
     middle, apart = 0.5 * (ones + others), np.abs(ones - others).max(axis=1)
     at_rest = (np.abs(middle) <= 0.5 * apart[:, None]).all(axis=1) & (apart < 0.1)
     near = (np.abs(middle - known.states) <= apart[:, None]).all(axis=1) & (apart < 0.1)
@@ -573,13 +560,13 @@ def test_means_of_corners_have_secants_in_bounds_that_some_corner_reaches(seed):
     random = np.random.default_rng(seed)
     hull, error = random.normal(size=(300, 3, 3)), np.abs(random.normal(size=(3, 3)))
     normals, steps = random.normal(size=(2, 20, 3))
-    bounds = support(hull, 0.0 * error, normals, steps)
+    bounds = agent_claims.support(hull, 0.0 * error, normals, steps)
     every = np.einsum("kn,hnm,km->kh", normals, hull, steps)
     assert bounds.high == pytest.approx(every.max(axis=1), rel=1e-12)
     assert bounds.low == pytest.approx(every.min(axis=1), rel=1e-12)
     sizes = np.abs(normals)[:, None] @ np.abs(hull).max(axis=0) @ np.abs(steps)[:, :, None]
     assert bounds.size == pytest.approx(sizes[:, 0, 0], rel=1e-12)
-    wider = support(hull, error, normals, steps)
+    wider = agent_claims.support(hull, error, normals, steps)
     for signs in combinations((-1.0, 1.0), repeat=2):
         moved = np.einsum("kn,nm,km->k", normals, error * np.outer([1, *signs], [1, 1, 1]), steps)
         assert (bounds.high + moved <= wider.high + 1e-12).all()
@@ -590,10 +577,10 @@ def test_a_jump_is_found_by_halving_however_low_it_is():
     at, height = 0.123456, 1e-4
     x, y = np.array([[1.0]]), np.array([[-1.0]])
     hull, exact = np.array([[[-1.0]], [[1.0]]]), np.zeros((1, 1))
-    bounds, small = (support(size * hull, exact, x, x - y) for size in (1.0, 1e-6))
+    bounds, small = (agent_claims.support(size * hull, exact, x, x - y) for size in (1.0, 1e-6))
 
     def found(function, slack=0.0, within=bounds):
-        return steepest(lambda z: (function(z), slack + 0.0 * z), x, y, x, within)
+        return agent_claims.steepest(lambda z: (function(z), slack + 0.0 * z), x, y, x, within)
 
     def velocity(states):
         return 0.5 * states + height * (states > at)
@@ -608,16 +595,18 @@ def test_a_jump_is_found_by_halving_however_low_it_is():
 
 def test_samples_are_measured_by_the_nearest_matrix_as_a_part_of_the_largest():
     known = np.array([[[4.0, 1.0]], [[2.0, 0.0]]])
-    near = [[2.0, 0.004]]
-    assert farthest_from_all(known, np.array([near])) == pytest.approx(1e-3)
-    assert farthest_from_all(known, np.array([near, [[4.4, 1.0]]])) == pytest.approx(0.1)
-    assert farthest_from_all(known, np.array([[[np.nan, 1.0]], near])) == np.inf
-    assert farthest_from_all(0.0 * known, 0.0 * known) == 0.0
+    near, from_all = [[2.0, 0.004]], agent_claims.farthest_from_all
+    assert agent_claims.farthest_from_all(known, np.array([near])) == pytest.approx(1e-3)
+    assert agent_claims.farthest_from_all(known, np.array([near, [[4.4, 1.0]]])) == pytest.approx(
+        0.1
+    )
+    assert agent_claims.farthest_from_all(known, np.array([[[np.nan, 1.0]], near])) == np.inf
+    assert agent_claims.farthest_from_all(0.0 * known, 0.0 * known) == 0.0
     # No matrix that is no number lies in a hull.
     hull = np.array([[[0.0, 1.0]], [[2.0, 1.0]]])
     for wrong in ([[np.nan, 1.0]], [[1.0, np.nan]], [[np.inf, 1.0]]):
         samples = np.array([[[1.0, 1.0]], wrong, [[1.0, 1.0]]])
-        assert farthest_outside(hull, np.zeros((1, 2)), samples) == np.inf
+        assert agent_claims.farthest_outside(hull, np.zeros((1, 2)), samples) == np.inf
 
 
 @given(st.integers(0, 10**6))

@@ -81,9 +81,7 @@ def test_followers_make_up_for_what_moves_them_more_than_their_sender_alone():
     assert not ech.promise(alone, SETTINGS).promised
     away = largest_deviation(alone)
     assert away[-1] - away[-2] > 0.5 * (away[-2] - away[-3])
-
-
-def test_what_a_wind_does_is_said_to_be_ignored_and_no_bounds_are_announced():
+    # What a wind does that carries nobody away is said to be ignored.
     parts = parts_of(air((0.2, 0.0), 0.3), path=CIRCLE)
     line = ech.promise(parts, SETTINGS).hypotheses[Hypothesis.EXACT_STATES]
     assert line.text.endswith("the guarantee ignores this")

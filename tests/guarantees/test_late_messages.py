@@ -13,14 +13,7 @@ import scipy.optimize
 import scipy.sparse as sp
 
 from echelon.agents.network.channel import Bursts, Network
-from echelon.guarantees.messages.late_messages import (
-    LateRate,
-    ages_of,
-    is_proved,
-    late_rates,
-    longest_ways,
-    losses_in_a_row,
-)
+from echelon.guarantees.messages import late_messages as t9
 from echelon.guarantees.stopping.tube import _falling
 
 TREE = np.array([[3.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
@@ -153,7 +146,7 @@ def rate_ratio(draw, heard, led, c, s, dt, oldest, how):
     flown = agreeing(draw, heard, led, c, s, dt, 400, oldest, how)
     times = dt * np.arange(len(flown))
     ratios = []
-    for late in late_rates(L, c, oldest * Fraction(dt)):
+    for late in t9.late_rates(L, c, oldest * Fraction(dt)):
         start, heaviest = (flown[0] / late.weights).max(), late.weights.max()
         m = _falling(start, late.rate * heaviest, heaviest, s, times)
         ratios.append((flown / (late.weights * m[:, None])).max())
@@ -175,7 +168,7 @@ def test_the_rates_of_the_papers_tree():
 
     for age, about in ((0, 8.0), (20, 4.6), (50, 2.75), (100, 1.65), (300, 0.63), (500, 0.39)):
         best = scipy.optimize.brentq(short, 0.0, c, args=(age / 1000.0,))
-        [late, *_] = late_rates(sp.csr_array(TREE), c, Fraction(age, 1000))
+        [late, *_] = t9.late_rates(sp.csr_array(TREE), c, Fraction(age, 1000))
         # The search ends within 1e-5 of the best one, below it.
         assert (1.0 - 1e-5) * 0.999 * best <= late.rate <= 0.999 * best
         assert late.rate == pytest.approx(about, rel=0.02)
@@ -189,16 +182,16 @@ def test_a_faster_rate_is_neither_proved_nor_true():
     # All messages as old as allowed, near rest: the root of the delayed loop is the best rate.
     c, dt, oldest, L = 10.0, 0.002, 50, sp.csr_array(TREE)
     age = oldest * Fraction(dt)
-    [best, *_] = late_rates(L, c, age)
-    assert is_proved(best, L, c, age)
-    assert not is_proved(LateRate(1.01 * best.rate, best.weights), L, c, age)
+    [best, *_] = t9.late_rates(L, c, age)
+    assert t9.is_proved(best, L, c, age)
+    assert not t9.is_proved(t9.LateRate(1.01 * best.rate, best.weights), L, c, age)
     flown = agreeing(np.random.default_rng(0), HEARD, LED, c, 1e9, dt, 3000, oldest, "fixed")
     seen = -np.log(flown[-1] / flown[-501]) / (500 * dt)
     assert best.rate <= seen.min() and seen.max() <= 1.02 * best.rate / 0.999
     # Weights that break the inequality prove nothing.
-    assert not is_proved(best._replace(weights=np.ones(3)), L, c, age)
-    assert not is_proved(best._replace(weights=-best.weights), L, c, age)
-    assert not is_proved(best, L, c, 2 * age)
+    assert not t9.is_proved(best._replace(weights=np.ones(3)), L, c, age)
+    assert not t9.is_proved(best._replace(weights=-best.weights), L, c, age)
+    assert not t9.is_proved(best, L, c, 2 * age)
 
 
 # ---- 3: the arrival where all hear one way -------------------------------------------------------
@@ -206,7 +199,7 @@ def test_a_faster_rate_is_neither_proved_nor_true():
 
 def arrival_ratio(draw, heard, led, c, s, dt, oldest, how, ways=None):
     L = laplacian(heard, led)
-    ways = longest_ways(sp.csr_array(L)) if ways is None else ways
+    ways = t9.longest_ways(sp.csr_array(L)) if ways is None else ways
     w = np.linalg.solve(L, np.ones(len(led)))
     flown = agreeing(draw, heard, led, c, s, dt, 400, oldest, how)
     times = np.maximum(dt * (np.arange(len(flown))[:, None] - (ways - 1) * oldest), 0.0)
@@ -221,8 +214,8 @@ def test_one_way_messages_delay_the_arrival_by_their_age_on_each_link():
 
 def test_longest_ways_are_those_of_the_graph():
     heard = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [1, 1, 0, 0], [0, 0, 1, 0]], float)
-    assert longest_ways(sp.csr_array(laplacian(heard, np.ones(4)))).tolist() == [1, 2, 3, 4]
-    assert longest_ways(sp.csr_array(TREE)) is None
+    assert t9.longest_ways(sp.csr_array(laplacian(heard, np.ones(4)))).tolist() == [1, 2, 3, 4]
+    assert t9.longest_ways(sp.csr_array(TREE)) is None
 
 
 def test_where_followers_hear_each_other_the_arrival_is_later_than_that():
@@ -309,7 +302,7 @@ def test_losses_in_a_row_are_those_of_many_links(numbers, monkeypatch):
     # As rare as one message in 2,000, which can be counted.
     monkeypatch.setattr("echelon.guarantees.messages.late_messages.RARE", 1.0)
     net, whole, shares = channel(**numbers), True, []
-    lost = losses_in_a_row(net, 1, 2000)
+    lost = t9.losses_in_a_row(net, 1, 2000)
     links = lost_by_links(net, np.random.default_rng(3), 200_000)
     for gone in itertools.islice(links, lost + 1):
         whole &= gone
@@ -325,18 +318,18 @@ def test_the_mean_age_is_that_of_many_links():
         lost = np.where(gone, lost + 1, 0)
     # A step of delay, half a period of four steps, and what was lost.
     seen = 0.005 * (1 + 1.5 + 4 * lost.mean())
-    assert ages_of(net, 0.005, 12000, 6, 2).mean == pytest.approx(seen, rel=0.02)
+    assert t9.ages_of(net, 0.005, 12000, 6, 2).mean == pytest.approx(seen, rel=0.02)
     # Without losses: 4 steps of delay, 2 of jitter, 4 between two messages.
-    ages = ages_of(channel(delay=0.02, jitter=0.012), 0.005, 12000, 6, 2)
+    ages = t9.ages_of(channel(delay=0.02, jitter=0.012), 0.005, 12000, 6, 2)
     assert (ages.lost, ages.arrived, ages.oldest) == (0, 10, 10)
     assert ages.first_packet == pytest.approx(2 * 0.05)
-    assert ages_of(channel(loss=1.0), 0.005, 12000, 6, 2).first_packet is None
+    assert t9.ages_of(channel(loss=1.0), 0.005, 12000, 6, 2).first_packet is None
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1])
 def test_outages_that_never_end_have_an_age(share):
     network = Network(rate=25.0, bursts=Bursts(share, 2.0**63), loss=0.1, forget=1.0)
-    ages = ages_of(network.prepared(0.02, 100.0, 0), 0.02, 5000, 6, 2)
+    ages = t9.ages_of(network.prepared(0.02, 100.0, 0), 0.02, 5000, 6, 2)
     # The whole run, and the delay.
     assert np.isfinite(ages.mean) and ages.mean < 101.0
     assert (ages.mean < 0.1) == (share == 0.0)

@@ -148,6 +148,13 @@ def test_waypoints_fit_together_as_their_class_says():
 
     assert "bounded derivatives" in path_fault(Cut(times, points), chains_of(MODEL), 10.0)
 
+    # Nor are derivatives of another making those of the path.
+    class Told(ech.references.Circle):
+        def derivatives(self, t, order, coordinates):
+            return 0.0 * super().derivatives(t, order, coordinates)
+
+    assert "replaces `derivatives`" in path_fault(Told(), chains_of(MODEL), 10.0)
+
 
 @pytest.mark.parametrize("horizon", [60.0, 1e5])
 def test_the_bounds_of_a_path_hold_between_samples_however_long_it_is(horizon):
@@ -166,14 +173,6 @@ def test_the_bounds_of_a_path_hold_between_samples_however_long_it_is(horizon):
         assert low <= every[:, order].min() <= low + 0.1 * size
         assert high - 0.1 * size <= every[:, order].max() <= high
     assert float(pieces.times[-1]) == horizon
-
-
-def test_derivatives_of_another_making_are_not_those_of_the_path():
-    class Told(ech.references.Circle):
-        def derivatives(self, t, order, coordinates):
-            return 0.0 * super().derivatives(t, order, coordinates)
-
-    assert "replaces `derivatives`" in path_fault(Told(), chains_of(MODEL), 10.0)
 
 
 @pytest.mark.parametrize("name", ["where", "root", "sine"])

@@ -199,15 +199,16 @@ def test_one_step_of_the_integrator_that_runs_decides():
             sizes = np.linalg.norm(result.errors, axis=(1, 2))
         assert bool(sizes[-40:].max() < sizes[:40].max()) is holds
     assert found.hypotheses[Hypothesis.SAMPLING].number > 1.0
-
-
-def test_the_printed_step_keeps_no_offset():
-    model = ech.models.Linear(A=[[-0.5]], B=[[1.0]])
-    gain = ech.synthesize(model, ech.Graph.path(2), ech.gains.FixedGain("identity", coupling=0.2))
-    parts = parts_of(model, ech.Graph.path(2), gain)
-    assert ech.promise(parts, settings(integrator="printed", dt=1.0)).promised
-    away = parts.replace(formation=ech.Formation([[0.0], [1.0]]))
-    step = ech.promise(away, settings(integrator="printed", dt=1.0)).hypotheses[Hypothesis.SAMPLING]
+    # The printed step keeps no offset.
+    model, printed = (
+        ech.models.Linear(A=[[-0.5]], B=[[1.0]]),
+        settings(integrator="printed", dt=1.0),
+    )
+    gain = ech.synthesize(model, PATH, ech.gains.FixedGain("identity", coupling=0.2))
+    parts = parts_of(model, PATH, gain)
+    assert ech.promise(parts, printed).promised
+    away = parts.replace(formation=ech.Formation([[0.0], [1.0], [1.0], [1.0]]))
+    step = ech.promise(away, printed).hypotheses[Hypothesis.SAMPLING]
     assert step.fails and "ignores the goals" in step.text
 
 

@@ -51,11 +51,9 @@ def test_leaders_apart_come_together_no_faster_than_their_own_coupling(coupling)
     assert found.rate == pytest.approx(coupling) and measured == pytest.approx(coupling, rel=1e-2)
     assert found.slowest == -found.rate and found.tube.arrival is None
     assert f"decay at {coupling} 1/s or faster" in found.sentence()
-
-
-def test_leaders_that_start_alike_leave_the_rate_to_their_followers():
-    found = shrinking(formation(0.0, 0.05), 1.0, 2.0)[1]
-    assert found.rate == pytest.approx(4.0) and found.tube.arrival is not None
+    # Leaders that start alike leave the rate to their followers.
+    alike = promise(formation(0.0, coupling), ech.Settings(horizon=2.0, dt=0.02))
+    assert alike.rate == pytest.approx(4.0) and alike.tube.arrival is not None
 
 
 def test_passive_leaders_apart_come_together_by_their_own_drift():

@@ -103,17 +103,41 @@ def test_a_leader_with_a_path_beside_an_unknown_law_has_a_reference():
     assert lines["Assumption 4, leader tracks"].text == "no mode of the leader is known"
 
 
-def test_a_leader_that_echelon_does_not_know_leaves_nothing_guaranteed():
-    class Away(ech.laws.TrimInput):
-        """A leader that drives away."""
+class Away(ech.laws.TrimInput):
+    """A leader that drives away."""
 
-        def update(self, model, view, memory):
-            return model.physical(jnp.ones(2)), memory
+    def update(self, model, view, memory):
+        return model.physical(jnp.ones(2)), memory
 
-    law = ech.laws.Consensus(GAIN, feedforward="none")
-    assert ech.promise(parts_of(law), SETTINGS).promised
-    found = ech.promise(parts_of(law, Away()), SETTINGS)
-    assert UNKNOWN in found.sentence() and not found.promised
+
+class Elsewhere(ech.laws.StoppingLeader):
+    """It is expected where it is not."""
+
+    def expected(self, model, t, deviation, age, period):
+        there = super().expected(model, t, deviation, age, period)
+        return there._replace(signal=there.signal + 1.0)
+
+
+class Driven(ech.laws.StoppingPoint):
+    """Its input has the wrong sign."""
+
+    def update(self, model, view, memory):
+        u, memory = super().update(model, view, memory)
+        return -u, memory
+
+
+@pytest.mark.parametrize("network", [None, ech.Network(rate=50.0, loss=0.1)])
+def test_what_is_proved_of_laws_is_not_of_their_subclasses(network):
+    leader, follower = ech.laws.StoppingLeader(), ech.laws.StoppingPoint()
+    law, rest = ech.laws.Consensus(GAIN, feedforward="none"), ech.laws.TrimInput()
+    known, own = [(follower, leader)], [(Driven(), leader), (follower, Elsewhere())]
+    if network is None:
+        known, own = [*known, (law, rest), (Renamed(GAIN), rest)], [*own, (law, Away())]
+    for laws, promised in ((known, True), (own, False)):
+        for pair in laws:
+            parts = parts_of(*pair).replace(world=ech.World(network=network))
+            found = ech.promise(parts, SETTINGS)
+            assert found.promised == promised != (UNKNOWN in found.sentence())
 
 
 CODE = sorted(

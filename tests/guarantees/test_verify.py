@@ -15,19 +15,8 @@ from hypothesis import strategies as st
 import echelon as ech
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.named_class import resolve
+from echelon.guarantees.verifier import algebra
 from echelon.guarantees.verifier.agent_claims import farthest_outside
-from echelon.guarantees.verifier.algebra import (
-    ends_of_many,
-    first_unproved,
-    grounded_rows,
-    inverse,
-    is_positive_definite,
-    observable,
-    product,
-    rightmost,
-    rows_of,
-    spectrum,
-)
 from echelon.guarantees.verifier.findings import unchecked
 from echelon.guarantees.verifier.saved_gain import SavedGraph
 from echelon.guarantees.verifier.verify import judge
@@ -144,8 +133,8 @@ def test_a_proof_that_holds_is_found_again_at_its_rate_and_not_far_above(files):
     hull[:, rows, columns] = region["hull"]["values"]
     parts = (told["P"], told["model"]["B"], told["R"])
     parts = (*map(np.array, parts), hull, np.array(region["error"]), Fraction(region["strength"]))
-    assert first_unproved(*parts, region["rate"]) is None
-    assert first_unproved(*parts, region["rate"] * (1.0 + 1e-4)) is not None
+    assert algebra.first_unproved(*parts, region["rate"]) is None
+    assert algebra.first_unproved(*parts, region["rate"] * (1.0 + 1e-4)) is not None
 
 
 SAME = {
@@ -295,11 +284,11 @@ def test_the_command_prints_a_table_and_exits_by_what_holds(files, echelon, tmp_
 )
 def test_a_gram_matrix_is_definite_exactly_when_its_rows_have_full_rank(rows):
     M = np.array(rows, float)
-    gram = rows_of(M.T @ M)
+    gram = algebra.rows_of(M.T @ M)
     full = np.linalg.matrix_rank(M) == M.shape[1]
-    assert is_positive_definite(gram) is bool(full)
+    assert algebra.is_positive_definite(gram) is bool(full)
     if full:
-        one = product(gram, inverse(gram))
+        one = algebra.product(gram, algebra.inverse(gram))
         assert all(x == (i == j) for i, row in enumerate(one) for j, x in enumerate(row))
 
 
@@ -307,30 +296,24 @@ def test_the_sign_of_a_minor_is_not_a_matter_of_rounding():
     # det = (1 + e) - 1 with e half of what float64 can see beside 1, and its negative.
     one, tiny = Fraction(1), Fraction(1, 2**60)
     for last, definite in ((1 + tiny, True), (1 - tiny, False), (one, False)):
-        assert is_positive_definite([[one, one], [one, last]]) is definite
+        assert algebra.is_positive_definite([[one, one], [one, last]]) is definite
     # Of symmetric matrices to the last bit alone.
-    assert is_positive_definite([[2 * one, tiny], [tiny, 2 * one]])
-    assert not is_positive_definite([[2 * one, tiny], [0 * one, 2 * one]])
-    assert not is_positive_definite([[one, 0 * one], [tiny, one]])
+    assert algebra.is_positive_definite([[2 * one, tiny], [tiny, 2 * one]])
+    assert not algebra.is_positive_definite([[2 * one, tiny], [0 * one, 2 * one]])
+    assert not algebra.is_positive_definite([[one, 0 * one], [tiny, one]])
 
 
 @pytest.mark.parametrize("followers", [3, 30, 450])
 def test_the_spectrum_of_a_chain_is_its_closed_form(followers):
     edges = np.array([(k, k + 1, 1.0) for k in range(followers)])
-    found, bound = spectrum(SavedGraph(followers + 1, (0,), edges, np.zeros(1)), edges)
+    found, bound = algebra.spectrum(SavedGraph(followers + 1, (0,), edges, np.zeros(1)), edges)
     k = np.arange(1, followers + 1)
     wanted = 4.0 * np.sin((2 * k - 1) * np.pi / (4 * followers + 2)) ** 2
     assert found == pytest.approx(wanted, rel=1e-11)
     assert found[0] == pytest.approx(wanted[0], rel=1e-13)
     assert wanted[0] * (1.0 - 1e-11) <= bound <= wanted[0]
     many = wanted if followers <= 400 else wanted[[0, -1]]
-    assert ends_of_many(found) == pytest.approx(many, rel=1e-11)
-
-
-def test_the_exact_laplacian_loses_no_weight():
-    edges = np.array([(0, 1, 0.1), (1, 2, 0.2), (0, 2, 0.7)])
-    rows = grounded_rows(SavedGraph(3, (0,), edges, np.zeros(1)), edges)
-    assert rows[0][0] == Fraction(0.1) + Fraction(0.2) and rows[0][1] == -Fraction(0.2)
+    assert algebra.ends_of_many(found) == pytest.approx(many, rel=1e-11)
 
 
 @given(st.integers(0, 10**6), st.integers(1, 5), st.integers(0, 3))
@@ -343,13 +326,16 @@ def test_the_rank_of_what_is_seen_is_that_of_the_part_that_is_built_in(seed, see
     A[seen:] = random.normal(size=(hidden, n))
     turn, _ = np.linalg.qr(random.normal(size=(n, n)))
     C = np.eye(n)[:1]
-    assert observable(turn @ A @ turn.T, C @ turn.T) == seen
+    assert algebra.observable(turn @ A @ turn.T, C @ turn.T) == seen
 
 
-def test_the_rightmost_eigenvalue_knows_how_well_it_is_known():
-    value, slack = rightmost(np.diag([-3.0, -1.0]))
+def test_the_exact_laplacian_loses_no_weight_and_eigenvalues_know_how_well_they_are_known():
+    edges = np.array([(0, 1, 0.1), (1, 2, 0.2), (0, 2, 0.7)])
+    rows = algebra.grounded_rows(SavedGraph(3, (0,), edges, np.zeros(1)), edges)
+    assert rows[0][0] == Fraction(0.1) + Fraction(0.2) and rows[0][1] == -Fraction(0.2)
+    value, slack = algebra.rightmost(np.diag([-3.0, -1.0]))
     assert value == -1.0 and slack < 1e-13
-    value, slack = rightmost(np.array([[-1.0, 1.0], [0.0, -1.0]]))
+    value, slack = algebra.rightmost(np.array([[-1.0, 1.0], [0.0, -1.0]]))
     assert value == pytest.approx(-1.0, abs=1e-7) and 1e-10 < slack
 
 
