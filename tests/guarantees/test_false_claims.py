@@ -596,12 +596,10 @@ def test_a_jump_is_found_by_halving_however_low_it_is():
 def test_samples_are_measured_by_the_nearest_matrix_as_a_part_of_the_largest():
     known = np.array([[[4.0, 1.0]], [[2.0, 0.0]]])
     near, from_all = [[2.0, 0.004]], agent_claims.farthest_from_all
-    assert agent_claims.farthest_from_all(known, np.array([near])) == pytest.approx(1e-3)
-    assert agent_claims.farthest_from_all(known, np.array([near, [[4.4, 1.0]]])) == pytest.approx(
-        0.1
-    )
-    assert agent_claims.farthest_from_all(known, np.array([[[np.nan, 1.0]], near])) == np.inf
-    assert agent_claims.farthest_from_all(0.0 * known, 0.0 * known) == 0.0
+    assert from_all(known, np.array([near])) == pytest.approx(1e-3)
+    assert from_all(known, np.array([near, [[4.4, 1.0]]])) == pytest.approx(0.1)
+    assert from_all(known, np.array([[[np.nan, 1.0]], near])) == np.inf
+    assert from_all(0.0 * known, 0.0 * known) == 0.0
     # No matrix that is no number lies in a hull.
     hull = np.array([[[0.0, 1.0]], [[2.0, 1.0]]])
     for wrong in ([[np.nan, 1.0]], [[1.0, np.nan]], [[np.inf, 1.0]]):
