@@ -125,33 +125,20 @@ def test_a_domain_that_was_seen_at_stored_frames_alone_covers_no_run_from_outsid
         assert ech.summary(result)["covered"] is covered
 
 
-# ---- every reader --------------------------------------------------------------------------------
-
-FILE = """
-import numpy as np
-import echelon as ech
-
-class Cart(ech.models.DoubleIntegrator):
-    most: float = 0.05
-    @property
-    def input_limits(self):
-        return ech.models.Limits(np.eye(2), (-self.most,) * 2, (self.most,) * 2)
-"""
-SCENARIO = """
+SCENARIO = f"""
 name: carts
-model: {python: "cart.py:Cart", parameters: {dimension: 2}}
-graph: {name: path, agents: 3}
-formation: {name: line}
-reference: {name: circle, radius: 0.5, rate: 0.2}
-follower: {law: stopping-point}
-initial: {spread: {position: 1.0}}
-simulation: {horizon: 2.0, dt: 0.01}
+model: {{python: "{__file__}:Cart", parameters: {{dimension: 2}}}}
+graph: {{name: path, agents: 3}}
+formation: {{name: line}}
+reference: {{name: circle, radius: 0.5, rate: 0.2}}
+follower: {{law: stopping-point}}
+initial: {{spread: {{position: 1.0}}}}
+simulation: {{horizon: 2.0, dt: 0.01}}
 """
 
 
 @pytest.mark.slow
 def test_check_run_sweep_verify_and_json_agree(echelon, tmp_path):
-    (tmp_path / "cart.py").write_text(FILE)
     (tmp_path / "carts.yaml").write_text(SCENARIO)
     code, out, _ = echelon("check", "carts.yaml")
     assert code == 1 and f"while {WHILE}" in " ".join(out.split())

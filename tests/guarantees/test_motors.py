@@ -27,9 +27,6 @@ QUADROTOR = ech.models.Quadrotor()
 MIXER = np.asarray(QUADROTOR.input_limits.matrix)
 
 
-# ---- a path over time ----------------------------------------------------------------------------
-
-
 def hard(t):
     """All functions that a path may be made of, where each is defined."""
     u, v = 0.3 * jnp.sin(t) + 0.5, jnp.sqrt(1.5 + jnp.cos(2.0 * t))
@@ -60,9 +57,6 @@ def test_a_path_and_its_derivatives_lie_in_their_enclosure(path):
             assert (highs - lows <= np.ptp(seen, axis=0) + 0.5 * size).all()
 
 
-# ---- agents over time ----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("roots", [(2.0, 2.5, 3.0), (4.0, 4.5, 5.0)])
 def test_responses_stay_in_their_slices(roots):
     slices, size = slices_of(Chain.of(roots)), len(roots)
@@ -88,9 +82,6 @@ def test_responses_stay_in_their_slices(roots):
             driven = np.array(piece.whole.driven, float)
             assert (grown[inside].max(axis=0) <= driven + 1e-4 * driven).all()
     assert float(slices[0].begin) == 0.0 and slices[-1].end is None
-
-
-# ---- motors --------------------------------------------------------------------------------------
 
 
 def flown(free, bounds):
