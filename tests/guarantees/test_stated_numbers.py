@@ -177,7 +177,7 @@ LINES = {
 """On which side the number of a line that holds is stated, where, and its factor."""
 
 PARENTS = ("follower.feedforward=parent", "graph={edges: [[0, 1], [1, 2], [2, 3]]}")
-QUICK = ("integrators", "van-der-pol", "unicycle", "paper-global")
+QUICK = ("integrators", "van-der-pol", "unicycle")
 SLOW = ("crossing", "leader-lost", "paper-radio", "paper-windy")
 
 
