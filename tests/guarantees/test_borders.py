@@ -303,25 +303,28 @@ def test_a_bound_that_no_integrator_decides_is_promised_and_flown():
     assert result.states[:, :, 1].min() >= found.tube.left - 1.0
 
 
-def weaker(self, x):
-    """A torque that is lost where a pendulum hangs level."""
-    return ech.models.Pendulum.input_map(self, x) * jnp.cos(x[0])
+class Lost(ech.models.Pendulum):
+    """A pendulum whose torque is lost where it hangs level, which inherits a word."""
+
+    def input_map(self, x):
+        return super().input_map(x) * jnp.cos(x[0])
 
 
-def quicker(self, x):
-    """Speeds that are larger elsewhere."""
-    return ech.models.Unicycle.input_map(self, x) * (1.0 + x[0] ** 2)
+class Quickened(ech.models.Unicycle):
+    """A unicycle that is quicker elsewhere, which inherits the bound of its speed."""
+
+    def input_map(self, x):
+        return super().input_map(x) * (1.0 + x[0] ** 2)
 
 
-def damped(self, x):
-    """Another friction, which leaves true what is inherited."""
-    return ech.models.Pendulum.drift(self, x) - jnp.stack([0.0 * x[0], x[1] ** 3])
+class Damped(ech.models.Pendulum):
+    """A pendulum of another friction: what it inherits is proved of it again."""
+
+    def drift(self, x):
+        return super().drift(x) - jnp.stack([0.0 * x[0], x[1] ** 3])
 
 
-Lost = own("Lost", ech.models.Pendulum, input_map=weaker)
-Quickened = own("Quickened", ech.models.Unicycle, input_map=quicker)
-OWN = (Lost(), Quickened(), own("Stated", Lost, **STATED)())
-OWN += (own("Damped", ech.models.Pendulum, drift=damped)(),)
+OWN = (Lost(), Quickened(), Damped(), own("Stated", Lost, **STATED)())
 OWN += (own("Renamed", ech.models.Unicycle, input_names=("v", "w"))(),)
 BUNDLED = ("Unicycle", "Pendulum", "VanDerPol", "SingleIntegrator", "DoubleIntegrator", "Quadrotor")
 BUNDLED += ("PlanarQuadrotor", "QuadrotorEuler", "QuadrotorThrust")
@@ -351,8 +354,15 @@ class Sailing(ech.ControlAffine):
 
 
 Located = own("Located", Sailing, position=("x",), **STATED)
-HUNDREDTHS = {"flat_chains": FlatChains((2, 2), (0, 0)), "output": lambda _, x: x[:2] / 100.0}
-Hundredth = own("Hundredth", ech.models.DoubleIntegrator, **STATED | HUNDREDTHS)
+
+
+class Hundredth(ech.models.DoubleIntegrator):
+    """A double integrator whose outputs are in hundreds of metres."""
+
+    flat_chains, flat_bounds = FlatChains((2, 2), (0, 0)), ()
+
+    def output(self, x):
+        return x[:2] / 100.0
 
 
 def afloat(model, x=0.0):

@@ -38,17 +38,34 @@ def own(name, base, **parts):
     return type(name, (base,), {"__module__": __name__, **stated, **parts})
 
 
-def backwards(bound, words):
-    """A cart with such a bound on its speed to the left."""
-    output = {"output_names": ("back", "v"), "output": lambda _, x: x.at[0].multiply(-1.0)}
-    return output | {"flat_bounds": (FlatBound(("back",), 1, bound, words),)}
+class Slower(Cart):
+    """The same where it is slower than 1 m/s to the left."""
+
+    flat_chains, output_names = Cart.flat_chains, ("back", "v")
+    flat_bounds = (FlatBound(("back",), 1, -1.0, "a speed below 1 m/s"),)
+
+    def output(self, x):
+        return x.at[0].multiply(-1.0)
 
 
-Slower = own("Slower", Cart, **backwards(-1.0, "a speed below 1 m/s"))
-Faster = own("Faster", Cart, **backwards(-2.0, "a speed below 2 m/s"))
-Nowhere = own("Nowhere", Cart, **backwards(1e9, "a speed that nobody has"))
+class Early(Cart):
+    """An input that reaches the first derivative too."""
+
+    flat_chains, flat_bounds = Cart.flat_chains, ()
+
+    def input_map(self, x):
+        return jnp.array([[1e-3], [1.0]])
+
+
+def backwards(name, bound):
+    """A cart with another bound on its speed to the left."""
+    return own(name, Slower, flat_bounds=(FlatBound(("back",), 1, bound, "a speed"),))
+
+
+Faster, Nowhere = backwards("Faster", -2.0), backwards("Nowhere", 1e9)
+
+
 # An input that reaches the first derivative too.
-Early = own("Early", Cart, input_map=lambda _, x: jnp.array([[1e-3], [1.0]]))
 
 
 def promised(model, **initial):
