@@ -283,9 +283,6 @@ def test_a_step_too_long_for_the_gain_takes_the_promise_away(share, verdict):
     assert grows is not found.promised
 
 
-# ---- who is promised nothing ----
-
-
 def test_followers_that_ignore_each_other_or_their_trim_are_promised_nothing():
     _, found = checked({"law": "passive"})
     assert not found.promised
@@ -316,9 +313,6 @@ def test_every_failure_says_what_to_change():
         for line in ech.check(*ech.build(ech.load_scenario(name))).lines:
             assert line.statement and line.text, line.statement
             assert isinstance(line.kind, Kind) and isinstance(line.verdict, Verdict)
-
-
-# ---- other lines ----
 
 
 def test_a_long_path_says_which_eigenvalues_it_looked_at():

@@ -47,9 +47,6 @@ def echelon(echelon, here):
     return echelon
 
 
-# ---- the table ----
-
-
 @pytest.mark.parametrize("scenario", ["van-der-pol", "integrators"])
 def test_what_is_said_to_be_missing_is_accepted_where_it_is_said_to_go(scenario):
     rows = {row.method: row for row in ech.design(ech.load_scenario(scenario)).designs}
@@ -132,9 +129,6 @@ def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to():
     fastest = f"this one converges fastest ({at_most(-short.promise.loop.slowest)} 1/s)"
     assert fastest in because(short, tried, 0.005)
     assert "It needs a step below" in because(long, tried, 1.0)
-
-
-# ---- the slice ----
 
 
 @pytest.fixture(scope="module")

@@ -93,9 +93,6 @@ def test_what_is_no_linear_system_is_refused():
             ech.state_space(ech.build(ech.load_scenario(name, changes)).parts)
 
 
-# ---- files of MATLAB ----
-
-
 FLOW = scipy.linalg.expm(0.1 * np.block([[*OSCILLATOR], [np.zeros((1, 3))]]))[:2]
 
 

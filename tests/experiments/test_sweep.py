@@ -242,9 +242,6 @@ def test_of_starts_that_no_tube_covers_none_is_promised_among_many():
     assert first.tube is not second.tube
 
 
-# ---- the dataset ----
-
-
 def test_a_sweep_is_each_of_its_runs():
     scenario = ech.load_scenario("van-der-pol", SHORT)
     found = ech.sweep(scenario, {"seed": range(3), "follower.gain.coupling": [1.0, 2.0]})

@@ -46,9 +46,6 @@ def promised(parts, horizon=8.0):
     return promise(parts, ech.Settings(horizon=horizon, dt=0.01))
 
 
-# ---- the certificate -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("roots", "order"), [((4.0,), 0), ((2.0, 3.0), 1), ((2.0, 2.5, 3.0), 1)])
 def test_a_vector_grows_no_longer_than_its_room(roots, order):
     draw, p = np.random.default_rng(0), len(roots)

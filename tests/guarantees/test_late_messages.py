@@ -20,9 +20,6 @@ TREE = np.array([[3.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 """Of the paper's tree: the leader is heard by the first follower."""
 
 
-# ---- deviations in NumPy -------------------------------------------------------------------------
-
-
 def sigma(x, s):
     return x / np.sqrt(1.0 + (x / s) ** 2)
 

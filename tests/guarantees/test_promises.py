@@ -460,9 +460,6 @@ def test_plans_are_promised_nothing():
     )
 
 
-# ---- what is told of the model itself ----
-
-
 def of_one_state(drift, states="x"):
     """A model of chained integrators whose last rate is a function and the input."""
 
