@@ -204,10 +204,11 @@ def test_one_step_of_the_integrator_that_runs_decides():
         ech.models.Linear(A=[[-0.5]], B=[[1.0]]),
         settings(integrator="printed", dt=1.0),
     )
-    gain = ech.synthesize(model, PATH, ech.gains.FixedGain("identity", coupling=0.2))
-    parts = parts_of(model, PATH, gain)
+    pair = ech.Graph.path(2)
+    gain = ech.synthesize(model, pair, ech.gains.FixedGain("identity", coupling=0.2))
+    parts = parts_of(model, pair, gain)
     assert ech.promise(parts, printed).promised
-    away = parts.replace(formation=ech.Formation([[0.0], [1.0], [1.0], [1.0]]))
+    away = parts.replace(formation=ech.Formation([[0.0], [1.0]]))
     step = ech.promise(away, printed).hypotheses[Hypothesis.SAMPLING]
     assert step.fails and "ignores the goals" in step.text
 
