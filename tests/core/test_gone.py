@@ -5,6 +5,7 @@ import functools
 import pytest
 
 import echelon as ech
+from echelon.agents.models.model_check import check_model
 from echelon.core import gone
 from echelon.experiments.scenario.scenario import Scenario
 
@@ -23,6 +24,19 @@ def test_a_name_that_is_gone_says_what_to_use(name):
     assert last not in family.__all__
     with pytest.raises(AttributeError, match=f"^`echelon.{name}` is gone; "):
         getattr(family, last)
+
+
+@pytest.mark.parametrize(("name", "now"), gone.RENAMED.items())
+def test_a_name_that_changed_still_works_with_a_warning(name, now):
+    with pytest.warns(FutureWarning, match=f"^`echelon.{name}` is now `echelon.{now}`, and goes"):
+        assert getattr(ech, name) is getattr(ech, now)
+
+
+@pytest.mark.parametrize(("old", "now"), gone.METHODS.items())
+def test_a_method_of_a_model_that_changed_its_name_is_named(old, now):
+    kind = type("Own", (ech.models.DoubleIntegrator,), {old: lambda self, *values: values})
+    with pytest.raises(ech.errors.ModelError, match=f"^`{old}` of `Own` is now `{now}`; rename"):
+        check_model(kind())
 
 
 def test_a_name_that_never_was_is_said_not_to_exist():

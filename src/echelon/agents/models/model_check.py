@@ -13,6 +13,7 @@ from echelon.agents.models.model import ControlAffine, Limits
 from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import ModelError, did_you_mean, is_number, listing
+from echelon.core.gone import METHODS
 from echelon.core.numerics import precision
 from echelon.core.trace import checked_trace, error_summary
 from echelon.core.types import Array
@@ -71,6 +72,9 @@ def _check_kind(model: ControlAffine) -> str:
         raise ModelError(
             f"the model is {model!r}, and must be an instance of a `ControlAffine` class."
         )
+    for old, now in METHODS.items():
+        if hasattr(model, old):
+            raise ModelError(f"`{old}` of `{type(model).__name__}` is now `{now}`; rename it.")
     return type(model).__name__
 
 
