@@ -226,7 +226,6 @@ class FlatLaw(Law):
         return self._counting(self.ready.zero_memory())
 
     def _counting(self, memory: FlatMemory) -> FlatMemory:
-        """Return a memory that counts the rows that act, if there are any."""
         return memory if self.safety is None else memory._replace(active=0.0 * memory.half)
 
     def signal(
@@ -342,10 +341,7 @@ def _positive(root: object) -> bool:
 def _outside(
     chains: Chains, model: ControlAffine, states: Array, bound: FlatBound
 ) -> Iterator[tuple[int, str]]:
-    """Yield the rows of states (K, n) beyond a bound of one output.
-
-    There the inputs push it the wrong way, or without integrators it is below.
-    """
+    """There the inputs push it the wrong way, or without integrators it is below."""
     output = chains.outputs.index(bound.outputs[0])
     if not chains.size:
         yield from _below(chains, model, states, bound)
@@ -365,7 +361,6 @@ def _outside(
 def _below(
     chains: Chains, model: ControlAffine, states: Array, bound: FlatBound
 ) -> Iterator[tuple[int, str]]:
-    """Yield the rows of states (K, n) at which the state alone is not above a bound."""
     output, order = chains.outputs.index(bound.outputs[0]), bound.derivative
 
     def one(x: State) -> jax.Array:

@@ -312,10 +312,7 @@ class FlatLoop(eqx.Module):
         period: Scalar | float,
         memory: FlatMemory,
     ) -> FlatMemory:
-        """Return the memory with a part of the push along the thrust ascribed to its scale.
-
-        Their sum stays: the scale times the thrust, and the push, do not jump.
-        """
+        """Their sum stays: the scale times the thrust, and the push, do not jump."""
         assert self.thrust is not None and memory.scale is not None
         v, rest = memory.delivered, _at_rest(model, memory.delivered)[self.thrust]
         # What one more unit of thrust adds to y'': inputs enter affinely.
@@ -336,10 +333,7 @@ class FlatLoop(eqx.Module):
         return wrap_angles(error, *jumps) if jumps else error
 
     def _observed(self, model: ControlAffine, x: State, v: Input) -> tuple[jax.Array, jax.Array]:
-        """Return what the observer measures of each output, and its rate under an input v, (m,).
-
-        It is the speed y', whose rate is y''; and of an output that an input moves at once, y.
-        """
+        """Return y' and its rate y'' under v, (m,); of an output that an input moves at once, y."""
         u = model.physical(v)
 
         def velocity(x: State) -> State:

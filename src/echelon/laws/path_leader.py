@@ -301,18 +301,12 @@ def _backward(flows: Array) -> Array:
 
 
 def _flows(A: Array, G: Array, Q: Array, span: float) -> Array:
-    """Return exp(-H span) for each Hamiltonian matrix H = [[A, -G], [-Q, -A']], (N, 2n, 2n).
-
-    [X; Y] with [X; Y]' = H [X; Y] has P = Y X^-1 for the Riccati equation's solution. With A and
-    G held this is exact at any length of a step, where a Runge-Kutta step of fast modes is not
-    stable.
-    """
+    """Return exp(-H span), H = [[A, -G], [-Q, -A']]: [X; Y]' = H [X; Y] has P = Y X^-1, exactly."""
     H = np.block([[A, -G], [np.broadcast_to(-Q, A.shape), -A.swapaxes(1, 2)]])
     return scipy.linalg.expm(-span * H)
 
 
 def _before(P: Array, flow: Array) -> Array:
-    """Return P one interval earlier."""
     n = len(P)
     X, Y = flow[:n, :n] + flow[:n, n:] @ P, flow[n:, :n] + flow[n:, n:] @ P
     # Rounding alone makes it asymmetric, and would grow with every interval.

@@ -271,10 +271,7 @@ def _projected(
     low: Float[jax.Array, " K"],
     used: Bool[jax.Array, " K"],
 ) -> Float[jax.Array, " d"]:
-    """Return the vector with normals u >= low that is nearest, to rounding or nearly.
-
-    Hildreth's dual ascent: the row that is off most is corrected, again and again.
-    """
+    """Hildreth's dual ascent: the row that is off most is corrected, again and again."""
 
     def corrected(now: _Ascent) -> _Ascent:
         change = jnp.where(used, jnp.maximum(-now.pull, low - normals @ now.u), 0.0)

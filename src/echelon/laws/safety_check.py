@@ -55,7 +55,6 @@ def check_numbers(
 def _check_space(
     safety: Safety, law: FlatLaw, model: ControlAffine, offsets: Float[Array, "N n"]
 ) -> None:
-    """Check that agents regard each other in time, and have goals that are apart."""
     scales = safety.scales(model)
     least = safety.needed_reach(np.array([law.speed_of(k) for k in law.places(model)]), scales)
     if safety.reach < least:

@@ -79,7 +79,6 @@ def path(
 
 
 def _files(target: Path, every: bool, paths: "list[Polynomials]") -> dict[Path, str]:
-    """Return the file of a path, or those of all agents and the one that lists them."""
     texts = [path.text() for path in paths]
     if not every:
         return {target: texts[0]}

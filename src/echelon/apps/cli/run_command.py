@@ -143,7 +143,6 @@ def run(
 def _new_run(
     name: str, changes: Sequence[str], out: Path | None, force: bool, quiet: bool, figures: bool
 ) -> "tuple[Scenario, Experiment, Job]":
-    """Return the scenario, its parts, and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
 
     scenario = load_scenario(name, changes)
@@ -162,7 +161,6 @@ def _new_run(
 
 
 def _unfinished_run(folder: Path) -> "tuple[Scenario, Experiment, Job]":
-    """Return the scenario, its parts, and the job in a folder."""
     from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
     from echelon.output.archive.chunks import Chunks
 
@@ -182,7 +180,6 @@ def _simulate(
     watched: "WatchedRun | None",
     quiet: bool,
 ) -> "Result":
-    """Return the run, which is stored and shown while it is computed."""
     from echelon.experiments.scenario import build
     from echelon.simulation.step.drive import Stopped
 
@@ -365,7 +362,6 @@ def _new_sweep(
     keep_states: int | None,
     quiet: bool,
 ) -> "tuple[Sweep, Batches, Job]":
-    """Return a sweep and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
 
     scenario = load_scenario(name, changes)
@@ -386,7 +382,6 @@ def _new_sweep(
 
 
 def _unfinished_sweep(folder: Path) -> "tuple[Sweep, Batches, Job]":
-    """Return the sweep and the job in a folder."""
     from echelon.output.archive.study_folder import Batches
 
     batches = Batches(folder)

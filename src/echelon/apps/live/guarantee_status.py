@@ -32,11 +32,7 @@ _NEAR = 1.1
 
 @final
 class _Newest:
-    """A thread that works on requests; of several that wait only the last is worked on.
-
-    Args:
-        work: called with the request.
-    """
+    """A thread that works on requests; of several that wait only the last is worked on."""
 
     def __init__(self, work: Callable[["_Request"], None]) -> None:
         """Start the thread, which waits for a request."""
@@ -176,10 +172,7 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
 
 
 def _end(panel: Panel, knobs: Knobs, edge: float | None) -> float | None:
-    """Return a coupling above the edge at which errors begin to grow in held steps.
-
-    None without an edge, and where they grow nowhere or everywhere on the slider.
-    """
+    """None without an edge, and where they grow nowhere or everywhere on the slider."""
     if edge is None or "coupling" not in panel.ranges:
         return None
     settings, highest = panel.experiment.settings, panel.ranges["coupling"].high
@@ -317,7 +310,6 @@ class GuaranteeStatus:
         self._follow_transient(picture.time, size, halved)
 
     def _follow_transient(self, time: float, size: float, halved: bool) -> None:
-        """Record the errors of the transient, and compare later errors with them."""
         rate = max(self.badge.get("rate") or 0.0, 1e-9)
         if time > self.since + min(_LONGEST, max(_SHORTEST, _TRANSIENT / rate)):
             limit = max(_GROWTH * self.transient, SETTLED)
@@ -327,7 +319,6 @@ class GuaranteeStatus:
         self.reference = self.transient if self.fresh else self.reference
 
     def _departure(self, picture: Picture) -> str:
-        """Return a sentence about an agent outside its domain; empty if all are inside."""
         out = outside(picture.states[:, self.columns], *self.chart.T)
         if not out.any():
             return ""
@@ -349,7 +340,6 @@ class GuaranteeStatus:
         return int(self.large and not self.badge.get("anywhere"))
 
     def _too_near(self) -> str:
-        """Return a sentence about hulls that are nearer than they keep; empty if none are."""
         kept = self.badge.get("apart")
         if kept is None or self.near >= kept - ROUNDING:
             return ""
@@ -359,7 +349,6 @@ class GuaranteeStatus:
         )
 
     def _current(self) -> JsonObject:
-        """Return the badge for the present state."""
         self.severity = self._severity()
         if self.severity == 0:
             return self.badge

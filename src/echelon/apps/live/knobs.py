@@ -256,7 +256,6 @@ class LiveParts:
 
 
 def _start(experiment: Experiment) -> Knobs:
-    """Return the positions at which the knobs have no effect."""
     network, knobs = experiment.parts.world.network, Knobs(_coupling(experiment))
     if network is None:
         return knobs
@@ -264,7 +263,6 @@ def _start(experiment: Experiment) -> Knobs:
 
 
 def _coupling(experiment: Experiment) -> float | None:
-    """Return the coupling of the followers' law; None of a law without one."""
     drive, dt = experiment.parts.drive, experiment.settings.dt
     if drive.gain is not None:
         return drive.gain.coupling

@@ -112,7 +112,6 @@ class Panel:
         return self._moved(knobs, name, value)
 
     def _moved(self, knobs: Knobs, name: str, value: Any) -> Knobs:
-        """Return the knobs with another number for one of them, clamped to its range."""
         if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
             raise SimulationError(f"`{name}` got `{value}`, and must be a number.")
         gain = self.live.unweighted_gain(knobs)
@@ -137,12 +136,6 @@ class Panel:
         return changed._replace(weight=1.0, coupling=coupling)
 
     def _reshaped(self, knobs: Knobs, value: Any, at: float) -> Knobs:
-        """Return the knobs of a formation that begins to take another shape at a time (s).
-
-        Raises:
-            SimulationError: there is no such shape, or a reshape is under way.
-            LawError: with `safety`, a leader or an heir would move beside its path.
-        """
         check_choice("shape", value, (AS_GIVEN, *self.options["shape"]))
         under_way = knobs.reshaping
         if under_way is not None and at < under_way.end:
@@ -256,7 +249,6 @@ def under(scenario: Scenario, law: str) -> tuple[Scenario, Experiment]:
 
 
 def _with_law(scenario: Scenario, law: str, keep_leader: bool) -> Scenario:
-    """Return a scenario with another follower law and those of its keys that the law takes."""
     data = copy.deepcopy(scenario.data)
     data.pop("live", None)
     surplus = foreign_keys(FollowerSpec, law)

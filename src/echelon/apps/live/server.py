@@ -76,11 +76,6 @@ def with_changes(scenario: Scenario) -> Scenario:
 
 
 def _continue(swarm: LiveLoop, run: Recording) -> None:
-    """Let a loop start from the last state of a run.
-
-    Raises:
-        SimulationError: the run has no state of these agents.
-    """
     shape = np.shape(swarm.states)
     if not len(run.times) or run.states.shape[1:] != shape:
         got = "no state" if not len(run.times) else f"{run.agents} agents"
@@ -91,11 +86,6 @@ def _continue(swarm: LiveLoop, run: Recording) -> None:
 
 
 def _check_speed(swarm: LiveLoop) -> None:
-    """Check that a loop keeps up with real time.
-
-    Raises:
-        SimulationError: it does not; the message says how many agents could.
-    """
     swarm.advance()  # which compiles
     best = float("inf")
     for _ in range(3):

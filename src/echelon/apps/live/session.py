@@ -167,11 +167,7 @@ class Session:
         self.promiser = Promiser(self.status.update)
 
     def _check(self) -> None:
-        """Check the events of the scenario, and compile the laws that they choose.
-
-        Raises:
-            SimulationError: an event is not possible.
-        """
+        """Check the events of the scenario, and compile the laws that they choose."""
         panel, happened = self.panel, ()
         for event in self.future:
             try:
@@ -351,7 +347,6 @@ class Session:
         return {**state, "moments": moments, "nearest": self.swarm.nearest.tolist()}
 
     def _panel_message(self) -> JsonObject:
-        """Return the controls and the information flow of the present law."""
         panel, heard = self.panel, heard_by(self.swarm.parts.receives)
         return {"panel": panel.sliders(), "choices": panel.choices(), "heard": heard}
 
@@ -441,7 +436,6 @@ class Session:
             self._set(knobs)
 
     def _set(self, knobs: Knobs) -> None:
-        """Set all knobs, and compute what is guaranteed from now on."""
         self.knobs = knobs
         self.status.begin()
         self.swarm.apply(knobs)
@@ -472,7 +466,6 @@ class Session:
         self.send(self.state())
 
     def _reset(self) -> None:
-        """Restart from the initial states, with the knobs as they are."""
         # At the start nobody has been lost.
         self.knobs = self.knobs._replace(events=(), reshaping=None)
         self.swarm.apply(self.knobs)

@@ -181,7 +181,6 @@ class LiveLoop:
         return loop.share, gain.coupling, gain.P, gain.R, gain.R_inverse, gain.inner
 
     def _look_ahead(self, step: int) -> None:
-        """Compute when the graph switches in the periods about a step."""
         schedule, dt = self.parts.graph.schedule, self.settings.dt
         if schedule is None or schedule.period is None or step in self.ahead:
             return
@@ -277,7 +276,6 @@ class LiveLoop:
         self.loop = dataclasses.replace(self.loop, moving=moving)
 
     def _count(self, knobs: Knobs) -> None:
-        """Let those be there who are after the events of the knobs."""
         if self.loop.presence is None:
             return
         law, graph = self.loop.follower, self.parts.graph
@@ -292,7 +290,6 @@ class LiveLoop:
         return dataclasses.replace(channel, slots=steps // int(channel.every) + 2, bursty=True)
 
     def _in_world(self, loop: Loop, knobs: Knobs) -> Loop:
-        """Return the loop with the network and the noise of the knobs."""
         network, settings = self.panel.network(knobs), self.settings
         if network is not None:
             channel = network.prepared(settings.dt, math.inf, settings.seed)
@@ -302,7 +299,6 @@ class LiveLoop:
         return loop
 
     def _numbers(self, knobs: Knobs) -> tuple[PyTree, ...]:
-        """Return the values of the adjustable numbers at these positions of the knobs."""
         share, gain = np.asarray(float(knobs.feedforward)), self.panel.gain(knobs)
         if knobs.coupling is None:
             return (share,)

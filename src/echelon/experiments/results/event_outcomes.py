@@ -82,7 +82,6 @@ def event_outcomes(result: Result) -> tuple[EventOutcome, ...]:
 
 
 def _outcome(result: Result, event: JsonObject, end: float) -> EventOutcome:
-    """Return what followed an event until another time."""
     late, times = 0.5 * result.settings.dt, result.times
     # A change acts from the first step on that does not begin before it.
     frames = np.flatnonzero((times >= event["at"] - late) & (times < end - late))
@@ -118,7 +117,6 @@ def _new_leader(result: Result, frames: Int[np.ndarray, " F"]) -> tuple[int, flo
 
 
 def _too_near(result: Result, event: JsonObject, frames: Int[np.ndarray, " F"]) -> float | None:
-    """Return how near to another an agent joins that keeps apart, if that is too near."""
     safety, here = result.drive.safety, result.presence
     if safety is None or here is None or event["what"] != "join" or not len(frames):
         return None

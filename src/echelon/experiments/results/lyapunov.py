@@ -170,11 +170,7 @@ def _rounding(result: Result, P: Array, value: Array) -> float:
 
 
 class _Fields(NamedTuple):
-    """States (T, N, n), the drift under the drive and xdot there, and the headings (T,).
-
-    The metric is in axes that turn with the headings; `rates` are those of the headings, rad/s.
-    Both are None where the axes do not turn.
-    """
+    """States, drift, xdot (T, N, n); headings (T,) and rates (rad/s), None if axes do not turn."""
 
     states: jax.Array
     drift: jax.Array
@@ -193,10 +189,7 @@ def _fields(
     u: jax.Array,
     steps: jax.Array,
 ) -> tuple[_Fields, _Fields]:
-    """Return the fields at states x (T, N, n) under inputs u (T, N, m) at steps (T,), and after it.
-
-    The velocity is taken to be the same one step later.
-    """
+    """The velocity is taken to be the same one step later."""
 
     def velocity(x: jax.Array, u: jax.Array, agent: jax.Array, step: jax.Array) -> jax.Array:
         return disturbed(motion.plant, *draw(motion.wind, step, agent))(x, u)
@@ -229,7 +222,6 @@ def _fields(
 def _in_metric_axes(
     model: ControlAffine, fields: _Fields, y: Float[Array, "T N n"]
 ) -> tuple[Float[Array, "T N n"], Float[Array, "T N n"], Float[Array, "T N n"]]:
-    """Return y, the drift and xdot in the axes of the metric."""
     f, xdot = np.asarray(fields.drift), np.asarray(fields.xdot)
     if fields.headings is None or fields.rates is None:
         return y, f, xdot

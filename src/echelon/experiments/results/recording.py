@@ -442,7 +442,6 @@ def foreseen(
 def _ahead(
     parts: Parts, start: Float[Array, "N n"], times: Float[Array, " T"]
 ) -> tuple[Float[Array, "T N n"], Float[Array, "T n"] | None]:
-    """Return the states at the start and the goals from then on, and the reference if any."""
     with precision("float64"):
         path = parts.drive.reference_states(parts.model, jnp.asarray(times))
     if path is None:

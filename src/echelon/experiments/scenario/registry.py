@@ -25,7 +25,6 @@ class Entry(NamedTuple):
 
 
 def _family(module: str, **entries: tuple[str, str]) -> dict[str, Entry]:
-    """Return the entries of a family: classes of a module, each with its summary."""
     return {
         name.replace("_", "-"): Entry(f"echelon.{module}:{cls}", text)
         for name, (cls, text) in entries.items()

@@ -79,8 +79,6 @@ text; aliases of aliases multiply without bound."""
 
 @final
 class _Reading:
-    """Traverses the composed nodes, and collects the places of values and the faults."""
-
     def __init__(self, where: Where, text: str) -> None:
         self.where, self.most = where, len(text) + _ALIASED
         self.yaml = YAML(typ="safe", pure=True)

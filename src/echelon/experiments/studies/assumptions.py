@@ -106,7 +106,6 @@ def pair_values(P: Array, d: Array, f: Array) -> Array:
 def _largest(
     P: Float[Array, "n n"], offsets: Float[Array, "N n"], drifts: Float[Array, "N n"]
 ) -> tuple[float, tuple[int, int]]:
-    """Return the largest value over all pairs, and the pair."""
     best, at = -np.inf, (0, 0)
     for start in range(0, len(offsets), _ROWS):
         rows = slice(start, start + _ROWS)
@@ -219,7 +218,6 @@ def _leader_line(promise: Promise, follows: bool) -> Statement:
 
 
 def _reference_line(model: ControlAffine, demand: ReferenceDemand, settings: Settings) -> Statement:
-    """Return the reference's speed and acceleration, and whether the input limits suffice."""
     limited = settings.limits and model.input_limits is not None
     unit = position_unit(model) or "1"
     sizes = ((demand.speed, f"{unit}/s"), (demand.acceleration, f"{unit}/s^2"))

@@ -70,7 +70,6 @@ DriveOf = Callable[[Parts], Drive]
 def _consensus(
     gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bool = True
 ) -> DriveOf:
-    """Return the drive with the consensus law under a gain and the scenario's leader."""
     return lambda parts: parts.drive.with_follower(
         Consensus(gain(parts), feedforward, trim, parts.drive.frame)
     )
@@ -89,7 +88,6 @@ def _riccati(parts: Parts) -> Gain:
 
 
 def _reference(parts: Parts) -> Any:
-    """Return the reference of the scenario's leader; None without one."""
     return getattr(getattr(parts.drive, "leader", None), "reference", None)
 
 
@@ -193,7 +191,6 @@ def _with_starts(parts: Parts, settings: Settings) -> Parts:
 
 
 def _fly(parts: Parts, settings: Settings, part: Callable[[float], None]) -> RunNumbers:
-    """Run a method, and measure the time of solving, or of the compiled steps."""
     watch = _Watch(part)
     result = simulate(parts, settings, watch)
     seconds = watch.seconds if result.work is None else result.work.seconds

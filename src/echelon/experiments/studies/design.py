@@ -179,7 +179,6 @@ def because(best: Design, designs: tuple[Design, ...], dt: float) -> str:
 
 
 def _advantage(best: Design, others: list[Design], dt: float) -> str:
-    """Return the advantage of a design over those for which the step is equally suitable."""
     assert best.promise is not None
     _, *argument, rate = best.merit(dt)
     rivals = [d for d in others if (d.step > dt) == (best.step > dt)]
@@ -222,7 +221,6 @@ def _design(method: type[Method], arguments: dict[str, Any], built: Experiment) 
 
 
 def _missing_keys(method: str, missing: list[str], parts: Parts) -> str:
-    """Return how to give a method its missing keys."""
     model = parts.model
     state = [*model.state_groups, *model.state_names][0]
     examples = {"domain": f"domain: {{{state}: HALF_WIDTH, ...}}"}
@@ -248,7 +246,6 @@ def with_gain(parts: Parts, gain: Gain) -> Parts:
 
 
 def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Promise) -> Design:
-    """Return the design of a gain, with its margins."""
     loop = guarantee.loop
     (A, B), closed = loop.linear, loop.closed
     poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
@@ -263,7 +260,6 @@ def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Promise) 
 
 
 def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dict[str, Any]:
-    """Return the scenario's arguments of this method, and its domain if the method needs one."""
     if spec is not None and not spec.file and not spec.python and spec.method == method.name:
         return {**method.defaults, **spec.arguments}
     gain = parts.drive.gain

@@ -70,7 +70,6 @@ def compare_structure(file: Path, again: bytes) -> Iterator[Finding]:
 
 
 def _structure(file: Path | bytes) -> dict[str, JsonObject]:
-    """Return dimensions, type and attributes of each group and variable as text, by its path."""
     # Here, since it is slow to load.
     import h5netcdf
 
@@ -215,7 +214,6 @@ def with_leader_gain(experiment: Experiment, stored: object) -> tuple[Experiment
 
 
 def _led_by(parts: Parts, gain: Gain) -> Parts:
-    """Return the parts with another gain of the leaders."""
     drive = parts.drive
     assert isinstance(drive, Laws)
     leader = drive.leader
@@ -224,7 +222,6 @@ def _led_by(parts: Parts, gain: Gain) -> Parts:
 
 
 def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
-    """Compare the guarantee, the scenario, the parts and the starts in a dataset."""
     (run, data), (parts, settings), name = read_recording(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
     value = _as_json(promise(parts, settings).as_mapping())
@@ -248,7 +245,6 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
 def _compare_frames(
     run: Recording, data: Labelled, experiment: Experiment, name: str
 ) -> Iterator[Finding]:
-    """Compare the times of the frames, who is there at each, and offsets that change with time."""
     (parts, settings), stored = experiment, data.arrays()
     steps = np.minimum(np.arange(len(run.states)) * settings.store_every, settings.steps)
     times, schedule = steps * settings.dt, parts.graph.schedule

@@ -102,7 +102,6 @@ def _checked(axes: list[Axis]) -> tuple[Axis, ...]:
 
 
 def _read(text: str) -> Axis:
-    """Return the axis of a text."""
     place = "--over " + " ".join(text.split())
     key, equals, values = text.partition("=")
     if not equals or not all(part.strip() for part in key.split(".")):
@@ -325,6 +324,5 @@ class Sweep:
                 self.frames.check(FrameShape.of(build(case), self.every), axis.key)
 
     def _columns(self) -> int:
-        """Return how many values are stored of a run, without its frames."""
         agents = self.first_built.parts.graph.agents
         return len(RUN_COLUMNS) + len(WORDS) + len(AGENT_COLUMNS) * agents

@@ -101,11 +101,7 @@ def compute(
 def _missing(
     runs: int, before: Sequence[SweepBatch], size: int, seeds: int = 1
 ) -> Iterator[tuple[int, int]]:
-    """Yield the batches (first, count) that are still to compute.
-
-    If a case has more seeds than a batch has runs, no batch contains two cases; otherwise all runs
-    of a case are in one batch.
-    """
+    """Cases with more seeds than a batch has runs share no batch; no batch splits other cases."""
     whole = seeds if seeds > size else size - size % seeds
     at = 0
     for first, end in [*sorted((b.first, b.first + b.runs) for b in before), (runs, runs)]:

@@ -198,7 +198,6 @@ def _arranged(plan: Sweep, whole: Array) -> Array:
 
 
 def _values(axis: Axis) -> Array:
-    """Return the values of an axis: numbers where all are, else text."""
     if isinstance(axis.values, range):
         return np.array(axis.values)
     numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in axis.values)

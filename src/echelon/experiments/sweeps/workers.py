@@ -71,7 +71,6 @@ class Workers:
         return SweepBatch(first, columns_of(rows), frames)
 
     def _build(self, run: SweepRun) -> Experiment | str:
-        """Return the parts and settings of a run, or why they cannot be built."""
         if self._last[0] != run.case:
             try:
                 case: Experiment | str = build(self.plan.case(run.place))

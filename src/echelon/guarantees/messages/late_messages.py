@@ -428,7 +428,6 @@ _UNPROVED = Uncovered(
 
 
 def _uncovered(network: Network, following: Following) -> Uncovered | None:
-    """Return why T9 does not cover a network, whatever its ages."""
     if network.loss >= 1.0:
         return Uncovered("no message arrives", "set `loss` of the network below 1", True)
     if network.messages is MessageContent.STATE:
@@ -524,7 +523,6 @@ def bias_line(parts: Parts, settings: Settings) -> Statement | None:
 
 
 def _swinging_line(parts: Parts) -> Statement | None:
-    """Say that agents with motors that lag may swing if they hear each other late."""
     actuator, graph = parts.world.actuator, parts.graph
     lag = 0.0 if actuator is None else actuator.lag
     if parts.world.network is None or not lag or graph.directed:

@@ -154,12 +154,7 @@ def _angles(alone: Array) -> Array:
 
 
 def _turns(values: Array, own: Array) -> tuple[Array, Array]:
-    """Return the turns (K,) of the determinants along the circle, and the most of each step (K, T).
-
-    Args:
-        values: (T + 1, m) of T on half of the circle.
-        own: (K,) factors.
-    """
+    """Return the turns (K,) of determinants of T (T + 1, m), and the most of each step (K, T)."""
     turns, most = np.zeros(len(own)), np.zeros((len(own), len(values) - 1))
     for k in range(0, len(own), _CHUNK):
         # The other half is that of the conjugate factors.
@@ -173,10 +168,7 @@ def _turns(values: Array, own: Array) -> tuple[Array, Array]:
 
 
 def _joined(values: Array, own: Array) -> bool:
-    """Tell whether no factor between two neighbours of `own` puts a zero on the circle.
-
-    Each 1 - own * value is linear in the factor, so that it passes 0 only in half a turn.
-    """
+    """Each 1 - own * value is linear in the factor, so that it passes 0 only in half a turn."""
     each = 1.0 - own[:, None, None] * values
     return bool((np.abs(np.angle(each[1:] / each[:-1])) < 0.5 * np.pi).all())
 
@@ -272,7 +264,6 @@ def bisect_whole(fits: Callable[[int], bool], low: int, high: int) -> int:
 
 
 def _decays(case: OwnCase, step: LateStep, delay: int) -> bool:
-    """Tell whether every loop decays, and together those that hear each other."""
     # The loops of a conjugate pair mirror each other.
     own = np.unique(case.own[np.imag(case.own) >= 0.0])
     if len(own) > _FEW or case.between:

@@ -255,10 +255,7 @@ def modes_of(parts: Parts) -> NetworkModes:
 
 
 def _of_all(graph: Graph) -> Spectrum:
-    """Return the eigenvalues of the Laplacian of all agents of a directed graph, but for one 0.
-
-    The disagreement between agents has a mode for each of them; another 0 is one that never ends.
-    """
+    """Return Laplacian eigenvalues of all agents but for one 0; another 0 never ends."""
     values = np.linalg.eigvals(graph.laplacian().toarray()).astype(complex)
     values = in_order(np.delete(values, np.abs(values).argmin()))
     return Spectrum(values, len(values), 0.0)
@@ -274,11 +271,7 @@ def all_alike(drive: Drive, model: ControlAffine) -> bool:
 
 
 def _edge(gain: Gain, linear: Linearization, low: float) -> float | None:
-    """Return the coupling from which on the gain's own argument holds here; None without one.
-
-    The argument is P A + A'P - rho P B R^-1 B'P <= 0 at a strength rho = 2 c lambda that is the
-    gain's own; it is looked at again with this A and B.
-    """
+    """Return the coupling from which P A + A'P - rho P B R^-1 B'P <= 0 at the gain's own rho."""
     claim = gain.certificate
     if claim.edge is None or not low > 0.0:
         return None

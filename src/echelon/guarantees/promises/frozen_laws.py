@@ -115,7 +115,6 @@ def leader_path_of(parts: Parts, settings: Settings, leaders: Leaders) -> Leader
 
 
 def _as_sensed(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderPath:
-    """Return a path as a law that turns with the heading sees it, or as it is."""
     assert isinstance(parts.drive, Laws)
     model, still = parts.model, np.zeros(len(times))
     path = LeaderPath(times, states, inputs, np.asarray(model.trim[0], float), still, still)
@@ -440,7 +439,6 @@ def _about(
 
 
 def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices | None:
-    """Return the leader's own law along its path; None where it has no gain."""
     assert isinstance(parts.drive, Laws)
     model, gain = parts.model, gain_of(parts.drive.leader)
     if gain is None:
@@ -454,7 +452,6 @@ def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices 
 
 
 def _culprit(parts: Parts, loop: LinearLoop, path: LeaderPath, frozen: FrozenLaws) -> str:
-    """Return the state whose return to the trim helps most where the law is worst, in words."""
     assert isinstance(parts.drive, Laws)
     model, trim = parts.model, np.asarray(parts.model.trim[0], float)
     n, k = len(trim), int(np.flatnonzero(path.times == frozen.growth().when)[0])

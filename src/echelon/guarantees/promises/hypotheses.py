@@ -162,11 +162,7 @@ def _agreement(case: Case) -> Statement:
 
 
 def _drifting(case: Case) -> Statement:
-    """Say by how much free leaders drift apart, and what is left: containment.
-
-    Behind leaders that move freely, e = y_F + L_g^-1 L_FL y_L of linear agents obeys the modes of
-    the disagreement; the rows of -L_g^-1 L_FL are weights that add to one.
-    """
+    """Here e = y_F + L_g^-1 L_FL y_L of linear agents obeys the modes of the disagreement."""
     away = apart(case.parts, case.settings, case.leaders.starts)
     first, unit = case.parts.graph.leaders[0], f"{position_unit(case.parts.model)} ".lstrip()
     text = (
@@ -294,7 +290,6 @@ def uncovered(graph: Graph, event: Event) -> str:
 
 
 def _leads(graph: Graph, event: Event) -> bool:
-    """Tell whether an agent that is lost was followed until then."""
     schedule = graph.schedule
     assert schedule is not None and schedule.nearest is not None
     row = schedule.row(event.at)
@@ -323,7 +318,6 @@ def as_mapping(event: Event) -> JsonObject:
 
 
 def _through(graph: Graph, event: Event, guarantee: Promise) -> JsonObject:
-    """Return what is guaranteed through an event: of which kind, and in words."""
     why = uncovered(graph, event)
     if why or not guarantee.promised:
         text = f"Nothing is guaranteed through it: {why}." if why else "Nothing is guaranteed."

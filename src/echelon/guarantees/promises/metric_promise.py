@@ -68,7 +68,6 @@ def claims_line(parts: Parts, loop: LinearLoop, region: RegionCertificate | None
 def _difference(
     parts: Parts, gain: Gain, loop: LinearLoop, region: RegionCertificate | None
 ) -> str:
-    """Return the first difference in words; empty without any."""
     claim, low = gain.certificate, parts.graph.spectrum().low
     if abs(claim.lambda_min - low) > _SAME * low:
         ours, theirs = about(low, 4), about(claim.lambda_min, 4)
@@ -88,7 +87,6 @@ def _difference(
 
 
 def _rate(region: RegionCertificate | None) -> str:
-    """Return a promise on a domain in words, with the digits that are compared."""
     if region is None:
         return "nothing"
     kind, theorem = region.kind, region.theorem
@@ -232,7 +230,6 @@ class MetricPromise(Promise):
         return f"{text}. {self._regional(self.region)}"
 
     def _regional(self, region: RegionCertificate) -> str:
-        """Return what the region adds, as strong as its own argument and no stronger."""
         certified, condition, theorem = self.certified, self.condition, region.theorem
         by, what = self.kind.value, f"errors shrink at {at_most(region.rate)} 1/s or faster"
         what = "V does not increase" if theorem is Theorem.A5 else what

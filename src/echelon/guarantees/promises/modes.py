@@ -201,7 +201,6 @@ def _linear(case: Case) -> Iterator[Statement]:
 
 
 def _bent(case: Case) -> Iterator[Statement]:
-    """Yield what is left of these lines where there is no linearization: what a region says."""
     for name in (Hypothesis.DETECTABLE, Hypothesis.COUPLING, Hypothesis.ALONG_PATH):
         yield vacuous(name, _LINEAR, _BENT)
     region = case.region
@@ -299,11 +298,7 @@ def _decaying(case: Case) -> Statement:
 
 
 def _taking_turns(case: Case) -> Statement:
-    """Whether the disagreement decays however graphs take turns.
-
-    Stable modes of each do not say so; one sum of squares that falls on all of them does, whenever
-    they switch (theory page, T8).
-    """
+    """Stable modes of each do not say so; a sum of squares that falls on all of them does (T8)."""
     name, loop = Hypothesis.SWITCHING, case.loop
     edge, c, common = loop.certificate.edge, loop.closed.coupling, loop.common
     if not case.governed:
@@ -392,7 +387,6 @@ def sampling_line(case: Case) -> Statement:
 
 
 def _by_substeps(case: Case) -> str:
-    """Return how many substeps of the integrator decay, as a remedy."""
     settings = case.settings
     tried = (settings._replace(substeps=k) for k in _SUBSTEPS if k > settings.substeps)
     enough = next((x.substeps for x in tried if case.loop.radius(x) < 1.0), None)
@@ -404,7 +398,6 @@ def _by_substeps(case: Case) -> str:
 def _step_line(
     case: Case, radius: float, text: str, remedy: str, reason: str = _GROWS
 ) -> Statement:
-    """Return the line of a step from its spectral radius; the reason it is unstable, if it is."""
     dt = case.settings.dt
     number = radius, f"dt {dt:g} s"
     if radius < 1.0:

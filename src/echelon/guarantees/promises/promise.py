@@ -250,7 +250,6 @@ class Promise(abc.ABC):
         return f"The {what} ignores that {self.without}." if self.without else ""
 
     def _claim(self) -> str:
-        """Return what is claimed, after the conditions that are left to the run."""
         if not self.conditions:
             return self.guarantee()
         text = f"Not guaranteed: this holds while {' and '.join(self.conditions)}."
@@ -371,7 +370,6 @@ def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) ->
 
 
 def _computed(prepared: Prepared, parts: Parts, settings: Settings, brief: bool = False) -> Promise:
-    """Return what is guaranteed of parts, and store it if nothing was left out."""
     with precision("float64"):
         computed = prover_of(prepared.parts.drive).of(prepared, settings, brief)
     if not brief:
@@ -383,7 +381,6 @@ def _computed(prepared: Prepared, parts: Parts, settings: Settings, brief: bool 
 
 
 def _prefix_of(computed: Promise, parts: Parts, settings: Settings) -> Prefix | None:
-    """Return what is guaranteed until the first event that is not covered; None for nothing."""
     line = computed.hypotheses.get(Hypothesis.EVENTS)
     if line is None or not line.fails or line.number is None:
         return None
@@ -401,7 +398,6 @@ def _prefix_of(computed: Promise, parts: Parts, settings: Settings) -> Prefix | 
 
 
 def _stored(parts: Parts) -> dict[Settings, Promise]:
-    """Return the guarantees of parts by settings, of what their code reads now."""
     # A formation is no dataclass, whose parts would be found.
     reads = foreign_key((parts, parts.formation.motion))
     return _cache.setdefault(parts, {}).setdefault(reads, {})

@@ -86,10 +86,7 @@ def region_of(parts: Parts, settings: Settings, leaders: Leaders) -> Region:
 
 
 def _region_at_bend(parts: Parts, settings: Settings, leaders: Leaders, gain: Gain) -> Region:
-    """Return what a metric promises about a trim at which the model bends.
-
-    It has no linearization there, but a hull holds the slopes of all its sides nearby.
-    """
+    """It has no linearization there, but a hull holds the slopes of all its sides nearby."""
     text = "the model is not differentiable at the trim, and its slopes there do not all contract"
     none = unneeded(_NAME, Kind.VERTICES, text, number_text="none")
     try:
@@ -134,13 +131,11 @@ def _with_inner(parts: Parts, gain: Gain, pairs: DomainPairs) -> DomainPairs | N
 def _contraction(
     parts: Parts, gain: Gain, pairs: DomainPairs, exact: bool
 ) -> RegionCertificate | None:
-    """Return what a gain's metric contracts at its coupling; None for nothing."""
     B, spectrum = linearize(parts.model).B, parts.graph.spectrum()
     return contracting_region(pairs, gain.P, B, gain.R, exact, gain.coupling, spectrum)
 
 
 def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCertificate | None:
-    """Return what the metric promises on the claim's domain behind a relayed input."""
     model, spectrum, exact = parts.model, parts.graph.spectrum(), claim.kind is Kind.PROOF
     domain = claim.domain.straight(model)
     if claim.theorem is Theorem.A5:
@@ -158,7 +153,6 @@ def _strength(parts: Parts, gain: Gain) -> float:
 def _withheld(
     parts: Parts, settings: Settings, leaders: Leaders, gain: Gain, certificate: RegionCertificate
 ) -> tuple[str, str]:
-    """Return why the gain in the law that runs does not keep what the metric could, and a cure."""
     if gain.inner is not None:
         return "the hull is of the drift without the gain's inner loop", "remove the inner loop"
     return _not_the_law(parts, settings, leaders, certificate)
@@ -195,10 +189,7 @@ def _not_the_law(
 def _uncovered_input(
     parts: Parts, settings: Settings, leaders: Leaders, domain: Domain
 ) -> tuple[str, str]:
-    """Return which input of the leader is outside of a hull that inputs count in, and a cure.
-
-    The slopes of f + g u depend on u where g varies, and those in the hull are of the domain's u.
-    """
+    """Slopes of f + g u depend on u where g varies; those in the hull are of the domain's u."""
     model, count = parts.model, len(leaders.starts)
     varying = ~constant_inputs(model, domain)
     if leaders.rest or not varying.any():

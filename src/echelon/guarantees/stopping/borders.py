@@ -324,11 +324,7 @@ def _exact(values: Array) -> tuple[Fraction, ...]:
 
 
 def _few(starts: Array) -> Array:
-    """Return starts (K, r) that stand for all: the extreme ones where the speed alone differs.
-
-    Raises:
-        GainError: there are too many.
-    """
+    """Return starts (K, r) that stand for all: the extreme ones where the speed alone differs."""
     starts = starts.copy()
     starts[:, 0] = 0.0
     starts[np.abs(starts) < _LEVEL] = 0.0
@@ -339,11 +335,6 @@ def _few(starts: Array) -> Array:
 
 
 def _distinct(starts: Array) -> Array:
-    """Return each start once.
-
-    Raises:
-        GainError: there are too many.
-    """
     distinct = np.unique(starts, axis=0)
     if len(distinct) > _STARTS:
         raise GainError(

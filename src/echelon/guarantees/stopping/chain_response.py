@@ -110,7 +110,6 @@ def _gain(chain: Chain, order: int) -> Fraction:
 
 
 def _solve(rows: list[list[Fraction]], right: list[Fraction]) -> list[Fraction]:
-    """Return the solution of linear equations, exactly."""
     n = len(right)
     table = [[*row, b] for row, b in zip(rows, right, strict=True)]
     for k in range(n):

@@ -37,13 +37,7 @@ _FOLLOWED = 1e-6
 
 
 class _Missing(NamedTuple):
-    """What the model lacks while the plant follows the path, at times (T,) and of outputs (m,).
-
-    Attributes:
-        current: of the outputs' speeds, (T, m).
-        force: of their accelerations, (T, m).
-        left: by how much the plant does not follow the path, (T,).
-    """
+    """The model lacks speeds and accelerations (T, m); the plant leaves its path by `left` (T,)."""
 
     current: jax.Array
     force: jax.Array
@@ -86,12 +80,7 @@ def drift_line(run: StoppingRun) -> Statement | None:
 
 
 class _Lasting(NamedTuple):
-    """What the model lacks of an agent's motion in the mean, as speeds of its outputs, (m,).
-
-    Attributes:
-        current: what it lacks of the speed.
-        push: the speed that an acceleration which it lacks demands of agreement.
-    """
+    """What lasts, (m,), as speeds; `push` is what an acceleration demands of agreement."""
 
     current: Array
     push: Array
@@ -120,7 +109,6 @@ def _lasting(run: StoppingRun, law: FlatLaw, plant: ControlAffine) -> _Lasting |
 
 
 def _drifts(agent: int, law: FlatLaw, whose: str, lasting: _Lasting) -> Statement | None:
-    """Return that an agent may drift away, by what a current and a push demand of agreement."""
     chains = law.ready.chains
     for k, (name, degree) in enumerate(zip(chains.outputs, chains.degrees, strict=True)):
         current, push, s = float(lasting.current[k]), float(lasting.push[k]), law.speed_of(k)
@@ -144,7 +132,6 @@ def _fails(text: str, remedy: str, number: float | None = None, shown: str = "")
 
 
 def _missing_on_path(run: StoppingRun, loop: FlatLoop, plant: ControlAffine) -> _Missing:
-    """Return what the model lacks of a plant along the leader's path until the horizon."""
     world, model, leader = run.parts.world, run.parts.model, run.leader
     push, air = np.zeros(len(model.state_names)), np.zeros((2, len(model.state_names)))
     if world.disturbance is not None:

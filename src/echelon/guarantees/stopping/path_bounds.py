@@ -145,11 +145,6 @@ def path_fault(reference: Guide | None, chains: Chains, horizon: float) -> str:
 
 @memoize
 def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: float) -> None:
-    """Check a path.
-
-    Raises:
-        GainError: it may lack a derivative.
-    """
     if type(reference).derivatives is not Reference.derivatives:
         raise GainError("a path replaces `derivatives`, which may be those of another path")
     picked = np.array([COORDINATES.index(name) for name in outputs])
@@ -167,11 +162,7 @@ def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: 
 
 
 def _check_joints(reference: Reference, order: int) -> None:
-    """Check that the class of a path says that its parts fit together.
-
-    Raises:
-        GainError: it does not.
-    """
+    """Check that the class of a path says that its parts fit together."""
     kinds = type(reference).__mro__
     joined, parts, path = (
         next(k for k, kind in enumerate(kinds) if name in vars(kind))

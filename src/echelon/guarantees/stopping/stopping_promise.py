@@ -149,7 +149,6 @@ class StoppingPromise(Promise):
 
 
 def _own_line(run: StoppingRun, problem: Problem) -> Statement | None:
-    """Return how late own states may be."""
     parts, law, network = run.parts, run.law, run.network
     if parts.graph.schedule is not None or network is None and parts.world.network is not None:
         # What is known of the ideal network is not true of one that no theorem covers.

@@ -172,10 +172,7 @@ def switching_line(graph: Graph, leaderward: bool, left_out: str, rate: float) -
 
 
 def _left_behind(graph: Graph, leaderward: bool) -> str:
-    """Return whom the leader does not reach along the edges that are heard; empty for nobody.
-
-    Laws are made for a graph without its events, and nobody has asked this of a part of them yet.
-    """
+    """Laws are made for a graph without its events: of a part of them nobody has asked this."""
     schedule = graph.schedule
     assert schedule is not None
     since, lost = "in a period", np.array([], int)
@@ -429,7 +426,6 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
 
 
 def _offsets_line(run: StoppingRun) -> Statement:
-    """Say whether all offsets are of flat outputs, and leave the errors of other states alone."""
     model = run.parts.model
     motion = run.parts.formation.motion
     names = [model.state_names[k] for k in np.flatnonzero(np.ptp(run.parts.formation.offsets, 0))]

@@ -372,7 +372,6 @@ def _is_close(stored: Array, expected: Array) -> bool:
 
 
 def _check_trim(facts: Facts, model: ControlAffine) -> Iterator[Finding]:
-    """Check the equilibrium, A and B at the trim, and A also by difference quotients."""
     saved, n = facts.saved.model, len(facts.saved.P)
     sizes = np.multiply.outer(_STEPS, np.maximum(1.0, np.abs(saved.state)))
     displaced = saved.state + np.stack([sizes, -sizes])[..., None] * np.eye(n)
@@ -393,16 +392,7 @@ def _check_trim(facts: Facts, model: ControlAffine) -> Iterator[Finding]:
 
 
 def _quotients_off(saved: SavedModel, at: Evaluated, steps: Array) -> float:
-    """Return the largest relative distance of A to its one-sided difference quotients.
-
-    For each entry the step with the least error counts: longer steps have curvature, shorter ones
-    rounding. At a kink one of the two sides differs, at a jump every step.
-
-    Args:
-        saved: the model as stored in the file.
-        at: the model at the trim and at each state displaced by each step.
-        steps: (2, J, n), for both sides.
-    """
+    """Of `steps` (2, J, n) the best counts: long ones have curvature, short ones rounding."""
     # Axes: side, step, displaced state, velocity.
     shape = (*steps.shape, -1)
     quotients = (at.velocities[1:] - at.velocities[0]).reshape(shape) / steps[..., None]
@@ -414,7 +404,6 @@ def _quotients_off(saved: SavedModel, at: Evaluated, steps: Array) -> float:
 
 
 def _check_domain(facts: Facts, region: SavedRegion, model: ControlAffine) -> Iterator[Finding]:
-    """Search the domain for states that contradict the guarantee."""
     saved = facts.saved
     yield decide("the domain lies inside the chart", _is_inside_chart(saved.model, region, model))
     some = points(saved, region)
@@ -445,7 +434,6 @@ def _check_domain(facts: Facts, region: SavedRegion, model: ControlAffine) -> It
 
 
 def _is_inside_chart(saved: SavedModel, region: SavedRegion, model: ControlAffine) -> bool:
-    """Return whether all bounded states lie inside the chart of the model."""
     for name, (low, high) in model.chart.items():
         k = saved.state_names.index(name)
         least, most = saved.state[k] + region.lower[k], saved.state[k] + region.upper[k]
@@ -457,10 +445,7 @@ def _is_inside_chart(saved: SavedModel, region: SavedRegion, model: ControlAffin
 def _check_secants(
     facts: Facts, region: SavedRegion, model: ControlAffine, some: Points
 ) -> Finding:
-    """Check velocity differences of pairs of states against the hull or the rate.
-
-    This detects a discontinuous velocity and wrong derivatives.
-    """
+    """Differences of velocities reveal a discontinuous velocity and wrong derivatives."""
     saved, at = facts.saved, pairs(facts.saved, region, some)
     x, y = saved.model.state + at.ones, saved.model.state + at.others
     steps = x - y
@@ -494,10 +479,7 @@ def _normals(metric: Array, sizes: Array) -> Array:
 
 
 def _decay(facts: Facts, region: SavedRegion, steps: Array) -> SupportBounds:
-    """Return bounds of d'P (v(x) - v(y)) that follow from the rate and the strongest feedback.
-
-    They follow from P A + A'P - strength P W P + 2 rate P <= 0, integrated from y to x = y + d.
-    """
+    """By P A + A'P - strength P W P + 2 rate P <= 0, integrated from y to x = y + d."""
     saved, n = facts.saved, len(facts.saved.P)
     W = region.hull[:, :, n:] if region.theorem == "T2" else facts.weighted[None]
     metric_step, rate = steps @ saved.P, region.rate * (1.0 - _SAMPLED)

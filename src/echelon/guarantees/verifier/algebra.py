@@ -67,12 +67,7 @@ def ends_of_many(values: Array) -> Array:
 
 
 def _least(inner_weights: Array, leader_weights: Array) -> tuple[float, float]:
-    """Return the smallest eigenvalue of L = diag(apart 1 + led) - apart, and a lower bound of it.
-
-    L^-1 has no negative entries. It is applied by an elimination without subtractions, which loses
-    no digits for any range of weights (Grassmann, Taksar, Heyman). For every x > 0, no eigenvalue
-    of L^-1 exceeds the largest entry of L^-1 x / x (Collatz, Wielandt).
-    """
+    """Return lambda_min of L = diag(apart 1 + led) - apart and 1 / max(L^-1 x / x) <= it."""
     steps = eliminate(inner_weights, leader_weights)
     if steps is None:
         return 0.0, 0.0
@@ -337,7 +332,6 @@ def directed_spectrum(graph: SavedGraph, edges: Array) -> tuple[Array, float, fl
 
 
 def _reachable(is_neighbour: Array, leader_weights: Array) -> Array:
-    """Return which agents a leader reaches, directly or through others, (n,)."""
     reached = leader_weights.copy()
     for _ in range(len(leader_weights)):
         reached = reached | (is_neighbour & reached).any(axis=1)
@@ -345,7 +339,6 @@ def _reachable(is_neighbour: Array, leader_weights: Array) -> Array:
 
 
 def _strong_components(is_neighbour: Array) -> list[Array]:
-    """Return the strongly connected components, by powers of the adjacency matrix."""
     ways = np.eye(len(is_neighbour), dtype=bool) | is_neighbour
     for _ in range(max(1, int(np.ceil(np.log2(max(2, len(is_neighbour))))))):
         ways = (ways.astype(np.float32) @ ways.astype(np.float32)) > 0.0
@@ -358,11 +351,7 @@ def _strong_components(is_neighbour: Array) -> list[Array]:
 
 
 def _least_of_block(inside: Array, outside: Array) -> float:
-    """Return the smallest eigenvalue of diag(inside 1 + outside) - inside, of one component.
-
-    Inverse iteration by an elimination without subtractions; the eigenvalue lies between the least
-    and the largest x / L^-1 x (Collatz, Wielandt).
-    """
+    """Inverse iteration: it is between the least and largest x / L^-1 x (Collatz, Wielandt)."""
     steps = eliminate(inside, outside)
     if steps is None:
         return 0.0

@@ -115,7 +115,6 @@ def check_linearization(facts: Facts) -> Iterator[Finding]:
 
 
 def _check_between(facts: Facts) -> Iterator[Finding]:
-    """Check that the modes between the extreme eigenvalues decay."""
     values, followers = facts.eigenvalues, facts.saved.graph.agents - len(facts.saved.graph.leaders)
     every = followers <= algebra.ALL_MODES or facts.saved.graph.directed
     if every or facts.saved.graph.switches or facts.saved.abscissa >= 0.0:
@@ -128,7 +127,6 @@ def _check_between(facts: Facts) -> Iterator[Finding]:
 
 
 def _checked_eigenvalues(facts: Facts) -> Array:
-    """Return the eigenvalues whose modes the file covers."""
     graph = facts.saved.graph
     if graph.directed or graph.switches:
         return facts.eigenvalues

@@ -113,7 +113,6 @@ def _differs(claim: str, stored: str, value: str, reason: str) -> Finding:
 
 
 def _shown(value: object) -> str:
-    """Return a value for a table; of a text or a list only what it is."""
     array = _array(value)
     if array is not None:
         return f"{' x '.join(map(str, array.shape))} number{'s' * (array.size != 1)}"
@@ -129,8 +128,6 @@ def _is_number(value: object) -> bool:
 
 
 def _array(value: object) -> Array | None:
-    """Return nested lists of numbers as an array, otherwise None."""
-
     def plain(x: object) -> bool:
         return all(map(plain, x)) if isinstance(x, list) else _is_number(x)
 

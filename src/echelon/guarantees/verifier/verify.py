@@ -77,7 +77,6 @@ def states_gain(document: JsonObject) -> bool:
 
 
 def _promise_findings(promise: object) -> Iterator[Finding]:
-    """Yield what can be checked of a run's guarantee by itself, and name the rest."""
     if not isinstance(promise, dict):
         yield decide("promise", False, text="it must be a mapping")
         return
@@ -137,7 +136,6 @@ def judge(findings: Sequence[Finding], note: str = "") -> Verification:
 
 
 def _no_decay_sentence(saved: SavedGain) -> str:
-    """Return the sentence that is added for a correct file whose gain is not stabilizing."""
     if saved.abscissa < 0.0:
         return ""
     return f" The gain guarantees no decay: the slowest mode is {about(saved.abscissa)} 1/s."

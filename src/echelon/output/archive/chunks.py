@@ -106,7 +106,6 @@ class Chunks:
         return bool(self._begun().get("figures", True))
 
     def _begun(self) -> JsonObject:
-        """Return what was written when the run began."""
         try:
             return json.loads((self.place / _BEGUN).read_text("utf-8"))
         except _DAMAGED as error:
@@ -115,7 +114,6 @@ class Chunks:
             ) from error
 
     def _digest(self) -> str:
-        """Return a digest of the scenario and of every file that it names."""
         files = [self.folder / SCENARIO_FILE, *sorted((self.folder / INPUTS).rglob("*"))]
         digest = hashlib.sha256()
         for file in (file for file in files if file.is_file()):
@@ -186,7 +184,6 @@ class Chunks:
 
 
 def _arrays(stretch: Stretch) -> JsonObject:
-    """Return a stretch as named arrays."""
     plain = {name: getattr(stretch, name) for name in _PLAIN}
     sums = {f"sums_{name}": value for name, value in stretch.sums._asdict().items()}
     moment = {f"moment_{k}": value for k, value in enumerate(stretch.moment)}
@@ -198,7 +195,6 @@ _PLAIN = ("done", "times", "states", "inputs", "seconds")
 
 
 def _stretch(first: int, stored: JsonObject) -> Stretch:
-    """Return the stretch of named arrays."""
     count = sum(name.startswith("moment_") for name in stored)
     stopped = stored.get("stopped")
     return Stretch(

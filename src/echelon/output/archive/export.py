@@ -134,7 +134,6 @@ def _parquet(run: "Result") -> bytes:
 
 
 def _arrays(run: "Result") -> "JsonObject":
-    """Return the arrays of a run by name."""
     from echelon.experiments.results.recording import recording_of
 
     data = recording_of(run)

@@ -98,7 +98,6 @@ def _traced(parts: Parts, settings: Settings, agent: int) -> tuple[OwnLaw, dict[
 
 
 def _head(settings: Settings, agent: int, formation: str) -> tuple[str, dict[str, float | str]]:
-    """Return the comment at the head of each file, and the constants."""
     mark = hashlib.sha256(f"{__version__}\n{settings.dt!r}\n{formation}".encode()).hexdigest()
     about = f"The law of agent {agent}, by echelon {__version__}; see law.json."
     return about, {"AGENT": agent, "DT": settings.dt, "FORMATION": mark}
@@ -111,7 +110,6 @@ def _facts(
     sentence: str,
     files: Mapping[str, str],
 ) -> str:
-    """Return law.json."""
     dt = float(constants["DT"])
     described = {
         "agent": constants["AGENT"],
@@ -135,7 +133,6 @@ def _sizes(functions: Mapping[str, LawFunction]) -> dict[str, int]:
 
 
 def _description(own: OwnLaw, functions: Mapping[str, LawFunction]) -> JsonObject:
-    """Return whom an agent hears, and the names and units of its numbers."""
     model = own.loop.model
     return {
         "leads": own.leads,
@@ -246,7 +243,6 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
 
 
 def _network(parts: Parts) -> Network:
-    """Return the network of parts that can fly."""
     network = parts.world.network
     if network is None or network.messages is not MessageContent.DEVIATION:
         got = "no `network`" if network is None else "`network.messages` `state`"
@@ -292,7 +288,6 @@ def _offsets(parts: Parts, settings: Settings) -> JsonObject:
 
 
 def _fence(parts: Parts, settings: Settings) -> JsonObject:
-    """Return a box about the starts and the plan, and a speed."""
     prepared = prepare(parts, settings)
     drive, model = prepared.parts.drive, parts.model
     assert isinstance(drive, Laws)
@@ -320,7 +315,6 @@ def _rounded(values: Array) -> list[float]:
 
 
 def _vehicles(parts: Parts, settings: Settings) -> tuple[JsonObject, dict[str, str]]:
-    """Return the simulated vehicles: their numbers, and the files of their motions."""
     prepared, model = prepare(parts, settings), parts.model
     motion, agents = prepared.problem.motion, parts.graph.agents
     about = "The motion of a simulated vehicle in a part of a control step."

@@ -245,11 +245,7 @@ def _named_folder(out: Path, force: bool, by: str, how: str) -> Path:
 
 
 def _clear(out: Path, present: Sequence[str], names: Sequence[str]) -> None:
-    """Remove an earlier run or comparison, so that `names` are free.
-
-    Raises:
-        OutputError: one is being written, or a file of such a name is not from echelon.
-    """
+    """Refuse where one is being written, or a file of such a name is not from echelon."""
     earlier = {name for mark, files in _MARKS.items() if mark in present for name in files}
     foreign = [name for name in present if name in {*names} - earlier]
     if foreign:

@@ -111,7 +111,6 @@ def claim_files(place: PathLike) -> ClaimFiles:
 
 
 def _place(path: Path) -> Path:
-    """Return the folder or file that a path means, after checking that it may make claims."""
     if not path.exists():
         raise OutputError(f"`{path}` does not exist; give the folder of a run, or a gain file.")
     check_exists(path)
@@ -157,10 +156,7 @@ def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -
 
 
 def _converged(result: Result) -> bool:
-    """Tell whether errors shrank or remained small: a local guarantee does not cover every start.
-
-    Where errors grow, so may the rounding of another processor, and a difference proves nothing.
-    """
+    """Where errors grow, so may another processor's rounding: a difference proves nothing."""
     if result.outcome in (Outcome.DIVERGED, Outcome.LEFT_CHART):
         return False
     first, last = sizes(result)
@@ -184,7 +180,6 @@ def _repeated(experiment: Experiment, data: Labelled, steps: int) -> Result | No
 
 
 def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Finding]:
-    """Compare dataset, summary and report with those of the run computed again."""
     assert files.data is not None
     laws = isinstance(result.parts.drive, Laws)
     digits = _PRECISIONS[result.settings.precision] if laws else _SOLVED
@@ -212,7 +207,6 @@ def _compare_origin(stored: JsonObject, data: Labelled) -> Iterator[Finding]:
 def _compare_dataset(
     name: str, data: Labelled, result: Result, digits: Digits
 ) -> Iterator[Finding]:
-    """Compare arrays and attributes of a dataset, but those of the parts of the run."""
     parts = labelled_parts(result.parts, result.settings)
     stored, again = data.arrays(), with_sums(result)
     for key, value in again.arrays().items():
@@ -316,7 +310,6 @@ def check_files(
 def _computed(
     files: ClaimFiles, source: Scenario, repeat: bool, begin: Callable[[str], None]
 ) -> Iterator[Finding]:
-    """Yield what is computed again from a scenario: the guarantee, and then the run."""
     begin("computing the guarantee again, which takes up to a minute")
     experiment, findings = experiment_of(source, files.claims, files.gain)
     yield from findings
@@ -335,7 +328,6 @@ def _computed(
 
 
 def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | None, str]:
-    """Return the scenario from which claims are computed again; or None, and what is against it."""
     if files.scenario is None:
         return trusted, "" if trusted is not None else "no scenario is beside the file"
     own = load_scenario(files.scenario)
@@ -351,7 +343,6 @@ def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | Non
 
 
 def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[Finding], str]:
-    """Return what independent code finds in each file, and its notes."""
     model = None if trusted is None else build(trusted).parts.model
     checked = [each for each in (files.gain, files.claims) if each is not None]
     results = [verifier.verify(each, model) for each in checked]

@@ -248,10 +248,7 @@ def formation(run: Recording) -> "Figure":
 def _worst(
     ax: "Axes", run: Recording, times: Array, errors: Array, keep: Array, floor: float
 ) -> None:
-    """Draw the follower with the largest steady error, and the largest error at each time.
-
-    A run that ended before its steady window is evaluated as a whole.
-    """
+    """A run that ended before its steady window is evaluated as a whole."""
     window = float(run.attributes.get("steady_window", 0.2 * run.horizon))
     steady = run.times >= run.horizon - window
     with np.errstate(over="ignore", invalid="ignore"):
@@ -513,7 +510,6 @@ def _clip(ax: "Axes", values: Array, limited: bool) -> None:
 
 
 def _limits(ax: "Axes", values: Array) -> None:
-    """Draw the limits 0 and 100 %, and shade the area beyond."""
     for value in (0.0, 100.0):
         ax.axhline(value, label="limit" if value else None, **draw.LIMIT)
     low, high = min(-8.0, float(np.nanmin(values))), max(108.0, float(np.nanmax(values)))
@@ -523,7 +519,6 @@ def _limits(ax: "Axes", values: Array) -> None:
 
 
 def _agents_over(ax: "Axes", run: Recording, times: Array, values: Array) -> None:
-    """Draw a number of each agent (T, N) as lines, or as quantiles of a large swarm."""
     if run.agents > draw.NAMED:
         bands(ax, times, values[:, list(run.followers)])
         first = run.leaders[0]

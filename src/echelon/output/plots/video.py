@@ -343,7 +343,6 @@ def _curves(figure: Any, run: Recording, ends: Array) -> list[Any]:
 
 
 def _draw_errors(ax: "Axes", run: Recording, keep: Array) -> None:
-    """Draw the formation errors, or the worst and the median of a large swarm."""
     followers, floor = list(run.followers), error_rounding(run)
     errors = run.goal_distances(keep)[:, followers]
     if run.agents > draw.NAMED:

@@ -93,13 +93,11 @@ def _errors_table(comparison: Comparison, printed: bool) -> "Table":
 
 
 def _unit(rows: Sequence[ComparisonRow]) -> str:
-    """Return the unit of the errors, which all methods share."""
     units = (row.flight.result.length_unit for row in rows if row.flight is not None)
     return next(units, "")
 
 
 def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
-    """Yield the cells of one method: whole-run errors, steady errors, settling time."""
     if row.flight is None:
         return
     for name in ("rmse", "steady_rmse"):
@@ -112,7 +110,6 @@ def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
 
 
 def _costs_table(comparison: Comparison) -> "Table":
-    """Return the costs, one row per method: effort, computing, information."""
     runs = [row.flight for row in comparison.rows if row.flight is not None]
     # In the ideal network no run has ages of messages.
     costs = {
@@ -156,7 +153,6 @@ def _table(title: str, columns: Sequence[str]) -> "Table":
 
 
 def _guaranteed(promise: Promise) -> str:
-    """Return the guaranteed rate, with its theorem if there is one."""
     if promise.rate is None:
         return "none"
     if not promise.promised:
@@ -166,7 +162,6 @@ def _guaranteed(promise: Promise) -> str:
 
 
 def _remarks(row: ComparisonRow) -> Iterator[str]:
-    """Yield why a method did not run, how its run ended, its solver times, and warnings."""
     if row.flight is None:
         yield row.reason
         return
@@ -214,7 +209,6 @@ def verdict(comparison: Comparison) -> tuple[str, ...]:
 
 
 def _among_settled(some: bool, sentence: str) -> str:
-    """Return a sentence on methods that settle, which says so if others do not."""
     if not some or not sentence:
         return sentence
     return f"Of those that settle, {sentence.replace('All ', 'all ', 1)}"
@@ -240,13 +234,11 @@ def _closest(rows: Sequence[ComparisonRow]) -> str:
 
 
 def _numbers(rows: Sequence[ComparisonRow], name: str) -> dict[str, float]:
-    """Return a number of all rows that have it, by label."""
     values = {row.label: row.number(name) for row in rows}
     return {label: value for label, value in values.items() if value is not None}
 
 
 def _best(rows: Sequence[ComparisonRow], claim: str, name: str) -> str:
-    """Return which method has the smallest of a number, and the next one."""
     ranking = sorted((value, label) for label, value in _numbers(rows, name).items())
     if not ranking:
         return ""

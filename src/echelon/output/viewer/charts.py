@@ -28,8 +28,6 @@ class Charts(NamedTuple):
 
 
 class _Sheet:
-    """Collects curves as columns."""
-
     def __init__(self, run: Recording) -> None:
         # Denser at the start, where inputs change quickly.
         last = len(run.times) - 1
@@ -126,7 +124,6 @@ def _off_reference(run: Recording, reference: Float[Array, "T n"]) -> Float[Arra
 
 
 def _slope(run: Recording, begin: float, times: float) -> list[JsonObject]:
-    """Return the line of the guaranteed rate from the first value on, if there is one."""
     rate = run.rate
     if rate is None or begin <= 0.0 or not np.isfinite(begin):
         return []

@@ -259,10 +259,7 @@ def _rate_in_words(promise: Mapping[str, Any]) -> str:
 
 
 def _badge_of_run(run: Recording) -> dict[str, str] | None:
-    """Return the badge of a run, withdrawn if the guarantee does not cover the run.
-
-    None where no guarantee was computed.
-    """
+    """None where no guarantee was computed; withdrawn if it does not cover the run."""
     if not run.promise["sentence"]:
         return None
     badge, outcome = promise_badge(run.promise), run.attributes.get("outcome")

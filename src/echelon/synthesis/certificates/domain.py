@@ -165,7 +165,6 @@ def _check_turns(model: ControlAffine, state: Array) -> None:
 
 
 def _check_chart(model: ControlAffine, state: Array) -> None:
-    """Check that a bounded state stays where the model's equations hold."""
     trim = np.asarray(model.trim[0], float)
     for name, (low, high) in model.chart.items():
         k = model.state_names.index(name)

@@ -81,11 +81,7 @@ class _Scaled(NamedTuple):
 
 
 def _scale(values: object, name: str) -> _Scaled:
-    """Return floats (or dyadic fractions) as integers over one power of two.
-
-    Raises:
-        GainError: a value is not finite or is no dyadic fraction.
-    """
+    """Return floats (or dyadic fractions) as integers over one power of two."""
     # As objects they stay Python's numbers: float64 would round an integer above 2^53.
     array = np.asarray(values, object)
     try:
@@ -102,11 +98,7 @@ def _scale(values: object, name: str) -> _Scaled:
 
 
 def _symmetrize(values: object, name: str) -> _Scaled:
-    """Return the symmetric part of a square matrix, exactly.
-
-    Raises:
-        GainError: the matrix is asymmetric by more than rounding.
-    """
+    """Return the symmetric part of a square matrix, exactly; more than rounding is refused."""
     matrix = _scale(values, name)
     skew = matrix.minus(matrix.transpose()).absolute().integers
     if skew.size and skew.max() > _ASYMMETRY * Fraction(matrix.absolute().integers.max()):
@@ -117,7 +109,6 @@ def _symmetrize(values: object, name: str) -> _Scaled:
 
 
 def _definiteness(matrix: _Scaled) -> Definiteness:
-    """Say whether a symmetric matrix is positive definite."""
     rest, previous, smallest = matrix.integers, 1, None
     while len(rest):
         pivot, row, rest = rest[0, 0], rest[0, 1:], rest[1:, 1:]
@@ -193,7 +184,6 @@ def _constant_part(
 
 
 def _check_shapes(vertices: Array, error: Array, B: Array, P: Array) -> None:
-    """Raise unless all matrices belong to n states and there is a vertex."""
     n = len(P)
     shapes = {
         "vertices": (np.shape(vertices), (len(vertices), n, n)),

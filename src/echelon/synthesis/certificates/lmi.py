@@ -318,7 +318,6 @@ def _rate(P: Array, As: Array, S: Array | None, strength: float) -> float:
 
 
 def _condition(P: Array) -> float:
-    """Return the condition number of P, infinite where it is not positive definite."""
     low, high = np.linalg.eigvalsh(P)[[0, -1]]
     return float(high / low) if low > 0.0 else np.inf
 
@@ -353,11 +352,7 @@ def _cvxpy() -> Any:
 
 
 def _least(cp: Any, goal: Any, cones: list[Any], gaps: list[Any]) -> bool:
-    """Minimize with every gap X_k < 0; False where the solver has no point.
-
-    Few vertices bind, so those that a solution violates are added until there are none. The
-    variables hold the solution, however the solver ended.
-    """
+    """Few vertices bind, so those that a solution violates are added until there are none."""
     new = np.unique(np.linspace(0, len(gaps) - 1, min(len(gaps), _FIRST)).astype(int)).tolist()
     active = list[int]()
     while True:
@@ -390,11 +385,7 @@ def _pull(As: Array, basis: Array) -> Array:
 
 
 def _gaps(cp: Any, slopes: list[Array], x: Any) -> list[Any]:
-    """Return sum_i x_i slopes_k[i] for each k, turned by a dense orthogonal matrix.
-
-    An unknown that enters few rows of many cones is eliminated first by the solver, which fills its
-    matrix: unturned, 60 vertices of 12 states take ten times as long.
-    """
+    """Turned by a dense orthogonal matrix: unturned, 60 x 12 states take ten times as long."""
     # Here, since it takes long to load.
     import scipy.fft
 

@@ -213,7 +213,6 @@ class Method(Declared):
         return Gain(P, R, coupling, self.name, certificate, inner)
 
     def _checked_feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
-        """Return the result of `feedback`, after checking its type and shapes."""
         result, name = self.feedback(model, linear), type(self).__name__
         if not isinstance(result, Feedback):
             raise GainError(
