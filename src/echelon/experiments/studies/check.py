@@ -101,7 +101,7 @@ def _spread_line(low: float, high: float, delay: float, best: float) -> Statemen
 
 
 def _agreement_lines(agreement: AgreementModes) -> Iterator[Statement]:
-    """s + c lambda e^(-s tau) first has s = i w at tau = (pi/2 - |arg lambda|) / (c |lambda|)."""
+    """A root s = i w of s + c lambda e^(-s tau) has w = c |lambda|, and a phase of pi/2."""
     c, values = agreement
     delays = (0.5 * np.pi - np.abs(np.angle(values))) / (c * np.abs(values))
     at, sizes = int(delays.argmin()), np.abs(values)
