@@ -10,13 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from echelon.agents.models.chains import (
-    Chains,
-    chains_of,
-    check_bounds,
-    flatten,
-    switch_on,
-)
+from echelon.agents.models.chains import Chains, chains_of, check_bounds, flatten, switch_on
 from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.compiled import cached_jit

@@ -77,12 +77,7 @@ class PathLeader(Law):
         return model.difference(x, self.reference.follow(model, t)[0] + offset)
 
     def expected(
-        self,
-        model: ControlAffine,
-        t: Scalar,
-        deviation: State,
-        age: Scalar,
-        period: Scalar | float,
+        self, model: ControlAffine, t: Scalar, deviation: State, age: Scalar, period: Scalar | float
     ) -> Expected:
         """Return the path with what is left of the deviation, at the leader's slowest mode."""
         left = deviation * jnp.exp(-jnp.asarray(self.fading, deviation.dtype) * age)

@@ -23,11 +23,7 @@ _ROUNDING = 1e-9
 
 
 def check_numbers(
-    law: FlatLaw,
-    model: ControlAffine,
-    graph: Graph,
-    offsets: Float[Array, "N n"],
-    period: float,
+    law: FlatLaw, model: ControlAffine, graph: Graph, offsets: Float[Array, "N n"], period: float
 ) -> None:
     """Check that a prepared follower's law with `safety` can keep agents apart, starts aside.
 

@@ -28,8 +28,7 @@ ResumedFiguresOption = Annotated[
     ),
 ]
 FolderOption = Annotated[
-    Path | None,
-    typer.Option("--out", help="Output folder (default: a new folder in runs/)."),
+    Path | None, typer.Option("--out", help="Output folder (default: a new folder in runs/).")
 ]
 ForceOption = Annotated[
     bool, typer.Option("--force", help="Replace earlier output of echelon in --out.")

@@ -228,8 +228,7 @@ def video(
     file: Annotated[Path, typer.Argument(help="The video file, ending in .mp4 or .gif.")],
     speed: Annotated[float, typer.Option(help="Playback speed; 2 plays twice as fast.")] = 1.0,
     size: Annotated[
-        str | None,
-        typer.Option(metavar="WxH", help="Pixels (default: 960x540, of a GIF 640x360)."),
+        str | None, typer.Option(metavar="WxH", help="Pixels (default: 960x540, of a GIF 640x360).")
     ] = None,
     fps: Annotated[
         float | None, typer.Option(help="Pictures a second (default: 25, of a GIF 12.5).")

@@ -9,14 +9,7 @@ import numpy as np
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import Reshape
 from echelon.apps.live.attendance import KINDS, RESHAPE, as_entries, happened
-from echelon.apps.live.knobs import (
-    SLIDERS,
-    Knobs,
-    LiveParts,
-    Reshaping,
-    ranges_of,
-    write_keys,
-)
+from echelon.apps.live.knobs import SLIDERS, Knobs, LiveParts, Reshaping, ranges_of, write_keys
 from echelon.core.errors import ScenarioError, SimulationError, did_you_mean, listing
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario import registry

@@ -15,13 +15,7 @@ from echelon.apps.live.guarantee_status import GuaranteeStatus, Promiser, lost
 from echelon.apps.live.knobs import Knobs
 from echelon.apps.live.panel import Panel, check_choice, under
 from echelon.apps.live.swarm import LiveLoop, Picture
-from echelon.core.errors import (
-    EchelonError,
-    GraphError,
-    LawError,
-    ScenarioError,
-    SimulationError,
-)
+from echelon.core.errors import EchelonError, GraphError, LawError, ScenarioError, SimulationError
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import amount
 from echelon.experiments.results.recording import Recording, foreseen

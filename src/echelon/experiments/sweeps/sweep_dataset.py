@@ -12,12 +12,7 @@ from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.dataset import labelled_parts
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.metrics import RunNumbers, metrics
-from echelon.experiments.results.run_numbers import (
-    AGENT_NUMBERS,
-    ERROR,
-    RUN_NUMBERS,
-    Quantity,
-)
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, ERROR, RUN_NUMBERS, Quantity
 from echelon.experiments.scenario.scenario import key_label
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps.plan import (

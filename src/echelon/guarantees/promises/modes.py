@@ -352,13 +352,7 @@ def sampling_line(case: Case) -> Statement:
     """Whether it still decays in steps of the integrator that runs, with the input held."""
     name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     if not (loop.every and case.governed):
-        return unneeded(
-            name,
-            _LINEAR,
-            _NOT_STABLE,
-            None,
-            f"dt {settings.dt:g} s",
-        )
+        return unneeded(name, _LINEAR, _NOT_STABLE, None, f"dt {settings.dt:g} s")
     radius, printed = loop.radius(settings), settings.integrator == "printed"
     goals = np.asarray(case.parts.model.trim[0], float) + case.parts.formation.offsets
     if printed and goals.any():

@@ -290,10 +290,7 @@ def _upward(case: _BorderCase) -> tuple[list[Clearance], dict[str, object]]:
         clearance_of(
             chain,
             case.bound.derivative - 1,
-            (
-                Push(_exact(lead[1 : p + 1]), case.own),
-                Push(_exact(start[1 : p + 1]), case.speed),
-            ),
+            (Push(_exact(lead[1 : p + 1]), case.own), Push(_exact(start[1 : p + 1]), case.speed)),
             case.allowed,
         )
         for lead in led

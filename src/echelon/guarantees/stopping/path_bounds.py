@@ -92,11 +92,7 @@ def _pieces(reference: Guide, horizon: float, outputs: tuple[str, ...], order: i
 
 
 def least_on_path(
-    leader: StoppingLeader,
-    model: ControlAffine,
-    horizon: float,
-    outputs: Sequence[int],
-    order: int,
+    leader: StoppingLeader, model: ControlAffine, horizon: float, outputs: Sequence[int], order: int
 ) -> float:
     """Return what a derivative on a leader's path is not below until the horizon.
 

@@ -254,13 +254,7 @@ def _to_floats(matrix: Rows) -> Array:
 
 
 def first_unproved(
-    P: Array,
-    B: Array,
-    R: Array,
-    hull: Array,
-    error: Array,
-    strength: Fraction,
-    rate: float,
+    P: Array, B: Array, R: Array, hull: Array, error: Array, strength: Fraction, rate: float
 ) -> int | None:
     """Return the first vertex A at which the rate is not proved, or None if all are.
 

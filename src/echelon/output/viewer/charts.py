@@ -37,12 +37,7 @@ class _Sheet:
         self.columns: list[Array] = []
 
     def line(
-        self,
-        name: str | None,
-        values: Array,
-        colour: int | str,
-        log: bool,
-        floor: float = FLOOR,
+        self, name: str | None, values: Array, colour: int | str, log: bool, floor: float = FLOOR
     ) -> JsonObject:
         return self.thinned(name, values[self.frames], colour, log, floor)
 

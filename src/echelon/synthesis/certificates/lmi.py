@@ -137,11 +137,7 @@ class Metric(NamedTuple):
 
 
 def rate_of(
-    P: Array,
-    As: Array,
-    B: Array | None = None,
-    R: Array | None = None,
-    strength: float = 0.0,
+    P: Array, As: Array, B: Array | None = None, R: Array | None = None, strength: float = 0.0
 ) -> float:
     """Return the largest alpha with P A_k + A_k'P - strength P B R^-1 B'P <= -2 alpha P for all k.
 
@@ -248,11 +244,7 @@ def robust_lqr(As: Array, B: Array, Q: Array, R: Array, W: Array | None = None) 
 
 
 def contraction(
-    As: Array,
-    B: Array,
-    rate: float,
-    condition_max: float = 1e4,
-    W: Array | None = None,
+    As: Array, B: Array, rate: float, condition_max: float = 1e4, W: Array | None = None
 ) -> Metric:
     """Return the metric of least strength rho that contracts every vertex at `rate`, with R = I.
 
