@@ -165,13 +165,7 @@ class FlatLaw(Law):
     ) -> Speed:
         """Return s as set by the user, or what bounds allow each link of the path from a leader.
 
-        Args:
-            model: the agent.
-            chains: of it.
-            most: of an output.
-            share: of what leads to the bound of an output.
-            links: whose speeds add up.
-            slowest: what the leader's path takes a bounded length to, at least.
+        `links` speeds add up; `slowest` gives what the path takes a bounded length to, at least.
         """
         if self.speed is not None:
             return self.speed

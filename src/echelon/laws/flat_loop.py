@@ -105,10 +105,8 @@ class FlatLoop(eqx.Module):
     """The inner loop of one agent.
 
     Attributes:
-        chains: of the model.
         weights: (r, m) k_l / k0 of each output, zero beyond its q.
         stiffness: (m,) k0.
-        observer: of the acceleration that the model lacks, which is compensated.
         thrust: the number of the input whose scale is estimated; None for none.
         angles: which outputs are angles, such as a yaw.
     """

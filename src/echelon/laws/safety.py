@@ -217,14 +217,7 @@ class Safety:
     ) -> tuple[Float[jax.Array, " d"], jax.Array]:
         """Return the rate nearest to a desired one that lets no hull come too near.
 
-        Args:
-            rate: of the stopping point relative to the leader's, m/s.
-            near: the others.
-            scales: as by `scales`.
-            speeds: that the rate's entries may have.
-
-        Returns:
-            The rate (d,), and how many rows act on it.
+        Return also how many rows act on it; `speeds` are those that its entries may have.
         """
         corners = jnp.where(near.known[:, None, None], near.gaps, 0.0) * scales[None, None]
         nearest = nearest_point(corners)

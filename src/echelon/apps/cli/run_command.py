@@ -32,12 +32,7 @@ if TYPE_CHECKING:
 
 @final
 class Job:
-    """Work of a command whose results are stored part by part.
-
-    Args:
-        command: that computes it.
-        chunks: the parts that are stored.
-    """
+    """Work of a command whose results are stored part by part."""
 
     def __init__(self, command: Literal["run", "sweep"], chunks: "Chunks") -> None:
         """Store the parts in the folder of the chunks."""
@@ -239,12 +234,7 @@ def _write(job: Job, result: "Result", figures: bool, quiet: bool) -> None:
 
 @final
 class WatchedRun:
-    """A run whose page shows each part as soon as it is computed; a fault of the page ends nothing.
-
-    Args:
-        scenario: of the run.
-        experiment: that it describes.
-    """
+    """A run whose page shows each part as soon as it is computed; a fault of the page ends nothing."""
 
     def __init__(self, scenario: "Scenario", experiment: "Experiment") -> None:
         """Prepare the page, as far as it is known before the run."""

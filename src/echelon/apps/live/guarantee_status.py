@@ -91,9 +91,6 @@ class Promiser:
 
     A guarantee takes seconds. The first look at another position of the knobs does not wait for it:
     each has a thread, and no answer about an earlier position is given.
-
-    Args:
-        answer: called with the badge of the page.
     """
 
     def __init__(self, answer: Callable[[JsonObject], None]) -> None:
@@ -245,11 +242,6 @@ class GuaranteeStatus:
 
     It is restored once all agents are in their domain and errors have halved; of agents that keep
     apart, once their hulls are as far apart as they keep.
-
-    Args:
-        model: of the agents.
-        graph: of their communication.
-        show: called with each new badge.
     """
 
     def __init__(

@@ -96,12 +96,7 @@ class Knobs(NamedTuple):
 
 @final
 class LiveParts:
-    """The gain, formation, graph and wind of a loop at any position of the knobs.
-
-    Args:
-        scenario: without knobs.
-        experiment: that it describes.
-    """
+    """The gain, formation, graph and wind of a loop at any position of the knobs."""
 
     def __init__(self, scenario: Scenario, experiment: Experiment) -> None:
         """Begin with the scenario's own parts."""
@@ -177,9 +172,7 @@ class LiveParts:
     def motion(self, knobs: Knobs, room: FormationMotion | None) -> FormationMotion | None:
         """Return how offsets change with time: the scenario's own, or to the shape of the knobs.
 
-        Args:
-            knobs: with the reshape that is under way, if any.
-            room: a motion with room for one; None where a loop has none.
+        `room` is a motion with room for one; None where a loop has none.
         """
         own = self.parts.formation.motion
         if own is not None or room is None:

@@ -26,12 +26,7 @@ _METHODS = (Riccati.name, InnerLoop.name)
 
 @final
 class Panel:
-    """The controls that a scenario has, and the scenario at any position of the knobs.
-
-    Args:
-        scenario: without knobs.
-        experiment: that it describes.
-    """
+    """The controls that a scenario has, and the scenario at any position of the knobs."""
 
     def __init__(self, scenario: Scenario, experiment: Experiment) -> None:
         """Collect the controls."""

@@ -28,13 +28,7 @@ from echelon.simulation.engine.frame_numbers import ClosestPair
 
 @final
 class LoopsByLaw:
-    """Loops by the followers' law, each also with agents that can be lost and join.
-
-    Args:
-        panel: of the first law.
-        swarm: its loop.
-        send: called with messages to the pages.
-    """
+    """Loops by the followers' law, each also with agents that can be lost and join."""
 
     def __init__(self, panel: Panel, swarm: LiveLoop, send: Callable[[JsonObject], None]) -> None:
         """Begin with one loop."""
@@ -43,10 +37,6 @@ class LoopsByLaw:
 
     def prepare(self, law: str, eventful: bool) -> tuple[Panel, LiveLoop]:
         """Return the loop under a law with its panel, compiled if it is not yet.
-
-        Args:
-            law: of the followers.
-            eventful: whether agents can be lost and join.
 
         Raises:
             EchelonError: the law is unknown, or does not fit these agents.
@@ -134,10 +124,7 @@ _KICK_SPEED, _KICK_DISTANCE = 2.0, 0.5  # m/s of a velocity, else of the first p
 class Session:
     """A loop that runs in a thread by the clock, as long as a page watches.
 
-    Args:
-        scenario: of the loop; the events of its `live` section are repeated.
-        panel: of its controls.
-        swarm: the loop.
+    The events of the scenario's `live` section are repeated.
     """
 
     def __init__(self, scenario: Scenario, panel: Panel, swarm: LiveLoop) -> None:

@@ -56,11 +56,7 @@ class LiveEngine(NamedTuple):
 def choose_stepper(loop: Loop, unlike: Loop, states: Array, settings: Settings) -> LiveEngine:
     """Return what steps a loop: native code wherever it can be made.
 
-    Args:
-        loop: to begin with.
-        unlike: one that differs from it in all numbers that will change.
-        states: (N, n) at the beginning.
-        settings: of the scenario.
+    `unlike` differs from it in all numbers that will change.
     """
     by_jax = LiveEngine(
         JaxStepper(loop, states), settings.precision if len(states) <= _MANY else "float32"
@@ -111,12 +107,7 @@ class Picture(NamedTuple):
 class LiveLoop:
     """Agents under laws that are simulated without an end time.
 
-    Args:
-        parts: of a scenario.
-        settings: of it.
-        panel: the numbers that its knobs set.
-        eventful: whether agents can be lost and join, and the formation can take other shapes,
-            which no native code steps.
+    With `eventful` agents can be lost and join, and shapes change, in no native code.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.

@@ -90,12 +90,7 @@ def save_dataset(run: "Result | xr.Dataset", path: PathLike) -> None:
 
 
 def run_file(result: Result, data: Labelled | None = None) -> bytes:
-    """Return `run.nc`: the dataset in groups, and the sums over all steps.
-
-    Args:
-        result: the run.
-        data: its labelled arrays, computed if None.
-    """
+    """Return `run.nc`: the dataset in groups, and the sums over all steps."""
     return with_sums(result, data).netcdf(_group_of)
 
 
@@ -216,12 +211,7 @@ def digest_of(files: Mapping[str, bytes]) -> str:
 
 
 def labelled_parts(parts: Parts, settings: Settings) -> Labelled:
-    """Return the arrays of `dataset` that do not depend on how a run went.
-
-    Args:
-        parts: of the run, with its drive completed.
-        settings: of the run.
-    """
+    """Return the arrays of `dataset` that do not depend on how a run went."""
     model, graph = parts.model, parts.graph
     agents, units = np.arange(graph.agents), dict(zip(model.state_names, model.state_units))
     variables: Variables = {

@@ -17,16 +17,13 @@ class EventOutcome(NamedTuple):
 
     Attributes:
         at: when it happened, s.
-        text: what happened, in words.
         peak: the largest error of a follower that is there; None without a frame.
         restored: from when on all of these stayed below 1 cm, s; None if they did not.
         until: of the last frame before the next event, s.
-        unit: of errors.
         leader: who leads from then on, and its largest distance from the path; None where that does
             not change, or nobody follows a path.
         near: the scaled distance to another agent at which one joins that keeps apart, m, where it
             is less than what they keep; else None.
-        guarantee: what is guaranteed through it, in words.
         sampled: whether there are steps between the frames.
     """
 

@@ -26,7 +26,6 @@ class Labelled(NamedTuple):
     Attributes:
         variables: name -> (dimensions, values) or (dimensions, values, attributes).
         coordinates: the same; one with the name of its only dimension may be values alone.
-        attributes: of the dataset.
     """
 
     variables: Variables

@@ -241,12 +241,7 @@ def _rotate_back(model: ControlAffine, values: jax.Array, angles: jax.Array) -> 
 
 @final
 class Deviations:
-    """Computes z and delta for a graph, whose Laplacian is factored once.
-
-    Args:
-        graph: the communication graph.
-        difference: of states (T, E, n).
-    """
+    """Computes z and delta for a graph, whose Laplacian is factored once."""
 
     def __init__(self, graph: Graph, difference: _Difference) -> None:
         """Build the differences along the edges."""

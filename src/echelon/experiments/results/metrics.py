@@ -182,7 +182,6 @@ class Avoidance(NamedTuple):
         times: at which each slice begins, s.
         distance: the least distance between two agents in it, m.
         active: pairs of agents of which one changed the other's rate, each way, on average.
-        ellipsoid: about each agent.
     """
 
     times: Float[np.ndarray, " B"]
@@ -239,9 +238,6 @@ class RunNumbers:
     """A run with what its numbers are computed from.
 
     Attributes:
-        result: the run.
-        metrics: of the run.
-        promise: of its parts.
         computing: computing time (s) for one agent and one second of the run, without compilation;
             None if it was not measured.
     """

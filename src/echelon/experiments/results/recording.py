@@ -100,12 +100,9 @@ class Recording(FrameNumbers):
         name: of the scenario, or of the model.
         model: the name of its class.
         times: s.
-        states: of all agents.
         inputs: as delivered by the actuators.
         reference: the leaders' reference state; None without one.
         offsets: each agent's goal relative to its leader; the first one where it moves.
-        leaders: their numbers.
-        nearest: each agent's nearest leader.
         edges: with `weights`; of a graph that switches, all edges that exist at some time.
         heard: whether each end of an edge receives from the other.
         schedule: the weights over time, and who is there; None where they are constant.
@@ -412,15 +409,7 @@ def foreseen(
     name: str,
     promise: JsonObject = _NO_PROMISE,
 ) -> Recording:
-    """Return a recording of agents that stay at their goals, by which the scene is sized.
-
-    Args:
-        parts: of the run, with its drive completed.
-        settings: of the run.
-        states: at the beginning.
-        name: of the scenario.
-        promise: as `Promise.as_mapping` returns it; none by default.
-    """
+    """Return a recording of agents that stay at their goals, by which the scene is sized."""
     model, fixed = parts.model, labelled_parts(parts, settings)
     times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)
     ahead, reference = _ahead(parts, states, times)
@@ -460,11 +449,7 @@ def so_far(
 ) -> Recording:
     """Return a part of a run as a recording.
 
-    Args:
-        run: as returned by `foreseen`.
-        stretch: the part, with finite numbers.
-        potential: V (T,) of states minus offsets (T, N, n); None where there is none.
-        formation: of the run.
+    `run` is one of `foreseen`; `potential` gives V (T,) of states minus offsets (T, N, n).
     """
     moving = None if formation.motion is None else formation.offsets_at(stretch.times)
     lyapunov, count = None, len(stretch.times)

@@ -45,7 +45,6 @@ class FiniteCondition(NamedTuple):
     Attributes:
         verdict: vacuous where f is the same at all goals, so that every P >= I passes.
         largest: of (xi_i - xi_j)'P (f(xi_i) - f(xi_j)) over the pairs; at most 0 where it holds.
-        pair: the agents with that value.
         least: smallest eigenvalue of P; at least 1 where it holds.
         agents: how many agents' goals were compared: all up to a thousand.
     """

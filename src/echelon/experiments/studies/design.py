@@ -36,10 +36,8 @@ class Design(NamedTuple):
     """A method on the scenario: its gain with its properties, or the reason why there is none.
 
     Attributes:
-        method: its name.
         gain: None where the method fails, for the `reason`.
         parts: of the scenario with that gain.
-        promise: of these parts.
         reason: empty where there is a gain.
         fastest: largest modulus of a pole of the loop, 1/s.
         step: the longest sampling period (s) for which all checked modes remain stable.

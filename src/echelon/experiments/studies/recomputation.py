@@ -133,11 +133,7 @@ def recompute(
 ) -> Iterator[Finding]:
     """Yield a finding for each value that a run's files state and its scenario gives.
 
-    Args:
-        experiment: of the run, as `experiment_of` returns it.
-        scenario: of the run.
-        claims: the run's `summary.json`, or the output of `check --json`.
-        data: the run's `run.nc`, of which the guarantee, the scenario and the starts are compared.
+    `claims` are as in `experiment_of`; of `run.nc` parts, guarantee and starts are compared.
 
     Raises:
         EchelonError: a file cannot be read.

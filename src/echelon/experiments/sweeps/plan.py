@@ -139,7 +139,6 @@ class FrameShape(NamedTuple):
     Attributes:
         times: (T,) s.
         states, inputs: names.
-        agents: their number N.
     """
 
     times: tuple[float, ...]

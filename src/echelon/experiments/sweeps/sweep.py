@@ -65,14 +65,7 @@ def compute(
 ) -> None:
     """Compute the runs of a sweep that are in no batch yet.
 
-    Args:
-        plan: the sweep.
-        keep: takes every batch.
-        progress: called several times a second; an error that it raises ends the sweep.
-        before: batches that were computed earlier.
-        threads: as in `sweep`.
-        cluster: address of a dask scheduler, whose workers compute the batches; by default this
-            process does.
+    `keep` takes every batch; an error that `progress` raises, called often, ends the sweep.
 
     Raises:
         KeyboardInterrupt: Ctrl-C; all batches that `keep` received are complete.

@@ -244,10 +244,7 @@ _CHUNK = 500_000
 def labelled_frames(plan: Sweep, axes: Variables, values: StoredFrames) -> Labelled:
     """Return arrays of all runs, with a dimension for each key, as a dataset.
 
-    Args:
-        plan: of the sweep.
-        axes: the values of each key.
-        values: `states` and `inputs` (key, .., time, agent, state / input).
+    `values` are `states` and `inputs` (key, .., time, agent, state or input).
     """
     assert plan.frames is not None
     fixed = labelled_parts(*plan.first_built).coordinates

@@ -26,12 +26,7 @@ _FRAMES = 20
 
 @final
 class Workers:
-    """Computes the runs of a sweep, batch by batch; a case is built once for its seeds.
-
-    Args:
-        plan: the sweep.
-        threads: as in `sweep`.
-    """
+    """Computes the runs of a sweep, batch by batch; a case is built once for its seeds."""
 
     def __init__(self, plan: Sweep, threads: int | None = None) -> None:
         """Build the first case."""

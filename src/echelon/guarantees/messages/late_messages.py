@@ -98,11 +98,6 @@ def losses_in_a_row(channel: Channel, links: int, messages: int) -> int | None:
     With pi the shares of a link that works or is out, P the chances of its next message and D the
     chances that one is lost, L + 1 given messages are lost with probability pi'D (P D)^L 1, and
     there are fewer places for them than messages on all links.
-
-    Args:
-        channel: of the run.
-        links: how many.
-        messages: on each of them.
     """
     starts, step = _outages(channel)
 
@@ -157,10 +152,7 @@ class LateRate(NamedTuple):
 def late_rates(L: sp.csr_array, c: float, age: Fraction) -> tuple[LateRate, ...]:
     """Return rates at which stopping points agree, the fastest first; none where none is proved.
 
-    Args:
-        L: grounded Laplacian of the followers.
-        c: the coupling.
-        age: tau, s.
+    `L` is the grounded Laplacian of the followers, `age` is tau in s.
     """
     L, ones = sp.csr_array(L), np.ones_like(L.diagonal())
     own = sp.diags_array(L.diagonal())
@@ -236,8 +228,6 @@ class Uncovered(NamedTuple):
     """Why T9 does not cover a network, and what would help.
 
     Attributes:
-        text: the reason.
-        remedy: what to change.
         lost: whether no formation comes together, or not at its goals.
     """
 
@@ -250,13 +240,9 @@ class Following(NamedTuple):
     """What T9 asks of a run beside its network.
 
     Attributes:
-        graph: who receives from whom.
         leaderward: whether followers' law hears only those nearer to a leader.
-        coupling: c.
         speed: s of followers, the smallest of all outputs.
         still: whether the leader is where it stays from the start on.
-        apart: whether leaders start apart.
-        avoiding: whether followers keep away from each other.
     """
 
     graph: Graph
@@ -272,14 +258,12 @@ class LateMessages(NamedTuple):
     """What T9 says of stopping points over a network.
 
     Attributes:
-        ages: of messages.
         rate: at which stopping points agree in the end whatever is lost, 1/s.
         ways: (F,) links of the longest way to each follower, where all hear one way; else None.
         weights: (F,) of followers where all hear one way: w with m' = -sigma(c m) / max w.
         rates: where some hear each other: at which, and weights, all but a few runs agree.
         sums: (K,) d_i, the sums of weights that followers hear.
         spread: max w, w = L_g^-1 1.
-        coupling: c.
         speed: s of followers, the smallest of all outputs; 0 without one leader that has a plan.
         leaderward: whether neighbours with fewer hops alone are heard.
     """
@@ -366,15 +350,7 @@ class LateMessages(NamedTuple):
 def late_messages_of(
     network: Network | None, following: Following, dt: float, horizon: float, steps: int
 ) -> LateMessages | Uncovered | None:
-    """Return what T9 says of a run over a network, or why nothing; None for the ideal network.
-
-    Args:
-        network: of the run.
-        following: who follows how.
-        dt: a step, s.
-        horizon: of the run, s.
-        steps: their number.
-    """
+    """Return what T9 says of a run over a network, or why nothing; None for the ideal network."""
     if network is None:
         return None
     obstacle = _uncovered(network, following)

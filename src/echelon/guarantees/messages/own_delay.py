@@ -189,9 +189,6 @@ class OwnCase(NamedTuple):
     """What the margin of own states is computed of.
 
     Attributes:
-        problem: prepared.
-        world: of the run.
-        law: of the followers.
         own: (K,) factors on z of single loops, real or complex: sums of weights over a network,
             eigenvalues of the graph on the ideal one.
         between: whether all real factors between the least and the largest count too.

@@ -35,7 +35,6 @@ class CommonMetric(NamedTuple):
     """The sum of all delta_i'P delta_i on graphs that take turns.
 
     Attributes:
-        gain: of which P is.
         laplacians: (F, F) of each graph, grounded; of one that is symmetric its extreme
             eigenvalues alone, (2,).
         weakest: s > 0 with L + L' >= 2 s for each of them; 0 where there is none.
@@ -111,7 +110,6 @@ class LinearLoop(NamedTuple):
         symmetric: whether they are of a symmetric matrix between followers' errors.
         every: whether the modes of all eigenvalues of the graph decay.
         slowest: real part of the slowest mode, 1/s; of an interval, of the modes looked at.
-        certificate: of the linearization.
         common: the sum of all delta_i'P delta_i near the trim on graphs that take turns (T8); None
             where the graph does not switch.
     """

@@ -184,7 +184,6 @@ class Growth(NamedTuple):
         rate: at which they grow over all of it, 1/s; below 0 where they shrink.
         most: ln of how often they multiply in the part of it that is worst for them.
         when: s, where they grow fastest.
-        whose: errors they are.
     """
 
     rate: float

@@ -51,10 +51,7 @@ _ROUNDING = 1e-9  # of the fastest mode, in the slowest
 def claims_line(parts: Parts, loop: LinearLoop, region: RegionCertificate | None) -> Statement:
     """Return whether the certificate that a gain carries is of what runs.
 
-    Args:
-        parts: what runs.
-        loop: near the trim.
-        region: what the gain's metric promises here where the leader's input is relayed.
+    `region` is what the metric promises here where the leader's input is relayed.
     """
     gain, name, kind = parts.drive.gain, Hypothesis.CLAIMS, Kind.LINEARIZATION
     if gain is None:
@@ -102,7 +99,6 @@ class MetricPromise(Promise):
     """What is guaranteed near the trim, and on a domain where a metric contracts there.
 
     Attributes:
-        case: what it was computed of.
         turns: what the leader's heading may do, in words; empty where the law does not turn.
         slowest_turn: the slowest mode in the steady turns of `turns`, 1/s.
     """

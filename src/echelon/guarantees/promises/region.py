@@ -52,7 +52,6 @@ class Region(NamedTuple):
     Attributes:
         certificate: of the law that runs; None where nothing is promised.
         relayed: what the metric promises where the leader's input is relayed; None for nothing.
-        line: what was found.
     """
 
     certificate: RegionCertificate | None
@@ -268,8 +267,6 @@ class CertifiedSet(NamedTuple):
     Attributes:
         radius: 0 where the set is empty, infinite where the domain bounds nothing.
         kind: of the argument; samples where the leader's excursion is read off a run of its own.
-        why: what limits the radius, or why there is none.
-        remedy: what would make one; empty where there is one.
     """
 
     radius: float

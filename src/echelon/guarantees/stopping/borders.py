@@ -53,11 +53,7 @@ class Clearance(NamedTuple):
 def clearance_of(chain: Chain, order: int, pushes: Sequence[Push], allowed: Fraction) -> Clearance:
     """Return how far v^(order) falls under all pushes together, and the start that is left.
 
-    Args:
-        chain: of the output.
-        order: below the chain's last.
-        pushes: the leader's, and the agent's.
-        allowed: how far it may fall.
+    `order` is below the chain's last; `pushes` are the leader's, and the agent's.
     """
     left = [chain.derivative(chain.free(push.start), order) for push in pushes if push.start]
     free = add(*left) if left else Poly()
@@ -155,7 +151,6 @@ class Border(NamedTuple):
     """A border of the chart, and what is left to it.
 
     Attributes:
-        bound: what the model says of it.
         left: how far agents stay from it, at least.
         steepest: how far the outputs' speed may be off the leader's at the start.
         path: what the leader's path takes the bounded derivative to, at least.

@@ -158,9 +158,7 @@ class KnownBounds(NamedTuple):
     """The borders of a model's flat coordinates, and how they are known.
 
     Attributes:
-        bounds: None where they are not known.
         kind: of the argument: samples where somebody's class states them.
-        fault: why they are not known.
     """
 
     bounds: Sequence[FlatBound] | None

@@ -100,11 +100,7 @@ def motors_of(
 ) -> Motors:
     """Return what the motors of an agent give on a path, pushed off it.
 
-    Args:
-        frame: of the agent.
-        slices: of time.
-        path: what is followed asks on each slice.
-        pushes: the leader's off its path, and the agent's off the leader; all add up.
+    `path` is what is followed, slice by slice; `pushes` (the leader's, the agent's) add up.
     """
     least, largest, slope = None, Fraction(0), Fraction(0)
     for piece, demand in zip(slices, path, strict=True):

@@ -38,11 +38,8 @@ class StoppingPromise(Promise):
     """What T5 guarantees, and what that rests on.
 
     Attributes:
-        run: what it was computed of.
-        tube: what is guaranteed; None for nothing.
         strength: the coupling c.
         hold: the longest step (s) that keeps the largest stopping point from growing.
-        separation: what is guaranteed of distances; None where agents do not keep apart.
     """
 
     run: StoppingRun

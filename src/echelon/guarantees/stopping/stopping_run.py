@@ -202,8 +202,6 @@ class StoppingRun(NamedTuple):
     """A run under the law, as its theorem sees it.
 
     Attributes:
-        parts: prepared.
-        settings: how it is computed.
         states: (N, n) at the start.
         flat: (N, r, m) the same in flat coordinates, less the offsets and their derivatives.
         ahead: (r, m) of what the leader follows.

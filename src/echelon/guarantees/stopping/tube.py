@@ -52,9 +52,7 @@ _SLACK = 1e-9
 def arrival_of(run: StoppingRun, position: Sequence[int]) -> float | None:
     """Return when (s) all followers are within 1 cm for good; None where it is not known.
 
-    Args:
-        run: under the law.
-        position: which outputs are one.
+    `position` says which outputs are one.
     """
     graph, law = run.parts.graph, run.law
     by_parents = law.feedforward is Feedforward.PARENT
@@ -278,7 +276,6 @@ class Tube(NamedTuple):
         steepest: how far the bounded output's speed may be off the leader's at the start.
         arrival: the time (s) from which on all followers are within 1 cm of their goals; None where
             it is not known, or was left out.
-        who: which starts are meant, in words.
         borders: what is claimed of each border, and of what it was computed; ready for JSON.
         motor_load: None where motors have no limits, may not suffice, or were left out.
         graphs: which graphs are meant, and this one, in words.

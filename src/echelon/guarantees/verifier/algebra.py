@@ -262,14 +262,7 @@ def first_unproved(
     within +- error of A. Such a change adds at most |P| error + its transpose, entry by entry; its
     row sums on the diagonal dominate it for any signs (Gershgorin).
 
-    Args:
-        P: (n, n), symmetric to the bit and positive definite.
-        B: (n, m).
-        R: (m, m), symmetric positive definite.
-        hull: (K, n, n).
-        error: (n, n).
-        strength: a lower bound of 2 c lambda_min.
-        rate: 1/s.
+    `hull` is (K, n, n), `error` (n, n); P must be symmetric to the bit, `strength` from below.
     """
     metric, change = rows_of(P), rows_of(abs(error))
     pull = product(metric, rows_of(B))

@@ -78,7 +78,6 @@ class Facts(NamedTuple):
     """Recomputed quantities that several claims use.
 
     Attributes:
-        saved: the content of the file.
         eigenvalues: of the grounded Laplacian; the stored ones if the file has no edges.
         bound: a lower bound of lambda_min; for a directed graph, of the decay of its weighted sum.
         pull: R^-1 B' (m, n), rounded once.

@@ -32,10 +32,8 @@ class Verification(NamedTuple):
     """All findings with their overall verdict.
 
     Attributes:
-        findings: one per claim.
         verdict: `refused` if a claim is false, `incomplete` if all checked claims hold and some
             could not be checked, otherwise `verified`.
-        sentence: the verdict as text.
         note: the end of the sentence, on a correct gain that is not stabilizing.
     """
 

@@ -32,10 +32,6 @@ class Chunks:
     """The stretches of one run in its folder, each in a file named by its first step.
 
     So stretches that two processes computed of the same run fit together.
-
-    Args:
-        folder: of the run.
-        by: the folder in it that holds them.
     """
 
     def __init__(self, folder: Path, by: str = CHUNKS) -> None:

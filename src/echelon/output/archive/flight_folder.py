@@ -55,11 +55,7 @@ _LATE = "other networks than `network`"
 def law_files(parts: Parts, settings: Settings, agent: int, formation: str) -> dict[str, str]:
     """Return the files of one agent's law by name.
 
-    Args:
-        parts: of the whole formation.
-        settings: the step `dt` and whether the actuators' limits act.
-        agent: its number.
-        formation: a text that is equal for all agents of the formation alone.
+    `formation` is a text that is equal for all agents of the formation alone.
 
     Raises:
         OutputError: the law has no scalar operations; with the file and line of a user's code.
@@ -207,10 +203,7 @@ _SINKING = -0.5  # m/s
 def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, str]:
     """Return the files of a flight by name.
 
-    Args:
-        parts: of the formation; what they say of plants, wind and sensors is of simulated vehicles.
-        settings: of the run.
-        formation: a text that is equal for all agents of the formation alone.
+    What `parts` say of plants, wind and sensors is of simulated vehicles.
 
     Raises:
         FlightError: messages are not those that fly.

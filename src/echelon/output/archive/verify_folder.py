@@ -67,14 +67,7 @@ scenario settles it by."""
 
 
 class ClaimFiles(NamedTuple):
-    """Files with claims about a run's gain or law, and what belongs to them; None for each absent.
-
-    Attributes:
-        gain: a gain file.
-        claims: the summary of a run, or the output of a check.
-        data: the dataset of the run.
-        scenario: the scenario of the run.
-    """
+    """Files with claims about a run's gain or law, and what belongs to them; None for each absent."""
 
     gain: Path | None = None
     claims: Path | None = None
@@ -84,9 +77,6 @@ class ClaimFiles(NamedTuple):
 
 def claim_files(place: PathLike) -> ClaimFiles:
     """Return the files of a run that `verify` reads.
-
-    Args:
-        place: the folder of a run, its summary, a gain file, or the output of a check.
 
     Raises:
         GainError: a file cannot be read, or is no JSON.
@@ -127,11 +117,6 @@ def _place(path: Path) -> Path:
 
 def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
     """Yield a finding for each array, number and text that only the run itself gives.
-
-    Args:
-        files: of the run.
-        scenario: of the run, which is simulated once more.
-        experiment: of it, with the gains that the files state.
 
     Raises:
         EchelonError: the run cannot be computed, or a file cannot be read.
@@ -289,11 +274,7 @@ def check_files(
 ) -> tuple[Verification, str]:
     """Return what holds of files with claims, and what is against their scenario, if anything.
 
-    Args:
-        files: of a run, or a gain file.
-        trusted: the scenario whose code may be executed.
-        repeat: whether to simulate the scenario again.
-        begin: called with a text before each part that may take a minute or longer.
+    `begin` is called with a text before each part that may take a minute or longer.
     """
     source, obstacle = _source(files, trusted)
     findings, note = _independent(files, trusted)

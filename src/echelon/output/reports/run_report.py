@@ -97,12 +97,7 @@ def report(result: Result) -> str:
 
 
 def whole_report(run: Recording, numbers: str) -> str:
-    """Return the numbers of a run, its guarantee with all conditions, and where it is from.
-
-    Args:
-        run: as it is stored.
-        numbers: its `report`; empty where there is none.
-    """
+    """Return the numbers of a run, its guarantee with all conditions, and where it is from."""
     message, promise = str(run.attributes["message"]), run.promise
     facts = f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s"
     versions = {k[8:]: v for k, v in run.attributes.items() if k.startswith("version_")}

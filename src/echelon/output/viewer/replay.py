@@ -274,11 +274,7 @@ def _badge_of_run(run: Recording) -> dict[str, str] | None:
 
 @final
 class Growing:
-    """The parts of a run so far, for any number of pages.
-
-    Args:
-        run: its recording before the first frame.
-    """
+    """The parts of a run so far, for any number of pages."""
 
     def __init__(self, run: Recording) -> None:
         """Create the page without frames."""

@@ -28,7 +28,6 @@ class Obstacle(NamedTuple):
     """A mode that no constant metric can keep from growing.
 
     Attributes:
-        vertex: which matrix has it.
         eigenvalue: 1/s; on the imaginary axis where the mode is `defective`.
         defective: whether it is a Jordan block on the axis rather than an unstable mode.
         states: indices of the states that take part, those that feed a Jordan block included.

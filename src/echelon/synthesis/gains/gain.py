@@ -139,7 +139,6 @@ class Feedback(NamedTuple):
         rho: the strength 2 c lambda_min from which on P A + A'P - rho P B R^-1 B'P <= 0 at the trim
             is guaranteed, so that the smallest coupling is rho / (2 lambda_min); 0 where any
             coupling suffices, None where no bound is known.
-        region: the guarantee on a domain; None without one.
         inner: (m, n) feedback K of an inner loop, closed in A; None without.
     """
 
