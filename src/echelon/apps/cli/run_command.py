@@ -234,7 +234,7 @@ def _write(job: Job, result: "Result", figures: bool, quiet: bool) -> None:
 
 @final
 class WatchedRun:
-    """A run whose page shows each part as soon as it is computed; a fault of the page ends nothing."""
+    """A run whose page shows each part once it is computed; a fault of the page ends nothing."""
 
     def __init__(self, scenario: "Scenario", experiment: "Experiment") -> None:
         """Prepare the page, as far as it is known before the run."""

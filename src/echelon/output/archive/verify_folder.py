@@ -67,7 +67,7 @@ scenario settles it by."""
 
 
 class ClaimFiles(NamedTuple):
-    """Files with claims about a run's gain or law, and what belongs to them; None for each absent."""
+    """Files with claims about a run's gain or law, and what belongs to them; None if absent."""
 
     gain: Path | None = None
     claims: Path | None = None
