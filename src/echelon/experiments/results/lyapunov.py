@@ -195,10 +195,8 @@ def _fields(
         return disturbed(motion.plant, *draw(motion.wind, step, agent))(x, u)
 
     moving = jax.vmap(jax.vmap(velocity, in_axes=(0, 0, 0, None)), in_axes=(0, 0, None, 0))
-    later, xdot = (
-        jax.vmap(lambda *at: motion.advance(*at)[0])(x, u, steps),
-        moving(x, u, jnp.arange(x.shape[1]), steps),
-    )
+    later = jax.vmap(lambda *at: motion.advance(*at)[0])(x, u, steps)
+    xdot = moving(x, u, jnp.arange(x.shape[1]), steps)
 
     def heading(t: jax.Array, x: jax.Array) -> jax.Array | None:
         return drive.heading(model, t, x)

@@ -91,10 +91,8 @@ def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> ja
 def trim_line(parts: Parts, settings: Settings) -> Statement:
     """Say whether the actuators deliver the trim input, without which no agent holds its trim."""
     model, world, name = parts.model, parts.world, Hypothesis.TRIM_WITHIN_LIMITS
-    plants, trim = (
-        (world.plant_for(model), *world.plants.values()),
-        np.asarray(model.trim[1], float),
-    )
+    plants = (world.plant_for(model), *world.plants.values())
+    trim = np.asarray(model.trim[1], float)
     if any(_forced_off_trim(world.actuator, plant, trim) for plant in plants):
         text, remedy = "the motors' `minimum` is more than the trim needs", "lower `minimum`"
         return fails(name, Kind.PROOF, text, remedy=remedy, reason=f"{text}: no agent holds it")
@@ -203,10 +201,8 @@ def _symmetric(case: Case) -> Statement:
     if not broken:
         return holds(name, kind, f"f and g are invariant under them{where}", 0, "0 broken")
     agent, why = next(iter(broken.items()))
-    text, remedy = (
-        f"the offset of agent {agent}: {why}{where}",
-        "offset only states that f and g do not use",
-    )
+    text = f"the offset of agent {agent}: {why}{where}"
+    remedy = "offset only states that f and g do not use"
     count, reason = len(broken), "an offset is no symmetry of the dynamics"
     return fails(name, kind, text, count, f"{count} broken", remedy=remedy, reason=reason)
 

@@ -271,10 +271,8 @@ def _decaying(case: Case) -> Statement:
     name, loop = Hypothesis.DISAGREEMENT_DECAY, case.loop
     if not case.governed:
         drive = case.parts.drive
-        text, remedy = (
-            f"no theorem covers `{type(drive).__name__}`",
-            "use laws that a theorem covers",
-        )
+        text = f"no theorem covers `{type(drive).__name__}`"
+        remedy = "use laws that a theorem covers"
         if isinstance(drive, Laws) and drive.metric(case.parts.model) is not None:
             text = "the model's `difference` of two states that are close is not x - y"
             remedy = "let `difference` wrap angles, and be x - y else"
@@ -305,10 +303,8 @@ def _taking_turns(case: Case) -> Statement:
         text = "no theorem covers this law on switching graphs"
         return fails(name, _LINEAR, text, remedy="use `consensus`", reason=text)
     if _has_sum(loop) and common is not None:
-        text, rate = (
-            "sum_i delta_i'P delta_i increases on no graph, whenever they switch",
-            max(0.0, common.rate),
-        )
+        text = "sum_i delta_i'P delta_i increases on no graph, whenever they switch"
+        rate = max(0.0, common.rate)
         return holds(name, _LINEAR, text, rate, f"{at_most(rate)} 1/s")
     text = "no one P is known that serves all graphs of the schedule"
     remedy = "use the law `stopping-point`"

@@ -459,10 +459,8 @@ def _check_secants(
         normals, claim = steps @ saved.P, "pairs converge at the rate"
         bounds = _decay(facts, region, steps)
     else:
-        normals, claim = (
-            _normals(steps @ saved.P, np.abs(steps) @ slope.T),
-            "secants lie in the hull",
-        )
+        normals = _normals(steps @ saved.P, np.abs(steps) @ slope.T)
+        claim = "secants lie in the hull"
         bounds = support(region.hull[:, :, :n], region.error[:, :n], normals, steps)
     worst = steepest(velocity, x, y, normals, bounds)
     text = f"of {len(x)} pairs of states, relative"

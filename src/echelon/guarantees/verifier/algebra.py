@@ -50,10 +50,8 @@ def spectrum(graph: SavedGraph, edges: Array) -> CheckedSpectrum:
     (i, j), weights, selection = edges[:, :2].astype(int).T, edges[:, 2], followers(graph)
     W = np.zeros((graph.agents, graph.agents))
     np.add.at(W, (np.append(i, j), np.append(j, i)), np.append(weights, weights))
-    inner_weights, leader_weights = (
-        W[np.ix_(selection, selection)],
-        W[np.ix_(selection, graph.leaders)].sum(axis=1),
-    )
+    inner_weights = W[np.ix_(selection, selection)]
+    leader_weights = W[np.ix_(selection, graph.leaders)].sum(axis=1)
     values = scipy.linalg.eigvalsh(
         np.diag(inner_weights.sum(axis=1) + leader_weights) - inner_weights
     )
@@ -301,10 +299,8 @@ def directed_spectrum(graph: SavedGraph, edges: Array) -> tuple[Array, float, fl
     W, selection = np.zeros((graph.agents, graph.agents)), followers(graph)
     # On an edge (i, j), j receives from i.
     W[edges[:, 1].astype(int), edges[:, 0].astype(int)] = edges[:, 2]
-    inner_weights, leader_weights = (
-        W[np.ix_(selection, selection)],
-        W[np.ix_(selection, graph.leaders)].sum(axis=1),
-    )
+    inner_weights = W[np.ix_(selection, selection)]
+    leader_weights = W[np.ix_(selection, graph.leaders)].sum(axis=1)
     L = np.diag(inner_weights.sum(axis=1) + leader_weights) - inner_weights
     if not _reachable(inner_weights > 0.0, leader_weights > 0.0).all():
         return np.zeros(len(L), complex), 0.0, 0.0

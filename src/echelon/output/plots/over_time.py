@@ -214,11 +214,9 @@ def formation(run: Recording) -> "Figure":
     Of a large swarm it shows quantiles, the median and the worst follower.
     """
     followers, many = list(run.followers), run.agents > draw.NAMED
-    errors, floor, bound = (
-        run.formation_errors[:, followers],
-        error_rounding(run),
-        run.error_bound(),
-    )
+    errors = run.formation_errors[:, followers]
+    floor = error_rounding(run)
+    bound = run.error_bound()
     marks = [SETTLED] if run.length_unit else []
     # The end of the bound may lie far below all errors, so only its start sets the axis.
     marks = np.array(marks if bound is None else [*marks, bound[0]])

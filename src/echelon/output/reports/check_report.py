@@ -15,11 +15,9 @@ _PAPERS = {
     *(Topic.AUTONOMOUS, Topic.GRAPH, Topic.GROUNDED, Topic.POSITIVE, Topic.SCHUR, Topic.EDGES),
     *(Topic.MONOTONE, Topic.DRIFT_ALONG_Z, Topic.LMI_AS_PRINTED, Topic.FINITE),
 }
-_RESTS, _LOOP, _PRINTED = (
-    "what a guarantee rests on",
-    "leader, links and margins of this loop",
-    "the paper's printed claims; the guarantee does not need those that fail",
-)
+_RESTS = "what a guarantee rests on"
+_LOOP = "leader, links and margins of this loop"
+_PRINTED = "the paper's printed claims; the guarantee does not need those that fail"
 
 
 def grouped(lines: Sequence[Statement]) -> dict[str, list[Statement]]:
