@@ -87,7 +87,8 @@ class FlatLaw(Law):
         if len(set(roots)) < len(roots):
             raise LawError(f"`roots` are {list(roots)}, and must be different from each other.")
         speeds = self.speed if isinstance(self.speed, Sequence) else (self.speed,)
-        if self.speed is not None and not all(map(_moves, speeds)):
+        numbers = all(isinstance(speed, int | float) and speed > 0.0 for speed in speeds)
+        if self.speed is not None and not numbers:
             raise LawError(
                 f"`speed` is {self.speed}, and must be positive, or a list of such numbers."
             )
@@ -301,10 +302,6 @@ class FlatLaw(Law):
         names = listing(name + "'" * bound.derivative for name in bound.outputs)
         for k in np.flatnonzero(~(np.linalg.norm(values, axis=1) > bound.above + _REST)):
             yield int(k), f"{names} are 0 there, and allowed is {bound.within}"
-
-
-def _moves(speed: object) -> bool:
-    return isinstance(speed, int | float) and speed > 0.0
 
 
 def _left(roots: tuple[float, ...], bound: FlatBound, slowest: float) -> float:

@@ -272,7 +272,7 @@ def sweep(model: ControlAffine, reference: Guide, horizon: float) -> tuple[Array
         )
     held = np.append(np.arange(1, 2 * count, 2), 2 * count)
     push = B[held] @ np.linalg.solve(R, B[held].swapaxes(1, 2))
-    P = _backward(_flows(A[held], push, Q, horizon / count))
+    P = _backward(A[held], push, Q, horizon / count)
     if not np.isfinite(P).all():
         raise LawError(
             f"`lqr` cannot hold `{name}` on the reference `{path}`: no feedback keeps its "
@@ -282,10 +282,12 @@ def sweep(model: ControlAffine, reference: Guide, horizon: float) -> tuple[Array
     return K, _decay(P, Q + K.swapaxes(1, 2) @ R @ K)
 
 
-def _backward(flows: Array) -> Array:
-    """Return P (N + 1, n, n) at the ends of N intervals, from their flows and that of the end."""
-    n = flows.shape[-1] // 2
-    P = [np.zeros((n, n))]
+def _backward(A: Array, G: Array, Q: Array, span: float) -> Array:
+    """Return P (N + 1, n, n) at the ends of N intervals of `span`, from A and G in them and then."""
+    # [X; Y]' = H [X; Y] has P = Y X^-1 for the solution of the Riccati equation. With A and G held
+    # this is exact, where a Runge-Kutta step of fast modes would not be stable.
+    H = np.block([[A, -G], [np.broadcast_to(-Q, A.shape), -A.swapaxes(1, 2)]])
+    flows, P = scipy.linalg.expm(-span * H), [np.zeros(Q.shape)]
     # What overflows is rejected afterwards, by its NaN.
     with np.errstate(all="ignore"):
         for _ in range(max(len(flows) - 1, _HELD)):
@@ -293,12 +295,6 @@ def _backward(flows: Array) -> Array:
         for flow in flows[-2::-1]:
             P.append(_before(P[-1], flow))
     return np.array(P[::-1])
-
-
-def _flows(A: Array, G: Array, Q: Array, span: float) -> Array:
-    """Return exp(-H span), H = [[A, -G], [-Q, -A']]: [X; Y]' = H [X; Y] has P = Y X^-1, exactly."""
-    H = np.block([[A, -G], [np.broadcast_to(-Q, A.shape), -A.swapaxes(1, 2)]])
-    return scipy.linalg.expm(-span * H)
 
 
 def _before(P: Array, flow: Array) -> Array:

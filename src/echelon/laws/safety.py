@@ -229,8 +229,11 @@ class Safety:
         used = near.known & (far <= self.reach)
         short = jnp.where(used, low - normals @ (rate * scales), 0.0)
         u = rate * scales + self._aside(normals, short)
-        u = _shrunk(_projected(u, normals, low, used), normals, low, used) / scales
-        # Less of it still meets all rows that 0 meets.
+        u = _projected(u, normals, low, used)
+        # The largest part that meets all rows which 0 meets; less of it still meets them.
+        along = normals @ u
+        over = used & (low <= 0.0) & (along < low)
+        u = u * jnp.where(over, low / jnp.where(over, along, -1.0), 1.0).min(initial=1.0) / scales
         u = u * (speeds / jnp.maximum(jnp.abs(u), speeds)).min()
         active = (short > 0.0).sum()
         return jnp.where(active > 0, u, rate), active.astype(rate.dtype)
@@ -278,18 +281,6 @@ def _projected(
 
     start = _Ascent(jnp.zeros((), jnp.int32), u, 0.0 * low, jnp.full((), jnp.inf, u.dtype))
     return jax.lax.while_loop(off, corrected, start).u
-
-
-def _shrunk(
-    u: Float[jax.Array, " d"],
-    normals: Float[jax.Array, "K d"],
-    low: Float[jax.Array, " K"],
-    used: Bool[jax.Array, " K"],
-) -> Float[jax.Array, " d"]:
-    """Return the largest part of a vector that meets all rows which 0 meets."""
-    along = normals @ u
-    over = used & (low <= 0.0) & (along < low)
-    return u * jnp.where(over, low / jnp.where(over, along, -1.0), 1.0).min(initial=1.0)
 
 
 def hull_points(

@@ -341,7 +341,8 @@ class Session:
         """
         name, value = request.get("name"), request.get("value")
         if name == "save":
-            return self._saved()
+            text = "A scenario begins at 0 s, so a continued run is not saved as one."
+            return {"fault": text} if self.swarm.first else {"text": self.first.saved(self.events)}
         if name in ("pause", "reset"):
             self._later(lambda: self._pause(bool(value)) if name == "pause" else self._reset())
             return {}
@@ -359,11 +360,6 @@ class Session:
             return {"fault": _without_place(error)}
         self._later(lambda: self.apply(event))
         return event
-
-    def _saved(self) -> JsonObject:
-        if self.swarm.first:
-            return {"fault": "A scenario begins at 0 s, so a continued run is not saved as one."}
-        return {"text": self.first.saved(self.events)}
 
     def _later(self, action: Callable[[], None]) -> None:
         with self.changed:

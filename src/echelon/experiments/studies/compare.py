@@ -224,14 +224,9 @@ def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
     if any(eqx.tree_equal(drive, other) for other in others):
         return None
     law, gain, feedforward = getattr(drive, "follower", drive), drive.gain, drive.feedforward
-    name = _law_name(drive) if gain is None else gain.method
+    kind = type(law).__name__
+    name = _LAW_NAMES.get(kind, kind) if gain is None else gain.method
     label = name if feedforward is Feedforward.NONE else f"{name}-{feedforward}"
     if not type(law).__module__.startswith("echelon."):
-        label = type(law).__name__
+        label = kind
     return f"{label}, own" if label in {row.label for row in rows} else label
-
-
-def _law_name(drive: Drive) -> str:
-    """Return the name of the followers' law in scenarios, or that of the drive's class."""
-    kind = type(getattr(drive, "follower", drive)).__name__
-    return _LAW_NAMES.get(kind, kind)

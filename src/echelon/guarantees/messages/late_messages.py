@@ -117,9 +117,8 @@ def losses_in_a_row(channel: Channel, links: int, messages: int) -> int | None:
 
 def _outages(channel: Channel) -> tuple[Array, Array]:
     """Return pi'D (2, 2), a row for each of two moments, and P D (2, 2) of the same."""
-    loss, share, begins, ends = (
-        float(x) for x in (channel.loss, channel.share, channel.begins, channel.ends)
-    )
+    numbers = channel.loss, channel.share, channel.begins, channel.ends
+    loss, share, begins, ends = map(float, numbers)
     if not channel.bursty:
         begins, share, ends = 0.0, 0.0, 1.0
     loss, stays = min(1.0, loss + _GRID * (loss > 0.0)), min(1.0, 1.0 - ends + _GRID)
@@ -366,9 +365,8 @@ def late_messages_of(
     leaderward = network.hears is NeighbourChoice.LEADERWARD
     if leaderward and c * dt > 1.0 + 1e-12:
         # A mean has weights of sum 1, however small those of the graph are.
-        text = (
-            f"with `hears: leaderward` weights count as 1, and c dt = {at_least(c * dt)} is above 1"
-        )
+        text = "with `hears: leaderward` weights count as 1, "
+        text += f"and c dt = {at_least(c * dt)} is above 1"
         return Uncovered(text, f"lower `follower.coupling` to {at_most(1.0 / dt, 4)}", True)
     if leaderward and not ages.hops_last:
         return _UNSETTLED
@@ -418,11 +416,8 @@ def _uncovered(network: Network, following: Following) -> Uncovered | None:
         text = "agents that keep apart do not always move as their messages ask"
         return Uncovered(text, "remove `safety` to see what is guaranteed without it", False)
     if following.graph.schedule is not None:
-        return Uncovered(
-            "the graph switches, and late messages are covered for one graph only",
-            "use a graph that does not switch",
-            False,
-        )
+        text = "the graph switches, and late messages are covered for one graph only"
+        return Uncovered(text, "use a graph that does not switch", False)
     return None
 
 

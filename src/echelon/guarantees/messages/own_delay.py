@@ -4,7 +4,6 @@ One agent's step is linearized at the trim as it runs: law, memory, motors and i
 model as the law knows it.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -247,17 +246,13 @@ def longest_delay(case: OwnCase, step: LateStep) -> int:
         # Every one at first, and then every tenth part of it.
         more = min(most, last + 1 + max(last, 0) // _EACH)
         if not _decays(case, step, more):
-            return bisect_whole(lambda k: _decays(case, step, k), last, more)
+            # The last one that decays, between one that does and one that does not.
+            while more - last > 1:
+                middle = (last + more) // 2
+                last, more = (middle, more) if _decays(case, step, middle) else (last, middle)
+            return last
         last = more
     return last
-
-
-def bisect_whole(fits: Callable[[int], bool], low: int, high: int) -> int:
-    """Return the last whole number that fits, of one that does and one that does not."""
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return low
 
 
 def _decays(case: OwnCase, step: LateStep, delay: int) -> bool:

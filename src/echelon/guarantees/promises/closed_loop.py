@@ -243,7 +243,10 @@ def modes_of(parts: Parts) -> NetworkModes:
     if not all_alike(parts.drive, parts.model):
         return NetworkModes(graph.spectrum(), not graph.directed and graph.schedule is None)
     if graph.directed:
-        return NetworkModes(_of_all(graph), False)
+        # All eigenvalues but for one 0; another 0 is a mode that never ends.
+        values = np.linalg.eigvals(graph.laplacian().toarray()).astype(complex)
+        values = in_order(np.delete(values, np.abs(values).argmin()))
+        return NetworkModes(Spectrum(values, len(values), 0.0), False)
     if graph.agents <= _DENSE:
         whole = np.linalg.eigvalsh(graph.laplacian().toarray())[1:]
         return NetworkModes(Spectrum(whole, len(whole), graph.spectrum().proved), False)
@@ -252,18 +255,10 @@ def modes_of(parts: Parts) -> NetworkModes:
     return NetworkModes(Spectrum(ends, graph.agents - 1, graph.spectrum().proved), False)
 
 
-def _of_all(graph: Graph) -> Spectrum:
-    """Return Laplacian eigenvalues of all agents but for one 0; another 0 never ends."""
-    values = np.linalg.eigvals(graph.laplacian().toarray()).astype(complex)
-    values = in_order(np.delete(values, np.abs(values).argmin()))
-    return Spectrum(values, len(values), 0.0)
-
-
 def all_alike(drive: Drive, model: ControlAffine) -> bool:
     """Tell whether the leaders obey the followers' law, with nothing fed forward."""
     leader, follower = getattr(drive, "leader", None), getattr(drive, "follower", None)
-    same = leader is not None and type(leader) is type(follower)
-    same = same and not drive.unknown
+    same = leader is not None and type(leader) is type(follower) and not drive.unknown
     silent = drive.feedforward is Feedforward.NONE and drive.metric(model) is not None
     return same and silent and bool(eqx.tree_equal(leader, follower))
 

@@ -67,14 +67,6 @@ class LeaderPath(NamedTuple):
         """What followers at the leader's own states are asked with."""
         return PathSamples(self.times, self.states, self.inputs, self.states, self.rates)
 
-    def extreme_rates(self) -> tuple[float, ...]:
-        """Return the least and the largest rate, rad/s, once where they are one; no zero."""
-        if not len(self.rates):
-            return ()
-        # Flatness maps round: a heading that stays seems to turn at 1e-17.
-        known = np.round([self.rates.min(), self.rates.max()], 9)
-        return tuple(rate for rate in dict.fromkeys(known.tolist()) if rate)
-
     def own_headings(self, parts: Parts) -> Array:
         """Return how far a leader's own gain is turned in these axes, (K,)."""
         turns = getattr(getattr(parts.drive, "leader", None), "turns", False)
@@ -166,9 +158,6 @@ def _pushes(model: ControlAffine, now: States, soon: States) -> tuple[States, ja
 
 
 # ---- linearizations ------------------------------------------------------------------------------
-# Behind a leader at x(t) small errors obey delta' = (A - lambda B K) delta with A, B and K those of
-# x(t), and split by the eigenvalues of the graph as they do at the trim. What these do in turn,
-# each for as long as it is the nearest sample, is a sign and no proof.
 
 _STARTS = 64
 """Starts that are looked at, with the moments of the path one shape for the compiler."""
@@ -308,11 +297,14 @@ class FrozenLaws(NamedTuple):
 
     @property
     def turns(self) -> tuple[float, ...]:
-        """The least and the largest rate of the heading along the path, rad/s.
+        """The least and the largest rate of the heading, rad/s, once where they are one; no zero.
 
         All slopes are in its axes; none where it does not turn, or the law does not.
         """
-        return self.path.extreme_rates()
+        rates = self.path.rates
+        # Flatness maps round: a heading that stays seems to turn at 1e-17.
+        known = np.round([rates.min(), rates.max()], 9).tolist() if len(rates) else ()
+        return tuple(rate for rate in dict.fromkeys(known) if rate)
 
     @property
     def on_path(self) -> tuple[ModeMatrices, ...]:
@@ -383,10 +375,8 @@ def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Arra
     starts = starts[:, few]
     rows = path.at_start(parts.model, starts.reshape(-1, starts.shape[2]))
     size = MOMENTS + _STARTS
-    parts_of = [
-        _followers(parts, loop, PathSamples._make(part[k : k + size] for part in rows))
-        for k in range(0, len(rows.times), size)
-    ]
+    slices = (slice(k, k + size) for k in range(0, len(rows.times), size))
+    parts_of = [_followers(parts, loop, PathSamples(*(x[each] for x in rows))) for each in slices]
     return ModeMatrices._make(map(np.concatenate, zip(*parts_of, strict=True)))
 
 

@@ -227,9 +227,8 @@ def _smooth(case: Case) -> Statement:
 
 def _matched(case: Case) -> Statement:
     name, leaders = Hypothesis.MATCHED_MOTION, case.leaders
-    remedy = (
-        "`feedforward: relay` removes the lag, but requires the leader's input at every follower"
-    )
+    remedy = "`feedforward: relay` removes the lag, "
+    remedy += "but requires the leader's input at every follower"
     if not case.matched and leaders.answer and case.governed:
         text = "the leader reacts to followers that do not know its input, and nothing is known "
         text += "of that loop"
@@ -243,9 +242,8 @@ def _matched(case: Case) -> Statement:
     elif case.fed_by_parents:
         text = "each follower is sent its parent's input"
     else:
-        text = (
-            "every follower receives the leader's input, which the paper's network does not provide"
-        )
+        text = "every follower receives the leader's input, "
+        text += "which the paper's network does not provide"
     return holds(name, Kind.PROOF, text)
 
 

@@ -68,9 +68,8 @@ def turning(case: Case) -> Iterator[Statement]:
     text = f"in a steady turn of {about(worst)} rad/s, as on the leader's path, the disagreement "
     text += "does not decay"
     fastest = _fastest(case, worst)
-    remedy = (
-        f"turn no faster than {at_most(fastest)} rad/s" if fastest > 0.0 else "use another gain"
-    )
+    remedy = "use another gain"
+    remedy = f"turn no faster than {at_most(fastest)} rad/s" if fastest > 0.0 else remedy
     yield fails(_NAME, kind, text, *number, remedy=remedy, reason=text)
 
 
@@ -245,10 +244,9 @@ def _detectable(case: Case) -> Statement:
         return holds(name, _LINEAR, "z = 0 is reached", *number)
     names = sorted({k for mode in hidden for k in np.flatnonzero(np.abs(mode.direction) > 0.1)})
     along = ", ".join(f"`{model.state_names[k]}`" for k in names)
-    text = (
-        f"no input feels {n - rank} of {n} directions of disagreement, and along {along} it does "
-    )
-    return fails(name, _LINEAR, f"{text}not decay by itself", *number, remedy="choose another P")
+    text = f"no input feels {n - rank} of {n} directions of disagreement, and along {along} it "
+    text += "does not decay by itself"
+    return fails(name, _LINEAR, text, *number, remedy="choose another P")
 
 
 def _coupled(case: Case) -> Statement:
@@ -259,9 +257,8 @@ def _coupled(case: Case) -> Statement:
     if c >= edge:
         text = "from the edge on every mode decays: near the trim, and of linear agents anywhere"
         return holds(Hypothesis.COUPLING, Kind.PROOF, text, *number)
-    text = (
-        f"coupling {about(c, 4)} is below the edge {at_least(edge, 4)} of what this gain guarantees"
-    )
+    text = f"coupling {about(c, 4)} is below the edge {at_least(edge, 4)} "
+    text += "of what this gain guarantees"
     remedy = f"raise `coupling` to {at_least(edge, 4)} or more"
     return fails(Hypothesis.COUPLING, Kind.PROOF, text, *number, remedy=remedy)
 
@@ -332,10 +329,8 @@ def _along(case: Case) -> Statement:
     growth, states = frozen.growth(), len(frozen.times)
     number = growth.rate, f"{at_least(growth.rate)} 1/s"
     if not growth.lost:
-        text = (
-            f"small errors decay over {amount(states, 'state')} of it, each frozen until the next"
-        )
-        return holds(name, Kind.SAMPLES, text, *number)
+        text = f"small errors decay over {amount(states, 'state')} of it, "
+        return holds(name, Kind.SAMPLES, f"{text}each frozen until the next", *number)
     grown = f"{about(np.exp(min(growth.most, 99.0)), 2)}-fold on a part of it"
     grown = f"at {about(growth.rate)} 1/s" if growth.rate >= 0.0 else grown
     text = f"along the leader's path the {growth.whose} errors grow {grown}, fastest at "

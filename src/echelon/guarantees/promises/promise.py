@@ -237,7 +237,9 @@ class Promise(abc.ABC):
 
     def sentence(self) -> str:
         """Return what is guaranteed, in sentences, and no more than that."""
-        text = self._claim() if self.claimed else self._against()
+        text = self.guarantee() if self.claimed else self._against()
+        if self.conditions:
+            text = f"Not guaranteed: this holds while {' and '.join(self.conditions)}. {text}"
         if self.claimed and self.without:
             text += f" {self.ignored()}"
         noted = (self.hypotheses.get(name) for name in _NOTED)
@@ -249,12 +251,6 @@ class Promise(abc.ABC):
         what = "claim" if self.conditions else "guarantee"
         return f"The {what} ignores that {self.without}." if self.without else ""
 
-    def _claim(self) -> str:
-        if not self.conditions:
-            return self.guarantee()
-        text = f"Not guaranteed: this holds while {' and '.join(self.conditions)}."
-        return f"{text} {self.guarantee()}"
-
     def _against(self) -> str:
         """Return all that stands against a guarantee, and what would help."""
         against = (line for line in self.hypotheses.values() if line.fails and line.reason)
@@ -262,10 +258,8 @@ class Promise(abc.ABC):
         until = "" if self.prefix is None else f" {self.prefix.sentence()}"
         first = self.prefix if self.prefix and self.prefix.promise.promised else None
         which = "" if first is None else f" from {at_most(first.at, 6)} s on"
-        text = (
-            f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. What would help: {remedies}."
-        )
-        return text + until
+        text = f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. "
+        return f"{text}What would help: {remedies}.{until}"
 
     def as_mapping(self) -> dict[str, Any]:
         """Return it ready for JSON; what does not exist is None."""

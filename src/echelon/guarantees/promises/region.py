@@ -41,6 +41,7 @@ from echelon.synthesis.certificates.lmi import falls
 from echelon.synthesis.gains.gain import Gain
 
 _NAME = Hypothesis.REGION
+_INNER = "the hull is of the drift without the gain's inner loop", "remove the inner loop"
 _ROUNDED = 1e-9  # of a normalized input
 _NEAR = 1e-3
 """How far about a trim the slopes of its sides are looked at, in units of each state."""
@@ -78,7 +79,8 @@ def region_of(parts: Parts, settings: Settings, leaders: Leaders) -> Region:
         text = f"P does not contract on the domain at coupling {about(gain.coupling, 4)}, "
         text += f"2 c lambda_min = {about(_strength(parts, gain), 4)}"
         return Region(None, None, _lost(text, "raise `coupling`, or shrink the `domain`"))
-    text, remedy = _withheld(parts, settings, leaders, gain, certificate)
+    inner = gain.inner is not None
+    text, remedy = _INNER if inner else _not_the_law(parts, settings, leaders, certificate)
     if text:
         return Region(None, certificate, _lost(text, remedy))
     return Region(certificate, certificate, _line(parts, certificate))
@@ -149,23 +151,13 @@ def _strength(parts: Parts, gain: Gain) -> float:
     return 2.0 * gain.coupling * parts.graph.spectrum().proved
 
 
-def _withheld(
-    parts: Parts, settings: Settings, leaders: Leaders, gain: Gain, certificate: RegionCertificate
-) -> tuple[str, str]:
-    if gain.inner is not None:
-        return "the hull is of the drift without the gain's inner loop", "remove the inner loop"
-    return _not_the_law(parts, settings, leaders, certificate)
-
-
 def _not_the_law(
     parts: Parts, settings: Settings, leaders: Leaders, certificate: RegionCertificate
 ) -> tuple[str, str]:
     """Return why what is fed forward takes away what the metric could keep, and what would not."""
     if _turns_away(parts, leaders):
-        text = (
-            f"the law turns with the leader's heading, and {certificate.theorem} needs fixed axes"
-        )
-        return text, "keep the leader's heading at the trim's"
+        text = f"the law turns with the leader's heading, and {certificate.theorem} needs fixed "
+        return f"{text}axes", "keep the leader's heading at the trim's"
     feedforward, theorem = parts.drive.feedforward, certificate.theorem
     # The parent of all is a leader where no agent is farther away, and what it sends is relayed.
     if feedforward is Feedforward.PARENT and parts.graph.depths().max() > 1:
@@ -176,10 +168,8 @@ def _not_the_law(
         return text, "set `feedforward: relay`"
     # A leader at its trim makes no velocity beyond it, and its raw input is that of the trim.
     if feedforward is Feedforward.RELAY_VELOCITY and theorem is Theorem.T2 and not leaders.rest:
-        text = (
-            "T2 covers the leader's raw input; what each agent computes from its velocity varies "
-        )
-        return f"{text}with g, and is not enclosed", "set `feedforward: relay`"
+        text = "T2 covers the leader's raw input; what each agent computes from its velocity "
+        return f"{text}varies with g, and is not enclosed", "set `feedforward: relay`"
     if not leaders.agree:
         return f"{theorem} covers one leader, or leaders that agree", "start them alike"
     return _uncovered_input(parts, settings, leaders, certificate.domain)
@@ -319,9 +309,8 @@ def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> C
     j = int(np.argmin(radii))
     name, wide = model.state_names[j], margins[j]
     if radii[j] == 0.0:
-        text = (
-            f"the leader alone reaches {about(away[j])} in `{name}`, and the domain {about(wide)}"
-        )
+        text = f"the leader alone reaches {about(away[j])} in `{name}`, "
+        text += f"and the domain {about(wide)}"
         return CertifiedSet(0.0, kind, text, "widen the domain, or slow the reference")
     # On a directed graph a sum with weights falls, which one agent's share may exceed so much.
     shrink = 1.0 / np.sqrt(parts.graph.spectrum().skew)

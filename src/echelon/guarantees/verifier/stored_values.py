@@ -82,7 +82,8 @@ def _described(array: Array) -> str:
 
 def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> Finding:
     if isinstance(stored, str) and isinstance(value, str):
-        fine, at = _same_text(stored, value), _first_difference(stored, value)
+        fine, pairs = _same_text(stored, value), enumerate(zip(stored, value))
+        at = next((k for k, (x, y) in pairs if x != y), min(len(stored), len(value)))
         shown = [ascii(text[at : at + _SHOWN])[1:-1] for text in (stored, value)]
         reason = f"from character {at} on `{shown[0]}` is stored, and computed is `{shown[1]}`"
         return _finding(claim, stored, value, fine, reason)
@@ -153,8 +154,3 @@ def _same_text(stored: str, value: str) -> bool:
         return False
     pairs = zip(_NUMBER.findall(stored), _NUMBER.findall(value), strict=True)
     return all(a == b or max(abs(float(a)), abs(float(b))) <= _USUAL.noise for a, b in pairs)
-
-
-def _first_difference(a: str, b: str) -> int:
-    pairs = enumerate(zip(a, b))
-    return next((k for k, (x, y) in pairs if x != y), min(len(a), len(b)))

@@ -64,7 +64,8 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verification:
     document = read_json(path)
     if states_gain(document):
         saved = read(document, path)
-        return judge(_collect(_findings(saved, model)), _no_decay_sentence(saved))
+        note = f" The gain guarantees no decay: the slowest mode is {about(saved.abscissa)} 1/s."
+        return judge(_collect(_findings(saved, model)), note if saved.abscissa >= 0.0 else "")
     return judge(_collect(_promise_findings(document["promise"])))
 
 
@@ -131,12 +132,6 @@ def judge(findings: Sequence[Finding], note: str = "") -> Verification:
         text = f"Incomplete: {text}; not checked: {names}.{note}"
         return Verification(tuple(findings), "incomplete", text, note)
     return Verification(tuple(findings), "verified", f"Verified: {text}.{note}", note)
-
-
-def _no_decay_sentence(saved: SavedGain) -> str:
-    if saved.abscissa < 0.0:
-        return ""
-    return f" The gain guarantees no decay: the slowest mode is {about(saved.abscissa)} 1/s."
 
 
 def _check_definite(saved: SavedGain) -> Iterator[Finding]:

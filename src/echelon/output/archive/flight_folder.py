@@ -129,12 +129,15 @@ def _sizes(functions: Mapping[str, LawFunction]) -> dict[str, int]:
 
 
 def _description(own: OwnLaw, functions: Mapping[str, LawFunction]) -> JsonObject:
-    model = own.loop.model
+    model, schedule, switching = own.loop.model, own.schedule, None
+    if schedule is not None:
+        starts, weights = schedule.starts.tolist(), own.weights.tolist()
+        switching = {"starts": starts, "weights": weights, "period": schedule.period}
     return {
         "leads": own.leads,
         "hears": list(own.neighbours),
         "weights": own.weights[0].tolist(),
-        "switching": _switching(own),
+        "switching": switching,
         "feed_forward_from": own.source,
         "states": dict(zip(model.state_names, model.state_units, strict=True)),
         "inputs": dict(zip(model.input_names, model.input_units, strict=True)),
@@ -147,14 +150,6 @@ def _description(own: OwnLaw, functions: Mapping[str, LawFunction]) -> JsonObjec
         "memory": len(functions["begin"].outputs["memory"]),
         "operations": {name: f.operations for name, f in functions.items()},
     }
-
-
-def _switching(own: OwnLaw) -> JsonObject | None:
-    """Return when which weights hold, of a graph that switches; a period repeats."""
-    if own.schedule is None:
-        return None
-    starts, weights = own.schedule.starts.tolist(), own.weights.tolist()
-    return {"starts": starts, "weights": weights, "period": own.schedule.period}
 
 
 def network_facts(
