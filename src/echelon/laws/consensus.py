@@ -62,7 +62,6 @@ class Consensus(Law):
     angle: Scalar | None = None
 
     def __check_init__(self) -> None:
-        """Check that the gain is one."""
         if not isinstance(self.gain, Gain):
             raise LawError(
                 f"`gain` of `Consensus` is {self.gain!r}, and must be a `Gain`, as `synthesize` "

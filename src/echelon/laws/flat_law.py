@@ -72,7 +72,6 @@ class FlatLaw(Law):
     speeds: Speed | None = None
 
     def __check_init__(self) -> None:
-        """Check that roots are distinct and positive, and other numbers positive."""
         if self.roots is not None and self.rate is not None:
             raise LawError("got `roots` and `rate`, allowed is one of them.")
         for name in ("rate", "coupling"):

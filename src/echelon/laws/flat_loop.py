@@ -46,7 +46,6 @@ class Observer:
     scale: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check both numbers."""
         for name in ("push", "scale"):
             value = getattr(self, name)
             if isinstance(value, bool) or not (0.0 <= value < math.inf):
@@ -57,7 +56,6 @@ class Observer:
             raise LawError("`scale` of the observer needs its `push`, which is 0.")
 
     def __bool__(self) -> bool:
-        """Tell whether there is one."""
         return self.push > 0.0
 
     @classmethod

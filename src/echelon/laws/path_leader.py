@@ -45,7 +45,6 @@ class PathLeader(Law):
     fading: Array | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self) -> None:
-        """Check that the reference is one."""
         check_kind_of(self.reference)
 
     def start(self, model: ControlAffine) -> State:
@@ -283,7 +282,7 @@ def sweep(model: ControlAffine, reference: Guide, horizon: float) -> tuple[Array
 
 
 def _backward(A: Array, G: Array, Q: Array, span: float) -> Array:
-    """Return P (N + 1, n, n) at the ends of N intervals, from A and G within them and at the end."""
+    """Return P (N + 1, n, n) at the ends of N intervals, from A and G in them and at the end."""
     # [X; Y]' = H [X; Y] has P = Y X^-1 for the solution of the Riccati equation. With A and G held
     # this is exact, where a Runge-Kutta step of fast modes would not be stable.
     H = np.block([[A, -G], [np.broadcast_to(-Q, A.shape), -A.swapaxes(1, 2)]])

@@ -145,7 +145,6 @@ class Safety:
     of_model: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check every number."""
         if self.radii is not None:
             radii = tuple(np.atleast_1d(np.asarray(self.radii, object)).tolist())
             object.__setattr__(self, "radii", radii)

@@ -146,7 +146,6 @@ class StoppingPoint(FlatLaw):
     ahead: Array | None = None
 
     def __check_init__(self) -> None:
-        """Check that the feed-forward sends zeta'."""
         allowed = (Feedforward.RELAY, Feedforward.PARENT)
         if self.feedforward not in allowed:
             raise LawError(

@@ -35,7 +35,6 @@ class Job:
     """Work of a command whose results are stored part by part."""
 
     def __init__(self, command: Literal["run", "sweep"], chunks: "Chunks") -> None:
-        """Store the parts in the folder of the chunks."""
         self.command, self.chunks = command, chunks
 
     @property
@@ -237,7 +236,6 @@ class WatchedRun:
     """A run whose page shows each part once it is computed; a fault of the page ends nothing."""
 
     def __init__(self, scenario: "Scenario", experiment: "Experiment") -> None:
-        """Prepare the page, as far as it is known before the run."""
         from echelon.experiments.results.lyapunov import fixed_metric, potential
         from echelon.experiments.results.recording import foreseen
         from echelon.guarantees.promises.promise import promise

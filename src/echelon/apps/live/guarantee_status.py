@@ -35,7 +35,6 @@ class _Newest:
     """A thread that works on requests; of several that wait only the last is worked on."""
 
     def __init__(self, work: Callable[["_Request"], None]) -> None:
-        """Start the thread, which waits for a request."""
         self.work = work
         self.request: _Request | None = None
         self.changed, self.ended = threading.Condition(), False
@@ -43,13 +42,11 @@ class _Newest:
         self.thread.start()
 
     def ask(self, request: "_Request") -> None:
-        """Replace the request that waits."""
         with self.changed:
             self.request = request
             self.changed.notify()
 
     def end(self) -> None:
-        """End the thread."""
         with self.changed:
             self.ended = True
             self.changed.notify()
@@ -94,7 +91,6 @@ class Promiser:
     """
 
     def __init__(self, answer: Callable[[JsonObject], None]) -> None:
-        """Start the threads, which wait for a request."""
         self.answer, self.lock = answer, threading.Lock()
         self.number = self.complete = 0
         self.workers = _Newest(self._look), _Newest(self._judge)
@@ -247,7 +243,6 @@ class GuaranteeStatus:
     def __init__(
         self, model: ControlAffine, graph: Graph, show: Callable[[JsonObject], None]
     ) -> None:
-        """Begin without a guarantee."""
         self.names, self.followers = [*model.chart], list(graph.followers)
         self.columns = [model.state_names.index(name) for name in self.names]
         self.chart = np.array([*model.chart.values()], float).reshape(-1, 2)

@@ -99,7 +99,6 @@ class LiveParts:
     """The gain, formation, graph and wind of a loop at any position of the knobs."""
 
     def __init__(self, scenario: Scenario, experiment: Experiment) -> None:
-        """Begin with the scenario's own parts."""
         self.scenario, self.parts = scenario, experiment.parts
         model = self.parts.model
         self.start = _start(experiment)

@@ -29,7 +29,6 @@ class Panel:
     """The controls that a scenario has, and the scenario at any position of the knobs."""
 
     def __init__(self, scenario: Scenario, experiment: Experiment) -> None:
-        """Collect the controls."""
         self.scenario, self.experiment = scenario, experiment
         self.live = LiveParts(scenario, experiment)
         self.start = self.live.start

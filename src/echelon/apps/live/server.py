@@ -115,14 +115,12 @@ class _Live(Handler, abc.ABC):
     session: Session
 
     def do_GET(self) -> None:
-        """Send the page, or the stream until the page closes."""
         if self.path == "/stream" and self.allowed():
             self._stream()
         elif self.path != "/stream":
             super().do_GET()
 
     def do_POST(self) -> None:
-        """Apply the request of a page."""
         if not self.allowed():
             return
         try:

@@ -31,7 +31,6 @@ class LoopsByLaw:
     """Loops by the followers' law, each also with agents that can be lost and join."""
 
     def __init__(self, panel: Panel, swarm: LiveLoop, send: Callable[[JsonObject], None]) -> None:
-        """Begin with one loop."""
         self.first, self.send = panel, send
         self.ready = {(panel.law, swarm.eventful): (panel, swarm)}
 
@@ -128,7 +127,6 @@ class Session:
     """
 
     def __init__(self, scenario: Scenario, panel: Panel, swarm: LiveLoop) -> None:
-        """Check the events of the scenario; nothing runs before `start`."""
         self.scenario, self.panel, self.swarm = scenario, panel, swarm
         self.knobs, self.paused, self.watchers, self.ended = panel.start, False, 0, False
         self.run = foreseen_of(swarm, "")

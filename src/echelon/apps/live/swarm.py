@@ -116,7 +116,6 @@ class LiveLoop:
     def __init__(
         self, parts: Parts, settings: Settings, panel: LiveParts, eventful: bool = False
     ) -> None:
-        """Prepare the loop and its stepper."""
         disturbance = parts.world.disturbance or Disturbance()
         world = dataclasses.replace(parts.world, disturbance=disturbance)
         parts = room_for_events(parts, settings.dt) if eventful else parts

@@ -242,7 +242,6 @@ class Deviations:
     """Computes z and delta for a graph, whose Laplacian is factored once."""
 
     def __init__(self, graph: Graph, difference: _Difference) -> None:
-        """Build the differences along the edges."""
         i, j = graph.edges.T
         edge = np.arange(len(i))
         signs = np.concatenate([graph.weights, -graph.weights])

@@ -161,7 +161,6 @@ class Recording(FrameNumbers):
     moving: Float[np.ndarray, "T N n"] | None = None
 
     def __repr__(self) -> str:
-        """Return the name and the sizes."""
         frames = amount(len(self.times), "frame")
         return f"Recording({self.name!r}, {self.agents} agents, {frames})"
 

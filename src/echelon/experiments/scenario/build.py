@@ -164,7 +164,6 @@ class _Builder:
 
     @contextlib.contextmanager
     def at(self, *path: str | int) -> Iterator[None]:
-        """Record an error that is raised inside, and continue."""
         try:
             yield
         except MissingExtraError:
@@ -187,7 +186,6 @@ class _Builder:
             refuse(self.faults)
 
     def check_run(self) -> None:
-        """Check that a scenario has no live events, and that its run fits in memory."""
         with self.at("live"):
             if self.scenario.live:
                 raise ScenarioError(
@@ -199,7 +197,6 @@ class _Builder:
         self.settle()
 
     def parts(self) -> Parts:
-        """Return all parts."""
         scenario, model = self.scenario, self.model
         world, leadership = self._world(), self._leadership()
         events = self._events(leadership)

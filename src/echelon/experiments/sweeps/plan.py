@@ -224,7 +224,6 @@ class Sweep:
     def __init__(
         self, scenario: Scenario, axes: tuple[Axis, ...], every: int | None = None
     ) -> None:
-        """Check all values, each with the first ones of the other axes."""
         self.scenario, self.axes, self.every = scenario, axes, every
         if every is not None and every < 1:
             raise ScenarioError(f"`keep_states` is {every}, and must be a whole number from 1 on.")

@@ -29,7 +29,6 @@ class Workers:
     """Computes the runs of a sweep, batch by batch; a case is built once for its seeds."""
 
     def __init__(self, plan: Sweep, threads: int | None = None) -> None:
-        """Build the first case."""
         self.plan, self.runs = plan, Batch(threads)
         first = plan.first_built
         self._last: tuple[int, Experiment | str] = 0, first

@@ -87,11 +87,9 @@ class _Lasting(NamedTuple):
 
     @classmethod
     def none(cls, law: FlatLaw) -> "_Lasting":
-        """Return that of a model that lacks nothing."""
         return cls(*np.zeros((2, len(law.ready.chains.degrees))))
 
     def less(self, other: "_Lasting") -> "_Lasting":
-        """Return what is left of it beside another agent's."""
         return _Lasting(self.current - other.current, self.push - other.push)
 
 
@@ -174,12 +172,10 @@ class _Driven(NamedTuple):
         return jnp.concatenate([x, e, v])
 
     def parts(self, z: jax.Array) -> tuple[State, jax.Array, jax.Array]:
-        """Return x, e and w."""
         end = self.states + self.loop.chains.size
         return z[: self.states], z[self.states : end], z[end:]
 
     def input(self, z: jax.Array) -> jax.Array:
-        """Return the physical input."""
         _, e, w = self.parts(z)
         return self.model.physical(self.loop.chains.acting_input(e, w))
 
@@ -188,12 +184,10 @@ class _Driven(NamedTuple):
         return flat_output(self.model, self.loop.chains.outputs, x)
 
     def velocity(self, x: State, u: jax.Array) -> State:
-        """Return the rate of the state."""
         drag, wind = self.air
         return self.plant.velocity(x, u) + self.push + drag * (wind - x)
 
     def moved(self, z: jax.Array) -> jax.Array:
-        """Return the rate of z."""
         x, e, w = self.parts(z)
         return jnp.concatenate(
             [self.velocity(x, self.input(z)), self.loop.chains.rate(e, w), jnp.zeros_like(w)]

@@ -257,7 +257,6 @@ class _MotorCase(NamedTuple):
 
     @classmethod
     def of(cls, run: StoppingRun, frame: Airframe) -> "_MotorCase":
-        """Return it of a run."""
         chain, graph = run.chain(0), run.parts.graph
         speeds = _speeds([run.speed(k) for k in range(4)])
         off = run.flat[list(graph.leaders)] - run.ahead

@@ -81,7 +81,6 @@ class _Motion(NamedTuple):
 
     @classmethod
     def of(cls, claims: JsonObject) -> "_Motion":
-        """Return the bounds for the stored claims."""
         rho = np.asarray(claims["roots"], float)
         times = np.linspace(0.0, 30.0 / rho.min(), _CELLS)
         (free, integrals), (first, turn_integral) = (

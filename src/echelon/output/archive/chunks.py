@@ -35,7 +35,6 @@ class Chunks:
     """
 
     def __init__(self, folder: Path, by: str = CHUNKS) -> None:
-        """Use a folder, which may not exist yet."""
         self.folder, self.place = folder, folder / by
 
     @property

@@ -27,7 +27,6 @@ class Batches:
     """The batches of a sweep in its folder, each in a file named by its first run."""
 
     def __init__(self, folder: Path) -> None:
-        """Use a folder, which may not exist yet."""
         self.folder, self.chunks = folder, Chunks(folder, BATCHES)
         self.frames = Chunks(folder, f"{BATCHES}/frames")
 
@@ -128,7 +127,6 @@ class Flights:
     """The datasets of a comparison, each written as soon as its run is complete."""
 
     def __init__(self, folder: Path) -> None:
-        """Begin without an error."""
         self.folder = folder
         self.error: OSError | None = None
 

@@ -49,7 +49,6 @@ class _Sheet:
         log: bool = False,
         floor: float = FLOOR,
     ) -> JsonObject:
-        """Take the values in `frames`."""
         curve = np.asarray(values, np.float64)
         if log:
             # A logarithm has no 0, and values below the floor are rounding errors.

@@ -277,7 +277,6 @@ class Growing:
     """The parts of a run so far, for any number of pages."""
 
     def __init__(self, run: Recording) -> None:
-        """Create the page without frames."""
         more = {"growing": True, "horizon": run.horizon}
         self.html = page(run.name, pack(header(run, space_of(run)) | more, {})).encode()
         self.blocks, self.done = list[bytes](), False

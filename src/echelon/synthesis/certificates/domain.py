@@ -26,7 +26,6 @@ class Domain:
     """
 
     def __init__(self, lower: Array, upper: Array, input_lower: Array, input_upper: Array) -> None:
-        """Store the bounds, read-only."""
         self.lower, self.upper = np.array(lower, float), np.array(upper, float)
         self.input_lower, self.input_upper = (
             np.array(input_lower, float),
@@ -101,11 +100,9 @@ class Domain:
         return ", ".join(named) or "all states"
 
     def __eq__(self, other: object) -> bool:
-        """Tell whether two domains have the same bounds."""
         return isinstance(other, Domain) and self._bounds() == other._bounds()
 
     def __hash__(self) -> int:
-        """Hash what `__eq__` compares."""
         return hash(self._bounds())
 
     def _bounds(self) -> tuple[tuple[float, ...], ...]:

@@ -52,31 +52,25 @@ class _Scaled(NamedTuple):
     bits: int
 
     def times(self, other: "_Scaled") -> "_Scaled":
-        """Return the matrix product (or that with a number)."""
         if other.integers.ndim == 0:
             return _Scaled(self.integers * other.integers[()], self.bits + other.bits)
         return _Scaled(self.integers @ other.integers, self.bits + other.bits)
 
     def plus(self, other: "_Scaled") -> "_Scaled":
-        """Return the sum."""
         bits = max(self.bits, other.bits)
         left, right = 1 << (bits - self.bits), 1 << (bits - other.bits)
         return _Scaled(self.integers * left + other.integers * right, bits)
 
     def minus(self, other: "_Scaled") -> "_Scaled":
-        """Return the difference."""
         return self.plus(_Scaled(-other.integers, other.bits))
 
     def transpose(self) -> "_Scaled":
-        """Return the transpose."""
         return _Scaled(self.integers.T, self.bits)
 
     def absolute(self) -> "_Scaled":
-        """Return the absolute values."""
         return _Scaled(abs(self.integers), self.bits)
 
     def row_sums(self) -> "_Scaled":
-        """Return the diagonal matrix of the sums of rows."""
         return _Scaled(np.diag(self.integers.sum(axis=1)), self.bits)
 
 

@@ -66,7 +66,6 @@ class Gain(eqx.Module):
         certificate: Certificate,
         inner: Array | None = None,
     ) -> None:
-        """Reject P or R not symmetric positive definite, and a coupling that is not positive."""
         check_definite("P", P)
         check_definite("R", R)
         check_coupling(coupling)
