@@ -48,7 +48,8 @@ class LoopsByLaw:
         what = "room for events" if eventful else f"the law `{law}`"
         self.send({"note": f"Compiling {what}; the loop continues meanwhile."})
         try:
-            panel = self._panel(law)
+            same = (panel for (name, _), (panel, _) in self.ready.items() if name == law)
+            panel = next(same, None) or Panel(*under(self.first.scenario, law))
             loop = LiveLoop(*panel.experiment, panel.live, eventful)
             # The first step compiles the rest.
             loop.advance()
@@ -56,12 +57,6 @@ class LoopsByLaw:
         finally:
             self.send({"note": ""})
         return self.ready[key]
-
-    def _panel(self, law: str) -> Panel:
-        for (name, _), (panel, _) in self.ready.items():
-            if name == law:
-                return panel
-        return Panel(*under(self.first.scenario, law))
 
 
 _AHEAD, _APART = 60.0, 0.1

@@ -110,7 +110,6 @@ class Recording(FrameNumbers):
         position: indices of the coordinates that a picture shows; none of an abstract agent.
         bounds: of the inputs; None without limits.
         lyapunov: V; None where the law has none.
-        lyapunov_rate: its derivative.
         metric: P of V, where there is a gain; else None.
         saturated: fraction of steps in which a limit changed the agent's input.
         tracking: of the leaders; None without a reference.
@@ -370,9 +369,8 @@ def _bounds(values: Mapping[str, np.ndarray]) -> InputBounds | None:
 def _tracking(values: Mapping[str, np.ndarray]) -> TrackingErrors | None:
     if "tracking_error" not in values:
         return None
-    return TrackingErrors(
-        values["tracking_error"], _texts(values, "output"), _texts(values, "output_unit")
-    )
+    names, units = _texts(values, "output"), _texts(values, "output_unit")
+    return TrackingErrors(values["tracking_error"], names, units)
 
 
 def _modes(values: Mapping[str, np.ndarray]) -> LoopPoles | None:
@@ -385,13 +383,10 @@ def _modes(values: Mapping[str, np.ndarray]) -> LoopPoles | None:
 def _avoidance(values: Mapping[str, np.ndarray]) -> Avoidance | None:
     if "ellipsoid_radius" not in values:
         return None
-    radius, height, limit = (
-        float(values[name]) for name in ("ellipsoid_radius", "ellipsoid_height", "kept_distance")
-    )
-    times, distance, active = (
-        values.get(name, np.zeros(0)) for name in ("slice_start", "scaled_distance", "active_rows")
-    )
-    return Avoidance(times, distance, active, Ellipsoid(radius, height, limit))
+    names = "ellipsoid_radius", "ellipsoid_height", "kept_distance"
+    ellipsoid = Ellipsoid(*(float(values[name]) for name in names))
+    slices = "slice_start", "scaled_distance", "active_rows"
+    return Avoidance(*(values.get(name, np.zeros(0)) for name in slices), ellipsoid)
 
 
 def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:

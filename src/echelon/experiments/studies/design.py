@@ -38,7 +38,6 @@ class Design(NamedTuple):
     Attributes:
         gain: None where the method fails, for the `reason`.
         parts: of the scenario with that gain.
-        reason: empty where there is a gain.
         fastest: largest modulus of a pole of the loop, 1/s.
         step: the longest sampling period (s) for which all checked modes remain stable.
         factors: the interval of stable factors on the coupling; None if unstable.

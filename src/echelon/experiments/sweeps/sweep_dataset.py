@@ -36,7 +36,6 @@ REFUSED, MISSING = -1, -2
 """In place of an outcome: of a run whose parts cannot be built, and of one that is still to do."""
 OUTCOMES = {outcome: code for code, outcome in enumerate(Outcome)}
 
-
 Columns = Mapping[str, Array]
 """Of some runs: an array (runs,) for each number, and (runs, agents) for those of an agent."""
 

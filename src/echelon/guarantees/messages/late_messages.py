@@ -71,11 +71,6 @@ class AgeLimits(NamedTuple):
         """The age, in steps, to which hop counts are used."""
         return HOP_LIFE * (self.forgotten - 1)
 
-    @property
-    def hops_last(self) -> bool:
-        """Whether a link delivers before the hop counts that it delivered are forgotten."""
-        return self.arrived is not None and self.arrived <= self.hop_life
-
 
 def ages_of(channel: Channel, dt: float, steps: int, links: int, hops: int) -> AgeLimits:
     """Return the ages on a number of links in a run of so many steps (dt in s)."""
@@ -368,7 +363,7 @@ def late_messages_of(
         text = "with `hears: leaderward` weights count as 1, "
         text += f"and c dt = {at_least(c * dt)} is above 1"
         return Uncovered(text, f"lower `follower.coupling` to {at_most(1.0 / dt, 4)}", True)
-    if leaderward and not ages.hops_last:
+    if leaderward and (ages.arrived is None or ages.arrived > ages.hop_life):
         return _UNSETTLED
     if leaderward:
         # Of any part of the neighbours nearer to the leader the mean is taken.

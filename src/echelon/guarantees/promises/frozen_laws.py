@@ -278,9 +278,7 @@ class FrozenLaws(NamedTuple):
     Attributes:
         path: the leader's; without any states where it rests at its trim or follows none that is
             known.
-        along: the followers' law along the leader's path.
         leader: the leader's own law there; None where it is not known.
-        starts: the followers' law where agents start.
         culprit: what takes the law out of where it stabilizes, in words; empty where nothing does.
     """
 

@@ -158,7 +158,6 @@ class Border(NamedTuple):
         led: whether the leader starts on its path in these outputs, and so keeps to it.
         turn: by what angle (deg) a velocity as large as the leader's may be off it at the start;
             infinite where the bound is of no velocity.
-        data: what is claimed, and what it was computed of; ready for JSON.
         beside: whether offsets that change with time move agents in the bounded derivative.
     """
 

@@ -218,8 +218,6 @@ class MotorLoad(NamedTuple):
         least, largest: of a motor's thrust, N.
         most: that it has, N.
         tilt: the steepest, rad.
-        alone: None where agents that start like the leader do not.
-        data: what it was computed of; ready for JSON.
     """
 
     least: float

@@ -28,7 +28,6 @@ _FEW, _ALL = 20, 4000
 _EXACT = Fraction(1, 10**9)
 """Of the highest derivative; one that is known so well in one piece is constant."""
 
-
 _Rows: TypeAlias = tuple[tuple[Interval, ...], ...]
 
 

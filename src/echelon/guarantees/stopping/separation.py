@@ -30,7 +30,6 @@ class Separation(NamedTuple):
         speeds: (d,) of the followers in them.
         step: for which inputs are held, s.
         ideal: whether the run is one that the theorem covers.
-        tube: of the agents' other states.
         kind: of the argument: that of the tube, or weaker.
     """
 

@@ -261,7 +261,6 @@ def _left(roots: Array, starts: Array, times: Array) -> Array:
 
 _PROOF = Kind.PROOF
 
-
 _ANY = ("any graph in which the leader reaches every agent", "this graph")
 
 
@@ -279,7 +278,6 @@ class Tube(NamedTuple):
         borders: what is claimed of each border, and of what it was computed; ready for JSON.
         motor_load: None where motors have no limits, may not suffice, or were left out.
         graphs: which graphs are meant, and this one, in words.
-        network: what T9 says; None for the ideal network.
         offsets: how they change with time, and bounds of that; None of constant ones.
         kind: of the argument: the chains' responses and the path are enclosed in rationals; what
             somebody's class states of its flat coordinates or its motors was seen at samples.
@@ -416,17 +414,14 @@ def _graphs(run: StoppingRun) -> tuple[str, str]:
     schedule, law = run.parts.graph.schedule, run.law
     if law.feedforward is Feedforward.PARENT:
         # The speeds of the links add up in the tube.
-        return (
-            f"any tree in which none is more than {amount(run.links, 'link')} from a leader",
-            "this one",
-        )
+        text = f"any tree in which none is more than {amount(run.links, 'link')} from a leader"
+        return text, "this one"
     if schedule is None:
         return _ANY
     every = "eventually" if schedule.period is None else "in every period"
     along = "along neighbours nearer to it " if law.leaderward else ""
-    return f"any switching graphs over which the leader reaches every agent {along}{every}", (
-        "these"
-    )
+    text = "any switching graphs over which the leader reaches every agent "
+    return f"{text}{along}{every}", "these"
 
 
 def _nothing(text: str, remedy: str, *before: Statement) -> tuple[None, list[Statement]]:

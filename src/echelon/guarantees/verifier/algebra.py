@@ -52,9 +52,8 @@ def spectrum(graph: SavedGraph, edges: Array) -> CheckedSpectrum:
     np.add.at(W, (np.append(i, j), np.append(j, i)), np.append(weights, weights))
     inner_weights = W[np.ix_(selection, selection)]
     leader_weights = W[np.ix_(selection, graph.leaders)].sum(axis=1)
-    values = scipy.linalg.eigvalsh(
-        np.diag(inner_weights.sum(axis=1) + leader_weights) - inner_weights
-    )
+    L = np.diag(inner_weights.sum(axis=1) + leader_weights) - inner_weights
+    values = scipy.linalg.eigvalsh(L)
     values[0], bound = _least(inner_weights, leader_weights)
     return CheckedSpectrum(values, bound)
 
@@ -71,12 +70,8 @@ def _least(inner_weights: Array, leader_weights: Array) -> tuple[float, float]:
         return 0.0, 0.0
     # Iteration alone converges too slowly if the next eigenvalue is close, hence this start. Its
     # small entries must be too large: from above, y / x decreases to the eigenvalue at once.
-    x = y = (
-        np.abs(
-            scipy.linalg.eigh(solve_by_elimination(*steps, np.eye(len(leader_weights))))[1][:, -1]
-        )
-        + 1e-8
-    )
+    whole = solve_by_elimination(*steps, np.eye(len(leader_weights)))
+    x = y = np.abs(scipy.linalg.eigh(whole)[1][:, -1]) + 1e-8
     for _ in range(_ITERATIONS):
         # Entries far from the slowest mode underflow, and the ratio y / x needs positive ones.
         x = np.maximum(y / np.linalg.norm(y), 1e-150)
@@ -89,11 +84,8 @@ def _least(inner_weights: Array, leader_weights: Array) -> tuple[float, float]:
 
 def eliminate(inner_weights: Array, leader_weights: Array) -> tuple[Array, Array] | None:
     """Return weights (N, N) and pivots (N,) of an elimination; None if an agent is cut off."""
-    W, leader_weights, pivots = (
-        inner_weights.copy(),
-        leader_weights.copy(),
-        np.zeros(len(leader_weights)),
-    )
+    W, leader_weights = inner_weights.copy(), leader_weights.copy()
+    pivots = np.zeros(len(leader_weights))
     for k in range(len(W)):
         pivots[k] = leader_weights[k] + W[k, k + 1 :].sum()
         if not pivots[k] > 0.0:

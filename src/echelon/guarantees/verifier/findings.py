@@ -16,7 +16,6 @@ ROUNDING = 1e-12
 DECIDED = 1e-6
 """A rate is undecided if its rounding exceeds this fraction of it."""
 
-
 VERDICTS = ("holds", "recomputed", "refused", "not checked")
 """Verified by code of its own; equal to what the code gives again that made it; false; open."""
 

@@ -204,7 +204,6 @@ _WRITERS: "dict[str, Callable[[Result], bytes]]" = {
     "html": _page,
 }
 
-
 _HEAD = """# For Crazyswarm2, by echelon. Edit the addresses. Before the start each vehicle
 # stands at its `initial_position`, below the first point of its CSV file.
 robots:

@@ -13,7 +13,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import Outcome, OutputError
-from echelon.core.types import JsonObject, PathLike
+from echelon.core.types import PathLike
 from echelon.experiments.results.dataset import SUM, labelled_parts, run_file, with_sums
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.recording import read_recording
@@ -175,18 +175,13 @@ def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Find
         stored, value = read_json(files.claims), json.loads(json.dumps(summary(result)))
         theirs, ours = [{k: x[k] for k in names if k in x} for x in (stored, value)]
         yield from compare_values("", theirs, ours, digits)
-        yield from _compare_origin(stored, data)
+        # What both files say of the program: nothing else says it.
+        versions = {k[8:]: x for k, x in data.attributes.items() if k.startswith("version_")}
+        value = {"engine": data.attributes.get("computed_by"), "versions": versions}
+        yield from compare_values("", {key: stored.get(key) for key in value}, value)
     written = files.data.parent / REPORT
     if written.is_file() and not stopped:
         yield _compare_report(written, report(result) + "\n")
-
-
-def _compare_origin(stored: JsonObject, data: Labelled) -> Iterator[Finding]:
-    """Compare what both files say of the program: nothing else says it."""
-    attributes = data.attributes
-    versions = {k[8:]: text for k, text in attributes.items() if k.startswith("version_")}
-    value = {"engine": attributes.get("computed_by"), "versions": versions}
-    yield from compare_values("", {key: stored.get(key) for key in value}, value)
 
 
 def _compare_dataset(

@@ -20,7 +20,6 @@ from echelon.experiments.results.run_numbers import (
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.guarantees.promises.promise import Promise
 from echelon.output.reports.run_report import PRINTED, ROUNDING, is_papers_experiment, say
-from echelon.simulation.step.solver_stats import SolverStats
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -74,13 +73,10 @@ def _errors_table(comparison: Comparison, printed: bool) -> "Table":
     followers = graphs[0].followers if graphs and len(graphs[0].followers) <= _NAMED else ()
     whole, last = f"{comparison.horizon:.3g} s", f"last {comparison.steady_window:.3g} s"
     heads = ["leader", *(f"F{k}" for k in followers)] if followers else ["leader", "worst F"]
-    title = f"{comparison.scenario}, {whole}: RMSE" + "".join(
-        f", {text}" for text in comparison.conditions
-    )
+    title = ", ".join([comparison.scenario, f"{whole}: RMSE", *comparison.conditions])
     columns = [f"{head}\n{whole}" for head in heads] + [f"{head}\n{last}" for head in heads]
-    within = AGENT_NUMBERS["settling_time"].column.format(
-        settled=settling_bound(_unit(comparison.rows))
-    )
+    settled = settling_bound(_unit(comparison.rows))
+    within = AGENT_NUMBERS["settling_time"].column.format(settled=settled)
     table = _table(title, [*columns, within])
     for row in comparison.rows:
         table.add_row(row.label, *_errors(row, bool(followers)))
@@ -168,18 +164,14 @@ def _remarks(row: ComparisonRow) -> Iterator[str]:
     result = row.flight.result
     if result.outcome is not Outcome.COMPLETED:
         yield result.message
-    if result.work is not None:
-        yield _solver_times(result.work)
+    if (work := result.work) is not None:
+        yield (
+            f"{work.solver} computed {amount(work.solves, 'plan')} with "
+            f"{amount(work.failures, 'failure')}, in {work.median_ms:.3g} ms (median; 99th "
+            f"percentile {work.p99_ms:.3g}, worst {work.worst_ms:.3g}) each; iterations: "
+            f"median {work.iterations_median:.3g}, worst {work.iterations_worst}."
+        )
     yield from result.warnings
-
-
-def _solver_times(figures: SolverStats) -> str:
-    return (
-        f"{figures.solver} computed {amount(figures.solves, 'plan')} with "
-        f"{amount(figures.failures, 'failure')}, in {figures.median_ms:.3g} ms (median; 99th "
-        f"percentile {figures.p99_ms:.3g}, worst {figures.worst_ms:.3g}) each; iterations: "
-        f"median {figures.iterations_median:.3g}, worst {figures.iterations_worst}."
-    )
 
 
 # ---- the paragraph ------------------------------------------------------------------------------

@@ -155,20 +155,16 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
         columns += ["printed,\nconsensus", "printed,\noptimiz."]
     agents = f"{result.graph.agents} x {type(result.model).__name__}"
     name = result.provenance.get("scenario") or agents
-    title = f"{name}, {_length(result)}, seed {result.settings.seed}"
+    end = result.times[-1] if len(result.times) else 0.0
+    length = "" if result.outcome.reached else f"{end:g} s of "
+    length += f"{result.settings.horizon:g} s"
+    title = f"{name}, {length}, seed {result.settings.seed}"
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
     for column in columns:
         table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
     for row in _rows(result, numbers, printed):
         table.add_row(*row)
     return table
-
-
-def _length(result: Result) -> str:
-    horizon = f"{result.settings.horizon:g} s"
-    if result.outcome.reached:
-        return horizon
-    return f"{result.times[-1] if len(result.times) else 0.0:g} s of {horizon}"
 
 
 def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
