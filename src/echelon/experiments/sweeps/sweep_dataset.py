@@ -192,10 +192,8 @@ def _arranged(plan: Sweep, whole: Array) -> Array:
 
 
 def _values(axis: Axis) -> Array:
-    if isinstance(axis.values, range):
-        return np.array(axis.values)
-    numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in axis.values)
-    if numbers:
+    numbers = (isinstance(v, int | float) and not isinstance(v, bool) for v in axis.values)
+    if isinstance(axis.values, range) or all(numbers):
         return np.array(axis.values)
     values = [v if isinstance(v, str) else inline_yaml(v) for v in axis.values]
     return np.array(values, object)

@@ -79,10 +79,9 @@ def region_of(parts: Parts, settings: Settings, leaders: Leaders) -> Region:
         text = f"P does not contract on the domain at coupling {about(gain.coupling, 4)}, "
         text += f"2 c lambda_min = {about(_strength(parts, gain), 4)}"
         return Region(None, None, _lost(text, "raise `coupling`, or shrink the `domain`"))
-    inner = gain.inner is not None
-    text, remedy = _INNER if inner else _not_the_law(parts, settings, leaders, certificate)
-    if text:
-        return Region(None, certificate, _lost(text, remedy))
+    why = _INNER if gain.inner is not None else _not_the_law(parts, settings, leaders, certificate)
+    if why[0]:
+        return Region(None, certificate, _lost(*why))
     return Region(certificate, certificate, _line(parts, certificate))
 
 

@@ -151,14 +151,12 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
         "settled": settling_bound(result.length_unit),
     }
     columns = ["agent", *(quantity.column.format(**texts) for quantity in _COLUMNS.values())]
-    if printed:
-        columns += ["printed,\nconsensus", "printed,\noptimiz."]
+    columns += ["printed,\nconsensus", "printed,\noptimiz."] * printed
     agents = f"{result.graph.agents} x {type(result.model).__name__}"
     name = result.provenance.get("scenario") or agents
     end = result.times[-1] if len(result.times) else 0.0
-    length = "" if result.outcome.reached else f"{end:g} s of "
-    length += f"{result.settings.horizon:g} s"
-    title = f"{name}, {length}, seed {result.settings.seed}"
+    part = "" if result.outcome.reached else f"{end:g} s of "
+    title = f"{name}, {part}{result.settings.horizon:g} s, seed {result.settings.seed}"
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
     for column in columns:
         table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
