@@ -386,7 +386,8 @@ def _avoidance(values: Mapping[str, np.ndarray]) -> Avoidance | None:
     names = "ellipsoid_radius", "ellipsoid_height", "kept_distance"
     ellipsoid = Ellipsoid(*(float(values[name]) for name in names))
     slices = "slice_start", "scaled_distance", "active_rows"
-    return Avoidance(*(values.get(name, np.zeros(0)) for name in slices), ellipsoid)
+    times, distance, active = (values.get(name, np.zeros(0)) for name in slices)
+    return Avoidance(times, distance, active, ellipsoid)
 
 
 def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:

@@ -65,7 +65,7 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verification:
     if states_gain(document):
         saved = read(document, path)
         note = f" The gain guarantees no decay: the slowest mode is {about(saved.abscissa)} 1/s."
-        return judge(_collect(_findings(saved, model)), note if saved.abscissa >= 0.0 else "")
+        return judge(_collect(_findings(saved, model)), "" if saved.abscissa < 0.0 else note)
     return judge(_collect(_promise_findings(document["promise"])))
 
 
