@@ -59,9 +59,8 @@ class EventOutcome(NamedTuple):
         seen = f"in the stored frames {seen}" if self.sampled else seen
         if self.leader is not None:
             agent, off = self.leader
-            seen += (
-                f"; agent {agent} leads, {off:.3g} {self.unit}".rstrip() + " off the path at most"
-            )
+            away = f"{off:.3g} {self.unit}".rstrip()
+            seen += f"; agent {agent} leads, {away} off the path at most"
         if self.near is not None:
             seen += f"; it joins {self.near:.3g} m from another agent, nearer than hulls keep"
         return f"{text}: {seen}. {self.guarantee}"

@@ -129,9 +129,8 @@ class _Reading:
 
     def key(self, node: Node, path: KeyPath) -> str | int:
         if not isinstance(node, ScalarNode):
-            self.add_fault(
-                node, path, "got a list or mapping as a key, allowed is a word or a number."
-            )
+            text = "got a list or mapping as a key, allowed is a word or a number."
+            self.add_fault(node, path, text)
             return "?"
         key = self.meaning(node)
         return key if type(key) is int else str(node.value)

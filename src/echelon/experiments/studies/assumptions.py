@@ -191,11 +191,10 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
     both = not promise.hypotheses[Hypothesis.SYMMETRY].fails
     both = both and monotone.verdict is Verdict.HOLDS
     text, remedy = "needs Assumption 5 and symmetric offsets", "see Assumption 5 and the offsets"
-    yield (
-        holds(Topic.DRIFT_ALONG_Z, _LINEAR, text)
-        if both
-        else fails(Topic.DRIFT_ALONG_Z, _LINEAR, text, remedy=remedy)
-    )
+    if both:
+        yield holds(Topic.DRIFT_ALONG_Z, _LINEAR, text)
+    else:
+        yield fails(Topic.DRIFT_ALONG_Z, _LINEAR, text, remedy=remedy)
     yield _printed_line(parts, promise)
     yield _finite_line(parts, promise)
 

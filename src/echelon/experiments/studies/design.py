@@ -182,9 +182,8 @@ def _advantage(best: Design, others: list[Design], dt: float) -> str:
     if not others:
         return "It is the only stable design."
     if not rivals:
-        return (
-            f"Of {1 + len(others)} stable designs only this one is stable at the scenario's step."
-        )
+        text = f"Of {1 + len(others)} stable designs only this one is "
+        return f"{text}stable at the scenario's step."
     number = {1: "both"}.get(len(rivals), f"all {1 + len(rivals)}") + " stable designs"
     if len(rivals) < len(others):
         number += f" with a step {'above' if best.step > dt else 'below'} the scenario's"

@@ -481,9 +481,8 @@ def _decay(facts: Facts, region: SavedRegion, steps: Array) -> SupportBounds:
     saved, n = facts.saved, len(facts.saved.P)
     W = region.hull[:, :, n:] if region.theorem == "T2" else facts.weighted[None]
     metric_step, rate = steps @ saved.P, region.rate * (1.0 - _SAMPLED)
-    feedback = (
-        0.5 * region.strength * np.einsum("kn,hnm,km->kh", metric_step, W, metric_step).max(axis=1)
-    )
+    most = np.einsum("kn,hnm,km->kh", metric_step, W, metric_step).max(axis=1)
+    feedback = 0.5 * region.strength * most
     size = np.einsum("kn,kn->k", metric_step, steps)
     return SupportBounds(
         np.full(len(steps), -np.inf), feedback - rate * size, feedback + rate * size
