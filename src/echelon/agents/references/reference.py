@@ -21,7 +21,7 @@ from echelon.core.types import Array, Declared, Input, Scalar, State
 # ---- a motion of a model -------------------------------------------------------------------------
 
 
-class Guide(Declared):
+class LeaderPath(Declared):
     """The motion that a leader follows: a path in space, or one of states and inputs."""
 
     @abc.abstractmethod
@@ -68,7 +68,7 @@ _MAX_TIME = 10**9
 """s; thirty years, longer than any run."""
 
 
-class Reference(Guide):
+class Reference(LeaderPath):
     """A path t -> (x, y, z, yaw), in metres and radians; t in seconds."""
 
     joined: ClassVar[int] = 0
@@ -214,11 +214,11 @@ def check_kind_of(reference: object) -> None:
         ReferenceError: it is not.
     """
     # A path of states is one too, but users know the name `Reference`.
-    kind = Guide if isinstance(reference, Guide) else Reference
+    kind = LeaderPath if isinstance(reference, LeaderPath) else Reference
     check_kind("reference", reference, kind, ReferenceError)
 
 
-def check_reference(reference: Guide) -> None:
+def check_reference(reference: LeaderPath) -> None:
     """Check that a value is a reference, and the values that it returns.
 
     Raises:

@@ -18,7 +18,7 @@ from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import EchelonError, GraphError, LawError, ScenarioError, SimulationError
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import amount
-from echelon.experiments.results.recording import Recording, foreseen
+from echelon.experiments.results.recording import Recording, empty_recording
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.plots.space import Space, space_of
 from echelon.output.viewer.charts import distance_chart
@@ -105,7 +105,7 @@ def _path(swarm: LiveLoop, space: Space) -> list[list[float]]:
 
 def foreseen_of(swarm: LiveLoop, name: str) -> Recording:
     """Return a recording with all of a loop but its frames."""
-    return foreseen(swarm.parts, swarm.settings, np.asarray(swarm.states), name)
+    return empty_recording(swarm.parts, swarm.settings, np.asarray(swarm.states), name)
 
 
 _PICTURE, _MESSAGE = 0, 1

@@ -27,7 +27,7 @@ from echelon.experiments.results.labelled import Labelled, read_labelled
 from echelon.experiments.results.metrics import Avoidance, Ellipsoid
 from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.engine.record import Stretch
+from echelon.simulation.engine.record import Segment
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.settings import Settings
 
@@ -116,7 +116,7 @@ class Recording(FrameNumbers):
         modes: None where the laws have no linearization.
         messages: over a network; None in the ideal one.
         avoidance: how agents kept apart, without slices before they did; None where they do not.
-        promise: as `Promise.as_mapping` returns it.
+        promise: as `Guarantee.as_mapping` returns it.
         horizon, dt: s.
         attributes: provenance and settings, as stored.
         events: what happened, by time: `at` (s), `what`, `agents`, `until` (s) and `text`.
@@ -397,7 +397,7 @@ def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:
     return MessageAges(*rows, float(values["forget"]))
 
 
-def foreseen(
+def empty_recording(
     parts: Parts,
     settings: Settings,
     states: Float[Array, "N n"],
@@ -438,29 +438,29 @@ def _ahead(
 
 def so_far(
     run: Recording,
-    stretch: Stretch,
+    segment: Segment,
     potential: Callable[[Array], Array] | None,
     formation: Formation,
 ) -> Recording:
     """Return a part of a run as a recording.
 
-    `run` is one of `foreseen`; `potential` gives V (T,) of states minus offsets (T, N, n).
+    `run` is one of `empty_recording`; `potential` gives V (T,) of states minus offsets (T, N, n).
     """
-    moving = None if formation.motion is None else formation.offsets_at(stretch.times)
-    lyapunov, count = None, len(stretch.times)
+    moving = None if formation.motion is None else formation.offsets_at(segment.times)
+    lyapunov, count = None, len(segment.times)
     if potential is not None:
         # Block by block, the last one padded with copies.
-        y = stretch.states - run.offsets
+        y = segment.states - run.offsets
         whole = -(-count // _BLOCK) * _BLOCK
         padded = np.concatenate([y, np.repeat(y[-1:], whole - count, axis=0)])
         blocks = map(potential, np.split(padded, whole // _BLOCK))
         lyapunov = np.concatenate([*blocks])[:count]
     return dataclasses.replace(
         run,
-        times=stretch.times,
-        states=stretch.states,
-        inputs=stretch.inputs,
-        reference=stretch.reference,
+        times=segment.times,
+        states=segment.states,
+        inputs=segment.inputs,
+        reference=segment.reference,
         moving=moving,
         lyapunov=lyapunov,
     )

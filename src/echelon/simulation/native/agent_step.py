@@ -106,7 +106,7 @@ def check_information(loop: Loop) -> None:
 
 
 def check_distances(loop: Loop) -> None:
-    """Check that agents keep no distances from each other, are always there and have no heirs.
+    """Check that agents keep no distances, are always there and have no backup leaders.
 
     Raises:
         Unsupported: they are not so.

@@ -46,7 +46,7 @@ from echelon.simulation.step.knowledge import (
     packet_size,
     parts_of,
 )
-from echelon.simulation.step.motion import Motion, MotionState
+from echelon.simulation.step.motion import MotionState, PlantStep
 
 
 class LawFunction(NamedTuple):
@@ -406,7 +406,7 @@ def message_words(own: OwnLaw) -> list[str]:
 # ---- the motion of a simulated vehicle -----------------------------------------------------------
 
 
-def move_function(motion: Motion) -> LawFunction:
+def move_function(motion: PlantStep) -> LawFunction:
     """Return `move`: how one agent moves in a step of its own motion, under its actuators.
 
     Raises:
@@ -432,7 +432,7 @@ def move_function(motion: Motion) -> LawFunction:
     return LawFunction("move", about, sizes, {"x": x, "memory": memory})
 
 
-def motions_of(motion: Motion, agents: int, substeps: int) -> list[Motion]:
+def motions_of(motion: PlantStep, agents: int, substeps: int) -> list[PlantStep]:
     """Return the motion of each agent in a part of a step."""
     rows = [motion] * agents
     if motion.rows is not None:
