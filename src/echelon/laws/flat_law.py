@@ -78,7 +78,6 @@ class FlatLaw(Law):
     speeds: Speed | None = None
 
     def __check_init__(self) -> None:
-        """Check that roots are distinct and positive, and other numbers positive."""
         if self.roots is not None and self.rate is not None:
             raise LawError("got `roots` and `rate`, allowed is one of them.")
         for name in ("rate", "coupling"):
@@ -93,7 +92,8 @@ class FlatLaw(Law):
         if len(set(roots)) < len(roots):
             raise LawError(f"`roots` are {list(roots)}, and must be different from each other.")
         speeds = self.speed if isinstance(self.speed, Sequence) else (self.speed,)
-        if self.speed is not None and not all(map(_moves, speeds)):
+        numbers = all(isinstance(speed, int | float) and speed > 0.0 for speed in speeds)
+        if self.speed is not None and not numbers:
             raise LawError(
                 f"`speed` is {self.speed}, and must be positive, or a list of such numbers."
             )
@@ -171,13 +171,7 @@ class FlatLaw(Law):
     ) -> Speed:
         """Return s as set by the user, or what bounds allow each link of the path from a leader.
 
-        Args:
-            model: the agent.
-            chains: of it.
-            most: of an output.
-            share: of what leads to the bound of an output.
-            links: whose speeds add up.
-            slowest: what the leader's path takes a bounded length to, at least.
+        `links` speeds add up; `slowest` gives what the path takes a bounded length to, at least.
         """
         if self.speed is not None:
             return self.speed
@@ -226,7 +220,6 @@ class FlatLaw(Law):
         return self._counting(self.ready.zero_memory())
 
     def _counting(self, memory: FlatMemory) -> FlatMemory:
-        """Return a memory that counts the rows that act, if there are any."""
         return memory if self.safety is None else memory._replace(active=0.0 * memory.half)
 
     def signal(
@@ -316,10 +309,6 @@ class FlatLaw(Law):
             yield int(k), f"{names} are 0 there, and allowed is {bound.within}"
 
 
-def _moves(speed: object) -> bool:
-    return isinstance(speed, int | float) and speed > 0.0
-
-
 def _left(roots: tuple[float, ...], bound: FlatBound, slowest: float) -> float:
     """Return the speed of each output at which agreement alone leads to a bound; 0 for none."""
     allowed = slowest - bound.above
@@ -342,10 +331,7 @@ def _positive(root: object) -> bool:
 def _outside(
     chains: Chains, model: ControlAffine, states: Array, bound: FlatBound
 ) -> Iterator[tuple[int, str]]:
-    """Yield the rows of states (K, n) beyond a bound of one output.
-
-    There the inputs push it the wrong way, or without integrators it is below.
-    """
+    """There the inputs push it the wrong way, or without integrators it is below."""
     output = chains.outputs.index(bound.outputs[0])
     if not chains.size:
         yield from _below(chains, model, states, bound)
@@ -365,7 +351,6 @@ def _outside(
 def _below(
     chains: Chains, model: ControlAffine, states: Array, bound: FlatBound
 ) -> Iterator[tuple[int, str]]:
-    """Yield the rows of states (K, n) at which the state alone is not above a bound."""
     output, order = chains.outputs.index(bound.outputs[0]), bound.derivative
 
     def one(x: State) -> jax.Array:

@@ -45,7 +45,6 @@ class PathLeader(Law):
     fading: Array | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self) -> None:
-        """Check that the reference is one."""
         check_kind_of(self.reference)
 
     def start(self, model: ControlAffine) -> State:
@@ -77,12 +76,7 @@ class PathLeader(Law):
         return model.difference(x, self.reference.follow(model, t)[0] + offset)
 
     def expected(
-        self,
-        model: ControlAffine,
-        t: Scalar,
-        deviation: State,
-        age: Scalar,
-        period: Scalar | float,
+        self, model: ControlAffine, t: Scalar, deviation: State, age: Scalar, period: Scalar | float
     ) -> Expected:
         """Return the path with what is left of the deviation, at the leader's slowest mode."""
         left = deviation * jnp.exp(-jnp.asarray(self.fading, deviation.dtype) * age)
@@ -277,7 +271,7 @@ def sweep(model: ControlAffine, reference: LeaderPath, horizon: float) -> tuple[
         )
     held = np.append(np.arange(1, 2 * count, 2), 2 * count)
     push = B[held] @ np.linalg.solve(R, B[held].swapaxes(1, 2))
-    P = _backward(_flows(A[held], push, Q, horizon / count))
+    P = _backward(A[held], push, Q, horizon / count)
     if not np.isfinite(P).all():
         raise LawError(
             f"`lqr` cannot hold `{name}` on the reference `{path}`: no feedback keeps its "
@@ -287,10 +281,12 @@ def sweep(model: ControlAffine, reference: LeaderPath, horizon: float) -> tuple[
     return K, _decay(P, Q + K.swapaxes(1, 2) @ R @ K)
 
 
-def _backward(flows: Array) -> Array:
-    """Return P (N + 1, n, n) at the ends of N intervals, from their flows and that of the end."""
-    n = flows.shape[-1] // 2
-    P = [np.zeros((n, n))]
+def _backward(A: Array, G: Array, Q: Array, span: float) -> Array:
+    """Return P (N + 1, n, n) at the ends of N intervals, from A and G in them and at the end."""
+    # [X; Y]' = H [X; Y] has P = Y X^-1 for the solution of the Riccati equation. With A and G held
+    # this is exact, where a Runge-Kutta step of fast modes would not be stable.
+    H = np.block([[A, -G], [np.broadcast_to(-Q, A.shape), -A.swapaxes(1, 2)]])
+    flows, P = scipy.linalg.expm(-span * H), [np.zeros(Q.shape)]
     # What overflows is rejected afterwards, by its NaN.
     with np.errstate(all="ignore"):
         for _ in range(max(len(flows) - 1, _HELD)):
@@ -300,19 +296,7 @@ def _backward(flows: Array) -> Array:
     return np.array(P[::-1])
 
 
-def _flows(A: Array, G: Array, Q: Array, span: float) -> Array:
-    """Return exp(-H span) for each Hamiltonian matrix H = [[A, -G], [-Q, -A']], (N, 2n, 2n).
-
-    [X; Y] with [X; Y]' = H [X; Y] has P = Y X^-1 for the Riccati equation's solution. With A and
-    G held this is exact at any length of a step, where a Runge-Kutta step of fast modes is not
-    stable.
-    """
-    H = np.block([[A, -G], [np.broadcast_to(-Q, A.shape), -A.swapaxes(1, 2)]])
-    return scipy.linalg.expm(-span * H)
-
-
 def _before(P: Array, flow: Array) -> Array:
-    """Return P one interval earlier."""
     n = len(P)
     X, Y = flow[:n, :n] + flow[:n, n:] @ P, flow[n:, :n] + flow[n:, n:] @ P
     # Rounding alone makes it asymmetric, and would grow with every interval.

@@ -39,11 +39,7 @@ def saturated_decay(
 
     With v = c |x| / s the function F(v) = sqrt(1 + v^2) - arsinh(1/v) falls by c per second.
 
-    Args:
-        start: x at the beginning.
-        coupling: c, 1/s.
-        inverse: 1/s of each entry, 0 where sigma is linear.
-        age: the time, s.
+    `inverse` is 1/s of each entry, 0 where sigma is linear; `age` is in s.
     """
     v = coupling * jnp.abs(start) * inverse
     linear = v < _LINEAR
@@ -150,7 +146,6 @@ class StoppingPoint(FlatLaw):
     ahead: Array | None = None
 
     def __check_init__(self) -> None:
-        """Check that the feed-forward sends zeta'."""
         allowed = (Feedforward.RELAY, Feedforward.PARENT)
         if self.feedforward not in allowed:
             raise LawError(

@@ -32,15 +32,9 @@ if TYPE_CHECKING:
 
 @final
 class Job:
-    """Work of a command whose results are stored part by part.
-
-    Args:
-        command: that computes it.
-        chunks: the parts that are stored.
-    """
+    """Work of a command whose results are stored part by part."""
 
     def __init__(self, command: Literal["run", "sweep"], chunks: "Chunks") -> None:
-        """Store the parts in the folder of the chunks."""
         self.command, self.chunks = command, chunks
 
     @property
@@ -143,7 +137,6 @@ def run(
 def _new_run(
     name: str, changes: Sequence[str], out: Path | None, force: bool, quiet: bool, figures: bool
 ) -> "tuple[Scenario, Experiment, Job]":
-    """Return the scenario, its parts, and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
 
     scenario = load_scenario(name, changes)
@@ -162,7 +155,6 @@ def _new_run(
 
 
 def _unfinished_run(folder: Path) -> "tuple[Scenario, Experiment, Job]":
-    """Return the scenario, its parts, and the job in a folder."""
     from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
     from echelon.output.archive.chunks import Chunks
 
@@ -182,7 +174,6 @@ def _simulate(
     watched: "WatchedRun | None",
     quiet: bool,
 ) -> "Result":
-    """Return the run, which is stored and shown while it is computed."""
     from echelon.experiments.scenario import build
     from echelon.simulation.step.drive import Stopped
 
@@ -242,15 +233,9 @@ def _write(job: Job, result: "Result", figures: bool, quiet: bool) -> None:
 
 @final
 class WatchedRun:
-    """A run whose page shows each part as soon as it is computed; a fault of the page ends nothing.
-
-    Args:
-        scenario: of the run.
-        experiment: that it describes.
-    """
+    """A run whose page shows each part once it is computed; a fault of the page ends nothing."""
 
     def __init__(self, scenario: "Scenario", experiment: "Experiment") -> None:
-        """Prepare the page, as far as it is known before the run."""
         from echelon.experiments.results.lyapunov import fixed_metric, potential
         from echelon.experiments.results.recording import empty_recording
         from echelon.guarantees.promises.promise import guarantee
@@ -365,7 +350,6 @@ def _new_sweep(
     keep_states: int | None,
     quiet: bool,
 ) -> "tuple[Sweep, Batches, Job]":
-    """Return a sweep and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
 
     scenario = load_scenario(name, changes)
@@ -386,7 +370,6 @@ def _new_sweep(
 
 
 def _unfinished_sweep(folder: Path) -> "tuple[Sweep, Batches, Job]":
-    """Return the sweep and the job in a folder."""
     from echelon.output.archive.study_folder import Batches
 
     batches = Batches(folder)

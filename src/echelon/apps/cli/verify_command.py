@@ -77,7 +77,6 @@ def _advice(
     obstacle: str,
     scenario: str | None,
 ) -> "Iterator[str]":
-    """Yield how what is open can be checked, and what a refusal may come from."""
     from echelon.guarantees.verifier.agent_claims import MODEL
     from echelon.guarantees.verifier.verify import PROMISE
 
@@ -92,7 +91,6 @@ def _advice(
 
 
 def _other_version(file: Path, files: "ClaimFiles") -> "Iterator[str]":
-    """Yield that a run was written by another version, if its summary says so, and what to do."""
     if files.claims is None:
         return
     from echelon.core.files import versions
@@ -108,7 +106,6 @@ def _other_version(file: Path, files: "ClaimFiles") -> "Iterator[str]":
 
 
 def _as_mapping(verification: "Verification") -> "JsonObject":
-    """Return a verification ready for JSON."""
     return {
         "verdict": verification.verdict,
         "holds": verification.holds,
@@ -118,10 +115,7 @@ def _as_mapping(verification: "Verification") -> "JsonObject":
 
 
 def _print_verification(verification: "Verification", run: Path | None) -> None:
-    """Print what was checked by which means, the reasons of what is not verified, and the verdict.
-
-    `run` is the folder if the claims are of a whole run.
-    """
+    """`run` is the folder if the claims are of a whole run."""
     by = {"recomputed": list["CheckResult"](), "independent": list["CheckResult"]()}
     for finding in verification.findings:
         by["recomputed" if finding.by_scenario else "independent"].append(finding)

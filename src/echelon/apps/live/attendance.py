@@ -29,11 +29,8 @@ class Attendance(NamedTuple):
     """Who is there before the last event and after it, in three rows.
 
     Attributes:
-        weights: of the exchange.
-        present: whether an agent is there.
         nearest: whom it follows.
         since: since when it has been there, s.
-        step: of the event.
     """
 
     weights: Float[Array, "3 K"]

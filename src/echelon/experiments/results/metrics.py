@@ -72,7 +72,6 @@ def _output_errors(
 
 
 def _root_mean(total: float | np.floating, steps: float | np.floating) -> float | None:
-    """Return the root of a mean of squares, from their sum; None where there is no mean."""
     return finite_or_none(np.sqrt(total / steps)) if steps > 0 else None
 
 
@@ -118,10 +117,7 @@ def _followers(result: Result, exists: bool) -> tuple[FollowerMetrics, ...]:
 
 
 def _settling_time(result: Result, agent: int, last: float) -> float | None:
-    """Return the time after which the error stays below 1 cm, to a step, or None.
-
-    `last` is the error in the last stored frame, after the last step in the sums.
-    """
+    """`last` is the error in the last stored frame, after the last step in the sums."""
     if not last <= SETTLED:
         return None
     first, settings = float(result.sums.unsettled[agent]) + 1.0, result.settings
@@ -186,7 +182,6 @@ class Avoidance(NamedTuple):
         times: at which each slice begins, s.
         distance: the least distance between two agents in it, m.
         active: pairs of agents of which one changed the other's rate, each way, on average.
-        ellipsoid: about each agent.
     """
 
     times: Float[np.ndarray, " B"]
@@ -243,9 +238,6 @@ class RunNumbers:
     """A run with what its numbers are computed from.
 
     Attributes:
-        result: the run.
-        metrics: of the run.
-        promise: of its parts.
         computing: computing time (s) for one agent and one second of the run, without compilation;
             None if it was not measured.
     """

@@ -56,7 +56,6 @@ class Quantity(NamedTuple):
         column: of a table; `{unit}`, `{window}` (s) and `{settled}` stand for those of the run.
         of: computes it from the `RunNumbers` of a run, for an agent's number those of all
             followers, (F,); None for what `metrics` computes of each agent.
-        shown: where it appears.
         key: in JSON; its name by default.
         scale: of the number in tables: 100 for a percentage.
         digits: most digits in tables.

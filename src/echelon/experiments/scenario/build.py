@@ -150,8 +150,6 @@ def origin_of(scenario: Scenario) -> dict[str, Any]:
 
 @final
 class _Builder:
-    """Builds the parts of a scenario, and collects their faults with the places of their keys."""
-
     def __init__(self, scenario: Scenario) -> None:
         """Build what all other parts need, whose faults they would report again."""
         self.scenario, self.faults = scenario, list[ScenarioFault]()
@@ -166,7 +164,6 @@ class _Builder:
 
     @contextlib.contextmanager
     def at(self, *path: str | int) -> Iterator[None]:
-        """Record an error that is raised inside, and continue."""
         try:
             yield
         except MissingExtraError:
@@ -189,7 +186,6 @@ class _Builder:
             refuse(self.faults)
 
     def check_run(self) -> None:
-        """Check that a scenario has no live events, and that its run fits in memory."""
         with self.at("live"):
             if self.scenario.live:
                 raise ScenarioError(
@@ -201,7 +197,6 @@ class _Builder:
         self.settle()
 
     def parts(self) -> Parts:
-        """Return all parts."""
         scenario, model = self.scenario, self.model
         world, leadership = self._world(), self._leadership()
         events = self._events(leadership)
@@ -250,7 +245,6 @@ class _Builder:
         python: str | None,
         arguments: Mapping[str, object] = NOTHING,
     ) -> NamedClass:
-        """Return a member of a table, or a class in a file of the user."""
         if python is not None:
             cls = user_class(self.scenario.folder, python, kind)
             return NamedClass(cls, python, arguments, by_user=True)
@@ -288,7 +282,6 @@ class _Builder:
         return reference
 
     def _formation(self) -> Formation:
-        """Return the formation, with its motion; its faults are noted."""
         spec, starts = self.scenario.formation, self.scenario.initial.states
         formation = self._shape(spec)
         if spec.assign == "nearest":
@@ -475,7 +468,6 @@ class _Builder:
         return leadership
 
     def _events(self, leadership: Leadership | None) -> list[Event]:
-        """Return what happens during the run; a fault is noted at its event."""
         events = [_event(spec) for spec in self.scenario.events]
         backups = () if leadership is None else leadership.backups
         for k, text in event_faults(self.graph, events, backups, self.scenario.simulation.horizon):
@@ -506,7 +498,6 @@ def _event(spec: EventSpec) -> Event:
 
 
 def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) -> ControlAffine:
-    """Return a model with a named set of parameters, some of them changed."""
     named = getattr(part.cls, "named", None)
     if named is None:
         raise ModelError(

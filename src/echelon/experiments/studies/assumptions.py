@@ -45,7 +45,6 @@ class FiniteCondition(NamedTuple):
     Attributes:
         verdict: vacuous where f is the same at all goals, so that every P >= I passes.
         largest: of (xi_i - xi_j)'P (f(xi_i) - f(xi_j)) over the pairs; at most 0 where it holds.
-        pair: the agents with that value.
         least: smallest eigenvalue of P; at least 1 where it holds.
         agents: how many agents' goals were compared: all up to a thousand.
     """
@@ -106,7 +105,6 @@ def pair_values(P: Array, d: Array, f: Array) -> Array:
 def _largest(
     P: Float[Array, "n n"], offsets: Float[Array, "N n"], drifts: Float[Array, "N n"]
 ) -> tuple[float, tuple[int, int]]:
-    """Return the largest value over all pairs, and the pair."""
     best, at = -np.inf, (0, 0)
     for start in range(0, len(offsets), _ROWS):
         rows = slice(start, start + _ROWS)
@@ -193,11 +191,10 @@ def drift_lines(parts: Parts, settings: Settings, promise: Guarantee) -> Iterato
     both = not promise.hypotheses[Hypothesis.SYMMETRY].fails
     both = both and monotone.verdict is Verdict.HOLDS
     text, remedy = "needs Assumption 5 and symmetric offsets", "see Assumption 5 and the offsets"
-    yield (
-        holds(Topic.DRIFT_ALONG_Z, _LINEAR, text)
-        if both
-        else fails(Topic.DRIFT_ALONG_Z, _LINEAR, text, remedy=remedy)
-    )
+    if both:
+        yield holds(Topic.DRIFT_ALONG_Z, _LINEAR, text)
+    else:
+        yield fails(Topic.DRIFT_ALONG_Z, _LINEAR, text, remedy=remedy)
     yield _printed_line(parts, promise)
     yield _finite_line(parts, promise)
 
@@ -219,7 +216,6 @@ def _leader_line(promise: Guarantee, follows: bool) -> Statement:
 
 
 def _reference_line(model: ControlAffine, demand: ReferenceDemand, settings: Settings) -> Statement:
-    """Return the reference's speed and acceleration, and whether the input limits suffice."""
     limited = settings.limits and model.input_limits is not None
     unit = position_unit(model) or "1"
     sizes = ((demand.speed, f"{unit}/s"), (demand.acceleration, f"{unit}/s^2"))

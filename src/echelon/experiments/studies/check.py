@@ -89,11 +89,7 @@ def _switching_lines(promise: Guarantee) -> Iterator[Statement]:
 
 
 def _spread_line(low: float, high: float, delay: float, best: float) -> Statement:
-    """Return whether the ratio of the graph's eigenvalues reduces the delay margin much.
-
-    Couplings are chosen for lambda_min, and the delay margin of a mode decreases with c lambda;
-    `best` is the delay margin at lambda_min.
-    """
+    """Couplings are chosen for lambda_min; the delay margin of a mode decreases with c lambda."""
     ratio = high / low
     if not ratio > _WIDE:
         text = f"at most {_WIDE}, so the fastest mode reduces the delay margin little"
@@ -105,11 +101,7 @@ def _spread_line(low: float, high: float, delay: float, best: float) -> Statemen
 
 
 def _agreement_lines(agreement: AgreementModes) -> Iterator[Statement]:
-    """Yield the delay margin of zeta' = -c L zeta: (pi/2 - |arg lambda|) / (c |lambda|).
-
-    A root s = i w of s + c lambda e^(-s tau) has w = c |lambda|, and first reaches the axis at that
-    delay.
-    """
+    """A root s = i w of s + c lambda e^(-s tau) has w = c |lambda|, and a phase of pi/2."""
     c, values = agreement
     delays = (0.5 * np.pi - np.abs(np.angle(values))) / (c * np.abs(values))
     at, sizes = int(delays.argmin()), np.abs(values)

@@ -70,7 +70,6 @@ DriveOf = Callable[[Parts], Controller]
 def _consensus(
     gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bool = True
 ) -> DriveOf:
-    """Return the drive with the consensus law under a gain and the scenario's leader."""
     return lambda parts: parts.drive.with_follower(
         Consensus(gain(parts), feedforward, trim, parts.drive.frame)
     )
@@ -89,7 +88,6 @@ def _riccati(parts: Parts) -> Gain:
 
 
 def _reference(parts: Parts) -> Any:
-    """Return the reference of the scenario's leader; None without one."""
     return getattr(getattr(parts.drive, "leader", None), "reference", None)
 
 
@@ -193,7 +191,6 @@ def _with_starts(parts: Parts, settings: Settings) -> Parts:
 
 
 def _fly(parts: Parts, settings: Settings, part: Callable[[float], None]) -> RunNumbers:
-    """Run a method, and measure the time of solving, or of the compiled steps."""
     watch = _Watch(part)
     result = simulate(parts, settings, watch)
     seconds = watch.seconds if result.work is None else result.work.seconds
@@ -227,14 +224,9 @@ def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
     if any(eqx.tree_equal(drive, other) for other in others):
         return None
     law, gain, feedforward = getattr(drive, "follower", drive), drive.gain, drive.feedforward
-    name = _law_name(drive) if gain is None else gain.method
+    kind = type(law).__name__
+    name = _LAW_NAMES.get(kind, kind) if gain is None else gain.method
     label = name if feedforward is Feedforward.NONE else f"{name}-{feedforward}"
     if not type(law).__module__.startswith("echelon."):
-        label = type(law).__name__
+        label = kind
     return f"{label}, own" if label in {row.label for row in rows} else label
-
-
-def _law_name(drive: Controller) -> str:
-    """Return the name of the followers' law in scenarios, or that of the drive's class."""
-    kind = type(getattr(drive, "follower", drive)).__name__
-    return _LAW_NAMES.get(kind, kind)

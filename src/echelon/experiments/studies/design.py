@@ -36,11 +36,8 @@ class Design(NamedTuple):
     """A method on the scenario: its gain with its properties, or the reason why there is none.
 
     Attributes:
-        method: its name.
         gain: None where the method fails, for the `reason`.
         parts: of the scenario with that gain.
-        promise: of these parts.
-        reason: empty where there is a gain.
         fastest: largest modulus of a pole of the loop, 1/s.
         step: the longest sampling period (s) for which all checked modes remain stable.
         factors: the interval of stable factors on the coupling; None if unstable.
@@ -179,16 +176,14 @@ def because(best: Design, designs: tuple[Design, ...], dt: float) -> str:
 
 
 def _advantage(best: Design, others: list[Design], dt: float) -> str:
-    """Return the advantage of a design over those for which the step is equally suitable."""
     assert best.promise is not None
     _, *argument, rate = best.merit(dt)
     rivals = [d for d in others if (d.step > dt) == (best.step > dt)]
     if not others:
         return "It is the only stable design."
     if not rivals:
-        return (
-            f"Of {1 + len(others)} stable designs only this one is stable at the scenario's step."
-        )
+        text = f"Of {1 + len(others)} stable designs only this one is "
+        return f"{text}stable at the scenario's step."
     number = {1: "both"}.get(len(rivals), f"all {1 + len(rivals)}") + " stable designs"
     if len(rivals) < len(others):
         number += f" with a step {'above' if best.step > dt else 'below'} the scenario's"
@@ -222,7 +217,6 @@ def _design(method: type[Method], arguments: dict[str, Any], built: Experiment) 
 
 
 def _missing_keys(method: str, missing: list[str], parts: Parts) -> str:
-    """Return how to give a method its missing keys."""
     model = parts.model
     state = [*model.state_groups, *model.state_names][0]
     examples = {"domain": f"domain: {{{state}: HALF_WIDTH, ...}}"}
@@ -248,7 +242,6 @@ def with_gain(parts: Parts, gain: Gain) -> Parts:
 
 
 def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Guarantee) -> Design:
-    """Return the design of a gain, with its margins."""
     loop = guarantee.loop
     (A, B), closed = loop.linear, loop.closed
     poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
@@ -263,7 +256,6 @@ def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Guarantee
 
 
 def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dict[str, Any]:
-    """Return the scenario's arguments of this method, and its domain if the method needs one."""
     if spec is not None and not spec.file and not spec.python and spec.method == method.name:
         return {**method.defaults, **spec.arguments}
     gain = parts.drive.gain

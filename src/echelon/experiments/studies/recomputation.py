@@ -70,7 +70,6 @@ def compare_structure(file: Path, again: bytes) -> Iterator[CheckResult]:
 
 
 def _structure(file: Path | bytes) -> dict[str, JsonObject]:
-    """Return dimensions, type and attributes of each group and variable as text, by its path."""
     # Here, since it is slow to load.
     import h5netcdf
 
@@ -134,11 +133,7 @@ def recompute(
 ) -> Iterator[CheckResult]:
     """Yield a finding for each value that a run's files state and its scenario gives.
 
-    Args:
-        experiment: of the run, as `experiment_of` returns it.
-        scenario: of the run.
-        claims: the run's `summary.json`, or the output of `check --json`.
-        data: the run's `run.nc`, of which the guarantee, the scenario and the starts are compared.
+    `claims` are as in `experiment_of`; of `run.nc` parts, guarantee and starts are compared.
 
     Raises:
         EchelonError: a file cannot be read.
@@ -217,7 +212,6 @@ def with_leader_gain(
 
 
 def _led_by(parts: Parts, gain: Gain) -> Parts:
-    """Return the parts with another gain of the leaders."""
     drive = parts.drive
     assert isinstance(drive, Laws)
     leader = drive.leader
@@ -226,7 +220,6 @@ def _led_by(parts: Parts, gain: Gain) -> Parts:
 
 
 def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[CheckResult]:
-    """Compare the guarantee, the scenario, the parts and the starts in a dataset."""
     (run, data), (parts, settings), name = read_recording(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
     value = _as_json(guarantee(parts, settings).as_mapping())
@@ -250,7 +243,6 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
 def _compare_frames(
     run: Recording, data: Labelled, experiment: Experiment, name: str
 ) -> Iterator[CheckResult]:
-    """Compare the times of the frames, who is there at each, and offsets that change with time."""
     (parts, settings), stored = experiment, data.arrays()
     steps = np.minimum(np.arange(len(run.states)) * settings.store_every, settings.steps)
     times, schedule = steps * settings.dt, parts.graph.schedule

@@ -104,11 +104,6 @@ def state_space(parts: Parts, file: PathLike | None = None) -> StateSpace:
 
 
 def _check(parts: Parts) -> None:
-    """Check what a linear system cannot have.
-
-    Raises:
-        SimulationError: the parts have it.
-    """
     size = parts.graph.agents * len(parts.model.state_names)
     fault = None
     if not isinstance(parts.drive, Laws):

@@ -12,12 +12,7 @@ from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.dataset import labelled_parts
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.metrics import RunNumbers, metrics
-from echelon.experiments.results.run_numbers import (
-    AGENT_NUMBERS,
-    ERROR,
-    RUN_NUMBERS,
-    Quantity,
-)
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, ERROR, RUN_NUMBERS, Quantity
 from echelon.experiments.scenario.scenario import key_label
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps.plan import (
@@ -40,7 +35,6 @@ if TYPE_CHECKING:
 REFUSED, MISSING = -1, -2
 """In place of an outcome: of a run whose parts cannot be built, and of one that is still to do."""
 OUTCOMES = {outcome: code for code, outcome in enumerate(Outcome)}
-
 
 Columns = Mapping[str, Array]
 """Of some runs: an array (runs,) for each number, and (runs, agents) for those of an agent."""
@@ -198,11 +192,8 @@ def _arranged(plan: Sweep, whole: Array) -> Array:
 
 
 def _values(axis: Axis) -> Array:
-    """Return the values of an axis: numbers where all are, else text."""
-    if isinstance(axis.values, range):
-        return np.array(axis.values)
-    numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in axis.values)
-    if numbers:
+    numbers = (isinstance(v, int | float) and not isinstance(v, bool) for v in axis.values)
+    if isinstance(axis.values, range) or all(numbers):
         return np.array(axis.values)
     values = [v if isinstance(v, str) else inline_yaml(v) for v in axis.values]
     return np.array(values, object)
@@ -250,10 +241,7 @@ _CHUNK = 500_000
 def labelled_frames(plan: Sweep, axes: Variables, values: StoredFrames) -> Labelled:
     """Return arrays of all runs, with a dimension for each key, as a dataset.
 
-    Args:
-        plan: of the sweep.
-        axes: the values of each key.
-        values: `states` and `inputs` (key, .., time, agent, state / input).
+    `values` are `states` and `inputs` (key, .., time, agent, state or input).
     """
     assert plan.frames is not None
     fixed = labelled_parts(*plan.first_built).coordinates

@@ -26,15 +26,9 @@ _FRAMES = 20
 
 @final
 class Workers:
-    """Computes the runs of a sweep, batch by batch; a case is built once for its seeds.
-
-    Args:
-        plan: the sweep.
-        threads: as in `sweep`.
-    """
+    """Computes the runs of a sweep, batch by batch; a case is built once for its seeds."""
 
     def __init__(self, plan: Sweep, threads: int | None = None) -> None:
-        """Build the first case."""
         self.plan, self.runs = plan, Batch(threads)
         first = plan.first_built
         self._last: tuple[int, Experiment | str] = 0, first
@@ -71,7 +65,6 @@ class Workers:
         return SweepBatch(first, columns_of(rows), frames)
 
     def _build(self, run: SweepRun) -> Experiment | str:
-        """Return the parts and settings of a run, or why they cannot be built."""
         if self._last[0] != run.case:
             try:
                 case: Experiment | str = build(self.plan.case(run.place))

@@ -21,11 +21,7 @@ class GuaranteeInputs(NamedTuple):
     """The data of a run from which its guarantee is computed.
 
     Attributes:
-        parts: prepared.
-        settings: of the run.
         loop: the closed loop near the trim.
-        leaders: what is known of them without a run.
-        region: the certificate on a domain; None without one.
         slopes: (K, n, n) the slopes of the drift on all sides of the trim, if it bends there and
             they are known; else None.
         frozen: the law along the leader's path and at the starts; None where it is not needed.

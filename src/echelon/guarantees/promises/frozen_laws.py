@@ -67,14 +67,6 @@ class LeaderRun(NamedTuple):
         """What followers at the leader's own states are asked with."""
         return PathSamples(self.times, self.states, self.inputs, self.states, self.rates)
 
-    def extreme_rates(self) -> tuple[float, ...]:
-        """Return the least and the largest rate, rad/s, once where they are one; no zero."""
-        if not len(self.rates):
-            return ()
-        # Flatness maps round: a heading that stays seems to turn at 1e-17.
-        known = np.round([self.rates.min(), self.rates.max()], 9)
-        return tuple(rate for rate in dict.fromkeys(known.tolist()) if rate)
-
     def own_headings(self, parts: Parts) -> Array:
         """Return how far a leader's own gain is turned in these axes, (K,)."""
         turns = getattr(getattr(parts.drive, "leader", None), "turns", False)
@@ -115,7 +107,6 @@ def leader_run_of(parts: Parts, settings: Settings, leaders: Leaders) -> LeaderR
 
 
 def _as_sensed(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderRun:
-    """Return a path as a law that turns with the heading sees it, or as it is."""
     assert isinstance(parts.drive, Laws)
     model, still = parts.model, np.zeros(len(times))
     path = LeaderRun(times, states, inputs, np.asarray(model.trim[0], float), still, still)
@@ -167,9 +158,6 @@ def _pushes(model: ControlAffine, now: States, soon: States) -> tuple[States, ja
 
 
 # ---- linearizations ------------------------------------------------------------------------------
-# Behind a leader at x(t) small errors obey delta' = (A - lambda B K) delta with A, B and K those of
-# x(t), and split by the eigenvalues of the graph as they do at the trim. What these do in turn,
-# each for as long as it is the nearest sample, is a sign and no proof.
 
 _STARTS = 64
 """Starts that are looked at, with the moments of the path one shape for the compiler."""
@@ -185,7 +173,6 @@ class Growth(NamedTuple):
         rate: at which they grow over all of it, 1/s; below 0 where they shrink.
         most: ln of how often they multiply in the part of it that is worst for them.
         when: s, where they grow fastest.
-        whose: errors they are.
     """
 
     rate: float
@@ -291,9 +278,7 @@ class FrozenLaws(NamedTuple):
     Attributes:
         path: the leader's; without any states where it rests at its trim or follows none that is
             known.
-        along: the followers' law along the leader's path.
         leader: the leader's own law there; None where it is not known.
-        starts: the followers' law where agents start.
         culprit: what takes the law out of where it stabilizes, in words; empty where nothing does.
     """
 
@@ -310,11 +295,14 @@ class FrozenLaws(NamedTuple):
 
     @property
     def turns(self) -> tuple[float, ...]:
-        """The least and the largest rate of the heading along the path, rad/s.
+        """The least and the largest rate of the heading, rad/s, once where they are one; no zero.
 
         All slopes are in its axes; none where it does not turn, or the law does not.
         """
-        return self.path.extreme_rates()
+        rates = self.path.rates
+        # Flatness maps round: a heading that stays seems to turn at 1e-17.
+        known = np.round([rates.min(), rates.max()], 9).tolist() if len(rates) else ()
+        return tuple(rate for rate in dict.fromkeys(known) if rate)
 
     @property
     def on_path(self) -> tuple[ModeMatrices, ...]:
@@ -385,10 +373,8 @@ def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderRun, states: Array
     starts = starts[:, few]
     rows = path.at_start(parts.model, starts.reshape(-1, starts.shape[2]))
     size = MOMENTS + _STARTS
-    parts_of = [
-        _followers(parts, loop, PathSamples._make(part[k : k + size] for part in rows))
-        for k in range(0, len(rows.times), size)
-    ]
+    slices = (slice(k, k + size) for k in range(0, len(rows.times), size))
+    parts_of = [_followers(parts, loop, PathSamples(*(x[each] for x in rows))) for each in slices]
     return ModeMatrices._make(map(np.concatenate, zip(*parts_of, strict=True)))
 
 
@@ -440,7 +426,6 @@ def _about(
 
 
 def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices | None:
-    """Return the leader's own law along its path; None where it has no gain."""
     assert isinstance(parts.drive, Laws)
     model, gain = parts.model, gain_of(parts.drive.leader)
     if gain is None:
@@ -454,7 +439,6 @@ def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices 
 
 
 def _culprit(parts: Parts, loop: LinearLoop, path: LeaderRun, frozen: FrozenLaws) -> str:
-    """Return the state whose return to the trim helps most where the law is worst, in words."""
     assert isinstance(parts.drive, Laws)
     model, trim = parts.model, np.asarray(parts.model.trim[0], float)
     n, k = len(trim), int(np.flatnonzero(path.times == frozen.growth().when)[0])

@@ -91,10 +91,8 @@ def _drifts(model: ControlAffine, law: Law | Controller | None, states: States) 
 def trim_line(parts: Parts, settings: Settings) -> Statement:
     """Say whether the actuators deliver the trim input, without which no agent holds its trim."""
     model, world, name = parts.model, parts.world, Hypothesis.TRIM_WITHIN_LIMITS
-    plants, trim = (
-        (world.plant_for(model), *world.plants.values()),
-        np.asarray(model.trim[1], float),
-    )
+    plants = (world.plant_for(model), *world.plants.values())
+    trim = np.asarray(model.trim[1], float)
     if any(_forced_off_trim(world.actuator, plant, trim) for plant in plants):
         text, remedy = "the motors' `minimum` is more than the trim needs", "lower `minimum`"
         return fails(name, Kind.PROOF, text, remedy=remedy, reason=f"{text}: no agent holds it")
@@ -162,11 +160,7 @@ def _agreement(case: GuaranteeInputs) -> Statement:
 
 
 def _drifting(case: GuaranteeInputs) -> Statement:
-    """Say by how much free leaders drift apart, and what is left: containment.
-
-    Behind leaders that move freely, e = y_F + L_g^-1 L_FL y_L of linear agents obeys the modes of
-    the disagreement; the rows of -L_g^-1 L_FL are weights that add to one.
-    """
+    """Here e = y_F + L_g^-1 L_FL y_L of linear agents obeys the modes of the disagreement."""
     away = apart(case.parts, case.settings, case.leaders.starts)
     first, unit = case.parts.graph.leaders[0], f"{position_unit(case.parts.model)} ".lstrip()
     text = (
@@ -207,10 +201,8 @@ def _symmetric(case: GuaranteeInputs) -> Statement:
     if not broken:
         return holds(name, kind, f"f and g are invariant under them{where}", 0, "0 broken")
     agent, why = next(iter(broken.items()))
-    text, remedy = (
-        f"the offset of agent {agent}: {why}{where}",
-        "offset only states that f and g do not use",
-    )
+    text = f"the offset of agent {agent}: {why}{where}"
+    remedy = "offset only states that f and g do not use"
     count, reason = len(broken), "an offset is no symmetry of the dynamics"
     return fails(name, kind, text, count, f"{count} broken", remedy=remedy, reason=reason)
 
@@ -235,9 +227,8 @@ def _smooth(case: GuaranteeInputs) -> Statement:
 
 def _matched(case: GuaranteeInputs) -> Statement:
     name, leaders = Hypothesis.MATCHED_MOTION, case.leaders
-    remedy = (
-        "`feedforward: relay` removes the lag, but requires the leader's input at every follower"
-    )
+    remedy = "`feedforward: relay` removes the lag, "
+    remedy += "but requires the leader's input at every follower"
     if not case.matched and leaders.answer and case.governed:
         text = "the leader reacts to followers that do not know its input, and nothing is known "
         text += "of that loop"
@@ -251,9 +242,8 @@ def _matched(case: GuaranteeInputs) -> Statement:
     elif case.fed_by_parents:
         text = "each follower is sent its parent's input"
     else:
-        text = (
-            "every follower receives the leader's input, which the paper's network does not provide"
-        )
+        text = "every follower receives the leader's input, "
+        text += "which the paper's network does not provide"
     return holds(name, Kind.PROOF, text)
 
 
@@ -296,7 +286,6 @@ def uncovered(graph: Graph, event: Event) -> str:
 
 
 def _leads(graph: Graph, event: Event) -> bool:
-    """Tell whether an agent that is lost was followed until then."""
     schedule = graph.schedule
     assert schedule is not None and schedule.nearest is not None
     row = schedule.row(event.at)
@@ -325,7 +314,6 @@ def as_mapping(event: Event) -> JsonObject:
 
 
 def _through(graph: Graph, event: Event, guarantee: Guarantee) -> JsonObject:
-    """Return what is guaranteed through an event: of which kind, and in words."""
     why = uncovered(graph, event)
     if why or not guarantee.promised:
         text = f"Nothing is guaranteed through it: {why}." if why else "Nothing is guaranteed."

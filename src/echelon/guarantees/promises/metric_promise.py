@@ -51,10 +51,7 @@ _ROUNDING = 1e-9  # of the fastest mode, in the slowest
 def claims_line(parts: Parts, loop: LinearLoop, region: RegionCertificate | None) -> Statement:
     """Return whether the certificate that a gain carries is of what runs.
 
-    Args:
-        parts: what runs.
-        loop: near the trim.
-        region: what the gain's metric promises here where the leader's input is relayed.
+    `region` is what the metric promises here where the leader's input is relayed.
     """
     gain, name, kind = parts.drive.gain, Hypothesis.CLAIMS, Kind.LINEARIZATION
     if gain is None:
@@ -68,7 +65,6 @@ def claims_line(parts: Parts, loop: LinearLoop, region: RegionCertificate | None
 def _difference(
     parts: Parts, gain: Gain, loop: LinearLoop, region: RegionCertificate | None
 ) -> str:
-    """Return the first difference in words; empty without any."""
     claim, low = gain.certificate, parts.graph.spectrum().low
     if abs(claim.lambda_min - low) > _SAME * low:
         ours, theirs = about(low, 4), about(claim.lambda_min, 4)
@@ -88,7 +84,6 @@ def _difference(
 
 
 def _rate(region: RegionCertificate | None) -> str:
-    """Return a promise on a domain in words, with the digits that are compared."""
     if region is None:
         return "nothing"
     kind, theorem = region.kind, region.theorem
@@ -104,7 +99,6 @@ class MetricPromise(Guarantee):
     """What is guaranteed near the trim, and on a domain where a metric contracts there.
 
     Attributes:
-        case: what it was computed of.
         turns: what the leader's heading may do, in words; empty where the law does not turn.
         slowest_turn: the slowest mode in the steady turns of `turns`, 1/s.
     """
@@ -232,7 +226,6 @@ class MetricPromise(Guarantee):
         return f"{text}. {self._regional(self.region)}"
 
     def _regional(self, region: RegionCertificate) -> str:
-        """Return what the region adds, as strong as its own argument and no stronger."""
         certified, condition, theorem = self.certified, self.condition, region.theorem
         by, what = self.kind.value, f"errors shrink at {at_most(region.rate)} 1/s or faster"
         what = "V does not increase" if theorem is Theorem.A5 else what

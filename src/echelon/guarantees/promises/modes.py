@@ -68,9 +68,8 @@ def turning(case: GuaranteeInputs) -> Iterator[Statement]:
     text = f"in a steady turn of {about(worst)} rad/s, as on the leader's path, the disagreement "
     text += "does not decay"
     fastest = _fastest(case, worst)
-    remedy = (
-        f"turn no faster than {at_most(fastest)} rad/s" if fastest > 0.0 else "use another gain"
-    )
+    remedy = "use another gain"
+    remedy = f"turn no faster than {at_most(fastest)} rad/s" if fastest > 0.0 else remedy
     yield fails(_NAME, kind, text, *number, remedy=remedy, reason=text)
 
 
@@ -201,7 +200,6 @@ def _linear(case: GuaranteeInputs) -> Iterator[Statement]:
 
 
 def _bent(case: GuaranteeInputs) -> Iterator[Statement]:
-    """Yield what is left of these lines where there is no linearization: what a region says."""
     for name in (Hypothesis.DETECTABLE, Hypothesis.COUPLING, Hypothesis.ALONG_PATH):
         yield vacuous(name, _LINEAR, _BENT)
     region = case.region
@@ -246,10 +244,9 @@ def _detectable(case: GuaranteeInputs) -> Statement:
         return holds(name, _LINEAR, "z = 0 is reached", *number)
     names = sorted({k for mode in hidden for k in np.flatnonzero(np.abs(mode.direction) > 0.1)})
     along = ", ".join(f"`{model.state_names[k]}`" for k in names)
-    text = (
-        f"no input feels {n - rank} of {n} directions of disagreement, and along {along} it does "
-    )
-    return fails(name, _LINEAR, f"{text}not decay by itself", *number, remedy="choose another P")
+    text = f"no input feels {n - rank} of {n} directions of disagreement, and along {along} it "
+    text += "does not decay by itself"
+    return fails(name, _LINEAR, text, *number, remedy="choose another P")
 
 
 def _coupled(case: GuaranteeInputs) -> Statement:
@@ -260,9 +257,8 @@ def _coupled(case: GuaranteeInputs) -> Statement:
     if c >= edge:
         text = "from the edge on every mode decays: near the trim, and of linear agents anywhere"
         return holds(Hypothesis.COUPLING, Kind.PROOF, text, *number)
-    text = (
-        f"coupling {about(c, 4)} is below the edge {at_least(edge, 4)} of what this gain guarantees"
-    )
+    text = f"coupling {about(c, 4)} is below the edge {at_least(edge, 4)} "
+    text += "of what this gain guarantees"
     remedy = f"raise `coupling` to {at_least(edge, 4)} or more"
     return fails(Hypothesis.COUPLING, Kind.PROOF, text, *number, remedy=remedy)
 
@@ -272,10 +268,8 @@ def _decaying(case: GuaranteeInputs) -> Statement:
     name, loop = Hypothesis.DISAGREEMENT_DECAY, case.loop
     if not case.governed:
         drive = case.parts.drive
-        text, remedy = (
-            f"no theorem covers `{type(drive).__name__}`",
-            "use laws that a theorem covers",
-        )
+        text = f"no theorem covers `{type(drive).__name__}`"
+        remedy = "use laws that a theorem covers"
         if isinstance(drive, Laws) and drive.metric(case.parts.model) is not None:
             text = "the model's `difference` of two states that are close is not x - y"
             remedy = "let `difference` wrap angles, and be x - y else"
@@ -299,21 +293,15 @@ def _decaying(case: GuaranteeInputs) -> Statement:
 
 
 def _taking_turns(case: GuaranteeInputs) -> Statement:
-    """Whether the disagreement decays however graphs take turns.
-
-    Stable modes of each do not say so; one sum of squares that falls on all of them does, whenever
-    they switch (theory page, T8).
-    """
+    """Stable modes of each do not say so; a sum of squares that falls on all of them does (T8)."""
     name, loop = Hypothesis.SWITCHING, case.loop
     edge, c, common = loop.certificate.edge, loop.closed.coupling, loop.common
     if not case.governed:
         text = "no theorem covers this law on switching graphs"
         return fails(name, _LINEAR, text, remedy="use `consensus`", reason=text)
     if _has_sum(loop) and common is not None:
-        text, rate = (
-            "sum_i delta_i'P delta_i increases on no graph, whenever they switch",
-            max(0.0, common.rate),
-        )
+        text = "sum_i delta_i'P delta_i increases on no graph, whenever they switch"
+        rate = max(0.0, common.rate)
         return holds(name, _LINEAR, text, rate, f"{at_most(rate)} 1/s")
     text = "no one P is known that serves all graphs of the schedule"
     remedy = "use the law `stopping-point`"
@@ -341,10 +329,8 @@ def _along(case: GuaranteeInputs) -> Statement:
     growth, states = frozen.growth(), len(frozen.times)
     number = growth.rate, f"{at_least(growth.rate)} 1/s"
     if not growth.lost:
-        text = (
-            f"small errors decay over {amount(states, 'state')} of it, each frozen until the next"
-        )
-        return holds(name, Kind.SAMPLES, text, *number)
+        text = f"small errors decay over {amount(states, 'state')} of it, "
+        return holds(name, Kind.SAMPLES, f"{text}each frozen until the next", *number)
     grown = f"{about(np.exp(min(growth.most, 99.0)), 2)}-fold on a part of it"
     grown = f"at {about(growth.rate)} 1/s" if growth.rate >= 0.0 else grown
     text = f"along the leader's path the {growth.whose} errors grow {grown}, fastest at "
@@ -357,13 +343,7 @@ def sampling_line(case: GuaranteeInputs) -> Statement:
     """Whether it still decays in steps of the integrator that runs, with the input held."""
     name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     if not (loop.every and case.governed):
-        return unneeded(
-            name,
-            _LINEAR,
-            _NOT_STABLE,
-            None,
-            f"dt {settings.dt:g} s",
-        )
+        return unneeded(name, _LINEAR, _NOT_STABLE, None, f"dt {settings.dt:g} s")
     radius, printed = loop.radius(settings), settings.integrator == "printed"
     goals = np.asarray(case.parts.model.trim[0], float) + case.parts.formation.offsets
     if printed and goals.any():
@@ -392,7 +372,6 @@ def sampling_line(case: GuaranteeInputs) -> Statement:
 
 
 def _by_substeps(case: GuaranteeInputs) -> str:
-    """Return how many substeps of the integrator decay, as a remedy."""
     settings = case.settings
     tried = (settings._replace(substeps=k) for k in _SUBSTEPS if k > settings.substeps)
     enough = next((x.substeps for x in tried if case.loop.radius(x) < 1.0), None)
@@ -404,7 +383,6 @@ def _by_substeps(case: GuaranteeInputs) -> str:
 def _step_line(
     case: GuaranteeInputs, radius: float, text: str, remedy: str, reason: str = _GROWS
 ) -> Statement:
-    """Return the line of a step from its spectral radius; the reason it is unstable, if it is."""
     dt = case.settings.dt
     number = radius, f"dt {dt:g} s"
     if radius < 1.0:

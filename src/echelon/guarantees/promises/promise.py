@@ -237,7 +237,9 @@ class Guarantee(abc.ABC):
 
     def sentence(self) -> str:
         """Return what is guaranteed, in sentences, and no more than that."""
-        text = self._claim() if self.claimed else self._against()
+        text = self.guarantee() if self.claimed else self._against()
+        if self.conditions:
+            text = f"Not guaranteed: this holds while {' and '.join(self.conditions)}. {text}"
         if self.claimed and self.without:
             text += f" {self.ignored()}"
         noted = (self.hypotheses.get(name) for name in _NOTED)
@@ -249,13 +251,6 @@ class Guarantee(abc.ABC):
         what = "claim" if self.conditions else "guarantee"
         return f"The {what} ignores that {self.without}." if self.without else ""
 
-    def _claim(self) -> str:
-        """Return what is claimed, after the conditions that are left to the run."""
-        if not self.conditions:
-            return self.guarantee()
-        text = f"Not guaranteed: this holds while {' and '.join(self.conditions)}."
-        return f"{text} {self.guarantee()}"
-
     def _against(self) -> str:
         """Return all that stands against a guarantee, and what would help."""
         against = (line for line in self.hypotheses.values() if line.fails and line.reason)
@@ -263,10 +258,8 @@ class Guarantee(abc.ABC):
         until = "" if self.prefix is None else f" {self.prefix.sentence()}"
         first = self.prefix if self.prefix and self.prefix.promise.promised else None
         which = "" if first is None else f" from {at_most(first.at, 6)} s on"
-        text = (
-            f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. What would help: {remedies}."
-        )
-        return text + until
+        text = f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. "
+        return f"{text}What would help: {remedies}.{until}"
 
     def as_mapping(self) -> dict[str, Any]:
         """Return it ready for JSON; what does not exist is None."""
@@ -373,7 +366,6 @@ def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) ->
 def _computed(
     prepared: Prepared, parts: Parts, settings: Settings, brief: bool = False
 ) -> Guarantee:
-    """Return what is guaranteed of parts, and store it if nothing was left out."""
     with precision("float64"):
         computed = prover_of(prepared.parts.drive).of(prepared, settings, brief)
     if not brief:
@@ -385,7 +377,6 @@ def _computed(
 
 
 def _prefix_of(computed: Guarantee, parts: Parts, settings: Settings) -> Prefix | None:
-    """Return what is guaranteed until the first event that is not covered; None for nothing."""
     line = computed.hypotheses.get(Hypothesis.EVENTS)
     if line is None or not line.fails or line.number is None:
         return None
@@ -403,7 +394,6 @@ def _prefix_of(computed: Guarantee, parts: Parts, settings: Settings) -> Prefix 
 
 
 def _stored(parts: Parts) -> dict[Settings, Guarantee]:
-    """Return the guarantees of parts by settings, of what their code reads now."""
     # A formation is no dataclass, whose parts would be found.
     reads = foreign_key((parts, parts.formation.motion))
     return _cache.setdefault(parts, {}).setdefault(reads, {})

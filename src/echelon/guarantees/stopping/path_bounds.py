@@ -28,7 +28,6 @@ _FEW, _ALL = 20, 4000
 _EXACT = Fraction(1, 10**9)
 """Of the highest derivative; one that is known so well in one piece is constant."""
 
-
 _Rows: TypeAlias = tuple[tuple[Interval, ...], ...]
 
 
@@ -92,11 +91,7 @@ def _pieces(reference: LeaderPath, horizon: float, outputs: tuple[str, ...], ord
 
 
 def least_on_path(
-    leader: StoppingLeader,
-    model: ControlAffine,
-    horizon: float,
-    outputs: Sequence[int],
-    order: int,
+    leader: StoppingLeader, model: ControlAffine, horizon: float, outputs: Sequence[int], order: int
 ) -> float:
     """Return what a derivative on a leader's path is not below until the horizon.
 
@@ -145,11 +140,6 @@ def path_fault(reference: LeaderPath | None, chains: Chains, horizon: float) -> 
 
 @memoize
 def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: float) -> None:
-    """Check a path.
-
-    Raises:
-        GainError: it may lack a derivative.
-    """
     if type(reference).derivatives is not Reference.derivatives:
         raise GainError("a path replaces `derivatives`, which may be those of another path")
     picked = np.array([COORDINATES.index(name) for name in outputs])
@@ -167,11 +157,7 @@ def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: 
 
 
 def _check_joints(reference: Reference, order: int) -> None:
-    """Check that the class of a path says that its parts fit together.
-
-    Raises:
-        GainError: it does not.
-    """
+    """Check that the class of a path says that its parts fit together."""
     kinds = type(reference).__mro__
     joined, parts, path = (
         next(k for k, kind in enumerate(kinds) if name in vars(kind))

@@ -38,11 +38,8 @@ class StoppingPromise(Guarantee):
     """What T5 guarantees, and what that rests on.
 
     Attributes:
-        run: what it was computed of.
-        tube: what is guaranteed; None for nothing.
         strength: the coupling c.
         hold: the longest step (s) that keeps the largest stopping point from growing.
-        separation: what is guaranteed of distances; None where agents do not keep apart.
     """
 
     run: StoppingRun
@@ -149,7 +146,6 @@ class StoppingPromise(Guarantee):
 
 
 def _own_line(run: StoppingRun, problem: Problem) -> Statement | None:
-    """Return how late own states may be."""
     parts, law, network = run.parts, run.law, run.network
     if parts.graph.schedule is not None or network is None and parts.world.network is not None:
         # What is known of the ideal network is not true of one that no theorem covers.

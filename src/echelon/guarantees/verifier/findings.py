@@ -16,7 +16,6 @@ ROUNDING = 1e-12
 DECIDED = 1e-6
 """A rate is undecided if its rounding exceeds this fraction of it."""
 
-
 VERDICTS = ("holds", "recomputed", "refused", "not checked")
 """Verified by code of its own; equal to what the code gives again that made it; false; open."""
 
@@ -80,7 +79,6 @@ class Recomputed(NamedTuple):
     """Recomputed quantities that several claims use.
 
     Attributes:
-        saved: the content of the file.
         eigenvalues: of the grounded Laplacian; the stored ones if the file has no edges.
         bound: a lower bound of lambda_min; for a directed graph, of the decay of its weighted sum.
         pull: R^-1 B' (m, n), rounded once.

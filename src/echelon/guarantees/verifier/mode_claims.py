@@ -100,7 +100,9 @@ def check_linearization(facts: Recomputed) -> Iterator[CheckResult]:
     """Check the claims about the linearization at the trim."""
     saved = facts.saved
     yield decide("kind of the slowest mode", saved.kind == "linearization", saved.kind)
-    result, slack = _slowest(facts, _checked_eigenvalues(facts))
+    every = saved.graph.directed or saved.graph.switches
+    values = facts.eigenvalues if every else algebra.ends_of_many(facts.eigenvalues)
+    result, slack = _slowest(facts, values)
     if saved.abscissa < 0.0 and slack > _MODE_DECIDED * abs(result):
         text = f"undecided: the rounding is {at_least(slack, 2)}"
         yield decide("slowest mode, 1/s", False, saved.abscissa, result, text)
@@ -115,24 +117,14 @@ def check_linearization(facts: Recomputed) -> Iterator[CheckResult]:
 
 
 def _check_between(facts: Recomputed) -> Iterator[CheckResult]:
-    """Check that the modes between the extreme eigenvalues decay."""
     values, followers = facts.eigenvalues, facts.saved.graph.agents - len(facts.saved.graph.leaders)
     every = followers <= algebra.ALL_MODES or facts.saved.graph.directed
     if every or facts.saved.graph.switches or facts.saved.abscissa >= 0.0:
         return
-    values = (
-        values[1:-1] if len(values) > 2 else np.geomspace(values[0], values[-1], _BETWEEN)[1:-1]
-    )
+    values = values if len(values) > 2 else np.geomspace(values[0], values[-1], _BETWEEN)
+    values = values[1:-1]
     result, slack = _slowest(facts, values[1:-1])
     yield decide("all modes between decay", result + slack < 0.0, "", result)
-
-
-def _checked_eigenvalues(facts: Recomputed) -> Array:
-    """Return the eigenvalues whose modes the file covers."""
-    graph = facts.saved.graph
-    if graph.directed or graph.switches:
-        return facts.eigenvalues
-    return algebra.ends_of_many(facts.eigenvalues)
 
 
 def _slowest(facts: Recomputed, values: Array) -> tuple[float, float]:

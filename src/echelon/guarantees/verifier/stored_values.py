@@ -36,14 +36,7 @@ _SHOWN = 60
 def compare_values(
     claim: str, stored: object, value: object, digits: Digits = _USUAL
 ) -> Iterator[CheckResult]:
-    """Yield a finding for each number, matrix or text of a stored value.
-
-    Args:
-        claim: the name of the value.
-        stored: plain data of a file.
-        value: the same, computed again.
-        digits: to which numbers must agree.
-    """
+    """Yield a finding for each number, matrix or text of a stored value."""
     arrays = _array(stored), _array(value)
     if isinstance(stored, dict) and isinstance(value, dict):
         for key in [*value, *(key for key in stored if key not in value)]:
@@ -89,7 +82,8 @@ def _described(array: Array) -> str:
 
 def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> CheckResult:
     if isinstance(stored, str) and isinstance(value, str):
-        fine, at = _same_text(stored, value), _first_difference(stored, value)
+        fine, pairs = _same_text(stored, value), enumerate(zip(stored, value))
+        at = next((k for k, (x, y) in pairs if x != y), min(len(stored), len(value)))
         shown = [ascii(text[at : at + _SHOWN])[1:-1] for text in (stored, value)]
         reason = f"from character {at} on `{shown[0]}` is stored, and computed is `{shown[1]}`"
         return _finding(claim, stored, value, fine, reason)
@@ -115,7 +109,6 @@ def _differs(claim: str, stored: str, value: str, reason: str) -> CheckResult:
 
 
 def _shown(value: object) -> str:
-    """Return a value for a table; of a text or a list only what it is."""
     array = _array(value)
     if array is not None:
         return f"{' x '.join(map(str, array.shape))} number{'s' * (array.size != 1)}"
@@ -131,8 +124,6 @@ def _is_number(value: object) -> bool:
 
 
 def _array(value: object) -> Array | None:
-    """Return nested lists of numbers as an array, otherwise None."""
-
     def plain(x: object) -> bool:
         return all(map(plain, x)) if isinstance(x, list) else _is_number(x)
 
@@ -165,8 +156,3 @@ def _same_text(stored: str, value: str) -> bool:
         return False
     pairs = zip(_NUMBER.findall(stored), _NUMBER.findall(value), strict=True)
     return all(a == b or max(abs(float(a)), abs(float(b))) <= _USUAL.noise for a, b in pairs)
-
-
-def _first_difference(a: str, b: str) -> int:
-    pairs = enumerate(zip(a, b))
-    return next((k for k, (x, y) in pairs if x != y), min(len(a), len(b)))

@@ -81,7 +81,6 @@ class _Motion(NamedTuple):
 
     @classmethod
     def of(cls, claims: JsonObject) -> "_Motion":
-        """Return the bounds for the stored claims."""
         rho = np.asarray(claims["roots"], float)
         times = np.linspace(0.0, 30.0 / rho.min(), _CELLS)
         (free, integrals), (first, turn_integral) = (
@@ -167,7 +166,6 @@ def _range(frame: JsonObject, demands: Array) -> tuple[Array, Array, Array]:
 def _random_motions(
     frame: JsonObject, demands: Array, ranges: tuple[Array, Array, Array]
 ) -> tuple[float, float]:
-    """Return the least and largest motor thrust of random motions at the hardest times."""
     cells = np.array_split(np.arange(demands.shape[1]), _TIMES)
     hardest = [cell[ranges[0][cell].argmin()] for cell in cells]
     draw = np.random.default_rng(0)
@@ -191,7 +189,6 @@ def _random_motions(
 
 
 def _check_single_starts(claims: JsonObject, motion: _Motion) -> Iterator[CheckResult]:
-    """Yield a finding for each other start from which the motors are claimed to suffice."""
     alone, ahead, most = claims["alone"], claims["ahead"], float(claims["most"])
     if alone is None:
         return
@@ -326,7 +323,6 @@ def tube_findings(tube: JsonObject) -> Iterator[CheckResult]:
 def _check_margin(
     border: JsonObject, roots: Sequence[Fraction], name: str
 ) -> Iterator[CheckResult]:
-    """Yield findings on the margin to a border and on the steepest admissible start."""
     order = int(border["derivative"]) - 1
     allowed = float(border["path"]) - float(border["above"])
     total = float(border["speed"]) + float(border["leader_speed"])
@@ -348,7 +344,6 @@ def _check_margin(
 
 
 def _pad_start(start: Sequence[float], size: int) -> Array:
-    """Return a start padded with zeros to one entry per root."""
     return np.pad(np.asarray(start, float), (0, size - len(start)))
 
 
@@ -476,7 +471,6 @@ def _remainder(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
 
 
 def _variations(chain: list[list[Fraction]], x: Fraction) -> int:
-    """Return the number of sign changes of the sequence at x."""
     signs = []
     for part in chain:
         total = Fraction(0)

@@ -32,10 +32,8 @@ class Verification(NamedTuple):
     """All findings with their overall verdict.
 
     Attributes:
-        findings: one per claim.
         verdict: `refused` if a claim is false, `incomplete` if all checked claims hold and some
             could not be checked, otherwise `verified`.
-        sentence: the verdict as text.
         note: the end of the sentence, on a correct gain that is not stabilizing.
     """
 
@@ -66,7 +64,8 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verification:
     document = read_json(path)
     if states_gain(document):
         saved = read(document, path)
-        return judge(_collect(_findings(saved, model)), _no_decay_sentence(saved))
+        note = f" The gain guarantees no decay: the slowest mode is {about(saved.abscissa)} 1/s."
+        return judge(_collect(_findings(saved, model)), "" if saved.abscissa < 0.0 else note)
     return judge(_collect(_promise_findings(document["promise"])))
 
 
@@ -77,7 +76,6 @@ def states_gain(document: JsonObject) -> bool:
 
 
 def _promise_findings(promise: object) -> Iterator[CheckResult]:
-    """Yield what can be checked of a run's guarantee by itself, and name the rest."""
     if not isinstance(promise, dict):
         yield decide("promise", False, text="it must be a mapping")
         return
@@ -134,13 +132,6 @@ def judge(findings: Sequence[CheckResult], note: str = "") -> Verification:
         text = f"Incomplete: {text}; not checked: {names}.{note}"
         return Verification(tuple(findings), "incomplete", text, note)
     return Verification(tuple(findings), "verified", f"Verified: {text}.{note}", note)
-
-
-def _no_decay_sentence(saved: SavedGain) -> str:
-    """Return the sentence that is added for a correct file whose gain is not stabilizing."""
-    if saved.abscissa < 0.0:
-        return ""
-    return f" The gain guarantees no decay: the slowest mode is {about(saved.abscissa)} 1/s."
 
 
 def _check_definite(saved: SavedGain) -> Iterator[CheckResult]:

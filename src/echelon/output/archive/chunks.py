@@ -32,14 +32,9 @@ class Chunks:
     """The stretches of one run in its folder, each in a file named by its first step.
 
     So stretches that two processes computed of the same run fit together.
-
-    Args:
-        folder: of the run.
-        by: the folder in it that holds them.
     """
 
     def __init__(self, folder: Path, by: str = CHUNKS) -> None:
-        """Use a folder, which may not exist yet."""
         self.folder, self.place = folder, folder / by
 
     @property
@@ -106,7 +101,6 @@ class Chunks:
         return bool(self._begun().get("figures", True))
 
     def _begun(self) -> JsonObject:
-        """Return what was written when the run began."""
         try:
             return json.loads((self.place / _BEGUN).read_text("utf-8"))
         except _DAMAGED as error:
@@ -115,7 +109,6 @@ class Chunks:
             ) from error
 
     def _digest(self) -> str:
-        """Return a digest of the scenario and of every file that it names."""
         files = [self.folder / SCENARIO_FILE, *sorted((self.folder / INPUTS).rglob("*"))]
         digest = hashlib.sha256()
         for file in (file for file in files if file.is_file()):
@@ -186,7 +179,6 @@ class Chunks:
 
 
 def _arrays(segment: Segment) -> JsonObject:
-    """Return a stretch as named arrays."""
     plain = {name: getattr(segment, name) for name in _PLAIN}
     sums = {f"sums_{name}": value for name, value in segment.sums._asdict().items()}
     moment = {f"moment_{k}": value for k, value in enumerate(segment.moment)}
@@ -198,7 +190,6 @@ _PLAIN = ("done", "times", "states", "inputs", "seconds")
 
 
 def _segment(first: int, stored: JsonObject) -> Segment:
-    """Return the stretch of named arrays."""
     count = sum(name.startswith("moment_") for name in stored)
     stopped = stored.get("stopped")
     return Segment(

@@ -34,7 +34,6 @@ def result_page(result: Result) -> str:
 
 
 def _name(result: Result) -> str:
-    """Return the name of the scenario, or of the model."""
     # The parts of a run from disk are not built, which executes code, only to display it.
     if result in STORED:
         return recording_of(result).name
@@ -57,7 +56,6 @@ def result_replay(result: Result) -> str:
 
 
 def _observed(result: Result) -> str:
-    """Return what was observed of growing errors as a list."""
     # A promise takes seconds to compute, so other runs do without.
     if not len(result.times) or not ends_farther(result):
         return ""
@@ -82,7 +80,6 @@ def _table(result: Result) -> str:
 
 
 def _cells(result: Result) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of leaders and followers, with the labels of the report."""
     numbers = metrics(result)
     errors = result.goal_distances([0, -1] if len(result.times) else [])
     saturated = AGENT_NUMBERS["saturated"]

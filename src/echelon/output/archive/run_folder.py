@@ -147,7 +147,6 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
 
 
 def _unfinished(folder: Path, segments: list[Segment]) -> Result:
-    """Return a run from the chunks in its folder."""
     if not (folder / SCENARIO_FILE).is_file():
         raise OutputError(f"the run in `{folder}` ended before any of it was stored.")
     scenario = load_scenario(folder / SCENARIO_FILE)
@@ -156,7 +155,6 @@ def _unfinished(folder: Path, segments: list[Segment]) -> Result:
 
 
 def _stored(file: Path, parts: Parts | None) -> Result:
-    """Return a run from its file, beside which its summary and its inputs may be."""
     _, data = read_recording(file)
     within = file.name == DATA
     names = sorted((file.parent / INPUTS).rglob("*")) if within else []
@@ -217,7 +215,6 @@ def _sums(file: Path, arrays: Mapping[str, Array]) -> Sums:
 def _built(
     file: Path, parts: Parts | None, digest: str, attributes: JsonObject, settings: Settings
 ) -> Parts:
-    """Return the parts of a run, built from its scenario unless they are given."""
     own = build(_scenario(file, digest, attributes)).parts if parts is None else parts
     return prepare(own, settings).parts
 

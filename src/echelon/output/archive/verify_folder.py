@@ -13,7 +13,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import Outcome, OutputError
-from echelon.core.types import JsonObject, PathLike
+from echelon.core.types import PathLike
 from echelon.experiments.results.dataset import SUM, labelled_parts, run_file, with_sums
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.recording import read_recording
@@ -67,14 +67,7 @@ scenario settles it by."""
 
 
 class ClaimFiles(NamedTuple):
-    """Files with claims about a run's gain or law, and what belongs to them; None for each absent.
-
-    Attributes:
-        gain: a gain file.
-        claims: the summary of a run, or the output of a check.
-        data: the dataset of the run.
-        scenario: the scenario of the run.
-    """
+    """Files with claims about a run's gain or law, and what belongs to them; None if absent."""
 
     gain: Path | None = None
     claims: Path | None = None
@@ -84,9 +77,6 @@ class ClaimFiles(NamedTuple):
 
 def claim_files(place: PathLike) -> ClaimFiles:
     """Return the files of a run that `verify` reads.
-
-    Args:
-        place: the folder of a run, its summary, a gain file, or the output of a check.
 
     Raises:
         GainError: a file cannot be read, or is no JSON.
@@ -111,7 +101,6 @@ def claim_files(place: PathLike) -> ClaimFiles:
 
 
 def _place(path: Path) -> Path:
-    """Return the folder or file that a path means, after checking that it may make claims."""
     if not path.exists():
         raise OutputError(f"`{path}` does not exist; give the folder of a run, or a gain file.")
     check_exists(path)
@@ -130,11 +119,6 @@ def compare_run(
     files: ClaimFiles, scenario: Scenario, experiment: Experiment
 ) -> Iterator[CheckResult]:
     """Yield a finding for each array, number and text that only the run itself gives.
-
-    Args:
-        files: of the run.
-        scenario: of the run, which is simulated once more.
-        experiment: of it, with the gains that the files state.
 
     Raises:
         EchelonError: the run cannot be computed, or a file cannot be read.
@@ -159,10 +143,7 @@ def compare_run(
 
 
 def _converged(result: Result) -> bool:
-    """Tell whether errors shrank or remained small: a local guarantee does not cover every start.
-
-    Where errors grow, so may the rounding of another processor, and a difference proves nothing.
-    """
+    """Where errors grow, so may another processor's rounding: a difference proves nothing."""
     if result.outcome in (Outcome.DIVERGED, Outcome.LEFT_CHART):
         return False
     first, last = sizes(result)
@@ -186,7 +167,6 @@ def _repeated(experiment: Experiment, data: Labelled, steps: int) -> Result | No
 
 
 def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[CheckResult]:
-    """Compare dataset, summary and report with those of the run computed again."""
     assert files.data is not None
     laws = isinstance(result.parts.drive, Laws)
     digits = _PRECISIONS[result.settings.precision] if laws else _SOLVED
@@ -197,24 +177,18 @@ def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Chec
         stored, value = read_json(files.claims), json.loads(json.dumps(summary(result)))
         theirs, ours = [{k: x[k] for k in names if k in x} for x in (stored, value)]
         yield from compare_values("", theirs, ours, digits)
-        yield from _compare_origin(stored, data)
+        # What both files say of the program: nothing else says it.
+        versions = {k[8:]: x for k, x in data.attributes.items() if k.startswith("version_")}
+        value = {"engine": data.attributes.get("computed_by"), "versions": versions}
+        yield from compare_values("", {key: stored.get(key) for key in value}, value)
     written = files.data.parent / REPORT
     if written.is_file() and not stopped:
         yield _compare_report(written, report(result) + "\n")
 
 
-def _compare_origin(stored: JsonObject, data: Labelled) -> Iterator[CheckResult]:
-    """Compare what both files say of the program: nothing else says it."""
-    attributes = data.attributes
-    versions = {k[8:]: text for k, text in attributes.items() if k.startswith("version_")}
-    value = {"engine": attributes.get("computed_by"), "versions": versions}
-    yield from compare_values("", {key: stored.get(key) for key in value}, value)
-
-
 def _compare_dataset(
     name: str, data: Labelled, result: Result, digits: Digits
 ) -> Iterator[CheckResult]:
-    """Compare arrays and attributes of a dataset, but those of the parts of the run."""
     parts = labelled_parts(result.parts, result.settings)
     stored, again = data.arrays(), with_sums(result)
     for key, value in again.arrays().items():
@@ -297,11 +271,7 @@ def check_files(
 ) -> tuple[Verification, str]:
     """Return what holds of files with claims, and what is against their scenario, if anything.
 
-    Args:
-        files: of a run, or a gain file.
-        trusted: the scenario whose code may be executed.
-        repeat: whether to simulate the scenario again.
-        begin: called with a text before each part that may take a minute or longer.
+    `begin` is called with a text before each part that may take a minute or longer.
     """
     source, obstacle = _source(files, trusted)
     findings, note = _independent(files, trusted)
@@ -318,7 +288,6 @@ def check_files(
 def _computed(
     files: ClaimFiles, source: Scenario, repeat: bool, begin: Callable[[str], None]
 ) -> Iterator[CheckResult]:
-    """Yield what is computed again from a scenario: the guarantee, and then the run."""
     begin("computing the guarantee again, which takes up to a minute")
     experiment, findings = experiment_of(source, files.claims, files.gain)
     yield from findings
@@ -337,7 +306,6 @@ def _computed(
 
 
 def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | None, str]:
-    """Return the scenario from which claims are computed again; or None, and what is against it."""
     if files.scenario is None:
         return trusted, "" if trusted is not None else "no scenario is beside the file"
     own = load_scenario(files.scenario)
@@ -353,7 +321,6 @@ def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | Non
 
 
 def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[CheckResult], str]:
-    """Return what independent code finds in each file, and its notes."""
     model = None if trusted is None else build(trusted).parts.model
     checked = [each for each in (files.gain, files.claims) if each is not None]
     results = [verifier.verify(each, model) for each in checked]

@@ -152,7 +152,6 @@ def _near_leaders(run: Recording) -> Recording:
 
 
 def _stretches(run: Recording) -> list[tuple[str, Array]]:
-    """Return the weights (E,) of each graph of a schedule, with its time span."""
     if run.schedule is None:
         return [("", run.weights)]
     spans = list(run.schedule.spans())[:_STRETCHES]
@@ -245,7 +244,6 @@ def _gap(places: Array, edge: Array, line: Array) -> float:
 def _links(
     ax: "Axes", run: Recording, places: Array, curves: list[Array], weights: Array, small: float
 ) -> None:
-    """Draw the edges, with widths by their weights."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     wide = np.clip(1.6 * np.sqrt(weights / run.weights.max()), 0.3, 1.6) * small
