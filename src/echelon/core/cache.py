@@ -65,7 +65,6 @@ class BoundedCache(Generic[_V]):
     def __init__(
         self, most: int, size: Callable[[_V], int] | None = None, room: int = sys.maxsize
     ) -> None:
-        """Create an empty cache."""
         self._most, self._size, self._room = most, size, room
         self._values: OrderedDict[Hashable, _V] = OrderedDict()
         self._lock = threading.Lock()

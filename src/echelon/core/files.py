@@ -114,11 +114,9 @@ class CellPage:
     height: int
 
     def __repr__(self) -> str:
-        """Return what to do with it outside of a notebook."""
         return f"CellPage({len(self.text) / 1e6:.2g} MB of HTML in `text`; a notebook shows it)"
 
     def _repr_html_(self) -> str:
-        """Return the page in a frame of its own."""
         style = f"width: 100%; height: {self.height}px; border: 1px solid #8888; border-radius: 6px"
         return f'<iframe style="{style}" srcdoc="{html.escape(self.text)}"></iframe>'
 

@@ -109,7 +109,6 @@ def _untraced(array: object) -> object:
 
 @functools.lru_cache(1024)
 def _fields(kind: type) -> tuple[str, ...] | None:
-    """Return the names of the fields of a dataclass; None of another class."""
     if not dataclasses.is_dataclass(kind):
         return None
     return tuple(field.name for field in dataclasses.fields(kind))
@@ -122,8 +121,6 @@ def _has_dict(kind: type) -> bool:
 
 @final
 class _Walk:
-    """A walk through a tree of values that collects its bits and its foreign parts."""
-
     def __init__(self) -> None:
         self.foreign: list[tuple[type, object]] = []
         self._bits: list[bytes] = []
@@ -170,7 +167,6 @@ class _Walk:
             self.visit(part)
 
     def _object(self, value: object, kind: type) -> None:
-        """Collect an object of unknown kind, and of a foreign one what it holds and reads."""
         ours = kind.__module__.partition(".")[0] in _TRUSTED or _is_installed(kind.__module__)
         if not ours and id(value) not in self._seen:
             self._seen.add(id(value))

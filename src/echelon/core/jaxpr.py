@@ -96,7 +96,6 @@ def _is_filled(params: Params) -> bool:
 
 
 def _gather(params: Params, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
-    """Return windows of an array."""
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     batches = numbers.operand_batching_dims, numbers.start_indices_batching_dims
     places, outside = _window(x.shape, indices, sizes, numbers.start_index_map, batches)
@@ -112,7 +111,6 @@ def _gather(params: Params, x: np.ndarray, indices: np.ndarray) -> np.ndarray | 
 def _scatter(
     params: Params, x: np.ndarray, indices: np.ndarray, updates: np.ndarray
 ) -> np.ndarray | None:
-    """Return an array with windows of it replaced."""
     result = x.copy()
     if params["update_jaxpr"] is not None:
         return None
@@ -387,7 +385,6 @@ _INDICES: dict[str, tuple[int, int | None]] = {
 
 
 def _inner_jaxpr(equation: JaxprEqn) -> Jaxpr | ClosedJaxpr:
-    """Return the jaxpr, closed or not, that an equation of an `INLINED` primitive calls."""
     return next(
         equation.params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in equation.params
     )
@@ -476,7 +473,6 @@ def _add(
 
 
 def _alone(places: np.ndarray) -> np.ndarray:
-    """Return each place as a tuple of one, which adding joins."""
     entries = np.empty(places.size, object)
     entries[:] = [(int(place),) for place in places.flat]
     return entries.reshape(places.shape)

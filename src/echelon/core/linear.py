@@ -249,11 +249,7 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
 
 
 def _stabilizing(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """Return SciPy's solution, after checking that it stabilizes.
-
-    Raises:
-        LinAlgError: a mode is left on the imaginary axis.
-    """
+    """Return SciPy's solution, after checking that it stabilizes."""
     P = scipy.linalg.solve_continuous_are(A, B, Q, R)
     S = B @ np.linalg.solve(R, B.T)
     # The Hamiltonian's eigenvalues are those of A - S P and their mirror images. They are 0 where
@@ -347,7 +343,6 @@ def as_matrix(name: str, value: Weight, size: int) -> Array:
 
 
 def _check_size(name: str, matrix: Array) -> None:
-    """Check that the numbers of a weight can be computed with."""
     largest = np.abs(matrix).max(initial=0.0)
     if LARGEST <= largest < np.inf:
         raise GainError(f"`{name}` goes up to {largest:.3g}, and must stay below {LARGEST:g}.")

@@ -76,7 +76,6 @@ def _steps(jaxpr: Jaxpr | ClosedJaxpr) -> Iterator[tuple[str, list[bytes], bool]
 
 
 def _inner(values: Iterable[object]) -> Iterator[Any]:
-    """Yield the jaxprs among parameters of an equation, those in tuples too."""
     for value in values:
         if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
             yield value

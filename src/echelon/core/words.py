@@ -18,7 +18,6 @@ class Word(enum.Enum):
     """A word with a meaning: its name stands in tables and files, its value is the meaning."""
 
     def __str__(self) -> str:
-        """Return the word as tables and files have it."""
         return self.name.lower().replace("_", "-")
 
     @classmethod
@@ -120,7 +119,6 @@ class Theorem(Word):
     T10 = "agents never touch, and each stays in its tube"
 
     def __str__(self) -> str:
-        """Return the theorem's name as the theory page has it."""
         return self.name
 
 
@@ -141,7 +139,6 @@ class Verdict(Word):
     VACUOUS = "vacuous"
 
     def __str__(self) -> str:
-        """Return the verdict."""
         return self.value
 
     @classmethod

@@ -196,7 +196,6 @@ def check_bounds(model: ControlAffine, chains: Chains) -> None:
 
 
 def _fault_of(bound: FlatBound, chains: Chains) -> str:
-    """Return the fault of a bound in words; empty where there is none."""
     outputs, order = bound.outputs, bound.derivative
     named = isinstance(outputs, tuple | list) and all(n in chains.outputs for n in outputs)
     if not named or len(set(outputs)) != max(1, len(outputs)):
@@ -264,7 +263,6 @@ def _check_size(model: ControlAffine, chains: Chains) -> None:
 
 
 def _check_map(model: ControlAffine, chains: Chains) -> None:
-    """Check at samples that coordinates by a user's `flatten` are rates of each other."""
     if "flatten" not in chains.declared or not is_by_user(model, "flatten"):
         return
     n, m, draw = len(model.state_names), len(chains.outputs), np.random.default_rng(0)

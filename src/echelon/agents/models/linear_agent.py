@@ -40,7 +40,6 @@ class Integrator(ControlAffine):
     dimension: int = eqx.field(default=2, static=True)
 
     def __check_init__(self) -> None:
-        """Refuse a dimension below one."""
         name, dimension = f"`dimension` of `{type(self).__name__}`", self.dimension
         # True is an integer to Python, and no dimension.
         integral = isinstance(dimension, numbers.Integral) and not isinstance(dimension, bool)
@@ -138,7 +137,6 @@ class DoubleIntegrator(Integrator):
     flat_chains, flat_bounds = _ONE_AN_AXIS, ()
 
     def __check_init__(self) -> None:
-        """Refuse a negative drag."""
         check_not_negative(self, drag=self.drag)
 
     def drift(self, x: State) -> State:
@@ -181,7 +179,6 @@ def read_matrices(file: PathLike) -> dict[str, Array]:
 
 
 def _content(file: PathLike) -> Mapping[str, object]:
-    """Return all that a MATLAB file holds, by name."""
     # Imported here: few models are in files, and SciPy's readers load slowly.
     from scipy.io import loadmat
 
@@ -198,7 +195,6 @@ def _content(file: PathLike) -> Mapping[str, object]:
 
 
 def _dense(value: object) -> Array:
-    """Return a matrix that MATLAB may have stored as a sparse one."""
     to_array = getattr(value, "toarray", None)
     return np.asarray(value if to_array is None else to_array())
 
@@ -235,7 +231,6 @@ class Linear(ControlAffine):
         C: Sequence[Sequence[float]] | Array | None = None,
         names: Sequence[str] = (),
     ) -> None:
-        """Check and keep the matrices as float64."""
         # NumPy's float64: a JAX array made outside of an x64 context would already be rounded.
         self.A, self.B = _matrix("A", A), _matrix("B", B)
         n, m = len(self.A), self.B.shape[1]
@@ -339,11 +334,7 @@ class Linear(ControlAffine):
 
 
 def _continuous(A: Array, B: Array, step: float) -> tuple[Array, Array]:
-    """Return the continuous-time (A, B) that (A, B) sample with inputs held over a step (s).
-
-    Raises:
-        ModelError: there is none.
-    """
+    """Return the continuous-time (A, B) of which these are samples, inputs held a step (s)."""
     from scipy.linalg import expm, logm
 
     eigenvalues = np.linalg.eigvals(A)

@@ -109,7 +109,6 @@ class _Default(Generic[_T]):
 
     # Without `__set__` it gives way to a field of the instance, as a property would not.
     def __get__(self, instance: object, owner: type) -> "_T | _Default[_T]":
-        """Return the value for an instance."""
         return self if instance is None else self.make(instance)
 
 
@@ -403,7 +402,6 @@ class ControlAffine(Declared):
 
 
 def _trim_input(model: ControlAffine, u: _Inputs) -> _Inputs:
-    """Return u* in the shape (..., m) and precision of u."""
     xp = u.__array_namespace__()
     return xp.broadcast_to(xp.asarray(model.trim[1], u.dtype), u.shape)
 

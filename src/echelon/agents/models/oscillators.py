@@ -30,7 +30,6 @@ class Pendulum(ControlAffine):
     flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
 
     def __check_init__(self) -> None:
-        """Refuse a stiffness that is not positive or a negative damping."""
         check_positive(self, stiffness=self.stiffness)
         check_not_negative(self, damping=self.damping)
 
@@ -56,7 +55,6 @@ class VanDerPol(ControlAffine):
     flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
 
     def __check_init__(self) -> None:
-        """Refuse a damping that is negative or not finite."""
         check_not_negative(self, damping=self.damping)
 
     def drift(self, x: State) -> State:

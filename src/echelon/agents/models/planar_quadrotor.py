@@ -54,7 +54,6 @@ class PlanarQuadrotor(ControlAffine):
     flat_chains = FlatChains((4, 4), (2, 0))
 
     def __check_init__(self) -> None:
-        """Refuse parameters that are not positive."""
         names = ("mass", "inertia", "gravity", "arm", "motor_thrust")
         check_positive(self, **{name: getattr(self, name) for name in names})
 
@@ -160,7 +159,6 @@ class LinearPlanarQuadrotor(ControlAffine):
     state_groups = {"position": ("y", "z"), "velocity": ("vy", "vz")}
 
     def __check_init__(self) -> None:
-        """Refuse parameters that are not positive."""
         check_positive(self, mass=self.mass, inertia=self.inertia, gravity=self.gravity)
 
     @property

@@ -63,7 +63,6 @@ older ones and the thrust upgrade kit; their inertia is Foerster's."""
 def _with_rate(
     curve: Callable[[jax.Array], jax.Array], s: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return curve(s) and its derivative."""
     return jax.jvp(curve, (s,), (jnp.ones_like(s),))
 
 

@@ -202,7 +202,6 @@ class CrazyflieAttitude(RigidVehicle):
         return cls(**{**sets[name], **changes})
 
     def __check_init__(self) -> None:
-        """Reject parameters that no vehicle can have."""
         names = ("mass", "thrust_gain", "stiffness", "rate_damping", "command_gain", "yaw_damping")
         limits = ("motor_thrust", "tilt_limit", "yaw_rate_limit")
         check_positive(self, **{name: getattr(self, name) for name in names + limits})

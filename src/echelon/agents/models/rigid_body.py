@@ -169,7 +169,6 @@ class RigidVehicle(ControlAffine):
     flat_order = 4
 
     def __check_init__(self) -> None:
-        """Refuse a gravity that is not positive."""
         check_positive(self, gravity=self.gravity)
 
     def output(self, x: State) -> Output:

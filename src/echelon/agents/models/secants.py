@@ -150,7 +150,6 @@ class Sides(NamedTuple):
         return np.any(stays, axis=0)
 
     def _seen(self, slopes: Array) -> Array:
-        """Return whether slopes over the narrow steps are more than rounding."""
         return slopes > _NOISE * self.rounding[..., None] / _STEPS[1::2, None, None]
 
 

@@ -28,7 +28,6 @@ def split_weights(edges: Iterable[Sequence[float]]) -> tuple[Array, Array]:
 
 
 def _whole(values: Sequence[Any] | Array, what: str) -> Array:
-    """Return agent numbers, or rows of them, as integers, after checking that they are whole."""
     if isinstance(values, np.ndarray) and np.issubdtype(values.dtype, np.signedinteger):
         return values.astype(np.int64)
     if not _are_whole(values):
@@ -93,7 +92,6 @@ def links(i: Array | int, j: Array) -> Array:
 
 
 def _ascending(pairs: Array) -> Array:
-    """Return pairs with the smaller number first."""
     # Three times as fast as sorting each pair.
     i, j = pairs.T
     return np.stack([np.minimum(i, j), np.maximum(i, j)], axis=1)
@@ -120,7 +118,6 @@ def give_weights(edges: Iterable[Sequence[float]], weights: Sequence[float]) -> 
 
 
 def _repeated(edges: Array, agents: int) -> Array:
-    """Return the indices of edges that occur more than once."""
     # One number per edge sorts ten times faster than rows, and large graphs have millions.
     number = edges[:, 0] * agents + edges[:, 1]
     ordered = np.sort(number)
@@ -180,7 +177,6 @@ def name_agents(agents: np.ndarray) -> str:
 
 
 def _square(matrix: ArrayLike) -> Array:
-    """Return an adjacency matrix as numbers, after checking it."""
     try:
         weights = np.asarray(matrix, np.float64)
     except (TypeError, ValueError):
@@ -247,11 +243,7 @@ def advising(points: Array, radius: float) -> Iterator[None]:
 
 
 def _advice(points: Array, radius: float) -> str:
-    """Return the smallest radius that connects the points, as a clause.
-
-    It is empty where they are connected, or too many to measure. The radius is the longest edge of
-    the shortest spanning tree.
-    """
+    """Name the longest edge of the shortest spanning tree if that helps."""
     if len(points) > _MOST:
         return ""
     from scipy.sparse.csgraph import minimum_spanning_tree

@@ -68,7 +68,6 @@ def _nearest(graph: Graph) -> tuple[Array, Array, Array]:
 
 
 def _by_follower(graph: Graph, near: Array, before: Array) -> Iterator[str]:
-    """Yield which followers receive from which leaders, those with equal paths together."""
     groups: dict[str, list[int]] = {}
     for agent in graph.followers:
         direct = [other for other in graph.neighbours(agent) if other in graph.leaders]

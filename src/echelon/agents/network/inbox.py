@@ -86,7 +86,6 @@ class Inbox:
         forward_names: tuple[str, ...],
         stamps: "Stamps | None" = None,
     ) -> None:
-        """Receive nothing yet."""
         self._stamps = stamps
         self._senders, self._source = tuple(senders), source
         self._names, self._forward_names = names, forward_names
@@ -136,7 +135,6 @@ class Surroundings:
     time: Float[Array, " K"]
 
     def __init__(self, senders: Sequence[int], names: tuple[str, ...]) -> None:
-        """Receive nothing yet."""
         self._places, self.names = {who: k for k, who in enumerate(senders)}, names
         self.hulls = np.full((len(senders), len(names)), np.nan)
         self.time = np.full(len(senders), -np.inf)
@@ -189,7 +187,6 @@ class Stamps:
         needs_packet: bool,
         heirs: Sequence[int] = (),
     ) -> None:
-        """Store nothing yet."""
         self.needs_packet = needs_packet
         self.time, self.hops = np.full(links, -np.inf), np.full(links, _FAR)
         self.packet: Packet | None = None
@@ -236,7 +233,6 @@ class Stamps:
         return None
 
     def _read(self, packet: Packet) -> Packet | Received:
-        """Return a packet with floats of its own, or why it is not used."""
         whole = all(isinstance(x, numbers.Integral) for x in (packet.leader, packet.epoch))
         # Where nobody hands the lead over, a packet of a later epoch would win for ever.
         fine = whole and packet.leader in self._leaders and 0 <= packet.epoch <= self._last_epoch

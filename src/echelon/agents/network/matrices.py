@@ -260,7 +260,6 @@ def check_reached(graph: GraphMatrices) -> None:
 
 
 def _cut_off(graph: GraphMatrices, lost: Array) -> str:
-    """Return the error message about agents that no leader ever reaches."""
     who = f"{name_agents(lost)} no path to a leader ({_name_leaders(graph)})"
     if graph.schedule is not None and graph.schedule.period is not None:
         return (

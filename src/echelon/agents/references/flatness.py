@@ -326,7 +326,6 @@ def _velocities(model: ControlAffine, states: jax.Array, inputs: jax.Array) -> j
 def _derivative(
     reference: Reference, times: jax.Array, names: tuple[str, ...], order: int
 ) -> jax.Array:
-    """Return one derivative (T,) of one output of a path."""
     return jax.vmap(lambda t: reference.derivatives(t, order, names)[order, 0])(times)
 
 

@@ -22,11 +22,10 @@ class Hover(Reference):
     yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
-        """Refuse what is not finite."""
         check_finite(self, position=(self.position, 3), **_turning(self))
 
     def __call__(self, t: Scalar) -> jax.Array:
-        """Return the point."""
+        """Return the point at time t."""
         # In the precision of t, which is that of the run.
         return in_space(jnp.asarray(self.position, t.dtype), yaw_at(self, t))
 
@@ -40,7 +39,6 @@ class Line(Reference):
     yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
-        """Refuse what is not finite."""
         check_finite(self, start=(self.start, 3), velocity=(self.velocity, 3), **_turning(self))
 
     def __call__(self, t: Scalar) -> jax.Array:
@@ -76,7 +74,6 @@ class Periodic(Reference):
         """Return the point (x, y) of the loop about the center at an angle (rad)."""
 
     def __check_init__(self) -> None:
-        """Reject numbers that are not finite."""
         names = ("rate", "phase", "yaw", "yaw_rate")
         check_finite(self, center=(self.center, 3), **{n: (getattr(self, n), None) for n in names})
 
@@ -108,7 +105,6 @@ class Lemniscate(Periodic):
     yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
-        """Reject numbers that are not finite."""
         check_finite(self, amplitude=(self.amplitude, 2))
 
     def loop(self, angle: Scalar) -> tuple[Scalar, Scalar]:
@@ -134,7 +130,6 @@ class FigureEight(Periodic):
     yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
-        """Reject numbers that are not finite."""
         check_finite(self, amplitude=(self.amplitude, 2))
 
     def loop(self, angle: Scalar) -> tuple[Scalar, Scalar]:
@@ -158,7 +153,6 @@ class Circle(Periodic):
     yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
-        """Reject numbers that are not finite."""
         check_finite(self, radius=(self.radius, None))
 
     def loop(self, angle: Scalar) -> tuple[Scalar, Scalar]:

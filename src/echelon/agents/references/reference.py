@@ -142,7 +142,6 @@ def _derivatives(path: Reference, chosen: tuple[int, ...], order: int, t: Scalar
 
 
 def _heading_coordinate(model: ControlAffine) -> int | None:
-    """Return the index of the coordinate that is the model's heading, if one is."""
     name = heading_of(model).state
     return COORDINATES.index(name) if name in COORDINATES and name in model.flat_outputs else None
 
@@ -164,7 +163,6 @@ def _turns(reference: Reference, index: int, rest: float) -> bool:
 
 @memoize
 def _check_map(model: ControlAffine) -> None:
-    """Trace the flatness map, and check the state and the input that it returns."""
     name, shapes = type(model).__name__, (len(model.state_names), len(model.input_names))
     with precision("float64"):
         returned = checked_trace(

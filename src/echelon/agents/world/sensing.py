@@ -116,8 +116,6 @@ class Estimator(eqx.Module):
         return estimate._replace(inputs=jnp.concatenate([estimate.inputs[1:], u[None]]))
 
     def _moved(self, model: ControlAffine, x: State, push: jax.Array, u: Input) -> State:
-        """Return the state a step later."""
-
         def velocity(x: State, u: Input) -> State:
             return model.velocity(x, u).at[np.array(self.pushed, int)].add(push)
 
@@ -151,7 +149,6 @@ class Sensing:
     estimator: Estimation = Estimation.NONE
 
     def __post_init__(self) -> None:
-        """Check every number."""
         for name, value in (("delay", self.delay), *self.noise.items()):
             if not (is_number(value) and 0.0 <= float(value) < math.inf):
                 what = "`delay`" if name == "delay" else f"`noise` of `{name}`"
@@ -194,7 +191,6 @@ class Sensing:
         return Sensors(std if std.any() else None, key, late, estimator)
 
     def __str__(self) -> str:
-        """Return the sensing in words."""
         parts = [f"{1e3 * self.delay:g} ms late"] if self.delay else []
         parts += ["noise " + ", ".join(f"`{k}` {v:g}" for k, v in self.noise.items())] * bool(
             self.noise

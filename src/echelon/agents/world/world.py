@@ -57,7 +57,6 @@ def vary_parameters(
 
 
 def _scale_value(value: Any, factor: float) -> Any:
-    """Return a number, an array, or nested tuples of numbers times a factor; None where neither."""
     # True is a number to Python, but a switch cannot be scaled.
     if isinstance(value, bool | str):
         return None
@@ -101,14 +100,12 @@ def differences(model: ControlAffine, plant: ControlAffine) -> str:
 
 
 def _as_lists(value: Any) -> Any:
-    """Return lists for tuples and arrays."""
     # Arrays compare entry by entry, lists as a whole.
     value = value.tolist() if isinstance(value, np.ndarray) else value
     return list(map(_as_lists, value)) if isinstance(value, tuple | list) else value
 
 
 def _format_value(value: Any) -> str:
-    """Return a parameter as text with six digits."""
     value = _as_lists(value)
     if isinstance(value, list):
         return f"({', '.join(map(_format_value, value))})"

@@ -49,7 +49,6 @@ def _wave_product(a: Wave, b: Wave) -> list[tuple[Fraction, Wave | None]]:
 
 
 def _monomial_product(a: Monomial, b: Monomial) -> list[tuple[Fraction, Monomial]]:
-    """Return the product of two monomials as a sum of monomials."""
     result: list[tuple[Fraction, dict[int, Exponent]]] = [(Fraction(1), dict(a))]
     # A monomial contains each atom once: powers are merged, products of waves become two terms.
     for atom, exponent in b:
@@ -239,10 +238,7 @@ def wave_points(arc: Interval, orders: Iterable[int]) -> list[dict[tuple[int, in
 
 
 def _cuts(arc: Interval) -> list[Gaussian]:
-    """Return directions at half the angles of the start, the cuts and the end of an arc.
-
-    Two pieces below 180 degrees, four above; the full circle if the ends nearly meet.
-    """
+    """Two pieces below 180 degrees, four above; the full circle if the ends nearly meet."""
     start, end = arc.lo / 2, arc.hi / 2
     if end - start >= pi().lo - Fraction(1, 1 << 40) or max(abs(start), abs(end)) > _FAR:
         return _FULL

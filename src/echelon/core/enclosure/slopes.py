@@ -220,7 +220,6 @@ def _mixture(value: Polynomial, side: Polynomial, one: Sloped, other: Sloped) ->
 
 
 def _larger(atoms: Atoms, a: Sloped, b: Sloped) -> Sloped:
-    """Return max(a, b)."""
     difference = a.value - b.value
     reached = atoms.range(difference)
     if reached.lo >= 0 or reached.hi <= 0:
@@ -269,7 +268,6 @@ def _sign(atoms: Atoms, p: Sloped) -> Sloped:
 
 
 def _comparison(name: str) -> Rule:
-    """Return the rule of a comparison, by the range of the difference of its operands."""
     certain, never, chosen = _COMPARED[name]
 
     def compare(atoms: Atoms, a: object, b: object) -> bool | Switch:
@@ -355,7 +353,6 @@ def _either(atoms: Atoms, which: Switch, no: Sloped, yes: Sloped) -> Sloped:
 
 
 def _undecided(atoms: Atoms) -> Polynomial:
-    """Return an unknown between 0 and 1."""
     return atoms.fresh(("undecided", object()), Interval(Fraction(0), Fraction(1)))
 
 
@@ -380,7 +377,6 @@ def _as_number(atoms: Atoms, entry: _Entry) -> Sloped:
 
 
 def _as_integer(atoms: Atoms, kind: str, entry: _Entry) -> bool | int | Switch:
-    """Return an entry as a boolean or as an integer, truncated towards 0."""
     if isinstance(entry, Switch):
         if kind == "b":
             return entry

@@ -69,7 +69,6 @@ def program(plan: Plan) -> str:
 def _write_uniform(
     w: Writer, plan: Plan, slots: dict[str, str], numbers: Sequence[Node], last: str
 ) -> None:
-    """Write the loop over the steps that computes what is the same for all agents."""
     with loop(w, slots["first_step"], last) as (step, _, _):
         passed = w.put(f"sub i64 {step}, {slots['first_step']}")
         table = w.part(slots["table"], passed, plan.table)
@@ -87,7 +86,6 @@ def _write_uniform(
 
 
 def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str, str]:
-    """Write where the numbers of a group are."""
     blocks = w.put(f"mul i64 {group}, {slots['blocks']}")
     edges = w.put(f"mul i64 {group}, {slots['edge_blocks']}")
     parts = {
@@ -101,7 +99,6 @@ def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str
 
 
 def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
-    """Write all steps of a group, task by task."""
     with loop(w, "0", slots["count"]) as (number, _, _):
         first = w.put(f"mul i64 {number}, {len(TASK)}")
         task = {name: w.load("i64", slots["schedule"], first, k) for k, name in enumerate(TASK)}
@@ -125,7 +122,6 @@ def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
 
 
 def _context(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers: int) -> Context:
-    """Write where the numbers are that change from step to step."""
     step = w.put(f"add i64 {slots['first_step']}, {passed}")
     odd = w.put(f"trunc i64 {passed} to i1")
     mirror, next_mirror = (
@@ -153,10 +149,7 @@ _AT_HAND = 12
 
 
 def _with_uniform(w: Writer, context: Context, body: Body) -> Context:
-    """Write the load of what is the same for all agents, before the loop over them.
-
-    In the loop, LLVM would load it again after every store, which might change it.
-    """
+    """In the loop, LLVM would load it again after every store, which might change it."""
     leaves = [n for n in needed(body.results()) if n.op == "leaf" and n.value[0] == "uniform"]
     values = {n.value[1]: _load_uniform(w, context, *n.value) for n in leaves[:_AT_HAND]}
     return context._replace(at_hand=values)
@@ -227,7 +220,6 @@ def _new_minima(body: Body) -> list[tuple[Node, bool]]:
 
 
 def _has_no_effect(op: str, node: Node) -> bool:
-    """Tell whether an operation with a number changes no sum or minimum."""
     neutral = {"add": 0.0, "min": NO_MINIMUM}.get(op)
     return neutral is not None and node is node.graph.constant(neutral)
 
@@ -235,7 +227,6 @@ def _has_no_effect(op: str, node: Node) -> bool:
 def _load(
     w: Writer, context: Context, block: str, base: str, kind: str, rest: Sequence[int]
 ) -> str:
-    """Write the load of a leaf of a body, except for sums over neighbours."""
     plan = context.plan
     if kind == "row":
         return w.load_row(base, rest[0])
@@ -252,7 +243,6 @@ def _load(
 def _write(
     w: Writer, context: Context, body: Body, emitter: Emitter, base: str, block: str
 ) -> None:
-    """Write the results of a body: in the rows of its block, and for its neighbours."""
     for row, node in body.stores.items():
         w.store_row(emitter.value(node), base, row)
     with only_if(w, context.slots["input_step"]):
@@ -274,7 +264,6 @@ def _write(
 
 
 def _note_exceptions(w: Writer, row: int, body: Body, emitter: Emitter, base: str) -> None:
-    """Write that a row becomes 1 where an exception holds."""
     kind, either = w.kind(True, False), ""
     for node in body.exceptions:
         if node.op != "constant" or node.value:
@@ -288,7 +277,6 @@ def _note_exceptions(w: Writer, row: int, body: Body, emitter: Emitter, base: st
 
 @contextlib.contextmanager
 def _if_effective(w: Writer, emitter: Emitter, op: str, node: Node) -> Iterator[str]:
-    """Write what is done with a number, only where a uniform truth says that it has an effect."""
     if node.op == "select" and node.args[0].uniform:
         which, *sides = node.args
         for k, side in enumerate(sides):
@@ -303,7 +291,6 @@ def _if_effective(w: Writer, emitter: Emitter, op: str, node: Node) -> Iterator[
 
 
 def _load_uniform(w: Writer, context: Context, kind: str, *rest: int) -> str:
-    """Write a number that is the same for all agents."""
     if kind == "steady":
         late = w.put(f"icmp sge i64 {context.step}, {context.slots['first_steady']}")
         return w.put(f"uitofp i1 {late} to {w.scalar}")
@@ -361,7 +348,6 @@ def wait(w: Writer, slots: dict[str, str], before: str, after: str) -> None:
 
 
 def _wait_for(w: Writer, slots: dict[str, str], other: str, count: str) -> None:
-    """Write that a thread waits for another."""
     at = w.part(slots["progress"], other, _APART, "i64")
     start, turn, here = (w.fresh(stem) for stem in ("start", "turn", "here"))
     w.do(f"br label %{start}")

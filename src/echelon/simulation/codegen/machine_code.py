@@ -72,7 +72,6 @@ class Code:
     """A kernel as machine code, which exists as long as this object."""
 
     def __init__(self, text: str) -> None:
-        """Compile a text, or load its code from the cache."""
         binding = llvm()
         import llvmlite
 

@@ -26,7 +26,6 @@ class ChunkGrid:
     """
 
     def __init__(self, settings: Settings, longest: int) -> None:
-        """Choose the points."""
         self.steps, self.every = settings.steps, settings.store_every
         longest = min(longest, self.every * -(-self.frames // _CHUNKS))
         # Frames farther apart than a chunk is long are cut between, and those cuts are not stored.
@@ -84,7 +83,6 @@ def advance_until_lost(
 def _first_lost(
     stepper: Stepper, now: Moment, counts: Array, reference: Array | None, formations: int
 ) -> dict[int, tuple[Array, Array]]:
-    """Return states and inputs at the steps at which formations first are not finite."""
     total, step, lost = int(counts.sum()), 0, np.zeros(formations, bool)
     frames = dict[int, tuple[Array, Array]]()
     while step < total and not lost.all():

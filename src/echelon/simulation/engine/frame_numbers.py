@@ -198,7 +198,6 @@ class FrameNumbers(abc.ABC):
 def _approaches_of_some(
     places: Float[Array, "T N k"], presence: Bool[Array, "T N"], times: Float[Array, " T"]
 ) -> list[ClosestPair]:
-    """Return `approaches` of the agents that are present in each frame."""
     pairs = list[ClosestPair]()
     for place, here, time in zip(places, presence, times.tolist(), strict=True):
         who = np.flatnonzero(here)

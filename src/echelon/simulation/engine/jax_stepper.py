@@ -55,7 +55,6 @@ class JaxStepper(Stepper):
     """
 
     def __init__(self, loop: Loop, states: Array, reason: str = "", devices: int = 1) -> None:
-        """Store what the steps need."""
         self.loop, self.states, self.reason = loop, states, reason
         self.mesh = mesh_of(devices, len(states)) if devices > 1 else None
 
@@ -104,7 +103,6 @@ class JaxFormations(Stepper):
     """
 
     def __init__(self, loops: Sequence[Loop], states: Array, reason: str = "") -> None:
-        """Stack what differs."""
         self.count, self.states, self.reason = len(loops), states, reason
         self.loop, self.axes = _stack(loops)
 

@@ -52,7 +52,6 @@ class Laws(Drive):
     follower: Law
 
     def __check_init__(self) -> None:
-        """Check the types of the laws."""
         for place in ("leader", "follower"):
             check_kind(place, getattr(self, place), Law)
 
@@ -357,7 +356,6 @@ def is_long(settings: Settings, agents: int) -> bool:
 
 
 def _in_words(error: EchelonError) -> str:
-    """Return why there is no native code."""
     if isinstance(error, Unsupported):
         return f"there is no native code for {error}"
     return str(error).rstrip(".")

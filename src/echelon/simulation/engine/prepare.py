@@ -38,7 +38,6 @@ class Prepared(NamedTuple):
 
 
 def _size(prepared: Prepared) -> int:
-    """Return the bytes of what is held with prepared parts."""
     arrays = jax.tree.leaves((prepared.problem.meter, prepared.problem.states))
     return sum(np.asarray(array).nbytes for array in arrays)
 
@@ -75,7 +74,6 @@ def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepare
 
 
 def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
-    """Prepare parts that are not in the cache."""
     model, graph, formation = parts.model, parts.graph, parts.formation
     # Gains, plans and starts are the same in a float32 run, and so is what is guaranteed of them.
     with precision("float64"):
@@ -159,7 +157,6 @@ def check_memory(model: ControlAffine, agents: int, settings: Settings) -> None:
 
 
 def _check_events(parts: Parts, settings: Settings) -> None:
-    """Check that all that happens does so during the run."""
     graph = parts.graph
     for fault in event_faults(graph.before, graph.events, graph.heirs, settings.horizon):
         raise SimulationError(f"{fault.text}.")
@@ -229,7 +226,6 @@ def _coarse(model: ControlAffine, states: Array, settings: Settings) -> Iterator
 
 
 def _goals(model: ControlAffine, formation: Formation) -> Iterator[str]:
-    """Yield offsets that break a symmetry of the model, and goals that are equal or too close."""
     broken = formation.broken_symmetries(model)
     # One warning is enough: the other offsets mostly break the same symmetry.
     for agent, reason in list(broken.items())[:1]:
@@ -255,7 +251,6 @@ def _goals(model: ControlAffine, formation: Formation) -> Iterator[str]:
 
 
 def _meetings(model: ControlAffine, motion: FormationMotion) -> Iterator[str]:
-    """Yield the reshapes in which agents touch on their straight ways."""
     for begin, i, j, apart in motion.meetings():
         if apart <= 2.0 * (model.radius or 0.0) + _MET:
             yield (
@@ -265,7 +260,6 @@ def _meetings(model: ControlAffine, motion: FormationMotion) -> Iterator[str]:
 
 
 def _starts(model: ControlAffine, states: Array) -> Iterator[str]:
-    """Yield the first agent that starts where the equations do not hold, for each state."""
     for name, (low, high) in model.chart.items():
         values = states[:, model.state_names.index(name)]
         outside = np.flatnonzero(~((low < values) & (values < high)))

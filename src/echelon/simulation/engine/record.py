@@ -186,7 +186,6 @@ class Recorder:
                 yield self._closed(problem, mine, unfinished)
 
     def _by_formation(self, rows: Float[np.ndarray, "T FN k"]) -> Float[np.ndarray, "T F N k"]:
-        """Return rows of agents that follow each other, with an axis of formations."""
         count = len(self.problems)
         return rows.reshape(len(rows), count, rows.shape[1] // count, rows.shape[2])
 
@@ -201,14 +200,12 @@ class Recorder:
         return self._finite & (inside >= ALWAYS).all(axis=(1, 2))
 
     def _nothing(self) -> Stretch:
-        """Return a stretch without frames, whose arrays have the right shapes."""
         states = np.concatenate([problem.states for problem in self.problems])
         m = len(self.problems[0].model.input_names)
         empty = np.zeros((0, *states.shape)), np.zeros((0, len(states), m))
         return Stretch(0, 0, np.zeros(0), *empty, None, self.sums, (), None, 0.0)
 
     def _closed(self, problem: Problem, whole: Stretch, unfinished: Outcome) -> Record:
-        """Return the record of a formation, cut at its first frame that is not finite."""
         # In the order of frames, then agents: the first row is the first to be lost.
         lost = np.argwhere(~_finite(whole))
         outcome, message = self._verdict(problem, whole, lost, unfinished)
@@ -218,7 +215,6 @@ class Recorder:
     def _verdict(
         self, problem: Problem, whole: Stretch, lost: Array, unfinished: Outcome
     ) -> tuple[Outcome, str]:
-        """Return how a run ended; `lost` are the frames and agents that are not finite."""
         if len(lost):
             frame, agent = lost[0]
             role, when = _role(problem, agent).lower(), f"by t = {whole.times[frame]:.6g} s"
@@ -233,7 +229,6 @@ class Recorder:
         return unfinished, f"{what} at t = {reached:.6g} s; what was computed is kept."
 
     def _completed(self, problem: Problem, whole: Stretch) -> tuple[Outcome, str]:
-        """Return how a run ended that reached its horizon: whether all stayed in their chart."""
         last, meter, model = whole.states[-1], problem.meter, problem.model
         inside = inside_at_last(meter, whole.sums.inside, last, self.grid.steps)
         if not inside.size or inside.min() >= ALWAYS:
@@ -279,6 +274,5 @@ def join(stretches: Sequence[Stretch]) -> Stretch | None:
 
 
 def _finite(stretch: Stretch) -> Bool[np.ndarray, "T N"]:
-    """Return which agents are finite in which frames."""
     states, inputs = (np.isfinite(part).all(axis=2) for part in (stretch.states, stretch.inputs))
     return np.logical_and(states, inputs)

@@ -33,7 +33,6 @@ class RunSoFar:
     """
 
     def __init__(self, prepared: Prepared, recorder: Recorder, stepper: Stepper) -> None:
-        """Note how many steps were taken."""
         self._prepared, self._recorder, self._stepper = prepared, recorder, stepper
         self.done, self.steps = recorder.done, recorder.grid.steps
 
@@ -112,10 +111,7 @@ def simulate(
 
 @contextlib.contextmanager
 def _mixed_tables() -> Iterator[None]:
-    """Say which table of a user JAX cannot use in two precisions.
-
-    It keeps one converted copy of an array of NumPy, by its identity and not by the precision.
-    """
+    """JAX keeps one converted copy of an array of NumPy, by its identity and not the precision."""
     try:
         yield
     except ValueError as error:
@@ -217,7 +213,6 @@ class _ChunkLoop:
         self.now = chunk.now
 
     def _hand_over(self, keep: Keep | None) -> None:
-        """Pass the new stretch to the callback."""
         new = join(self.recorder.stretches[self.handed_over :])
         if keep is not None and new is not None:
             keep(new)

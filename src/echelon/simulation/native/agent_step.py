@@ -162,7 +162,6 @@ def signal_size(loop: Loop) -> int:
 
 
 def _signal_of(loop: Loop, law: Law, x: jax.Array, offset: jax.Array, memory: Memory) -> jax.Array:
-    """Return the signal of an agent, of length 0 if it has none."""
     signal = law.signal(loop.model, x, offset, memory)
     return jnp.zeros(0, x.dtype) if signal is None else signal
 
@@ -305,10 +304,7 @@ def body_of(
 
 
 def _before_and_in_window(inputs: StepInputs, sums: list[Node]) -> list[Node]:
-    """Return a number for all steps and for the steady window as one before and one in the window.
-
-    Each step then adds to one of the two only.
-    """
+    """Split sums into before and in the steady window: each step adds to one of the two only."""
     all_, steady = sums
     return [all_.graph.make("select", inputs.steady[()], 0.0, all_), steady]
 
@@ -326,7 +322,6 @@ def _difference(loop: Loop, graph: ScalarGraph, states: int, signals: int) -> li
 def _step_inputs(
     loop: Loop, graph: ScalarGraph, rows: BlockRows, law: Law, leads: bool, follows: bool
 ) -> StepInputs:
-    """Return what a step depends on as leaves of a graph."""
     n, signals = len(rows.state), signal_size(loop)
 
     def row(places: range) -> np.ndarray:
@@ -373,7 +368,6 @@ def single(node: Node) -> np.ndarray:
 
 
 def _placed(rows: BlockRows, named: dict[str, list[Node]]) -> dict[int, Node]:
-    """Return row -> node for the entries of each name."""
     return {
         row: node
         for name, entries in named.items()

@@ -164,7 +164,6 @@ class SwarmBlocks(Places):
             )
 
     def _order_edges(self) -> None:
-        """Order the edges: ends that are near in memory follow each other."""
         ends = self.position[np.asarray(self.loop.meter.edges)].T
         i, j = np.minimum(*ends), np.maximum(*ends)
         # Leaders are near to all.
@@ -183,7 +182,6 @@ class SwarmBlocks(Places):
         return bool(then < 0.9 * now)
 
     def _place(self, near: Array, degrees: Array | None) -> None:
-        """Place all agents; those of one degree side by side if degrees are given."""
         self.agents, self.segments = ordered(self.loop, self.lanes, near, degrees)
         self.position = first_places(self.agents)
 
@@ -294,7 +292,6 @@ class FormationBlocks(Places):
 
 
 def _aligned_copy(values: Array, dtype: np.dtype | type) -> Array:
-    """Return numbers in memory that is aligned for whole vectors."""
     copy = aligned(values.shape, dtype)
     copy[:] = values
     return copy
@@ -390,7 +387,6 @@ def ordered(loop: Loop, lanes: int, near: Array, degrees: Array | None) -> tuple
 
 
 def _among(order: Array, some: Array) -> Array:
-    """Return some agents in an order of all."""
     which = np.zeros(len(order), bool)
     which[some] = True
     return order[which[order]]

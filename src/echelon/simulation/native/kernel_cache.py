@@ -111,7 +111,6 @@ class Kernels:
     """
 
     def __init__(self) -> None:
-        """Begin with an empty cache."""
         # A sweep over models has one after the other.
         self.codes, self._kernels = BoundedCache[Code](_MOST), BoundedCache[Kernel](_MOST)
 

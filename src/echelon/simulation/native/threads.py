@@ -32,7 +32,6 @@ _Part = TypeVar("_Part")
 
 @cache
 def _yield_processor() -> Any:
-    """Return the function of the system by which a thread yields its processor."""
     if sys.platform == "win32":
         return ctypes.WinDLL("kernel32").SwitchToThread
     return ctypes.CDLL(None).sched_yield
@@ -56,7 +55,6 @@ class ThreadPool:
     """
 
     def __init__(self, places: Places, pool: Executor | None, threads: int | None) -> None:
-        """Begin with no thread running."""
         self.places, self.pool = places, pool
         large = len(places.agents) >= _SHARED
         self.threads = 1 if places.batched else threads or (processors() if large else 1)
@@ -116,7 +114,6 @@ class ThreadPool:
     def _run_swarm(
         self, code: Code, values: dict[str, int], firsts: dict[str, Array], uniform_values: Array
     ) -> None:
-        """Let each thread do its tasks."""
         assert self._workers is not None
         # Each count has its own cache line.
         progress = aligned((self.threads, 8), np.int64)
@@ -136,7 +133,6 @@ class ThreadPool:
         share(self._workers, run_thread, range(self.threads))
 
     def _schedule(self, steps: int, thread: int) -> Array:
-        """Return the tasks of a thread."""
         if (steps, thread) not in self._schedules:
             if len(self._schedules) > 8 * self.threads:
                 self._schedules.clear()

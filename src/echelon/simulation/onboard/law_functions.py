@@ -91,8 +91,6 @@ def law_functions(own: OwnLaw, bits: int = 64) -> dict[str, LawFunction]:
 
 @final
 class _Traces:
-    """Traces the functions of one agent in a precision (bits)."""
-
     def __init__(self, own: OwnLaw, bits: int) -> None:
         self.own, self.bits = own, bits
         self.loop, self.law = own.loop, own.law
@@ -212,7 +210,6 @@ class _Traces:
     # ---- where messages are late ----
 
     def _expectation(self, prediction: Prediction) -> Iterator[LawFunction]:
-        """Yield where a leader is expected, and how it is carried on."""
         loop, follower, s = self.loop, self.loop.follower, self.s
         assert loop.channel is not None
         size = packet_size(loop.channel, s, self.k, self.m)
@@ -289,10 +286,7 @@ class _Traces:
         outputs: tuple[str, ...],
         sizes: Mapping[str, int | None],
     ) -> LawFunction:
-        """Return a function whose leaves have the names of its inputs.
-
-        What `compute` returns after its outputs must be finite where it is valid.
-        """
+        """What `compute` returns after its outputs must be finite where the function is valid."""
         graph = ScalarGraph(self.bits)
         leaves = [
             single(graph.leaf(key)) if size is None else leaves_of(graph, key, range(size))
@@ -344,7 +338,6 @@ def _fewer(truths: Sequence[Node]) -> list[Node]:
 
 
 def _flat(tree: PyTree) -> jax.Array:
-    """Return the numbers of a tree, one after the other."""
     return jnp.concatenate([jnp.zeros(0), *map(jnp.ravel, jax.tree.leaves(tree))])
 
 

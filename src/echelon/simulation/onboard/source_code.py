@@ -430,7 +430,6 @@ def law_single(a):
 
 
 def _python_literal(value: float | bool) -> str:
-    """Return a plain number, to the bit."""
     if isinstance(value, bool) or math.isfinite(value):
         return repr(value)
     return "math.nan" if math.isnan(value) else f"{'-' * (value < 0.0)}math.inf"

@@ -101,7 +101,6 @@ def symbols(owner: str) -> Algebra:
 
 
 def _rules(ca: ModuleType) -> dict[str, Rule]:
-    """Return the rules of JAX's primitives for symbols, in addition to those of the walk."""
     written: dict[str, Rule] = {
         "integer_pow": lambda params, x: map_entries(lambda value: value ** params["y"], x),
         # A symbol counts as finite, since its value is unknown; solvers report what is not.
@@ -120,7 +119,6 @@ def _rules(ca: ModuleType) -> dict[str, Rule]:
 
 
 def _functions(ca: ModuleType) -> dict[str, Callable[..., object]]:
-    """Return the primitives that are functions of entries."""
     return {
         **{name: getattr(ca, name) for name in _SAME_NAME},
         **{name: getattr(operator, name) for name in ("lt", "le", "gt", "ge", "eq", "ne", "pow")},

@@ -37,12 +37,9 @@ _SETTLING = 20
 
 
 class _Optimized(Drive):
-    """A drive whose leaders follow a reference, or keep their trim."""
-
     reference: eqx.AbstractVar[Guide | None]
 
     def __check_init__(self) -> None:
-        """Check the type of the reference."""
         if self.reference is not None:
             check_kind_of(self.reference)
 
@@ -158,8 +155,6 @@ class RecedingHorizon(_Optimized):
 
 @final
 class _Planners:
-    """The planners of all agents; called with the measured states, they return the inputs."""
-
     def __init__(self, problem: Problem, reference: Guide | None, mpc: MPC, hold: int) -> None:
         began = time.perf_counter()
         settings, graph = problem.settings, problem.graph
@@ -294,7 +289,6 @@ class HostStepper(Stepper):
         hold: int,
         work: Callable[[], SolverStats],
     ) -> None:
-        """Assemble the loop."""
         law = HeldInput(len(problem.model.input_names))
         self.loop, self.states = assemble(problem, law, law), problem.states
         self.pilot, self.hold, self._work = pilot, hold, work
@@ -363,7 +357,6 @@ class HostStepper(Stepper):
                 return
 
     def _query_pilot(self, chunk: "_HeldChunk") -> None:
-        """Put the pilot's inputs into the agents' memories where a hold begins, once."""
         if chunk.step % self.hold or chunk.step == self._queried:
             return
         # Solvers work in float64, and so are the states that they start from.
@@ -380,7 +373,6 @@ class HostStepper(Stepper):
         )
 
     def _take(self, chunk: "_HeldChunk", count: int, store: bool = False) -> None:
-        """Take steps, or store a frame."""
         # As an array, so that another count does not compile again.
         counts = np.array([count], np.int32)
         chunk.now, frames, sums = advance(
@@ -395,8 +387,6 @@ class HostStepper(Stepper):
 
 @final
 class _HeldChunk:
-    """The frames and sums of a chunk while it is computed."""
-
     def __init__(self, now: Moment, sums: Sums, reference: Array | None) -> None:
         self.now, self.step, self.first = now, int(now.step), now.step
         self.sums, self.reference = sums, reference

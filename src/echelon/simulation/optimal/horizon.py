@@ -78,7 +78,6 @@ class MPC:
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what is out of range."""
         for name in ("period", "horizon"):
             check_seconds(name, getattr(self, name))
         if self.horizon < self.period:

@@ -50,7 +50,6 @@ class TrackingOptions:
     solver: str = "ipopt"
 
     def __post_init__(self) -> None:
-        """Refuse what is out of range."""
         check_seconds("interval", self.interval)
         if not 0.0 <= self.input_weight < math.inf:
             raise PlanError(

@@ -50,7 +50,6 @@ def signed(x: Node, like: Node) -> Node:
 
 
 def _sine_and_cosine(x: Node) -> tuple[Node, Node]:
-    """Return both; the graph shares their common operations."""
     g, eps, width = x.graph, EPS[x.graph.bits], 0.62  # (pi / 4)^2 is 0.617
     # Below, nothing is subtracted, and the quarter is 0.
     far = g.make("unlikely", less(g.constant(0.61), x * x))
@@ -254,7 +253,6 @@ def _small_angle(t: Node) -> Node:
 
 
 def _angle(y: Node, x: Node) -> Node:
-    """Return the angle of any point (x, y)."""
     g, a, b = y.graph, size(y), size(x)
     low, high = g.make("min", a, b), g.make("max", a, b)
     # Two infinite sides are equal, and two zero sides have the angle 0.
@@ -408,10 +406,7 @@ def _positive_power(x: Node, y: Node) -> Node:
 
 
 def _logarithm(x: Node) -> tuple[Node, Node]:
-    """Return ln x for x >= 0 as the sum of two numbers, the second a rounding error of the first.
-
-    The logarithm of a large number is large, and a power needs as many digits behind its point.
-    """
+    """Return ln x for x >= 0 as a number and its rounding error: a power needs these digits."""
     g, bits = x.graph, x.graph.bits
     e, f = g.make("exponent", x), g.make("mantissa", x) - 1.0
     below = f + 2.0

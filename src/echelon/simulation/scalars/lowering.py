@@ -183,7 +183,6 @@ def _round(graph: ScalarGraph, params: Params, x: np.ndarray) -> np.ndarray:
 
 
 def _scan(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
-    """Return the results of a loop of fixed length, unrolled."""
     params, body = equation.params, equation.params["jaxpr"]
     length, constant, carried = params["length"], params["num_consts"], params["num_carry"]
     if length > LONGEST:
@@ -255,7 +254,6 @@ def _parts(rows: np.ndarray) -> list[list[int]]:
 
 
 def _eliminate(graph: ScalarGraph, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solution by Gauss's method."""
     both, n = np.column_stack([matrix, right]), len(matrix)
     for k in range(n):
         _pivot(graph, both, k, n)
@@ -281,7 +279,6 @@ def _pivot(graph: ScalarGraph, rows: np.ndarray, k: int, n: int) -> Node:
 
 
 def _by_triangle(A: np.ndarray, right: np.ndarray, lower: bool, unit: bool) -> np.ndarray:
-    """Return the solution of equations whose matrix is triangular."""
     b, n = right.copy(), len(A)
     for k in range(n) if lower else reversed(range(n)):
         for j in range(k) if lower else range(k + 1, n):
@@ -386,7 +383,6 @@ def _rows(equation: JaxprEqn, operands: Arrays) -> np.ndarray:
 
 
 def _at(algebra: Algebra, equation: JaxprEqn, operands: Arrays, rows: np.ndarray) -> np.ndarray:
-    """Return the result of an equation at constant indices."""
     first = _FIRST.get(equation.primitive.name)
     if first is None:
         constant = [operands[0], rows, *operands[2:]]

@@ -104,7 +104,6 @@ class TypeRules:
     """
 
     def __init__(self, graph: ScalarGraph) -> None:
-        """Begin with the nodes that come next."""
         self.graph, self._checked = graph, len(graph.nodes)
 
     def __call__(self, equation: JaxprEqn, results: Arrays) -> Arrays:
@@ -144,7 +143,6 @@ class TypeRules:
         return map_entries(lambda e: self._bounded(e, kind) if isinstance(e, Node) else e, result)
 
     def _bounded(self, x: Node, kind: np.dtype) -> Node:
-        """Return a whole number of a type: as it is, wrapped, or with an exception."""
         g, limits, exact = self.graph, np.iinfo(kind), _EXACT[self.graph.bits]
         least, most, (low, high) = float(limits.min), float(limits.max), range_of(x)
         if max(least, -exact) <= low and high <= min(most, exact):
@@ -164,7 +162,6 @@ _PARTIAL = {"reduce_sum", "cumsum", "reduce_prod", "cumprod", "dot_general", "in
 
 
 def _is_well_typed(node: Node) -> bool:
-    """Tell whether an operation has truths, or numbers, where it needs them."""
     truths = [a.truth for a in node.args]
     if node.op == "select":
         return truths[0] and truths[1] == truths[2]

@@ -90,7 +90,6 @@ def numbers(now: Moment) -> tuple[Array, ...]:
 
 
 def _leaf(stored: Array, like: jax.Array) -> jax.Array:
-    """Return one of the numbers as the leaf that it was in the moment."""
     if _is_key(like):
         return jax.random.wrap_key_data(jnp.asarray(stored), impl=jax.random.key_impl(like))
     return jnp.asarray(stored, like.dtype)

@@ -44,7 +44,6 @@ class Leadership:
     timeout: float = 0.3
 
     def __post_init__(self) -> None:
-        """Check all."""
         object.__setattr__(self, "heirs", tuple(self.heirs))
         if not self.heirs:
             raise SimulationError("`heirs` is empty, and must name at least one follower.")

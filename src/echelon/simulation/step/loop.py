@@ -290,10 +290,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
 
 
 def _levels(graph: Graph) -> Array:
-    """Return the places of followers among the followers, (D, W), a row for each depth.
-
-    A row that is too short repeats its first entry.
-    """
+    """Return followers' places among followers by depth, (D, W); short rows repeat a place."""
     depth = graph.depths()[list(graph.followers)]
     rows = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
     # One shape for all levels, as a scan needs; a copy of an agent does what the agent does.

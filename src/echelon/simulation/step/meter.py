@@ -136,7 +136,6 @@ class OfAgent(NamedTuple):
 
 
 def _twice(steady: jax.Array, square: jax.Array) -> Float[jax.Array, "2"]:
-    """Return a square for all steps and for those of the steady window."""
     return jnp.where(jnp.stack([jnp.asarray(True), steady]), square, 0.0)
 
 
@@ -344,7 +343,6 @@ class Meter(eqx.Module):
         return _twice(steady, self._length(x - offset - reference)), deviation * deviation
 
     def _length(self, deviation: jax.Array) -> jax.Array:
-        """Return the squared length of the measured part of a deviation (n,)."""
         part = deviation[np.array(self.measured)]
         return jnp.sum(part * part)
 

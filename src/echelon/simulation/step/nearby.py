@@ -94,7 +94,6 @@ def _exchanged(
     sends: Bool[jax.Array, " K"],
     links: tuple[Array, Array],
 ) -> Sightings:
-    """Return the messages with those that arrive at a step, and those that are sent at it."""
     channel, seen = loop.channel, now.world.seen
     assert channel is not None
     arrival = channel.arrivals(seen.posts, now.step, seen.stamp)

@@ -82,7 +82,6 @@ def begin(loop: Loop, states: States) -> Moment:
 
 
 def _feedforward_size(loop: Loop, moment: Moment) -> int:
-    """Return how many numbers leaders send to their followers."""
     return jax.eval_shape(lambda: _lead(loop, moment, _sent(loop, moment)[0])).message.shape[1]
 
 
@@ -150,8 +149,6 @@ def control(loop: Loop, now: Moment) -> Control:
 
 
 def _chosen(first: Bool[jax.Array, " L"], one: Action, other: Action) -> Action:
-    """Return what some agents do as in one of two actions, and all others as in the other one."""
-
     def pick(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(first.reshape(-1, *[1] * (jnp.ndim(a) - 1)), a, b)
 
@@ -159,7 +156,6 @@ def _chosen(first: Bool[jax.Array, " L"], one: Action, other: Action) -> Action:
 
 
 def _lead(loop: Loop, now: Moment, z: Float[jax.Array, "N s"]) -> Action:
-    """Return what the leaders do."""
     # Nobody is before a leader whose input it could be sent.
     silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), z.dtype)
     rows = loop.leaders, silence, now.leader_memory
@@ -177,7 +173,6 @@ def _act_all(
     leads: bool = False,
     near: Near | None = None,
 ) -> Action:
-    """Return what some agents do, with what they are sent (K, k), remember and know of others."""
     x, t = now.states, time_of(loop, now)
     offsets, rates = offsets_at(loop, law, t, agents)
 
@@ -279,8 +274,6 @@ def _with_arrivals(loop: Loop, now: Moment) -> Moment:
 
 
 def _where(loop: Loop, chosen: Bool[jax.Array, " N"], one: Moment, other: Moment) -> Moment:
-    """Return a moment in which some agents are as in one moment, and all others as in another."""
-
     def some(agents: Array | slice) -> Callable[[jax.Array, jax.Array], jax.Array]:
         def pick(a: jax.Array, b: jax.Array) -> jax.Array:
             mask = chosen[agents]
@@ -306,7 +299,6 @@ def _where(loop: Loop, chosen: Bool[jax.Array, " N"], one: Moment, other: Moment
 
 
 def _move(loop: Loop, now: Moment, acted: Control) -> Moment:
-    """Return the moment one dt later under what all agents do."""
     world = acted.world
     own = MotionState() if world.motion is None else world.motion
     states, own = loop.motion.advance(now.states, acted.inputs, now.step, own)
