@@ -20,21 +20,13 @@ PART = ".part"
 
 
 def write_atomic(path: Path, content: bytes | str) -> None:
-    """Write a file completely; if that fails, its previous content remains.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a file completely, or raise `OSError` and leave its previous content."""
     data = content.encode() if isinstance(content, str) else content
     make_atomic(path, lambda part: _write(part, data))
 
 
 def make_atomic(path: Path, make: Callable[[Path], object]) -> None:
-    """Let `make` write a temporary file, and rename it when it is complete.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Let `make` write a temporary file, and rename it when it is complete; `OSError` if not."""
     if path.exists() and not path.is_file():
         # A pipe or a device cannot be replaced by a rename.
         make(path)
@@ -63,10 +55,7 @@ _PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy", "llvmlite")
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that compute.
-
-    In a checkout, `git` is the commit.
-    """
+    """Return the versions of Python and of the packages that compute, and a checkout's `git`."""
     result = {"python": platform.python_version(), "echelon": __version__}
     for package in _PACKAGES:
         try:

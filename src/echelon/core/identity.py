@@ -40,10 +40,7 @@ def identify(value: object) -> tuple[bytes, Foreign]:
 
 
 def digest(value: object) -> bytes | None:
-    """Return a digest, equal only for values of the same classes and bits, in every process.
-
-    None if a part is of a class or function outside echelon and its dependencies.
-    """
+    """Return a digest, equal only for equal classes and bits; None if a part is foreign."""
     bits, foreign = identify(value)
     return None if foreign else bits
 
@@ -78,11 +75,7 @@ def key_of_foreign(bits: bytes, foreign: Foreign) -> Hashable:
 
 
 def array_bits(array: object) -> bytes:
-    """Return the bits of an array of NumPy or JAX; of a large one, such as a graph's, a digest.
-
-    Raises:
-        ValueError: its entries are objects, whose bits are addresses; or it is traced.
-    """
+    """Return an array's bits, of a large one a digest; `ValueError` if of objects or traced."""
     # Imported here, since the command line opens its cache before it needs them.
     import numpy as np
 

@@ -22,22 +22,14 @@ class Word(enum.Enum):
 
     @classmethod
     def named(cls, name: object) -> Self:
-        """Return the member of a name; a member is returned as it is.
-
-        Raises:
-            KeyError: there is none.
-        """
+        """Return the member of a name, or a member itself; `KeyError` if there is none."""
         if isinstance(name, cls):
             return name
         return {str(member): member for member in cls}[str(name)]
 
     @classmethod
     def checked(cls, name: object, what: str) -> Self:
-        """Return the member of a name, as `named`; `what` has the name, such as "`a` of the b".
-
-        Raises:
-            SimulationError: there is none.
-        """
+        """Return `named`; raise `SimulationError` about `what`, such as "`a` of the b"."""
         check_name(f"{what} is", str(name), map(str, cls), SimulationError)
         return cls.named(name)
 

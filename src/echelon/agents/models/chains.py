@@ -120,10 +120,7 @@ def differentiate(model: ControlAffine, chains: Chains, x: State, e: jax.Array) 
 def derivatives_of(
     model: ControlAffine, chains: Chains, x: State, e: jax.Array, order: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return y .. y^(order - 1), y' .. y^(order) at w = 0, and the effect of w on the latter.
-
-    Their shapes are (order, m), (order, m) and (m, order, m).
-    """
+    """Return y .. y^(order - 1), y' .. y^(order) at w = 0, both (order, m); d/dw (m, order, m)."""
     zero = jnp.zeros(len(model.input_names), x.dtype)
 
     def field(x: State, e: jax.Array, w: Input) -> tuple[State, jax.Array]:
@@ -176,12 +173,7 @@ def switch_on(model: ControlAffine, chains: Chains, x: State, ahead: jax.Array) 
 
 
 def check_bounds(model: ControlAffine, chains: Chains) -> None:
-    """Check that each flat bound of a model has a form for which proofs exist.
-
-    Raises:
-        ModelError: its outputs do not end chains of the same length, its derivative is the output
-            itself or one that the inputs reach, or its value is no finite number.
-    """
+    """Raise `ModelError` unless each flat bound of a model has a form for which proofs exist."""
     name, bounds = f"`{type(model).__name__}`", model.flat_bounds
     if bounds is None:
         return

@@ -161,11 +161,7 @@ _NAMES = ("A", "B", "C", "D", "Ts")
 
 
 def read_matrices(file: PathLike) -> dict[str, Array]:
-    """Return the matrices A and B of a `.mat` file, and C, D and Ts where it has them.
-
-    Raises:
-        ModelError: the file cannot be read, or lacks A or B.
-    """
+    """Return A and B of a `.mat` file, and C, D, Ts where it has them; else `ModelError`."""
     content = _content(file)
     names = [name for name in content if not name.startswith("__")]
     missing = [name for name in ("A", "B") if name not in names]

@@ -415,11 +415,7 @@ def wrap_angles(difference: State, *angles: int) -> State:
 
 
 def check_positive(owner: object, **values: float) -> None:
-    """Check that each named parameter is a finite positive number.
-
-    Raises:
-        ModelError: one is not.
-    """
+    """Raise `ModelError` unless each named parameter is a finite positive number."""
     # The comparisons are false for NaN, which is rejected too.
     for name, value in values.items():
         if not (is_number(value) and 0.0 < value < float("inf")):
@@ -430,11 +426,7 @@ def check_positive(owner: object, **values: float) -> None:
 
 
 def check_not_negative(owner: object, **values: float) -> None:
-    """Check that each named parameter is a finite number of at least zero.
-
-    Raises:
-        ModelError: one is not.
-    """
+    """Raise `ModelError` unless each named parameter is a finite number of at least zero."""
     for name, value in values.items():
         if not (is_number(value) and 0.0 <= value < float("inf")):
             raise ModelError(

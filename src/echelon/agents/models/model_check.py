@@ -318,10 +318,7 @@ def _check_trim(model: ControlAffine, name: str, u: np.ndarray) -> None:
 def trim_shortfall(
     model: ControlAffine, trim_input: Float[Array, " m"] | None = None
 ) -> dict[str, Shortfall]:
-    """Return the inputs of the trim that the actuators cut, by name.
-
-    `trim_input` is the trim of another model that these actuators are to hold.
-    """
+    """Return the inputs of the trim, or of another model's `trim_input`, that the actuators cut."""
     requested, delivered = np.asarray(model.trim[1], float), at_trim(model).delivered
     if trim_input is not None and (trim_input != requested).any():
         with precision("float64"):

@@ -28,11 +28,7 @@ Vector: TypeAlias = Float[jax.Array, " 3"]
 
 
 def check_moments(owner: object, inertia: tuple[float, ...]) -> None:
-    """Check that an inertia is three positive moments.
-
-    Raises:
-        ModelError: it is not.
-    """
+    """Raise `ModelError` unless an inertia is three positive moments."""
     if not isinstance(inertia, (tuple, list)) or len(inertia) != 3:
         raise ModelError(
             f"`inertia` of `{type(owner).__name__}` is {inertia}, and must be three moments "
@@ -42,11 +38,7 @@ def check_moments(owner: object, inertia: tuple[float, ...]) -> None:
 
 
 def check_inertia(inertia: tuple[float, float, float]) -> None:
-    """Check that a rigid body can have these principal moments of inertia, kg m^2.
-
-    Raises:
-        ModelError: one exceeds the sum of the other two, by more than rounding.
-    """
+    """Raise `ModelError` if a principal moment (kg m^2) exceeds the sum of the other two."""
     # Ixx + Iyy - Izz = int 2 z^2 dm >= 0 for each axis, with equality for a flat plate: hence the
     # slack.
     total = sum(inertia)
@@ -100,10 +92,7 @@ def body_rates(zeta: Vector, zeta_dot: Vector) -> Vector:
 
 
 def tilt_towards(direction: Vector, yaw: Scalar) -> Vector:
-    """Return the angles zeta with the given yaw whose thrust axis points along `direction`.
-
-    The length of `direction` does not matter.
-    """
+    """Return the angles zeta with the given yaw whose thrust axis points along `direction`."""
     sy, cy = jnp.sin(yaw), jnp.cos(yaw)
     # With the yaw undone R e3 is (cos roll sin pitch, -sin roll, cos roll cos pitch).
     forward = cy * direction[0] + sy * direction[1]

@@ -189,13 +189,7 @@ def sides(point: Float[Array, " n"], values: Float[Array, "K k"]) -> Sides:
 def find_gap(
     function: _Function, points: Float[Array, "K n"], units: Float[Array, " n"]
 ) -> Gap | None:
-    """Return where the derivative of a function by JAX is not its slope, or None.
-
-    Args:
-        function: (n,) -> (k,), traceable by JAX.
-        points: where the two are compared.
-        units: of each variable.
-    """
+    """Return where the derivative of a traceable function by JAX is not its slope, or None."""
     with precision("float64"):
         around = jnp.asarray(np.stack([stencil(point, units) for point in points]))
         values = np.asarray(jax.jit(jax.vmap(jax.vmap(function)))(around))

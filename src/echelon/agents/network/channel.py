@@ -265,10 +265,7 @@ class Channel(eqx.Module):
         receivers: Array | jax.Array,
         senders: Array | jax.Array,
     ) -> Posts:
-        """Return the posts after a step; agents send at every `every`-th one.
-
-        Links (K,) along which nothing is sent, such as cut ones, lose the message.
-        """
+        """Return the posts after a step; links (K,) that carry nothing lose the message."""
         number = step // self.every
         slot = number % self.slots
 

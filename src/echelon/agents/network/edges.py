@@ -98,11 +98,7 @@ def _ascending(pairs: Array) -> Array:
 
 
 def give_weights(edges: Iterable[Sequence[float]], weights: Sequence[float]) -> list[list[float]]:
-    """Return edges (i, j, weight) from edges (i, j) and a list of weights.
-
-    Raises:
-        GraphError: their numbers differ, or an edge has a weight already.
-    """
+    """Return edges (i, j, weight) from edges (i, j) and as many weights, else `GraphError`."""
     edges, weights = [list(edge) for edge in edges], list(weights)
     if len(edges) != len(weights):
         raise GraphError(
@@ -149,10 +145,7 @@ def count_grid(rows: int, columns: int) -> int:
 
 
 def check_size(agents: int, least: int, kind: str, edges: int = 0, share: float = 0) -> None:
-    """Check that a kind of graph has enough agents, and that agents and edges fit into memory.
-
-    The number of edges is `edges`, plus about a `share` of all pairs.
-    """
+    """Check that agents are enough, and that `edges` plus a `share` of all pairs fit memory."""
     _check_whole(agents)
     if agents < least:
         raise GraphError(f"a {kind} needs at least {least} agents, and has {agents}.")
@@ -197,11 +190,7 @@ def _square(matrix: ArrayLike) -> Array:
 def edges_of_matrix(
     matrix: ArrayLike, leaders: Iterable[int], directed: bool | None
 ) -> tuple[list[list[float]], Iterable[int], int, bool]:
-    """Return edges, leaders, the number of agents and whether edges are directed, of an adjacency.
-
-    Raises:
-        GraphError: the matrix is not square, not finite, or not that of such a graph.
-    """
+    """Return edges, leaders, agents and whether directed, of an adjacency; else `GraphError`."""
     weights = _square(matrix)
     symmetric = bool((weights == weights.T).all())
     if directed is False and not symmetric:

@@ -87,11 +87,7 @@ def agents_of(event: Event) -> tuple[int, ...]:
 
 
 def check_heirs(graph: GraphMatrices, heirs: Sequence[int]) -> None:
-    """Check who may lead after the leader of a graph.
-
-    Raises:
-        GraphError: one is no agent, leads already or is named twice, or there are several leaders.
-    """
+    """Raise `GraphError` unless these agents may lead after the only leader of a graph."""
     for k, heir in enumerate(heirs):
         if not _is_agent(heir, graph.agents):
             last = graph.agents - 1
@@ -213,10 +209,7 @@ def schedule_of(
     heirs: Sequence[int] = (),
     absent: Sequence[int] = (),
 ) -> Schedule:
-    """Return when which links of a graph hold, who is present, and whom each agent follows.
-
-    Who is `absent` is so until the end, whatever happens.
-    """
+    """Return the schedule of links, presence and leaders; `absent` agents are so until the end."""
     base = graph.schedule or Schedule(np.zeros(1), graph.weights[None], None)
     ends = [event.end for event in events if isinstance(event, Cut)]
     times = [*base.starts.tolist(), *(event.at for event in events), *ends]

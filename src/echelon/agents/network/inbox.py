@@ -140,10 +140,7 @@ class Surroundings:
         self.time = np.full(len(senders), -np.inf)
 
     def take(self, message: object, clock: float | None) -> bool:
-        """Store the hull of a message, and tell whether it could be used.
-
-        `clock` is the receiver's time, s; None in the ideal network, where the last one is used.
-        """
+        """Store a hull, and tell whether it is of use; `clock` (s) is None in the ideal network."""
         if not isinstance(message, Message) or not isinstance(message.sender, numbers.Integral):
             return False
         place = self._places.get(int(message.sender))

@@ -18,10 +18,7 @@ from echelon.core.types import Array, States
 
 
 class GraphMatrices(abc.ABC):
-    """Weighted edges between agents 0 .. N-1, and the matrices that they make; abstract.
-
-    Its attributes are those of `Graph`.
-    """
+    """Weighted edges between agents, and the matrices that they make; abstract, as `Graph`."""
 
     edges: Array
     weights: Array
@@ -53,10 +50,7 @@ class GraphMatrices(abc.ABC):
         return sp.csr_array(csgraph.laplacian(A, use_out_degree=self.directed))
 
     def grounded_laplacian(self) -> sp.csr_array:
-        """Return the follower block of the Laplacian, sparse and positive definite.
-
-        It is the paper's L of Lemma 1; of a directed graph it is not symmetric.
-        """
+        """Return the Laplacian's follower block, the paper's L of Lemma 1; sparse."""
         return self._grounded_laplacian(self.weights)
 
     def _grounded_laplacian(self, weights: Array, leaderward: bool = False) -> sp.csr_array:
@@ -150,11 +144,7 @@ def _apart(L: sp.csr_array, out: Array, weight: float) -> sp.csr_array:
 
 
 def ordered_outward(graph: GraphMatrices) -> tuple[tuple[int, tuple[int, ...]], ...]:
-    """Return `Graph.outward`.
-
-    Raises:
-        GraphError: the graph switches.
-    """
+    """Return `Graph.outward`; raise `GraphError` if the graph switches."""
     if graph.schedule is not None:
         raise GraphError("the graph switches, and plans are made in one order for all times.")
     # Stable, so that agents at equal distance stay in the order of their numbers.
@@ -188,11 +178,7 @@ def outward_edges(graph: GraphMatrices) -> tuple[Array, Array]:
 
 
 def parents_of(graph: GraphMatrices) -> tuple[int, ...]:
-    """Return `Graph.parents`.
-
-    Raises:
-        GraphError: as there.
-    """
+    """Return `Graph.parents`, or raise as it does."""
     if graph.schedule is not None:
         raise GraphError(
             "the graph switches, and an agent has no one parent for all times; the feed-forward "
@@ -230,11 +216,7 @@ def shares(graph: GraphMatrices, agent: int, earlier: tuple[int, ...]) -> Array:
 
 
 def check_reached(graph: GraphMatrices) -> None:
-    """Check that leaders reach every agent along all edges, and along the last ones for ever.
-
-    Raises:
-        GraphError: they do not.
-    """
+    """Raise `GraphError` unless leaders reach all along all edges, and along the last for ever."""
     schedule = graph.schedule
     periodic = schedule is not None and schedule.period is not None
     lost = lost_along(
@@ -275,10 +257,7 @@ def _cut_off(graph: GraphMatrices, lost: Array) -> str:
 
 
 def lost_along(graph: GraphMatrices, weights: Array, leaders: Sequence[int] | None = None) -> Array:
-    """Return the agents that no leader reaches along the edges that have a weight (E,).
-
-    The leaders are those of the graph where none are named.
-    """
+    """Return the agents that no leader, by default of the graph, reaches along weights (E,)."""
     leaders = graph.leaders if leaders is None else leaders
     if not graph.directed:
         # One direction of each edge is enough, which halves the time for millions of edges.

@@ -51,10 +51,7 @@ class Schedule(NamedTuple):
         return np.searchsorted(self.starts, times, side="right") - 1
 
     def switches(self, dt: float, horizon: float, first: int = 0) -> tuple[Array, Array]:
-        """Return the first steps (K,) of rows and the rows (K,), in steps of dt (s).
-
-        They cover a horizon (s), starting with the period of number `first`.
-        """
+        """Return first steps (K,) and rows (K,) over a horizon (s), from a period's number on."""
         rounds = 1 if self.period is None else int(np.floor(horizon / self.period)) + 1
         begins = (first + np.arange(rounds)) * (self.period or 0.0)
         times = (begins[:, None] + self.starts).reshape(-1)
@@ -106,11 +103,7 @@ class United(NamedTuple):
 def unite(
     stretches: Sequence[Stretch], agents: int | None, period: float | None, directed: bool
 ) -> United:
-    """Return the edges of all stretches, each once, and their schedule.
-
-    Raises:
-        GraphError: a stretch has an invalid edge, or the times do not ascend from 0.
-    """
+    """Return the edges of all stretches, each once, and their schedule; `GraphError` if invalid."""
     starts = np.array([at for at, _ in stretches], float)
     _check_times(starts, period)
     read = [split_weights(edges) for _, edges in stretches]

@@ -68,11 +68,7 @@ class Targets(NamedTuple):
 
 
 def reference_targets(model: ControlAffine, reference: Guide | None, times: Array) -> Targets:
-    """Return the targets of a leader: its reference by the model's flatness map, or its trim.
-
-    Raises:
-        PlanError: the model has no such map, or the reference is not finite.
-    """
+    """Return a leader's targets: its reference by `flat`, or its trim; else raise `PlanError`."""
     # Without a reference a leader stays at rest, at its trim.
     if reference is None:
         x = np.tile(np.asarray(model.trim[0], float), (len(times), 1))
@@ -98,10 +94,7 @@ def shifted_targets(model: ControlAffine, targets: Targets, offset: Array) -> Ta
 
 
 def mean_targets(model: ControlAffine, states: Array, inputs: Array, share: Array) -> Targets:
-    """Return the mean of targets with states (J, T, n) and inputs (J, T, m), by shares (J,).
-
-    A sum of squared errors to several targets equals that to their mean plus a constant.
-    """
+    """Return the mean of targets (J, T, ..) by shares (J,): errors to both differ by a constant."""
     return _targets(model, np.tensordot(share, states, 1), np.tensordot(share, inputs, 1))
 
 
@@ -160,14 +153,7 @@ _NEAR = 1e-3
 def reference_demand(
     model: ControlAffine, reference: Guide, horizon: float, samples: int = _SAMPLES
 ) -> ReferenceDemand:
-    """Return the demand of a reference on a model that can be led along it.
-
-    Args:
-        model: the agent.
-        reference: to be followed exactly.
-        horizon: s.
-        samples: number of times at which the demand is computed.
-    """
+    """Return the demand of a reference on a model that it can lead, over a horizon (s)."""
     near = min(_NEAR, 1e-2 * horizon)
     times = np.linspace(near, horizon - near, samples)
     with precision("float64"):
@@ -197,14 +183,7 @@ def reference_demand(
 def reference_warnings(
     model: ControlAffine, reference: Guide, horizon: float, limits: bool = True
 ) -> tuple[str, ...]:
-    """Return one sentence with its numbers for each fault of a reference.
-
-    Args:
-        model: the agent; it can be led along the reference.
-        reference: to be followed exactly.
-        horizon: s.
-        limits: whether the actuators' limits apply.
-    """
+    """Return one sentence with its numbers for each fault of a reference that leads a model."""
     required, model_name = reference_demand(model, reference, horizon), type(model).__name__
     name, warnings = type(reference).__name__, [*reference.remarks()]
     times = np.linspace(0.0, horizon, _SAMPLES)
@@ -291,10 +270,7 @@ def flat_inputs(model: ControlAffine, reference: Guide, times: Array) -> Array:
 
 
 def demand(model: ControlAffine, inputs: Array) -> Array:
-    """Return the share of the actuators' range about the trim that each input (T, m) uses, (T,).
-
-    One is the limit; without limits it is zero.
-    """
+    """Return the used share (T,) of the actuators' range about the trim; 0 without limits."""
     if model.input_limits is None:
         return np.zeros(len(inputs))
     G, low, high = (np.asarray(part, float) for part in model.input_limits)

@@ -46,19 +46,11 @@ class Guide(Declared):
 
     @abc.abstractmethod
     def check(self) -> None:
-        """Check the values that the reference returns.
-
-        Raises:
-            ReferenceError: it is malformed.
-        """
+        """Raise `ReferenceError` if the values that the reference returns are malformed."""
 
     @abc.abstractmethod
     def fit(self, model: ControlAffine) -> None:
-        """Check that a model can be led along it.
-
-        Raises:
-            LawError: it cannot; the message says why.
-        """
+        """Raise `LawError`, which says why, unless a model can be led along it."""
 
 
 # ---- a path in space -----------------------------------------------------------------------------
@@ -206,22 +198,14 @@ def numbers_of(value: object) -> Array:
 
 
 def check_kind_of(reference: object) -> None:
-    """Check that a value is a reference.
-
-    Raises:
-        ReferenceError: it is not.
-    """
+    """Raise `ReferenceError` unless a value is a reference."""
     # A path of states is one too, but users know the name `Reference`.
     kind = Guide if isinstance(reference, Guide) else Reference
     check_kind("reference", reference, kind, ReferenceError)
 
 
 def check_reference(reference: Guide) -> None:
-    """Check that a value is a reference, and the values that it returns.
-
-    Raises:
-        ReferenceError: it is none, or returns anything but (x, y, z, yaw).
-    """
+    """Raise `ReferenceError` unless a value is a reference, which returns what it must."""
     check_kind_of(reference)
     reference.check()
 

@@ -63,11 +63,7 @@ class Estimator(eqx.Module):
 
     @classmethod
     def of(cls, model: ControlAffine, std: Float[Array, " n"], late: int, dt: float) -> "Estimator":
-        """Return the filter of a model whose states are measured with deviations (n,).
-
-        Raises:
-            SimulationError: the Riccati equation has no solution.
-        """
+        """Return the filter for measurements with deviations (n,), else raise `SimulationError`."""
         n, names = len(model.state_names), model.state_groups.get("velocity", ())
         pushed = tuple(model.state_names.index(name) for name in names)
         A, B = linearize(model)
@@ -99,10 +95,7 @@ class Estimator(eqx.Module):
     def measure(
         self, model: ControlAffine, before: Estimate, y: State, first: jax.Array
     ) -> tuple[State, Estimate]:
-        """Return the state now, and the estimate as of a measurement y (n,).
-
-        The `first` one is taken as it is.
-        """
+        """Return the state now and the estimate at a measurement y (n,), the `first` as it is."""
         x = jnp.where(first, y, self._moved(model, before.x, before.push, before.inputs[0]))
         more = jnp.asarray(self.gain, x.dtype) @ model.difference(y, x)
         x, push = x + more[: len(x)], before.push + more[len(x) :]

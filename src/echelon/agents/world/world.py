@@ -71,11 +71,7 @@ def _scale_value(value: Any, factor: float) -> Any:
 
 
 def check_plant(model: ControlAffine, plant: ControlAffine) -> None:
-    """Check that a plant has the states and inputs of the model.
-
-    Raises:
-        ModelError: it does not.
-    """
+    """Raise `ModelError` unless a plant has the states and inputs of the model."""
     for what in ("state_names", "input_names"):
         expected, got = getattr(model, what), getattr(plant, what)
         if expected != got:

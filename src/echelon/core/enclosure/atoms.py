@@ -324,11 +324,7 @@ class Atom:
 
     @property
     def reach(self) -> Interval:
-        """Return the range.
-
-        Raises:
-            OpenError: the atom has none.
-        """
+        """Return the range; raise `OpenError` if there is none."""
         if self.interval is None:
             raise OpenError(self.name)
         return self.interval
@@ -364,10 +360,7 @@ class Atoms:
         return Polynomial({((atom, 1),): Fraction(1)})
 
     def fresh(self, key: object, interval: Interval, *behind: Polynomial) -> Polynomial:
-        """Return a variable for a value of which only the range is known.
-
-        The same `key` gives the same variable; a range of one point gives a number.
-        """
+        """Return a variable of a known range, one for each `key`; a number if that is one point."""
         # A constant keeps polynomials short and does not double the vertices of a hull.
         if interval.lo == interval.hi:
             return constant(interval.lo)
@@ -432,11 +425,7 @@ class Atoms:
         return frozenset().union(*(self.known[atom].sources for atom in p.exponents()))
 
     def elementary(self, name: str, p: Polynomial) -> Polynomial:
-        """Return a function of `ELEMENTARY` of a polynomial.
-
-        Raises:
-            GainError: it is not defined on the whole box.
-        """
+        """Return a function of `ELEMENTARY`; `GainError` if it is not defined on the whole box."""
         function, interval = ELEMENTARY[name], self.range(p)
         if not function.defined(interval):
             verb = "divides by" if name == "reciprocal" else f"takes `{name}` of"
@@ -562,11 +551,7 @@ def _wave_corners(arc: Interval, waves: list[Wave]) -> list[dict[Exponent, Fract
 
 
 def check_count(count: int) -> None:
-    """Check the number of vertices of a hull.
-
-    Raises:
-        GainError: there are more than `MOST_VERTICES`.
-    """
+    """Raise `GainError` if a hull has more than `MOST_VERTICES` vertices."""
     if count > MOST_VERTICES:
         raise GainError(
             f"the hull of Jacobians has {count} vertices, and may have {MOST_VERTICES}; "

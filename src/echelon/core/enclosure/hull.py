@@ -131,14 +131,7 @@ def slope_hull(
 
 
 def slope_columns(function: _Function, states: Box, inputs: Box) -> tuple[int, ...]:
-    """Return the entries of x in which a function (x, v) -> (k,) has slope 0 on the whole box.
-
-    No vertices are built, so the number of other slopes does not matter.
-
-    Raises:
-        OpenError: the slopes depend on an entry that the box leaves open.
-        GainError: as in `slope_hull`.
-    """
+    """Return the entries of x in which a function (x, v) -> (k,) has slope 0; as `slope_hull`."""
     atoms = Atoms()
     x, v = _variables(atoms, states, inputs, ())
     values = _evaluate(function, _sloped(x), map_entries(number, v), atoms)

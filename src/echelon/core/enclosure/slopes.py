@@ -182,10 +182,7 @@ _ANSWERS = bool | np.bool_ | Switch
 
 
 def slopes_in(atoms: Atoms) -> Algebra:
-    """Return the algebra of values with their slopes.
-
-    Evaluating in it raises `GainError` where a function has no enclosure, or no slope.
-    """
+    """Return the algebra of values with slopes; it raises `GainError` where one is missing."""
     bound = {name: functools.partial(rule, atoms) for name, rule in _RULES.items()}
     return Algebra({**bound, **_SUMS}, number, _lift, rules.outside, _fold)
 

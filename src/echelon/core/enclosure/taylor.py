@@ -219,11 +219,7 @@ def _applied(name: str, ends: Ends) -> Ends:
 
 
 def power(x: Series, exponent: Series | int) -> Series:
-    """Return x to a constant exponent.
-
-    Raises:
-        GainError: the exponent varies.
-    """
+    """Return x to a constant exponent; raise `GainError` if it varies."""
     k = exponent if isinstance(exponent, Series) else number(int(exponent), x.order)
     if k.moves:
         raise GainError("a path has an exponent that varies in time, which has no enclosure.")
@@ -464,11 +460,7 @@ class EnclosedPiece(NamedTuple):
 def enclose_finely(
     function: Callable[[jax.Array], jax.Array], times: Sequence[Fraction], order: int
 ) -> Iterator[EnclosedPiece]:
-    """Yield enclosures as `enclose_derivatives` does, of pieces halved where there are none.
-
-    Raises:
-        GainError: a piece of 0.1 ms has none, or so many pieces are not enough.
-    """
+    """Yield as `enclose_derivatives`, in pieces halved where there are none, to 0.1 ms."""
     spans, count = list(zip(times, times[1:], strict=False))[::-1], 0
     while spans:
         low, high = spans.pop()

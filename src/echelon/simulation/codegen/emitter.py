@@ -292,12 +292,7 @@ def general_case(results: Sequence[Node]) -> Mapping[Node, Node]:
 
 
 def find_fast_path(results: Sequence[Node], choices: Iterable[tuple[Node, bool]]) -> FastPath:
-    """Return each node with every unlikely truth assumed not to hold.
-
-    Args:
-        results: of the step.
-        choices: further truths, and for each whether it is unlikely to hold, or not to hold.
-    """
+    """Return each node with every unlikely truth assumed not to hold, `choices` included."""
     sides, depths, excluded = dict(choices), dict[Node, int](), list[tuple[int, Node]]()
 
     def assume(node: Node, args: Sequence[Node]) -> Node | bool | None:

@@ -346,11 +346,7 @@ def _shuffle(w: Writer, a: str, b: str, order: Sequence[int]) -> str:
 
 
 def measure_edges(w: Writer, context: Context, start: str, end: str) -> None:
-    """Write the loop that adds up by how much distances along edges differ from the formation's.
-
-    A block of edges has the differences of their goals, row by row, the distances of these, and the
-    sums.
-    """
+    """Write the loop that adds up by how much distances along edges differ from their goals'."""
     plan, slots, axes = context.plan, context.slots, context.plan.edges
     with loop(w, start, end) as (block, _, _):
         base = w.part(slots["edges"], block, (len(axes) + 2) * plan.lanes)

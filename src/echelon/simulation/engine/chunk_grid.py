@@ -64,10 +64,7 @@ class ChunkGrid:
 def advance_until_lost(
     stepper: Stepper, now: Moment, counts: Array, reference: Array | None, formations: int
 ) -> tuple[Chunk, Array]:
-    """Return a chunk, and the steps after each of its points.
-
-    If formations diverge in it, there is a point at the first step at which each is not finite.
-    """
+    """Return a chunk and the steps after its points, one of them where a formation diverges."""
     chunk = stepper.advance(now, counts, reference)
     if not stepper.repeats or np.isfinite(np.asarray(chunk.now.states)).all():
         return chunk, counts

@@ -100,10 +100,7 @@ class FrameNumbers(abc.ABC):
 
     @property
     def errors(self) -> Float[Array, "T N n"]:
-        """Deviation of each agent from its goal relative to its nearest leader.
-
-        The leaders' rows are zero.
-        """
+        """Deviation of each agent from its goal relative to its nearest leader; 0 of leaders."""
         return self.deviations()
 
     @property

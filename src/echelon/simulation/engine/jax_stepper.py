@@ -94,13 +94,7 @@ class JaxStepper(Stepper):
 
 @final
 class JaxFormations(Stepper):
-    """Steps many formations whose loops differ in numbers alone, each as if it were alone.
-
-    Args:
-        loops: of each formation.
-        states: (N, n) at the beginning, formation by formation.
-        reason: as in `JaxStepper`.
-    """
+    """Steps many formations whose loops differ in numbers alone, each as if it were alone."""
 
     def __init__(self, loops: Sequence[Loop], states: Array, reason: str = "") -> None:
         self.count, self.states, self.reason = len(loops), states, reason
@@ -172,11 +166,7 @@ def _differ(leaves: Sequence[object]) -> bool:
 
 
 def mesh_of(devices: int, agents: int) -> Mesh:
-    """Return a row of devices, over which the agents are spread.
-
-    Raises:
-        SimulationError: JAX has fewer, or the number of agents is no multiple of them.
-    """
+    """Return a row of devices; `SimulationError` if JAX has fewer, or agents are no multiple."""
     available = jax.devices()
     if devices > len(available):
         raise SimulationError(

@@ -339,10 +339,7 @@ def choose_engine(
 
 
 def worth_native(settings: Settings, agents: int) -> bool:
-    """Tell whether native code steps the agents: if it is requested, or saves time.
-
-    It computes on processors alone.
-    """
+    """Tell whether native code is requested, or saves time; it computes on processors alone."""
     if settings.engine != "auto":
         return settings.engine == "native"
     if settings.devices > 1 or not is_long(settings, agents):

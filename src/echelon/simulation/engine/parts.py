@@ -32,11 +32,7 @@ Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.nd
 def read_states(
     values: object, shape: tuple[int, ...], what: str, meaning: str
 ) -> Float[Array, "..."]:
-    """Return a copy of given states, after checking them; `what` and `meaning` are for messages.
-
-    Raises:
-        SimulationError: they have another shape, or are not finite.
-    """
+    """Return a checked copy of states, else `SimulationError` with `what` and `meaning`."""
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):

@@ -130,11 +130,7 @@ def channel_of(parts: Parts, settings: Settings) -> Channel | None:
 
 
 def check_engine(parts: Parts, settings: Settings) -> None:
-    """Check, before anything is compiled, that the engine which is requested can step the agents.
-
-    Raises:
-        EchelonError: it cannot, or a part is malformed or does not fit the others.
-    """
+    """Raise `EchelonError`, before compiling, unless the requested engine can step the agents."""
     if settings.engine == "native":
         prepared = prepare(parts, settings)
         with precision("float64"):
@@ -142,11 +138,7 @@ def check_engine(parts: Parts, settings: Settings) -> None:
 
 
 def check_memory(model: ControlAffine, agents: int, settings: Settings) -> None:
-    """Check that memory suffices for what a run of so many agents stores.
-
-    Raises:
-        SimulationError: it does not; the text says how many frames would fit.
-    """
+    """Raise `SimulationError`, with how many frames would fit, unless memory suffices for a run."""
     n, m = len(model.state_names), len(model.input_names)
     every = settings.store_every
     # The last term is the reference.

@@ -122,10 +122,7 @@ class Recorder:
         return self.complete or stopped or not self._finite.any()
 
     def keep(self, chunk: Chunk, counts: Array, reference: Array | None, seconds: float) -> None:
-        """Keep the stretch of a chunk with so many steps after each point.
-
-        It followed a reference (S, n) step by step.
-        """
+        """Keep the stretch of a chunk with steps after its points, along a reference (S, n)."""
         first = self.done
         # One that stopped has fewer points.
         points = (first + np.cumsum(counts) - counts)[: len(chunk.states)]
@@ -250,14 +247,7 @@ def _role(problem: Problem, agent: int) -> str:
 
 
 def inside_at_last(meter: Meter, inside: Array, last: Array, steps: int) -> Array:
-    """Return `Sums.inside` (..., N, k) with the moment of the last step's end, which begins none.
-
-    Args:
-        meter: of the run.
-        inside: as it was counted at the beginning of each step.
-        last: the states (..., N, n) at the end.
-        steps: of the run.
-    """
+    """Return `Sums.inside` (..., N, k) with the last moment, which begins no step."""
     beyond = outside(last[..., meter.charted], *meter.chart.T)
     return np.minimum(inside, np.where(beyond, steps, ALWAYS))
 

@@ -25,12 +25,7 @@ from echelon.simulation.step.solver_stats import SolverStats
 
 @final
 class RunSoFar:
-    """A run in progress, as passed to callbacks.
-
-    Attributes:
-        done: how many steps were taken.
-        steps: of the whole run.
-    """
+    """A run in progress, as passed to callbacks: `done` of so many `steps` were taken."""
 
     def __init__(self, prepared: Prepared, recorder: Recorder, stepper: Stepper) -> None:
         self._prepared, self._recorder, self._stepper = prepared, recorder, stepper
@@ -124,16 +119,7 @@ def _mixed_tables() -> Iterator[None]:
 
 
 def reassemble(parts: Parts, settings: Settings, stretches: Sequence[Stretch]) -> Result:
-    """Return the result of a run that was ended from outside.
-
-    Args:
-        parts: those of the run.
-        settings: those of the run.
-        stretches: all that it gave to `keep`.
-
-    Raises:
-        EchelonError: as in `simulate`.
-    """
+    """Return the result of a run, ended from outside, from all stretches that it gave to `keep`."""
     prepared = prepare(parts, settings)
     with precision("float64"):
         stepper = prepared.parts.drive.stepper(prepared.problem)

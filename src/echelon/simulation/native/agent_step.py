@@ -69,11 +69,7 @@ class BlockRows(NamedTuple):
 
     @classmethod
     def of(cls, loop: Loop, varying: int = 0) -> "BlockRows":
-        """Return the rows of a loop of which so many numbers differ between formations.
-
-        Raises:
-            Unsupported: the memory of a law is not made of numbers, or messages take time.
-        """
+        """Return a loop's rows; `Unsupported` if memory is not numbers, or messages take time."""
         check_information(loop)
         if not loop.motion.ideal:
             raise Unsupported(
@@ -91,11 +87,7 @@ class BlockRows(NamedTuple):
 
 
 def check_information(loop: Loop) -> None:
-    """Check that agents know exact states, current messages, and nothing else.
-
-    Raises:
-        Unsupported: they do not.
-    """
+    """Raise `Unsupported` unless agents know exact states, current messages, and nothing else."""
     if loop.moving is not None:
         raise Unsupported("formations that change with time")
     if loop.channel is not None:
@@ -106,11 +98,7 @@ def check_information(loop: Loop) -> None:
 
 
 def check_distances(loop: Loop) -> None:
-    """Check that agents keep no distances from each other, are always there and have no heirs.
-
-    Raises:
-        Unsupported: they are not so.
-    """
+    """Raise `Unsupported` if agents keep distances, come or go, or have heirs."""
     for part, text in (
         (loop.follower.safety, "agents that keep away from each other"),
         (loop.presence or loop.succession, "agents that are lost, join or take the lead"),
@@ -120,11 +108,7 @@ def check_distances(loop: Loop) -> None:
 
 
 def memory_size(law: Law) -> int:
-    """Return how many numbers the memory of one agent under a law has.
-
-    Raises:
-        Unsupported: it is not made of numbers, such as a random key.
-    """
+    """Return how many numbers a law's memory has; `Unsupported` of others, as a random key."""
     leaves = jax.tree.leaves(jax.eval_shape(law.init))
     for leaf in leaves:
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -383,11 +367,7 @@ _SIZES = (1e9, 1e6, 1e3)
 
 
 def exceptions_of(graph: ScalarGraph, body: Body) -> list[Node]:
-    """Return where the numbers of an agent are not what JAX computes.
-
-    Raises:
-        Unsupported: nothing is known of the angles in a difference.
-    """
+    """Return where an agent's numbers are not what JAX computes; `Unsupported` if not known."""
     truths, false = graph.exceptions_of(body.results()), graph.constant(False)
     truths += _between(graph, body)
     uniform = [truth for truth in truths if truth.uniform]

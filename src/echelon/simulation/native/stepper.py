@@ -222,10 +222,7 @@ class NativeStepper(Stepper):
         self._hold = hold
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
-        """Take steps, one draw of the wind and one stretch of the graph after the other.
-
-        The inputs of the first step are then in the rows.
-        """
+        """Take steps by draws of wind and stretches of the graph, with first inputs in the rows."""
         wind, input_step = self.loop.motion.wind, step
         most = _TASKS // len(self.places.segments)
         if self.plan.leaders_ahead:

@@ -94,10 +94,7 @@ class ThreadPool:
         share(self.pool, run_groups, np.array_split(groups, min(len(groups), 8)))
 
     def copy(self, blocks: Array, rows: range, values: Array, inward: bool = False) -> None:
-        """Read rows of blocks into values of the agents (N, rows), or write them there (`inward`).
-
-        The values are contiguous and of the precision of the blocks, or float64 to read into.
-        """
+        """Read rows of blocks into (N, rows), of their precision or float64; `inward` writes."""
         count, part = len(blocks), blocks[:, rows.start : rows.stop]
         pool = self._workers or self.pool
 
@@ -147,10 +144,7 @@ class ThreadPool:
 
 
 def share(pool: Executor, act: Callable[[_Part], None], parts: Iterable[_Part]) -> None:
-    """Let threads act on a part each: all of them or, if Ctrl-C comes before, none.
-
-    Otherwise those that began would wait forever for those that did not.
-    """
+    """Let all threads act, or none if Ctrl-C comes before: some would wait for the others."""
     gate, all_submitted, futures = Event(), list[bool](), list[Future[None]]()
 
     def begin(part: _Part) -> None:

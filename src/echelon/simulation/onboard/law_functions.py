@@ -79,12 +79,7 @@ class LawFunction(NamedTuple):
 
 
 def law_functions(own: OwnLaw, bits: int = 64) -> dict[str, LawFunction]:
-    """Return what an agent computes, by name, in double or single precision (64 or 32 bits).
-
-    Raises:
-        Unsupported: the agent needs more than them, or its law has no scalar operations; with the
-            file and line of a user's code.
-    """
+    """Return what an agent computes, in 64 or 32 bits; else `Unsupported`, with the user's line."""
     check_distances(own.loop)
     return {function.name: function for function in _Traces(own, bits).all()}
 
@@ -400,11 +395,7 @@ def message_words(own: OwnLaw) -> list[str]:
 
 
 def move_function(motion: Motion) -> LawFunction:
-    """Return `move`: how one agent moves in a step of its own motion, under its actuators.
-
-    Raises:
-        Unsupported: the plant has no scalar operations; with the file and line of a user's code.
-    """
+    """Return `move`, a step of an agent's own motion; else `Unsupported`, with the user's line."""
     plant, lags = motion.plant, motion.motors is not None and motion.motors.lag is not None
     n, m = len(plant.state_names), len(plant.input_names)
 

@@ -25,11 +25,7 @@ Expression: TypeAlias = "SX | float"
 
 
 def casadi() -> ModuleType:
-    """Return the library.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """Return the library; raise `MissingExtraError` if it is not installed."""
     # Here, since it comes with an extra, and takes long to load.
     try:
         import casadi

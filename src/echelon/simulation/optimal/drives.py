@@ -182,11 +182,7 @@ class _Planners:
         return solver_stats("mpc", self.mpc.solver, *work)
 
     def __call__(self, step: int, states: Array) -> Array:
-        """Return the desired inputs (N, m) of all agents, planned in the order of the graph.
-
-        Raises:
-            Stopped: a solver failed, and `on_failure` is `stop`.
-        """
+        """Return the inputs (N, m) in the graph's order; `Stopped` if a solver fails so."""
         inputs = np.zeros((len(states), self.horizon.m))
         for agent, earlier, share in self.turns:
             targets = self._targets(agent, earlier, share, step // self.hold)
@@ -254,11 +250,7 @@ _PLANS = 64
 
 @final
 class HeldInput(Law):
-    """u = the input (m,) in the agent's memory, which the pilot writes.
-
-    Args:
-        size: m.
-    """
+    """u = the input (m,) in the agent's memory, which the pilot writes."""
 
     size: int = eqx.field(static=True)
 
@@ -310,11 +302,7 @@ class HostStepper(Stepper):
         return self.hold * max(1, _PLANS // len(self.states))
 
     def recall(self, leaves: Sequence[Array]) -> Moment:
-        """Raise an error, since the plans of a pilot are not part of a moment.
-
-        Raises:
-            SimulationError: always.
-        """
+        """Raise `SimulationError`: the plans of a pilot are not part of a moment."""
         raise SimulationError(
             "a run with planned inputs cannot be continued from stored data; start it again."
         )

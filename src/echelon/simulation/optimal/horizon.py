@@ -137,15 +137,7 @@ class Horizon:
     """
 
     def __init__(self, model: ControlAffine, mpc: MPC, steps: int, dt: float, limits: bool) -> None:
-        """Build the quadratic program.
-
-        Args:
-            model: of the agent.
-            mpc: the horizon.
-            steps: of the horizon's grid.
-            dt: of that grid, s.
-            limits: whether the actuators' limits are constraints.
-        """
+        """Build the quadratic program for a grid of `steps` of dt (s)."""
         self.steps, self.dt = steps, dt
         self.n, self.m = len(model.state_names), len(model.input_names)
         Q, R = mpc.weights(model)
@@ -238,11 +230,7 @@ def _limit_rows(model: ControlAffine, limits: bool) -> tuple[Array, Array, Array
 def _assembly(
     model: ControlAffine, steps: int, dt: float, rows: Array
 ) -> "tuple[Function, Function]":
-    """Return the flow (x, v) -> x after dt, and the function of the equations along a course.
-
-    The latter takes states (n, N) and inputs (m, N), and returns the matrix of the program and the
-    right-hand side (n, N) of its equations.
-    """
+    """Return the flow (x, v) -> x, and (states (n, N), inputs (m, N)) -> matrix and rhs (n, N)."""
     ca, n, m = casadi(), len(model.state_names), len(model.input_names)
     x, v = ca.SX.sym("x", n), ca.SX.sym("v", m)
     owner = type(model).__name__

@@ -447,10 +447,7 @@ def _shifted_chebyshev(degree: int, width: Fraction) -> list[Fraction]:
 
 @functools.cache
 def economized(series: Callable[[int], Fraction], width: float, tolerance: float) -> list[float]:
-    """Return coefficients, lowest first, with an error below a tolerance for s in [0, width].
-
-    `series(k)` is the Taylor coefficient of s^k.
-    """
+    """Return coefficients of sum series(k) s^k, lowest first, within a tolerance on [0, width]."""
     end, rest, count = Fraction(width), Fraction(tolerance), 1
     while abs(series(count)) * end**count > rest / 8:
         count += 1

@@ -56,16 +56,7 @@ from echelon.simulation.scalars.whole_numbers import WHOLE_NUMBERS, TypeRules
 def lower(
     function: Callable[..., PyTree], graph: ScalarGraph, arguments: Sequence[PyTree]
 ) -> Arrays:
-    """Return the results of a function for JAX, flattened, as arrays of nodes and numbers.
-
-    Args:
-        function: takes arrays and returns a tree of arrays.
-        graph: that the nodes belong to.
-        arguments: trees of arrays of nodes (of dtype object), or of plain numbers.
-
-    Raises:
-        Unsupported: a primitive has no scalar operations.
-    """
+    """Return results of a JAX function, flattened, as nodes and numbers; or raise `Unsupported`."""
     leaves, tree = jax.tree.flatten(list(arguments), is_leaf=lambda a: isinstance(a, np.ndarray))
     # In the precision of the run: a user's function may ask for it (`x.dtype`).
     name: Precision = "float64" if graph.bits == 64 else "float32"

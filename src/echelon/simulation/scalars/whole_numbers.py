@@ -97,21 +97,13 @@ def may_be_exception(graph: ScalarGraph, node: Node, size: float) -> bool:
 
 
 class TypeRules:
-    """Checks the results of each equation of a trace, and gives them the range of their type.
-
-    Args:
-        graph: of the results.
-    """
+    """Checks the results of each equation of a trace, and gives them the range of their type."""
 
     def __init__(self, graph: ScalarGraph) -> None:
         self.graph, self._checked = graph, len(graph.nodes)
 
     def __call__(self, equation: JaxprEqn, results: Arrays) -> Arrays:
-        """Return the results of an equation with the rounding, or wrapping, of their type.
-
-        Raises:
-            Unsupported: there is no native code for one.
-        """
+        """Return results with the rounding, or wrapping, of their type; or raise `Unsupported`."""
         new, name = self.graph.nodes[self._checked :], equation.primitive.name
         if not all(map(_is_well_typed, new)):
             raise Unsupported(f"`{name}` of truths{where(equation)}")

@@ -86,10 +86,7 @@ class Loop(eqx.Module):
 def offsets_at(
     loop: Loop, law: Law, t: Scalar, agents: Array | jax.Array
 ) -> tuple[Float[jax.Array, "K n"], Float[jax.Array, "K n"] | None]:
-    """Return what agents (K,) under a law take for their offsets at a time (s), and the rates.
-
-    There are no rates of constant offsets, or where the law does not use them.
-    """
+    """Return offsets of agents (K,) at a time (s), and their rates if a law uses moving ones."""
     offsets, motion = jnp.asarray(loop.offsets, t.dtype)[agents], loop.moving
     if motion is None:
         return offsets, None

@@ -51,15 +51,7 @@ def look_around(
     knowledge: Knowledge | None,
     mail: Mail | None,
 ) -> tuple[Near | None, Sightings | None]:
-    """Return what each agent knows of all others, rows (N, N - 1, ..), and the messages after it.
-
-    Args:
-        loop: of the run.
-        now: the moment, as agents measure it.
-        leads: who leads.
-        knowledge: of the agents; None in the ideal network.
-        mail: likewise.
-    """
+    """Return what each agent knows of all others (N, N - 1, ..), and the messages after it."""
     if loop.follower.safety is None:
         return None, None
     hulls, agents = all_hulls(loop, now), len(loop.order)

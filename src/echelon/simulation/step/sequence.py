@@ -317,10 +317,7 @@ def _move(loop: Loop, now: Moment, acted: Control) -> Moment:
 def measured_step(
     loop: Loop, now: Moment, reference: Array | None, first: jax.Array | int
 ) -> tuple[Moment, Sums]:
-    """Return the moment one dt later, and the sums of this step.
-
-    `reference` (S, n) is what the leaders follow from the step `first` on.
-    """
+    """Return the moment one dt later and its sums; `reference` (S, n) starts at step `first`."""
     now = _with_arrivals(loop, now)
     acted = control(loop, now)
     followed = reference_at(reference, now.step - first, now.states)
