@@ -2,6 +2,7 @@
 
 import numbers
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -171,10 +172,12 @@ def read_matrices(file: PathLike) -> dict[str, Array]:
             f"`{file}` lacks {listing(missing)} and {held}; save the matrices by themselves, as in "
             "`save('plant.mat', 'A', 'B', 'C', 'D')`."
         )
-    return {name: _dense(content[name]) for name in _NAMES if name in names}
+    # MATLAB may have stored a matrix as a sparse one.
+    held = {name: content[name] for name in _NAMES if name in names}
+    return {k: np.asarray(m.toarray() if hasattr(m, "toarray") else m) for k, m in held.items()}
 
 
-def _content(file: PathLike) -> Mapping[str, object]:
+def _content(file: PathLike) -> Mapping[str, Any]:
     # Imported here: few models are in files, and SciPy's readers load slowly.
     from scipy.io import loadmat
 
@@ -188,11 +191,6 @@ def _content(file: PathLike) -> Mapping[str, object]:
         raise ModelError(f"`{file}` cannot be read: {error.strerror or error}.") from None
     except Exception as error:  # SciPy raises whatever a damaged file causes
         raise ModelError(f"`{file}` is not a MATLAB file that can be read: {error}.") from None
-
-
-def _dense(value: object) -> Array:
-    to_array = getattr(value, "toarray", None)
-    return np.asarray(value if to_array is None else to_array())
 
 
 # ---- a linear agent ------------------------------------------------------------------------------

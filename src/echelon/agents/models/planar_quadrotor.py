@@ -157,19 +157,10 @@ class LinearPlanarQuadrotor(ControlAffine):
     position = ("y", "z")
     radius = 0.07  # of the Crazyflie with its propellers
     state_groups = {"position": ("y", "z"), "velocity": ("vy", "vz")}
+    trim, input_scale = PlanarQuadrotor.trim, PlanarQuadrotor.input_scale
 
     def __check_init__(self) -> None:
         check_positive(self, mass=self.mass, inertia=self.inertia, gravity=self.gravity)
-
-    @property
-    def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Hover at the origin."""
-        return (0.0,) * 6, (self.mass * self.gravity, 0.0)
-
-    @property
-    def input_scale(self) -> tuple[tuple[float, ...], ...]:
-        """S = diag(m, Ixx)."""
-        return diagonal(self.mass, self.inertia)
 
     @property
     def input_limits(self) -> Limits:

@@ -74,10 +74,7 @@ class QuadrotorEuler(RigidVehicle):
         return jnp.concatenate([nothing, lift, nothing, spin])
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
-        """Return the state and input that fly a path (x, y, z, yaw).
-
-        The path is given with its first four derivatives, (5, 4).
-        """
+        """Return the state and input that fly a path (x, y, z, yaw) with derivatives, (5, 4)."""
         x, thrust, bend = flown_along(derivatives, self.gravity)
         return x, jnp.append(thrust[0], bend)
 
@@ -114,10 +111,7 @@ class QuadrotorThrust(RigidVehicle):
         return jnp.concatenate([jnp.zeros((9, 4), x.dtype), spin, thrust])
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
-        """Return the state and input that fly a path (x, y, z, yaw).
-
-        The path is given with its first four derivatives, (5, 4).
-        """
+        """Return the state and input that fly a path (x, y, z, yaw) with derivatives, (5, 4)."""
         x, thrust, bend = flown_along(derivatives, self.gravity)
         return jnp.append(x, thrust[0]), jnp.append(thrust[1], bend)
 
@@ -242,10 +236,7 @@ class CrazyflieAttitude(RigidVehicle):
         return jnp.concatenate([nothing, lift, nothing, turn])
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
-        """Return the state and input that fly a path (x, y, z, yaw).
-
-        The path is given with its first four derivatives, (5, 4).
-        """
+        """Return the state and input that fly a path (x, y, z, yaw) with derivatives, (5, 4)."""
         x, thrust, bend = flown_along(derivatives, self.gravity)
         back = self.stiffness * x[6:8] + self.rate_damping * x[9:11]
         tilt = (bend[:2] + back) / self.command_gain

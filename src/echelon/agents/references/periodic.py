@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from echelon.agents.references.reference import Reference, check_finite, in_space, yaw_at
+from echelon.agents.references.reference import Reference, check_finite, in_space
 from echelon.core.types import Scalar
 
 # ---- straight ------------------------------------------------------------------------------------
@@ -27,7 +27,7 @@ class Hover(Reference):
     def __call__(self, t: Scalar) -> jax.Array:
         """Return the point at time t."""
         # In the precision of t, which is that of the run.
-        return in_space(jnp.asarray(self.position, t.dtype), yaw_at(self, t))
+        return in_space(jnp.asarray(self.position, t.dtype), self.yaw + self.yaw_rate * t)
 
 
 class Line(Reference):
@@ -45,7 +45,7 @@ class Line(Reference):
         """Return the point at time t."""
         return in_space(
             jnp.asarray(self.start, t.dtype) + t * jnp.asarray(self.velocity, t.dtype),
-            yaw_at(self, t),
+            self.yaw + self.yaw_rate * t,
         )
 
 
@@ -83,7 +83,7 @@ class Periodic(Reference):
         cx, cy, cz = self.center
         # Plain numbers would stack in a type of their own, and not in that of t.
         zero = jnp.zeros_like(x)
-        return jnp.stack([cx + x, cy + y, cz + zero, yaw_at(self, t) + zero])
+        return jnp.stack([cx + x, cy + y, cz + zero, self.yaw + self.yaw_rate * t + zero])
 
 
 class Lemniscate(Periodic):

@@ -3,7 +3,7 @@
 import abc
 import functools
 from collections.abc import Callable, Sequence
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -208,25 +208,6 @@ def check_reference(reference: Guide) -> None:
     """Raise `ReferenceError` unless a value is a reference, which returns what it must."""
     check_kind_of(reference)
     reference.check()
-
-
-class Yawing(Protocol):
-    """A path whose yaw (rad) grows at a constant rate (rad/s)."""
-
-    @property
-    def yaw(self) -> float:
-        """At time 0."""
-        ...
-
-    @property
-    def yaw_rate(self) -> float:
-        """Of its growth."""
-        ...
-
-
-def yaw_at(path: Yawing, t: Scalar) -> jax.Array:
-    """Return the yaw (rad) of a path at time t."""
-    return path.yaw + path.yaw_rate * t
 
 
 def in_space(point: jax.Array, yaw: float | jax.Array) -> jax.Array:

@@ -62,7 +62,8 @@ def program(plan: Plan) -> str:
     attributes = f"attributes #0 = {{ nounwind noinline {width} {_ATTRIBUTES} }}"
     # The weights of a branch that is hardly ever taken.
     unlikely = '!0 = !{!"branch_weights", i32 1, i32 1000}'
-    parts = [*sorted(w.declared), "", head, *w.lines, "}", "", _entry()]
+    run = _ENTRIES.get(platform.machine(), _OTHER)
+    parts = [*sorted(w.declared), "", head, *w.lines, "}", "", run]
     return "\n".join([*parts, "", attributes, unlikely, ""])
 
 
@@ -113,7 +114,11 @@ def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
         w.label(follow)
         if plan.edges:
             measure_edges(w, context, task["first_edge"], task["last_edge"])
-        context = _with_uniform(w, context, plan.others)
+        # In the loop, LLVM would load it again after every store, which might change it.
+        leaves = [n.value for n in needed(plan.others.results()) if n.op == "leaf"]
+        uniform = [value for value in leaves if value[0] == "uniform"][:_AT_HAND]
+        at_hand = {value[1]: _load_uniform(w, context, *value) for value in uniform}
+        context = context._replace(at_hand=at_hand)
         with loop(w, task["start"], task["end"]) as (block, _, _):
             _act(w, context, plan.others, block)
         w.do(f"br label %{done}")
@@ -146,13 +151,6 @@ def _context(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers:
 
 _AT_HAND = 12
 """Numbers that are the same for all agents and stay in registers while a task is done."""
-
-
-def _with_uniform(w: Writer, context: Context, body: Body) -> Context:
-    """In the loop, LLVM would load it again after every store, which might change it."""
-    leaves = [n for n in needed(body.results()) if n.op == "leaf" and n.value[0] == "uniform"]
-    values = {n.value[1]: _load_uniform(w, context, *n.value) for n in leaves[:_AT_HAND]}
-    return context._replace(at_hand=values)
 
 
 def _lead(w: Writer, context: Context, task: dict[str, str]) -> None:
@@ -416,19 +414,12 @@ define void @run(ptr noalias %slots) nounwind {
   ret void
 }"""
 _ENTRIES = {"x86_64": _X86, "AMD64": _X86, "aarch64": _ARM, "arm64": _ARM}
+"""The function `run`, which calls `steps`, as LLVM moves arithmetic over neither end of a call.
+
+Denormal numbers are 0 in it, in operands and in results, as in JAX: an operation with one takes a
+hundred times as long. Each thread sets its processor's register so, and puts it back at the end."""
 
 _ATTRIBUTES = " ".join(
     f'"denormal-fp-math{suffix}"="preserve-sign,preserve-sign"' for suffix in ("", "-f32")
 )
 """What LLVM must know to fold constants as the processor would."""
-
-
-def _entry() -> str:
-    """Return the function `run` as text for LLVM, which calls `steps` and is all that is called.
-
-    It treats denormal numbers as 0, in operands and in results, as JAX does: an operation with one
-    takes a hundred times as long. Each thread sets the bits of its processor's register that say so
-    when it enters a kernel, and puts them back when it leaves.
-    """
-    # A function of its own, because LLVM moves arithmetic over neither end of a call.
-    return _ENTRIES.get(platform.machine(), _OTHER)

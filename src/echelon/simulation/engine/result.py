@@ -232,10 +232,6 @@ class Result(FrameNumbers):
         """
         return CellPage(notebook_page("replay", self), height)
 
-    def with_provenance(self, **texts: str) -> "Result":
-        """Return a copy with more provenance."""
-        return dataclasses.replace(self, provenance={**self.provenance, **texts})
-
 
 def finite_or_none(value: float | np.floating | None) -> float | None:
     """Return a number as a float, or None where it does not exist or is not finite."""

@@ -341,7 +341,8 @@ def at_index(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands:
     if has_function(equation):
         raise Unsupported(f"`scatter` of a function{where(equation)}")
     rows, ends = _rows(equation, operands), _ends(equation, operands)
-    drops = _drops(equation)
+    # Indices outside of a table are ignored; otherwise they are clipped.
+    drops = equation.params.get("mode") == jax.lax.GatherScatterMode.FILL_OR_DROP
     if not drops:
         rows = np.stack([_clipped(graph, rows[..., k], n) for k, n in enumerate(ends)], axis=-1)
     unknown = [k for k in range(len(ends)) if any(isinstance(e, Node) for e in rows[..., k].flat)]
@@ -386,13 +387,6 @@ def _is(graph: ScalarGraph, entries: tuple[Entry, ...], place: tuple[int, ...]) 
     """Return whether numbers are those of a place."""
     same = [graph.make("eq", entry(e), float(p)) for e, p in zip(entries, place, strict=True)]
     return functools.reduce(functools.partial(graph.make, "and"), same, True)
-
-
-def _drops(equation: JaxprEqn) -> bool:
-    """Tell whether indices outside of a table are ignored; otherwise they are clipped."""
-    from jax.lax import GatherScatterMode
-
-    return equation.params.get("mode") == GatherScatterMode.FILL_OR_DROP
 
 
 def _elsewhere(equation: JaxprEqn, operands: Arrays) -> np.ndarray:
