@@ -20,8 +20,6 @@ from echelon.core.errors import ModelError, listing
 from echelon.core.limits import excess_states
 from echelon.core.types import Array, Input, InputMap, Output, PathLike, State
 
-# ---- integrators ---------------------------------------------------------------------------------
-
 _PREFIXES = ("", "v", "a")
 _UNITS = ("m", "m/s", "m/s^2")
 """Of a position and its first two derivatives."""
@@ -156,8 +154,6 @@ class DoubleIntegrator(Integrator):
         return jnp.concatenate([position, velocity]), acceleration + self.drag * velocity
 
 
-# ---- matrices in a MATLAB file -------------------------------------------------------------------
-
 _NAMES = ("A", "B", "C", "D", "Ts")
 
 
@@ -192,8 +188,6 @@ def _content(file: PathLike) -> Mapping[str, Any]:
     except Exception as error:  # SciPy raises whatever a damaged file causes
         raise ModelError(f"`{file}` is not a MATLAB file that can be read: {error}.") from None
 
-
-# ---- a linear agent ------------------------------------------------------------------------------
 
 _EXACT = 1e-9
 """Relative; what remains of a discrete-time model when it is sampled again."""

@@ -14,8 +14,6 @@ from echelon.core.errors import ModelError, did_you_mean, is_number, listing
 from echelon.core.trace import call_once_traced
 from echelon.core.types import Array, Declared, Input, InputMap, Output, Scalar, State
 
-# ---- what a model may state of its motors --------------------------------------------------------
-
 
 class Airframe(NamedTuple):
     """A rigid body under four motors, whose thrusts and torques are all that moves it.
@@ -35,9 +33,6 @@ class Airframe(NamedTuple):
     arm: float
     torque_per_thrust: float
     motor_thrust: float
-
-
-# ---- what a model may state of its heading -------------------------------------------------------
 
 
 class Heading(NamedTuple):
@@ -90,10 +85,9 @@ class Turn(NamedTuple):
         return slope
 
 
-# ---- the interface -------------------------------------------------------------------------------
-# It is the agent of the paper's Definition 1. A user's model needs two methods and two tuples of
-# names; everything else has a default, which a class attribute, a property or a method of the same
-# name replaces.
+# `ControlAffine` is the agent of the paper's Definition 1. A user's model needs two methods and two
+# tuples of names; everything else has a default, which a class attribute, a property or a method of
+# the same name replaces.
 
 Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 Rows: TypeAlias = tuple[tuple[float, ...], ...]

@@ -10,8 +10,6 @@ from echelon.agents.models.model import (
 )
 from echelon.core.types import InputMap, State
 
-# ---- the pendulum --------------------------------------------------------------------------------
-
 
 class Pendulum(ControlAffine):
     """angledot = rate, ratedot = -stiffness sin(angle) - damping rate + u.
@@ -40,9 +38,6 @@ class Pendulum(ControlAffine):
     def input_map(self, x: State) -> InputMap:
         """Return g = (0; 1)."""
         return jnp.array([[0.0], [1.0]], x.dtype)
-
-
-# ---- the Van der Pol oscillator ------------------------------------------------------------------
 
 
 class VanDerPol(ControlAffine):

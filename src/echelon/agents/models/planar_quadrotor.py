@@ -134,9 +134,6 @@ class PlanarQuadrotor(ControlAffine):
         return jnp.where(fits(commanded, self.motor_thrust), u, delivered)
 
 
-# ---- linearized about hover ----------------------------------------------------------------------
-
-
 class LinearPlanarQuadrotor(ControlAffine):
     """yddot = -g roll, zddot = -g + u1 / m, rollddot = u2 / Ixx: hover's linearization.
 

@@ -270,9 +270,6 @@ class Quadrotor(RigidVehicle):
         return jnp.where(fits(commanded, self.motor_thrust), u, delivered)
 
 
-# ---- as printed ----------------------------------------------------------------------------------
-
-
 class PrintedQuadrotor(ControlAffine):
     """The quadrotor as printed in the paper (literal).
 

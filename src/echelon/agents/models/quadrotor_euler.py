@@ -18,7 +18,6 @@ from echelon.core.errors import ModelError, check_name
 from echelon.core.numerics import derivatives as derivatives_of
 from echelon.core.types import Input, InputMap, Scalar, State
 
-# ---- computed torque -----------------------------------------------------------------------------
 # An inner loop on board cancels the attitude dynamics, so that Euler-angle accelerations become the
 # input. Gains made for these agents say what formation laws can promise above such a loop.
 
@@ -114,9 +113,6 @@ class QuadrotorThrust(RigidVehicle):
         """Return the state and input that fly a path (x, y, z, yaw) with derivatives, (5, 4)."""
         x, thrust, bend = flown_along(derivatives, self.gravity)
         return jnp.append(x, thrust[0]), jnp.append(thrust[1], bend)
-
-
-# ---- a Crazyflie under its own attitude controller -----------------------------------------------
 
 
 def _identified(mass: float, gain: float, stiffness: float, damping: float, command: float,

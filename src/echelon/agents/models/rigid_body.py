@@ -21,7 +21,6 @@ from echelon.agents.models.model import (
 from echelon.core.errors import ModelError
 from echelon.core.types import Input, Output, Scalar, State
 
-# ---- the body ------------------------------------------------------------------------------------
 # Body to world is Rz(yaw) Ry(pitch) Rx(roll).
 
 Vector: TypeAlias = Float[jax.Array, " 3"]
@@ -124,8 +123,6 @@ def attitude_along(path: jax.Array, gravity: float) -> Callable[[Scalar], Vector
     return lambda s: tilt_towards(lift(s), yaw[0] + s * yaw[1] + 0.5 * s**2 * yaw[2])
 
 
-# ---- vehicles under thrust -----------------------------------------------------------------------
-
 # z'' = (T/m) cos(roll) cos(pitch) - g, and none of the three factors passes 0 unless z'' passes -g.
 # Each vehicle declares bound and chains itself: a proof reads no declaration of a base class whose
 # motion it does not have (`declarations.py`).
@@ -169,7 +166,6 @@ class RigidVehicle(ControlAffine):
         return wrap_angles(x - y, 6, 7, 8)
 
 
-# ---- motors with limits --------------------------------------------------------------------------
 # Clipping each motor by itself changes the torques and flips vehicles. Attitude-priority mixing
 # keeps the torques: the collective gives way first, then yaw, and roll and pitch are scaled only
 # when they alone do not fit.

@@ -232,7 +232,7 @@ def advising(points: Array, radius: float) -> Iterator[None]:
 
 
 def _advice(points: Array, radius: float) -> str:
-    """Name the longest edge of the shortest spanning tree if that helps."""
+    """Return the least connecting radius, the shortest tree's longest edge, as a clause."""
     if len(points) > _MOST:
         return ""
     from scipy.sparse.csgraph import minimum_spanning_tree

@@ -72,9 +72,6 @@ class Exchange(eqx.Module):
         return jnp.where(total > 0.0, z / jnp.where(total > 0.0, total, 1.0), alone)
 
 
-# ---- others that may come near -------------------------------------------------------------------
-
-
 class Near(NamedTuple):
     """K others as one agent knows them: of each the r points in whose hull its position stays.
 

@@ -310,7 +310,7 @@ class Formation:
 
 
 def _distinct(rows: Array) -> tuple[Array, Array]:
-    """As `numpy.unique`, which takes seconds for a million rows, but in the rows' order."""
+    """Return each kind's first row and each row's kind; `numpy.unique` would take seconds."""
     varying = rows[:, np.ptp(rows, axis=0) > 0.0]
     order = np.lexsort(varying.T[::-1]) if varying.size else np.arange(len(rows))
     changed = (varying[order[1:]] != varying[order[:-1]]).any(axis=1)

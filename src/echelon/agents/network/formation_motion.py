@@ -229,9 +229,6 @@ def blend(u: jax.Array) -> jax.Array:
     return u**6 * share
 
 
-# ---- assignment ----------------------------------------------------------------------------------
-
-
 def nearest_places(
     leaders: Sequence[int], before: Float[Array, "N d"], after: Float[Array, "N d"]
 ) -> Int[Array, " N"]:
@@ -256,9 +253,6 @@ def nearest_places(
     ways = (before / size)[others][:, None] - (after / size)[others][None]
     order[others] = others[linear_sum_assignment((ways * ways).sum(axis=2))[1]]
     return order
-
-
-# ---- checks --------------------------------------------------------------------------------------
 
 
 def _check_reshapes(reshapes: Sequence[Reshape], shape: tuple[int, ...]) -> None:

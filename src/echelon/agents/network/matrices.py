@@ -7,8 +7,6 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 from jaxtyping import Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from echelon.agents.network.edges import name_agents
 from echelon.agents.network.exchange import Exchange
@@ -18,7 +16,7 @@ from echelon.core.types import Array, States
 
 
 class GraphMatrices(abc.ABC):
-    """Weighted edges between agents, and the matrices that they make; abstract, as `Graph`."""
+    """Weighted edges, and the matrices that they make; abstract, its attributes are `Graph`'s."""
 
     edges: Array
     weights: Array
@@ -140,9 +138,6 @@ def _apart(L: sp.csr_array, out: Array, weight: float) -> sp.csr_array:
     return sp.csr_array(kept @ L + sp.diags_array(weight * out))
 
 
-# ---- order and parents ---------------------------------------------------------------------------
-
-
 def ordered_outward(graph: GraphMatrices) -> tuple[tuple[int, tuple[int, ...]], ...]:
     """Return `Graph.outward`; raise `GraphError` if the graph switches."""
     if graph.schedule is not None:
@@ -168,8 +163,8 @@ def outward_edges(graph: GraphMatrices) -> tuple[Array, Array]:
         raise GraphError("the graph switches, and no agent is nearer to a leader at all times.")
     exchange = graph.exchange(leaderward=True)
     edges = np.stack([exchange.senders, exchange.receivers], axis=1)
-    links = coo_array((np.ones(len(edges)), edges.T), (graph.agents, graph.agents))
-    if connected_components(links, directed=False)[0] > 1:
+    links = sp.coo_array((np.ones(len(edges)), edges.T), (graph.agents, graph.agents))
+    if csgraph.connected_components(links, directed=False)[0] > 1:
         raise GraphError(
             "the directed graph splits into one part for each leader: no agent receives from more "
             "than one of them; leave `directed` out, or give the edges."
@@ -210,9 +205,6 @@ def shares(graph: GraphMatrices, agent: int, earlier: tuple[int, ...]) -> Array:
     """Return the share of each neighbour in an agent's targets, by the weights of edges."""
     weights = np.asarray(graph.adjacency()[[agent]].toarray()).ravel()[list(earlier)]
     return weights / weights.sum()
-
-
-# ---- agents that leaders reach -------------------------------------------------------------------
 
 
 def check_reached(graph: GraphMatrices) -> None:

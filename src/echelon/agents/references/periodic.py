@@ -9,8 +9,6 @@ import jax.numpy as jnp
 from echelon.agents.references.reference import Reference, check_finite, in_space
 from echelon.core.types import Scalar
 
-# ---- straight ------------------------------------------------------------------------------------
-
 _Vector = tuple[float, ...]
 
 
@@ -51,9 +49,6 @@ class Line(Reference):
 
 def _turning(path: Hover | Line) -> dict[str, object]:
     return {"yaw": (path.yaw, None), "yaw_rate": (path.yaw_rate, None)}
-
-
-# ---- periodic ------------------------------------------------------------------------------------
 
 
 class Periodic(Reference):

@@ -19,8 +19,6 @@ from echelon.core.errors import ReferenceError, check_kind
 from echelon.core.numerics import precision
 from echelon.core.types import Array, PathLike, Scalar
 
-# ---- the common base -----------------------------------------------------------------------------
-
 
 class PolynomialPath(Reference):
     """Polynomials of degree 7 between times, constant before and after; abstract.
@@ -75,9 +73,6 @@ def _horner(coefficients: Array | jax.Array, s: Scalar | float) -> Any:
     for coefficient in others:
         value = value * s + coefficient
     return value
-
-
-# ---- through timed points ------------------------------------------------------------------------
 
 
 class Waypoints(PolynomialPath):
@@ -199,8 +194,6 @@ def _fit(times: Float[Array, " K"], points: Float[Array, "K 4"]) -> Float[Array,
     coefficients[:-1, :, (points == points[0]).all(axis=0)] = 0.0
     return coefficients
 
-
-# ---- pieces and their files ----------------------------------------------------------------------
 
 _COLUMNS = ("duration", *(f"{name}^{k}" for name in COORDINATES for k in range(8)))
 _ORDERS = 4

@@ -18,8 +18,6 @@ from echelon.core.numerics import derivatives, precision
 from echelon.core.trace import call_once_traced, check_array, checked_trace
 from echelon.core.types import Array, Declared, Input, Scalar, State
 
-# ---- a motion of a model -------------------------------------------------------------------------
-
 
 class Guide(Declared):
     """The motion that a leader follows: a path in space, or one of states and inputs."""
@@ -52,8 +50,6 @@ class Guide(Declared):
     def fit(self, model: ControlAffine) -> None:
         """Raise `LawError`, which says why, unless a model can be led along it."""
 
-
-# ---- a path in space -----------------------------------------------------------------------------
 
 COORDINATES = ("x", "y", "z", "yaw")
 _MAX_TIME = 10**9

@@ -19,8 +19,6 @@ from echelon.core.numerics import Draw, key_of, normals, rk4
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Estimation
 
-# ---- a filter with a constant gain ---------------------------------------------------------------
-
 _INPUT, _PUSH, _DRIFT = 0.1, 1.0, 0.01
 """Densities, by the root of a second: of what acts beside the inputs, in normalized ones; of how
 fast a push on the velocity changes; and of all states, in their units."""
@@ -113,9 +111,6 @@ class Estimator(eqx.Module):
             return model.velocity(x, u).at[np.array(self.pushed, int)].add(push)
 
         return rk4(velocity, x, u, self.dt)
-
-
-# ---- sensors -------------------------------------------------------------------------------------
 
 
 @final

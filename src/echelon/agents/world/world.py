@@ -15,8 +15,6 @@ from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.sensing import Sensing
 from echelon.core.errors import ModelError, SimulationError, did_you_mean, listing
 
-# ---- agents that differ from the model -----------------------------------------------------------
-
 
 def vary_parameters(
     model: ControlAffine, parameters: Mapping[str, Any], scale: Mapping[str, float]
@@ -107,8 +105,6 @@ def _format_value(value: Any) -> str:
         return f"({', '.join(map(_format_value, value))})"
     return f"{value:.6g}" if isinstance(value, numbers.Real) else str(value)
 
-
-# ---- the world -----------------------------------------------------------------------------------
 
 LATE = "messages are late or lost"
 

@@ -232,8 +232,6 @@ class Emitter:
             return w.put(f"select {which} {args[0]}, {kind} {args[1]}, {kind} {args[2]}")
         return w.operation(node.op, args, node.args[0].truth, uniform)
 
-    # ---- branches ----
-
     def _write_in_order(self, nodes: Iterable[Node], owner: Mapping[Node, Branch]) -> None:
         for node in nodes:
             if node in owner or node in self.values:
@@ -268,9 +266,6 @@ class Emitter:
         for node in branch.outputs:
             values = f"[ {self.values[node]}, %{end} ], [ zeroinitializer, %{before} ]"
             self.values[node] = w.put(f"phi {w.kind(node.truth, False)} {values}")
-
-
-# ---- the fast path -------------------------------------------------------------------------------
 
 
 class FastPath(NamedTuple):

@@ -161,9 +161,6 @@ def _is_sound(term: Term) -> bool:
     return term.number == 0.0 or 1.0 / _LARGEST <= abs(term.number) <= _LARGEST
 
 
-# ---- fewer terms ---------------------------------------------------------------------------------
-
-
 def _fewer(terms: Sequence[Term]) -> list[Term]:
     fewer, bare = _merged(terms), list(map(_bare, terms))
     if all(map(_is_sound, bare)):
@@ -238,9 +235,6 @@ def _without(term: Term, common: Common) -> Term | None:
     return Term(number, factors[:place] + factors[place + 1 :])
 
 
-# ---- terms as nodes ------------------------------------------------------------------------------
-
-
 def _sum_of(like: Node, terms: Sequence[Term]) -> Node:
     total, sign = like.graph.constant(0.0), 0.0
     for term in terms:
@@ -265,8 +259,6 @@ def _size_of(like: Node, term: Term) -> tuple[float, Node]:
         product = product * factor
     return math.copysign(1.0, term.number), product
 
-
-# ---- quotients -----------------------------------------------------------------------------------
 
 _CONTINUOUS = {"add", "sub", "mul", "neg"}
 """Operations that may read a quotient with another rounding; if it is truncated or compared, 49/49

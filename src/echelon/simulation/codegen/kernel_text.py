@@ -169,9 +169,6 @@ def _lead(w: Writer, context: Context, task: dict[str, str]) -> None:
                 w.store_row(w.load_row(base, plan.message_start + k), messages, k)
 
 
-# ---- a body --------------------------------------------------------------------------------------
-
-
 def _act(w: Writer, context: Context, body: Body, block: str) -> None:
     """Write what the agents of a block do: the fast path, and the general case it falls back to."""
     nodes = body.all()
@@ -379,8 +376,6 @@ def announce(w: Writer, slots: dict[str, str], task: str) -> None:
         count = w.put(f"add i64 {task}, 1")
         w.do(f"store atomic i64 {count}, ptr {at} release, align 8")
 
-
-# ---- denormal numbers ----------------------------------------------------------------------------
 
 _X86 = """\
 declare void @llvm.x86.sse.stmxcsr(ptr)

@@ -295,9 +295,6 @@ def _neighbour_at(
     return listed_block(w, places, str(lane), start)
 
 
-# ---- what neighbours read ------------------------------------------------------------------------
-
-
 def write_mirror(w: Writer, context: Context, values: Sequence[str], block: str) -> None:
     """Write what neighbours will read: of formations row by row, else agent after agent."""
     plan, lanes, far = context.plan, w.lanes, stride(context.plan.width, w.lanes)
@@ -340,9 +337,6 @@ def _shuffle(w: Writer, a: str, b: str, order: Sequence[int]) -> str:
     if a == b == "zeroinitializer":
         return a
     return w.put(f"shufflevector {w.vector} {a}, {w.vector} {b}, <{w.lanes} x i32> <{places}>")
-
-
-# ---- edges ---------------------------------------------------------------------------------------
 
 
 def measure_edges(w: Writer, context: Context, start: str, end: str) -> None:

@@ -83,8 +83,6 @@ class Batch:
         for place, (parts, settings) in enumerate(runs):
             yield results.pop(place) if place in results else _run_alone(parts, settings, progress)
 
-    # ---- groups ----
-
     def _groups(self, runs: Sequence[Run]) -> list[list[_BatchJob]]:
         cases: dict[int, tuple[_SharedRun, list[int]]] = {}
         for place, (parts, settings) in enumerate(runs):
@@ -113,8 +111,6 @@ class Batch:
                     group = self.kinds.of(loop, unseeded)
                 shared[unseeded] = _SharedRun(prepared, Starts(prepared.parts), loop, group)
         return shared[unseeded]
-
-    # ---- runs ----
 
     def _together(
         self, jobs: list[_BatchJob], progress: StepCount | None

@@ -58,9 +58,6 @@ class ChunkGrid:
         return ((points % self.every == 0) | (points == self.steps)) & ~repeated
 
 
-# ---- the step at which a run diverges ------------------------------------------------------------
-
-
 def advance_until_lost(
     stepper: Stepper, now: Moment, counts: Array, reference: Array | None, formations: int
 ) -> tuple[Chunk, Array]:

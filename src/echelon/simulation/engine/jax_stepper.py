@@ -89,9 +89,6 @@ class JaxStepper(Stepper):
         return Chunk(now, states, inputs, sums.split(1))
 
 
-# ---- many formations -----------------------------------------------------------------------------
-
-
 @final
 class JaxFormations(Stepper):
     """Steps many formations whose loops differ in numbers alone, each as if it were alone."""
@@ -160,9 +157,6 @@ def _differ(leaves: Sequence[object]) -> bool:
         return False
     # By their bits: NaN equals itself there, and -0 differs from 0.
     return any(np.asarray(leaf).tobytes() != np.asarray(leaves[0]).tobytes() for leaf in leaves)
-
-
-# ---- several devices -----------------------------------------------------------------------------
 
 
 def mesh_of(devices: int, agents: int) -> Mesh:

@@ -147,9 +147,6 @@ class Parts:
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
 
-# ---- the states at the beginning -----------------------------------------------------------------
-
-
 def initial_states(parts: Parts, seed: int) -> Float[Array, "N n"]:
     """Return the states (N, n) at time zero.
 

@@ -167,8 +167,6 @@ def _check_offsets(model: ControlAffine, parts: Parts) -> None:
         )
 
 
-# ---- what is allowed and probably not intended ---------------------------------------------------
-
 _HALF_TURN = 3.0
 """Below half a turn in rad: no smaller spread is looked at, since `difference` is compiled."""
 _MET = 1e-9

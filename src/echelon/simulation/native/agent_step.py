@@ -359,9 +359,6 @@ def _placed(rows: BlockRows, named: dict[str, list[Node]]) -> dict[int, Node]:
     }
 
 
-# ---- where the numbers of an agent are not what JAX computes -------------------------------------
-
-
 _SIZES = (1e9, 1e6, 1e3)
 """Sizes of what neighbours read, of which the first is taken for which a difference is right."""
 

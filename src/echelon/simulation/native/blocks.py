@@ -235,7 +235,7 @@ class SwarmBlocks(Places):
 
 @final
 class FormationBlocks(Places):
-    """One agent of several formations in a vector: a neighbour of a block is a block."""
+    """Vectors hold one agent of several formations; numbers go formation by formation."""
 
     def __init__(self, loops: Sequence[Loop], lanes: int) -> None:
         """Place the agents of loops that differ only in numbers."""

@@ -222,7 +222,7 @@ class NativeStepper(Stepper):
         self._hold = hold
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
-        """Take steps by draws of wind and stretches of the graph, with first inputs in the rows."""
+        """Take steps, one draw and one stretch at a time; the rows then have the first inputs."""
         wind, input_step = self.loop.motion.wind, step
         most = _TASKS // len(self.places.segments)
         if self.plan.leaders_ahead:
@@ -380,9 +380,6 @@ def _total_and_window(sums: Array) -> Array:
     return np.stack([sums[:, 0] + sums[:, 1], sums[:, 1]])
 
 
-# ---- what neighbours read of agents at a moment --------------------------------------------------
-
-
 def offsets_of(loops: Sequence[Loop], dtype: np.dtype) -> Float[Array, "N n"]:
     """Return the goals' offsets of all agents, loop by loop."""
     # Runs that differ only in their initial states share one loop, and are often thousands.
@@ -425,9 +422,6 @@ def mirror_values(
     return np.concatenate([relative, np.concatenate(sent)], axis=1)
 
 
-# ---- wind and noise ------------------------------------------------------------------------------
-
-
 _AHEAD, _AT_ONCE = 64, 50_000
 """Holding intervals that are drawn in a call, and the most draws; a call takes 0.5 ms."""
 
@@ -440,9 +434,6 @@ def _drawn(
     many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
     one = jax.vmap(draw, (None, None, 0))
     return jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, None))(many, steps, agents)
-
-
-# ---- reused memory -------------------------------------------------------------------------------
 
 
 _MOST, _LARGE = 16, 2**20

@@ -132,8 +132,6 @@ def _differing(leaves: Sequence[Any]) -> Array:
     return (stacked != stacked[0]).any(axis=0)
 
 
-# ---- loops that one program steps ----------------------------------------------------------------
-
 _MOST = 256
 """Kinds of loops for which it is cached which numbers they read."""
 

@@ -391,9 +391,6 @@ def message_words(own: OwnLaw) -> list[str]:
     return [*names, *heading]
 
 
-# ---- the motion of a simulated vehicle -----------------------------------------------------------
-
-
 def move_function(motion: Motion) -> LawFunction:
     """Return `move`, a step of an agent's own motion; else `Unsupported`, with the user's line."""
     plant, lags = motion.plant, motion.motors is not None and motion.motors.lag is not None

@@ -93,9 +93,6 @@ def symbols(owner: str) -> Algebra:
     return Algebra(_rules(casadi()), float, lambda numbers: numbers, lambda: float("nan"), unknown)
 
 
-# ---- the rules -----------------------------------------------------------------------------------
-
-
 def _rules(ca: ModuleType) -> dict[str, Rule]:
     written: dict[str, Rule] = {
         "integer_pow": lambda params, x: map_entries(lambda value: value ** params["y"], x),

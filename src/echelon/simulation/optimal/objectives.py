@@ -101,13 +101,10 @@ def grid(horizon: float, dt: float, interval: float) -> PlanTimes:
     return PlanTimes(-(-count // hold), hold, dt)
 
 
-# ---- problems ------------------------------------------------------------------------------------
-
-
 def tracking(
     model: ControlAffine, planning: TrackingOptions, times: PlanTimes, limits: bool, fine: bool
 ) -> OptimalControl:
-    """Return an agent's problem; parameters: outputs (q,), input (m,), factor on input weights."""
+    """Return an agent's problem; parameters: outputs (q,), normalized input (m,), a factor."""
     W, q = planning.weights(model), len(model.output_names)
     input_cost = _input_cost(model)
 
