@@ -150,21 +150,19 @@ _NEAR = 1e-3
 
 @memoize
 @np.errstate(over="ignore", invalid="ignore")
-def reference_demand(
-    model: ControlAffine, reference: Guide, horizon: float, samples: int = _SAMPLES
-) -> ReferenceDemand:
+def reference_demand(model: ControlAffine, reference: Guide, horizon: float) -> ReferenceDemand:
     """Return the demand of a reference on a model that it can lead, over a horizon (s)."""
     near = min(_NEAR, 1e-2 * horizon)
-    times = np.linspace(near, horizon - near, samples)
+    times = np.linspace(near, horizon - near, _SAMPLES)
     with precision("float64"):
         x, u = follow_at(model, reference, np.concatenate([times - near, times, times + near]))
-        before, now, after = x.reshape(3, samples, -1)
-        inputs = u.reshape(3, samples, -1)[1]
-        rate = np.asarray(_rate(model, before, now, after, near))
-        velocities = np.asarray(_velocities(model, now, inputs))
+        x = x.reshape(3, _SAMPLES, -1)
+        inputs = u.reshape(3, _SAMPLES, -1)[1]
+        rate = np.asarray(_rate(model, *x, near))
+        velocities = np.asarray(_velocities(model, x[1], inputs))
     ratios = demand(model, inputs)
     k = int(np.argmax(ratios))
-    speed, acceleration = _motion(model, x.reshape(3, samples, -1), near)
+    speed, acceleration = _motion(model, x, near)
     root = np.sqrt(np.asarray(model.weights[0], float))
     away = root * np.abs(rate - velocities)
     j, i = np.unravel_index(int(away.argmax()), away.shape)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import SimulationError, is_number
+from echelon.core.linear import discretize
 from echelon.core.numerics import Draw, key_of, normals, rk4
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Estimation
@@ -66,11 +67,10 @@ class Estimator(eqx.Module):
         pushed = tuple(model.state_names.index(name) for name in names)
         A, B = linearize(model)
         size, m = n + len(pushed), B.shape[1]
-        whole = np.zeros((size + m, size + m))
-        whole[:n, :n], whole[:n, size:] = A, B
-        whole[list(pushed), range(n, size)] = 1.0
-        step = scipy.linalg.expm(dt * whole)
-        F, G = step[:size, :size], step[:size, size:]
+        rates, entries = np.zeros((size, size)), np.zeros((size, m))
+        rates[:n, :n], entries[:n] = A, B
+        rates[list(pushed), range(n, size)] = 1.0
+        F, G = discretize(rates, entries, dt)
         drift = np.append(np.full(n, _DRIFT), np.full(len(pushed), _PUSH))
         Q = _INPUT**2 / dt * G @ G.T + np.diag(dt * drift**2)
         C, R = np.eye(n, size), np.diag(np.maximum(std, _EXACT) ** 2)

@@ -100,7 +100,7 @@ class Plans(_Optimized):
         """
         settings = problem.settings
         times = grid(settings.horizon, settings.dt, self.options.interval)
-        formation_plan = plan_formation(
+        plan = plan_formation(
             problem.model,
             problem.graph,
             problem.formation,
@@ -111,8 +111,7 @@ class Plans(_Optimized):
             limits=settings.limits,
         )
         # One input per interval; the last interval may extend beyond the run's end.
-        inputs = np.stack([plan.inputs for plan in formation_plan.plans], axis=1)
-        plan = formation_plan
+        inputs = np.stack([each.inputs for each in plan.plans], axis=1)
         work = plan.seconds, plan.iterations, plan.failures, plan.setup_seconds
         stats = solver_stats("optimization", self.options.solver, *work)
         return HostStepper(

@@ -17,7 +17,7 @@ import scipy.sparse
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import PlanError
-from echelon.core.linear import without_warnings
+from echelon.core.linear import discretize, without_warnings
 from echelon.core.numerics import precision, rk4
 from echelon.core.types import Array
 from echelon.simulation.optimal.casadi import casadi, casadi_function
@@ -197,17 +197,10 @@ def _interleave(inputs: Array, states: Array) -> Array:
 
 def _cost_to_go(model: ControlAffine, Q: Array, R: Array, dt: float) -> Array:
     """Return the cost matrix of the LQR about the trim in discrete time."""
-    A, B = linearize(model)
-    n, m = B.shape
-    block = np.zeros((n + m, n + m))
-    block[:n, :n], block[:n, n:] = A, B
-    # expm([[A, B], [0, 0]] dt) holds both matrices of a step with the input held, exactly.
-    flow = scipy.linalg.expm(block * dt)
+    step = discretize(*linearize(model), dt)
     try:
         with without_warnings():
-            return scipy.linalg.solve_discrete_are(
-                flow[:n, :n], flow[:n, n:], np.diag(dt * Q), np.diag(dt * R)
-            )
+            return scipy.linalg.solve_discrete_are(*step, np.diag(dt * Q), np.diag(dt * R))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise PlanError(
             f"the cost from the horizon's end on does not exist for `{type(model).__name__}`: "
