@@ -154,7 +154,7 @@ class LinearPlanarQuadrotor(ControlAffine):
     position = ("y", "z")
     radius = 0.07  # of the Crazyflie with its propellers
     state_groups = {"position": ("y", "z"), "velocity": ("vy", "vz")}
-    trim, input_scale = PlanarQuadrotor.trim, PlanarQuadrotor.input_scale
+    trim, input_scale = PlanarQuadrotor.trim, PlanarQuadrotor.input_scale  # pyright: ignore
 
     def __check_init__(self) -> None:
         check_positive(self, mass=self.mass, inertia=self.inertia, gravity=self.gravity)

@@ -290,7 +290,7 @@ class PrintedQuadrotor(ControlAffine):
     input_names, input_units = Quadrotor.input_names, Quadrotor.input_units
     output_names, position = Quadrotor.output_names, Quadrotor.position
     state_groups, chart = Quadrotor.state_groups, Quadrotor.chart
-    input_scale = Quadrotor.input_scale
+    input_scale = Quadrotor.input_scale  # pyright: ignore - a property
     radius = 0.07  # of the Crazyflie with its propellers
 
     def __check_init__(self) -> None:

@@ -67,7 +67,7 @@ class Traffic(NamedTuple):
     def of_agents(
         self, edges: Int[Array, "E 2"], agents: int, presence: Bool[Array, "T N"] | None = None
     ) -> Float[Array, "T N"]:
-        """Return the age (s) of the oldest message that each agent has; the absent count not."""
+        """Return the age (s) of each agent's oldest message; absent agents do not count."""
         ages = np.full((agents, len(self.ages)), -np.inf)
         both = True if presence is None else presence[:, edges].all(axis=2)
         for end in (0, 1):

@@ -235,7 +235,7 @@ class SwarmBlocks(Places):
 
 @final
 class FormationBlocks(Places):
-    """Vectors hold one agent of several formations; numbers go formation by formation."""
+    """Vectors hold one agent of several formations; agents are numbered formation by formation."""
 
     def __init__(self, loops: Sequence[Loop], lanes: int) -> None:
         """Place the agents of loops that differ only in numbers."""

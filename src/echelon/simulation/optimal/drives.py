@@ -181,7 +181,7 @@ class _Planners:
         return solver_stats("mpc", self.mpc.solver, *work)
 
     def __call__(self, step: int, states: Array) -> Array:
-        """Return the inputs (N, m) in the graph's order; `Stopped` if a solver fails so."""
+        """Return the inputs (N, m); raise `Stopped` if a solver fails and `on_failure` says so."""
         inputs = np.zeros((len(states), self.horizon.m))
         for agent, earlier, share in self.turns:
             targets = self._targets(agent, earlier, share, step // self.hold)
