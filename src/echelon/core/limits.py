@@ -72,7 +72,7 @@ def horizon_fault(horizon: float, dt: float) -> str | None:
 
 
 def excess_frames(frames: int, numbers: int, every: int) -> str | None:
-    """Return why frames of `numbers` numbers, every so many steps, exceed half of the memory."""
+    """Return why frames of `numbers` numbers, one each `every` steps, exceed half of memory."""
     size, room = 8 * _COPIES * frames * numbers, memory() // 2
     if size <= room:
         return None

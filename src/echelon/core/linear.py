@@ -288,7 +288,7 @@ def check_definite(name: str, matrix: np.ndarray) -> None:
 
 
 def check_eigenvalues(name: str, what: str, matrix: Array, bound: float) -> None:
-    """Raise `GainError`, not `what`, unless all eigenvalues exceed a bound, in any units."""
+    """Raise `GainError` that a matrix is not `what` unless its eigenvalues exceed a bound."""
     scaled, raw = (np.linalg.eigvalsh(m)[0] for m in (with_unit_diagonal(matrix), matrix))
     if not scaled > bound:
         least = raw if raw < 0.0 else scaled

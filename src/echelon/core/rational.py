@@ -52,7 +52,7 @@ def norm_above(first: Fraction, *others: Fraction) -> Fraction:
 
 
 def bisect(holds: Callable[[_Real], bool], low: _Real, high: _Real, halvings: int) -> _Real:
-    """Return a number that `holds`, as `low` does, near the border, by so many halvings."""
+    """Return a number near the border where `holds`, which is true at `low`, becomes false."""
     for _ in range(halvings):
         middle = (low + high) / 2
         low, high = (middle, high) if holds(middle) else (low, middle)

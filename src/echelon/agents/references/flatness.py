@@ -94,7 +94,7 @@ def shifted_targets(model: ControlAffine, targets: Targets, offset: Array) -> Ta
 
 
 def mean_targets(model: ControlAffine, states: Array, inputs: Array, share: Array) -> Targets:
-    """Return the mean of targets (J, T, ..) by shares (J,): errors to both differ by a constant."""
+    """Return the mean of targets (J, T, ..) by shares (J,); squared errors differ by a constant."""
     return _targets(model, np.tensordot(share, states, 1), np.tensordot(share, inputs, 1))
 
 
