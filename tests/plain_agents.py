@@ -9,7 +9,7 @@ import echelon as ech
 from echelon.output.archive.flight_folder import network_facts
 from echelon.simulation.onboard.law_functions import law_functions
 from echelon.simulation.onboard.source_code import python_text
-from echelon_flight.wire import Packet
+from echelon_flight.wire import LeaderPacket
 
 FAR = 2**30
 
@@ -217,5 +217,5 @@ def letter(own, facts, sender, time, draws):
         units = np.abs(np.diag(own.loop.model.input_scale))
         said[-len(units) :] *= units
     said = tuple(said.tolist())
-    packet = Packet(leader, max(0.0, time - draws.uniform(0.0, 0.9)), said)
+    packet = LeaderPacket(leader, max(0.0, time - draws.uniform(0.0, 0.9)), said)
     return ech.Message(sender, (own.signal_names, values), None, time, hops, packet)

@@ -236,7 +236,7 @@ def test_echelon_knows_five_names_of_flight_and_its_version():
     flight = importlib.import_module(FLIGHT.name)
     assert {name.removeprefix(f"{FLIGHT.name}.") for name in found} == {
         *("FlightError", "__version__"),
-        *("mission.check_options", "page_server.Handler", "wire.Packet"),
+        *("mission.check_options", "page_server.Handler", "wire.LeaderPacket"),
     }
     assert flight.__version__ == CONTAINED
 

@@ -18,7 +18,7 @@ from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Kind, Verdict
 from echelon.experiments.studies.check import check
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.stopping.stopping_run import stopping_run_of
 from echelon.guarantees.verifier.verify import verify
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
@@ -197,7 +197,7 @@ def test_one_p_serves_undirected_graphs_whenever_they_switch():
     A, B = linearize(CARTS)
     K, P = gain.R_inverse @ B.T @ gain.P, np.kron(np.eye(2), gain.P)
     parts, settings = flown(ech.Graph.switching(TURNS), gain), ech.Settings(4.0, 0.01)
-    rate = promise(parts, settings).rate
+    rate = guarantee(parts, settings).rate
     assert rate is not None and rate > 0.1
     x = draw.normal(size=8)
     for _ in range(30):
@@ -335,7 +335,7 @@ def stopping(graph, **law):
 
 def test_what_is_promised_of_a_linear_law_on_arrows_is_its_modes():
     gain = ech.synthesize(CARTS, RING, ech.gains.Riccati())
-    found = promise(flown(RING, gain), ech.Settings(4.0, 0.01))
+    found = guarantee(flown(RING, gain), ech.Settings(4.0, 0.01))
     A, B = linearize(CARTS)
     L = RING.grounded_laplacian().toarray()
     whole = np.kron(np.eye(3), A) - np.kron(L, gain.coupling * B @ gain.R_inverse @ B.T @ gain.P)
@@ -378,8 +378,8 @@ def test_graphs_that_take_turns_need_one_p_or_stopping_points():
     settings, turns = ech.Settings(4.0, 0.01), ech.Graph.switching(TURNS)
     strong = ech.synthesize(CARTS, turns, ech.gains.Riccati())
     weak = ech.synthesize(CARTS, turns, ech.gains.Riccati(coupling=0.2 * strong.coupling))
-    assert promise(flown(turns, strong), settings).promised
-    found = promise(flown(turns, weak), settings)
+    assert guarantee(flown(turns, strong), settings).promised
+    found = guarantee(flown(turns, weak), settings)
     assert not found.promised and "no one P is known" in found.sentence()
     # A chain of arrows of 9 holds no sum of squares alone.
     heavy = ech.Graph.switching([(0.0, [(0, 1), (1, 2, 9.0)])], directed=True)
@@ -393,7 +393,7 @@ def test_graphs_that_take_turns_need_one_p_or_stopping_points():
 def test_stopping_points_wait_for_links_and_agree_at_the_rate_of_a_period():
     graph = ech.Graph.switching([(0.0, [(0, 1)]), (0.5, [(1, 2)])], period=1.0)
     parts, settings = stopping(graph, observer=False), ech.Settings(16.0, 0.01)
-    found = promise(parts, settings)
+    found = guarantee(parts, settings)
     assert found.kind is Kind.PROOF and "in every period" in found.sentence()
     assert found.hypotheses[Hypothesis.SWITCHING].verdict is Verdict.HOLDS
     size = np.linalg.norm(ech.simulate(parts, settings).errors[:, 1:], axis=(1, 2))
@@ -403,7 +403,7 @@ def test_stopping_points_wait_for_links_and_agree_at_the_rate_of_a_period():
 def test_heard_leaderward_each_stretch_must_reach():
     turns = [(0.0, [(0, 1), (1, 2)]), (1.0, [(0, 2), (2, 1)])]
     with pytest.raises(EchelonError, match="from 1 s on where neighbours nearer"):
-        promise(stopping(ech.Graph.switching(turns), hears="leaderward"), ech.Settings(4.0, 0.01))
+        guarantee(stopping(ech.Graph.switching(turns), hears="leaderward"), ech.Settings(4.0, 0.01))
 
 
 # ---- attack --------------------------------------------------------------------------------------
@@ -500,10 +500,10 @@ def test_a_pair_in_the_midst_of_a_spectrum_counts_for_the_step():
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
     offsets = ech.Formation(np.zeros((64, 4)))
     parts = ech.Parts(CARTS, graph, offsets, drive, initial={"position": 1.0})
-    longest = promise(parts, ech.Settings(1.0, 0.002)).longest_step(ech.Settings(1.0, 0.002))
+    longest = guarantee(parts, ech.Settings(1.0, 0.002)).longest_step(ech.Settings(1.0, 0.002))
     for share, holds in ((0.95, True), (1.2, False)):
         chosen = ech.Settings(200 * share * longest, share * longest)
-        assert promise(parts, chosen).promised is holds
+        assert guarantee(parts, chosen).promised is holds
         errors = np.linalg.norm(ech.simulate(parts, chosen).errors[:, 61:], axis=(1, 2))
         assert bool(errors[-1] < errors[0]) is holds
 
@@ -531,7 +531,7 @@ def test_of_angles_that_wind_no_start_half_a_turn_apart_is_promised():
     starts = 2.0 * np.pi * np.arange(8)[:, None] / 8
     parts = ech.Parts(model, graph, ech.Formation(np.zeros((8, 1))), drive, initial=starts)
     chosen = ech.Settings(5.0, 0.01)
-    run, found = ech.simulate(parts, chosen), promise(parts, chosen)
+    run, found = ech.simulate(parts, chosen), guarantee(parts, chosen)
     assert np.abs(run.errors[-1]).max() > 5.0
     assert found.hypotheses[Hypothesis.STARTS].verdict is Verdict.FAILS
     assert found.certified.radius < np.pi

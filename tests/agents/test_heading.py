@@ -206,7 +206,7 @@ def test_what_is_promised_of_a_turn_is_the_rate_at_which_errors_shrink():
         for k, (place, share) in enumerate(zip(offsets, shares, strict=True))
     }
     run = flown(spin, starts, horizon=14.0)
-    found = ech.promise(run.parts, run.settings)
+    found = ech.guarantee(run.parts, run.settings)
     [line] = (x for x in found.hypotheses.values() if x.name == "law turns with the heading")
     sizes = np.linalg.norm(run.errors[:, 1:], axis=(1, 2))
     early, late = sizes[[400, 650]]
@@ -246,7 +246,7 @@ def test_the_formation_of_yaw_turn_is_held_to_rounding():
     parts, settings = build(ech.load_scenario("yaw-turn"))
     result = ech.simulate(parts, settings)
     assert np.abs(result.errors[-1]).max() < 1e-14
-    promise = ech.promise(parts, settings)
+    promise = ech.guarantee(parts, settings)
     assert promise.promised and promise.rate > 1.0
     parts, settings = build(ech.load_scenario("yaw-turn", ["follower.frame=world"]))
-    assert "`yaw`" in ech.promise(parts, settings).sentence()
+    assert "`yaw`" in ech.guarantee(parts, settings).sentence()

@@ -183,7 +183,7 @@ def in_units(drift, sizes, weigh):
 def test_a_bend_at_the_trim_is_seen_in_any_units_and_nothing_else(size, place):
     sizes = (size, 1.0) if place == 0 else (1.0, size)
     for name, drift in BENT.items():
-        assert at_trim(in_units(drift, sizes, False)).bends.any(), name
+        assert at_trim(in_units(drift, sizes, False)).kinks.any(), name
     for name, drift in SMOOTH.items():
         found = at_trim(in_units(drift, sizes, True))
-        assert not found.bends.any() and found.gap is None, name
+        assert not found.kinks.any() and found.gap is None, name

@@ -496,7 +496,7 @@ def test_what_cannot_be_derived_is_one_sentence():
 
 
 @pytest.mark.parametrize(
-    ("drift", "bends"),
+    ("drift", "kinks"),
     [
         (lambda x: -x + 3 * jnp.abs(x), True),
         (lambda x: jnp.where(x > 0, -2 * x, -x), True),
@@ -507,15 +507,15 @@ def test_what_cannot_be_derived_is_one_sentence():
         (lambda x: -x + jnp.where(x > 1e-3, 1.0, 0.0), False),
     ],
 )
-def test_a_bend_at_the_trim_is_seen_and_a_curve_is_none(drift, bends):
+def test_a_bend_at_the_trim_is_seen_and_a_curve_is_none(drift, kinks):
     assert check_model(scalar(drift)) == ()
-    assert at_trim(scalar(drift)).bends.any() == bends
+    assert at_trim(scalar(drift)).kinks.any() == kinks
 
 
 def test_an_input_map_may_bend_and_not_jump():
     bent = scalar(lambda x: -x, lambda x: 1.0 + jnp.abs(x)[:, None])
     jumping = scalar(lambda x: -x, lambda x: jnp.where(x > 0, 1.0, 2.0)[:, None])
-    assert not at_trim(bent).bends.any() and at_trim(jumping).bends.all()
+    assert not at_trim(bent).kinks.any() and at_trim(jumping).kinks.all()
 
 
 @pytest.mark.parametrize("name", ["velocity", "normalized_drift", "normalized", "physical"])

@@ -66,7 +66,7 @@ def test_a_ring_that_is_twisted_once_is_outside_of_what_is_guaranteed(make, peri
     starts = period * np.arange(6)[:, None] / 6
     parts = ech.Parts(model, graph, ech.Formation(np.zeros((6, 1))), drive, initial=starts)
     chosen = ech.Settings(5.0, 0.01)
-    found = ech.promise(parts, chosen)
+    found = ech.guarantee(parts, chosen)
     result = ech.simulate(parts, chosen)
     # Nobody's neighbours pull more one way than the other.
     assert np.ptp(result.states[-1]) > 0.8 * period

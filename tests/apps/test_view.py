@@ -373,7 +373,7 @@ def test_agents_with_a_size_have_the_chart_with_twice_their_radius(browser, run,
         assert page.evaluate("echelon.player.view.ellipsoids.shown.value") == 0
 
 
-def test_who_is_lost_vanishes_an_heir_leads_and_the_event_is_marked(browser, run, tmp_path):
+def test_who_is_lost_vanishes_a_backup_leader_leads_and_the_event_is_marked(browser, run, tmp_path):
     starts, weights = np.array([0.0, 2.0]), np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
     here = np.array([[True] * 4, [False, True, True, True]])
     schedule = Schedule(starts, weights, None, here, np.array([[0] * 4, [1] * 4]))
@@ -395,7 +395,7 @@ def test_who_is_lost_vanishes_an_heir_leads_and_the_event_is_marked(browser, run
         assert page.locator("footer .mark").get_attribute("title") == "agent 0 is lost"
         names = page.evaluate("[...document.querySelectorAll('.label')].map((x) => x.innerText)")
         assert names[1:] == ["leader", "2", "3"]
-        # Goals are relative to the heir, and errors are of those that are there.
+        # Goals are relative to the backup leader, and errors are of those that are there.
         goal = run.states[100, 1, :3] + run.offsets[2, :3] - run.offsets[1, :3]
         assert page.evaluate("echelon.goal(2)") == pytest.approx(goal, abs=1e-4)
         away = np.linalg.norm(run.states[100, 2, :3] - goal)

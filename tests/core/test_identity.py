@@ -261,11 +261,11 @@ def test_a_proof_is_not_that_of_numbers_that_changed(monkeypatch):
         return ech.Parts(model, graph, ech.Formation(np.zeros((3, 2))), drive)
 
     first = parts()
-    slow = ech.promise(first, settings).rate
-    assert ech.promise(first, settings) is ech.promise(first, settings)
+    slow = ech.guarantee(first, settings).rate
+    assert ech.guarantee(first, settings) is ech.guarantee(first, settings)
     monkeypatch.setitem(globals(), "SPEED", 3.0)
-    assert ech.promise(first, settings).rate > slow + 0.5
-    assert ech.promise(parts(), settings).rate > slow + 0.5
+    assert ech.guarantee(first, settings).rate > slow + 0.5
+    assert ech.guarantee(parts(), settings).rate > slow + 0.5
 
 
 class Caller:

@@ -56,7 +56,7 @@ def test_a_public_call_traces_a_model_once_and_a_second_time_to_find_clocks(bits
     # In single precision the checks of a law are in double, and so are theorems.
     traces = 1 if bits == "float64" else 2
     assert max(calls_of(lambda: ech.simulate(parts, settings))[1]) <= traces
-    assert max(calls_of(lambda: ech.promise(parts, settings))[1]) <= 2
+    assert max(calls_of(lambda: ech.guarantee(parts, settings))[1]) <= 2
 
 
 def test_an_array_that_is_changed_in_place_between_calls_counts():

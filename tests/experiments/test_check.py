@@ -233,7 +233,7 @@ class Yielding(ech.models.Pendulum):
 )
 def test_the_promise_is_as_strong_as_its_argument(robust, model, method, told, untold):
     built = with_gain(robust, ech.synthesize(model, PATH, method), model=model)
-    found = ech.promise(*built)
+    found = ech.guarantee(*built)
     assert found.promised and told in found.sentence() and untold not in found.sentence()
     assert not found.hypotheses[Hypothesis.CLAIMS].fails
 
@@ -264,7 +264,7 @@ def test_why_a_proof_became_samples_is_said(robust):
     ],
 )
 def test_what_a_gain_says_of_itself_is_not_believed_but_compared(robust, changes):
-    true, found = (ech.promise(*each) for each in (robust, with_claim(robust, **changes)))
+    true, found = (ech.guarantee(*each) for each in (robust, with_claim(robust, **changes)))
     assert (found.theorem, found.kind, found.rate) == (true.theorem, true.kind, true.rate)
     told = [key for key in changes if key != "hull"]
     assert found.hypotheses[Hypothesis.CLAIMS].fails is bool(told)

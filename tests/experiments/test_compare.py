@@ -15,11 +15,11 @@ from echelon.apps.cli.app import app
 from echelon.experiments.results import run_numbers
 from echelon.experiments.results.metrics import RunNumbers
 from echelon.experiments.results.run_numbers import (
+    Appearance,
     FollowerMetrics,
     LeaderMetrics,
     Metrics,
     Quantity,
-    Shown,
 )
 from echelon.experiments.studies.compare import LABELS, Comparison, ComparisonRow
 from echelon.output.reports.comparison_report import comparison_mapping, comparison_report, verdict
@@ -120,7 +120,7 @@ def test_a_number_of_the_table_is_in_every_table_that_it_names(planar, monkeypat
         return float(np.abs(run.result.states).max())
 
     number = Quantity(
-        "largest state", "m", column="largest\nstate", of=fastest, shown=Shown.COMPARISON
+        "largest state", "m", column="largest\nstate", of=fastest, shown=Appearance.COMPARISON
     )
     monkeypatch.setitem(run_numbers.RUN_NUMBERS, "largest_state", number)
     rows = comparison_mapping(planar)["methods"]
@@ -151,7 +151,9 @@ def test_the_scenario_s_own_law_is_always_a_row(changes, labels):
     told = comparison_mapping(found)["methods"]
     for row in found.rows:
         result = row.flight.result
-        assert told[row.label]["promise"] == ech.promise(result.parts, result.settings).as_mapping()
+        assert (
+            told[row.label]["promise"] == ech.guarantee(result.parts, result.settings).as_mapping()
+        )
 
 
 class Halved(ech.Law):

@@ -26,7 +26,7 @@ from echelon.experiments.sweeps.plan import Axis, Sweep, axes_of, read_axes
 from echelon.experiments.sweeps.sweep import _missing, compute
 from echelon.experiments.sweeps.sweep_dataset import columns_of, dataset_of, share_bounds, succeeded
 from echelon.experiments.sweeps.workers import SweepBatch
-from echelon.guarantees.promises.promise import promise, promises
+from echelon.guarantees.promises.promise import guarantee, promises
 from echelon.output.plots import study_figures as sweep_plots
 from echelon.output.plots.study_figures import sweep_figures
 from echelon.simulation.engine import batch, law_drive
@@ -272,7 +272,7 @@ def test_promises_of_many_seeds_are_those_of_each(changes):
     parts, chosen = experiment
     asked = [chosen._replace(seed=k) for k in range(3)]
     for one, each in zip(promises(parts, asked), asked, strict=True):
-        assert one.as_mapping() == promise(parts, each).as_mapping()
+        assert one.as_mapping() == guarantee(parts, each).as_mapping()
 
 
 def test_runs_with_noise_and_runs_without_fly_in_one_sweep():
@@ -289,7 +289,7 @@ def test_of_starts_that_no_tube_covers_none_is_promised_among_many():
     parts, chosen = built("paper-global", *far)
     asked = [chosen._replace(seed=k) for k in (0, 1)]
     first, second = promises(parts, asked)
-    assert [first.promised, second.promised] == [promise(parts, s).promised for s in asked]
+    assert [first.promised, second.promised] == [guarantee(parts, s).promised for s in asked]
     assert first.tube is not second.tube
 
 
@@ -318,7 +318,7 @@ def test_a_sweep_is_each_of_its_runs():
             np.testing.assert_allclose(here["final_error"].values[followers], last[followers])
             assert float(here["worst_final_error"]) == pytest.approx(last.max())
             assert int(here["outcome"]) == 0 and int(here["promised"]) == int(
-                promise(run.parts, run.settings).promised
+                guarantee(run.parts, run.settings).promised
             )
 
 

@@ -10,12 +10,12 @@ import scipy.linalg
 
 import echelon as ech
 from echelon.agents.models.chains import chains_of
-from echelon.agents.models.model import FlatBound, FlatChains, Flattened
+from echelon.agents.models.model import FlatBound, FlatChains, FlatCoordinates
 from echelon.core.digits import at_most
 from echelon.core.errors import EchelonError
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.stopping.borders import length_clearance_of
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
@@ -43,7 +43,7 @@ def driven(headings=(0.0, 0.0, 0.0), away=0.0, reference=CIRCLE, leader=None, **
 
 
 def promised(parts, horizon=8.0):
-    return promise(parts, ech.Settings(horizon=horizon, dt=0.01))
+    return guarantee(parts, ech.Settings(horizon=horizon, dt=0.01))
 
 
 # ---- the certificate -----------------------------------------------------------------------------
@@ -441,11 +441,11 @@ def test_declared_coordinates_change_as_the_equations_say(drag):
         def drift(self, x):
             return jnp.stack([x[1], -drag * x[1]])
 
-        def flatten(self, x, e):
-            return Flattened(x[:, None], lambda tops: tops / 2.0)
+        def to_flat(self, x, e):
+            return FlatCoordinates(x[:, None], lambda tops: tops / 2.0)
 
     if drag == 0.0:
         assert StoppingPoint().prepared(Mapped(), TREE).ready.chains.degrees == (2,)
         return
-    with pytest.raises(EchelonError, match="`flatten` of `Mapped` is not of its motion"):
+    with pytest.raises(EchelonError, match="`to_flat` of `Mapped` is not of its motion"):
         StoppingPoint().prepared(Mapped(), TREE)

@@ -42,7 +42,7 @@ def parts_of(model, kind, spread=1.0, **more):
 @pytest.mark.parametrize("kind", ["T1", pytest.param("T5", marks=pytest.mark.slow)])
 def test_a_limit_leaves_a_claim_to_the_run(kind):
     weak, strong = (Cart(dimension=2, most=most) for most in (0.05, 1e3))
-    found = ech.promise(parts_of(weak, kind), SETTINGS)
+    found = ech.guarantee(parts_of(weak, kind), SETTINGS)
     told = found.as_mapping()
     assert found.verdict is GuaranteeVerdict.CONDITIONAL and not found.promised and found.claimed
     assert str(found.theorem) == kind == told["theorem"]
@@ -66,7 +66,7 @@ def test_without_limits_the_same_claim_is_guaranteed(kind):
         (parts_of(free, kind), SETTINGS),
         (parts_of(Cart(dimension=2), kind), SETTINGS._replace(limits=False)),
     ):
-        found = ech.promise(parts, settings)
+        found = ech.guarantee(parts, settings)
         assert found.verdict is GuaranteeVerdict.GUARANTEED and found.promised, found.sentence()
         assert found.sentence().startswith(("Proved", "Local guarantee"))
 
@@ -77,7 +77,7 @@ def test_limits_of_a_plant_count_as_those_of_the_model(kind, whose):
     wide, weak = (Cart(dimension=2, most=most) for most in (np.inf, 0.05))
     world = ech.World(plant=weak) if whose == "all" else ech.World(plants={2: weak})
     parts = parts_of(wide, kind, world=world)
-    assert ech.promise(parts, SETTINGS).verdict is GuaranteeVerdict.CONDITIONAL
+    assert ech.guarantee(parts, SETTINGS).verdict is GuaranteeVerdict.CONDITIONAL
 
 
 def test_only_the_leader_at_its_limit_leaves_a_run_uncovered():
@@ -91,21 +91,21 @@ def test_only_the_leader_at_its_limit_leaves_a_run_uncovered():
 
 
 def test_agents_that_keep_apart_with_too_weak_motors_are_conditional():
-    found = ech.promise(*ech.build(ech.load_scenario("crossing")))
+    found = ech.guarantee(*ech.build(ech.load_scenario("crossing")))
     assert found.verdict is GuaranteeVerdict.CONDITIONAL and str(found.theorem) == "T10"
     badge = promise_badge(found.as_mapping())
     assert badge["state"] == "edge" and WHILE in badge["short"]
 
 
 def test_what_claims_nothing_has_no_condition():
-    found = ech.promise(*ech.build(ech.load_scenario("leader-lost")))
+    found = ech.guarantee(*ech.build(ech.load_scenario("leader-lost")))
     assert found.verdict is GuaranteeVerdict.NONE and found.conditions == ()
     assert promise_badge(found.as_mapping())["short"] == "no guarantee"
 
 
 def test_one_agent_that_cannot_hold_its_trim_leaves_nothing_guaranteed():
     change = "plant={agents: {2: {parameters: {motor_thrust: 0.06}}}}"
-    found = ech.promise(*ech.build(ech.load_scenario("paper", [change])))
+    found = ech.guarantee(*ech.build(ech.load_scenario("paper", [change])))
     assert not found.promised and "cannot hold the trim" in found.sentence()
 
 
@@ -113,7 +113,7 @@ def test_one_agent_that_cannot_hold_its_trim_leaves_nothing_guaranteed():
 def test_motors_that_cannot_give_as_little_as_the_trim_leave_nothing_guaranteed(minimum, promised):
     # A Crazyflie of 28 g hovers at 0.028 * 9.81 / 4 = 0.0687 N a motor.
     change = f"actuator={{minimum: {minimum}}}"
-    found = ech.promise(*ech.build(ech.load_scenario("paper", [change])))
+    found = ech.guarantee(*ech.build(ech.load_scenario("paper", [change])))
     assert found.promised is promised
     assert ("more than the trim needs" in found.sentence()) is not promised
 
@@ -127,7 +127,7 @@ def test_a_domain_that_was_seen_at_stored_frames_alone_covers_no_run_from_outsid
     formation = ech.Formation.line(model, GRAPH)
     starts = formation.offsets + np.array([[0, 0, 0, 0], [0.9, 0, 0, 0], [0.9, 0, 0, 0.0]])
     parts = ech.Parts(model, GRAPH, formation, laws, initial=starts)
-    assert ech.promise(parts, SETTINGS).hypotheses[Hypothesis.STARTS].fails
+    assert ech.guarantee(parts, SETTINGS).hypotheses[Hypothesis.STARTS].fails
     for every, covered in ((1, True), (5, None)):
         result = ech.simulate(parts, SETTINGS._replace(store_every=every))
         assert ech.summary(result)["covered"] is covered

@@ -34,7 +34,7 @@ def exact_radius(parts, dt):
 
 
 def sampling(parts, **settings):
-    found = ech.promise(parts, ech.Settings(**settings))
+    found = ech.guarantee(parts, ech.Settings(**settings))
     return found, found.hypotheses[Hypothesis.SAMPLING]
 
 
@@ -46,7 +46,7 @@ def test_an_integrator_that_damps_what_a_held_input_drives_guarantees_nothing():
     assert line.number == pytest.approx(exact_radius(parts, 0.12), rel=1e-6)
     # What runs with enough substeps is the exact flow, and grows.
     settings = ech.Settings(horizon=12.0, dt=0.12, substeps=50)
-    assert not ech.promise(parts, settings).promised
+    assert not ech.guarantee(parts, settings).promised
     errors = np.abs(ech.simulate(parts, settings).errors).max(axis=(1, 2))
     assert errors[-1] > 1e6 * errors[0]
     found, _ = sampling(parts, horizon=12.0, dt=0.02)

@@ -65,7 +65,7 @@ def test_a_step_that_one_follower_in_the_midst_does_not_bear_is_refused(count):
     graph, weights = crowd(lost, count)
     assert radii(A, B, B.T @ P, weights, DT).max() > 1.0
     settings = ech.Settings(2.0, DT)
-    found = ech.promise(parts_of(A, B, P, graph), settings)
+    found = ech.guarantee(parts_of(A, B, P, graph), settings)
     assert found.hypotheses[Hypothesis.SAMPLING].verdict is Verdict.FAILS
     longest = found.longest_step(settings)
     assert radii(A, B, B.T @ P, weights, 0.999 * longest).max() < 1.0
@@ -138,7 +138,7 @@ def test_the_slowest_mode_between_two_eigenvalues_is_none_too_fast():
     B, P = np.array([[0.0], [0.0], [1.0]]), np.diag([40.0, 40.0, 1.0])
     P[2, :2] = P[:2, 2] = 4.0, 1.0
     graph = ech.Graph.path(460)
-    loop = ech.promise(parts_of(A, B, P, graph), ech.Settings(1.0, 0.001)).loop
+    loop = ech.guarantee(parts_of(A, B, P, graph), ech.Settings(1.0, 0.001)).loop
     eigenvalues = 2.0 - 2.0 * np.cos(np.pi * (2.0 * np.arange(1, 460) - 1.0) / 919.0)
     worst = growth(A, B, B.T @ P, eigenvalues).max()
     assert loop.closed.between and worst < 0.0

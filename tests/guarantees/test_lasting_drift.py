@@ -49,7 +49,7 @@ def largest_deviation(parts):
 def test_an_agent_that_drifts_away_is_named_with_the_speed_that_it_would_need(name):
     world, graph, path = CASES[name]
     parts = parts_of(world, graph, path)
-    found = ech.promise(parts, SETTINGS)
+    found = ech.guarantee(parts, SETTINGS)
     line = found.hypotheses[Hypothesis.EXACT_STATES]
     # Drag on the velocity of the path, through the chain s + root: k1 / k0 = 1 / root.
     asked = 0.3 * 20.0 / ROOT if name == "moving air" else 5.0 * 2.0 / ROOT
@@ -69,7 +69,7 @@ def test_with_more_speed_nobody_drifts_away_and_the_guarantee_stays(name):
     fast = dict(roots=[ROOT], observer=False, speed=3.0)
     laws = ech.Laws(ech.laws.StoppingLeader(reference=path, **fast), ech.laws.StoppingPoint(**fast))
     parts = parts.replace(drive=laws)
-    assert ech.promise(parts, SETTINGS).promised
+    assert ech.guarantee(parts, SETTINGS).promised
     away = largest_deviation(parts)
     assert abs(away[-1] - away[-2]) < 0.05
 
@@ -82,16 +82,16 @@ def test_followers_make_up_for_what_moves_them_more_than_their_sender_alone():
     leader = ech.laws.StoppingLeader(reference=LINE, speed=2.0, **fast)
     laws = ech.Laws(leader, ech.laws.StoppingPoint(**slow))
     parts = parts_of(ech.World(plant=drag)).replace(drive=laws)
-    assert ech.promise(parts, SETTINGS).promised
+    assert ech.guarantee(parts, SETTINGS).promised
     away = largest_deviation(parts)
     assert abs(away[-1] - away[-2]) < 0.05
     alone = parts.replace(world=ech.World(plants={0: drag}))
-    assert not ech.promise(alone, SETTINGS).promised
+    assert not ech.guarantee(alone, SETTINGS).promised
     away = largest_deviation(alone)
     assert away[-1] - away[-2] > 0.5 * (away[-2] - away[-3])
 
 
 def test_what_a_wind_does_is_said_to_be_ignored_and_no_bounds_are_announced():
     parts = parts_of(air((0.2, 0.0), 0.3), path=CIRCLE)
-    line = ech.promise(parts, SETTINGS).hypotheses[Hypothesis.EXACT_STATES]
+    line = ech.guarantee(parts, SETTINGS).hypotheses[Hypothesis.EXACT_STATES]
     assert line.text.endswith("the guarantee ignores this")

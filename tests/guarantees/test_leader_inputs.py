@@ -50,15 +50,15 @@ def test_small_errors_are_guaranteed_only_with_inputs_that_the_hull_covers(push)
     chosen = ech.Settings(4.0, 0.01)
     named = {"x": 0.5, "y": 0.5}
 
-    def promise(domain):
+    def guarantee(domain):
         parts = parts_of(domain, ech.gains.RobustLQR, lambda gain: pushed(gain, push))
-        return ech.promise(parts, chosen)
+        return ech.guarantee(parts, chosen)
 
-    bare = promise(named)
+    bare = guarantee(named)
     assert bare.region is None or bare.theorem is not Theorem.T2
     line = " ".join(x.text for x in bare.hypotheses.values())
     assert "the leader's own input reaches" in line and ("`vy`" in line or "`vx`" in line)
-    covered = promise({**named, "vx": 0.5, "vy": 0.5})
+    covered = guarantee({**named, "vx": 0.5, "vy": 0.5})
     if push < 0.5:
         assert covered.theorem is Theorem.T2
         assert "vx in [-0.5, 0.5], vy in [-0.5, 0.5]" in covered.domain
@@ -69,7 +69,7 @@ def test_small_errors_are_guaranteed_only_with_inputs_that_the_hull_covers(push)
 def test_a_domain_says_which_inputs_stay_at_the_trim():
     domain = {"x": 0.5, "y": 0.5, "vx": 0.5}
     parts = parts_of(domain, ech.gains.RobustLQR, lambda _: ech.laws.TrimInput())
-    found = ech.promise(parts, ech.Settings(1.0, 0.01))
+    found = ech.guarantee(parts, ech.Settings(1.0, 0.01))
     assert found.theorem is Theorem.T2
     assert "vx in [-0.5, 0.5], vy at its trim" in found.domain
     assert "vy at its trim" in found.sentence()

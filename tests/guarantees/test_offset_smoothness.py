@@ -67,7 +67,7 @@ def guaranteed(*changes, model=CART, horizon=20.0, places=((1.0, 0.0), (2.0, 1.0
     formation = ech.Formation.from_offsets(model, GRAPH, dict(enumerate(places, 1)))
     formation = formation.moving(model, GRAPH, changes)
     parts = ech.Parts(model, GRAPH, formation, LAWS)
-    return parts, ech.promise(parts, ech.Settings(horizon=horizon, dt=0.01))
+    return parts, ech.guarantee(parts, ech.Settings(horizon=horizon, dt=0.01))
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_what_a_motion_reads_is_asked_again(monkeypatch):
     parts, value = guaranteed(Told())
     assert value.promised
     monkeypatch.setattr(sys.modules[__name__], "_JUMPS", True)
-    assert not ech.promise(parts, ech.Settings(horizon=20.0, dt=0.01)).promised
+    assert not ech.guarantee(parts, ech.Settings(horizon=20.0, dt=0.01)).promised
 
 
 def test_a_smooth_motion_between_reshapes_is_guaranteed():

@@ -21,7 +21,7 @@ from echelon.guarantees.promises.case import Case
 from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import agent_lines
 from echelon.guarantees.promises.leaders import leaders_of
-from echelon.guarantees.promises.promise import REQUIRED, Promise, promises
+from echelon.guarantees.promises.promise import REQUIRED, Guarantee, promises
 from echelon.laws.law import TrimInput
 
 # ---- all tellers say the same ----
@@ -61,7 +61,7 @@ def tellers(scenario, built, method, folder):
     """What everyone tells of a scenario, by who tells it, each as JSON."""
     result = ech.simulate(*built)
     report = " ".join(ech.report(result).split())
-    assert ech.promise(*built).sentence() in report
+    assert ech.guarantee(*built).sentence() in report
     (design,) = ech.design(scenario, method).designs
     (row,) = ech.compare(scenario, built, ("own",)).rows
     return {
@@ -95,7 +95,7 @@ def agree(name, method, feedforward, folder):
         else:  # where the method alone is at fault, it is a row with the same reason
             assert row.gain is None and str(refused).endswith(f": {row.reason}")
         return
-    promise, gain = ech.promise(*built), built.parts.drive.gain
+    promise, gain = ech.guarantee(*built), built.parts.drive.gain
     told = tellers(scenario, built, method, folder)
     wanted = core(json.loads(json.dumps(promise.as_mapping())))
     assert {who: core(each) for who, each in told.items()} == dict.fromkeys(told, wanted)
@@ -181,7 +181,7 @@ def test_a_gain_of_another_graph_is_promised_what_it_does_on_this_one():
     model, path = ech.models.DoubleIntegrator(1), ech.Graph.path(12)
     gain = ech.synthesize(model, ech.Graph.complete(6), ech.gains.Riccati(coupling=0.3))
     parts = parts_of(model, path, gain)
-    found = ech.promise(parts, settings())
+    found = ech.guarantee(parts, settings())
     slowest = true_slowest(model, path, gain)
     assert gain.certificate.abscissa < 1.1 * slowest < 0.0
     assert found.loop.slowest == pytest.approx(slowest, rel=1e-6)
@@ -200,7 +200,7 @@ def test_an_edited_coupling_is_promised_what_it_does():
     model = ech.models.Linear(A=[[0.0, 1.0], [1.0, 0.0]], B=[[0.0], [1.0]])
     gain = ech.synthesize(model, PATH, ech.gains.Riccati())
     weak = ech.Gain(gain.P, gain.R, 0.2, gain.method, gain.certificate)
-    found = ech.promise(parts_of(model, PATH, weak), settings())
+    found = ech.guarantee(parts_of(model, PATH, weak), settings())
     slowest = true_slowest(model, PATH, weak)
     assert gain.certificate.stable and slowest > 0.0 and not found.promised
     assert found.loop.slowest == pytest.approx(slowest, rel=1e-9)
@@ -211,7 +211,7 @@ def test_a_run_says_what_check_says_of_a_step_too_long():
     changes = ["graph={name: grid, rows: 10, columns: 15}", "formation={name: grid, columns: 15}"]
     changes += ["simulation.horizon=0.01", "report.steady_window=0.005"]
     built = ech.build(ech.load_scenario("planar-quadrotor", changes))
-    found = ech.promise(*built)
+    found = ech.guarantee(*built)
     assert found.reasons == ("with the input held over the step `dt` the disagreement grows",)
     report = " ".join(ech.report(ech.simulate(*built)).split())
     assert found.sentence() in report and "stable" not in report
@@ -224,7 +224,7 @@ def test_one_step_of_the_integrator_that_runs_decides():
     parts = parts_of(model, ech.Graph.ring(5), gain, initial={"x1": 1.0})
     for integrator, holds in (("rk4", True), ("euler", False), ("printed", False)):
         run = settings(integrator=integrator, dt=0.05, horizon=10.0)
-        found, result = ech.promise(parts, run), ech.simulate(parts, run)
+        found, result = ech.guarantee(parts, run), ech.simulate(parts, run)
         assert found.promised is holds
         with np.errstate(over="ignore"):
             sizes = np.linalg.norm(result.errors, axis=(1, 2))
@@ -236,9 +236,11 @@ def test_the_printed_step_keeps_no_offset():
     model = ech.models.Linear(A=[[-0.5]], B=[[1.0]])
     gain = ech.synthesize(model, ech.Graph.path(2), ech.gains.FixedGain("identity", coupling=0.2))
     parts = parts_of(model, ech.Graph.path(2), gain)
-    assert ech.promise(parts, settings(integrator="printed", dt=1.0)).promised
+    assert ech.guarantee(parts, settings(integrator="printed", dt=1.0)).promised
     away = parts.replace(formation=ech.Formation([[0.0], [1.0]]))
-    step = ech.promise(away, settings(integrator="printed", dt=1.0)).hypotheses[Hypothesis.SAMPLING]
+    step = ech.guarantee(away, settings(integrator="printed", dt=1.0)).hypotheses[
+        Hypothesis.SAMPLING
+    ]
     assert step.fails and "ignores the goals" in step.text
 
 
@@ -249,7 +251,7 @@ def test_vehicles_that_cannot_hold_their_trim_are_promised_nothing(change):
     short = ["simulation.horizon=0.01", "report.steady_window=0.005"]
     scenario = ech.load_scenario("planar-quadrotor", [change, *short])
     built = ech.build(scenario)
-    found = ech.promise(*built)
+    found = ech.guarantee(*built)
     assert not found.promised
     told = "the actuators deliver `thrust` 0.2 of 0.2747 N, and cannot hold the trim"
     assert told in found.sentence()
@@ -258,7 +260,7 @@ def test_vehicles_that_cannot_hold_their_trim_are_promised_nothing(change):
     assert not designs.recommended.promise.promised and told in designs.because
     assert told in " ".join(ech.report(ech.simulate(*built)).split())
     unlimited = built.settings._replace(limits=False)
-    assert ech.promise(built.parts, unlimited).promised
+    assert ech.guarantee(built.parts, unlimited).promised
 
 
 def leaders_apart(gain_of, gap):
@@ -272,10 +274,10 @@ def leaders_apart(gain_of, gap):
 def test_leaders_that_disagree_leave_no_proof_and_containment_is_said():
     method = ech.gains.Contraction({}, rate=0.5)
     together, apart = (leaders_apart(method, gap) for gap in (0.0, 1.0))
-    found = ech.promise(together, settings())
+    found = ech.guarantee(together, settings())
     assert (found.theorem, found.kind) == (Theorem.T1, Kind.PROOF)
     assert found.hypotheses[Hypothesis.LEADERS_AGREE].verdict is Verdict.HOLDS
-    found = ech.promise(apart, settings(horizon=20.0))
+    found = ech.guarantee(apart, settings(horizon=20.0))
     assert not found.promised and found.theorem is None and found.region is None
     line = found.hypotheses[Hypothesis.LEADERS_AGREE]
     assert line.fails and line.number == pytest.approx(1.0)
@@ -289,7 +291,7 @@ def test_free_leaders_of_a_limit_cycle_are_said_to_drift_apart():
     changes = ["graph={name: ring, agents: 12, leaders: [0, 6]}", "leader.start_error={}",
                "initial={states: {0: [2.0, 0.0], 6: [-1.0, 0.5]}}"]  # fmt: skip
     built = ech.build(ech.load_scenario("van-der-pol", changes))
-    found, result = ech.promise(*built), ech.simulate(*built)
+    found, result = ech.guarantee(*built), ech.simulate(*built)
     line = found.hypotheses[Hypothesis.LEADERS_AGREE]
     away = np.linalg.norm(result.states[:, 6] - result.states[:, 0], axis=1)
     assert not found.promised and line.number == pytest.approx(away.max(), rel=1e-2)
@@ -301,7 +303,7 @@ def test_leaders_that_come_together_leave_the_linearization():
     built = ech.build(ech.load_scenario("planar-quadrotor", ["graph.leaders=[0, 3]"]))
     states = {0: (0.0, 1.5, 0.0, 0.0, 0.0, 0.0)}
     built = built._replace(parts=built.parts.replace(initial=states, start_error={}))
-    found = ech.promise(*built)
+    found = ech.guarantee(*built)
     assert found.promised and found.theorem is None
     assert "brings them together" in found.hypotheses[Hypothesis.LEADERS_AGREE].text
 
@@ -314,7 +316,7 @@ def test_what_decays_unseen_is_no_cause():
     for P, holds in ((felt, True), ("identity", False)):
         gain = ech.synthesize(model, PATH, ech.gains.FixedGain(P))
         parts = parts_of(model, PATH, gain, initial={"position": 1.0})
-        found = ech.promise(parts, settings())
+        found = ech.guarantee(parts, settings())
         line = found.hypotheses[Hypothesis.DETECTABLE]
         assert line.number == 2 and line.fails is not holds and found.promised is holds
         assert ("no input feels 2 of 4 directions" in line.text) is not holds
@@ -325,7 +327,7 @@ def test_below_the_edge_the_edge_is_the_cause_and_not_the_step():
     scenario = ech.load_scenario("planar-quadrotor", [*changes, "simulation.horizon=12"])
     report = " ".join(ech.report(ech.run(scenario)).split())
     assert "Cause" not in report
-    line = ech.promise(*ech.build(scenario)).hypotheses[Hypothesis.COUPLING]
+    line = ech.guarantee(*ech.build(scenario)).hypotheses[Hypothesis.COUPLING]
     assert "coupling 0.5 is below the edge 2.525" in line.text
     assert "step `dt` is too long" not in report
 
@@ -347,7 +349,7 @@ def test_only_a_law_that_keeps_the_theorem_is_promised_it():
     for feedforward in map(str, Feedforward):
         for leader in (None, circle):
             parts = parts_of(model, PATH, gain, feedforward, leader)
-            found = ech.promise(parts, settings())
+            found = ech.guarantee(parts, settings())
             theorems[feedforward, leader is None] = found.theorem
             assert found.promised
     proved = {"none": (True, False), "relay": (True, True), "relay-velocity": (True, True),
@@ -360,7 +362,7 @@ def test_only_a_law_that_keeps_the_theorem_is_promised_it():
     errors = ech.simulate(parts, settings(horizon=10.0)).errors
     assert np.abs(errors[0]).max() == 0.0 and np.abs(errors[-1]).max() > 0.1
     assert "once the leader's input rests at its trim" in (
-        ech.promise(parts, settings()).sentence()
+        ech.guarantee(parts, settings()).sentence()
     )
 
 
@@ -369,7 +371,7 @@ def test_a_parent_that_is_the_leader_relays():
     for graph, kept in ((star, True), (PATH, False)):
         gain = ech.synthesize(model, graph, ech.gains.Contraction({}, rate=0.3))
         relayed, passed_on = (
-            ech.promise(parts_of(model, graph, gain, feedforward), settings())
+            ech.guarantee(parts_of(model, graph, gain, feedforward), settings())
             for feedforward in ("relay", "parent")
         )
         assert relayed.region is not None
@@ -383,7 +385,7 @@ def test_the_relayed_velocity_has_no_local_theorem_where_g_varies():
     gain = ech.synthesize(model, PATH, ech.gains.RobustLQR(bounds))
     moving = ech.laws.Tracking(ech.references.Circle(radius=0.2, rate=0.1))
     theorems = [
-        ech.promise(
+        ech.guarantee(
             parts.replace(drive=ech.Laws(leader, parts.drive.follower)), settings(dt=0.002)
         ).theorem
         for leader in (moving, ech.laws.TrimInput())
@@ -401,14 +403,14 @@ def test_two_eigenvalues_do_not_stand_for_those_between_them():
     P = [[40.0, 0.0, 4.0], [0.0, 40.0, 1.0], [4.0, 1.0, 1.0]]
     graph = ech.Graph.path(460)
     gain = ech.synthesize(model, graph, ech.gains.FixedGain(P))
-    found = ech.promise(parts_of(model, graph, gain), settings())
+    found = ech.guarantee(parts_of(model, graph, gain), settings())
     assert gain.certificate.modes == 2 and gain.certificate.abscissa < 0.0
     assert found.loop.slowest > 0.0 and not found.promised
 
 
 def test_agents_that_are_all_alike_agree_at_the_rate_of_the_whole_graph():
     built = ech.build(ech.load_scenario("integrators", ["simulation.horizon=30"]))
-    found, L = ech.promise(*built), built.parts.graph.laplacian().toarray()
+    found, L = ech.guarantee(*built), built.parts.graph.laplacian().toarray()
     assert found.rate == pytest.approx(np.linalg.eigvalsh(L)[1])
     errors = np.linalg.norm(ech.simulate(*built).errors, axis=(1, 2))
     seen = -np.log(errors[-1] / errors[-200]) / (199 * 0.1)
@@ -446,7 +448,7 @@ def test_the_report_says_whether_the_proof_covers_the_run(swinging, factor, told
     parts = swinging(factor)
     report = " ".join(ech.report(ech.simulate(parts, settings())).split())
     assert told in report
-    starts = ech.promise(parts, settings()).hypotheses[Hypothesis.STARTS]
+    starts = ech.guarantee(parts, settings()).hypotheses[Hypothesis.STARTS]
     assert starts.fails is (factor > 1.0)
     assert "guaranteed for linear agents" not in report
 
@@ -468,7 +470,7 @@ def test_a_run_that_will_grow_says_what_would_not(echelon):
     assert "There is a guarantee with `--set simulation.dt=" in err
     shorter = err.partition("`--set simulation.dt=")[2].partition("`")[0]
     change = f"simulation.dt={shorter}"
-    assert ech.promise(*ech.build(ech.load_scenario("planar-quadrotor", [change]))).promised
+    assert ech.guarantee(*ech.build(ech.load_scenario("planar-quadrotor", [change]))).promised
     _, _, err = echelon("run", "planar-quadrotor", *quick, "--out", "p", "--json")
     assert err == ""
 
@@ -479,7 +481,7 @@ def test_the_data_of_a_run_hold_the_whole_promise():
     parts = parts_of(model, PATH, gain)
     result = ech.simulate(parts, settings(horizon=0.1))
     told, data = ech.summary(result)["promise"], ech.dataset(result)
-    assert told == ech.promise(parts, settings(horizon=0.1)).as_mapping()
+    assert told == ech.guarantee(parts, settings(horizon=0.1)).as_mapping()
     # These lines are there only for laws that turn, graphs that switch, motors, networks, ...
     apart = {Hypothesis.HEADING_FRAME, Hypothesis.SWITCHING, Hypothesis.LIMITS}
     apart |= {Hypothesis.MESSAGES, Hypothesis.OWN_STATE, Hypothesis.SEPARATION, Hypothesis.EVENTS}
@@ -495,17 +497,17 @@ def test_the_data_of_a_run_hold_the_whole_promise():
 def test_a_promise_is_computed_once_for_as_long_as_its_parts_live():
     model = ech.models.Pendulum()
     parts = parts_of(model, PATH, ech.synthesize(model, PATH, ech.gains.Riccati()))
-    first = ech.promise(parts, settings())
-    assert ech.promise(parts, settings()) is first
-    assert ech.promise(ech.simulate(parts, settings()).parts, settings()) is first
-    assert ech.promise(parts, settings(dt=0.02)) is not first
+    first = ech.guarantee(parts, settings())
+    assert ech.guarantee(parts, settings()) is first
+    assert ech.guarantee(ech.simulate(parts, settings()).parts, settings()) is first
+    assert ech.guarantee(parts, settings(dt=0.02)) is not first
 
 
 def test_plans_are_promised_nothing():
     model = ech.models.DoubleIntegrator(2)
     goals = ech.Formation(np.zeros((4, 4)))
     parts = ech.Parts(model, PATH, goals, ech.optimal.Plans(ech.references.Circle()))
-    assert ech.promise(parts, settings()).sentence() == (
+    assert ech.guarantee(parts, settings()).sentence() == (
         "Nothing is guaranteed: no theorem covers `Plans`. What would help: use laws that a "
         "theorem covers."
     )
@@ -538,9 +540,9 @@ def test_a_trim_needs_room_on_both_sides_of_its_input(low, high, promised):
     model = of_one_state(lambda x: -x)
     type(model).input_limits = ech.models.Limits(((1.0,),), (low,), (high,))
     gain = ech.synthesize(model, PATH, ech.gains.FixedGain("identity", coupling=0.5))
-    promise = ech.promise(parts_of(model, PATH, gain), settings())
+    promise = ech.guarantee(parts_of(model, PATH, gain), settings())
     assert promise.promised == promised
-    unlimited = ech.promise(parts_of(model, PATH, gain), settings(limits=False))
+    unlimited = ech.guarantee(parts_of(model, PATH, gain), settings(limits=False))
     assert unlimited.promised
     if not promised:
         assert "actuators" in promise.sentence()
@@ -549,7 +551,7 @@ def test_a_trim_needs_room_on_both_sides_of_its_input(low, high, promised):
 def test_nothing_linear_is_promised_where_the_drift_bends_at_the_trim():
     model = of_one_state(lambda x: -x + 3.0 * jnp.abs(x))
     gain = ech.synthesize(model, PATH, ech.gains.FixedGain("identity", coupling=0.5))
-    promise = ech.promise(parts_of(model, PATH, gain), settings())
+    promise = ech.guarantee(parts_of(model, PATH, gain), settings())
     assert not promise.promised
     assert "the rate of `x` bends or jumps with `x` at the trim" in promise.sentence()
 
@@ -557,7 +559,7 @@ def test_nothing_linear_is_promised_where_the_drift_bends_at_the_trim():
 def test_slopes_of_both_sides_that_contract_are_promised_without_a_linearization():
     model = of_one_state(lambda x: -2.0 * x + jnp.maximum(x, 0.0))
     gain = ech.synthesize(model, PATH, ech.gains.FixedGain("identity", coupling=0.5))
-    promise = ech.promise(parts_of(model, PATH, gain), settings())
+    promise = ech.guarantee(parts_of(model, PATH, gain), settings())
     assert promise.promised and (promise.kind, promise.theorem) == (Kind.VERTICES, Theorem.T1)
     # The slower side, -1, and c times the smallest eigenvalue of the graph.
     assert promise.rate == pytest.approx(1.0 + 0.5 * PATH.spectrum().low, rel=1e-6)
@@ -577,7 +579,7 @@ def test_an_inner_loop_closes_around_the_slopes_of_both_sides():
     model = of_one_state(lambda x: jnp.stack([x[1], -0.5 * jnp.maximum(x[1], 0.0)]), "xv")
     gain = ech.synthesize(model, PATH, ech.gains.InnerLoop())
     assert gain.inner is not None
-    promise = ech.promise(parts_of(model, PATH, gain), settings())
+    promise = ech.guarantee(parts_of(model, PATH, gain), settings())
     assert promise.promised and (promise.kind, promise.theorem) == (Kind.VERTICES, Theorem.T1)
     sides = [np.array([[0.0, 1.0], [0.0, -slope]]) for slope in (0.0, 0.5)]
     assert 0.0 < promise.rate <= slowest_of_sides(sides, gain, PATH) + 1e-9
@@ -597,7 +599,7 @@ def test_a_leader_at_its_trim_has_no_velocity_that_a_bend_of_g_could_turn(feedfo
     gain = ech.synthesize(Bent(), PATH, ech.gains.FixedGain("identity", coupling=0.5))
     law = ech.laws.Consensus(gain, feedforward=feedforward)
     parts = parts_of(Bent(), PATH, gain).replace(drive=ech.Laws(ech.laws.TrimInput(), law))
-    promise = ech.promise(parts, settings())
+    promise = ech.guarantee(parts, settings())
     assert promise.promised and (promise.kind, promise.theorem) == (Kind.VERTICES, Theorem.T2)
     # g is 1 at the trim, and 1.0003 at the edge of what was looked at.
     assert promise.rate == pytest.approx(1.0 + 0.5 * PATH.spectrum().low, rel=1e-3)
@@ -606,7 +608,7 @@ def test_a_leader_at_its_trim_has_no_velocity_that_a_bend_of_g_could_turn(feedfo
 def test_a_hull_of_both_sides_is_promised_across_a_bend():
     model = of_one_state(lambda x: -2.0 * x + jnp.maximum(x, 0.0))
     gain = ech.synthesize(model, PATH, ech.gains.Contraction({"x": 2.0}, coupling=1.0))
-    promise = ech.promise(parts_of(model, PATH, gain), settings())
+    promise = ech.guarantee(parts_of(model, PATH, gain), settings())
     assert promise.promised and promise.kind is Kind.PROOF
     # The slower side, and what the feedback adds to it.
     assert promise.rate >= 0.99
@@ -630,7 +632,7 @@ def test_offsets_are_proved_on_the_domain_or_said_to_be_tried(drift, domain, ver
     parts = dataclasses.replace(
         parts_of(model, PATH, gain), formation=ech.Formation(np.arange(4.0)[:, None] * [1.0, 0.0])
     )
-    promise = ech.promise(parts, settings())
+    promise = ech.guarantee(parts, settings())
     line = promise.hypotheses[Hypothesis.SYMMETRY]
     assert (str(line.verdict), str(line.kind)) == (verdict, kind)
     assert promise.promised == (verdict == "holds")
@@ -650,7 +652,7 @@ def test_no_mode_and_no_edge_is_told_of_a_model_that_bends_at_its_trim(method):
     model = of_one_state(dragging, "xv")
     gain = ech.synthesize(model, PATH, method)
     parts = parts_of(model, PATH, gain, initial={"x": 0.1})
-    promise, run = ech.promise(parts, settings()), settings(horizon=0.1)
+    promise, run = ech.guarantee(parts, settings()), settings(horizon=0.1)
     assert promise.promised and promise.theorem is Theorem.T1
     assert promise.sentence().startswith("Guaranteed on a domain only")
     told = promise.as_mapping()
@@ -674,7 +676,7 @@ def test_a_step_too_long_for_one_side_of_a_bend_is_not_promised():
     gain = ech.synthesize(model, PATH, ech.gains.FixedGain("identity"))
     parts = parts_of(model, PATH, gain)
     for dt, holds in ((0.005, True), (0.05, False)):
-        promise = ech.promise(parts, settings(dt=dt))
+        promise = ech.guarantee(parts, settings(dt=dt))
         assert (
             promise.promised is holds and promise.hypotheses[Hypothesis.SAMPLING].fails is not holds
         )
@@ -694,7 +696,7 @@ def test_design_ranks_no_mode_of_a_model_that_bends():
 
 @final
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class RestPromise(Promise):
+class RestPromise(Guarantee):
     """What is guaranteed of followers that rest: nothing grows."""
 
     @classmethod
@@ -728,7 +730,7 @@ def test_a_law_names_what_proves_its_guarantee():
     model = ech.models.SingleIntegrator(2)
     goals = ech.Formation(np.zeros((4, 2)))
     parts = ech.Parts(model, PATH, goals, ech.Laws(TrimInput(), Rest()))
-    found = ech.promise(parts, settings())
+    found = ech.guarantee(parts, settings())
     assert type(found) is RestPromise and found.decays
     assert found.as_mapping()["sentence"] == "Followers rest where they start."
     assert ech.check(parts, settings()).promise is found
@@ -737,7 +739,7 @@ def test_a_law_names_what_proves_its_guarantee():
     seeds = [settings()._replace(seed=k) for k in range(2)]
     assert [type(each) for each in promises(parts, seeds)] == [RestPromise, RestPromise]
     other = parts.replace(drive=ech.Laws(TrimInput(), TrimInput()))
-    assert not ech.promise(other, settings()).promised
+    assert not ech.guarantee(other, settings()).promised
 
 
 def test_no_remedy_asks_for_a_step_of_zero_or_less():
@@ -751,7 +753,7 @@ def test_no_remedy_asks_for_a_step_of_zero_or_less():
     }
     for dt in (0.01, 0.001):
         given["simulation"] = {"horizon": 15.0, "dt": dt}
-        promise = ech.promise(*ech.build(ech.scenario_from_mapping(given)))
+        promise = ech.guarantee(*ech.build(ech.scenario_from_mapping(given)))
         for line in promise.hypotheses.values():
             for number in re.findall(r"(?:below|than|to) (-?[\d.e+-]*\d|inf|nan)", line.remedy):
                 assert 0.0 < float(number) < np.inf, line.remedy
@@ -777,6 +779,6 @@ def test_a_difference_that_is_not_x_minus_y_leaves_nothing_guaranteed():
     parts = ech.Parts(model, PATH, formation, laws, initial={"position": 0.1})
     result = ech.simulate(parts, settings())
     assert np.abs(result.errors[-1]).max() > 10.0 * np.abs(result.errors[0]).max()
-    found = ech.promise(parts, settings())
+    found = ech.guarantee(parts, settings())
     assert not found.promised and found.slowest is None
     assert "is not x - y" in found.sentence()

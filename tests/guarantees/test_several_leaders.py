@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.laws import Consensus, TrimInput
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 
@@ -43,7 +43,7 @@ def shrinking(parts, begin, end):
     sizes = np.linalg.norm(result.errors.reshape(len(result.times), -1), axis=1)
     first, last = np.searchsorted(result.times, [begin, end])
     measured = np.log(sizes[first] / sizes[last]) / (result.times[last] - result.times[first])
-    return measured, promise(parts, settings)
+    return measured, guarantee(parts, settings)
 
 
 @pytest.mark.parametrize("coupling", [0.05, 0.3])

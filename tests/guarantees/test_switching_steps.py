@@ -35,16 +35,16 @@ def test_held_steps_fall_on_all_graphs_in_any_order(seed):
     A, B = agent(rng)
     model = ech.models.Linear(A, B)
 
-    def promise(dt):
+    def guarantee(dt):
         graph = switching(graphs, dt, directed)
         gain = ech.synthesize(model, graph, ech.gains.Riccati())
         drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
         goals = ech.Formation(np.zeros((agents, len(A))))
         settings = ech.Settings(40 * dt, dt)
-        return ech.promise(ech.Parts(model, graph, goals, drive), settings), gain, settings
+        return ech.guarantee(ech.Parts(model, graph, goals, drive), settings), gain, settings
 
     try:
-        found, gain, settings = promise(1e-3)
+        found, gain, settings = guarantee(1e-3)
     except ech.EchelonError:
         return  # no one sum falls on these graphs
     longest = found.longest_step(settings)
@@ -52,14 +52,14 @@ def test_held_steps_fall_on_all_graphs_in_any_order(seed):
     for share in (0.5, 0.8, 0.99):
         maps = whole_steps(A, B, K, laplacians, share * longest)
         assert worst_growth(maps, 6) < 1.0
-        found, *_ = promise(share * longest)
+        found, *_ = guarantee(share * longest)
         assert found.promised
         assert worst_growth(maps, 6) <= np.exp(-found.rate * share * longest) * (1.0 + 1e-9)
         root = np.linalg.cholesky(gain.P).T
         whole = np.kron(np.eye(agents - 1), root)
         norms = [np.linalg.norm(whole @ M @ np.linalg.inv(whole), 2) for M in maps]
         assert max(norms) <= 1.0 + 1e-12
-    found, *_ = promise(1.01 * longest)
+    found, *_ = guarantee(1.01 * longest)
     assert found.hypotheses[Hypothesis.SAMPLING].verdict is Verdict.FAILS
     maps = whole_steps(A, B, K, laplacians, 1.01 * longest)
     whole = np.kron(np.eye(agents - 1), np.linalg.cholesky(gain.P).T)

@@ -83,7 +83,7 @@ def parts_of(law, leader=None):
 @pytest.mark.parametrize("name", LAWS)
 def test_nothing_is_said_of_a_law_that_echelon_does_not_know(name):
     parts = parts_of(LAWS[name])
-    found = ech.promise(parts, SETTINGS)
+    found = ech.guarantee(parts, SETTINGS)
     told = found.as_mapping()
     assert UNKNOWN in found.sentence() and str(found.verdict) == told["verdict"] == "none"
     assert not found.promised and not found.claimed
@@ -143,8 +143,8 @@ def test_a_leader_that_echelon_does_not_know_leaves_nothing_guaranteed():
             return model.physical(jnp.ones(2)), memory
 
     law = ech.laws.Consensus(GAIN, feedforward="none")
-    assert ech.promise(parts_of(law), SETTINGS).promised
-    found = ech.promise(parts_of(law, Away()), SETTINGS)
+    assert ech.guarantee(parts_of(law), SETTINGS).promised
+    found = ech.guarantee(parts_of(law, Away()), SETTINGS)
     assert UNKNOWN in found.sentence() and not found.promised
 
 

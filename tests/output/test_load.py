@@ -106,7 +106,7 @@ def test_every_function_gives_the_same_for_a_run_from_disk(run):
         assert ech.dataset(other).identical(ech.dataset(result))
         assert run_file(other) == run_file(result) == (folder / "run.nc").read_bytes()
         pd.testing.assert_frame_equal(ech.table(other), ech.table(result))
-        promises = (ech.promise(x.parts, x.settings).as_mapping() for x in (other, result))
+        promises = (ech.guarantee(x.parts, x.settings).as_mapping() for x in (other, result))
         assert next(promises) == next(promises)
     runs = (ech.load(folder), result)
     charts = map(charts_of, map(recording_of, runs))

@@ -92,7 +92,7 @@ def told(*changes, scenario="paper"):
     """What was observed of a short run."""
     quick = ["simulation.horizon=2", "report.steady_window=0.5"]
     result = run(scenario, *quick, *changes)
-    found = ech.promise(result.parts, result.settings)
+    found = ech.guarantee(result.parts, result.settings)
     return [*observations(result, ech.metrics(result), found)]
 
 

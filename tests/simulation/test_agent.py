@@ -287,8 +287,8 @@ def test_late_damaged_and_forged_messages_change_nothing():
         (message._replace(time=10**400), "no-message"),
         (message._replace(time=0.02, packet=packet._replace(time=10**400)), "no-message"),
         (message._replace(time=0.02, packet=packet._replace(leader=[0])), "no-message"),
-        (message._replace(time=0.02, packet=packet._replace(epoch="1")), "no-message"),
-        (message._replace(time=0.02, packet=packet._replace(epoch=10**9)), "no-message"),
+        (message._replace(time=0.02, packet=packet._replace(term="1")), "no-message"),
+        (message._replace(time=0.02, packet=packet._replace(term=10**9)), "no-message"),
         (message._replace(time=0.02, packet=None), "no-message"),
         (message._replace(time=0.02, hops="text"), "no-message"),
     ):

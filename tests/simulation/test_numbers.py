@@ -27,7 +27,7 @@ PARTS = {
     "damping": lambda x: ech.models.VanDerPol(damping=x),
     "radius": lambda x: ech.references.Circle(radius=x),
     "gain": lambda x: ech.Safety(gain=x),
-    "timeout": lambda x: ech.Leadership(heirs=(1,), timeout=x),
+    "timeout": lambda x: ech.Leadership(backups=(1,), timeout=x),
     "spacing": lambda x: ech.Formation.line(MODEL, GRAPH, spacing=x),
     "domain": lambda x: Domain.about(PENDULUM, {"angle": x}),
 }

@@ -11,7 +11,7 @@ import echelon as ech
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.sensing import Sensing
 from echelon.core.errors import EchelonError, SimulationError
-from echelon.simulation.step.motion import Motion, MotionState
+from echelon.simulation.step.motion import MotionState, PlantStep
 
 POINT = ech.models.DoubleIntegrator()
 N = len(POINT.input_names)
@@ -19,7 +19,7 @@ N = len(POINT.input_names)
 
 def motion(world, dt, **more):
     settings = ech.Settings(horizon=1.0, dt=dt, **more)
-    return Motion.of(POINT, world, settings, agents=1)
+    return PlantStep.of(POINT, world, settings, agents=1)
 
 
 def pushed(world, dt, steps, command, **more):
@@ -122,10 +122,10 @@ def test_agents_that_differ_move_each_as_its_own_plant():
     rng = np.random.default_rng(1)
     x, u = rng.normal(size=(3, 6)), rng.uniform(0.1, 0.3, size=(3, 2)) * [1.0, 1e-3]
     with jax.enable_x64(True):
-        mixed = Motion.of(base, ech.World(plants={1: heavy}), settings, agents=3)
+        mixed = PlantStep.of(base, ech.World(plants={1: heavy}), settings, agents=3)
         got, _ = mixed.advance(jnp.asarray(x), jnp.asarray(u), jnp.asarray(0), MotionState())
         for k, plant in enumerate((base, heavy, base)):
-            alone = Motion.of(base, ech.World(plant), settings)
+            alone = PlantStep.of(base, ech.World(plant), settings)
             own = alone.move(jnp.asarray(x[k]), jnp.asarray(u[k]), None, None)
             np.testing.assert_allclose(got[k], own, rtol=1e-14)
 

@@ -14,8 +14,8 @@ from echelon.agents.models.chains import (
     Chains,
     chains_of,
     check_bounds,
-    flatten,
-    switch_on,
+    initial_integrators,
+    to_flat,
 )
 from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.agents.network.formation_motion import OwnOffset
@@ -212,7 +212,7 @@ class FlatLaw(Law):
 
     def initial_memory(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x, with the derivatives of its reference."""
-        loop, e = self.ready, switch_on(model, self.ready.chains, x, ahead)
+        loop, e = self.ready, initial_integrators(model, self.ready.chains, x, ahead)
         # All take the turn that is next to one heading, so that it is a number like any other (T5).
         memory = loop.beside(loop.initial_memory(model, x, e), loop.stop(ahead))
         return self._counting(memory)
@@ -308,7 +308,7 @@ class FlatLaw(Law):
         places = np.array([chains.outputs.index(name) for name in bound.outputs])
 
         def one(x: State) -> jax.Array:
-            return flatten(model, chains, x, self.begin(model, x).chain).values
+            return to_flat(model, chains, x, self.begin(model, x).chain).values
 
         values = np.asarray(jax.vmap(one)(jnp.asarray(states)))[:, bound.derivative, places]
         names = listing(name + "'" * bound.derivative for name in bound.outputs)
@@ -369,7 +369,7 @@ def _below(
     output, order = chains.outputs.index(bound.outputs[0]), bound.derivative
 
     def one(x: State) -> jax.Array:
-        return flatten(model, chains, x, x[:0]).values[order, output]
+        return to_flat(model, chains, x, x[:0]).values[order, output]
 
     name = bound.outputs[0] + "'" * order
     for k, value in enumerate(np.asarray(jax.vmap(one)(jnp.asarray(states))).tolist()):
@@ -389,7 +389,7 @@ def _pushes(chains: Chains, model: ControlAffine, states: jax.Array, output: int
 
     def one(x: State) -> jax.Array:
         def derivative(e: jax.Array) -> jax.Array:
-            return flatten(model, chains, x, e).values[order, output]
+            return to_flat(model, chains, x, e).values[order, output]
 
         return jax.grad(derivative)(jnp.zeros(chains.size, x.dtype))[0]
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.chains import Chains, angles_among, flat_output, flatten
+from echelon.agents.models.chains import Chains, angles_among, flat_output, to_flat
 from echelon.agents.models.model import ControlAffine, wrap_angles
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.errors import LawError, listing
@@ -211,7 +211,7 @@ class FlatLoop(eqx.Module):
 
     def flat_values(self, model: ControlAffine, x: State, memory: FlatMemory) -> jax.Array:
         """Return the flat coordinates (r, m), corrected by the observer."""
-        values = flatten(model, self.chains, x, memory.chain).values
+        values = to_flat(model, self.chains, x, memory.chain).values
         if not self.observer:
             return values
         push_rate = self.observer.gains[1] * self._speed_error(model, x, memory)
@@ -237,7 +237,7 @@ class FlatLoop(eqx.Module):
         """
         x, period = view.x, view.period
         flat, values = (
-            flatten(model, self.chains, x, memory.chain),
+            to_flat(model, self.chains, x, memory.chain),
             self.flat_values(model, x, memory),
         )
         degrees = np.array(self.chains.degrees)

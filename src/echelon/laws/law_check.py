@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.flatness import reference_warnings
-from echelon.agents.references.reference import Guide, Reference
+from echelon.agents.references.reference import LeaderPath, Reference
 from echelon.core.cache import memoize
 from echelon.core.errors import LawError
 from echelon.core.jaxpr import used_leaves
@@ -148,7 +148,7 @@ def unknown_class(law: Law) -> str:
 
 def _parts(part: object) -> Iterator[object]:
     """Yield a law and all that is made of fields in it: its gain, for example."""
-    if dataclasses.is_dataclass(part) and not isinstance(part, type | Guide | ControlAffine):
+    if dataclasses.is_dataclass(part) and not isinstance(part, type | LeaderPath | ControlAffine):
         yield part
         for value in vars(part).values():
             yield from _parts(value)

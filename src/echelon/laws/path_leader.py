@@ -18,7 +18,7 @@ from echelon.agents.references.flatness import (
     followed_states,
     without_heading,
 )
-from echelon.agents.references.reference import Guide, check_kind_of, check_reference
+from echelon.agents.references.reference import LeaderPath, check_kind_of, check_reference
 from echelon.core.cache import BoundedCache
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ReferenceError
@@ -41,7 +41,7 @@ class PathLeader(Law):
         fading: the rate (1/s) at which others expect its deviation to fade; set by `predictable`.
     """
 
-    reference: Guide
+    reference: LeaderPath
     fading: Array | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self) -> None:
@@ -255,7 +255,7 @@ class PathLQR(PathLeader):
         return u - model.physical(v, trim=False), memory
 
 
-def sweep(model: ControlAffine, reference: Guide, horizon: float) -> tuple[Array, Array]:
+def sweep(model: ControlAffine, reference: LeaderPath, horizon: float) -> tuple[Array, Array]:
     """Return the gains K (N + 1, m, n) at equal times over a horizon (s), and the slowest decay.
 
     Along the linearization V = e'P e falls as V' = -e'(Q + K'R K) e, so that errors shrink at
@@ -328,7 +328,7 @@ def _decay(P: Array, W: Array) -> Array:
 
 @cached_jit
 def _slopes(
-    model: ControlAffine, reference: Guide, times: jax.Array
+    model: ControlAffine, reference: LeaderPath, times: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Return A (T, n, n) and B (T, n, m) of the deviation from a reference at times (T,)."""
 

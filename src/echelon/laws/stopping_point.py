@@ -14,7 +14,7 @@ from echelon.agents.models.model import ControlAffine, FlatBound, wrap_angles
 from echelon.agents.network.exchange import Near
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.flatness import first_state, followed_states
-from echelon.agents.references.reference import Guide, Reference, check_reference
+from echelon.agents.references.reference import LeaderPath, Reference, check_reference
 from echelon.core.cache import memoize
 from echelon.core.errors import LawError, check_kind, listing
 from echelon.core.numerics import greater, lesser, precision
@@ -284,7 +284,7 @@ class StoppingLeader(FlatLaw):
         reference: the path to follow; without one the trim's flat outputs are held.
     """
 
-    reference: Guide | None = None
+    reference: LeaderPath | None = None
 
     @property
     def information(self) -> tuple[str, ...]:
@@ -367,7 +367,7 @@ class StoppingLeader(FlatLaw):
     ) -> tuple[Input, FlatMemory]:
         """Return the leader's input."""
         if memory.active is not None:
-            # An heir that was held back when it took the lead gives way to nobody now.
+            # A backup leader that was held back when it took the lead gives way to nobody now.
             memory = memory._replace(active=0.0 * memory.half)
         away = self.deviation(model, view.t, view.x, view.offset, memory)
         rate = self._rate(model, view.t, away, view.period)

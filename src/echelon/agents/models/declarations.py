@@ -23,8 +23,8 @@ _OF_CLASSES = "__", "_abc_"
 _ABOUT = {
     "flat_chains": set[str](),
     "flat_bounds": {"flat_chains"},
-    "flatten": {"flat_chains"},
-    "switch_on": {"flat_chains"},
+    "to_flat": {"flat_chains"},
+    "initial_integrators": {"flat_chains"},
     "airframe": _LIMITS,
 }
 """Declarations of a model, and what each is about beside the motion and the outputs."""
@@ -41,8 +41,8 @@ def undeclared(model: ControlAffine, *names: str) -> tuple[str, ...]:
 
     Args:
         model: the agent.
-        names: of `flat_chains`, `flat_bounds`, `flatten`, `switch_on` and `airframe`, those that a
-            theorem reads.
+        names: of `flat_chains`, `flat_bounds`, `to_flat`, `initial_integrators` and `airframe`,
+            those that a theorem reads.
     """
     return tuple(name for name in names if _is_about_another(model, name))
 

@@ -34,7 +34,7 @@ class AtTrim(NamedTuple):
         drift, input_map, output: f (n,), g (n, m), h (q,).
         drift_slope, input_slope, output_slope: their Jacobians, with n as the last dimension more.
         delivered: the input that the actuators deliver for u*, (m,).
-        bends: (n, n) whether f + g u* has a kink in a state, by its values on both sides, or g
+        kinks: (n, n) whether f + g u* has a kink in a state, by its values on both sides, or g
             jumps there.
         gap: the entry of the drift or the input map whose derivative by JAX differs most clearly
             from the slope of its values; None where none does.
@@ -47,7 +47,7 @@ class AtTrim(NamedTuple):
     input_slope: Array
     output_slope: Array
     delivered: Array
-    bends: Array
+    kinks: Array
     gap: Gap | None
 
 
@@ -62,7 +62,7 @@ def at_trim(model: ControlAffine) -> AtTrim:
     derivatives = np.concatenate([values[3], values[4].reshape(-1, len(x))])
     slopes = sides(x, around)
     gap = slopes.gap(derivatives, units_at(x, units))
-    return AtTrim(*values, bends=_bends(slopes, u, len(x)), gap=gap)  # pyright: ignore
+    return AtTrim(*values, kinks=_kinks(slopes, u, len(x)), gap=gap)  # pyright: ignore
 
 
 def _units(model: ControlAffine) -> Array:
@@ -88,11 +88,11 @@ def _evaluate(model: ControlAffine, x: State, u: Input, points: States) -> list[
     return [*(function(x) for function in functions), *slopes, model.limit(u), around]
 
 
-def _bends(slopes: Sides, u: Array, n: int) -> Array:
+def _kinks(slopes: Sides, u: Array, n: int) -> Array:
     """Return (n, n) whether an entry of f + g u* has a kink, or one of g a jump, in each state."""
     motion = slopes.combine(np.hstack([np.eye(n), np.kron(np.eye(n), u)]))
     maps = slopes.combine(np.eye(n + n * len(u))[n:])
-    return motion.bends(n) | maps.jumps()[:, :n].reshape(n, -1, n).any(axis=1)
+    return motion.kinks(n) | maps.jumps()[:, :n].reshape(n, -1, n).any(axis=1)
 
 
 @memoize

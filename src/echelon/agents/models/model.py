@@ -165,7 +165,7 @@ class FlatBound(NamedTuple):
     within: str
 
 
-class Flattened(NamedTuple):
+class FlatCoordinates(NamedTuple):
     """A state in flat coordinates.
 
     Attributes:
@@ -294,14 +294,14 @@ class ControlAffine(Declared):
             "use the law `passive` for its leader, or add `flat_outputs`, `flat_order` and `flat`."
         )
 
-    def flatten(self, x: State, e: jax.Array) -> Flattened | None:
+    def to_flat(self, x: State, e: jax.Array) -> FlatCoordinates | None:
         """Return the flat coordinates of a state, e being the integrator states of `flat_chains`.
 
         Where it returns None they are computed by automatic differentiation.
         """
         return None
 
-    def switch_on(self, x: State, ahead: jax.Array) -> jax.Array | None:
+    def initial_integrators(self, x: State, ahead: jax.Array) -> jax.Array | None:
         """Return the initial states of the integrators before inputs; None leaves them open.
 
         `ahead` (r, m) are the flat outputs, with derivatives, of the path that the agent follows.

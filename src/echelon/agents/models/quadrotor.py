@@ -11,7 +11,7 @@ import numpy as np
 from echelon.agents.models.model import (
     Airframe,
     ControlAffine,
-    Flattened,
+    FlatCoordinates,
     Limits,
     Rows,
     check_positive,
@@ -223,7 +223,7 @@ class Quadrotor(RigidVehicle):
             jnp.concatenate([thrust[None], torque]),
         )
 
-    def flatten(self, x: State, e: jax.Array) -> Flattened:
+    def to_flat(self, x: State, e: jax.Array) -> FlatCoordinates:
         """Return position and yaw with derivatives; e is the thrust over mass minus g, its rate."""
         # With a = T/m, p^(2) = a R e3 - g e3, and R' = R [omega]x makes p^(3) = R (a q, -a p, a')
         # and p^(4) = R (2 a' q + a q' + a p r, -2 a' p - a p' + a q r, a'' - a (p^2 + q^2)).
@@ -247,7 +247,7 @@ class Quadrotor(RigidVehicle):
             spin = spin - free_spin(self.inertia, x[9:12])
             return jnp.concatenate([(snap[2] + a * (p**2 + q**2))[None], spin])
 
-        return Flattened(jnp.concatenate([path, heading[:, None]], axis=1), invert)
+        return FlatCoordinates(jnp.concatenate([path, heading[:, None]], axis=1), invert)
 
     def limit(self, u: Input) -> Input:
         """Return what four motors within [0, motor_thrust] deliver.

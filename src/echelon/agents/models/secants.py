@@ -120,21 +120,21 @@ class Sides(NamedTuple):
         slope = (0.5 * (axes.forward + axes.backward)[1] / units)[entry, variable]
         return Gap(float(derivative[entry, variable]), float(slope), int(entry), int(variable))
 
-    def bends(self, n: int) -> Array:
+    def kinks(self, n: int) -> Array:
         """Return (k, n) whether slopes of the two sides differ, or values, or they do not add up.
 
         What only bends between the axes is charged to the variable that moves first.
         """
         scale = _BENT * np.maximum(np.abs(self.forward), np.abs(self.backward))
-        bends = self._stays(self.forward - self.backward, scale) | self.jumps()
+        kinks = self._stays(self.forward - self.backward, scale) | self.jumps()
         axes, oblique = self.forward[..., :n], self.forward[..., n:]
         sums = axes @ _oblique(n).T
         size = _BENT * (np.abs(axes) @ np.abs(_oblique(n)).T)
         with np.errstate(invalid="ignore"):
             crooked = self._stays(oblique - sums, size)
         first = np.eye(n, dtype=bool)[0]
-        beside = np.any(bends[:, n:] | crooked, axis=1)
-        return bends[:, :n] | np.outer(beside, first)
+        beside = np.any(kinks[:, n:] | crooked, axis=1)
+        return kinks[:, :n] | np.outer(beside, first)
 
     def jumps(self) -> Array:
         """Return (k, q) whether values differ between the sides at any distance."""

@@ -70,7 +70,8 @@ class GraphMatrices(abc.ABC):
 
         With `leaderward` each agent uses only the neighbours that are nearer to a leader. Who is
         absent counts as one that hears the leader alone, with the largest weights of all, and so
-        does an heir that leads: nobody hears the one, and the other follows the leader's path.
+        does a backup leader that leads: nobody hears the one, and the other follows the leader's
+        path.
         """
         schedule, rows = self.schedule, self.weights[None]
         if schedule is None or schedule.present is None or schedule.nearest is None:

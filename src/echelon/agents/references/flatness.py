@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.reference import Guide, Reference, check_reference
+from echelon.agents.references.reference import LeaderPath, Reference, check_reference
 from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, PlanError
@@ -24,7 +24,7 @@ _FEW, _MANY = 512, 4096
 
 
 def follow_at(
-    model: ControlAffine, reference: Guide, times: Float[Array, " T"] | Float[jax.Array, " T"]
+    model: ControlAffine, reference: LeaderPath, times: Float[Array, " T"] | Float[jax.Array, " T"]
 ) -> tuple[Any, Any]:
     """Return the states (T, n) and inputs (T, m) that follow a reference exactly at times (T,)."""
     if isinstance(times, Tracer) or len(times) > _MANY:
@@ -37,20 +37,22 @@ def follow_at(
     return x, u
 
 
-def followed_states(model: ControlAffine, reference: Guide, times: Array | jax.Array) -> jax.Array:
+def followed_states(
+    model: ControlAffine, reference: LeaderPath, times: Array | jax.Array
+) -> jax.Array:
     """Return the states (T, n) that follow a reference exactly at times (T,)."""
     # `asarray` would compile a program of its own.
     return jax.device_put(follow_at(model, reference, times)[0])
 
 
-def first_state(model: ControlAffine, reference: Guide) -> State:
+def first_state(model: ControlAffine, reference: LeaderPath) -> State:
     """Return the state (n,) that follows a reference at time zero."""
     return jax.device_put(follow_at(model, reference, np.zeros(1))[0][0])
 
 
 @cached_jit
 def _follow_all(
-    model: ControlAffine, reference: Guide, times: Array | jax.Array
+    model: ControlAffine, reference: LeaderPath, times: Array | jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     return jax.vmap(lambda t: reference.follow(model, t))(times)
 
@@ -67,7 +69,7 @@ class Targets(NamedTuple):
     inputs: Array
 
 
-def reference_targets(model: ControlAffine, reference: Guide | None, times: Array) -> Targets:
+def reference_targets(model: ControlAffine, reference: LeaderPath | None, times: Array) -> Targets:
     """Return a leader's targets: its reference by `flat`, or its trim; else raise `PlanError`."""
     # Without a reference a leader stays at rest, at its trim.
     if reference is None:
@@ -150,7 +152,9 @@ _NEAR = 1e-3
 
 @memoize
 @np.errstate(over="ignore", invalid="ignore")
-def reference_demand(model: ControlAffine, reference: Guide, horizon: float) -> ReferenceDemand:
+def reference_demand(
+    model: ControlAffine, reference: LeaderPath, horizon: float
+) -> ReferenceDemand:
     """Return the demand of a reference on a model that it can lead, over a horizon (s)."""
     near = min(_NEAR, 1e-2 * horizon)
     times = np.linspace(near, horizon - near, _SAMPLES)
@@ -179,7 +183,7 @@ def reference_demand(model: ControlAffine, reference: Guide, horizon: float) -> 
 
 
 def reference_warnings(
-    model: ControlAffine, reference: Guide, horizon: float, limits: bool = True
+    model: ControlAffine, reference: LeaderPath, horizon: float, limits: bool = True
 ) -> tuple[str, ...]:
     """Return one sentence with its numbers for each fault of a reference that leads a model."""
     required, model_name = reference_demand(model, reference, horizon), type(model).__name__
@@ -206,7 +210,7 @@ def reference_warnings(
 
 
 def without_heading(
-    model: ControlAffine, reference: Guide, times: Float[Array, " T"]
+    model: ControlAffine, reference: LeaderPath, times: Float[Array, " T"]
 ) -> Bool[np.ndarray, " T"]:
     """Return when a path has speed 0, of a model that has no state at rest, such as a unicycle."""
     if not isinstance(reference, Reference) or model.flat_order < 1:
@@ -221,7 +225,7 @@ def without_heading(
     return np.linalg.norm(rates, axis=0) <= _AT_REST
 
 
-def _turned_over(model: ControlAffine, reference: Guide, horizon: float) -> Iterator[str]:
+def _turned_over(model: ControlAffine, reference: LeaderPath, horizon: float) -> Iterator[str]:
     """Yield where a derivative of a path passes a bound of the model, as a tilt beyond 90 deg."""
     # A bound on a length of several outputs is one on the speed, and holds at rest for no path.
     bounds = [bound for bound in model.flat_bounds or () if len(bound.outputs) == 1]
@@ -260,7 +264,7 @@ def infeasible(model: ControlAffine, required: ReferenceDemand) -> str:
     )
 
 
-def flat_inputs(model: ControlAffine, reference: Guide, times: Array) -> Array:
+def flat_inputs(model: ControlAffine, reference: LeaderPath, times: Array) -> Array:
     """Return the inputs (T, m) that follow a reference exactly, by the model's flatness map."""
     # Up to four nested derivatives of a path leave too few digits in float32 to judge limits.
     with precision("float64"):

@@ -19,7 +19,7 @@ from echelon.core.trace import call_once_traced, check_array, checked_trace
 from echelon.core.types import Array, Declared, Input, Scalar, State
 
 
-class Guide(Declared):
+class LeaderPath(Declared):
     """The motion that a leader follows: a path in space, or one of states and inputs."""
 
     @abc.abstractmethod
@@ -56,7 +56,7 @@ _MAX_TIME = 10**9
 """s; thirty years, longer than any run."""
 
 
-class Reference(Guide):
+class Reference(LeaderPath):
     """A path t -> (x, y, z, yaw), in metres and radians; t in seconds."""
 
     joined: ClassVar[int] = 0
@@ -196,11 +196,11 @@ def numbers_of(value: object) -> Array:
 def check_kind_of(reference: object) -> None:
     """Raise `ReferenceError` unless a value is a reference."""
     # A path of states is one too, but users know the name `Reference`.
-    kind = Guide if isinstance(reference, Guide) else Reference
+    kind = LeaderPath if isinstance(reference, LeaderPath) else Reference
     check_kind("reference", reference, kind, ReferenceError)
 
 
-def check_reference(reference: Guide) -> None:
+def check_reference(reference: LeaderPath) -> None:
     """Raise `ReferenceError` unless a value is a reference, which returns what it must."""
     check_kind_of(reference)
     reference.check()

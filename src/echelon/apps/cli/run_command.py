@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from echelon.experiments.sweeps.workers import SweepBatch
     from echelon.output.archive.chunks import Chunks
     from echelon.output.archive.study_folder import Batches
-    from echelon.simulation.engine.record import Stretch
+    from echelon.simulation.engine.record import Segment
     from echelon.simulation.engine.result import Result
     from echelon.simulation.engine.simulate import RunSoFar
 
@@ -186,18 +186,18 @@ def _simulate(
     from echelon.experiments.scenario import build
     from echelon.simulation.step.drive import Stopped
 
-    def store(stretch: "Stretch") -> None:
+    def store(segment: "Segment") -> None:
         if watched is not None:
-            watched.add(stretch)
+            watched.add(segment)
         try:
-            job.chunks.write(stretch)
+            job.chunks.write(segment)
         except OSError as error:
             raise Stopped(f"its folder cannot be written: {error.strerror or error},") from error
 
     stored = job.chunks.read()
     if watched is not None:
-        for stretch in stored:
-            watched.add(stretch)
+        for segment in stored:
+            watched.add(segment)
     horizon = f"{experiment.settings.horizon:g} s of {experiment.parts.graph.agents} agents"
     STATUS.begin(f"simulating {scenario.name}, {horizon}", not quiet)
     with job.cleanup():
@@ -252,29 +252,29 @@ class WatchedRun:
     def __init__(self, scenario: "Scenario", experiment: "Experiment") -> None:
         """Prepare the page, as far as it is known before the run."""
         from echelon.experiments.results.lyapunov import fixed_metric, potential
-        from echelon.experiments.results.recording import foreseen
-        from echelon.guarantees.promises.promise import promise
+        from echelon.experiments.results.recording import empty_recording
+        from echelon.guarantees.promises.promise import guarantee
         from echelon.output.viewer.replay import Growing
         from echelon.simulation.engine.prepare import prepare
 
         prepared = prepare(*experiment)
         parts, settings = prepared.parts, prepared.problem.settings
         self.formation = parts.formation
-        guarantee = promise(parts, settings).as_mapping()
-        self.run = foreseen(parts, settings, prepared.problem.states, scenario.name, guarantee)
+        stated = guarantee(parts, settings).as_mapping()
+        self.run = empty_recording(parts, settings, prepared.problem.states, scenario.name, stated)
         # The V of a P that turns is computed only at the end.
         P = None if parts.formation.motion is not None else fixed_metric(parts)
         self.potential = None if P is None else potential(parts.model, parts.graph, P)
         self.page = Growing(self.run)
 
-    def add(self, stretch: "Stretch") -> None:
+    def add(self, segment: "Segment") -> None:
         """Show a part that was computed."""
         from echelon.experiments.results.recording import so_far
 
         # An agent without finite numbers cannot be drawn; the page says so at the end.
-        if stretch.finite:
+        if segment.finite:
             with contextlib.suppress(OutputError):
-                self.page.add(so_far(self.run, stretch, self.potential, self.formation))
+                self.page.add(so_far(self.run, segment, self.potential, self.formation))
 
     def show_all(self, folder: Path) -> None:
         """Show the complete run until Ctrl-C."""

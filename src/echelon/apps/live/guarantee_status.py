@@ -19,7 +19,7 @@ from echelon.core.types import JsonObject
 from echelon.experiments.results.metrics import ROUNDING
 from echelon.experiments.scenario.build import build
 from echelon.guarantees.promises.closed_loop import LinearLoop
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.output.reports.run_report import beyond
 from echelon.output.viewer.replay import promise_badge
 from echelon.simulation.step.meter import SETTLED, outside
@@ -150,26 +150,26 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
         return {"state": "lost", "short": "no guarantee", "whole": text, "causes": [text]}
     try:
         unchanged = knobs == panel.start
-        guarantee = promise(*(panel.experiment if unchanged else build(panel.scenario_at(knobs))))
+        found = guarantee(*(panel.experiment if unchanged else build(panel.scenario_at(knobs))))
     except EchelonError as error:
         # A scenario that is refused has no guarantee, such as one with a disconnected graph.
         cause = str(error).removeprefix("mapping: ")
         return {"state": "lost", "short": "no guarantee", "whole": cause, "causes": [cause]}
-    stated = guarantee.as_mapping()
+    stated = found.as_mapping()
     badge: JsonObject = promise_badge(stated)
     badge["apart"] = ((stated["anywhere"] or {}).get("separation") or {}).get("distance")
-    badge["causes"] = [cause.sentence() for cause in guarantee.causes]
-    badge["edge"], badge["end"] = guarantee.edge, _end(panel, knobs, guarantee.edge)
-    badge["above"] = None if guarantee.edge is None else at_least(guarantee.edge)
-    badge["rate"] = guarantee.rate if guarantee.promised else None
-    certified = guarantee.certified
+    badge["causes"] = [cause.sentence() for cause in found.causes]
+    badge["edge"], badge["end"] = found.edge, _end(panel, knobs, found.edge)
+    badge["above"] = None if found.edge is None else at_least(found.edge)
+    badge["rate"] = found.rate if found.promised else None
+    certified = found.certified
     badge["anywhere"] = certified is not None and certified.radius == float("inf")
     # Shown where the guarantee does not cover the state.
-    badge["beyond"] = [*beyond(0.0, guarantee)]
-    edge, c = guarantee.edge, knobs.coupling
-    if guarantee.promised and edge is not None and c is not None and c < _NEAR * edge:
+    badge["beyond"] = [*beyond(0.0, found)]
+    edge, c = found.edge, knobs.coupling
+    if found.promised and edge is not None and c is not None and c < _NEAR * edge:
         badge |= {"state": "edge", "short": f"{badge['short']}, near its edge"}
-    elif not guarantee.promised and guarantee.slowest is not None:
+    elif not found.promised and found.slowest is not None:
         growth = _growth(panel.live.loop(knobs), panel.experiment.settings)
         badge["short"] = growth or badge["short"]
     return badge

@@ -141,7 +141,7 @@ class Panel:
 
         Raises:
             SimulationError: there is no such shape, or a reshape is under way.
-            LawError: with `safety`, a leader or an heir would move beside its path.
+            LawError: with `safety`, a leader or a backup leader would move beside its path.
         """
         check_choice("shape", value, (AS_GIVEN, *self.options["shape"]))
         under_way = knobs.reshaping

@@ -24,7 +24,7 @@ from echelon.core.errors import (
 )
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import amount
-from echelon.experiments.results.recording import Recording, foreseen
+from echelon.experiments.results.recording import Recording, empty_recording
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.plots.space import Space, space_of
 from echelon.output.viewer.charts import distance_chart
@@ -127,7 +127,7 @@ def _path(swarm: LiveLoop, space: Space) -> list[list[float]]:
 
 def foreseen_of(swarm: LiveLoop, name: str) -> Recording:
     """Return a recording with all of a loop but its frames."""
-    return foreseen(swarm.parts, swarm.settings, np.asarray(swarm.states), name)
+    return empty_recording(swarm.parts, swarm.settings, np.asarray(swarm.states), name)
 
 
 _PICTURE, _MESSAGE = 0, 1

@@ -33,7 +33,7 @@ from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.native import is_installed
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.scalars import Unsupported
-from echelon.simulation.step.loop import Loop, Moment, Switches, assemble
+from echelon.simulation.step.loop import Loop, LoopState, Switches, assemble
 from echelon.simulation.step.nearby import all_hulls
 from echelon.simulation.step.sequence import begin
 from echelon.simulation.step.settings import Settings
@@ -206,7 +206,7 @@ class LiveLoop:
         """Proceed from states at a step, with the same knobs; laws begin without memory."""
         with precision(self.precision):
             now = begin(self.loop, jnp.asarray(states))
-            self.now: Moment = now._replace(step=jnp.asarray(step, jnp.int32))
+            self.now: LoopState = now._replace(step=jnp.asarray(step, jnp.int32))
 
     def take_over(self, other: "LiveLoop") -> None:
         """Proceed from where another loop of the same laws is, with as much memory as fits."""

@@ -16,7 +16,7 @@ from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import avoidance, output_errors
 from echelon.guarantees.promises.hypotheses import as_mapping
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.settings import Settings
@@ -187,10 +187,10 @@ def _poles(result: Result) -> Variables:
 
     The law `stopping-point` closes chains by its roots, and only their agreement is in the loop.
     """
-    guarantee = promise(result.parts, result.settings)
-    if not guarantee.linear or guarantee.agreement is not None:
+    stated = guarantee(result.parts, result.settings)
+    if not stated.linear or stated.agreement is not None:
         return {}
-    poles, values = guarantee.loop.poles, guarantee.loop.eigenvalues
+    poles, values = stated.loop.poles, stated.loop.eigenvalues
     imaginary = {"mode_eigenvalue_imaginary": ("mode", np.imag(values))}
     return {
         "pole_real": (("mode", "pole"), np.real(poles)),
@@ -211,7 +211,7 @@ def _attributes(result: Result) -> JsonObject:
         "outcome": result.outcome.name.lower(),
         "message": result.message,
         "warnings": "\n".join(result.warnings),
-        "promise": json.dumps(promise(result.parts, result.settings).as_mapping()),
+        "promise": json.dumps(guarantee(result.parts, result.settings).as_mapping()),
         **solver,
     }
 

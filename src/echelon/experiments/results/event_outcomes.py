@@ -7,7 +7,7 @@ from jaxtyping import Int
 
 from echelon.core.types import JsonObject
 from echelon.guarantees.promises.hypotheses import events_in_words
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.simulation.engine.result import Result, finite_or_none
 from echelon.simulation.step.meter import SETTLED
 
@@ -72,7 +72,7 @@ class EventOutcome(NamedTuple):
 
 def event_outcomes(result: Result) -> tuple[EventOutcome, ...]:
     """Return what followed each event of a run that it reached, by time."""
-    listed = events_in_words(result.parts, promise(result.parts, result.settings))
+    listed = events_in_words(result.parts, guarantee(result.parts, result.settings))
     ends = [*(event["at"] for event in listed), np.inf][1:]
     return tuple(
         _outcome(result, event, end)

@@ -21,8 +21,8 @@ from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
-from echelon.simulation.step.drive import Drive
-from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.drive import Controller
+from echelon.simulation.step.motion import PlantStep
 
 # Below this fraction of its largest value V is rounding, and an increase means nothing.
 _ROUNDING = 1e-20
@@ -111,7 +111,7 @@ def _lyapunov(result: Result) -> Lyapunov | None:
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
         x, u = result.states, result.inputs
         steps = np.rint(result.times / result.settings.dt).astype(np.int32)
-        motion = Motion.of(result.model, result.world, result.settings, graph.agents)
+        motion = PlantStep.of(result.model, result.world, result.settings, graph.agents)
         fields = _fields(result.drive, result.model, motion, graph.leaders[0], x, u, steps)
         now, after = (
             _in_metric_axes(result.model, field, np.asarray(field.states) - offsets)
@@ -185,9 +185,9 @@ class _Fields(NamedTuple):
 
 @cached_jit
 def _fields(
-    drive: Drive,
+    drive: Controller,
     model: ControlAffine,
-    motion: Motion,
+    motion: PlantStep,
     leader: int,
     x: jax.Array,
     u: jax.Array,

@@ -22,13 +22,13 @@ from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.run_numbers import (
     AGENT_NUMBERS,
     RUN_NUMBERS,
+    Appearance,
     EdgeMetrics,
     FollowerMetrics,
     LeaderMetrics,
     Metrics,
-    Shown,
 )
-from echelon.guarantees.promises.promise import Promise, covered
+from echelon.guarantees.promises.promise import Guarantee, covered
 from echelon.simulation.engine.result import Result, finite_or_none
 from echelon.simulation.step.meter import SETTLED, output_error, steps_per_slice
 
@@ -252,7 +252,7 @@ class RunNumbers:
 
     result: Result
     metrics: Metrics
-    promise: Promise
+    promise: Guarantee
     computing: float | None = None
 
     def number(self, name: str) -> float | None:
@@ -265,7 +265,7 @@ class RunNumbers:
         value = None if compute is None else compute(self)
         return None if value is None or np.isnan(value).any() else value
 
-    def json(self, where: Shown) -> JsonObject:
+    def json(self, where: Appearance) -> JsonObject:
         """Return the numbers that appear somewhere, under their names in JSON."""
         return {
             quantity.key or name: self._value(name)

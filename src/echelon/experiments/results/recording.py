@@ -27,7 +27,7 @@ from echelon.experiments.results.labelled import Labelled, read_labelled
 from echelon.experiments.results.metrics import Avoidance, Ellipsoid
 from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.engine.record import Stretch
+from echelon.simulation.engine.record import Segment
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.settings import Settings
 
@@ -120,7 +120,7 @@ class Recording(FrameNumbers):
         modes: None where the laws have no linearization.
         messages: over a network; None in the ideal one.
         avoidance: how agents kept apart, without slices before they did; None where they do not.
-        promise: as `Promise.as_mapping` returns it.
+        promise: as `Guarantee.as_mapping` returns it.
         horizon, dt: s.
         attributes: provenance and settings, as stored.
         events: what happened, by time: `at` (s), `what`, `agents`, `until` (s) and `text`.
@@ -405,7 +405,7 @@ def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:
     return MessageAges(*rows, float(values["forget"]))
 
 
-def foreseen(
+def empty_recording(
     parts: Parts,
     settings: Settings,
     states: Float[Array, "N n"],
@@ -419,7 +419,7 @@ def foreseen(
         settings: of the run.
         states: at the beginning.
         name: of the scenario.
-        promise: as `Promise.as_mapping` returns it; none by default.
+        promise: as `Guarantee.as_mapping` returns it; none by default.
     """
     model, fixed = parts.model, labelled_parts(parts, settings)
     times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)
@@ -455,33 +455,33 @@ def _ahead(
 
 def so_far(
     run: Recording,
-    stretch: Stretch,
+    segment: Segment,
     potential: Callable[[Array], Array] | None,
     formation: Formation,
 ) -> Recording:
     """Return a part of a run as a recording.
 
     Args:
-        run: as returned by `foreseen`.
-        stretch: the part, with finite numbers.
+        run: as returned by `empty_recording`.
+        segment: the part, with finite numbers.
         potential: V (T,) of states minus offsets (T, N, n); None where there is none.
         formation: of the run.
     """
-    moving = None if formation.motion is None else formation.offsets_at(stretch.times)
-    lyapunov, count = None, len(stretch.times)
+    moving = None if formation.motion is None else formation.offsets_at(segment.times)
+    lyapunov, count = None, len(segment.times)
     if potential is not None:
         # Block by block, the last one padded with copies.
-        y = stretch.states - run.offsets
+        y = segment.states - run.offsets
         whole = -(-count // _BLOCK) * _BLOCK
         padded = np.concatenate([y, np.repeat(y[-1:], whole - count, axis=0)])
         blocks = map(potential, np.split(padded, whole // _BLOCK))
         lyapunov = np.concatenate([*blocks])[:count]
     return dataclasses.replace(
         run,
-        times=stretch.times,
-        states=stretch.states,
-        inputs=stretch.inputs,
-        reference=stretch.reference,
+        times=segment.times,
+        states=segment.states,
+        inputs=segment.inputs,
+        reference=segment.reference,
         moving=moving,
         lyapunov=lyapunov,
     )

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple, TypeVar, cast, final
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Bursts, Network
-from echelon.agents.network.events import Cut, Event, Join, Lose, check_heirs, event_faults
+from echelon.agents.network.events import Cut, Event, Join, Lose, check_backups, event_faults
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.reference import Guide, Reference, check_reference
+from echelon.agents.references.reference import LeaderPath, Reference, check_reference
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.sensing import Sensing
@@ -69,7 +69,7 @@ from echelon.laws.safety import Safety
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.prepare import check_engine, check_memory
-from echelon.simulation.engine.record import Stretch
+from echelon.simulation.engine.record import Segment
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import Keep, Progress, simulate
 from echelon.simulation.step.leadership import Leadership
@@ -117,7 +117,7 @@ def run(
     progress: Progress | None = None,
     built: Experiment | None = None,
     keep: Keep | None = None,
-    before: Sequence[Stretch] = (),
+    before: Sequence[Segment] = (),
 ) -> Result:
     """Simulate a scenario, and record in the result what it was computed from.
 
@@ -230,7 +230,7 @@ class _Builder:
         with self.at("plant", "agents"):
             world.check_agents(model, self.graph.agents)
         with self.at("leadership"):
-            laws.check_heirs(parts.graph)
+            laws.check_backups(parts.graph)
             if leadership is not None:
                 leadership.check_network(world.network)
         with self.at("network"):
@@ -276,7 +276,7 @@ class _Builder:
         check_model(model)
         return model
 
-    def _reference(self) -> Guide | None:
+    def _reference(self) -> LeaderPath | None:
         spec = self.scenario.reference
         # Files use the model's names, and a model that fails is reported by itself.
         if spec is None or self.model is None:
@@ -468,8 +468,8 @@ class _Builder:
     def _leadership(self) -> Leadership | None:
         spec, leadership = self.scenario.leadership, None
         if spec is not None:
-            with self.at("leadership", "heirs"):
-                check_heirs(self.graph, spec.heirs)
+            with self.at("leadership", "backups"):
+                check_backups(self.graph, spec.backups)
                 leadership = Leadership(**spec.model_dump())
             self.settle()
         return leadership
@@ -477,8 +477,8 @@ class _Builder:
     def _events(self, leadership: Leadership | None) -> list[Event]:
         """Return what happens during the run; a fault is noted at its event."""
         events = [_event(spec) for spec in self.scenario.events]
-        heirs = () if leadership is None else leadership.heirs
-        for k, text in event_faults(self.graph, events, heirs, self.scenario.simulation.horizon):
+        backups = () if leadership is None else leadership.backups
+        for k, text in event_faults(self.graph, events, backups, self.scenario.simulation.horizon):
             with self.at("events", k):
                 raise ScenarioError(f"{text}.")
         self.settle()

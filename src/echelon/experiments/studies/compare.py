@@ -13,14 +13,14 @@ from echelon.experiments.results.metrics import RunNumbers, metrics
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.laws.consensus import Consensus
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.simulate import RunSoFar, simulate
 from echelon.simulation.optimal.drives import Plans, RecedingHorizon
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import FixedGain, Gain, Method, synthesize
 from echelon.synthesis.gains.riccati import InnerLoop, Riccati
@@ -63,7 +63,7 @@ _LAW_NAMES = {
     entry.target.rpartition(":")[2]: name for name, entry in registry.FOLLOWER_LAWS.items()
 }
 
-DriveOf = Callable[[Parts], Drive]
+DriveOf = Callable[[Parts], Controller]
 """Returns the drive of a method for the parts of a scenario."""
 
 
@@ -198,7 +198,7 @@ def _fly(parts: Parts, settings: Settings, part: Callable[[float], None]) -> Run
     result = simulate(parts, settings, watch)
     seconds = watch.seconds if result.work is None else result.work.seconds
     computing = seconds / (parts.graph.agents * settings.horizon)
-    return RunNumbers(result, metrics(result), promise(result.parts, settings), computing)
+    return RunNumbers(result, metrics(result), guarantee(result.parts, settings), computing)
 
 
 class _Watch:
@@ -234,7 +234,7 @@ def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
     return f"{label}, own" if label in {row.label for row in rows} else label
 
 
-def _law_name(drive: Drive) -> str:
+def _law_name(drive: Controller) -> str:
     """Return the name of the followers' law in scenarios, or that of the drive's class."""
     kind = type(getattr(drive, "follower", drive)).__name__
     return _LAW_NAMES.get(kind, kind)

@@ -20,7 +20,7 @@ from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.sections import GainSpec
 from echelon.experiments.scenario.yaml import ScenarioFault
-from echelon.guarantees.promises.promise import Promise, promise
+from echelon.guarantees.promises.promise import Guarantee, guarantee
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
@@ -51,7 +51,7 @@ class Design(NamedTuple):
     method: str
     gain: Gain | None
     parts: Parts | None = None
-    promise: Promise | None = None
+    promise: Guarantee | None = None
     reason: str = ""
     fastest: float | None = None
     step: float = 0.0
@@ -216,9 +216,9 @@ def _design(method: type[Method], arguments: dict[str, Any], built: Experiment) 
     # Without the promise, whose computing time is the same for all.
     seconds = time.perf_counter() - began
     parts = with_gain(parts, gain)
-    guarantee = promise(parts, settings)
+    stated = guarantee(parts, settings)
     with precision("float64"):
-        return _evaluate(gain, parts, settings, guarantee)._replace(seconds=seconds)
+        return _evaluate(gain, parts, settings, stated)._replace(seconds=seconds)
 
 
 def _missing_keys(method: str, missing: list[str], parts: Parts) -> str:
@@ -247,7 +247,7 @@ def with_gain(parts: Parts, gain: Gain) -> Parts:
     return parts.replace(drive=drive.with_follower(law))
 
 
-def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Promise) -> Design:
+def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Guarantee) -> Design:
     """Return the design of a gain, with its margins."""
     loop = guarantee.loop
     (A, B), closed = loop.linear, loop.closed
@@ -287,24 +287,24 @@ def forecast(parts: Parts, settings: Settings) -> str:
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
-    guarantee = promise(parts, settings)
+    stated = guarantee(parts, settings)
     hypotheses = Hypothesis.DISAGREEMENT_DECAY, Hypothesis.SAMPLING
     # A step that is too long for a short time only has no reason.
-    grows = any(guarantee.hypotheses[hypothesis].reason for hypothesis in hypotheses)
+    grows = any(stated.hypotheses[hypothesis].reason for hypothesis in hypotheses)
     changes = " or ".join(f"`--set {change}`" for change in _changes(parts, settings) if grows)
     if not changes:
-        return guarantee.sentence()
-    return f"{guarantee.sentence()} There is a guarantee with {changes}."
+        return stated.sentence()
+    return f"{stated.sentence()} There is a guarantee with {changes}."
 
 
 def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
     """Yield the changes of a scenario, quickly computed, under which something is guaranteed."""
-    step = promise(parts, settings).hypotheses[Hypothesis.SAMPLING]
+    step = guarantee(parts, settings).hypotheses[Hypothesis.SAMPLING]
     if step.fails:
-        longest = _SHARE * promise(parts, settings).longest_step(settings)
+        longest = _SHARE * guarantee(parts, settings).longest_step(settings)
         # With an integer fraction of the step, the horizon remains a whole number of steps.
         shorter = settings.dt / math.ceil(settings.dt / longest) if longest > 0.0 else settings.dt
-        if promise(parts, settings._replace(dt=shorter)).promised:
+        if guarantee(parts, settings._replace(dt=shorter)).promised:
             yield f"simulation.dt={at_most(shorter, 6)}"
     law = parts.drive.follower if isinstance(parts.drive, Laws) else None
     if not isinstance(law, Consensus):
@@ -315,5 +315,5 @@ def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
     except EchelonError:
         return
     drive = parts.drive.with_follower(Consensus(gain, law.feedforward, law.trim, law.frame))
-    if promise(parts.replace(drive=drive), settings).promised:
+    if guarantee(parts.replace(drive=drive), settings).promised:
         yield '"follower.gain={method: inner-loop}"'

@@ -22,8 +22,8 @@ from echelon.experiments.scenario.self_contained import without_folders
 from echelon.experiments.scenario.yaml import read_yaml
 from echelon.experiments.studies.check import check
 from echelon.experiments.studies.design import with_gain
-from echelon.guarantees.promises.promise import promise
-from echelon.guarantees.verifier.findings import Finding, decide
+from echelon.guarantees.promises.promise import guarantee
+from echelon.guarantees.verifier.findings import CheckResult, decide
 from echelon.guarantees.verifier.saved_gain import parse_json, read_json
 from echelon.guarantees.verifier.stored_values import Digits, compare_values
 from echelon.laws.consensus import Consensus
@@ -44,7 +44,7 @@ _WRITTEN = {"units": ("s", "m"), "_FillValue": ("nan",)}
 """Attributes of variables and their values in every format, beside the names of coordinates."""
 
 
-def compare_attributes(file: Path) -> Iterator[Finding]:
+def compare_attributes(file: Path) -> Iterator[CheckResult]:
     """Yield a refused finding for each attribute of a group or variable that echelon never writes.
 
     Those of the root are compared with the run, one by one.
@@ -57,7 +57,7 @@ def compare_attributes(file: Path) -> Iterator[Finding]:
                 yield decide(ascii(claim)[1:-1], False, value, text=text)._replace(by_scenario=True)
 
 
-def compare_structure(file: Path, again: bytes) -> Iterator[Finding]:
+def compare_structure(file: Path, again: bytes) -> Iterator[CheckResult]:
     """Compare groups, dimensions, variables, types and attributes with those of a file in memory.
 
     Sizes and numbers are compared with the arrays.
@@ -65,7 +65,7 @@ def compare_structure(file: Path, again: bytes) -> Iterator[Finding]:
     claim, stored, value = f"{file.name}: structure", _structure(file), _structure(again)
     findings = [*compare_values(claim, stored, value)]
     refused = [each for each in findings if each.verdict == "refused"]
-    same = Finding(claim, f"{len(stored)} parts", f"{len(value)} parts", "recomputed", "", True)
+    same = CheckResult(claim, f"{len(stored)} parts", f"{len(value)} parts", "recomputed", "", True)
     yield from refused or [same]
 
 
@@ -105,7 +105,7 @@ SOLVED = Digits(1e-3)
 
 def experiment_of(
     scenario: Scenario, claims: Path | None, gain: Path | None
-) -> tuple[Experiment, list[Finding]]:
+) -> tuple[Experiment, list[CheckResult]]:
     """Return the parts of a run with the gains that its files state, and what is compared of them.
 
     Args:
@@ -117,7 +117,7 @@ def experiment_of(
         EchelonError: the scenario cannot be built, or a file cannot be read.
     """
     # As for a run: what is too large to have been run is refused.
-    experiment, findings = build(scenario, to_run=True), list[Finding]()
+    experiment, findings = build(scenario, to_run=True), list[CheckResult]()
     if gain is not None:
         findings += compare_gain(gain, experiment)
         with contextlib.suppress(GainError):
@@ -131,7 +131,7 @@ def experiment_of(
 
 def recompute(
     experiment: Experiment, scenario: Scenario, claims: Path | None, data: Path | None = None
-) -> Iterator[Finding]:
+) -> Iterator[CheckResult]:
     """Yield a finding for each value that a run's files state and its scenario gives.
 
     Args:
@@ -166,7 +166,7 @@ def with_gain_of(experiment: Experiment, file: Path) -> Experiment:
     return experiment._replace(parts=with_gain(parts, gain))
 
 
-def compare_gain(file: Path, experiment: Experiment) -> Iterator[Finding]:
+def compare_gain(file: Path, experiment: Experiment) -> Iterator[CheckResult]:
     """Compare a gain file with the gain of a scenario; its certificate the verifier checks."""
     try:
         with_gain_of(experiment, file)
@@ -184,7 +184,7 @@ def compare_gain(file: Path, experiment: Experiment) -> Iterator[Finding]:
     yield from compare_values(f"{file.name}: model", stored, value)
 
 
-def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Iterator[Finding]:
+def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Iterator[CheckResult]:
     """Compare a summary, or the output of a check, with what a scenario of a name gives."""
     if "lines" in stored:
         value = check(*experiment).as_mapping()
@@ -194,7 +194,9 @@ def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Ite
     yield from compare_values("", stored, _as_json(value))
 
 
-def with_leader_gain(experiment: Experiment, stored: object) -> tuple[Experiment, list[Finding]]:
+def with_leader_gain(
+    experiment: Experiment, stored: object
+) -> tuple[Experiment, list[CheckResult]]:
     """Return the parts with the gain that a summary states of the leaders, and what is compared.
 
     It must be that of the scenario up to what differs between solvers.
@@ -223,11 +225,11 @@ def _led_by(parts: Parts, gain: Gain) -> Parts:
     return parts.replace(drive=Laws(leader, drive.follower).prepare(parts.model, parts.graph))
 
 
-def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
+def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[CheckResult]:
     """Compare the guarantee, the scenario, the parts and the starts in a dataset."""
     (run, data), (parts, settings), name = read_recording(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
-    value = _as_json(promise(parts, settings).as_mapping())
+    value = _as_json(guarantee(parts, settings).as_mapping())
     yield from compare_values(f"{name}: promise", stored, value)
     text = read_yaml(str(run.attributes.get("scenario_text", "")), str(file))
     # A key twice is a fault; readers differ in which one they use.
@@ -247,7 +249,7 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
 
 def _compare_frames(
     run: Recording, data: Labelled, experiment: Experiment, name: str
-) -> Iterator[Finding]:
+) -> Iterator[CheckResult]:
     """Compare the times of the frames, who is there at each, and offsets that change with time."""
     (parts, settings), stored = experiment, data.arrays()
     steps = np.minimum(np.arange(len(run.states)) * settings.store_every, settings.steps)

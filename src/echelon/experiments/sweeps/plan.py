@@ -12,7 +12,7 @@ import numpy as np
 
 from echelon.core.errors import ScenarioError
 from echelon.core.limits import excess_runs
-from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, Shown, shown_in
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, Appearance, shown_in
 from echelon.experiments.scenario.scenario import Scenario, with_overrides
 from echelon.experiments.scenario.yaml import inline_yaml, read_yaml
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from echelon.experiments.scenario.build import Experiment
     from echelon.simulation.engine.result import Result
 
-RUN_COLUMNS = tuple(shown_in(RUN_NUMBERS, Shown.SWEEP))
-AGENT_COLUMNS = tuple(shown_in(AGENT_NUMBERS, Shown.SWEEP))
-SUMMARIZED = tuple(shown_in(RUN_NUMBERS, Shown.DISTRIBUTION))
+RUN_COLUMNS = tuple(shown_in(RUN_NUMBERS, Appearance.SWEEP))
+AGENT_COLUMNS = tuple(shown_in(AGENT_NUMBERS, Appearance.SWEEP))
+SUMMARIZED = tuple(shown_in(RUN_NUMBERS, Appearance.DISTRIBUTION))
 """The numbers that reports and figures show the distribution of."""
 UNIT = "error_unit"
 WORDS = (

@@ -31,7 +31,7 @@ from echelon.experiments.sweeps.plan import (
     StoredFrames,
     Sweep,
 )
-from echelon.guarantees.promises.promise import Promise
+from echelon.guarantees.promises.promise import Guarantee
 from echelon.simulation.engine.result import Result
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class SweepBatch(NamedTuple):
         return len(self.columns["outcome"])
 
 
-def numbers_of(result: Result, promise: Promise) -> JsonObject:
+def numbers_of(result: Result, promise: Guarantee) -> JsonObject:
     """Return the numbers of a run; what does not exist is NaN."""
     run = RunNumbers(result, metrics(result), promise)
     agents = {name: np.full(result.graph.agents, np.nan) for name in AGENT_COLUMNS}

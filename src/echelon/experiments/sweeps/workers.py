@@ -9,7 +9,7 @@ from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.sweeps.plan import Sweep, SweepRun
 from echelon.experiments.sweeps.sweep_dataset import SweepBatch, columns_of, numbers_of, refused
-from echelon.guarantees.promises.promise import Promise, promises
+from echelon.guarantees.promises.promise import Guarantee, promises
 from echelon.simulation.engine.batch import Batch, StepCount
 from echelon.simulation.engine.result import Result
 from echelon.simulation.native import is_installed
@@ -58,7 +58,7 @@ class Workers:
         for run in runs:
             result = run if isinstance(run, str) else next(results)
             guarantee = None if isinstance(run, str) else next(guarantees)
-            if isinstance(result, Result) and isinstance(guarantee, Promise):
+            if isinstance(result, Result) and isinstance(guarantee, Guarantee):
                 if result.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
                     raise KeyboardInterrupt
                 rows.append(numbers_of(result, guarantee))
@@ -87,7 +87,7 @@ class Workers:
         return Experiment(case.parts, settings._replace(store_every=every))
 
 
-def _promises(experiments: Sequence[Experiment]) -> Iterator[Promise | EchelonError]:
+def _promises(experiments: Sequence[Experiment]) -> Iterator[Guarantee | EchelonError]:
     """Yield the promises of runs; consecutive runs often differ only in the seed."""
     for _, same_parts in groupby(experiments, key=lambda experiment: id(experiment.parts)):
         runs = list(same_parts)

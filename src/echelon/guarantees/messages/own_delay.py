@@ -26,7 +26,7 @@ from echelon.laws.stopping_point import StoppingPoint
 from echelon.simulation.step.action import act
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.loop import Loop, assemble
-from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.motion import PlantStep
 
 # ---- a step of one agent that knows its own state late -------------------------------------------
 # With what it hears as an input h it is s+ = A s + B y + E z, z = d o - h, o = F y + G s, where y
@@ -297,7 +297,7 @@ def late_step(problem: Problem, law: StoppingPoint, lag: float) -> LateStep | No
     settings, model = problem.settings, problem.model
     motors = MotorArrays(np.asarray(lag), *[None] * 5) if lag else None
     how = settings.dt, settings.integrator, settings.limits, settings.substeps, motors
-    loop = assemble(problem._replace(motion=Motion(model, None, *how)), law, law)
+    loop = assemble(problem._replace(motion=PlantStep(model, None, *how)), law, law)
     A, B, E, G, F = (np.asarray(part, float) for part in _slopes(loop, law))
     if not all(np.isfinite(part).all() for part in (A, B, E, G, F)):
         return None

@@ -17,7 +17,7 @@ from echelon.synthesis.certificates.certificate import RegionCertificate
 from echelon.synthesis.certificates.domain import Domain
 
 
-class Case(NamedTuple):
+class GuaranteeInputs(NamedTuple):
     """The data of a run from which its guarantee is computed.
 
     Attributes:
@@ -49,7 +49,7 @@ class Case(NamedTuple):
     @property
     def smooth(self) -> bool:
         """Whether the model has a linearization at its trim."""
-        return not at_trim(self.parts.model).bends.any()
+        return not at_trim(self.parts.model).kinks.any()
 
     @property
     def governed(self) -> bool:

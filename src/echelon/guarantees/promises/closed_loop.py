@@ -14,7 +14,7 @@ from echelon.core.rational import bisect
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import Certificate, certify
 from echelon.synthesis.certificates.lmi import falls, rate_of
@@ -264,7 +264,7 @@ def _of_all(graph: Graph) -> Spectrum:
     return Spectrum(values, len(values), 0.0)
 
 
-def all_alike(drive: Drive, model: ControlAffine) -> bool:
+def all_alike(drive: Controller, model: ControlAffine) -> bool:
     """Tell whether the leaders obey the followers' law, with nothing fed forward."""
     leader, follower = getattr(drive, "leader", None), getattr(drive, "follower", None)
     same = leader is not None and type(leader) is type(follower)

@@ -49,7 +49,7 @@ class PathSamples(NamedTuple):
     rates: Array
 
 
-class LeaderPath(NamedTuple):
+class LeaderRun(NamedTuple):
     """Moments (K,), the leader's states (K, n) then, its normalized inputs (K, m), and its trim.
 
     A law that turns sees them in the axes of the headings (K,), which turn at rates (K,).
@@ -94,7 +94,7 @@ class LeaderPath(NamedTuple):
         return first._replace(times=np.zeros(count), states=np.asarray(seen))
 
 
-def leader_path_of(parts: Parts, settings: Settings, leaders: Leaders) -> LeaderPath:
+def leader_run_of(parts: Parts, settings: Settings, leaders: Leaders) -> LeaderRun:
     """Return where the leader goes: its reference, or by itself where its input rests."""
     model, times = parts.model, np.linspace(0.0, settings.horizon, MOMENTS)
     trim, m = np.asarray(model.trim[0], float), len(model.input_names)
@@ -114,11 +114,11 @@ def leader_path_of(parts: Parts, settings: Settings, leaders: Leaders) -> Leader
     return _as_sensed(parts, times, paths[frames, 0], np.zeros((MOMENTS, m)))
 
 
-def _as_sensed(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderPath:
+def _as_sensed(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderRun:
     """Return a path as a law that turns with the heading sees it, or as it is."""
     assert isinstance(parts.drive, Laws)
     model, still = parts.model, np.zeros(len(times))
-    path = LeaderPath(times, states, inputs, np.asarray(model.trim[0], float), still, still)
+    path = LeaderRun(times, states, inputs, np.asarray(model.trim[0], float), still, still)
     if not (parts.drive.follower.turning and len(times)):
         return path
     away = states[:, heading_index(model)] - rest_heading(model)
@@ -297,7 +297,7 @@ class FrozenLaws(NamedTuple):
         culprit: what takes the law out of where it stabilizes, in words; empty where nothing does.
     """
 
-    path: LeaderPath
+    path: LeaderRun
     along: ModeMatrices
     leader: ModeMatrices | None
     starts: ModeMatrices
@@ -360,7 +360,7 @@ def frozen_of(
     trim, starts = np.asarray(parts.model.trim[0], float), states - parts.formation.offsets
     if not isinstance(parts.drive, Laws):
         return None
-    path = leader_path_of(parts, settings, leaders)
+    path = leader_run_of(parts, settings, leaders)
     if not len(path.times) and (starts == trim).all():
         return None
     starts_there = frozen_starts(parts, loop, path, states[None])
@@ -375,7 +375,7 @@ def frozen_of(
     return frozen._replace(culprit=_culprit(parts, loop, path, frozen))
 
 
-def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Array) -> ModeMatrices:
+def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderRun, states: Array) -> ModeMatrices:
     """Return the laws of prepared parts frozen where agents start, in many runs (S, N, n).
 
     It is the same number of each run after the other.
@@ -453,7 +453,7 @@ def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices 
     return along._replace(gains=fed_back[:, None])
 
 
-def _culprit(parts: Parts, loop: LinearLoop, path: LeaderPath, frozen: FrozenLaws) -> str:
+def _culprit(parts: Parts, loop: LinearLoop, path: LeaderRun, frozen: FrozenLaws) -> str:
     """Return the state whose return to the trim helps most where the law is worst, in words."""
     assert isinstance(parts.drive, Laws)
     model, trim = parts.model, np.asarray(parts.model.trim[0], float)

@@ -31,7 +31,7 @@ from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.prepare import Prepared, prepare
 from echelon.simulation.engine.result import Result
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate
 
@@ -66,7 +66,7 @@ class AgreementModes(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class Promise(abc.ABC):
+class Guarantee(abc.ABC):
     """What is guaranteed of a closed loop, and what that rests on.
 
     Attributes:
@@ -97,7 +97,7 @@ class Promise(abc.ABC):
 
     @classmethod
     @abc.abstractmethod
-    def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "Promise":
+    def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "Guarantee":
         """Return what is guaranteed of prepared parts; `brief` leaves out what takes long."""
 
     def at(self, prepared: Prepared, settings: Sequence[Settings], brief: bool) -> "Promises":
@@ -297,7 +297,7 @@ class Prefix(NamedTuple):
     """What is guaranteed until a time (s), at which something happens that nothing covers."""
 
     at: float
-    promise: "Promise"
+    promise: "Guarantee"
 
     def as_mapping(self) -> dict[str, Any]:
         """Return it ready for JSON."""
@@ -308,12 +308,12 @@ class Prefix(NamedTuple):
         return f"Until {at_most(self.at, 6)} s: {self.promise.sentence()}"
 
 
-Promises: TypeAlias = Iterator[Promise | EchelonError]
-_cache: WeakKeyDictionary[Parts, dict[Hashable, dict[Settings, Promise]]] = WeakKeyDictionary()
+Promises: TypeAlias = Iterator[Guarantee | EchelonError]
+_cache: WeakKeyDictionary[Parts, dict[Hashable, dict[Settings, Guarantee]]] = WeakKeyDictionary()
 """By parts, by what foreign code in them reads now, and by settings."""
 
 
-def prover_of(drive: Drive) -> type[Promise]:
+def prover_of(drive: Controller) -> type[Guarantee]:
     """Return what proves the guarantees of a drive: of laws, what the followers' law names."""
     law = drive.follower if isinstance(drive, Laws) else Law
     # By name, since a law is below all that is proved of it.
@@ -324,7 +324,7 @@ def prover_of(drive: Drive) -> type[Promise]:
 
 
 @shared_traces()
-def promise(parts: Parts, settings: Settings) -> Promise:
+def guarantee(parts: Parts, settings: Settings) -> Guarantee:
     """Return what is guaranteed of parts under settings; computed once while the parts exist.
 
     Where a theorem certifies a set behind a leader that moves, and where free leaders start apart,
@@ -349,7 +349,7 @@ def guaranteed(parts: Parts, settings: Settings) -> str:
     plain = [x for x in fields if not isinstance(x, type(formation) | type(graph))]
     links = graph.edges, graph.weights, graph.agents, graph.leaders, graph.directed, graph.schedule
     rest = formation.offsets, formation.motion, links, settings
-    return load_or_compute(lambda: promise(parts, settings).sentence(), __name__, plain, rest)
+    return load_or_compute(lambda: guarantee(parts, settings).sentence(), __name__, plain, rest)
 
 
 def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) -> Promises:
@@ -370,7 +370,9 @@ def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) ->
         return
 
 
-def _computed(prepared: Prepared, parts: Parts, settings: Settings, brief: bool = False) -> Promise:
+def _computed(
+    prepared: Prepared, parts: Parts, settings: Settings, brief: bool = False
+) -> Guarantee:
     """Return what is guaranteed of parts, and store it if nothing was left out."""
     with precision("float64"):
         computed = prover_of(prepared.parts.drive).of(prepared, settings, brief)
@@ -382,7 +384,7 @@ def _computed(prepared: Prepared, parts: Parts, settings: Settings, brief: bool 
     return computed
 
 
-def _prefix_of(computed: Promise, parts: Parts, settings: Settings) -> Prefix | None:
+def _prefix_of(computed: Guarantee, parts: Parts, settings: Settings) -> Prefix | None:
     """Return what is guaranteed until the first event that is not covered; None for nothing."""
     line = computed.hypotheses.get(Hypothesis.EVENTS)
     if line is None or not line.fails or line.number is None:
@@ -393,14 +395,14 @@ def _prefix_of(computed: Promise, parts: Parts, settings: Settings) -> Prefix | 
     graph = parts.graph.until(line.number)
     until = settings._replace(horizon=steps * settings.dt, steady_window=None)
     try:
-        first = promise(parts.replace(graph=graph, events=graph.events), until)
+        first = guarantee(parts.replace(graph=graph, events=graph.events), until)
     except EchelonError:
         # Without what happens later somebody has no path to a leader for ever.
         return None
     return Prefix(line.number, first) if first.claimed else None
 
 
-def _stored(parts: Parts) -> dict[Settings, Promise]:
+def _stored(parts: Parts) -> dict[Settings, Guarantee]:
     """Return the guarantees of parts by settings, of what their code reads now."""
     # A formation is no dataclass, whose parts would be found.
     reads = foreign_key((parts, parts.formation.motion))
@@ -420,7 +422,7 @@ class Exit(NamedTuple):
     name: str
 
 
-def coverage(result: Result, promise: Promise) -> Iterator[str]:
+def coverage(result: Result, promise: Guarantee) -> Iterator[str]:
     """Say of a theorem's claim whether a run kept to what it rests on."""
     if promise.theorem is None or not len(result.times):
         return
@@ -436,7 +438,7 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
         yield f"The {what} covers this run: {promise.why_covered()}."
 
 
-def covered(result: Result, promise: Promise) -> bool | None:
+def covered(result: Result, promise: Guarantee) -> bool | None:
     """Return whether a run kept, in every step, to what a theorem's claim rests on.
 
     None where no theorem claims anything, and where the stored frames do not show it.
@@ -447,7 +449,7 @@ def covered(result: Result, promise: Promise) -> bool | None:
     return None if not against and _unseen(result, promise) else not against
 
 
-def _against(result: Result, promise: Promise) -> str:
+def _against(result: Result, promise: Guarantee) -> str:
     """Return why a claim does not cover a run; empty where it does."""
     left = None if promise.region is None else first_exit(result, promise)
     limited = float(result.saturated.max())
@@ -458,13 +460,13 @@ def _against(result: Result, promise: Promise) -> str:
     return promise.without
 
 
-def _unseen(result: Result, promise: Promise) -> bool:
+def _unseen(result: Result, promise: Guarantee) -> bool:
     """Tell whether stored frames alone show that agents stayed in the domain."""
     certified = not promise.hypotheses[Hypothesis.STARTS].fails and promise.theorem != Theorem.T2
     return promise.region is not None and not certified and result.settings.store_every > 1
 
 
-def first_exit(result: Result, promise: Promise) -> Exit | None:
+def first_exit(result: Result, promise: Guarantee) -> Exit | None:
     """Return who leaves the domain first, its offset aside; None where nobody does.
 
     T1 and A5 ask it of all agents. T2 asks it of the leaders, and of their inputs, with which the

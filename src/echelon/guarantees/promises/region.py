@@ -63,7 +63,7 @@ class Region(NamedTuple):
 def region_of(parts: Parts, settings: Settings, leaders: Leaders) -> Region:
     """Return what is promised on the domain that the gain of prepared parts was made for."""
     gain = parts.drive.gain
-    if gain is not None and gain.certificate.region is None and at_trim(parts.model).bends.any():
+    if gain is not None and gain.certificate.region is None and at_trim(parts.model).kinks.any():
         return _region_at_bend(parts, settings, leaders, gain)
     if gain is None or gain.certificate.region is None:
         text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"

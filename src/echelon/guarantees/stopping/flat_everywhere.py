@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from echelon.agents.models.chains import Chains, derivatives_of, flatten
+from echelon.agents.models.chains import Chains, derivatives_of, to_flat
 from echelon.agents.models.declarations import is_by_user
 from echelon.agents.models.model import Airframe, ControlAffine, FlatBound
 from echelon.agents.models.quadrotor import Quadrotor
@@ -135,7 +135,7 @@ def _inverted(
     top = np.arange(max(chains.degrees) + 1)[:, None] == np.array(chains.degrees)
 
     def one(x: State, e: jax.Array, tops: jax.Array) -> tuple[Input, jax.Array]:
-        flat = flatten(model, chains, x, e)
+        flat = to_flat(model, chains, x, e)
         u = model.physical(chains.acting_input(e, flat.invert(tops)))
         return u, jnp.where(top, tops, jnp.pad(flat.values, ((0, 1), (0, 0))))
 
@@ -179,7 +179,7 @@ def bounds_of(model: ControlAffine, chains: Chains) -> KnownBounds:
     the inputs act by an invertible constant matrix.
     """
     by_user = {name for name in chains.declared if is_by_user(model, name)}
-    mapped = Kind.SAMPLES if "flatten" in by_user else Kind.PROOF
+    mapped = Kind.SAMPLES if "to_flat" in by_user else Kind.PROOF
     if not {*_STATED} <= {*chains.declared}:
         fault = f"`{type(model).__name__}` does not state where its flat coordinates end"
         everywhere = _is_everywhere(model, chains)

@@ -11,7 +11,7 @@ import numpy as np
 
 from echelon.agents.models.chains import Chains
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.reference import COORDINATES, Guide, Reference
+from echelon.agents.references.reference import COORDINATES, LeaderPath, Reference
 from echelon.core.cache import memoize
 from echelon.core.digits import about
 from echelon.core.enclosure.interval import Interval, point
@@ -72,7 +72,7 @@ def pieces_of(
 
 
 @memoize
-def _pieces(reference: Guide, horizon: float, outputs: tuple[str, ...], order: int) -> Pieces:
+def _pieces(reference: LeaderPath, horizon: float, outputs: tuple[str, ...], order: int) -> Pieces:
     assert isinstance(reference, Reference)
     picked = np.array([COORDINATES.index(name) for name in outputs])
     times, values, parts = [Fraction(0)], list[_Rows](), reference.parts(horizon)
@@ -125,7 +125,7 @@ _SAME = 1e-6
 """Relative; far more than floats leave of a derivative."""
 
 
-def path_fault(reference: Guide | None, chains: Chains, horizon: float) -> str:
+def path_fault(reference: LeaderPath | None, chains: Chains, horizon: float) -> str:
     """Return why a path is not known to have bounded derivatives; empty where it has.
 
     An output with a chain of r integrators needs r - 1 continuous derivatives until the horizon (s)

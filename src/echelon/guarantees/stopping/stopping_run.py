@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from echelon.agents.models.chains import Chains, flat_output, flatten
+from echelon.agents.models.chains import Chains, flat_output, to_flat
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.edges import name_agents
 from echelon.agents.network.formation_motion import FormationMotion
@@ -67,7 +67,7 @@ def flat_states_of(model: ControlAffine, chains: Chains) -> FlatStates:
     x, e = (np.array(part, object) for part in (leaves[:n], leaves[n:]))
 
     def above(x: jax.Array, e: jax.Array) -> jax.Array:
-        return flatten(model, chains, x, e).values[1:]
+        return to_flat(model, chains, x, e).values[1:]
 
     try:
         [found] = lower(lambda x: flat_output(model, chains.outputs, x), graph, [x])
@@ -131,7 +131,7 @@ def _flat(
 
     def one(x: jax.Array, offset: jax.Array) -> jax.Array:
         memory = law.begin(model, x)
-        values = flatten(model, chains, x, memory.chain).values
+        values = to_flat(model, chains, x, memory.chain).values
         shift = flat_output(model, chains.outputs, offset)
         values = values.at[0].add(flat_output(model, chains.outputs, 0.0 * offset) - shift)
         # The law takes the turn of a heading that is next to the beginning of the leader's path.

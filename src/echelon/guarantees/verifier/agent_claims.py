@@ -16,7 +16,14 @@ from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import at_least
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.guarantees.verifier.findings import ROUNDING, TIGHT, Facts, Finding, decide, unchecked
+from echelon.guarantees.verifier.findings import (
+    ROUNDING,
+    TIGHT,
+    CheckResult,
+    Recomputed,
+    decide,
+    unchecked,
+)
 from echelon.guarantees.verifier.region_claims import needs_constant, slowest
 from echelon.guarantees.verifier.saved_gain import SavedGain, SavedModel, SavedRegion
 
@@ -332,7 +339,7 @@ _ROUNDING = 256.0 * float(np.finfo(float).eps)
 """Rounding of a model's own arithmetic relative to its terms."""
 
 
-def check_equations(facts: Facts, user_model: ControlAffine | None) -> Iterator[Finding]:
+def check_equations(facts: Recomputed, user_model: ControlAffine | None) -> Iterator[CheckResult]:
     """Check the claims about the model; without `user_model` it is rebuilt from the file."""
     saved, claim = facts.saved.model, MODEL
     model = model_of(saved) if user_model is None else user_model
@@ -348,7 +355,7 @@ def check_equations(facts: Facts, user_model: ControlAffine | None) -> Iterator[
         yield decide(claim, False, saved.path, "", text)
 
 
-def _check_model(facts: Facts, model: ControlAffine) -> Iterator[Finding]:
+def _check_model(facts: Recomputed, model: ControlAffine) -> Iterator[CheckResult]:
     saved, name = facts.saved.model, type(model).__name__
     if (tuple(model.state_names), tuple(model.input_names)) != (
         saved.state_names,
@@ -371,7 +378,7 @@ def _is_close(stored: Array, expected: Array) -> bool:
     return fits and bool((np.abs(stored - expected) <= TIGHT * np.abs(expected)).all())
 
 
-def _check_trim(facts: Facts, model: ControlAffine) -> Iterator[Finding]:
+def _check_trim(facts: Recomputed, model: ControlAffine) -> Iterator[CheckResult]:
     """Check the equilibrium, A and B at the trim, and A also by difference quotients."""
     saved, n = facts.saved.model, len(facts.saved.P)
     sizes = np.multiply.outer(_STEPS, np.maximum(1.0, np.abs(saved.state)))
@@ -413,7 +420,9 @@ def _quotients_off(saved: SavedModel, at: Evaluated, steps: Array) -> float:
     return float((gaps / np.where(sizes > 0.0, sizes, 1.0)).max())
 
 
-def _check_domain(facts: Facts, region: SavedRegion, model: ControlAffine) -> Iterator[Finding]:
+def _check_domain(
+    facts: Recomputed, region: SavedRegion, model: ControlAffine
+) -> Iterator[CheckResult]:
     """Search the domain for states that contradict the guarantee."""
     saved = facts.saved
     yield decide("the domain lies inside the chart", _is_inside_chart(saved.model, region, model))
@@ -455,8 +464,8 @@ def _is_inside_chart(saved: SavedModel, region: SavedRegion, model: ControlAffin
 
 
 def _check_secants(
-    facts: Facts, region: SavedRegion, model: ControlAffine, some: Points
-) -> Finding:
+    facts: Recomputed, region: SavedRegion, model: ControlAffine, some: Points
+) -> CheckResult:
     """Check velocity differences of pairs of states against the hull or the rate.
 
     This detects a discontinuous velocity and wrong derivatives.
@@ -493,7 +502,7 @@ def _normals(metric: Array, sizes: Array) -> Array:
     return np.where(which == 0, single, np.where(which == 1, mixed, metric))
 
 
-def _decay(facts: Facts, region: SavedRegion, steps: Array) -> SupportBounds:
+def _decay(facts: Recomputed, region: SavedRegion, steps: Array) -> SupportBounds:
     """Return bounds of d'P (v(x) - v(y)) that follow from the rate and the strongest feedback.
 
     They follow from P A + A'P - strength P W P + 2 rate P <= 0, integrated from y to x = y + d.

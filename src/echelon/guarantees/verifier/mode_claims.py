@@ -11,8 +11,8 @@ from echelon.guarantees.verifier.findings import (
     DECIDED,
     ROUNDING,
     TIGHT,
-    Facts,
-    Finding,
+    CheckResult,
+    Recomputed,
     compare,
     decide,
     unchecked,
@@ -25,7 +25,7 @@ _LOOSE = 1e-6
 """Relative to the largest eigenvalue; those of a nonnormal L keep only half of their digits."""
 
 
-def check_graph(saved: SavedGain) -> Iterator[Finding]:
+def check_graph(saved: SavedGain) -> Iterator[CheckResult]:
     """Check the edges before the spectrum is computed."""
     graph = saved.graph
     followers = graph.agents - len(graph.leaders)
@@ -43,7 +43,7 @@ def check_graph(saved: SavedGain) -> Iterator[Finding]:
         yield decide("graph", False, text=text + " missing")
 
 
-def check_spectrum(facts: Facts) -> Iterator[Finding]:
+def check_spectrum(facts: Recomputed) -> Iterator[CheckResult]:
     """Check the stored spectrum."""
     saved, stored = facts.saved, facts.saved.graph.spectrum
     result, claim = facts.eigenvalues, "graph spectrum"
@@ -68,7 +68,7 @@ def check_spectrum(facts: Facts) -> Iterator[Finding]:
     yield compare("lambda_max", saved.lambda_max, high, ROUNDING * high)
 
 
-def _compare_complex(recomputed: Array, stored: Array, high: float) -> Finding:
+def _compare_complex(recomputed: Array, stored: Array, high: float) -> CheckResult:
     """Compare complex eigenvalues; each is paired with the nearest remaining one."""
     gap, left = 0.0, list(stored.astype(complex))
     for value in recomputed:
@@ -96,7 +96,7 @@ _MOST_MODES = 16
 _MODE_DECIDED = 1e-3
 
 
-def check_linearization(facts: Facts) -> Iterator[Finding]:
+def check_linearization(facts: Recomputed) -> Iterator[CheckResult]:
     """Check the claims about the linearization at the trim."""
     saved = facts.saved
     yield decide("kind of the slowest mode", saved.kind == "linearization", saved.kind)
@@ -114,7 +114,7 @@ def check_linearization(facts: Facts) -> Iterator[Finding]:
     yield decide("observability rank", saved.observable == rank, saved.observable, rank)
 
 
-def _check_between(facts: Facts) -> Iterator[Finding]:
+def _check_between(facts: Recomputed) -> Iterator[CheckResult]:
     """Check that the modes between the extreme eigenvalues decay."""
     values, followers = facts.eigenvalues, facts.saved.graph.agents - len(facts.saved.graph.leaders)
     every = followers <= algebra.ALL_MODES or facts.saved.graph.directed
@@ -127,7 +127,7 @@ def _check_between(facts: Facts) -> Iterator[Finding]:
     yield decide("all modes between decay", result + slack < 0.0, "", result)
 
 
-def _checked_eigenvalues(facts: Facts) -> Array:
+def _checked_eigenvalues(facts: Recomputed) -> Array:
     """Return the eigenvalues whose modes the file covers."""
     graph = facts.saved.graph
     if graph.directed or graph.switches:
@@ -135,7 +135,7 @@ def _checked_eigenvalues(facts: Facts) -> Array:
     return algebra.ends_of_many(facts.eigenvalues)
 
 
-def _slowest(facts: Facts, values: Array) -> tuple[float, float]:
+def _slowest(facts: Recomputed, values: Array) -> tuple[float, float]:
     """Return the slowest mode, 1/s, and its rounding."""
     K = facts.saved.coupling * facts.feedback
     modes = np.linalg.eigvals(facts.closed - values[:, None, None] * K).real.max(axis=1)
@@ -148,7 +148,7 @@ def _slowest(facts: Facts, values: Array) -> tuple[float, float]:
     return slowest, max(slack for value, slack in result if value >= slowest - slack)
 
 
-def _doubt(facts: Facts, K: Array, value: float) -> algebra.Doubt:
+def _doubt(facts: Recomputed, K: Array, value: float) -> algebra.Doubt:
     """Return a bound on the error of a mode due to solving with R and rounding of an eigenvalue."""
     saved, eps = facts.saved, float(np.finfo(float).eps)
     # The smallest eigenvalue is exact to all digits, the others relative to the largest.
@@ -163,7 +163,7 @@ def _doubt(facts: Facts, K: Array, value: float) -> algebra.Doubt:
     return bound
 
 
-def _check_edge(facts: Facts) -> Iterator[Finding]:
+def _check_edge(facts: Recomputed) -> Iterator[CheckResult]:
     """Check the smallest coupling with a guaranteed stable linearization."""
     saved, claim = facts.saved, "edge of the coupling"
     threshold = _EDGES.get(saved.method)

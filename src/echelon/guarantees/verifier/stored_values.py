@@ -12,7 +12,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.core.words import amount
-from echelon.guarantees.verifier.findings import Finding
+from echelon.guarantees.verifier.findings import CheckResult
 
 
 class Digits(NamedTuple):
@@ -35,7 +35,7 @@ _SHOWN = 60
 
 def compare_values(
     claim: str, stored: object, value: object, digits: Digits = _USUAL
-) -> Iterator[Finding]:
+) -> Iterator[CheckResult]:
     """Yield a finding for each number, matrix or text of a stored value.
 
     Args:
@@ -66,7 +66,7 @@ def compare_values(
 
 def compare_arrays(
     claim: str, stored: Array | None, value: Array, digits: Digits = _USUAL
-) -> Finding:
+) -> CheckResult:
     """Return the finding for an array of numbers or words; NaN agrees with NaN."""
     if stored is None:
         return _differs(claim, "", _described(value), "it is missing")
@@ -80,14 +80,14 @@ def compare_arrays(
         fine = fine and (not value.size or _agree(theirs, ours, digits))
     if not fine:
         return _differs(*shown, "")
-    return Finding(*shown, "recomputed", "", True)
+    return CheckResult(*shown, "recomputed", "", True)
 
 
 def _described(array: Array) -> str:
     return f"{' x '.join(map(str, array.shape)) or 1} {'number' if array.size == 1 else 'numbers'}"
 
 
-def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> Finding:
+def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> CheckResult:
     if isinstance(stored, str) and isinstance(value, str):
         fine, at = _same_text(stored, value), _first_difference(stored, value)
         shown = [ascii(text[at : at + _SHOWN])[1:-1] for text in (stored, value)]
@@ -100,14 +100,16 @@ def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> 
     return _finding(claim, stored, value, type(stored) is type(value) and stored == value)
 
 
-def _finding(claim: str, stored: object, value: object, fine: bool, reason: str = "") -> Finding:
+def _finding(
+    claim: str, stored: object, value: object, fine: bool, reason: str = ""
+) -> CheckResult:
     if not fine:
         return _differs(claim, _shown(stored), _shown(value), reason)
-    return Finding(claim, _shown(stored), _shown(value), "recomputed", "", True)
+    return CheckResult(claim, _shown(stored), _shown(value), "recomputed", "", True)
 
 
-def _differs(claim: str, stored: str, value: str, reason: str) -> Finding:
-    return Finding(
+def _differs(claim: str, stored: str, value: str, reason: str) -> CheckResult:
+    return CheckResult(
         claim, stored, value, "refused", reason or "the scenario gives another value", True
     )
 

@@ -15,7 +15,7 @@ from echelon.agents.models.quadrotor import Quadrotor
 from echelon.core.digits import at_most
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
-from echelon.guarantees.verifier.findings import Finding, compare, decide
+from echelon.guarantees.verifier.findings import CheckResult, compare, decide
 
 # ---- thrusts of the motors -----------------------------------------------------------------------
 # The certificate encloses time slices in rational arithmetic. Here responses are evaluated at
@@ -29,7 +29,7 @@ _TIMES, _MOTIONS = 24, 4000
 """Times of random motions (the least thrust of each interval), and motions per time."""
 
 
-def motor_findings(claims: JsonObject) -> Iterator[Finding]:
+def motor_findings(claims: JsonObject) -> Iterator[CheckResult]:
     """Yield a finding for each claim about the motors."""
     motion = _Motion.of(claims)
     demands = [_demands(motion, _start_bounds(start)) for start in claims["starts"]]
@@ -190,7 +190,7 @@ def _random_motions(
     return float(thrusts.min()), float(thrusts.max())
 
 
-def _check_single_starts(claims: JsonObject, motion: _Motion) -> Iterator[Finding]:
+def _check_single_starts(claims: JsonObject, motion: _Motion) -> Iterator[CheckResult]:
     """Yield a finding for each other start from which the motors are claimed to suffice."""
     alone, ahead, most = claims["alone"], claims["ahead"], float(claims["most"])
     if alone is None:
@@ -220,7 +220,7 @@ _CLOSE = 1e-6
 _BLEND = np.polynomial.Polynomial([0, 0, 0, 0, 0, 0, 462, -1980, 3465, -3080, 1386, -252])
 
 
-def offset_findings(claim: JsonObject) -> Iterator[Finding]:
+def offset_findings(claim: JsonObject) -> Iterator[CheckResult]:
     """Yield whether the bounds of offsets and their derivatives are those of their motion."""
     if claim["sizes"] is None:
         return
@@ -258,7 +258,7 @@ def _sizes(claim: JsonObject) -> Array:
 _SLACK = 1e-9
 
 
-def separation_findings(claim: JsonObject) -> Iterator[Finding]:
+def separation_findings(claim: JsonObject) -> Iterator[CheckResult]:
     """Yield a finding for each condition of the theorem."""
     width, _, height = claim["radii"]
     scales = np.array([width / height if axis == "z" else 1.0 for axis in claim["axes"]])
@@ -304,7 +304,7 @@ def tube_of(promise: JsonObject) -> JsonObject | None:
     return tube if isinstance(tube, dict) and tube.get("format") == FORMAT else None
 
 
-def tube_findings(tube: JsonObject) -> Iterator[Finding]:
+def tube_findings(tube: JsonObject) -> Iterator[CheckResult]:
     """Yield a finding for each claim of a tube."""
     for border in tube["borders"]:
         roots = [Fraction(str(root)) for root in border["roots"]]
@@ -323,7 +323,9 @@ def tube_findings(tube: JsonObject) -> Iterator[Finding]:
         yield from separation_findings(tube["separation"])
 
 
-def _check_margin(border: JsonObject, roots: Sequence[Fraction], name: str) -> Iterator[Finding]:
+def _check_margin(
+    border: JsonObject, roots: Sequence[Fraction], name: str
+) -> Iterator[CheckResult]:
     """Yield findings on the margin to a border and on the steepest admissible start."""
     order = int(border["derivative"]) - 1
     allowed = float(border["path"]) - float(border["above"])

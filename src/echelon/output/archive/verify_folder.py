@@ -28,9 +28,9 @@ from echelon.experiments.scenario.scenario import (
 )
 from echelon.experiments.scenario.self_contained import files_of, names_code, without_folders
 from echelon.experiments.studies.recomputation import compare_structure, experiment_of, recompute
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.verifier import verify as verifier
-from echelon.guarantees.verifier.findings import Finding, unchecked
+from echelon.guarantees.verifier.findings import CheckResult, unchecked
 from echelon.guarantees.verifier.saved_gain import read_json
 from echelon.guarantees.verifier.stored_values import Digits, compare_arrays, compare_values
 from echelon.guarantees.verifier.verify import PROMISE, Verification, judge, states_gain
@@ -126,7 +126,9 @@ def _place(path: Path) -> Path:
 # ---- the run, computed again ---------------------------------------------------------------------
 
 
-def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
+def compare_run(
+    files: ClaimFiles, scenario: Scenario, experiment: Experiment
+) -> Iterator[CheckResult]:
     """Yield a finding for each array, number and text that only the run itself gives.
 
     Args:
@@ -149,7 +151,7 @@ def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -
         return
     result = dataclasses.replace(result, **origin_of(scenario))
     yield from compare_structure(files.data, run_file(result))
-    decided = bool(promise(*experiment).promised) and _converged(result)
+    decided = bool(guarantee(*experiment).promised) and _converged(result)
     for finding in _compare(files, data, result):
         differs = finding.verdict == "refused" and finding.stored and finding.value
         open_ = differs and not decided
@@ -183,7 +185,7 @@ def _repeated(experiment: Experiment, data: Labelled, steps: int) -> Result | No
     return dataclasses.replace(result, outcome=stored) if same else None
 
 
-def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Finding]:
+def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[CheckResult]:
     """Compare dataset, summary and report with those of the run computed again."""
     assert files.data is not None
     laws = isinstance(result.parts.drive, Laws)
@@ -201,7 +203,7 @@ def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Find
         yield _compare_report(written, report(result) + "\n")
 
 
-def _compare_origin(stored: JsonObject, data: Labelled) -> Iterator[Finding]:
+def _compare_origin(stored: JsonObject, data: Labelled) -> Iterator[CheckResult]:
     """Compare what both files say of the program: nothing else says it."""
     attributes = data.attributes
     versions = {k[8:]: text for k, text in attributes.items() if k.startswith("version_")}
@@ -211,7 +213,7 @@ def _compare_origin(stored: JsonObject, data: Labelled) -> Iterator[Finding]:
 
 def _compare_dataset(
     name: str, data: Labelled, result: Result, digits: Digits
-) -> Iterator[Finding]:
+) -> Iterator[CheckResult]:
     """Compare arrays and attributes of a dataset, but those of the parts of the run."""
     parts = labelled_parts(result.parts, result.settings)
     stored, again = data.arrays(), with_sums(result)
@@ -229,7 +231,7 @@ def _compare_dataset(
             yield from compare_values(f"{name}: observed", theirs, ours, digits)
 
 
-def _compare_report(file: Path, text: str) -> Finding:
+def _compare_report(file: Path, text: str) -> CheckResult:
     """Compare a report; last digits may be rounded in another way, and are then left open."""
     try:
         stored = file.read_text("utf-8")
@@ -303,7 +305,7 @@ def check_files(
     """
     source, obstacle = _source(files, trusted)
     findings, note = _independent(files, trusted)
-    computed = list[Finding]()
+    computed = list[CheckResult]()
     # A gain file by itself is no run.
     if source is not None and (files.claims is not None or files.data is not None):
         computed = [*_computed(files, source, repeat, begin)]
@@ -315,7 +317,7 @@ def check_files(
 
 def _computed(
     files: ClaimFiles, source: Scenario, repeat: bool, begin: Callable[[str], None]
-) -> Iterator[Finding]:
+) -> Iterator[CheckResult]:
     """Yield what is computed again from a scenario: the guarantee, and then the run."""
     begin("computing the guarantee again, which takes up to a minute")
     experiment, findings = experiment_of(source, files.claims, files.gain)
@@ -350,7 +352,7 @@ def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | Non
     return own, ""
 
 
-def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[Finding], str]:
+def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[CheckResult], str]:
     """Return what independent code finds in each file, and its notes."""
     model = None if trusted is None else build(trusted).parts.model
     checked = [each for each in (files.gain, files.claims) if each is not None]
@@ -359,8 +361,8 @@ def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[Find
 
 
 def _still_open(
-    findings: list[Finding], computed: list[Finding], obstacle: str
-) -> Iterator[Finding]:
+    findings: list[CheckResult], computed: list[CheckResult], obstacle: str
+) -> Iterator[CheckResult]:
     """Yield what independent code found, without what it left open and the scenario has settled."""
     agree = {each.claim.partition(": ")[2] for each in computed if each.verdict == "recomputed"}
     for each in findings:

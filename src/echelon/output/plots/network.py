@@ -217,8 +217,8 @@ def curves_of(places: Array, edges: Array, least: float) -> list[Array]:
 
 def _bend(places: Array, edge: Array, least: float) -> Array:
     # Links of adjacent agents bend to different sides.
-    bends = [bend * (-1.0) ** int(edge.min()) for bend in _BENDS]
-    lines = [_arc(places[edge[0]], places[edge[1]], bend) for bend in bends]
+    kinks = [bend * (-1.0) ** int(edge.min()) for bend in _BENDS]
+    lines = [_arc(places[edge[0]], places[edge[1]], bend) for bend in kinks]
     gaps = [_gap(places, edge, line) for line in lines]
     clear = [line for line, gap in zip(lines, gaps, strict=True) if gap > least]
     return clear[0] if clear else lines[int(np.argmax(gaps))]

@@ -25,7 +25,7 @@ from echelon.experiments.studies.basin import (
 from echelon.experiments.studies.compare import Comparison
 from echelon.experiments.sweeps.plan import SEED, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import save
 from echelon.output.plots.network import poles
@@ -321,7 +321,7 @@ def save_design_figures(
         GainError: `axes` names no two states of the model.
         OSError: the folder or a file cannot be written.
     """
-    loop = promise(parts, settings).loop
+    loop = guarantee(parts, settings).loop
     figures, radii = {}, None
     sliced = axes is not None or len(parts.model.state_names) > 1
     states = chosen_slice(parts.model, axes) if sliced else None
@@ -340,7 +340,7 @@ def _certified_set(
     A certified set much smaller than the observed one has a second panel.
     """
     run, plane = trial(parts, settings), slice_of(parts, states)
-    region = promise(run.parts, settings).certified
+    region = guarantee(run.parts, settings).certified
     certified, observed = None if region is None else region.radius, observed_radius(run, plane)
     names = (parts.model.state_names[states[0]], parts.model.state_names[states[1]])
     radii = Radii(names, certified, observed, plane.largest, run.horizon)

@@ -13,12 +13,12 @@ from echelon.experiments.results.run_numbers import (
     AGENT_NUMBERS,
     ERROR,
     RUN_NUMBERS,
-    Shown,
+    Appearance,
     settling_bound,
     shown_in,
 )
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
-from echelon.guarantees.promises.promise import Promise
+from echelon.guarantees.promises.promise import Guarantee
 from echelon.output.reports.run_report import PRINTED, ROUNDING, is_papers_experiment, say
 from echelon.simulation.step.solver_stats import SolverStats
 
@@ -117,7 +117,7 @@ def _costs_table(comparison: Comparison) -> "Table":
     # In the ideal network no run has ages of messages.
     costs = {
         name: quantity.column
-        for name, quantity in shown_in(RUN_NUMBERS, Shown.COMPARISON).items()
+        for name, quantity in shown_in(RUN_NUMBERS, Appearance.COMPARISON).items()
         if quantity.column
         and (quantity.absent != "-" or any(run.number(name) is not None for run in runs))
     }
@@ -155,7 +155,7 @@ def _table(title: str, columns: Sequence[str]) -> "Table":
     return table
 
 
-def _guaranteed(promise: Promise) -> str:
+def _guaranteed(promise: Guarantee) -> str:
     """Return the guaranteed rate, with its theorem if there is one."""
     if promise.rate is None:
         return "none"
@@ -317,7 +317,7 @@ def _row_mapping(row: ComparisonRow) -> JsonObject:
             f"follower_{name}": {str(f.agent): getattr(f, name) for f in followers}
             for name in ("rmse", "steady_rmse")
         },
-        **row.flight.json(Shown.COMPARISON),
+        **row.flight.json(Appearance.COMPARISON),
         "promise": row.flight.promise.as_mapping(),
         "told": list(result.parts.information.follower),
         "solver": None if result.work is None else result.work._asdict(),

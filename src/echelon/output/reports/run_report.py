@@ -31,7 +31,7 @@ from echelon.experiments.results.run_numbers import (
     settling_bound,
     steady_error,
 )
-from echelon.guarantees.promises.promise import Promise, coverage, promise
+from echelon.guarantees.promises.promise import Guarantee, coverage, guarantee
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED
 
@@ -219,20 +219,20 @@ def _cell(agent: LeaderMetrics | FollowerMetrics, name: str) -> str:
 
 def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
     """Return the sentences of a report: outcome, what was observed, world, guarantee, V."""
-    guarantee = promise(result.parts, result.settings)
+    stated = guarantee(result.parts, result.settings)
     return (
-        *_outcome(result, numbers, guarantee),
+        *_outcome(result, numbers, stated),
         *_closest(result, numbers),
         *(outcome.sentence() for outcome in event_outcomes(result)),
         *_lag(result),
-        *observations(result, numbers, guarantee),
+        *observations(result, numbers, stated),
         *_world(result),
-        *_guarantee(result, guarantee),
-        *_lyapunov_trend(result, guarantee),
+        *_guarantee(result, stated),
+        *_lyapunov_trend(result, stated),
     )
 
 
-def _outcome(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[str]:
+def _outcome(result: Result, numbers: Metrics, guarantee: Guarantee) -> Iterator[str]:
     yield result.message
     if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
         return
@@ -314,7 +314,7 @@ def _messages(result: Result) -> Iterator[str]:
     yield f"Messages: {traffic.sent} sent, {traffic.lost} lost{late}{ages}."
 
 
-def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
+def _guarantee(result: Result, guarantee: Guarantee) -> Iterator[str]:
     """Yield the guarantee, whether it covers this run, and the information that the law uses."""
     yield guarantee.sentence()
     slowest, coupling = guarantee.slowest, guarantee.coupling
@@ -334,7 +334,7 @@ def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
     yield f"Information used by each follower: {information}."
 
 
-def _lyapunov_trend(result: Result, guarantee: Promise) -> Iterator[str]:
+def _lyapunov_trend(result: Result, guarantee: Guarantee) -> Iterator[str]:
     """Yield whether V decreased, with a warning where theory forbids its increase."""
     v = lyapunov(result)
     if v is None or len(v.value) < 2 or not np.isfinite(v.value).all():
@@ -360,7 +360,7 @@ def _lyapunov_trend(result: Result, guarantee: Promise) -> Iterator[str]:
 # ---- what was observed in a poor run -------------------------------------------------------------
 
 
-def observations(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[str]:
+def observations(result: Result, numbers: Metrics, guarantee: Guarantee) -> Iterator[str]:
     """Yield what was observed of large errors, in sentences; no cause, since none was tried."""
     alone, text = _alone(result)
     yield from (text,) if text else ()
@@ -429,7 +429,7 @@ def _silent(result: Result) -> Bool[np.ndarray, "S N"]:
     return ~heard & here & ~leads
 
 
-def beyond(saturated: float, guarantee: Promise) -> Iterator[str]:
+def beyond(saturated: float, guarantee: Guarantee) -> Iterator[str]:
     """Yield that a guarantee does not cover a run whose errors grow.
 
     `saturated` is the largest fraction of steps in which an agent's input was at a limit.
@@ -444,7 +444,7 @@ def beyond(saturated: float, guarantee: Promise) -> Iterator[str]:
     yield f"{text}{limited if saturated else ''}."
 
 
-def _slow(result: Result, guarantee: Promise) -> Iterator[str]:
+def _slow(result: Result, guarantee: Guarantee) -> Iterator[str]:
     """Yield that the horizon is too short for the slowest mode."""
     by_mode = guarantee.slowest is not None
     rate = -guarantee.slowest if guarantee.slowest is not None else guarantee.rate
@@ -496,7 +496,7 @@ def sizes(result: Result) -> tuple[float, float]:
     return first, last
 
 
-def grows(result: Result, guarantee: Promise) -> bool:
+def grows(result: Result, guarantee: Guarantee) -> bool:
     """Return whether a run diverged, or its errors grew beyond what a guarantee allows for.
 
     Under one, errors that end below 1 cm are those of rounding and of inputs that are held.

@@ -15,9 +15,9 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.exchange import Exchange, Near
 from echelon.agents.network.inbox import (
     Inbox,
+    LeaderPacket,
     Message,
     NamedValues,
-    Packet,
     Received,
     Stamps,
     Surroundings,
@@ -34,7 +34,7 @@ from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.action import Action, act, feedforward_of
+from echelon.simulation.step.action import AgentOutput, act, feedforward_of
 from echelon.simulation.step.knowledge import (
     NOBODY,
     Ages,
@@ -160,7 +160,7 @@ class Step(NamedTuple):
     """
 
     signal: jax.Array
-    action: Action
+    action: AgentOutput
     finite: jax.Array
     letter: Letters | None = None
     hull: jax.Array | None = None
@@ -323,7 +323,7 @@ class Agent:
         self._schedule = graph.schedule
         with precision("float64"):
             self._names = _names(self._loop, self._law)
-        self._stamps = self._stamps_of(graph.leaders, graph.heirs)
+        self._stamps = self._stamps_of(graph.leaders, graph.backups)
         self._source = self._source_in(parts)
         self._inbox = Inbox(self.neighbours, self._source, *self._names, stamps=self._stamps)
         self._others = self._surroundings(graph.agents)
@@ -335,14 +335,14 @@ class Agent:
         self._late = False
         self._last: tuple[Array, Message | None] = np.array(self._loop.model.trim[1], float), None
 
-    def _stamps_of(self, leaders: Sequence[int], heirs: Sequence[int]) -> Stamps | None:
+    def _stamps_of(self, leaders: Sequence[int], backups: Sequence[int]) -> Stamps | None:
         channel = self._loop.channel
         if channel is None:
             return None
-        size = packet_size(channel, *self._sizes, bool(heirs))
+        size = packet_size(channel, *self._sizes, bool(backups))
         own = self.number if self.leads else None
         deviation = channel.messages is MessageContent.DEVIATION
-        return Stamps(len(self.neighbours), leaders, size, own, deviation, heirs)
+        return Stamps(len(self.neighbours), leaders, size, own, deviation, backups)
 
     def _succeed(self, stamps: Stamps) -> None:
         """Take the lead if nobody was heard to lead for long, or leave it to whoever has it."""
@@ -521,7 +521,7 @@ class Agent:
         packet, leader = self._stamps.packet, int(step.letter.packet.leader[0])
         if leader == self.number:
             content = tuple(step.letter.packet.content[0].tolist())
-            packet = Packet(leader, self._time, content, self._stamps.epoch)
+            packet = LeaderPacket(leader, self._time, content, self._stamps.term)
         if packet is None and self._stamps.needs_packet:
             return None
         message = self._message(step.letter.value[0])
@@ -560,7 +560,7 @@ class Agent:
         return expected_alone(self._loop, time, content, age, self._sizes[0])
 
     def _own(self, state: State, time: jax.Array) -> "OwnState":
-        # As in a run, where leaders may follow their heirs.
+        # As in a run, where leaders may follow their backup leaders.
         law = self._law if self._loop.succession is None else self._loop.follower
         memory = self._memory if self._begun else begin_alone(self._loop, law, state)
         self._late = self._late if self._begun else float(time) > 0.0

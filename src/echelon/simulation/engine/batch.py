@@ -31,7 +31,7 @@ from echelon.simulation.native.threads import processors
 from echelon.simulation.native.varying import ProgramKeys
 from echelon.simulation.step.drive import Stepper
 from echelon.simulation.step.loop import Loop, assemble
-from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.settings import Settings
 
 Run: TypeAlias = tuple[Parts, Settings]
@@ -194,7 +194,7 @@ def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _Ba
     if not world.ideal:
         # Draws of a seed of its own.
         drawn = {
-            "motion": Motion.of(problem.model, world, settings, len(states)),
+            "motion": PlantStep.of(problem.model, world, settings, len(states)),
             "channel": channel_of(prepared.parts, settings),
             "sensors": sensors_of(prepared.parts, settings),
         }

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from echelon.core.types import Array
-from echelon.simulation.step.drive import Chunk, Moment, Stepper
+from echelon.simulation.step.drive import Chunk, LoopState, Stepper
 from echelon.simulation.step.settings import Settings
 
 _CHUNKS = 100
@@ -59,7 +59,7 @@ class ChunkGrid:
 
 
 def advance_until_lost(
-    stepper: Stepper, now: Moment, counts: Array, reference: Array | None, formations: int
+    stepper: Stepper, now: LoopState, counts: Array, reference: Array | None, formations: int
 ) -> tuple[Chunk, Array]:
     """Return a chunk and the steps after its points, one of them where a formation diverges."""
     chunk = stepper.advance(now, counts, reference)
@@ -75,7 +75,7 @@ def advance_until_lost(
 
 
 def _first_lost(
-    stepper: Stepper, now: Moment, counts: Array, reference: Array | None, formations: int
+    stepper: Stepper, now: LoopState, counts: Array, reference: Array | None, formations: int
 ) -> dict[int, tuple[Array, Array]]:
     total, step, lost = int(counts.sum()), 0, np.zeros(formations, bool)
     frames = dict[int, tuple[Array, Array]]()

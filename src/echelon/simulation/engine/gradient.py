@@ -19,8 +19,8 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.simulate import sample_reference
 from echelon.simulation.step.distances import distance_of
-from echelon.simulation.step.drive import Drive, Problem
-from echelon.simulation.step.loop import Loop, Moment, assemble
+from echelon.simulation.step.drive import Controller, Problem
+from echelon.simulation.step.loop import Loop, LoopState, assemble
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.sequence import begin, measured_step
 from echelon.simulation.step.settings import Settings
@@ -95,7 +95,7 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
     return Gradient(float(value), by_variable, jax.tree.map(np.asarray, sums))
 
 
-def _values_of(problem: Problem, drive: Drive, wrt: Sequence[str]) -> dict[str, Array]:
+def _values_of(problem: Problem, drive: Controller, wrt: Sequence[str]) -> dict[str, Array]:
     gain = drive.gain
     if not isinstance(drive, Laws):
         raise SimulationError(
@@ -172,12 +172,12 @@ def _with_offsets(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
 
 
 def _sums(loop: Loop, states: jax.Array, reference: Array | None, steps: int) -> Sums:
-    def one(carry: tuple[Moment, Sums], _: None) -> tuple[tuple[Moment, Sums], None]:
+    def one(carry: tuple[LoopState, Sums], _: None) -> tuple[tuple[LoopState, Sums], None]:
         now, sums = measured_step(loop, carry[0], reference, 0)
         return (now, carry[1].plus(sums)), None
 
     @jax.checkpoint
-    def several(carry: tuple[Moment, Sums], _: None) -> tuple[tuple[Moment, Sums], None]:
+    def several(carry: tuple[LoopState, Sums], _: None) -> tuple[tuple[LoopState, Sums], None]:
         return jax.lax.scan(one, carry, None, length=few)
 
     # Checkpoints and the steps after each are then equally many: the least memory.

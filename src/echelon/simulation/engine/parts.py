@@ -22,7 +22,7 @@ from echelon.agents.world.world import World
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.types import Array
 from echelon.core.words import amount
-from echelon.simulation.step.drive import Drive, Information
+from echelon.simulation.step.drive import Controller, Information
 from echelon.simulation.step.leadership import Leadership
 
 Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.ndarray | None
@@ -75,7 +75,7 @@ class Parts:
     model: ControlAffine
     graph: Graph
     formation: Formation
-    drive: Drive
+    drive: Controller
     initial: Initial = None
     start_error: Mapping[str, float] = dataclasses.field(default_factory=dict)
     world: World = dataclasses.field(default_factory=World)
@@ -84,7 +84,7 @@ class Parts:
 
     def __post_init__(self) -> None:
         # The model is left out: `check_model` says more of what is wrong with one.
-        kinds = {"graph": Graph, "formation": Formation, "drive": Drive, "world": World}
+        kinds = {"graph": Graph, "formation": Formation, "drive": Controller, "world": World}
         for place, kind in kinds.items():
             check_kind(place, getattr(self, place), kind)
         if self.leadership is not None:
@@ -96,7 +96,7 @@ class Parts:
             )
         self._check_starts()
         object.__setattr__(self, "events", tuple(self.events))
-        object.__setattr__(self, "graph", self.graph.with_events(self.events, self.heirs))
+        object.__setattr__(self, "graph", self.graph.with_events(self.events, self.backups))
 
     def _check_starts(self) -> None:
         for named in (self.initial, self.start_error):
@@ -119,9 +119,9 @@ class Parts:
             )
 
     @property
-    def heirs(self) -> tuple[int, ...]:
+    def backups(self) -> tuple[int, ...]:
         """Who takes the lead after the leader, in this order."""
-        return () if self.leadership is None else tuple(self.leadership.heirs)
+        return () if self.leadership is None else tuple(self.leadership.backups)
 
     @property
     def information(self) -> Information:

@@ -24,8 +24,8 @@ from echelon.core.words import amount
 from echelon.simulation.engine.frame_numbers import ClosestPair
 from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.step.drive import Problem
-from echelon.simulation.step.meter import Meter
-from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.meter import RunStatistics
+from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.settings import Settings
 
 
@@ -90,7 +90,7 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         parts.world.check_agents(model, graph.agents)
         # Its own numbers first: whether they suit the laws is asked of a network that can be.
         channel = channel_of(parts, settings)
-        drive.check_heirs(graph)
+        drive.check_backups(graph)
         if parts.leadership is not None:
             parts.leadership.check_network(parts.world.network)
         drive.check_world(parts.world, graph, settings.dt)
@@ -98,8 +98,8 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
             model,
             graph,
             formation,
-            Motion.of(model, parts.world, settings, graph.agents),
-            Meter.of(
+            PlantStep.of(model, parts.world, settings, graph.agents),
+            RunStatistics.of(
                 model, graph, formation, settings, drive.safety and drive.safety.scales(model)
             ),
             settings,
@@ -150,7 +150,7 @@ def check_memory(model: ControlAffine, agents: int, settings: Settings) -> None:
 
 def _check_events(parts: Parts, settings: Settings) -> None:
     graph = parts.graph
-    for fault in event_faults(graph.before, graph.events, graph.heirs, settings.horizon):
+    for fault in event_faults(graph.before, graph.events, graph.backups, settings.horizon):
         raise SimulationError(f"{fault.text}.")
     if graph.presence is not None and settings.devices > 1:
         raise SimulationError(

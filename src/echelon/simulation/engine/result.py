@@ -20,7 +20,7 @@ from echelon.core.words import amount
 from echelon.simulation.engine.frame_numbers import ClosestPair, FrameChoice, FrameNumbers
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.traffic import Traffic, traffic
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats
@@ -113,7 +113,7 @@ class Result(FrameNumbers):
         return self.parts.formation
 
     @property
-    def drive(self) -> Drive:
+    def drive(self) -> Controller:
         """What drove the agents."""
         return self.parts.drive
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from echelon.agents.network.channel import NEVER, Channel, Posts
+from echelon.agents.network.channel import NEVER, Channel, InFlight
 from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.hearing import edges_of
 from echelon.core.compiled import cached_jit
@@ -32,12 +32,12 @@ from echelon.simulation.step.knowledge import (
     usable_age,
     write,
 )
-from echelon.simulation.step.leadership import Succession
-from echelon.simulation.step.loop import Presence, Switches, exchange_at
+from echelon.simulation.step.leadership import Failover
+from echelon.simulation.step.loop import ActiveAgents, Switches, exchange_at
 from echelon.simulation.step.messages import (
     age_of,
     all_readers,
-    led_by_heirs,
+    led_by_backups,
     links_with,
     take,
 )
@@ -98,7 +98,7 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
         readers = all_readers(graph.agents, np.array(graph.leaders))
         switches = Switches.of(graph, settings)
         numbers = np.asarray(steps), np.asarray(settings.dt)
-        cast = Presence.of(graph), Succession.of(graph, parts.leadership)
+        cast = ActiveAgents.of(graph), Failover.of(graph, parts.leadership)
         radio = _Radio(channel, exchange, switches, readers, receives, *numbers, *cast)
         followed = _follow(radio, ends.astype(np.int32))
         stamps, losses, counted = jax.tree.map(np.asarray, followed)
@@ -128,8 +128,8 @@ class _Radio(NamedTuple):
     receives: Bool[Array, " K"]
     steps: Array
     dt: Array
-    presence: Presence | None
-    succession: Succession | None
+    presence: ActiveAgents | None
+    succession: Failover | None
 
 
 class _Counts(NamedTuple):
@@ -152,7 +152,7 @@ class _Carry(NamedTuple):
     """What a network remembers; stamps at the last frame, losses since then, and the counts."""
 
     step: jax.Array
-    posts: Posts
+    posts: InFlight
     mail: Mail
     stamps: Int[jax.Array, " K"]
     losses: Int[jax.Array, " K"]
@@ -187,7 +187,7 @@ def _step(radio: _Radio, first: jax.Array, now: _Carry) -> _Carry:
     exchange = exchange_at(radio.exchange, radio.switches, now.step)
     mail = take(channel, exchange, now.step, now.posts, now.mail)
     if radio.succession is not None:
-        packet = led_by_heirs(radio, now.step, mail.packet, radio.dt)
+        packet = led_by_backups(radio, now.step, mail.packet, radio.dt)
         mail = mail._replace(packet=packet)
         readers = readers._replace(leads=packet.leader == readers.number)
     ages = age_of(now.step, mail.stamp, radio.dt)

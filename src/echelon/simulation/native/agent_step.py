@@ -98,7 +98,7 @@ def check_information(loop: Loop) -> None:
 
 
 def check_distances(loop: Loop) -> None:
-    """Raise `Unsupported` if agents keep distances, come or go, or have heirs."""
+    """Raise `Unsupported` if agents keep distances, come or go, or have backup leaders."""
     for part, text in (
         (loop.follower.safety, "agents that keep away from each other"),
         (loop.presence or loop.succession, "agents that are lost, join or take the lead"),

@@ -23,7 +23,7 @@ from echelon.simulation.native.threads import ThreadPool
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import needed
 from echelon.simulation.step.drive import Chunk, Stepper
-from echelon.simulation.step.loop import Loop, Moment, begin_forgetful, stretch_at
+from echelon.simulation.step.loop import Loop, LoopState, begin_forgetful, stretch_at
 from echelon.simulation.step.meter import ALWAYS, Sums
 from echelon.simulation.step.sequence import begin, signals
 
@@ -87,7 +87,7 @@ class NativeStepper(Stepper):
         self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
         # The moment in the blocks: a chunk that continues from it need not be written there.
-        self._moment: Moment | None = None
+        self._moment: LoopState | None = None
         self._hold, self._fallback_step = -1, -1
         axes, count = len(self.loop.meter.paired), len(loops)
         self._pairs = PairWatch(self.places, axes, count, self.dtype, _STEPS)
@@ -151,7 +151,7 @@ class NativeStepper(Stepper):
         more = int(_OPERATIONS[self.bits] / (self._work * agents))
         return max(_FEWEST, _AGENT_STEPS // agents, min(_ENOUGH, more))
 
-    def start(self) -> Moment:
+    def start(self) -> LoopState:
         """Return the moment at which the run begins."""
         states = np.asarray(self.states, self.dtype)
         if not len(self.rows.memory):
@@ -159,9 +159,9 @@ class NativeStepper(Stepper):
         pairs = zip(self.loops, np.split(np.asarray(self.states), len(self.loops)), strict=True)
         moments = [jax.tree.map(np.asarray, begin(loop, jnp.asarray(x))) for loop, x in pairs]
         many = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(m[1:] for m in moments))
-        return Moment(moments[0].step, *many)._replace(states=states)
+        return LoopState(moments[0].step, *many)._replace(states=states)
 
-    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+    def advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; divergence is detected afterwards."""
         if now is not self._moment:
             self._load(now)
@@ -180,7 +180,7 @@ class NativeStepper(Stepper):
         # Offsets, numbers and the wind are written with a moment.
         self._moment = None
 
-    def _advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+    def _advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
         self._clear_sums()
         first = int(now.step)
         table = None if reference is None else np.ascontiguousarray(reference, self.dtype)
@@ -289,7 +289,7 @@ class NativeStepper(Stepper):
 
     # ---- moments and sums ----
 
-    def _load(self, now: Moment) -> None:
+    def _load(self, now: LoopState) -> None:
         rows, x = self.rows, np.asarray(now.states, self.dtype)
         offsets = offsets_of(self.loops, self.dtype)
         self._write(rows.state, x)
@@ -320,7 +320,7 @@ class NativeStepper(Stepper):
         wide[:, :, : self.plan.width] = np.nan
         wide[:, :, : values.shape[1]] = lanes
 
-    def _moment_and_sums(self, first: int, step: int) -> tuple[Moment, Sums]:
+    def _moment_and_sums(self, first: int, step: int) -> tuple[LoopState, Sums]:
         rows = self.rows
         sums = range(rows.errors.start, rows.tracking.start)
         parts = ((part, self.dtype) for part in (rows.state, rows.memory, rows.cut))
@@ -331,7 +331,7 @@ class NativeStepper(Stepper):
         pairs = zip(self.memories, (self.leaders, self.followers), strict=True)
         memories = [unflatten(like, memory[agents]) for like, agents in pairs]
         fields: Any = [np.asarray(step, np.int32), x, *memories, cut.astype(np.int8)]
-        return Moment(*fields), self._sums(first, step, agent_sums)
+        return LoopState(*fields), self._sums(first, step, agent_sums)
 
     def _find_inexact(self) -> None:
         """Note the formations whose numbers are not what JAX computes."""
@@ -392,7 +392,7 @@ def offsets_of(loops: Sequence[Loop], dtype: np.dtype) -> Float[Array, "N n"]:
 
 def mirror_values(
     loops: Sequence[Loop],
-    now: Moment,
+    now: LoopState,
     x: Float[Array, "N n"],
     offsets: Float[Array, "N n"],
     with_signals: bool,

@@ -46,7 +46,7 @@ from echelon.simulation.step.knowledge import (
     packet_size,
     parts_of,
 )
-from echelon.simulation.step.motion import Motion, MotionState
+from echelon.simulation.step.motion import MotionState, PlantStep
 
 
 class LawFunction(NamedTuple):
@@ -391,7 +391,7 @@ def message_words(own: OwnLaw) -> list[str]:
     return [*names, *heading]
 
 
-def move_function(motion: Motion) -> LawFunction:
+def move_function(motion: PlantStep) -> LawFunction:
     """Return `move`, a step of an agent's own motion; else `Unsupported`, with the user's line."""
     plant, lags = motion.plant, motion.motors is not None and motion.motors.lag is not None
     n, m = len(plant.state_names), len(plant.input_names)
@@ -413,7 +413,7 @@ def move_function(motion: Motion) -> LawFunction:
     return LawFunction("move", about, sizes, {"x": x, "memory": memory})
 
 
-def motions_of(motion: Motion, agents: int, substeps: int) -> list[Motion]:
+def motions_of(motion: PlantStep, agents: int, substeps: int) -> list[PlantStep]:
     """Return the motion of each agent in a part of a step."""
     rows = [motion] * agents
     if motion.rows is not None:

@@ -18,15 +18,15 @@ from echelon.agents.references.flatness import (
     reference_targets,
     reference_warnings,
 )
-from echelon.agents.references.reference import Guide, check_kind_of
+from echelon.agents.references.reference import LeaderPath, check_kind_of
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, Input, State
 from echelon.laws.law import Law, LocalView
 from echelon.simulation.optimal.formation_plan import plan_formation
 from echelon.simulation.optimal.horizon import MPC, Answer, Course, Horizon
 from echelon.simulation.optimal.objectives import TrackingOptions, grid
-from echelon.simulation.step.drive import Chunk, Drive, Information, Problem, Stepper, Stopped
-from echelon.simulation.step.loop import Moment, assemble
+from echelon.simulation.step.drive import Chunk, Controller, Information, Problem, Stepper, Stopped
+from echelon.simulation.step.loop import LoopState, assemble
 from echelon.simulation.step.meter import Sums, on_host
 from echelon.simulation.step.sequence import advance, begin
 from echelon.simulation.step.settings import Settings
@@ -36,8 +36,8 @@ _SETTLING = 20
 """Most quadratic programs of an agent's first plan, which has no earlier plan as its guess."""
 
 
-class _Optimized(Drive):
-    reference: eqx.AbstractVar[Guide | None]
+class _Optimized(Controller):
+    reference: eqx.AbstractVar[LeaderPath | None]
 
     def __check_init__(self) -> None:
         if self.reference is not None:
@@ -83,7 +83,7 @@ class Plans(_Optimized):
         options: of the planning problems.
     """
 
-    reference: Guide | None = None
+    reference: LeaderPath | None = None
     options: TrackingOptions = eqx.field(default_factory=TrackingOptions, static=True)
 
     @property
@@ -132,7 +132,7 @@ class RecedingHorizon(_Optimized):
         mpc: the receding horizon.
     """
 
-    reference: Guide | None = None
+    reference: LeaderPath | None = None
     mpc: MPC = eqx.field(default_factory=MPC, static=True)
 
     @property
@@ -154,7 +154,7 @@ class RecedingHorizon(_Optimized):
 
 @final
 class _Planners:
-    def __init__(self, problem: Problem, reference: Guide | None, mpc: MPC, hold: int) -> None:
+    def __init__(self, problem: Problem, reference: LeaderPath | None, mpc: MPC, hold: int) -> None:
         began = time.perf_counter()
         settings, graph = problem.settings, problem.graph
         dt = hold * settings.dt
@@ -300,18 +300,18 @@ class HostStepper(Stepper):
         """Steps in which a few dozen plans are made."""
         return self.hold * max(1, _PLANS // len(self.states))
 
-    def recall(self, leaves: Sequence[Array]) -> Moment:
+    def recall(self, leaves: Sequence[Array]) -> LoopState:
         """Raise `SimulationError`: the plans of a pilot are not part of a moment."""
         raise SimulationError(
             "a run with planned inputs cannot be continued from stored data; start it again."
         )
 
-    def start(self) -> Moment:
+    def start(self) -> LoopState:
         """Return the moment at which the run begins, before the pilot gives any input."""
         self._queried = -1
         return begin(self.loop, self.states)
 
-    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+    def advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps, until a pilot stops or a state is not finite."""
         chunk = _HeldChunk(now, self.loop.meter.zero_sums(), reference)
         try:
@@ -374,7 +374,7 @@ class HostStepper(Stepper):
 
 @final
 class _HeldChunk:
-    def __init__(self, now: Moment, sums: Sums, reference: Array | None) -> None:
+    def __init__(self, now: LoopState, sums: Sums, reference: Array | None) -> None:
         self.now, self.step, self.first = now, int(now.step), now.step
         self.sums, self.reference = sums, reference
         self.states: list[Array] = []

@@ -16,7 +16,7 @@ from echelon.agents.references.flatness import (
     reference_targets,
     shifted_targets,
 )
-from echelon.agents.references.reference import Guide
+from echelon.agents.references.reference import LeaderPath
 from echelon.core.errors import PlanError
 from echelon.core.types import Array
 from echelon.simulation.optimal.objectives import (
@@ -72,7 +72,7 @@ def plan_formation(
     states: Array,
     grid: PlanTimes,
     *,
-    reference: Guide | None,
+    reference: LeaderPath | None,
     planning: TrackingOptions,
     limits: bool,
 ) -> FormationPlan:

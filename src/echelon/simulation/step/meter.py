@@ -57,7 +57,7 @@ class Sums(NamedTuple):
             in each of B slices of the run; infinite before.
         avoidance: (N, B) how many others changed the agent's rate, summed over the steps of each.
         closest: (1,) the smallest distance between two agents at the beginning of a step, and `met`
-            (1, 3) that step and the two; (0,) and (0, 3) where `Meter.paired` is empty.
+            (1, 3) that step and the two; (0,) and (0, 3) where `RunStatistics.paired` is empty.
     """
 
     steps: Total
@@ -137,7 +137,7 @@ def _twice(steady: jax.Array, square: jax.Array) -> Float[jax.Array, "2"]:
 
 
 @final
-class Meter(eqx.Module):
+class RunStatistics(eqx.Module):
     """Measures the agents at the beginning of each step, by the model and never by the plant."""
 
     model: ControlAffine
@@ -165,7 +165,7 @@ class Meter(eqx.Module):
         formation: Formation,
         settings: Settings,
         scales: Array | None = None,
-    ) -> "Meter":
+    ) -> "RunStatistics":
         """Return the meter of a run, in which agents that keep apart have `scales` (d,)."""
         per_slice = steps_per_slice(settings)
         measured = measured_states(model)
@@ -259,7 +259,7 @@ class Meter(eqx.Module):
             met=jnp.zeros((min(1, len(self.paired)), 3), jnp.int32),
         )
 
-    def following(self, nearest: jax.Array) -> "Meter":
+    def following(self, nearest: jax.Array) -> "RunStatistics":
         """Return a meter of errors relative to these leaders (N,)."""
         return dataclasses.replace(self, nearest=nearest)
 

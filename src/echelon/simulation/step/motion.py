@@ -34,7 +34,7 @@ class MotionState(NamedTuple):
 
 
 @final
-class Motion(eqx.Module):
+class PlantStep(eqx.Module):
     """The plant in its world, advanced a step at a time.
 
     Attributes:
@@ -92,7 +92,7 @@ class Motion(eqx.Module):
         windy = self.wind is not None and (self.wind.fade is not None or self.wind.air is not None)
         return self.motors is None and self.rows is None and self.substeps == 1 and not windy
 
-    def of_row(self, row: Row | None) -> "Motion":
+    def of_row(self, row: Row | None) -> "PlantStep":
         """Return the motion of one agent, of which `row` has the parameters of its own."""
         if row is None:
             return self
