@@ -122,10 +122,7 @@ def differentiate(model: ControlAffine, chains: Chains, x: State, e: jax.Array) 
 def derivatives_of(
     model: ControlAffine, chains: Chains, x: State, e: jax.Array, order: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return y .. y^(order - 1), y' .. y^(order) at w = 0, and the effect of w on the latter.
-
-    Their shapes are (order, m), (order, m) and (m, order, m).
-    """
+    """Return y .. y^(order - 1), y' .. y^(order) at w = 0, both (order, m); d/dw (m, order, m)."""
     zero = jnp.zeros(len(model.input_names), x.dtype)
 
     def field(x: State, e: jax.Array, w: Input) -> tuple[State, jax.Array]:
@@ -182,12 +179,7 @@ def initial_integrators(
 
 
 def check_bounds(model: ControlAffine, chains: Chains) -> None:
-    """Check that each flat bound of a model has a form for which proofs exist.
-
-    Raises:
-        ModelError: its outputs do not end chains of the same length, its derivative is the output
-            itself or one that the inputs reach, or its value is no finite number.
-    """
+    """Raise `ModelError` unless each flat bound of a model has a form for which proofs exist."""
     name, bounds = f"`{type(model).__name__}`", model.flat_bounds
     if bounds is None:
         return
@@ -202,7 +194,6 @@ def check_bounds(model: ControlAffine, chains: Chains) -> None:
 
 
 def _fault_of(bound: FlatBound, chains: Chains) -> str:
-    """Return the fault of a bound in words; empty where there is none."""
     outputs, order = bound.outputs, bound.derivative
     named = isinstance(outputs, tuple | list) and all(n in chains.outputs for n in outputs)
     if not named or len(set(outputs)) != max(1, len(outputs)):
@@ -270,7 +261,6 @@ def _check_size(model: ControlAffine, chains: Chains) -> None:
 
 
 def _check_map(model: ControlAffine, chains: Chains) -> None:
-    """Check at samples that coordinates by a user's `to_flat` are rates of each other."""
     if "to_flat" not in chains.declared or not is_by_user(model, "to_flat"):
         return
     n, m, draw = len(model.state_names), len(chains.outputs), np.random.default_rng(0)

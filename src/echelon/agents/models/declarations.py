@@ -72,7 +72,6 @@ def _is_about_another(model: ControlAffine, name: str) -> bool:
 
 
 def _is_data(name: str, value: object) -> bool:
-    """Tell whether an attribute is plain data of a user's class, as parameters are."""
     plain = not callable(value) and not hasattr(type(value), "__get__")
     return plain and not hasattr(ControlAffine, name)
 
@@ -91,7 +90,6 @@ def _levels(model: ControlAffine) -> Iterator[Mapping[str, object]]:
 
 
 def _is_foreign(value: object, kind: type) -> bool:
-    """Tell whether a function was not written in the body of its class."""
     function = getattr(value, "fget", None) or getattr(value, "__func__", value)
     function = inspect.unwrap(function) if callable(function) else function
     if not isinstance(function, FunctionType):

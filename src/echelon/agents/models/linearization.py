@@ -23,11 +23,7 @@ class Linearization(NamedTuple):
     B: Array
 
     def with_inner(self, K: Array | None) -> "Linearization":
-        """Return A - B K and B, the system with the inner loop v = -K (x - x*) + w closed.
-
-        Args:
-            K: (m, n); None where there is no inner loop.
-        """
+        """Return A - B K and B, with an inner loop v = -K (x - x*) + w closed; K (m, n) or None."""
         return self if K is None else Linearization(self.A - self.B @ K, self.B)
 
 
@@ -57,10 +53,7 @@ class AtTrim(NamedTuple):
 
 @memoize
 def at_trim(model: ControlAffine) -> AtTrim:
-    """Return the functions of a model at its trim, compiled together and computed once.
-
-    Compiling is most of the cost. The precision is float64, whatever that of the caller.
-    """
+    """Return the functions of a model at its trim, in float64 whatever the caller's precision."""
     x, u = (np.asarray(part, float) for part in model.trim)
     # Gains are stored in files, so they must not depend on the precision of the run that uses them.
     with precision("float64"):

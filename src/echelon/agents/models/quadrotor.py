@@ -63,7 +63,6 @@ older ones and the thrust upgrade kit; their inertia is Foerster's."""
 def _with_rate(
     curve: Callable[[jax.Array], jax.Array], s: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return curve(s) and its derivative."""
     return jax.jvp(curve, (s,), (jnp.ones_like(s),))
 
 
@@ -204,10 +203,7 @@ class Quadrotor(RigidVehicle):
         return jnp.concatenate([nothing, lift, nothing, spin])
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
-        """Return the state and input that fly a path (x, y, z, yaw).
-
-        The path is given with its first four derivatives, (5, 4).
-        """
+        """Return the state and input that fly a path (x, y, z, yaw) with derivatives, (5, 4)."""
         position, velocity, acceleration = derivatives[:3, :3]
         up = jnp.array([0.0, 0.0, self.gravity], derivatives.dtype)
         attitude = attitude_along(derivatives, self.gravity)
@@ -274,9 +270,6 @@ class Quadrotor(RigidVehicle):
         return jnp.where(fits(commanded, self.motor_thrust), u, delivered)
 
 
-# ---- as printed ----------------------------------------------------------------------------------
-
-
 class PrintedQuadrotor(ControlAffine):
     """The quadrotor as printed in the paper (literal).
 
@@ -297,20 +290,13 @@ class PrintedQuadrotor(ControlAffine):
     input_names, input_units = Quadrotor.input_names, Quadrotor.input_units
     output_names, position = Quadrotor.output_names, Quadrotor.position
     state_groups, chart = Quadrotor.state_groups, Quadrotor.chart
+    input_scale = Quadrotor.input_scale  # pyright: ignore - a property
     radius = 0.07  # of the Crazyflie with its propellers
 
     def __check_init__(self) -> None:
-        """Refuse a mass or inertia that is not positive.
-
-        The printed inertia itself is kept on purpose.
-        """
+        # The printed inertia itself is kept on purpose.
         check_positive(self, mass=self.mass)
         check_moments(self, self.inertia)
-
-    @property
-    def input_scale(self) -> tuple[tuple[float, ...], ...]:
-        """S = diag(m, Ixx, Iyy, Izz)."""
-        return diagonal(self.mass, *self.inertia)
 
     def drift(self, x: State) -> State:
         """Return f(x), without gravity as printed."""

@@ -150,7 +150,6 @@ class Sides(NamedTuple):
         return np.any(stays, axis=0)
 
     def _seen(self, slopes: Array) -> Array:
-        """Return whether slopes over the narrow steps are more than rounding."""
         return slopes > _NOISE * self.rounding[..., None] / _STEPS[1::2, None, None]
 
 
@@ -190,13 +189,7 @@ def sides(point: Float[Array, " n"], values: Float[Array, "K k"]) -> Sides:
 def find_gap(
     function: _Function, points: Float[Array, "K n"], units: Float[Array, " n"]
 ) -> Gap | None:
-    """Return where the derivative of a function by JAX is not its slope, or None.
-
-    Args:
-        function: (n,) -> (k,), traceable by JAX.
-        points: where the two are compared.
-        units: of each variable.
-    """
+    """Return where the derivative of a traceable function by JAX is not its slope, or None."""
     with precision("float64"):
         around = jnp.asarray(np.stack([stencil(point, units) for point in points]))
         values = np.asarray(jax.jit(jax.vmap(jax.vmap(function)))(around))

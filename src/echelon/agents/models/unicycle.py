@@ -89,7 +89,6 @@ class UnicyclePoint(ControlAffine):
     flat_order = 2
 
     def __check_init__(self) -> None:
-        """Refuse a point that is not ahead of the axle."""
         check_positive(self, ahead=self.ahead)
 
     @property

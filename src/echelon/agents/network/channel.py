@@ -81,7 +81,6 @@ class Network:
     seed: int | None = None
 
     def __post_init__(self) -> None:
-        """Check every number, and take words for their members."""
         check_kind("bursts", self.bursts, Bursts)
         values = dataclasses.asdict(self)
         values |= {f"bursts.{name}": value for name, value in values.pop("bursts").items()}
@@ -153,7 +152,6 @@ class Network:
         return f"neighbours' deviations from where they expect the leader; {leader}; all late"
 
     def __str__(self) -> str:
-        """Return the network in words."""
         parts = [f"{self.rate:g} Hz", f"delay {1e3 * self.delay:g} ms"]
         parts += [f"jitter up to {1e3 * self.jitter:g} ms"] if self.jitter else []
         parts += [f"{100.0 * self.loss:g} % lost"] if self.loss else []
@@ -267,10 +265,7 @@ class Channel(eqx.Module):
         receivers: Array | jax.Array,
         senders: Array | jax.Array,
     ) -> InFlight:
-        """Return the posts after a step; agents send at every `every`-th one.
-
-        Links (K,) along which nothing is sent, such as cut ones, lose the message.
-        """
+        """Return the posts after a step; links (K,) that carry nothing lose the message."""
         number = step // self.every
         slot = number % self.slots
 

@@ -32,7 +32,6 @@ class Lose:
     at: float
 
     def __str__(self) -> str:
-        """Return what happens, in words."""
         return f"agent {self.agent} is lost"
 
 
@@ -50,7 +49,6 @@ class Join:
     at: float
 
     def __str__(self) -> str:
-        """Return what happens, in words."""
         return f"agent {self.agent} joins"
 
 
@@ -75,7 +73,6 @@ class Cut:
         return math.inf if self.duration is None else self.at + self.duration
 
     def __str__(self) -> str:
-        """Return what happens, in words."""
         i, j = self.link
         span = "for ever" if self.duration is None else f"for {self.duration:g} s"
         return f"the link between agents {i} and {j} is cut {span}"
@@ -90,11 +87,7 @@ def agents_of(event: Event) -> tuple[int, ...]:
 
 
 def check_backups(graph: GraphMatrices, backups: Sequence[int]) -> None:
-    """Check who may lead after the leader of a graph.
-
-    Raises:
-        GraphError: one is no agent, leads already or is named twice, or there are several leaders.
-    """
+    """Raise `GraphError` unless these agents may lead after the only leader of a graph."""
     for k, backup in enumerate(backups):
         if not _is_agent(backup, graph.agents):
             last = graph.agents - 1
@@ -135,7 +128,6 @@ def event_faults(
 
 
 def _alone(graph: GraphMatrices, events: Sequence[Event], horizon: float) -> Iterator[EventFault]:
-    """Yield wrong times, agents and links."""
     pairs = {frozenset(edge) for edge in graph.edges.tolist()}
     for k, event in enumerate(events):
         span = event.duration if isinstance(event, Cut) else None
@@ -162,7 +154,6 @@ def _is_agent(value: object, agents: int) -> bool:
 def _in_order(
     graph: GraphMatrices, events: Sequence[Event], backups: Sequence[int]
 ) -> Iterator[EventFault]:
-    """Yield who is lost or joins where that is not possible."""
     absent = {x for event in events for x in agents_of(event) if _joins_first(x, events)}
     if graph.schedule is not None and graph.schedule.period is not None and events:
         yield EventFault(0, "a graph with a `period` takes no events")
@@ -194,7 +185,6 @@ def _by_time(events: Sequence[Event]) -> list[int]:
 
 
 def _joins_first(agent: int, events: Sequence[Event]) -> bool:
-    """Tell whether an agent is absent until it joins."""
     own = [events[k] for k in _by_time(events) if agents_of(events[k]) == (agent,)]
     return bool(own) and isinstance(own[0], Join)
 
@@ -223,10 +213,7 @@ def schedule_of(
     backups: Sequence[int] = (),
     absent: Sequence[int] = (),
 ) -> Schedule:
-    """Return when which links of a graph hold, who is present, and whom each agent follows.
-
-    Who is `absent` is so until the end, whatever happens.
-    """
+    """Return the schedule of links, presence and leaders; `absent` agents are so until the end."""
     base = graph.schedule or Schedule(np.zeros(1), graph.weights[None], None)
     ends = [event.end for event in events if isinstance(event, Cut)]
     times = [*base.starts.tolist(), *(event.at for event in events), *ends]

@@ -94,7 +94,6 @@ class Graph(GraphMatrices):
         directed: bool = False,
         weights: Sequence[float] | None = None,
     ) -> None:
-        """Check the edges, weights and leaders."""
         edges = edges if weights is None else give_weights(edges, weights)
         pairs, heavy = split_weights(edges)
         self.directed = bool(directed)
@@ -342,7 +341,6 @@ class Graph(GraphMatrices):
         return self._spectrum
 
     def _grounded(self) -> Grounded:
-        """Return the weights of the grounded Laplacian."""
         row = np.full(self.agents, -1)
         row[list(self.followers)] = np.arange(len(self.followers))
         ends = row[self.edges]
@@ -382,7 +380,6 @@ class Graph(GraphMatrices):
         return parents_of(self)
 
     def __eq__(self, other: object) -> bool:
-        """Tell whether two graphs have the same agents, leaders and edges in the same order."""
         return (
             isinstance(other, Graph)
             and self._constants == other._constants
@@ -391,7 +388,6 @@ class Graph(GraphMatrices):
         )
 
     def __hash__(self) -> int:
-        """Hash what `__eq__` compares."""
         return hash((self._constants, self.edges.tobytes(), self.weights.tobytes()))
 
     @property
@@ -401,6 +397,5 @@ class Graph(GraphMatrices):
         return self.agents, self.leaders, self.directed, times, self.events, self.backups
 
     def __repr__(self) -> str:
-        """Say the size."""
         edges = amount(len(self.edges), f"{'directed ' * self.directed}edge")
         return f"Graph({self.agents} agents, {edges}, leaders {list(self.leaders)})"

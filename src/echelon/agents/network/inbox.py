@@ -86,7 +86,6 @@ class Inbox:
         forward_names: tuple[str, ...],
         stamps: "Stamps | None" = None,
     ) -> None:
-        """Receive nothing yet."""
         self._stamps = stamps
         self._senders, self._source = tuple(senders), source
         self._names, self._forward_names = names, forward_names
@@ -136,16 +135,12 @@ class Surroundings:
     time: Float[Array, " K"]
 
     def __init__(self, senders: Sequence[int], names: tuple[str, ...]) -> None:
-        """Receive nothing yet."""
         self._places, self.names = {who: k for k, who in enumerate(senders)}, names
         self.hulls = np.full((len(senders), len(names)), np.nan)
         self.time = np.full(len(senders), -np.inf)
 
     def take(self, message: object, clock: float | None) -> bool:
-        """Store the hull of a message, and tell whether it could be used.
-
-        `clock` is the receiver's time, s; None in the ideal network, where the last one is used.
-        """
+        """Store a hull, and tell whether it is of use; `clock` (s) is None in the ideal network."""
         if not isinstance(message, Message) or not isinstance(message.sender, numbers.Integral):
             return False
         place = self._places.get(int(message.sender))
@@ -189,7 +184,6 @@ class Stamps:
         needs_packet: bool,
         backups: Sequence[int] = (),
     ) -> None:
-        """Store nothing yet."""
         self.needs_packet = needs_packet
         self.time, self.hops = np.full(links, -np.inf), np.full(links, _FAR)
         self.packet: LeaderPacket | None = None
@@ -236,7 +230,6 @@ class Stamps:
         return None
 
     def _read(self, packet: LeaderPacket) -> LeaderPacket | Received:
-        """Return a packet with floats of its own, or why it is not used."""
         whole = all(isinstance(x, numbers.Integral) for x in (packet.leader, packet.term))
         # Where nobody hands the lead over, a packet of a later term would win for ever.
         fine = whole and packet.leader in self._leaders and 0 <= packet.term <= self._last_term

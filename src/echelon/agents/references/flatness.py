@@ -70,11 +70,7 @@ class Targets(NamedTuple):
 
 
 def reference_targets(model: ControlAffine, reference: LeaderPath | None, times: Array) -> Targets:
-    """Return the targets of a leader: its reference by the model's flatness map, or its trim.
-
-    Raises:
-        PlanError: the model has no such map, or the reference is not finite.
-    """
+    """Return a leader's targets: its reference by `flat`, or its trim; else raise `PlanError`."""
     # Without a reference a leader stays at rest, at its trim.
     if reference is None:
         x = np.tile(np.asarray(model.trim[0], float), (len(times), 1))
@@ -100,10 +96,7 @@ def shifted_targets(model: ControlAffine, targets: Targets, offset: Array) -> Ta
 
 
 def mean_targets(model: ControlAffine, states: Array, inputs: Array, share: Array) -> Targets:
-    """Return the mean of targets with states (J, T, n) and inputs (J, T, m), by shares (J,).
-
-    A sum of squared errors to several targets equals that to their mean plus a constant.
-    """
+    """Return the mean of targets (J, T, ..) by shares (J,); squared errors differ by a constant."""
     return _targets(model, np.tensordot(share, states, 1), np.tensordot(share, inputs, 1))
 
 
@@ -160,27 +153,20 @@ _NEAR = 1e-3
 @memoize
 @np.errstate(over="ignore", invalid="ignore")
 def reference_demand(
-    model: ControlAffine, reference: LeaderPath, horizon: float, samples: int = _SAMPLES
+    model: ControlAffine, reference: LeaderPath, horizon: float
 ) -> ReferenceDemand:
-    """Return the demand of a reference on a model that can be led along it.
-
-    Args:
-        model: the agent.
-        reference: to be followed exactly.
-        horizon: s.
-        samples: number of times at which the demand is computed.
-    """
+    """Return the demand of a reference on a model that it can lead, over a horizon (s)."""
     near = min(_NEAR, 1e-2 * horizon)
-    times = np.linspace(near, horizon - near, samples)
+    times = np.linspace(near, horizon - near, _SAMPLES)
     with precision("float64"):
         x, u = follow_at(model, reference, np.concatenate([times - near, times, times + near]))
-        before, now, after = x.reshape(3, samples, -1)
-        inputs = u.reshape(3, samples, -1)[1]
-        rate = np.asarray(_rate(model, before, now, after, near))
-        velocities = np.asarray(_velocities(model, now, inputs))
+        x = x.reshape(3, _SAMPLES, -1)
+        inputs = u.reshape(3, _SAMPLES, -1)[1]
+        rate = np.asarray(_rate(model, *x, near))
+        velocities = np.asarray(_velocities(model, x[1], inputs))
     ratios = demand(model, inputs)
     k = int(np.argmax(ratios))
-    speed, acceleration = _motion(model, x.reshape(3, samples, -1), near)
+    speed, acceleration = _motion(model, x, near)
     root = np.sqrt(np.asarray(model.weights[0], float))
     away = root * np.abs(rate - velocities)
     j, i = np.unravel_index(int(away.argmax()), away.shape)
@@ -199,14 +185,7 @@ def reference_demand(
 def reference_warnings(
     model: ControlAffine, reference: LeaderPath, horizon: float, limits: bool = True
 ) -> tuple[str, ...]:
-    """Return one sentence with its numbers for each fault of a reference.
-
-    Args:
-        model: the agent; it can be led along the reference.
-        reference: to be followed exactly.
-        horizon: s.
-        limits: whether the actuators' limits apply.
-    """
+    """Return one sentence with its numbers for each fault of a reference that leads a model."""
     required, model_name = reference_demand(model, reference, horizon), type(model).__name__
     name, warnings = type(reference).__name__, [*reference.remarks()]
     times = np.linspace(0.0, horizon, _SAMPLES)
@@ -293,10 +272,7 @@ def flat_inputs(model: ControlAffine, reference: LeaderPath, times: Array) -> Ar
 
 
 def demand(model: ControlAffine, inputs: Array) -> Array:
-    """Return the share of the actuators' range about the trim that each input (T, m) uses, (T,).
-
-    One is the limit; without limits it is zero.
-    """
+    """Return the used share (T,) of the actuators' range about the trim; 0 without limits."""
     if model.input_limits is None:
         return np.zeros(len(inputs))
     G, low, high = (np.asarray(part, float) for part in model.input_limits)
@@ -328,7 +304,6 @@ def _velocities(model: ControlAffine, states: jax.Array, inputs: jax.Array) -> j
 def _derivative(
     reference: Reference, times: jax.Array, names: tuple[str, ...], order: int
 ) -> jax.Array:
-    """Return one derivative (T,) of one output of a path."""
     return jax.vmap(lambda t: reference.derivatives(t, order, names)[order, 0])(times)
 
 

@@ -38,7 +38,6 @@ class StatePath(LeaderPath):
     inputs: Array
 
     def __init__(self, times: Sequence[float], states: _Rows, inputs: _Rows) -> None:
-        """Check the knots."""
         self.times = numbers_of(times)
         if self.times.ndim != 1 or len(self.times) < 2 or not (np.diff(self.times) > 0).all():
             raise ReferenceError(

@@ -182,10 +182,7 @@ _ANSWERS = bool | np.bool_ | UndecidedComparison
 
 
 def slopes_in(atoms: Atoms) -> Algebra:
-    """Return the algebra of values with their slopes.
-
-    Evaluating in it raises `GainError` where a function has no enclosure, or no slope.
-    """
+    """Return the algebra of values with slopes; it raises `GainError` where one is missing."""
     bound = {name: functools.partial(rule, atoms) for name, rule in _RULES.items()}
     return Algebra({**bound, **_SUMS}, number, _lift, rules.outside, _fold)
 
@@ -220,7 +217,6 @@ def _mixture(value: Polynomial, side: Polynomial, one: Sloped, other: Sloped) ->
 
 
 def _larger(atoms: Atoms, a: Sloped, b: Sloped) -> Sloped:
-    """Return max(a, b)."""
     difference = a.value - b.value
     reached = atoms.range(difference)
     if reached.lo >= 0 or reached.hi <= 0:
@@ -269,7 +265,6 @@ def _sign(atoms: Atoms, p: Sloped) -> Sloped:
 
 
 def _comparison(name: str) -> Rule:
-    """Return the rule of a comparison, by the range of the difference of its operands."""
     certain, never, chosen = _COMPARED[name]
 
     def compare(atoms: Atoms, a: object, b: object) -> bool | UndecidedComparison:
@@ -363,7 +358,6 @@ def _either(atoms: Atoms, which: UndecidedComparison, no: Sloped, yes: Sloped) -
 
 
 def _undecided(atoms: Atoms) -> Polynomial:
-    """Return an unknown between 0 and 1."""
     return atoms.fresh(("undecided", object()), Interval(Fraction(0), Fraction(1)))
 
 
@@ -388,7 +382,6 @@ def _as_number(atoms: Atoms, entry: _Entry) -> Sloped:
 
 
 def _as_integer(atoms: Atoms, kind: str, entry: _Entry) -> bool | int | UndecidedComparison:
-    """Return an entry as a boolean or as an integer, truncated towards 0."""
     if isinstance(entry, UndecidedComparison):
         if kind == "b":
             return entry

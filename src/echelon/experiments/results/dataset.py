@@ -175,7 +175,10 @@ def _messages(result: Result) -> Variables:
 
 
 def _poles(result: Result) -> Variables:
-    """The law `stopping-point` closes chains by its roots; the loop is their agreement alone."""
+    """Return the poles of the linearized loop; nothing where laws have none.
+
+    The law `stopping-point` closes chains by its roots, and only their agreement is in the loop.
+    """
     stated = guarantee(result.parts, result.settings)
     if not stated.linear or stated.agreement is not None:
         return {}

@@ -120,7 +120,6 @@ def hull_of(loop: Loop, law: Law, own: OwnState) -> Float[jax.Array, "r d"] | No
 
 
 def _gaps(near: Near | None, hull: Float[jax.Array, "r d"] | None) -> Near | None:
-    """Return what an agent knows of others, from their hulls and its own."""
     return None if near is None or hull is None else near._replace(gaps=hull[None] - near.gaps)
 
 
@@ -293,7 +292,6 @@ class Agent:
     """
 
     def __init__(self, parts: Parts, agent: int, dt: float = 0.005, limits: bool = True) -> None:
-        """Prepare its law."""
         check_kind("parts", parts, Parts)
         check_kind("drive", parts.drive, Laws)
         if not isinstance(agent, numbers.Integral) or not 0 <= agent < parts.graph.agents:
@@ -338,7 +336,6 @@ class Agent:
         self._last: tuple[Array, Message | None] = np.array(self._loop.model.trim[1], float), None
 
     def _stamps_of(self, leaders: Sequence[int], backups: Sequence[int]) -> Stamps | None:
-        """Return where times and packets are stored; None in the ideal network."""
         channel = self._loop.channel
         if channel is None:
             return None
@@ -363,7 +360,6 @@ class Agent:
         self._law = self._loop.leader if self.leads else self._loop.follower
 
     def _surroundings(self, agents: int) -> Surroundings | None:
-        """Return where the hulls of others are stored; None where agents do not keep apart."""
         safety, model = self._loop.follower.safety, self._loop.model
         if safety is None:
             return None
@@ -480,7 +476,6 @@ class Agent:
         return self._last
 
     def _hulls(self) -> Near | None:
-        """Return the hulls of others for a follower, NaN for those that it did not receive."""
         if self._others is None or self.leads:
             return None
         others, d = len(self._others.time), len(self._loop.model.position)
@@ -502,7 +497,6 @@ class Agent:
         return Readers(jnp.array([self.number], jnp.int32), jnp.array([self.leads]))
 
     def _mail(self, stamps: Stamps) -> tuple[Mail, Ages]:
-        """Return what the agent keeps of what it received, and its ages (s)."""
         assert self._loop.channel is not None
         size = packet_size(self._loop.channel, *self._sizes, self._loop.succession is not None)
         packet = stamps.packet
@@ -522,7 +516,6 @@ class Agent:
         return mail, Ages(link, jnp.array([since]))
 
     def _written(self, step: "Step") -> Message | None:
-        """Return the message of a step; None of an agent that has heard of no leader."""
         if self._stamps is None or step.letter is None:
             return self._message(step.signal, step.action.message)
         packet, leader = self._stamps.packet, int(step.letter.packet.leader[0])
@@ -550,7 +543,6 @@ class Agent:
         return jnp.asarray(state, float)
 
     def _measured(self, y: State) -> tuple[State, Estimate | None]:
-        """Return the state that the agent assumes at a measurement (n,), and its estimate."""
         if self._estimator is None:
             return y, None
         model, before = self._loop.model, self._estimate

@@ -96,11 +96,6 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
 
 
 def _values_of(problem: Problem, drive: Controller, wrt: Sequence[str]) -> dict[str, Array]:
-    """Return the values of the variables by name.
-
-    Raises:
-        SimulationError: no laws drive the run, the law has no gain, or a variable is unknown.
-    """
     gain = drive.gain
     if not isinstance(drive, Laws):
         raise SimulationError(
@@ -118,11 +113,6 @@ def _values_of(problem: Problem, drive: Controller, wrt: Sequence[str]) -> dict[
 
 
 def _cost_number(cost: Cost, sums: Sums) -> jax.Array:
-    """Return the cost of sums.
-
-    Raises:
-        SimulationError: it fails, or is not one number.
-    """
     try:
         value = cost(sums)
     # The cost is the user's code, which may raise whatever it likes.
@@ -147,8 +137,6 @@ def _differentiate(
     steps: int,
     cost: Cost,
 ) -> tuple[tuple[jax.Array, Sums], dict[str, jax.Array]]:
-    """Return the cost, the sums of the run, and the slopes."""
-
     def whole(values: dict[str, jax.Array]) -> tuple[jax.Array, Sums]:
         start = jnp.asarray(values.get("initial", states))
         changed = _with_offsets(_with_gain(loop, values), values)
@@ -159,7 +147,6 @@ def _differentiate(
 
 
 def _with_gain(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
-    """Return the loop with other numbers in the followers' gain."""
     numbers = {name: values[name] for name in ("P", "R", "coupling") if name in values}
     if "R" in numbers:
         numbers["R_inverse"] = jnp.linalg.inv(numbers["R"])
@@ -172,7 +159,6 @@ def _with_gain(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
 
 
 def _with_offsets(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
-    """Return the loop with other offsets of the goals."""
     if "offsets" not in values:
         return loop
     offsets, meter = values["offsets"], loop.meter
@@ -186,8 +172,6 @@ def _with_offsets(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
 
 
 def _sums(loop: Loop, states: jax.Array, reference: Array | None, steps: int) -> Sums:
-    """Return the sums over the steps of a run."""
-
     def one(carry: tuple[LoopState, Sums], _: None) -> tuple[tuple[LoopState, Sums], None]:
         now, sums = measured_step(loop, carry[0], reference, 0)
         return (now, carry[1].plus(sums)), None

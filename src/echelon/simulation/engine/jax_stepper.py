@@ -55,7 +55,6 @@ class JaxStepper(Stepper):
     """
 
     def __init__(self, loop: Loop, states: Array, reason: str = "", devices: int = 1) -> None:
-        """Store what the steps need."""
         self.loop, self.states, self.reason = loop, states, reason
         self.mesh = mesh_of(devices, len(states)) if devices > 1 else None
 
@@ -90,21 +89,11 @@ class JaxStepper(Stepper):
         return Chunk(now, states, inputs, sums.split(1))
 
 
-# ---- many formations -----------------------------------------------------------------------------
-
-
 @final
 class JaxFormations(Stepper):
-    """Steps many formations whose loops differ in numbers alone, each as if it were alone.
-
-    Args:
-        loops: of each formation.
-        states: (N, n) at the beginning, formation by formation.
-        reason: as in `JaxStepper`.
-    """
+    """Steps many formations whose loops differ in numbers alone, each as if it were alone."""
 
     def __init__(self, loops: Sequence[Loop], states: Array, reason: str = "") -> None:
-        """Stack what differs."""
         self.count, self.states, self.reason = len(loops), states, reason
         self.loop, self.axes = _stack(loops)
 
@@ -170,15 +159,8 @@ def _differ(leaves: Sequence[object]) -> bool:
     return any(np.asarray(leaf).tobytes() != np.asarray(leaves[0]).tobytes() for leaf in leaves)
 
 
-# ---- several devices -----------------------------------------------------------------------------
-
-
 def mesh_of(devices: int, agents: int) -> Mesh:
-    """Return a row of devices, over which the agents are spread.
-
-    Raises:
-        SimulationError: JAX has fewer, or the number of agents is no multiple of them.
-    """
+    """Return a row of devices; `SimulationError` if JAX has fewer, or agents are no multiple."""
     available = jax.devices()
     if devices > len(available):
         raise SimulationError(

@@ -52,7 +52,6 @@ class Laws(Controller):
     follower: Law
 
     def __check_init__(self) -> None:
-        """Check the types of the laws."""
         for place in ("leader", "follower"):
             check_kind(place, getattr(self, place), Law)
 
@@ -340,10 +339,7 @@ def choose_engine(
 
 
 def worth_native(settings: Settings, agents: int) -> bool:
-    """Tell whether native code steps the agents: if it is requested, or saves time.
-
-    It computes on processors alone.
-    """
+    """Tell whether native code is requested, or saves time; it computes on processors alone."""
     if settings.engine != "auto":
         return settings.engine == "native"
     if settings.devices > 1 or not is_long(settings, agents):
@@ -357,7 +353,6 @@ def is_long(settings: Settings, agents: int) -> bool:
 
 
 def _in_words(error: EchelonError) -> str:
-    """Return why there is no native code."""
     if isinstance(error, Unsupported):
         return f"there is no native code for {error}"
     return str(error).rstrip(".")

@@ -122,10 +122,7 @@ class Recorder:
         return self.complete or stopped or not self._finite.any()
 
     def keep(self, chunk: Chunk, counts: Array, reference: Array | None, seconds: float) -> None:
-        """Keep the stretch of a chunk with so many steps after each point.
-
-        It followed a reference (S, n) step by step.
-        """
+        """Keep the stretch of a chunk with steps after its points, along a reference (S, n)."""
         first = self.done
         # One that stopped has fewer points.
         points = (first + np.cumsum(counts) - counts)[: len(chunk.states)]
@@ -186,7 +183,6 @@ class Recorder:
                 yield self._closed(problem, mine, unfinished)
 
     def _by_formation(self, rows: Float[np.ndarray, "T FN k"]) -> Float[np.ndarray, "T F N k"]:
-        """Return rows of agents that follow each other, with an axis of formations."""
         count = len(self.problems)
         return rows.reshape(len(rows), count, rows.shape[1] // count, rows.shape[2])
 
@@ -201,14 +197,12 @@ class Recorder:
         return self._finite & (inside >= ALWAYS).all(axis=(1, 2))
 
     def _nothing(self) -> Segment:
-        """Return a stretch without frames, whose arrays have the right shapes."""
         states = np.concatenate([problem.states for problem in self.problems])
         m = len(self.problems[0].model.input_names)
         empty = np.zeros((0, *states.shape)), np.zeros((0, len(states), m))
         return Segment(0, 0, np.zeros(0), *empty, None, self.sums, (), None, 0.0)
 
     def _closed(self, problem: Problem, whole: Segment, unfinished: Outcome) -> Record:
-        """Return the record of a formation, cut at its first frame that is not finite."""
         # In the order of frames, then agents: the first row is the first to be lost.
         lost = np.argwhere(~_finite(whole))
         outcome, message = self._verdict(problem, whole, lost, unfinished)
@@ -218,7 +212,6 @@ class Recorder:
     def _verdict(
         self, problem: Problem, whole: Segment, lost: Array, unfinished: Outcome
     ) -> tuple[Outcome, str]:
-        """Return how a run ended; `lost` are the frames and agents that are not finite."""
         if len(lost):
             frame, agent = lost[0]
             role, when = _role(problem, agent).lower(), f"by t = {whole.times[frame]:.6g} s"
@@ -233,7 +226,6 @@ class Recorder:
         return unfinished, f"{what} at t = {reached:.6g} s; what was computed is kept."
 
     def _completed(self, problem: Problem, whole: Segment) -> tuple[Outcome, str]:
-        """Return how a run ended that reached its horizon: whether all stayed in their chart."""
         last, meter, model = whole.states[-1], problem.meter, problem.model
         inside = inside_at_last(meter, whole.sums.inside, last, self.grid.steps)
         if not inside.size or inside.min() >= ALWAYS:
@@ -255,14 +247,7 @@ def _role(problem: Problem, agent: int) -> str:
 
 
 def inside_at_last(meter: RunStatistics, inside: Array, last: Array, steps: int) -> Array:
-    """Return `Sums.inside` (..., N, k) with the moment of the last step's end, which begins none.
-
-    Args:
-        meter: of the run.
-        inside: as it was counted at the beginning of each step.
-        last: the states (..., N, n) at the end.
-        steps: of the run.
-    """
+    """Return `Sums.inside` (..., N, k) with the last moment, which begins no step."""
     beyond = outside(last[..., meter.charted], *meter.chart.T)
     return np.minimum(inside, np.where(beyond, steps, ALWAYS))
 
@@ -279,6 +264,5 @@ def join(segments: Sequence[Segment]) -> Segment | None:
 
 
 def _finite(segment: Segment) -> Bool[np.ndarray, "T N"]:
-    """Return which agents are finite in which frames."""
     states, inputs = (np.isfinite(part).all(axis=2) for part in (segment.states, segment.inputs))
     return np.logical_and(states, inputs)

@@ -25,15 +25,9 @@ from echelon.simulation.step.solver_stats import SolverStats
 
 @final
 class RunSoFar:
-    """A run in progress, as passed to callbacks.
-
-    Attributes:
-        done: how many steps were taken.
-        steps: of the whole run.
-    """
+    """A run in progress, as passed to callbacks: `done` of so many `steps` were taken."""
 
     def __init__(self, prepared: Prepared, recorder: Recorder, stepper: Stepper) -> None:
-        """Note how many steps were taken."""
         self._prepared, self._recorder, self._stepper = prepared, recorder, stepper
         self.done, self.steps = recorder.done, recorder.grid.steps
 
@@ -112,10 +106,7 @@ def simulate(
 
 @contextlib.contextmanager
 def _mixed_tables() -> Iterator[None]:
-    """Say which table of a user JAX cannot use in two precisions.
-
-    It keeps one converted copy of an array of NumPy, by its identity and not by the precision.
-    """
+    """JAX keeps one converted copy of an array of NumPy, by its identity and not the precision."""
     try:
         yield
     except ValueError as error:
@@ -128,16 +119,7 @@ def _mixed_tables() -> Iterator[None]:
 
 
 def reassemble(parts: Parts, settings: Settings, segments: Sequence[Segment]) -> Result:
-    """Return the result of a run that was ended from outside.
-
-    Args:
-        parts: those of the run.
-        settings: those of the run.
-        segments: all that it gave to `keep`.
-
-    Raises:
-        EchelonError: as in `simulate`.
-    """
+    """Return the result of a run, ended from outside, from all stretches that it gave to `keep`."""
     prepared = prepare(parts, settings)
     with precision("float64"):
         stepper = prepared.parts.drive.stepper(prepared.problem)
@@ -217,7 +199,6 @@ class _ChunkLoop:
         self.now = chunk.now
 
     def _hand_over(self, keep: Keep | None) -> None:
-        """Pass the new stretch to the callback."""
         new = join(self.recorder.segments[self.handed_over :])
         if keep is not None and new is not None:
             keep(new)

@@ -67,10 +67,7 @@ class Traffic(NamedTuple):
     def of_agents(
         self, edges: Int[Array, "E 2"], agents: int, presence: Bool[Array, "T N"] | None = None
     ) -> Float[Array, "T N"]:
-        """Return the age of the oldest message that each agent has of its neighbours, s.
-
-        Neighbours that are absent do not count, and an agent that is absent has none.
-        """
+        """Return the age (s) of each agent's oldest message; absent agents do not count."""
         ages = np.full((agents, len(self.ages)), -np.inf)
         both = True if presence is None else presence[:, edges].all(axis=2)
         for end in (0, 1):
@@ -122,10 +119,7 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
 
 
 class _Radio(NamedTuple):
-    """The network of a run: who `receives` (K,) what, in a run of so many steps of dt (s).
-
-    Also who is there, and who takes the lead.
-    """
+    """The network of a run: who `receives` (K,) what, in a run of so many steps of dt (s)."""
 
     channel: Channel
     exchange: Exchange
@@ -169,10 +163,7 @@ class _Carry(NamedTuple):
 def _follow(
     radio: _Radio, ends: Int[Array, " T"]
 ) -> tuple[Int[jax.Array, "T K"], Int[jax.Array, "T K"], _Counts]:
-    """Return the newest stamps at each frame, the losses after it, and the counts of all steps.
-
-    What is between two frames ends before the steps ends (T,).
-    """
+    """Return the newest stamps at each frame, the losses after it, and the counts of all steps."""
 
     def frame(now: _Carry, end: jax.Array) -> tuple[_Carry, tuple[jax.Array, jax.Array]]:
         now, first = now._replace(losses=jnp.zeros_like(now.losses)), now.step
@@ -191,10 +182,7 @@ def _follow(
 
 
 def _step(radio: _Radio, first: jax.Array, now: _Carry) -> _Carry:
-    """Return what the network remembers a step later, of messages that say nothing.
-
-    Frames are stored at the step `first`.
-    """
+    """Take a step of messages that say nothing; frames are stored at the step `first`."""
     channel, readers = radio.channel, radio.readers
     exchange = exchange_at(radio.exchange, radio.switches, now.step)
     mail = take(channel, exchange, now.step, now.posts, now.mail)

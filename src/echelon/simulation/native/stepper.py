@@ -64,7 +64,6 @@ class NativeStepper(Stepper):
         variant: Loop | None = None,
         threads: int | None = None,
     ) -> None:
-        """Generate and compile the step."""
         self.varying = VaryingNumbers(loops, variant)
         self.loop, self.loops, self.states, self.fallback = loops[0], loops, states, fallback
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
@@ -98,7 +97,6 @@ class NativeStepper(Stepper):
 
     @cached_property
     def _no_sums(self) -> Array:
-        """The sums of no step, (rows, lanes)."""
         rows = self.rows
         # Whole vectors, because to repeat single numbers takes as long as many steps.
         initial = np.zeros((rows.total, self.plan.lanes), self.dtype)
@@ -106,7 +104,6 @@ class NativeStepper(Stepper):
         return initial[rows.errors.start :]
 
     def _reserve(self) -> None:
-        """Allocate blocks and mirrors, and compute what does not change during a run."""
         places, plan = self.places, self.plan
         self.blocks = aligned((places.blocks, plan.rows, plan.lanes), self.dtype)
         self.mirrors = places.mirrors(plan, self.dtype)
@@ -123,12 +120,10 @@ class NativeStepper(Stepper):
         self.edges, self.edge_weights = self.neighbourhood.edges, self.neighbourhood.weights
 
     def _read(self, rows: range, out: Array) -> Array:
-        """Read rows of all agents into an array (N, rows), and return it."""
         self.threads.copy(self.blocks, rows, out)
         return out
 
     def _write(self, rows: range, values: Array) -> None:
-        """Write values of all agents, (N, rows)."""
         self.threads.copy(self.blocks, rows, np.ascontiguousarray(values, self.dtype), inward=True)
 
     # ---- steps ----
@@ -227,10 +222,7 @@ class NativeStepper(Stepper):
         self._hold = hold
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
-        """Take steps, one draw of the wind and one stretch of the graph after the other.
-
-        The inputs of the first step are then in the rows.
-        """
+        """Take steps, one draw and one stretch at a time; the rows then have the first inputs."""
         wind, input_step = self.loop.motion.wind, step
         most = _TASKS // len(self.places.segments)
         if self.plan.leaders_ahead:
@@ -248,7 +240,6 @@ class NativeStepper(Stepper):
             step, steps = step + count, steps - count
 
     def _draw(self, number: int, hold: int) -> None:
-        """Write wind and noise of a holding interval."""
         if number == self._hold:
             return
         count = self._draws_ahead
@@ -292,7 +283,6 @@ class NativeStepper(Stepper):
 
     @property
     def _leader_mirror(self) -> Array:
-        """What is read of leaders."""
         if self.plan.row_major:
             return self.mirrors[0][:, : self.leader_blocks * self.plan.lanes]
         return self.mirrors[0][: self.leader_blocks]
@@ -300,7 +290,6 @@ class NativeStepper(Stepper):
     # ---- moments and sums ----
 
     def _load(self, now: LoopState) -> None:
-        """Write a moment into the blocks."""
         rows, x = self.rows, np.asarray(now.states, self.dtype)
         offsets = offsets_of(self.loops, self.dtype)
         self._write(rows.state, x)
@@ -318,7 +307,6 @@ class NativeStepper(Stepper):
         self._hold = -1
 
     def _write_mirror(self, values: Array) -> None:
-        """Write what neighbours read of all agents, (N, s)."""
         if self.plan.row_major:
             self.mirrors[0][:, : len(self.places.agents)] = values[self.places.agents].T
             return
@@ -333,7 +321,6 @@ class NativeStepper(Stepper):
         wide[:, :, : values.shape[1]] = lanes
 
     def _moment_and_sums(self, first: int, step: int) -> tuple[LoopState, Sums]:
-        """Return the moment in the blocks, and the sums from one step to another."""
         rows = self.rows
         sums = range(rows.errors.start, rows.tracking.start)
         parts = ((part, self.dtype) for part in (rows.state, rows.memory, rows.cut))
@@ -360,7 +347,6 @@ class NativeStepper(Stepper):
         self.edges[..., -1, :] = 0.0
 
     def _sums(self, first: int, end: int, agent_sums: Array) -> Sums:
-        """Return the sums over the steps from one to another; those of agents are given."""
         rows, leaders, meter = self.rows, self.leaders, self.loop.meter
         steady = max(0, end - max(first, int(meter.first_steady)))
         begin = rows.errors.start
@@ -392,9 +378,6 @@ class NativeStepper(Stepper):
 def _total_and_window(sums: Array) -> Array:
     """Return the sums of all steps and of the steady window (2, N) from those before and in it."""
     return np.stack([sums[:, 0] + sums[:, 1], sums[:, 1]])
-
-
-# ---- what neighbours read of agents at a moment --------------------------------------------------
 
 
 def offsets_of(loops: Sequence[Loop], dtype: np.dtype) -> Float[Array, "N n"]:
@@ -439,9 +422,6 @@ def mirror_values(
     return np.concatenate([relative, np.concatenate(sent)], axis=1)
 
 
-# ---- wind and noise ------------------------------------------------------------------------------
-
-
 _AHEAD, _AT_ONCE = 64, 50_000
 """Holding intervals that are drawn in a call, and the most draws; a call takes 0.5 ms."""
 
@@ -454,9 +434,6 @@ def _drawn(
     many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
     one = jax.vmap(draw, (None, None, 0))
     return jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, None))(many, steps, agents)
-
-
-# ---- reused memory -------------------------------------------------------------------------------
 
 
 _MOST, _LARGE = 16, 2**20
@@ -480,7 +457,6 @@ class BufferPool:
     """
 
     def __init__(self) -> None:
-        """Begin with no memory."""
         self._owners = list[Array]()
 
     def empty(self, shape: tuple[int, ...], dtype: np.dtype | type) -> Array:

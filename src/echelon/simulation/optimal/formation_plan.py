@@ -51,7 +51,6 @@ class FormationPlan(NamedTuple):
     """The plans of all agents, and the work of the solvers.
 
     Attributes:
-        grid: the times.
         plans: one for each agent; states on the grid and inputs held between.
         seconds: of solving, for each agent.
         iterations: of the solver, for each agent.
@@ -59,7 +58,6 @@ class FormationPlan(NamedTuple):
         setup_seconds: of building the solvers.
     """
 
-    grid: PlanTimes
     plans: tuple[Trajectory, ...]
     seconds: tuple[float, ...]
     iterations: tuple[int, ...]
@@ -106,7 +104,6 @@ def plan_formation(
             )
     order = range(graph.agents)
     return FormationPlan(
-        grid,
         tuple(plans[agent] for agent in order),
         tuple(planner.seconds[agent] for agent in order),
         tuple(planner.iterations[agent] for agent in order),
@@ -123,12 +120,7 @@ def plan_tracking(
     planning: TrackingOptions,
     limits: bool,
 ) -> Trajectory:
-    """Return the plan of one agent that follows targets.
-
-    Raises:
-        PlanError: the plan violates a constraint; the message names it and the amount.
-        MissingExtraError: casadi is not installed.
-    """
+    """Return an agent's plan to its targets; `PlanError` names a violated constraint."""
     return _Planner(model, planning, grid, limits).follow(0, start, targets)
 
 
@@ -176,15 +168,7 @@ class _Planner:
         neighbours: list[Array],
         displacements: list[Array],
     ) -> Trajectory:
-        """Return the plan of an agent that keeps its distances from neighbours.
-
-        Args:
-            agent: its number.
-            start: its state, (n,).
-            targets: the initial guess of the solver.
-            neighbours: the neighbours' states, (T, n) each.
-            displacements: displacements (n,) whose lengths are the distances.
-        """
+        """Return a plan that keeps the lengths of displacements (n,) to neighbours (T, n) each."""
         axes = list(self.model.position_indices())
         distances = np.array([np.linalg.norm(d[axes]) for d in displacements])
         # In the key, since the distances are constants of the problem; all else is its data.

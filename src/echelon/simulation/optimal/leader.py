@@ -74,7 +74,6 @@ class OptimalTracking(Law):
         planning: TrackingOptions | None = None,
         gain: Gain | None = None,
     ) -> None:
-        """Store the problem, which `prepared` solves."""
         self.reference, self.gain = reference, gain
         self.regulator, self.states, self.inputs = None, None, None
         self.horizon, self.limits = horizon, limits

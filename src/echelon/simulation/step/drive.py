@@ -90,7 +90,6 @@ def numbers(now: LoopState) -> tuple[Array, ...]:
 
 
 def _leaf(stored: Array, like: jax.Array) -> jax.Array:
-    """Return one of the numbers as the leaf that it was in the moment."""
     if _is_key(like):
         return jax.random.wrap_key_data(jnp.asarray(stored), impl=jax.random.key_impl(like))
     return jnp.asarray(stored, like.dtype)
@@ -127,11 +126,7 @@ class Stepper(abc.ABC):
         """
 
     def recall(self, leaves: Sequence[Array]) -> LoopState:
-        """Return the moment of which these are the numbers, in the order of its tree.
-
-        Raises:
-            SimulationError: the moment is of another run, or not all that decides what comes next.
-        """
+        """Return the moment of its numbers in tree order; `SimulationError` if of another run."""
         # The moment at the start says of what kind and shape each of the numbers is.
         like, tree = jax.tree.flatten(self.start())
         if [np.shape(leaf) for leaf in numbers(like)] != [np.shape(leaf) for leaf in leaves]:
@@ -190,18 +185,10 @@ class Controller(Declared):
 
     @abc.abstractmethod
     def stepper(self, problem: Problem) -> Stepper:
-        """Return the stepper of agents under a prepared drive.
-
-        Raises:
-            EchelonError: there is none, such as for a plan that violates a constraint.
-        """
+        """Return the stepper of agents under a prepared drive, else raise `EchelonError`."""
 
     def check_motion(self, formation: Formation, graph: Graph) -> tuple[str, ...]:
-        """Return warnings of a formation that changes with time.
-
-        Raises:
-            EchelonError: the drive cannot follow it.
-        """
+        """Return warnings of a moving formation; `EchelonError` if the drive cannot follow it."""
         raise SimulationError(
             "a formation that changes with time needs control laws, and plans and receding "
             "horizons have constant offsets; leave out `motion`."
@@ -243,11 +230,7 @@ class Controller(Declared):
         return True
 
     def prepare(self, model: ControlAffine, graph: Graph) -> "Controller":
-        """Return the drive completed with what depends on the model and the graph.
-
-        Raises:
-            LawError: a law does not fit the model or the graph.
-        """
+        """Return the drive completed for model and graph; `LawError` if a law does not fit."""
         return self
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
@@ -255,11 +238,7 @@ class Controller(Declared):
         return ()
 
     def check_world(self, world: World, graph: Graph, dt: float) -> None:
-        """Check that a world suits the drive, at a step dt (s).
-
-        Raises:
-            EchelonError: it does not.
-        """
+        """Raise `EchelonError` unless a world suits the drive at a step dt (s)."""
         for name in ("network", "sensing"):
             if getattr(world, name) is not None:
                 raise SimulationError(
@@ -268,11 +247,7 @@ class Controller(Declared):
                 )
 
     def check_backups(self, graph: Graph) -> None:
-        """Check that agents may be lost or join, and that backup leaders may take the lead.
-
-        Raises:
-            EchelonError: they may not.
-        """
+        """Raise `EchelonError` unless agents may be lost or join, and backup leaders may take the lead."""
         if graph.presence is not None or graph.backups:
             raise SimulationError(
                 f"agents are lost or join, or have backup leaders, but `{type(self).__name__}` "
@@ -280,18 +255,10 @@ class Controller(Declared):
             )
 
     def accept(self, problem: Problem) -> None:
-        """Check the starts of a run under a drive that is prepared.
-
-        Raises:
-            LawError: an agent starts where its law has no meaning.
-        """
+        """Raise `LawError` if an agent starts where its prepared law has no meaning."""
 
     def check_engine(self, problem: Problem) -> None:
-        """Check, before anything is compiled, that the engine which is requested can step this.
-
-        Raises:
-            SimulationError: it cannot.
-        """
+        """Raise `SimulationError`, before compiling, if the requested engine cannot step this."""
         if problem.settings.engine == "native":
             raise SimulationError(
                 "`engine` is `native`, and must be `auto` or `jax` where a solver drives agents."
@@ -307,11 +274,7 @@ class Controller(Declared):
         return None
 
     def with_follower(self, law: Law) -> "Controller":
-        """Return a drive with the same leaders, and followers under another law.
-
-        Raises:
-            SimulationError: the leaders have no law of their own.
-        """
+        """Return the drive with another follower law; `SimulationError` if leaders have none."""
         raise SimulationError(
             f"the leaders under `{type(self).__name__}` have no law of their own."
         )

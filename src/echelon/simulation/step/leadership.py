@@ -44,7 +44,6 @@ class Leadership:
     timeout: float = 0.3
 
     def __post_init__(self) -> None:
-        """Check all."""
         object.__setattr__(self, "backups", tuple(self.backups))
         if not self.backups:
             raise SimulationError("`backups` is empty, and must name at least one follower.")
@@ -94,13 +93,7 @@ class Failover(NamedTuple):
         leader: Int[jax.Array, " K"] | Array,
         waited: Float[jax.Array, " K"] | Array,
     ) -> Bool[jax.Array, " K"]:
-        """Return which of some agents take the lead.
-
-        Args:
-            number: of the agents.
-            leader: whom each follows.
-            waited: since each last heard of it, or began to listen, s.
-        """
+        """Return which of `number` take the lead, having `waited` (s) for whom they follow."""
         rank = jnp.asarray(self.rank)[number]
         # Beyond rounding, so that all see the same step.
         late = jnp.asarray(waited) > jnp.asarray(self.timeout) * (rank + 1) + _ROUNDED

@@ -86,10 +86,7 @@ class Loop(eqx.Module):
 def offsets_at(
     loop: Loop, law: Law, t: Scalar, agents: Array | jax.Array
 ) -> tuple[Float[jax.Array, "K n"], Float[jax.Array, "K n"] | None]:
-    """Return what agents (K,) under a law take for their offsets at a time (s), and the rates.
-
-    There are no rates of constant offsets, or where the law does not use them.
-    """
+    """Return offsets of agents (K,) at a time (s), and their rates if a law uses moving ones."""
     offsets, motion = jnp.asarray(loop.offsets, t.dtype)[agents], loop.moving
     if motion is None:
         return offsets, None
@@ -290,10 +287,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
 
 
 def _levels(graph: Graph) -> Array:
-    """Return the places of followers among the followers, (D, W), a row for each depth.
-
-    A row that is too short repeats its first entry.
-    """
+    """Return followers' places among followers by depth, (D, W); short rows repeat a place."""
     depth = graph.depths()[list(graph.followers)]
     rows = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
     # One shape for all levels, as a scan needs; a copy of an agent does what the agent does.

@@ -100,14 +100,7 @@ def readers_of(loop: Loop, packet: Packets) -> Readers:
 def heard_at_once(
     loop: Loop, now: LoopState, packet: Packets, said: Float[jax.Array, "L k"]
 ) -> Packets:
-    """Return the packets of an ideal network, in which all hear leaders in the same step.
-
-    Args:
-        loop: with backup leaders.
-        now: the moment.
-        packet: of all agents.
-        said: what leaders and backup leaders would say if they led.
-    """
+    """Return the packets of an ideal network, in which all hear leaders in the same step."""
     agents, number = len(loop.order), jnp.asarray(loop.leaders)
     here = present_at(loop, now.step)
     here = jnp.ones(agents, bool) if here is None else here

@@ -101,10 +101,7 @@ class Sums(NamedTuple):
         return Sums(*(np.where(w, a, b) for w, a, b in zip(shapes, self, others, strict=True)))
 
     def split(self, count: int) -> "Sums":
-        """Return the sums of `count` formations whose agents, leaders and edges follow each other.
-
-        Of one swarm of them all; its steps are those of each.
-        """
+        """Return sums of `count` formations in a row, from those of one swarm of them all."""
         # These have their axis of two in front of that of the agents.
         pairs = ("errors", "tracking")
         parts = {
@@ -136,7 +133,6 @@ class OfAgent(NamedTuple):
 
 
 def _twice(steady: jax.Array, square: jax.Array) -> Float[jax.Array, "2"]:
-    """Return a square for all steps and for those of the steady window."""
     return jnp.where(jnp.stack([jnp.asarray(True), steady]), square, 0.0)
 
 
@@ -344,7 +340,6 @@ class RunStatistics(eqx.Module):
         return _twice(steady, self._length(x - offset - reference)), deviation * deviation
 
     def _length(self, deviation: jax.Array) -> jax.Array:
-        """Return the squared length of the measured part of a deviation (n,)."""
         part = deviation[np.array(self.measured)]
         return jnp.sum(part * part)
 
@@ -388,8 +383,5 @@ def measured_states(model: ControlAffine) -> tuple[int, ...]:
 
 
 def output_error(model: ControlAffine, x: State, reference: State) -> Output:
-    """Return h(x) - h(reference), (q,), of two states (n,).
-
-    The states differ by the model's difference, which may wind angles.
-    """
+    """Return h(x) - h(reference) (q,); states differ by the model's difference, which may wind."""
     return model.output(reference + model.difference(x, reference)) - model.output(reference)

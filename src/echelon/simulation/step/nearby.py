@@ -51,15 +51,7 @@ def look_around(
     knowledge: Knowledge | None,
     mail: Mail | None,
 ) -> tuple[Near | None, NeighbourHulls | None]:
-    """Return what each agent knows of all others, rows (N, N - 1, ..), and the messages after it.
-
-    Args:
-        loop: of the run.
-        now: the moment, as agents measure it.
-        leads: who leads.
-        knowledge: of the agents; None in the ideal network.
-        mail: likewise.
-    """
+    """Return what each agent knows of all others (N, N - 1, ..), and the messages after it."""
     if loop.follower.safety is None:
         return None, None
     hulls, agents = all_hulls(loop, now), len(loop.order)
@@ -94,7 +86,6 @@ def _exchanged(
     sends: Bool[jax.Array, " K"],
     links: tuple[Array, Array],
 ) -> NeighbourHulls:
-    """Return the messages with those that arrive at a step, and those that are sent at it."""
     channel, seen = loop.channel, now.world.seen
     assert channel is not None
     arrival = channel.arrivals(seen.posts, now.step, seen.stamp)

@@ -82,7 +82,6 @@ def begin(loop: Loop, states: States) -> LoopState:
 
 
 def _feedforward_size(loop: Loop, moment: LoopState) -> int:
-    """Return how many numbers leaders send to their followers."""
     return jax.eval_shape(lambda: _lead(loop, moment, _sent(loop, moment)[0])).message.shape[1]
 
 
@@ -150,8 +149,6 @@ def control(loop: Loop, now: LoopState) -> Control:
 
 
 def _chosen(first: Bool[jax.Array, " L"], one: AgentOutput, other: AgentOutput) -> AgentOutput:
-    """Return what some agents do as in one of two actions, and all others as in the other one."""
-
     def pick(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(first.reshape(-1, *[1] * (jnp.ndim(a) - 1)), a, b)
 
@@ -159,7 +156,6 @@ def _chosen(first: Bool[jax.Array, " L"], one: AgentOutput, other: AgentOutput) 
 
 
 def _lead(loop: Loop, now: LoopState, z: Float[jax.Array, "N s"]) -> AgentOutput:
-    """Return what the leaders do."""
     # Nobody is before a leader whose input it could be sent.
     silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), z.dtype)
     rows = loop.leaders, silence, now.leader_memory
@@ -177,7 +173,6 @@ def _act_all(
     leads: bool = False,
     near: Near | None = None,
 ) -> AgentOutput:
-    """Return what some agents do, with what they are sent (K, k), remember and know of others."""
     x, t = now.states, time_of(loop, now)
     offsets, rates = offsets_at(loop, law, t, agents)
 
@@ -283,8 +278,6 @@ def _with_arrivals(loop: Loop, now: LoopState) -> LoopState:
 def _where(
     loop: Loop, chosen: Bool[jax.Array, " N"], one: LoopState, other: LoopState
 ) -> LoopState:
-    """Return a moment in which some agents are as in one moment, and all others as in another."""
-
     def some(agents: Array | slice) -> Callable[[jax.Array, jax.Array], jax.Array]:
         def pick(a: jax.Array, b: jax.Array) -> jax.Array:
             mask = chosen[agents]
@@ -310,7 +303,6 @@ def _where(
 
 
 def _move(loop: Loop, now: LoopState, acted: Control) -> LoopState:
-    """Return the moment one dt later under what all agents do."""
     world = acted.world
     own = MotionState() if world.motion is None else world.motion
     states, own = loop.motion.advance(now.states, acted.inputs, now.step, own)
@@ -329,10 +321,7 @@ def _move(loop: Loop, now: LoopState, acted: Control) -> LoopState:
 def measured_step(
     loop: Loop, now: LoopState, reference: Array | None, first: jax.Array | int
 ) -> tuple[LoopState, Sums]:
-    """Return the moment one dt later, and the sums of this step.
-
-    `reference` (S, n) is what the leaders follow from the step `first` on.
-    """
+    """Return the moment one dt later and its sums; `reference` (S, n) starts at step `first`."""
     now = _with_arrivals(loop, now)
     acted = control(loop, now)
     followed = reference_at(reference, now.step - first, now.states)
