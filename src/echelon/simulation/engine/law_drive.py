@@ -204,8 +204,8 @@ class Laws(Controller):
         if len(trees) > 1 or len(observers) > 1:
             raise SimulationError(
                 f"got `backups`, but followers under `{type(self.follower).__name__}` remember "
-                f"other things than a leader under {name}, and could not take over; give both the same "
-                "kind of law, with the same `observer`."
+                f"other things than a leader under {name}, and could not take over; give both "
+                "the same kind of law, with the same `observer`."
             )
 
     def accept(self, problem: Problem) -> None:

@@ -247,7 +247,7 @@ class Controller(Declared):
                 )
 
     def check_backups(self, graph: Graph) -> None:
-        """Raise `EchelonError` unless agents may be lost or join, and backup leaders may take the lead."""
+        """Raise `EchelonError` unless agents may be lost or join, and backups take the lead."""
         if graph.presence is not None or graph.backups:
             raise SimulationError(
                 f"agents are lost or join, or have backup leaders, but `{type(self).__name__}` "
