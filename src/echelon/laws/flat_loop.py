@@ -232,10 +232,8 @@ class FlatLoop(eqx.Module):
         The rate of the own offset (n,) is added to it.
         """
         x, period = view.x, view.period
-        flat, values = (
-            to_flat(model, self.chains, x, memory.chain),
-            self.flat_values(model, x, memory),
-        )
+        flat = to_flat(model, self.chains, x, memory.chain)
+        values = self.flat_values(model, x, memory)
         degrees = np.array(self.chains.degrees)
         lower = np.arange(len(values))[:, None] < degrees - 1
         k = jnp.where(lower, jnp.asarray(self.weights, x.dtype), 0.0)

@@ -115,10 +115,7 @@ def _as_mapping(verification: "Verification") -> "JsonObject":
 
 
 def _print_verification(verification: "Verification", run: Path | None) -> None:
-    """Print what was checked by which means, the reasons of what is not verified, and the verdict.
-
-    `run` is the folder if the claims are of a whole run.
-    """
+    """`run` is the folder if the claims are of a whole run."""
     by = {"recomputed": list["CheckResult"](), "independent": list["CheckResult"]()}
     for finding in verification.findings:
         by["recomputed" if finding.by_scenario else "independent"].append(finding)

@@ -123,12 +123,6 @@ class Panel:
         return changed._replace(weight=1.0, coupling=coupling)
 
     def _reshaped(self, knobs: Knobs, value: Any, at: float) -> Knobs:
-        """Return the knobs of a formation that begins to take another shape at a time (s).
-
-        Raises:
-            SimulationError: there is no such shape, or a reshape is under way.
-            LawError: with `safety`, a leader or a backup leader would move beside its path.
-        """
         check_choice("shape", value, (AS_GIVEN, *self.options["shape"]))
         under_way = knobs.reshaping
         if under_way is not None and at < under_way.end:

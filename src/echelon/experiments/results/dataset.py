@@ -175,10 +175,7 @@ def _messages(result: Result) -> Variables:
 
 
 def _poles(result: Result) -> Variables:
-    """Return the poles of the linearized loop; nothing where laws have none.
-
-    The law `stopping-point` closes chains by its roots, and only their agreement is in the loop.
-    """
+    """The law `stopping-point` closes chains by its roots; the loop is their agreement alone."""
     stated = guarantee(result.parts, result.settings)
     if not stated.linear or stated.agreement is not None:
         return {}

@@ -404,15 +404,7 @@ def empty_recording(
     name: str,
     promise: JsonObject = _NO_PROMISE,
 ) -> Recording:
-    """Return a recording of agents that stay at their goals, by which the scene is sized.
-
-    Args:
-        parts: of the run, with its drive completed.
-        settings: of the run.
-        states: at the beginning.
-        name: of the scenario.
-        promise: as `Guarantee.as_mapping` returns it; none by default.
-    """
+    """Return a recording of agents that stay at their goals, by which the scene is sized."""
     model, fixed = parts.model, labelled_parts(parts, settings)
     times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)
     ahead, reference = _ahead(parts, states, times)
@@ -452,11 +444,7 @@ def so_far(
 ) -> Recording:
     """Return a part of a run as a recording.
 
-    Args:
-        run: as returned by `empty_recording`.
-        segment: the part, with finite numbers.
-        potential: V (T,) of states minus offsets (T, N, n); None where there is none.
-        formation: of the run.
+    `run` is one of `empty_recording`; `potential` gives V (T,) of states minus offsets (T, N, n).
     """
     moving = None if formation.motion is None else formation.offsets_at(segment.times)
     lyapunov, count = None, len(segment.times)

@@ -230,9 +230,3 @@ def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
     if not type(law).__module__.startswith("echelon."):
         label = kind
     return f"{label}, own" if label in {row.label for row in rows} else label
-
-
-def _law_name(drive: Controller) -> str:
-    """Return the name of the followers' law in scenarios, or that of the drive's class."""
-    kind = type(getattr(drive, "follower", drive)).__name__
-    return _LAW_NAMES.get(kind, kind)

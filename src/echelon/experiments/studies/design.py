@@ -242,7 +242,6 @@ def with_gain(parts: Parts, gain: Gain) -> Parts:
 
 
 def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Guarantee) -> Design:
-    """Return the design of a gain, with its margins."""
     loop = guarantee.loop
     (A, B), closed = loop.linear, loop.closed
     poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))

@@ -220,7 +220,6 @@ def _led_by(parts: Parts, gain: Gain) -> Parts:
 
 
 def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[CheckResult]:
-    """Compare the guarantee, the scenario, the parts and the starts in a dataset."""
     (run, data), (parts, settings), name = read_recording(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
     value = _as_json(guarantee(parts, settings).as_mapping())
@@ -244,7 +243,6 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
 def _compare_frames(
     run: Recording, data: Labelled, experiment: Experiment, name: str
 ) -> Iterator[CheckResult]:
-    """Compare the times of the frames, who is there at each, and offsets that change with time."""
     (parts, settings), stored = experiment, data.arrays()
     steps = np.minimum(np.arange(len(run.states)) * settings.store_every, settings.steps)
     times, schedule = steps * settings.dt, parts.graph.schedule

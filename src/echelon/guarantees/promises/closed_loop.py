@@ -255,16 +255,6 @@ def modes_of(parts: Parts) -> NetworkModes:
     return NetworkModes(Spectrum(ends, graph.agents - 1, graph.spectrum().proved), False)
 
 
-def _of_all(graph: Graph) -> Spectrum:
-    """Return the eigenvalues of the Laplacian of all agents of a directed graph, but for one 0.
-
-    The disagreement between agents has a mode for each of them; another 0 is one that never ends.
-    """
-    values = np.linalg.eigvals(graph.laplacian().toarray()).astype(complex)
-    values = in_order(np.delete(values, np.abs(values).argmin()))
-    return Spectrum(values, len(values), 0.0)
-
-
 def all_alike(drive: Controller, model: ControlAffine) -> bool:
     """Tell whether the leaders obey the followers' law, with nothing fed forward."""
     leader, follower = getattr(drive, "leader", None), getattr(drive, "follower", None)

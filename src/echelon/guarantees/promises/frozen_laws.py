@@ -107,7 +107,6 @@ def leader_run_of(parts: Parts, settings: Settings, leaders: Leaders) -> LeaderR
 
 
 def _as_sensed(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderRun:
-    """Return a path as a law that turns with the heading sees it, or as it is."""
     assert isinstance(parts.drive, Laws)
     model, still = parts.model, np.zeros(len(times))
     path = LeaderRun(times, states, inputs, np.asarray(model.trim[0], float), still, still)
@@ -440,7 +439,6 @@ def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices 
 
 
 def _culprit(parts: Parts, loop: LinearLoop, path: LeaderRun, frozen: FrozenLaws) -> str:
-    """Return the state whose return to the trim helps most where the law is worst, in words."""
     assert isinstance(parts.drive, Laws)
     model, trim = parts.model, np.asarray(parts.model.trim[0], float)
     n, k = len(trim), int(np.flatnonzero(path.times == frozen.growth().when)[0])

@@ -160,11 +160,7 @@ def _agreement(case: GuaranteeInputs) -> Statement:
 
 
 def _drifting(case: GuaranteeInputs) -> Statement:
-    """Say by how much free leaders drift apart, and what is left: containment.
-
-    Behind leaders that move freely, e = y_F + L_g^-1 L_FL y_L of linear agents obeys the modes of
-    the disagreement; the rows of -L_g^-1 L_FL are weights that add to one.
-    """
+    """Here e = y_F + L_g^-1 L_FL y_L of linear agents obeys the modes of the disagreement."""
     away = apart(case.parts, case.settings, case.leaders.starts)
     first, unit = case.parts.graph.leaders[0], f"{position_unit(case.parts.model)} ".lstrip()
     text = (
@@ -318,7 +314,6 @@ def as_mapping(event: Event) -> JsonObject:
 
 
 def _through(graph: Graph, event: Event, guarantee: Guarantee) -> JsonObject:
-    """Return what is guaranteed through an event: of which kind, and in words."""
     why = uncovered(graph, event)
     if why or not guarantee.promised:
         text = f"Nothing is guaranteed through it: {why}." if why else "Nothing is guaranteed."

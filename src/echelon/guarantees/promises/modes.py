@@ -200,7 +200,6 @@ def _linear(case: GuaranteeInputs) -> Iterator[Statement]:
 
 
 def _bent(case: GuaranteeInputs) -> Iterator[Statement]:
-    """Yield what is left of these lines where there is no linearization: what a region says."""
     for name in (Hypothesis.DETECTABLE, Hypothesis.COUPLING, Hypothesis.ALONG_PATH):
         yield vacuous(name, _LINEAR, _BENT)
     region = case.region
@@ -294,11 +293,7 @@ def _decaying(case: GuaranteeInputs) -> Statement:
 
 
 def _taking_turns(case: GuaranteeInputs) -> Statement:
-    """Whether the disagreement decays however graphs take turns.
-
-    Stable modes of each do not say so; one sum of squares that falls on all of them does, whenever
-    they switch (theory page, T8).
-    """
+    """Stable modes of each do not say so; a sum of squares that falls on all of them does (T8)."""
     name, loop = Hypothesis.SWITCHING, case.loop
     edge, c, common = loop.certificate.edge, loop.closed.coupling, loop.common
     if not case.governed:
@@ -377,7 +372,6 @@ def sampling_line(case: GuaranteeInputs) -> Statement:
 
 
 def _by_substeps(case: GuaranteeInputs) -> str:
-    """Return how many substeps of the integrator decay, as a remedy."""
     settings = case.settings
     tried = (settings._replace(substeps=k) for k in _SUBSTEPS if k > settings.substeps)
     enough = next((x.substeps for x in tried if case.loop.radius(x) < 1.0), None)

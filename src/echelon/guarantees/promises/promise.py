@@ -366,7 +366,6 @@ def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) ->
 def _computed(
     prepared: Prepared, parts: Parts, settings: Settings, brief: bool = False
 ) -> Guarantee:
-    """Return what is guaranteed of parts, and store it if nothing was left out."""
     with precision("float64"):
         computed = prover_of(prepared.parts.drive).of(prepared, settings, brief)
     if not brief:
@@ -378,7 +377,6 @@ def _computed(
 
 
 def _prefix_of(computed: Guarantee, parts: Parts, settings: Settings) -> Prefix | None:
-    """Return what is guaranteed until the first event that is not covered; None for nothing."""
     line = computed.hypotheses.get(Hypothesis.EVENTS)
     if line is None or not line.fails or line.number is None:
         return None
@@ -396,7 +394,6 @@ def _prefix_of(computed: Guarantee, parts: Parts, settings: Settings) -> Prefix 
 
 
 def _stored(parts: Parts) -> dict[Settings, Guarantee]:
-    """Return the guarantees of parts by settings, of what their code reads now."""
     # A formation is no dataclass, whose parts would be found.
     reads = foreign_key((parts, parts.formation.motion))
     return _cache.setdefault(parts, {}).setdefault(reads, {})

@@ -379,7 +379,6 @@ def _is_close(stored: Array, expected: Array) -> bool:
 
 
 def _check_trim(facts: Recomputed, model: ControlAffine) -> Iterator[CheckResult]:
-    """Check the equilibrium, A and B at the trim, and A also by difference quotients."""
     saved, n = facts.saved.model, len(facts.saved.P)
     sizes = np.multiply.outer(_STEPS, np.maximum(1.0, np.abs(saved.state)))
     displaced = saved.state + np.stack([sizes, -sizes])[..., None] * np.eye(n)
@@ -414,7 +413,6 @@ def _quotients_off(saved: SavedModel, at: Evaluated, steps: Array) -> float:
 def _check_domain(
     facts: Recomputed, region: SavedRegion, model: ControlAffine
 ) -> Iterator[CheckResult]:
-    """Search the domain for states that contradict the guarantee."""
     saved = facts.saved
     yield decide("the domain lies inside the chart", _is_inside_chart(saved.model, region, model))
     some = points(saved, region)
@@ -456,10 +454,7 @@ def _is_inside_chart(saved: SavedModel, region: SavedRegion, model: ControlAffin
 def _check_secants(
     facts: Recomputed, region: SavedRegion, model: ControlAffine, some: Points
 ) -> CheckResult:
-    """Check velocity differences of pairs of states against the hull or the rate.
-
-    This detects a discontinuous velocity and wrong derivatives.
-    """
+    """Differences of velocities reveal a discontinuous velocity and wrong derivatives."""
     saved, at = facts.saved, pairs(facts.saved, region, some)
     x, y = saved.model.state + at.ones, saved.model.state + at.others
     steps = x - y
@@ -491,10 +486,7 @@ def _normals(metric: Array, sizes: Array) -> Array:
 
 
 def _decay(facts: Recomputed, region: SavedRegion, steps: Array) -> SupportBounds:
-    """Return bounds of d'P (v(x) - v(y)) that follow from the rate and the strongest feedback.
-
-    They follow from P A + A'P - strength P W P + 2 rate P <= 0, integrated from y to x = y + d.
-    """
+    """By P A + A'P - strength P W P + 2 rate P <= 0, integrated from y to x = y + d."""
     saved, n = facts.saved, len(facts.saved.P)
     W = region.hull[:, :, n:] if region.theorem == "T2" else facts.weighted[None]
     metric_step, rate = steps @ saved.P, region.rate * (1.0 - _SAMPLED)

@@ -117,7 +117,6 @@ def check_linearization(facts: Recomputed) -> Iterator[CheckResult]:
 
 
 def _check_between(facts: Recomputed) -> Iterator[CheckResult]:
-    """Check that the modes between the extreme eigenvalues decay."""
     values, followers = facts.eigenvalues, facts.saved.graph.agents - len(facts.saved.graph.leaders)
     every = followers <= algebra.ALL_MODES or facts.saved.graph.directed
     if every or facts.saved.graph.switches or facts.saved.abscissa >= 0.0:
@@ -126,14 +125,6 @@ def _check_between(facts: Recomputed) -> Iterator[CheckResult]:
     values = values[1:-1]
     result, slack = _slowest(facts, values[1:-1])
     yield decide("all modes between decay", result + slack < 0.0, "", result)
-
-
-def _checked_eigenvalues(facts: Recomputed) -> Array:
-    """Return the eigenvalues whose modes the file covers."""
-    graph = facts.saved.graph
-    if graph.directed or graph.switches:
-        return facts.eigenvalues
-    return algebra.ends_of_many(facts.eigenvalues)
 
 
 def _slowest(facts: Recomputed, values: Array) -> tuple[float, float]:

@@ -145,7 +145,6 @@ def _split_hull(facts: Recomputed, hull: Array) -> tuple[Array, Array]:
 
 
 def _proof(facts: Recomputed, region: SavedRegion) -> Iterator[CheckResult]:
-    """Check a proof in exact arithmetic: lambda_min first, then the inequality."""
     saved, claim = facts.saved, "rate at the vertices, proved"
     if region.theorem == "T2" or not np.array_equal(saved.P, saved.P.T):
         text = "a proof requires a constant g and an exactly symmetric P"

@@ -36,14 +36,7 @@ _SHOWN = 60
 def compare_values(
     claim: str, stored: object, value: object, digits: Digits = _USUAL
 ) -> Iterator[CheckResult]:
-    """Yield a finding for each number, matrix or text of a stored value.
-
-    Args:
-        claim: the name of the value.
-        stored: plain data of a file.
-        value: the same, computed again.
-        digits: to which numbers must agree.
-    """
+    """Yield a finding for each number, matrix or text of a stored value."""
     arrays = _array(stored), _array(value)
     if isinstance(stored, dict) and isinstance(value, dict):
         for key in [*value, *(key for key in stored if key not in value)]:

@@ -189,7 +189,6 @@ def _random_motions(
 
 
 def _check_single_starts(claims: JsonObject, motion: _Motion) -> Iterator[CheckResult]:
-    """Yield a finding for each other start from which the motors are claimed to suffice."""
     alone, ahead, most = claims["alone"], claims["ahead"], float(claims["most"])
     if alone is None:
         return
@@ -324,7 +323,6 @@ def tube_findings(tube: JsonObject) -> Iterator[CheckResult]:
 def _check_margin(
     border: JsonObject, roots: Sequence[Fraction], name: str
 ) -> Iterator[CheckResult]:
-    """Yield findings on the margin to a border and on the steepest admissible start."""
     order = int(border["derivative"]) - 1
     allowed = float(border["path"]) - float(border["above"])
     total = float(border["speed"]) + float(border["leader_speed"])

@@ -179,7 +179,6 @@ class Chunks:
 
 
 def _arrays(segment: Segment) -> JsonObject:
-    """Return a stretch as named arrays."""
     plain = {name: getattr(segment, name) for name in _PLAIN}
     sums = {f"sums_{name}": value for name, value in segment.sums._asdict().items()}
     moment = {f"moment_{k}": value for k, value in enumerate(segment.moment)}
@@ -191,7 +190,6 @@ _PLAIN = ("done", "times", "states", "inputs", "seconds")
 
 
 def _segment(first: int, stored: JsonObject) -> Segment:
-    """Return the stretch of named arrays."""
     count = sum(name.startswith("moment_") for name in stored)
     stopped = stored.get("stopped")
     return Segment(

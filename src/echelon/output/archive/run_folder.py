@@ -147,7 +147,6 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
 
 
 def _unfinished(folder: Path, segments: list[Segment]) -> Result:
-    """Return a run from the chunks in its folder."""
     if not (folder / SCENARIO_FILE).is_file():
         raise OutputError(f"the run in `{folder}` ended before any of it was stored.")
     scenario = load_scenario(folder / SCENARIO_FILE)

@@ -167,7 +167,6 @@ def _repeated(experiment: Experiment, data: Labelled, steps: int) -> Result | No
 
 
 def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[CheckResult]:
-    """Compare dataset, summary and report with those of the run computed again."""
     assert files.data is not None
     laws = isinstance(result.parts.drive, Laws)
     digits = _PRECISIONS[result.settings.precision] if laws else _SOLVED
@@ -187,18 +186,9 @@ def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Chec
         yield _compare_report(written, report(result) + "\n")
 
 
-def _compare_origin(stored: JsonObject, data: Labelled) -> Iterator[CheckResult]:
-    """Compare what both files say of the program: nothing else says it."""
-    attributes = data.attributes
-    versions = {k[8:]: text for k, text in attributes.items() if k.startswith("version_")}
-    value = {"engine": attributes.get("computed_by"), "versions": versions}
-    yield from compare_values("", {key: stored.get(key) for key in value}, value)
-
-
 def _compare_dataset(
     name: str, data: Labelled, result: Result, digits: Digits
 ) -> Iterator[CheckResult]:
-    """Compare arrays and attributes of a dataset, but those of the parts of the run."""
     parts = labelled_parts(result.parts, result.settings)
     stored, again = data.arrays(), with_sums(result)
     for key, value in again.arrays().items():
@@ -298,7 +288,6 @@ def check_files(
 def _computed(
     files: ClaimFiles, source: Scenario, repeat: bool, begin: Callable[[str], None]
 ) -> Iterator[CheckResult]:
-    """Yield what is computed again from a scenario: the guarantee, and then the run."""
     begin("computing the guarantee again, which takes up to a minute")
     experiment, findings = experiment_of(source, files.claims, files.gain)
     yield from findings
@@ -332,7 +321,6 @@ def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | Non
 
 
 def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[CheckResult], str]:
-    """Return what independent code finds in each file, and its notes."""
     model = None if trusted is None else build(trusted).parts.model
     checked = [each for each in (files.gain, files.claims) if each is not None]
     results = [verifier.verify(each, model) for each in checked]

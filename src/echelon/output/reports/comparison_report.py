@@ -149,7 +149,6 @@ def _table(title: str, columns: Sequence[str]) -> "Table":
 
 
 def _guaranteed(promise: Guarantee) -> str:
-    """Return the guaranteed rate, with its theorem if there is one."""
     if promise.rate is None:
         return "none"
     if not promise.promised:

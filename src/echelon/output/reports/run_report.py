@@ -296,7 +296,6 @@ def _messages(result: Result) -> Iterator[str]:
 
 
 def _guarantee(result: Result, guarantee: Guarantee) -> Iterator[str]:
-    """Yield the guarantee, whether it covers this run, and the information that the law uses."""
     yield guarantee.sentence()
     slowest, coupling = guarantee.slowest, guarantee.coupling
     if result.drive.gain is not None and guarantee.governed and slowest is not None:
@@ -316,7 +315,6 @@ def _guarantee(result: Result, guarantee: Guarantee) -> Iterator[str]:
 
 
 def _lyapunov_trend(result: Result, guarantee: Guarantee) -> Iterator[str]:
-    """Yield whether V decreased, with a warning where theory forbids its increase."""
     v = lyapunov(result)
     if v is None or len(v.value) < 2 or not np.isfinite(v.value).all():
         return
@@ -422,7 +420,6 @@ def beyond(saturated: float, guarantee: Guarantee) -> Iterator[str]:
 
 
 def _slow(result: Result, guarantee: Guarantee) -> Iterator[str]:
-    """Yield that the horizon is too short for the slowest mode."""
     by_mode = guarantee.slowest is not None
     rate = -guarantee.slowest if guarantee.slowest is not None else guarantee.rate
     if guarantee.promised and rate and result.settings.horizon * rate < _SETTLES:
