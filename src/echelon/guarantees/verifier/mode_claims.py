@@ -122,7 +122,6 @@ def _check_between(facts: Recomputed) -> Iterator[CheckResult]:
     if every or facts.saved.graph.switches or facts.saved.abscissa >= 0.0:
         return
     values = values if len(values) > 2 else np.geomspace(values[0], values[-1], _BETWEEN)
-    values = values[1:-1]
     result, slack = _slowest(facts, values[1:-1])
     yield decide("all modes between decay", result + slack < 0.0, "", result)
 
