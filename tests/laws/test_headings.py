@@ -144,8 +144,6 @@ def test_an_agent_by_itself_takes_one_heading_in_two_ways_for_one():
         np.testing.assert_allclose(also.signal.values, sent.signal.values, atol=1e-12)
 
 
-# ---- a run ---------------------------------------------------------------------------------------
-
 SETTINGS = ech.Settings(horizon=12.0, dt=0.02)
 ENGINES = ["jax", "native"]
 
@@ -237,9 +235,6 @@ def test_what_is_guaranteed_of_a_start_is_that_of_its_nearest_turn():
         sentences.add(ech.guarantee(parts, settings).sentence())
     [sentence] = sentences
     assert "after 0 s" in sentence or "1 cm" in sentence
-
-
-# ---- inputs and normalized inputs ----------------------------------------------------------------
 
 
 def test_a_follower_that_is_fed_with_the_leaders_input_turns_as_fast():
