@@ -49,13 +49,10 @@ LIMIT = 5.0
 
 
 def pytest_addoption(parser):
-    parser.addoption(
-        "--until",
-        type=float,
-        metavar="SECONDS",
-        help="run the selected tests in an order that the commit chooses, and end after so many "
-        "seconds of a processor",
+    told = (
+        "run the tests in an order that the commit chooses, until SECONDS of a processor are used"
     )
+    parser.addoption("--until", type=float, metavar="SECONDS", help=told)
 
 
 def pytest_configure(config):
@@ -100,7 +97,6 @@ OWN = {
 
 
 def shares_fixtures(item):
-    """Whether a test uses a fixture of its file, which other tests may use too."""
     parameters = getattr(item, "callspec", None)
     return bool(set(item.fixturenames) - OWN - set(parameters.params if parameters else ()))
 
@@ -123,7 +119,6 @@ def pytest_runtest_protocol(item):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item):
-    """Record how much of a processor a test takes, and whether it is marked as a long one."""
     begin = processor_time()
     result = yield
     spent = processor_time() - begin
@@ -132,7 +127,6 @@ def pytest_runtest_call(item):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Name the tests that take long and have no mark; how long depends on the machine."""
     reports = terminalreporter.getreports("passed")
     facts = [(report.nodeid, dict(report.user_properties)) for report in reports]
     keep_durations({name: x["processor_time"] for name, x in facts if x})

@@ -5,9 +5,10 @@ import functools
 import pytest
 
 import echelon as ech
-from echelon.agents.models.model_check import check_model
 from echelon.core import gone
 from echelon.experiments.scenario.scenario import Scenario
+
+KEYS = Scenario.model_json_schema()["properties"]
 
 
 @pytest.mark.parametrize("command", gone.COMMANDS)
@@ -24,22 +25,6 @@ def test_a_name_that_is_gone_says_what_to_use(name):
     assert last not in family.__all__
     with pytest.raises(AttributeError, match=f"^`echelon.{name}` is gone; "):
         getattr(family, last)
-
-
-@pytest.mark.parametrize(("name", "now"), gone.RENAMED.items())
-def test_a_name_that_changed_still_works_with_a_warning(name, now):
-    with pytest.warns(FutureWarning, match=f"^`echelon.{name}` is now `echelon.{now}`, and goes"):
-        assert getattr(ech, name) is getattr(ech, now)
-
-
-@pytest.mark.parametrize(("old", "now"), gone.METHODS.items())
-def test_a_method_of_a_model_that_changed_its_name_is_named(old, now):
-    kind = type("Own", (ech.models.DoubleIntegrator,), {old: lambda self, *values: values})
-    with pytest.raises(ech.errors.ModelError, match=f"^`{old}` of `Own` is now `{now}`; rename"):
-        check_model(kind())
-
-
-def test_a_name_that_never_was_is_said_not_to_exist():
     with pytest.raises(AttributeError, match=r"^`echelon\.formation` does not exist\.$"):
         ech.formation  # noqa: B018
 
@@ -51,8 +36,4 @@ def test_a_key_and_a_value_that_are_gone_say_what_to_use(monkeypatch):
         ech.load_scenario("paper", ["simulation.stride=2", "simulation.engine=c"])
     assert "simulation.stride=2: the key is gone; use `simulation.store_every`." in str(error.value)
     assert "simulation.engine=c: the value `c` is gone; use `native`." in str(error.value)
-
-
-@pytest.mark.parametrize("key", gone.KEYS)
-def test_a_key_that_is_gone_is_no_key(key):
-    assert key.rpartition(".")[2] not in Scenario.model_json_schema()["properties"]
+    assert not {key.rpartition(".")[2] for key in gone.KEYS} & {*KEYS}

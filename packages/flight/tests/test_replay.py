@@ -57,7 +57,6 @@ RECEIVERS = {"fresh": 0, "restarted": BOOT}
 
 
 def used(receiver, recorded):
-    """How many recorded letters and commands a receiver uses, at the times of the recording."""
     plans = [*recorded.letters, *((None, command) for command in recorded.commands)]
     opened = [receiver.open(datagram, t, WALL) for t, datagram in plans]
     real = [x for x in opened if not isinstance(x, Drop)]
@@ -123,23 +122,12 @@ def test_a_restarted_process_comes_back_and_its_start_is_no_other_s():
 
 
 def test_a_recorded_start_for_others_keeps_no_genuine_one_out():
-    """The station that was recorded began later, by its clock."""
     ground, agent, ahead = wire(GROUND), wire(1), wire(GROUND, boot=BOOT + 900)
     ahead.begin(BOOT)
     for to in (0, 0xFFFE):
         assert agent.open(ahead.start(WALL, WALL + 1.0, to), None, WALL).body is None
     ground.begin(ground.next_flight(WALL))
     assert join(ground, agent)
-
-
-def test_an_agent_s_letter_tells_no_flight():
-    agent, leader = wire(1), wire(0)
-    leader.begin(BOOT + 7)
-    assert agent.open(leader.letter(letter(0, 0.5)), None, WALL) is Drop.EARLY
-    assert agent.flight == agent.highest == 0
-
-
-# ---- stop ----------------------------------------------------------------------------------------
 
 
 def stops(ground, agent, wall=WALL, to=0xFFFE):
@@ -177,11 +165,7 @@ def test_a_stop_ends_one_flight_and_not_the_next(tmp_path):
         assert not isinstance(agent.open(stop, None, WALL), Drop)
 
 
-# ---- whole processes -----------------------------------------------------------------------------
-
-
 def replay(scene, other, term, count=40):
-    """Send letters of another flight between those of the leader."""
     for k in range(count):
         t = scene.context.clock.now
         if k % 4 == 0:
@@ -256,31 +240,11 @@ def test_a_number_that_cannot_be_stored_keeps_a_vehicle_on_the_ground(monkeypatc
     assert said.endswith("); make its folder writable.\n")
 
 
-# ---- the file ------------------------------------------------------------------------------------
-
-
-def test_the_number_survives_and_each_process_has_its_own(tmp_path):
-    own, other = (NumberFile(tmp_path / "key", name) for name in ("agent-1", "agent-2"))
-    assert own.read() == other.read() == 0
-    own.write(BOOT)
-    assert NumberFile(tmp_path / "key", "agent-1").read() == BOOT and other.read() == 0
-    assert sorted(x.name for x in tmp_path.iterdir()) == [
-        "key.agent-1.flight",
-        "key.agent-2.flight",
-    ]
-
-
-@pytest.mark.parametrize("text", ["", "abc", "-5", "1.5", "9" * 30, "12 13", "\xff"])
-def test_a_damaged_number_is_refused(text, tmp_path):
-    (tmp_path / "key.agent-1.flight").write_bytes(text.encode("latin-1"))
-    with pytest.raises(FlightError, match="must be a whole number below 2") as info:
-        NumberFile(tmp_path / "key", "agent-1").read()
-    assert "\n" not in str(info.value)
-
-
-def test_a_number_that_cannot_be_read_or_written_is_refused(tmp_path):
-    (tmp_path / "key.agent-1.flight").mkdir()
-    with pytest.raises(FlightError, match=r"cannot be read \(is a directory\)"):
-        NumberFile(tmp_path / "key", "agent-1").read()
+def test_a_number_that_is_damaged_or_has_no_place_is_refused(tmp_path):
+    for text in ("", "abc", "-5", "1.5", "9" * 30, "12 13", "\xff"):
+        (tmp_path / "key.agent-1.flight").write_bytes(text.encode("latin-1"))
+        with pytest.raises(FlightError, match="must be a whole number below 2") as info:
+            NumberFile(tmp_path / "key", "agent-1").read()
+        assert "\n" not in str(info.value)
     with pytest.raises(FlightError, match=r"cannot be stored in `/proc/self/key"):
         NumberFile(Path("/proc/self/key"), "agent-1").read()

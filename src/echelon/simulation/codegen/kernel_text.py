@@ -62,8 +62,7 @@ def program(plan: Plan) -> str:
     attributes = f"attributes #0 = {{ nounwind noinline {width} {_ATTRIBUTES} }}"
     # The weights of a branch that is hardly ever taken.
     unlikely = '!0 = !{!"branch_weights", i32 1, i32 1000}'
-    run = _ENTRIES.get(platform.machine(), _OTHER)
-    parts = [*sorted(w.declared), "", head, *w.lines, "}", "", run]
+    parts = [*sorted(w.declared), "", head, *w.lines, "}", "", _RUN]
     return "\n".join([*parts, "", attributes, unlikely, ""])
 
 
@@ -114,11 +113,7 @@ def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
         w.label(follow)
         if plan.edges:
             measure_edges(w, context, task["first_edge"], task["last_edge"])
-        # In the loop, LLVM would load it again after every store, which might change it.
-        leaves = [n.value for n in needed(plan.others.results()) if n.op == "leaf"]
-        uniform = [value for value in leaves if value[0] == "uniform"][:_AT_HAND]
-        at_hand = {value[1]: _load_uniform(w, context, *value) for value in uniform}
-        context = context._replace(at_hand=at_hand)
+        context = _with_uniform(w, context, plan.others)
         with loop(w, task["start"], task["end"]) as (block, _, _):
             _act(w, context, plan.others, block)
         w.do(f"br label %{done}")
@@ -151,6 +146,13 @@ def _context(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers:
 
 _AT_HAND = 12
 """Numbers that are the same for all agents and stay in registers while a task is done."""
+
+
+def _with_uniform(w: Writer, context: Context, body: Body) -> Context:
+    """In the loop, LLVM would load it again after every store, which might change it."""
+    leaves = [n for n in needed(body.results()) if n.op == "leaf" and n.value[0] == "uniform"]
+    values = {n.value[1]: _load_uniform(w, context, *n.value) for n in leaves[:_AT_HAND]}
+    return context._replace(at_hand=values)
 
 
 def _lead(w: Writer, context: Context, task: dict[str, str]) -> None:
@@ -408,7 +410,8 @@ define void @run(ptr noalias %slots) nounwind {
   call void @steps(ptr %slots)
   ret void
 }"""
-_ENTRIES = {"x86_64": _X86, "AMD64": _X86, "aarch64": _ARM, "arm64": _ARM}
+_RUNS = {"x86_64": _X86, "AMD64": _X86, "aarch64": _ARM, "arm64": _ARM}
+_RUN = _RUNS.get(platform.machine(), _OTHER)
 """The function `run`, which calls `steps`, as LLVM moves arithmetic over neither end of a call.
 
 Denormal numbers are 0 in it, in operands and in results, as in JAX: an operation with one takes a

@@ -51,6 +51,7 @@ class FormationPlan(NamedTuple):
     """The plans of all agents, and the work of the solvers.
 
     Attributes:
+        grid: the times.
         plans: one for each agent; states on the grid and inputs held between.
         seconds: of solving, for each agent.
         iterations: of the solver, for each agent.
@@ -58,6 +59,7 @@ class FormationPlan(NamedTuple):
         setup_seconds: of building the solvers.
     """
 
+    grid: PlanTimes
     plans: tuple[Trajectory, ...]
     seconds: tuple[float, ...]
     iterations: tuple[int, ...]
@@ -104,6 +106,7 @@ def plan_formation(
             )
     order = range(graph.agents)
     return FormationPlan(
+        grid,
         tuple(plans[agent] for agent in order),
         tuple(planner.seconds[agent] for agent in order),
         tuple(planner.iterations[agent] for agent in order),

@@ -341,7 +341,6 @@ def at_index(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands:
     if has_function(equation):
         raise Unsupported(f"`scatter` of a function{where(equation)}")
     rows, ends = _rows(equation, operands), _ends(equation, operands)
-    # Indices outside of a table are ignored; otherwise they are clipped.
     drops = equation.params.get("mode") == jax.lax.GatherScatterMode.FILL_OR_DROP
     if not drops:
         rows = np.stack([_clipped(graph, rows[..., k], n) for k, n in enumerate(ends)], axis=-1)
