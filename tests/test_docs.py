@@ -28,25 +28,20 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 
 
-def slow(*pages):
-    return pytest.param(pages, marks=pytest.mark.slow, id=pages[0])
-
-
+# What is read one after the other, in one folder; all but the first page takes long.
 FIRST = ("start", "agents", "graphs", "formations", "promises", "laws", "runs", "datasets")
-# What is read one after the other, in one folder.
+LONG = [
+    ("extending",),
+    (*FIRST, "troubleshooting"),
+    ("recipes", "sweeps", "comparing"),
+    *((name,) for name in ("networks", "events", "learning", "crazyflie", "autopilots")),
+    *((name,) for name in ("matlab", "onboard")),
+]
 JOURNEYS = [
     pytest.param(("README",), id="README"),
-    slow("extending"),
-    slow(*FIRST, "troubleshooting"),
-    slow("recipes", "sweeps", "comparing"),
-    slow("networks"),
-    slow("events"),
-    slow("learning"),
-    slow("crazyflie"),
-    slow("autopilots"),
-    slow("matlab"),
-    slow("onboard"),
+    *(pytest.param(pages, marks=pytest.mark.slow, id=pages[0]) for pages in LONG),
 ]
+
 
 FENCE = re.compile(
     r"^(?P<mark><!-- (?:not executed|needs (?P<needs>\w+)) -->\s+)?"
@@ -59,8 +54,6 @@ NUMBER = re.compile(r"(?<![\w.^-])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*\w)")
 
 
 class Block(NamedTuple):
-    """A fenced block of a page."""
-
     language: str
     title: str | None
     code: str
@@ -89,12 +82,10 @@ def blocks(path):
 
 
 def prose(path):
-    """The text without its fenced blocks."""
     return FENCE.sub("", path.read_text("utf-8"))
 
 
 def anchors(path):
-    """The anchors of a page's headings, as the site and the code hosts make them."""
     titles = re.findall(r"^#+ (.+)$", prose(path), re.MULTILINE)
     plain = [re.sub(r"[^\w\s-]", "", title.replace("`", "")).strip().lower() for title in titles]
     return {re.sub(r"[-\s]+", "-", title) for title in plain}
@@ -180,6 +171,21 @@ graph: {name: path, agents: 5}
 follower: {gain: {method: decay, weight: 2.0}}
 simulation: {horizon: 1.0, dt: 0.01}
 """
+DESIGNS = """
+import contextlib, io, json, sys
+from echelon.apps.cli.app import main
+
+said = []
+for words in ["--json"], ["--set", "follower.gain.Q=[1, 1]"], ["--set", "follower.gain.wait=1"]:
+    sys.argv = ["echelon", "design", "pushed.yaml", *words]
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as end:
+            said.append([end.code or 0, out.getvalue(), err.getvalue()])
+json.dump(said, sys.stdout)
+"""
 
 
 def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
@@ -203,27 +209,23 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
         (package / file).write_text(text.replace(above, f"{above}\n{line}"), "utf-8")
     (tmp_path / "pushed.yaml").write_text(PENDULUM)
 
-    def call(*arguments):
-        command = [sys.executable, "-m", "echelon", "design", "pushed.yaml", *arguments]
-        given = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
-        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=given)
-
-    done = call("--json")
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    given = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": path}}
+    command = [sys.executable, "-c", DESIGNS]
+    done = subprocess.run(command, capture_output=True, text=True, **given)
     assert done.returncode == 0, done.stderr
-    rows = {row["method"]: row for row in json.loads(done.stdout)["methods"]}
-    assert {*rows} == {*METHODS, "decay"} - {"given"}
+    (code, designs, _), taken, unknown = json.loads(done.stdout)
+    rows = {row["method"]: row for row in json.loads(designs)["methods"]}
+    assert code == 0 and {*rows} == {*METHODS, "decay"} - {"given"}
     assert (rows["decay"]["coupling"], rows["decay"]["edge"]) == (1.0, 0.0)
     assert rows["decay"]["slowest_mode"] < 0.0
     assert rows["contraction"]["reason"] == (
         "set `follower.gain={method: contraction, domain: {angle: HALF_WIDTH, ...}}` to try it"
     )
-    refused = call("--set", "follower.gain.Q=[1, 1]")
-    assert refused.returncode == 2
-    said = "got a key that `decay` does not take, allowed are `coupling`, `weight`."
-    assert refused.stderr.strip().endswith(f"--set follower.gain.Q=[1, 1]: {said}")
-    refused = call("--set", "follower.gain.wait=1")
-    assert "follower.gain.wait=1: got an unknown key" in refused.stderr
-    assert refused.stderr.strip().endswith("(did you mean `weight`?).")
+    said = "got a key that `decay` does not take, allowed are `coupling`, `weight`.\n"
+    assert taken[0] == 2 and taken[2].endswith(f"--set follower.gain.Q=[1, 1]: {said}")
+    assert "follower.gain.wait=1: got an unknown key" in unknown[2]
+    assert unknown[2].endswith("(did you mean `weight`?).\n")
 
 
 def test_few_blocks_are_left_out():
@@ -249,16 +251,16 @@ def test_every_scenario_on_the_pages_is_one(folder):
     assert seen >= 3
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
-def test_relative_links_and_images_lead_somewhere(path):
+def test_relative_links_and_images_lead_somewhere():
     dead = []
-    for target in LINK.findall(prose(path)):
-        if "://" in target or target.startswith("mailto:"):
-            continue
-        place, _, anchor = target.partition("#")
-        goal = (path.parent / place).resolve() if place else path
-        if not goal.exists() or (anchor and anchor not in anchors(goal)):
-            dead.append(target)
+    for path in PAGES:
+        for target in LINK.findall(prose(path)):
+            if "://" in target or target.startswith("mailto:"):
+                continue
+            place, _, anchor = target.partition("#")
+            goal = (path.parent / place).resolve() if place else path
+            if not goal.exists() or (anchor and anchor not in anchors(goal)):
+                dead.append((path.name, target))
     assert dead == []
 
 
@@ -277,7 +279,6 @@ def test_the_first_page_quotes_the_measured_numbers():
 
 
 def rows(text):
-    """The cells of every line of a table."""
     lines = (line for line in text.splitlines() if line.startswith("|"))
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
@@ -291,21 +292,17 @@ def test_the_reference_has_every_public_name_once():
     texts = "\n".join(path.read_text("utf-8") for path in (DOCS / "api").glob("*.md"))
     named = re.findall(r"^::: (echelon\.\S+)$", texts, re.MULTILINE)
     shown = [id(operator.attrgetter(name.removeprefix("echelon."))(ech)) for name in named]
-    families = [getattr(ech, name) for name in ech.__all__ if is_module(getattr(ech, name))]
-    public = {
-        id(getattr(family, name)): f"{family.__name__}.{name}"
-        for family in [*families, ech]
-        for name in getattr(family, "__all__", [])
-        if not is_module(getattr(family, name))
-    }
+    values = {f"echelon.{name}": getattr(ech, name) for name in ech.__all__}
+    families = [value for value in values.values() if isinstance(value, types.ModuleType)]
+    for family in families:
+        values |= {
+            f"{family.__name__}.{x}": getattr(family, x) for x in getattr(family, "__all__", [])
+        }
     assert len(shown) == len(set(shown))
     listed = re.findall(r"`(\w+)`", page("api.md").read_text("utf-8").partition("| page |")[2])
     assert sorted(listed) == sorted(name.rpartition(".")[2] for name in named)
-    assert [name for each, name in public.items() if each not in shown] == []
-
-
-def is_module(value):
-    return isinstance(value, types.ModuleType)
+    missing = [name for name, value in values.items() if id(value) not in shown]
+    assert [name for name in missing if not isinstance(values[name], types.ModuleType)] == []
 
 
 def test_every_page_is_in_the_navigation_and_is_there():

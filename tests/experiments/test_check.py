@@ -240,7 +240,7 @@ def test_the_promise_is_as_strong_as_its_argument(robust, model, method, told, u
     ],
 )
 def test_what_a_gain_says_of_itself_is_not_believed_but_compared(robust, changes):
-    true, found = (ech.promise(*each) for each in (robust, with_claim(robust, **changes)))
+    true, found = (ech.guarantee(*each) for each in (robust, with_claim(robust, **changes)))
     assert (found.theorem, found.kind, found.rate) == (true.theorem, true.kind, true.rate)
     told = [key for key in changes if key != "hull"]
     assert found.hypotheses[Hypothesis.CLAIMS].fails is bool(told)

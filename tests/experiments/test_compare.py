@@ -108,7 +108,7 @@ def test_a_number_of_the_table_is_in_every_table_that_it_names(planar, monkeypat
     def largest(run):
         return float(np.abs(run.result.states).max())
 
-    column = {"column": "largest\nstate", "of": largest, "shown": run_numbers.Shown.COMPARISON}
+    column = {"column": "largest\nstate", "of": largest, "shown": run_numbers.Appearance.COMPARISON}
     number = run_numbers.Quantity("largest state", "m", **column)
     monkeypatch.setitem(run_numbers.RUN_NUMBERS, "largest_state", number)
     rows = comparison_mapping(planar)["methods"]
@@ -135,7 +135,9 @@ def test_the_scenario_s_own_law_is_always_a_row(changes, labels):
     told = comparison_mapping(found)["methods"]
     for row in found.rows:
         result = row.flight.result
-        assert told[row.label]["promise"] == ech.promise(result.parts, result.settings).as_mapping()
+        assert (
+            told[row.label]["promise"] == ech.guarantee(result.parts, result.settings).as_mapping()
+        )
 
 
 class Halved(ech.Law):

@@ -24,7 +24,7 @@ from echelon.experiments.sweeps.plan import Axis, Sweep, axes_of, read_axes
 from echelon.experiments.sweeps.sweep import _missing, compute
 from echelon.experiments.sweeps.sweep_dataset import columns_of, dataset_of, share_bounds, succeeded
 from echelon.experiments.sweeps.workers import SweepBatch
-from echelon.guarantees.promises.promise import promise, promises
+from echelon.guarantees.promises.promise import guarantee, promises
 from echelon.output.plots.study_figures import sweep_figures
 from echelon.simulation.engine import batch, law_drive
 from echelon.simulation.engine.batch import Batch
@@ -238,7 +238,7 @@ def test_of_starts_that_no_tube_covers_none_is_promised_among_many():
     asked = [chosen._replace(seed=k) for k in (0, 1)]
     first, second = promises(parts, asked)
     for one, each in zip((first, second), asked, strict=True):
-        assert one.as_mapping() == promise(parts, each).as_mapping()
+        assert one.as_mapping() == guarantee(parts, each).as_mapping()
     assert first.tube is not second.tube
 
 
@@ -260,7 +260,7 @@ def test_a_sweep_is_each_of_its_runs():
         np.testing.assert_allclose(here["final_error"].values[followers], last[followers])
         assert float(here["worst_final_error"]) == pytest.approx(last.max())
         assert int(here["outcome"]) == 0
-        assert int(here["promised"]) == int(promise(run.parts, run.settings).promised)
+        assert int(here["promised"]) == int(guarantee(run.parts, run.settings).promised)
 
 
 def test_formations_and_schedules_in_a_sweep_are_those_of_single_runs_by_jax():

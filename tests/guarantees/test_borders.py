@@ -10,12 +10,12 @@ import scipy.linalg
 
 import echelon as ech
 from echelon.agents.models.chains import chains_of
-from echelon.agents.models.model import FlatBound, FlatChains, Flattened
+from echelon.agents.models.model import FlatBound, FlatChains, FlatCoordinates
 from echelon.core.digits import at_most
 from echelon.core.errors import EchelonError
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.stopping.borders import length_clearance_of
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
@@ -43,7 +43,7 @@ def driven(headings=(0.0, 0.0, 0.0), away=0.0, reference=CIRCLE, leader=None, **
 
 
 def promised(parts, horizon=8.0):
-    return promise(parts, ech.Settings(horizon=horizon, dt=0.01))
+    return guarantee(parts, ech.Settings(horizon=horizon, dt=0.01))
 
 
 @pytest.mark.parametrize(("roots", "order"), [((4.0,), 0), ((2.0, 3.0), 1), ((2.0, 2.5, 3.0), 1)])
@@ -397,8 +397,8 @@ class Mapped(Swing):
     def drift(self, x):
         return jnp.stack([x[1], -self.drag * x[1]])
 
-    def flatten(self, x, e):
-        return Flattened(x[:, None], lambda tops: tops / 2.0)
+    def to_flat(self, x, e):
+        return FlatCoordinates(x[:, None], lambda tops: tops / 2.0)
 
 
 Adrift = own("Adrift", Sailing, state_names=("x", "v", "w"), **STATED)
@@ -407,7 +407,7 @@ Adrift = own("Adrift", Sailing, state_names=("x", "v", "w"), **STATED)
 def test_declared_coordinates_hold_all_states_and_change_as_the_equations_say():
     assert StoppingPoint().prepared(Mapped(), TREE).ready.chains.degrees == (2,)
     for model, text in (
-        (Mapped(0.5), "`flatten` of `Mapped` is not of its motion"),
+        (Mapped(0.5), "`to_flat` of `Mapped` is not of its motion"),
         (Adrift(), "2 integrators in all, and must be 1 chains, .* with 3"),
     ):
         with pytest.raises(EchelonError, match=text):

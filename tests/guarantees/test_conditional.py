@@ -45,7 +45,7 @@ def parts_of(model, kind, spread=1.0, domain=WIDE, **more):
 @pytest.mark.parametrize("kind", ["T1", pytest.param("T5", marks=pytest.mark.slow)])
 def test_a_limit_leaves_a_claim_to_the_run(kind):
     weak, strong = (Cart(dimension=2, most=most) for most in (0.05, 1e3))
-    found = ech.promise(parts_of(weak, kind), SETTINGS)
+    found = ech.guarantee(parts_of(weak, kind), SETTINGS)
     told = found.as_mapping()
     assert found.verdict is GuaranteeVerdict.CONDITIONAL and not found.promised and found.claimed
     assert str(found.theorem) == kind == told["theorem"]
@@ -69,11 +69,11 @@ def test_a_claim_is_guaranteed_without_limits_of_the_model_and_of_every_plant(ki
         (parts_of(free, kind), SETTINGS),
         (parts_of(weak, kind), SETTINGS._replace(limits=False)),
     ):
-        found = ech.promise(parts, settings)
+        found = ech.guarantee(parts, settings)
         assert found.verdict is GuaranteeVerdict.GUARANTEED and found.promised, found.sentence()
         assert found.sentence().startswith(("Proved", "Local guarantee"))
     for world in (ech.World(plant=weak), ech.World(plants={2: weak})):
-        found = ech.promise(parts_of(wide, kind, world=world), SETTINGS)
+        found = ech.guarantee(parts_of(wide, kind, world=world), SETTINGS)
         assert found.verdict is GuaranteeVerdict.CONDITIONAL
 
 
@@ -88,11 +88,11 @@ def test_only_the_leader_at_its_limit_leaves_a_run_uncovered():
 
 
 def test_the_badge_says_what_is_conditional_and_what_is_none():
-    found = ech.promise(*ech.build(ech.load_scenario("crossing")))
+    found = ech.guarantee(*ech.build(ech.load_scenario("crossing")))
     assert found.verdict is GuaranteeVerdict.CONDITIONAL and str(found.theorem) == "T10"
     badge = promise_badge(found.as_mapping())
     assert badge["state"] == "edge" and WHILE in badge["short"]
-    found = ech.promise(*ech.build(ech.load_scenario("leader-lost")))
+    found = ech.guarantee(*ech.build(ech.load_scenario("leader-lost")))
     assert found.verdict is GuaranteeVerdict.NONE and found.conditions == ()
     assert promise_badge(found.as_mapping())["short"] == "no guarantee"
 
@@ -110,7 +110,7 @@ WEAK = "plant={agents: {2: {parameters: {motor_thrust: 0.06}}}}"
     ],
 )
 def test_motors_that_cannot_give_what_the_trim_needs_leave_nothing_guaranteed(change, said):
-    found = ech.promise(*ech.build(ech.load_scenario("paper", [change])))
+    found = ech.guarantee(*ech.build(ech.load_scenario("paper", [change])))
     assert found.promised is (said == "") and said in found.sentence()
     assert ("more than the trim" in found.sentence()) == ("0.07" in change)
 
@@ -119,7 +119,7 @@ def test_a_domain_that_was_seen_at_stored_frames_alone_covers_no_run_from_outsid
     parts = parts_of(DOUBLE, "T1", domain={"position": 1.0, "velocity": 4.0})
     starts = parts.formation.offsets + np.array([[0, 0, 0, 0], [0.9, 0, 0, 0], [0.9, 0, 0, 0.0]])
     parts = parts.replace(initial=starts)
-    assert ech.promise(parts, SETTINGS).hypotheses[Hypothesis.STARTS].fails
+    assert ech.guarantee(parts, SETTINGS).hypotheses[Hypothesis.STARTS].fails
     for every, covered in ((1, True), (5, None)):
         result = ech.simulate(parts, SETTINGS._replace(store_every=every))
         assert ech.summary(result)["covered"] is covered

@@ -72,7 +72,7 @@ def promised(model, **initial):
     drive = ech.Laws(ech.laws.StoppingLeader(), ech.laws.StoppingPoint())
     goals = ech.Formation(np.zeros((3, len(model.state_names))))
     parts = ech.Parts(model, GRAPH, goals, drive, initial=initial or {"x": 0.3})
-    return ech.promise(parts, ech.Settings(horizon=10.0, dt=0.01))
+    return ech.guarantee(parts, ech.Settings(horizon=10.0, dt=0.01))
 
 
 EFFECT = "leave out where its inputs lose their effect"
@@ -157,7 +157,7 @@ def test_motors_are_guaranteed_of_an_airframe_that_fits_alone(model, known):
     drive = ech.Laws(leader, ech.laws.StoppingPoint(roots=roots, speed=speeds))
     goals = ech.Formation(np.zeros((3, 12)))
     parts = ech.Parts(model, GRAPH, goals, drive, initial={"x": 0.1})
-    found = ech.promise(parts, ech.Settings(horizon=10.0, dt=0.005))
+    found = ech.guarantee(parts, ech.Settings(horizon=10.0, dt=0.005))
     line = found.hypotheses[Hypothesis.LIMITS]
     assert isinstance(found, StoppingPromise) and found.tube is not None
     assert (line.verdict is Verdict.HOLDS) == known == (found.tube.motor_load is not None)

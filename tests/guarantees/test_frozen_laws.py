@@ -21,9 +21,9 @@ def line_of(found, name=Hypothesis.ALONG_PATH):
 
 @pytest.mark.parametrize("yaw", [1.05, -1.2])
 def test_a_yaw_that_loses_the_formation_is_not_promised_unless_the_law_turns(yaw):
-    turning = ech.promise(*built("paper", f"reference.yaw={yaw}"))
+    turning = ech.guarantee(*built("paper", f"reference.yaw={yaw}"))
     assert turning.promised and not line_of(turning).fails
-    found = ech.promise(*built("paper", f"reference.yaw={yaw}", "follower.frame=world"))
+    found = ech.guarantee(*built("paper", f"reference.yaw={yaw}", "follower.frame=world"))
     line = line_of(found)
     assert not found.promised and line.fails and line.kind is Kind.SAMPLES
     assert line.number > 0.1 and f"`yaw` {yaw:.3g} rad" in found.sentence()
@@ -32,7 +32,7 @@ def test_a_yaw_that_loses_the_formation_is_not_promised_unless_the_law_turns(yaw
 
 @pytest.mark.parametrize("scenario", ["paper", "van-der-pol"])
 def test_no_bundled_scenario_that_flies_is_taken_its_promise(scenario):
-    assert not line_of(ech.promise(*built(scenario))).fails
+    assert not line_of(ech.guarantee(*built(scenario))).fails
 
 
 def poles_at_the_steepest(parts, settings):
@@ -53,18 +53,18 @@ def poles_at_the_steepest(parts, settings):
 def test_the_longest_step_is_that_of_the_steepest_tilt():
     parts, settings = built("paper", "follower.gain={method: inner-loop}")
     steep = 2.0 / np.abs(poles_at_the_steepest(parts, settings)).max()
-    found = ech.promise(parts, settings)
+    found = ech.guarantee(parts, settings)
     assert found.longest_step(settings) == pytest.approx(steep, rel=0.1)
     assert found.longest_step(settings) < 0.6 * found.loop.longest_step(settings)
     too_long = settings._replace(dt=0.02)
-    line = line_of(ech.promise(parts, too_long), Hypothesis.SAMPLING)
+    line = line_of(ech.guarantee(parts, too_long), Hypothesis.SAMPLING)
     assert line.fails and "along the leader's path" in line.text and "dt" in line.remedy
 
 
 def test_a_step_too_long_for_the_starts_alone_takes_no_promise_away():
     changes = ["follower.gain={method: inner-loop}", "simulation.dt=0.01"]
     changes += ["initial={states: {2: [1, 0.8, 1, 0, 0, 0, 0.9, 0, 0, 0, 0, 0]}}"]
-    found = ech.promise(*built("paper", *changes))
+    found = ech.guarantee(*built("paper", *changes))
     line = line_of(found, Hypothesis.SAMPLING)
     assert found.promised and line.fails and "where agents start" in line.text
 

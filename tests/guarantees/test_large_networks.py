@@ -67,7 +67,7 @@ def test_a_step_that_one_follower_in_the_midst_does_not_bear_is_refused(count):
     A, B, P, lost = lost_between(count, lost_in_steps)
     weights, settings = crowd(lost, count), ech.Settings(2.0, DT)
     assert radii(A, B, B.T @ P, weights, DT).max() > 1.0
-    found = ech.promise(parts_of(A, B, P, star(weights)), settings)
+    found = ech.guarantee(parts_of(A, B, P, star(weights)), settings)
     assert found.hypotheses[Hypothesis.SAMPLING].verdict is Verdict.FAILS
     longest = found.longest_step(settings)
     assert radii(A, B, B.T @ P, weights, 0.999 * longest).max() < 1.0
@@ -118,7 +118,7 @@ def test_the_slowest_mode_between_two_eigenvalues_is_none_too_fast(shift):
     A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-0.5, -1.0, -1.0]]) - shift * np.eye(3)
     B, P = np.array([[0.0], [0.0], [1.0]]), np.diag([40.0, 40.0, 1.0])
     P[2, :2] = P[:2, 2] = 4.0, 1.0
-    found = ech.promise(parts_of(A, B, P, ech.Graph.path(460)), ech.Settings(1.0, 0.001))
+    found = ech.guarantee(parts_of(A, B, P, ech.Graph.path(460)), ech.Settings(1.0, 0.001))
     eigenvalues = 2.0 - 2.0 * np.cos(np.pi * (2.0 * np.arange(1, 460) - 1.0) / 919.0)
     loop, worst = found.loop, growth(A, B, B.T @ P, eigenvalues).max()
     assert loop.closed.between and found.promised == (worst < 0.0) == (shift > 0.0)
@@ -149,7 +149,7 @@ def exact_radius(parts, dt):
 
 
 def sampling(parts, settings):
-    found = ech.promise(parts, settings)
+    found = ech.guarantee(parts, settings)
     return found, found.hypotheses[Hypothesis.SAMPLING]
 
 
@@ -161,7 +161,7 @@ def test_an_integrator_that_damps_what_a_held_input_drives_guarantees_nothing():
     assert line.number == pytest.approx(exact_radius(parts, 0.12), rel=1e-6)
     # What runs with enough substeps is the exact flow, and grows.
     settings = ech.Settings(horizon=12.0, dt=0.12, substeps=50)
-    assert not ech.promise(parts, settings).promised
+    assert not ech.guarantee(parts, settings).promised
     errors = np.abs(ech.simulate(parts, settings).errors).max(axis=(1, 2))
     assert errors[-1] > 1e6 * errors[0]
     found, _ = sampling(parts, ech.Settings(horizon=12.0, dt=0.02))

@@ -52,7 +52,7 @@ def largest_deviation(parts):
 def test_an_agent_that_drifts_away_is_named_with_the_speed_that_it_would_need(name):
     world, graph, path, who = CASES[name]
     parts = parts_of(world, graph, path)
-    found = ech.promise(parts, SETTINGS)
+    found = ech.guarantee(parts, SETTINGS)
     line = found.hypotheses[Hypothesis.EXACT_STATES]
     # Drag on the velocity of the path, through the chain s + root: k1 / k0 = 1 / root.
     asked = 0.3 * 20.0 / ROOT if name == "moving air" else 5.0 * 2.0 / ROOT
@@ -64,7 +64,7 @@ def test_an_agent_that_drifts_away_is_named_with_the_speed_that_it_would_need(na
     assert away[-1] - away[-2] > 0.9 * (away[-2] - away[-3]) > 0.5
     # With more speed nobody drifts away, and the guarantee stays.
     parts = parts_of(world, graph, path, speed=3.0)
-    assert ech.promise(parts, SETTINGS).promised
+    assert ech.guarantee(parts, SETTINGS).promised
     away = largest_deviation(parts)
     assert abs(away[-1] - away[-2]) < 0.05
 
@@ -74,14 +74,14 @@ def test_followers_make_up_for_what_moves_them_more_than_their_sender_alone():
     # and with a faster leader the followers receive what it commands.
     drag = ech.models.DoubleIntegrator(dimension=2, drag=2.4)
     parts = parts_of(ech.World(plant=drag), speed=2.0, follower={"speed": 1.0})
-    assert ech.promise(parts, SETTINGS).promised
+    assert ech.guarantee(parts, SETTINGS).promised
     away = largest_deviation(parts)
     assert abs(away[-1] - away[-2]) < 0.05
     alone = parts.replace(world=ech.World(plants={0: drag}))
-    assert not ech.promise(alone, SETTINGS).promised
+    assert not ech.guarantee(alone, SETTINGS).promised
     away = largest_deviation(alone)
     assert away[-1] - away[-2] > 0.5 * (away[-2] - away[-3])
     # What a wind does that carries nobody away is said to be ignored.
     parts = parts_of(air((0.2, 0.0), 0.3), path=CIRCLE)
-    line = ech.promise(parts, SETTINGS).hypotheses[Hypothesis.EXACT_STATES]
+    line = ech.guarantee(parts, SETTINGS).hypotheses[Hypothesis.EXACT_STATES]
     assert line.text.endswith("the guarantee ignores this")

@@ -15,7 +15,7 @@ from echelon.agents.world.sensing import Sensing
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Theorem, Verdict
 from echelon.guarantees.messages.own_delay import all_decay, late_step
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.simulation.engine.prepare import prepare
 
 CART = ech.models.DoubleIntegrator(2)
@@ -41,7 +41,7 @@ SETTINGS = ech.Settings(horizon=10.0, dt=DT)
 
 
 def said(parts, settings=SETTINGS):
-    return promise(parts, settings)
+    return guarantee(parts, settings)
 
 
 def over(guarantee):

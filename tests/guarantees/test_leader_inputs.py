@@ -31,7 +31,7 @@ def promised(leader, **inputs):
     model, settings = Growing(), ech.Settings(4.0, 0.01)
     gain = ech.synthesize(model, LINE, ech.gains.RobustLQR({"x": 0.5, "y": 0.5, **inputs}))
     drive = ech.Laws(leader(gain), ech.laws.Consensus(gain, feedforward="relay"))
-    return ech.promise(ech.Parts(model, LINE, ech.Formation(np.zeros((4, 2))), drive), settings)
+    return ech.guarantee(ech.Parts(model, LINE, ech.Formation(np.zeros((4, 2))), drive), settings)
 
 
 def pushed(gain, push):

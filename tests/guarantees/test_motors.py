@@ -17,7 +17,7 @@ from echelon.core.enclosure.taylor import enclose_derivatives
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Verdict
-from echelon.guarantees.promises.promise import promise, promises
+from echelon.guarantees.promises.promise import guarantee, promises
 from echelon.guarantees.stopping.chain_response import Chain, slices_of
 from echelon.guarantees.stopping.motor_load import MotorDemand, motors_for
 from echelon.guarantees.verifier.verify import verify
@@ -151,7 +151,7 @@ def gentle(*more):
 def hovering():
     """Parts and settings of a leader that hovers, whose path is one piece, and the promise."""
     parts, settings = gentle("reference={name: hover}", "leader.start_error={x: 5}")
-    return parts, settings, promise(parts, settings)
+    return parts, settings, guarantee(parts, settings)
 
 
 def test_a_brief_promise_is_the_same_but_for_arrival(hovering):
@@ -202,24 +202,24 @@ def test_motors_that_suffice_are_promised_and_verified(hovering, tmp_path):
 def test_motors_that_may_not_suffice_leave_the_tube_to_the_run(hovering):
     parts, settings, _ = hovering
     law = eqx.tree_at(lambda law: law.speed, parts.drive.follower, (4.0, 4.0, 0.7, 0.3))
-    found = promise(parts.replace(drive=parts.drive.with_follower(law)), settings)
+    found = guarantee(parts.replace(drive=parts.drive.with_follower(law)), settings)
     assert found.tube is not None and found.tube.motor_load is None
     assert found.claimed and not found.promised and "while no input" in found.sentence()
     line = found.hypotheses[Hypothesis.LIMITS]
     assert line.fails and "gentler `roots`" in line.remedy
-    free = promise(parts, settings._replace(limits=False))
+    free = guarantee(parts, settings._replace(limits=False))
     assert free.hypotheses[Hypothesis.LIMITS].verdict is Verdict.NOT_NEEDED
     # Nor do other motors than the model's.
     weaker = dataclasses.replace(QUADROTOR, motor_thrust=0.08)
     for world in (ech.World(plants={1: weaker}), ech.World(actuator=ech.Actuator(minimum=0.06))):
-        other = promise(parts.replace(world=world), settings)
+        other = guarantee(parts.replace(world=world), settings)
         assert other.claimed and not other.promised and "while no input" in other.sentence()
 
 
 @pytest.mark.slow
 def test_starts_at_the_edge_of_the_certificate_are_flown_within_it():
     parts, settings = gentle("simulation.horizon=6")
-    load = promise(parts, settings).tube.motor_load
+    load = guarantee(parts, settings).tube.motor_load
     draw, found = np.random.default_rng(0), []
     start = prepare(parts, settings).problem.states
     for kind in ("tilt", "sideways", "upward", "rate", "rest"):

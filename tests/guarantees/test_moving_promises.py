@@ -14,7 +14,7 @@ from echelon.core.statement import Hypothesis
 from echelon.experiments.scenario.build import Experiment
 from echelon.experiments.studies.check import check
 from echelon.experiments.studies.recomputation import compare_claims
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.stopping.moving_offsets import offset_sizes
 from echelon.guarantees.verifier.verify import verify
 
@@ -63,7 +63,7 @@ def test_bounds_of_offsets_hold_at_all_times_and_are_not_far_above():
 
 
 def test_a_motion_is_guaranteed_with_what_it_asks_of_the_chart():
-    still, moving = (promise(parts(x), SETTINGS) for x in ([], CHANGES))
+    still, moving = (guarantee(parts(x), SETTINGS) for x in ([], CHANGES))
     assert moving.claimed and moving.rate == still.rate
     assert "offsets may change as they do" in moving.sentence()
     assert "offsets" in moving.anywhere() and "offsets" not in still.anywhere()
@@ -78,7 +78,7 @@ def test_agents_stay_within_the_tube_of_a_moving_formation():
     gentle = ech.laws.StoppingPoint(roots=roots, speed=(0.7, 0.7, 0.5, 1.0))
     drive = ech.Laws(ech.laws.StoppingLeader(reference=CENTRE, roots=roots), gentle)
     one = parts([Rotate(0.3), Scale(0.2, 0.4)], position=0.5, attitude=0.1).replace(drive=drive)
-    value, still = promise(one, SETTINGS), promise(parts([]).replace(drive=drive), SETTINGS)
+    value, still = guarantee(one, SETTINGS), guarantee(parts([]).replace(drive=drive), SETTINGS)
     load = value.tube.motor_load
     assert load is not None and load.alone is None and still.tube.motor_load.alone is not None
     result = ech.simulate(one, SETTINGS)
@@ -90,10 +90,10 @@ def test_agents_stay_within_the_tube_of_a_moving_formation():
 
 
 def test_no_bound_of_a_user_s_motion_leaves_agents_with_borders_unguaranteed():
-    value = promise(parts([Wave()]), SETTINGS)
+    value = guarantee(parts([Wave()]), SETTINGS)
     assert not value.promised
     assert "no bound of the motion `Wave` is known" in value.sentence()
-    carts = promise(parts([Wave()], ech.models.DoubleIntegrator(3)), SETTINGS)
+    carts = guarantee(parts([Wave()], ech.models.DoubleIntegrator(3)), SETTINGS)
     assert carts.promised
 
 
@@ -102,15 +102,15 @@ def test_a_law_of_states_is_not_guaranteed():
     gain = ech.synthesize(model, GRAPH, ech.gains.Riccati())
     drive = ech.Laws(ech.laws.Tracking(CENTRE), ech.laws.Consensus(gain))
     still, moving = (parts(x, model).replace(drive=drive) for x in ([], [Rotate(0.5)]))
-    assert promise(still, SETTINGS).promised
-    value = promise(moving, SETTINGS)
+    assert guarantee(still, SETTINGS).promised
+    value = guarantee(moving, SETTINGS)
     assert not value.promised and value.hypotheses[Hypothesis.SYMMETRY].fails
     assert "offsets change with time" in value.sentence()
 
 
 def test_safety_keeps_the_tube_of_the_speed_and_promises_no_convergence():
     apart = ech.laws.StoppingPoint(safety=ech.Safety(radii=(0.1, 0.1, 0.3)))
-    still, moving = (promise(parts(x, follower=apart), SETTINGS) for x in ([], [Rotate(0.5)]))
+    still, moving = (guarantee(parts(x, follower=apart), SETTINGS) for x in ([], [Rotate(0.5)]))
     assert moving.tube.left == still.tube.left and moving.rate is None
     assert "not guaranteed while offsets change" in moving.sentence()
     assert "decay at" not in moving.sentence()
@@ -126,7 +126,7 @@ FORGERIES = {
 
 
 def test_claims_of_offsets_are_checked_by_code_of_its_own(tmp_path):
-    document = json.loads(json.dumps({"promise": promise(parts(CHANGES), SETTINGS).as_mapping()}))
+    document = json.loads(json.dumps({"promise": guarantee(parts(CHANGES), SETTINGS).as_mapping()}))
     file = tmp_path / "summary.json"
     file.write_text(json.dumps(document))
     assert verify(file).verdict == "incomplete", verify(file).sentence

@@ -52,7 +52,7 @@ class Told(OffsetMotion):
 def guaranteed(*changes, horizon=20.0):
     formation = ech.Formation.from_offsets(CART, GRAPH, {1: (1.0, 0.0), 2: (2.0, 1.0)})
     parts = ech.Parts(CART, GRAPH, formation.moving(CART, GRAPH, changes), LAWS)
-    return parts, ech.promise(parts, ech.Settings(horizon=horizon, dt=0.01))
+    return parts, ech.guarantee(parts, ech.Settings(horizon=horizon, dt=0.01))
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_what_a_motion_reads_is_asked_again(monkeypatch):
     parts, value = guaranteed(Told())
     assert value.promised
     monkeypatch.setattr(sys.modules[__name__], "_JUMPS", True)
-    assert not ech.promise(parts, ech.Settings(horizon=20.0, dt=0.01)).promised
+    assert not ech.guarantee(parts, ech.Settings(horizon=20.0, dt=0.01)).promised
 
 
 def test_a_smooth_motion_between_reshapes_is_guaranteed():

@@ -12,7 +12,7 @@ from echelon.agents.models.chains import chains_of
 from echelon.core.enclosure.taylor import enclose_derivatives
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.stopping.path_bounds import path_fault, pieces_of
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 
@@ -180,7 +180,7 @@ def test_behind_a_rough_path_nothing_is_guaranteed(name):
     drive = ech.Laws(StoppingLeader(reference=along((ROUGH | SMOOTH)[name])), StoppingPoint())
     graph = ech.Graph([(0, 1), (1, 2)])
     parts = ech.Parts(MODEL, graph, ech.Formation(np.zeros((3, 4))), drive, initial={"x": 1.0})
-    found = promise(parts, ech.Settings(horizon=10.0, dt=0.01))
+    found = guarantee(parts, ech.Settings(horizon=10.0, dt=0.01))
     assert found.promised == (name == "sine")
     if not found.promised:
         assert "`Along` is not known to have 2 bounded derivatives" in found.sentence()

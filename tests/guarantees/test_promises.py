@@ -23,7 +23,7 @@ from echelon.guarantees.promises.case import Case
 from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import agent_lines
 from echelon.guarantees.promises.leaders import leaders_of
-from echelon.guarantees.promises.promise import REQUIRED, Promise, promises
+from echelon.guarantees.promises.promise import REQUIRED, Guarantee, promises
 from echelon.laws.law import TrimInput
 
 # ---- all tellers say the same ----
@@ -62,7 +62,7 @@ def core(told):
 def tellers(scenario, built, method):
     """What everyone tells of a scenario, by who tells it, each as JSON."""
     result = ech.simulate(*built)
-    assert ech.promise(*built).sentence() in " ".join(ech.report(result).split())
+    assert ech.guarantee(*built).sentence() in " ".join(ech.report(result).split())
     (design,) = ech.design(scenario, method).designs
     (row,) = ech.compare(scenario, built, ("own",)).rows
     return {
@@ -84,7 +84,7 @@ def agree(name, method, feedforward, folder):
             with pytest.raises(ech.EchelonError, match=f"^{re.escape(str(refused))}$"):
                 act(scenario)
         return
-    promise, gain = ech.promise(*built), built.parts.drive.gain
+    promise, gain = ech.guarantee(*built), built.parts.drive.gain
     told = tellers(scenario, built, method)
     wanted = core(json.loads(json.dumps(promise.as_mapping())))
     assert {who: core(each) for who, each in told.items()} == dict.fromkeys(told, wanted)
@@ -165,7 +165,7 @@ def test_a_gain_of_another_graph_or_coupling_is_promised_what_it_does():
     model, path = ech.models.DoubleIntegrator(1), ech.Graph.path(12)
     gain = ech.synthesize(model, ech.Graph.complete(6), ech.gains.Riccati(coupling=0.3))
     parts = parts_of(model, path, gain)
-    found, slowest = ech.promise(parts, settings()), true_slowest(model, path, gain)
+    found, slowest = ech.guarantee(parts, settings()), true_slowest(model, path, gain)
     assert gain.certificate.abscissa < 1.1 * slowest < 0.0
     assert found.loop.slowest == pytest.approx(slowest, rel=1e-6)
     low = path.spectrum().low
@@ -179,7 +179,7 @@ def test_a_gain_of_another_graph_or_coupling_is_promised_what_it_does():
     model = ech.models.Linear(A=[[0.0, 1.0], [1.0, 0.0]], B=[[0.0], [1.0]])
     gain = ech.synthesize(model, PATH, ech.gains.Riccati())
     weak = ech.Gain(gain.P, gain.R, 0.2, gain.method, gain.certificate)
-    found = ech.promise(parts_of(model, PATH, weak), settings())
+    found = ech.guarantee(parts_of(model, PATH, weak), settings())
     slowest = true_slowest(model, PATH, weak)
     assert gain.certificate.stable and slowest > 0.0 and not found.promised
     assert found.loop.slowest == pytest.approx(slowest, rel=1e-9)
@@ -193,7 +193,7 @@ def test_one_step_of_the_integrator_that_runs_decides():
     parts = parts_of(model, ech.Graph.ring(5), gain, initial={"x1": 1.0})
     for integrator, holds in (("rk4", True), ("euler", False), ("printed", False)):
         run = settings(integrator=integrator, dt=0.05, horizon=10.0)
-        found, result = ech.promise(parts, run), ech.simulate(parts, run)
+        found, result = ech.guarantee(parts, run), ech.simulate(parts, run)
         assert found.promised is holds
         with np.errstate(over="ignore"):
             sizes = np.linalg.norm(result.errors, axis=(1, 2))
@@ -207,9 +207,9 @@ def test_one_step_of_the_integrator_that_runs_decides():
     pair = ech.Graph.path(2)
     gain = ech.synthesize(model, pair, ech.gains.FixedGain("identity", coupling=0.2))
     parts = parts_of(model, pair, gain)
-    assert ech.promise(parts, printed).promised
+    assert ech.guarantee(parts, printed).promised
     away = parts.replace(formation=ech.Formation([[0.0], [1.0]]))
-    step = ech.promise(away, printed).hypotheses[Hypothesis.SAMPLING]
+    step = ech.guarantee(away, printed).hypotheses[Hypothesis.SAMPLING]
     assert step.fails and "ignores the goals" in step.text
 
 
@@ -220,24 +220,24 @@ def test_vehicles_that_cannot_hold_their_trim_are_promised_nothing(change):
     short = ["simulation.horizon=0.01", "report.steady_window=0.005"]
     scenario = ech.load_scenario("planar-quadrotor", [change, *short])
     built = ech.build(scenario)
-    found, designs = ech.promise(*built), ech.design(scenario, "riccati")
+    found, designs = ech.guarantee(*built), ech.design(scenario, "riccati")
     told = "the actuators deliver `thrust` 0.2 of 0.2747 N, and cannot hold the trim"
     report = " ".join(ech.report(ech.simulate(*built)).split())
     assert not found.promised and not designs.recommended.promise.promised
     assert told in found.sentence() and told in designs.because and told in report
     assert found.hypotheses[Hypothesis.TRIM_WITHIN_LIMITS].number == pytest.approx(0.728, abs=1e-3)
-    assert ech.promise(built.parts, built.settings._replace(limits=False)).promised
+    assert ech.guarantee(built.parts, built.settings._replace(limits=False)).promised
 
 
 def test_leaders_that_disagree_leave_no_proof_and_containment_is_said():
     model, graph = ech.models.DoubleIntegrator(1), ech.Graph.path(4, leaders=(0, 3))
     gain = ech.synthesize(model, graph, ech.gains.Contraction({}, rate=0.5))
     states = np.zeros((4, 2))
-    found = ech.promise(parts_of(model, graph, gain, initial=states), settings())
+    found = ech.guarantee(parts_of(model, graph, gain, initial=states), settings())
     assert (found.theorem, found.kind) == (Theorem.T1, Kind.PROOF)
     assert found.hypotheses[Hypothesis.LEADERS_AGREE].verdict is Verdict.HOLDS
     apart = parts_of(model, graph, gain, initial=states + [[0, 0], [0, 0], [0, 0], [1, 0]])
-    found = ech.promise(apart, settings(horizon=20.0))
+    found = ech.guarantee(apart, settings(horizon=20.0))
     assert not found.promised and found.theorem is None and found.region is None
     line = found.hypotheses[Hypothesis.LEADERS_AGREE]
     assert line.fails and line.number == pytest.approx(1.0)
@@ -250,14 +250,14 @@ def test_leaders_that_disagree_leave_no_proof_and_containment_is_said():
 def test_leaders_that_come_together_leave_the_linearization_and_free_ones_drift_apart():
     built = ech.build(ech.load_scenario("planar-quadrotor", ["graph.leaders=[0, 3]"]))
     states = {0: (0.0, 1.5, 0.0, 0.0, 0.0, 0.0)}
-    found = ech.promise(built.parts.replace(initial=states, start_error={}), built.settings)
+    found = ech.guarantee(built.parts.replace(initial=states, start_error={}), built.settings)
     assert found.promised and found.theorem is None
     assert "brings them together" in found.hypotheses[Hypothesis.LEADERS_AGREE].text
     # Those of a limit cycle.
     changes = ["graph={name: ring, agents: 12, leaders: [0, 6]}", "leader.start_error={}",
                "initial={states: {0: [2.0, 0.0], 6: [-1.0, 0.5]}}"]  # fmt: skip
     built = ech.build(ech.load_scenario("van-der-pol", changes))
-    found, result = ech.promise(*built), ech.simulate(*built)
+    found, result = ech.guarantee(*built), ech.simulate(*built)
     line = found.hypotheses[Hypothesis.LEADERS_AGREE]
     away = np.linalg.norm(result.states[:, 6] - result.states[:, 0], axis=1)
     assert not found.promised and line.number == pytest.approx(away.max(), rel=1e-2)
@@ -273,7 +273,7 @@ def test_what_decays_unseen_is_no_cause():
     for P, holds in ((felt, True), ("identity", False)):
         gain = ech.synthesize(model, PATH, ech.gains.FixedGain(P))
         parts = parts_of(model, PATH, gain, initial={"position": 1.0})
-        found = ech.promise(parts, settings())
+        found = ech.guarantee(parts, settings())
         line = found.hypotheses[Hypothesis.DETECTABLE]
         assert line.number == 2 and line.fails is not holds and found.promised is holds
         assert ("no input feels 2 of 4 directions" in line.text) is not holds
@@ -294,14 +294,14 @@ def test_only_a_law_that_keeps_the_theorem_is_promised_it():
     for feedforward in map(str, Feedforward):
         proved = kept.get(feedforward, (False, False))
         for leader, proves in zip((None, circle), proved, strict=True):
-            found = ech.promise(parts_of(model, PATH, gain, feedforward, leader), settings())
+            found = ech.guarantee(parts_of(model, PATH, gain, feedforward, leader), settings())
             assert found.promised and found.theorem == (Theorem.T1 if proves else None)
     # What `none` is not promised, it does not keep: errors grow from nothing behind a circle.
     parts = parts_of(model, PATH, gain, "none", circle)
     errors = ech.simulate(parts, settings(horizon=10.0)).errors
     assert np.abs(errors[0]).max() == 0.0 and np.abs(errors[-1]).max() > 0.1
     rests = "once the leader's input rests at its trim"
-    assert rests in ech.promise(parts, settings()).sentence()
+    assert rests in ech.guarantee(parts, settings()).sentence()
 
 
 def test_a_parent_that_is_the_leader_relays():
@@ -309,7 +309,7 @@ def test_a_parent_that_is_the_leader_relays():
     for graph, kept in ((ech.Graph.star(4), True), (PATH, False)):
         gain = ech.synthesize(model, graph, ech.gains.Contraction({}, rate=0.3))
         relayed, passed_on = (
-            ech.promise(parts_of(model, graph, gain, feedforward), settings()).region
+            ech.guarantee(parts_of(model, graph, gain, feedforward), settings()).region
             for feedforward in ("relay", "parent")
         )
         assert relayed is not None and (passed_on is not None) == kept
@@ -324,12 +324,12 @@ def test_the_relayed_velocity_has_no_local_theorem_where_g_varies():
     for leader, velocity in ((moving, None), (None, Theorem.T2)):
         for feedforward, theorem in (("relay", Theorem.T2), ("relay-velocity", velocity)):
             parts = parts_of(model, PATH, gain, feedforward, leader)
-            assert ech.promise(parts, settings(dt=0.002)).theorem is theorem
+            assert ech.guarantee(parts, settings(dt=0.002)).theorem is theorem
 
 
 def test_agents_that_are_all_alike_agree_at_the_rate_of_the_whole_graph():
     built = ech.build(ech.load_scenario("integrators", ["simulation.horizon=30"]))
-    found, L = ech.promise(*built), built.parts.graph.laplacian().toarray()
+    found, L = ech.guarantee(*built), built.parts.graph.laplacian().toarray()
     assert found.rate == pytest.approx(np.linalg.eigvalsh(L)[1])
     errors = np.linalg.norm(ech.simulate(*built).errors, axis=(1, 2))
     seen = -np.log(errors[-1] / errors[-200]) / (199 * 0.1)
@@ -369,7 +369,7 @@ def test_the_report_says_whether_the_proof_covers_the_run(swinging, factor, worl
     parts = swinging(factor).replace(world=world)
     report = " ".join(ech.report(ech.simulate(parts, settings())).split())
     assert told in report
-    starts = ech.promise(parts, settings()).hypotheses[Hypothesis.STARTS]
+    starts = ech.guarantee(parts, settings()).hypotheses[Hypothesis.STARTS]
     assert starts.fails is (factor > 1.0)
     assert "guaranteed for linear agents" not in report
 
@@ -382,7 +382,7 @@ def test_a_run_that_will_grow_says_what_would_not(echelon):
     code, _, err = echelon("run", "planar-quadrotor", *quick, "--out", "o")
     assert code == 0 and err.startswith("echelon: Nothing is guaranteed: with the input held over")
     [shorter] = re.findall("There is a guarantee with `--set (simulation.dt=[^`]*)`", err)
-    assert ech.promise(*ech.build(ech.load_scenario("planar-quadrotor", [shorter]))).promised
+    assert ech.guarantee(*ech.build(ech.load_scenario("planar-quadrotor", [shorter]))).promised
     assert echelon("run", "planar-quadrotor", *quick, "--out", "p", "--json")[2] == ""
 
 
@@ -392,7 +392,7 @@ def test_the_data_of_a_run_hold_the_whole_promise():
     parts = parts_of(model, PATH, gain)
     result = ech.simulate(parts, settings(horizon=0.1))
     told, data = ech.summary(result)["promise"], ech.dataset(result)
-    assert told == ech.promise(parts, settings(horizon=0.1)).as_mapping()
+    assert told == ech.guarantee(parts, settings(horizon=0.1)).as_mapping()
     # These lines are there only for laws that turn, graphs that switch, motors, networks, ...
     apart = {Hypothesis.HEADING_FRAME, Hypothesis.SWITCHING, Hypothesis.LIMITS}
     apart |= {Hypothesis.MESSAGES, Hypothesis.OWN_STATE, Hypothesis.SEPARATION, Hypothesis.EVENTS}
@@ -408,10 +408,10 @@ def test_the_data_of_a_run_hold_the_whole_promise():
 def test_a_promise_is_computed_once_for_as_long_as_its_parts_live():
     model = ech.models.Pendulum()
     parts = parts_of(model, PATH, ech.synthesize(model, PATH, ech.gains.Riccati()))
-    first = ech.promise(parts, settings())
-    assert ech.promise(parts, settings()) is first
-    assert ech.promise(ech.simulate(parts, settings()).parts, settings()) is first
-    assert ech.promise(parts, settings(dt=0.02)) is not first
+    first = ech.guarantee(parts, settings())
+    assert ech.guarantee(parts, settings()) is first
+    assert ech.guarantee(ech.simulate(parts, settings()).parts, settings()) is first
+    assert ech.guarantee(parts, settings(dt=0.02)) is not first
 
 
 CARTS = ech.models.DoubleIntegrator()
@@ -455,7 +455,7 @@ def test_a_guarantee_is_stored_for_its_parts_and_settings_alone(monkeypatch):
 def test_plans_are_promised_nothing():
     model, goals = ech.models.DoubleIntegrator(2), ech.Formation(np.zeros((4, 4)))
     parts = ech.Parts(model, PATH, goals, ech.optimal.Plans(ech.references.Circle()))
-    assert ech.promise(parts, settings()).sentence() == (
+    assert ech.guarantee(parts, settings()).sentence() == (
         "Nothing is guaranteed: no theorem covers `Plans`. What would help: use laws that a "
         "theorem covers."
     )
@@ -485,9 +485,9 @@ def test_a_trim_needs_room_on_both_sides_of_its_input(low, high, promised):
     model = of_one_state(lambda x: -x)
     type(model).input_limits = ech.models.Limits(((1.0,),), (low,), (high,))
     parts = parts_of(model, PATH, identity_gain(model))
-    promise = ech.promise(parts, settings())
+    promise = ech.guarantee(parts, settings())
     assert promise.promised == promised != ("actuators" in promise.sentence())
-    assert ech.promise(parts, settings(limits=False)).promised
+    assert ech.guarantee(parts, settings(limits=False)).promised
 
 
 def identity_gain(model, graph=PATH):
@@ -496,18 +496,18 @@ def identity_gain(model, graph=PATH):
 
 def test_slopes_of_both_sides_that_contract_are_promised_without_a_linearization():
     grows = of_one_state(lambda x: -x + 3.0 * jnp.abs(x))
-    promise = ech.promise(parts_of(grows, PATH, identity_gain(grows)), settings())
+    promise = ech.guarantee(parts_of(grows, PATH, identity_gain(grows)), settings())
     assert not promise.promised
     assert "the rate of `x` bends or jumps with `x` at the trim" in promise.sentence()
     model = of_one_state(lambda x: -2.0 * x + jnp.maximum(x, 0.0))
-    promise = ech.promise(parts_of(model, PATH, identity_gain(model)), settings())
+    promise = ech.guarantee(parts_of(model, PATH, identity_gain(model)), settings())
     assert promise.promised and (promise.kind, promise.theorem) == (Kind.VERTICES, Theorem.T1)
     # The slower side, -1, and c times the smallest eigenvalue of the graph.
     assert promise.rate == pytest.approx(1.0 + 0.5 * PATH.spectrum().low, rel=1e-6)
     assert promise.domain == "x in [-0.001, 0.001]"
     # A hull of both sides is promised across the bend.
     gain = ech.synthesize(model, PATH, ech.gains.Contraction({"x": 2.0}, coupling=1.0))
-    promise = ech.promise(parts_of(model, PATH, gain), settings())
+    promise = ech.guarantee(parts_of(model, PATH, gain), settings())
     assert promise.promised and promise.kind is Kind.PROOF and promise.rate >= 0.99
 
 
@@ -515,7 +515,7 @@ def test_an_inner_loop_closes_around_the_slopes_of_both_sides():
     model = of_one_state(dragging, "xv")
     gain = ech.synthesize(model, PATH, ech.gains.InnerLoop())
     assert gain.inner is not None
-    promise = ech.promise(parts_of(model, PATH, gain), settings())
+    promise = ech.guarantee(parts_of(model, PATH, gain), settings())
     assert promise.promised and (promise.kind, promise.theorem) == (Kind.VERTICES, Theorem.T1)
     modes = np.linalg.eigvalsh(PATH.grounded_laplacian().toarray())
     assert 0.0 < promise.rate <= slowest_of_sides(gain, modes) + 1e-9
@@ -545,7 +545,7 @@ class Bent(ech.ControlAffine):
 @pytest.mark.parametrize("feedforward", ["none", "relay", "relay-velocity"])
 def test_a_leader_at_its_trim_has_no_velocity_that_a_bend_of_g_could_turn(feedforward):
     parts = parts_of(Bent(), PATH, identity_gain(Bent()), feedforward)
-    promise = ech.promise(parts, settings())
+    promise = ech.guarantee(parts, settings())
     assert promise.promised and (promise.kind, promise.theorem) == (Kind.VERTICES, Theorem.T2)
     # g is 1 at the trim, and 1.0003 at the edge of what was looked at.
     assert promise.rate == pytest.approx(1.0 + 0.5 * PATH.spectrum().low, rel=1e-3)
@@ -567,7 +567,7 @@ def test_offsets_are_proved_on_the_domain_or_said_to_be_tried(drift, domain, pro
     model = of_one_state(drift, "xv")
     gain = ech.synthesize(model, PATH, ech.gains.RobustLQR(domain, exact=True))
     apart = ech.Formation(np.arange(4.0)[:, None] * [1.0, 0.0])
-    promise = ech.promise(parts_of(model, PATH, gain).replace(formation=apart), settings())
+    promise = ech.guarantee(parts_of(model, PATH, gain).replace(formation=apart), settings())
     line = promise.hypotheses[Hypothesis.SYMMETRY]
     assert line.verdict is (Verdict.HOLDS if proved else Verdict.FAILS)
     assert line.kind is (Kind.PROOF if proved else Kind.SAMPLES)
@@ -588,7 +588,7 @@ def test_no_mode_and_no_edge_is_told_of_a_model_that_bends_at_its_trim(method):
     model = of_one_state(dragging, "xv")
     gain = ech.synthesize(model, PATH, method)
     parts = parts_of(model, PATH, gain, initial={"x": 0.1})
-    promise, run = ech.promise(parts, settings()), settings(horizon=0.1)
+    promise, run = ech.guarantee(parts, settings()), settings(horizon=0.1)
     assert promise.promised and promise.theorem is Theorem.T1
     assert promise.sentence().startswith("Guaranteed on a domain only")
     told = promise.as_mapping()
@@ -612,7 +612,7 @@ def test_a_step_too_long_for_one_side_of_a_bend_is_not_promised():
     model = of_one_state(lambda x: -x - 300.0 * jnp.maximum(x - 0.0, 0.0) ** 1)
     parts = parts_of(model, PATH, ech.synthesize(model, PATH, ech.gains.FixedGain("identity")))
     for dt, holds in ((0.005, True), (0.05, False)):
-        promise = ech.promise(parts, settings(dt=dt))
+        promise = ech.guarantee(parts, settings(dt=dt))
         assert promise.promised is holds
         assert promise.hypotheses[Hypothesis.SAMPLING].fails is not holds
 
@@ -622,7 +622,7 @@ def test_a_step_too_long_for_one_side_of_a_bend_is_not_promised():
 
 @final
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class RestPromise(Promise):
+class RestPromise(Guarantee):
     """What is guaranteed of followers that rest: nothing grows."""
 
     ground = None
@@ -656,7 +656,7 @@ def test_a_law_names_what_proves_its_guarantee():
     model = ech.models.SingleIntegrator(2)
     goals = ech.Formation(np.zeros((4, 2)))
     parts = ech.Parts(model, PATH, goals, ech.Laws(TrimInput(), Rest()))
-    found = ech.promise(parts, settings())
+    found = ech.guarantee(parts, settings())
     assert type(found) is RestPromise and found.decays
     assert found.as_mapping()["sentence"] == "Followers rest where they start."
     assert ech.check(parts, settings()).promise is found
@@ -665,7 +665,7 @@ def test_a_law_names_what_proves_its_guarantee():
     seeds = [settings()._replace(seed=k) for k in range(2)]
     assert [type(each) for each in promises(parts, seeds)] == [RestPromise, RestPromise]
     other = parts.replace(drive=ech.Laws(TrimInput(), TrimInput()))
-    assert not ech.promise(other, settings()).promised
+    assert not ech.guarantee(other, settings()).promised
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.001])
@@ -678,7 +678,7 @@ def test_no_remedy_asks_for_a_step_of_zero_or_less(dt):
         "events": [{"at": 5.0, "cut": [0, 1]}],
         "simulation": {"horizon": 15.0, "dt": dt},
     }
-    promise = ech.promise(*ech.build(ech.scenario_from_mapping(given)))
+    promise = ech.guarantee(*ech.build(ech.scenario_from_mapping(given)))
     for line in promise.hypotheses.values():
         for number in re.findall(r"(?:below|than|to) (-?[\d.e+-]*\d|inf|nan)", line.remedy):
             assert 0.0 < float(number) < np.inf, line.remedy
@@ -699,6 +699,6 @@ def test_a_difference_that_is_not_x_minus_y_leaves_nothing_guaranteed():
     parts = parts_of(model, PATH, gain, initial={"position": 0.1})
     result = ech.simulate(parts, settings())
     assert np.abs(result.errors[-1]).max() > 10.0 * np.abs(result.errors[0]).max()
-    found = ech.promise(parts, settings())
+    found = ech.guarantee(parts, settings())
     assert not found.promised and found.slowest is None
     assert "is not x - y" in found.sentence()

@@ -9,7 +9,7 @@ import pytest
 import echelon as ech
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.stopping import separation
 from echelon.guarantees.stopping.stopping_run import FlatStates
 from echelon.guarantees.verifier.verify import verify
@@ -25,7 +25,7 @@ def guaranteed(safety=ech.Safety(radii=(0.1, 0.1, 0.3)), settings=SETTINGS, **wo
     drive = ech.Laws(ech.laws.StoppingLeader(), ech.laws.StoppingPoint(safety=safety))
     formation = ech.Formation.from_offsets(MODEL, graph, offsets)
     parts = ech.Parts(MODEL, graph, formation, drive, initial=starts, world=ech.World(**world))
-    return parts, promise(parts, settings)
+    return parts, guarantee(parts, settings)
 
 
 def test_a_position_that_was_seen_at_samples_alone_is_not_called_proved(monkeypatch):
@@ -33,7 +33,7 @@ def test_a_position_that_was_seen_at_samples_alone_is_not_called_proved(monkeypa
     assert value.separation.kind is value.tube.kind is Kind.PROOF
     # As of outputs whose equations no trace follows.
     monkeypatch.setattr(separation, "flat_states_of", lambda *_: FlatStates((), ()))
-    seen = promise(parts, SETTINGS._replace(horizon=2.0))
+    seen = guarantee(parts, SETTINGS._replace(horizon=2.0))
     assert seen.separation.kind is Kind.SAMPLES and seen.sentence().startswith("Seen at samples")
 
 
@@ -77,7 +77,7 @@ def test_numbers_in_a_sentence_state_no_more_than_is_guaranteed():
     assert "radii of 0.1234 x 0.1234 m" in value.sentence()
     slow = ech.laws.StoppingPoint(rate=0.12, coupling=0.12, speed=100.0)
     drive = ech.Laws(ech.laws.StoppingLeader(rate=0.12), slow)
-    value = promise(guaranteed()[0].replace(drive=drive), SETTINGS)
+    value = guarantee(guaranteed()[0].replace(drive=drive), SETTINGS)
     shown = float(value.sentence().split("within 1 cm after ")[1].split(" s")[0])
     assert 10.0 < value.tube.arrival <= shown <= value.tube.arrival + 1.0
 
@@ -89,9 +89,9 @@ def test_metres_are_of_positions_in_metres():
     parts, value = guaranteed(None)
     assert value.tube.arrival is not None
     far = parts.replace(model=Far())
-    assert promise(far, SETTINGS).promised and promise(far, SETTINGS).tube.arrival is None
+    assert guarantee(far, SETTINGS).promised and guarantee(far, SETTINGS).tube.arrival is None
     with pytest.raises(ech.EchelonError, match="needs the position in m"):
-        promise(guaranteed()[0].replace(model=Far()), SETTINGS)
+        guarantee(guaranteed()[0].replace(model=Far()), SETTINGS)
 
 
 FORGERIES = {

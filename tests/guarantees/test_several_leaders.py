@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.laws import Consensus, TrimInput
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 
@@ -42,7 +42,7 @@ def shrinking(parts, begin, end):
     sizes = np.linalg.norm(result.errors.reshape(len(result.times), -1), axis=1)
     first, last = np.searchsorted(result.times, [begin, end])
     measured = np.log(sizes[first] / sizes[last]) / (result.times[last] - result.times[first])
-    return measured, promise(parts, settings)
+    return measured, guarantee(parts, settings)
 
 
 @pytest.mark.parametrize("coupling", [0.05, 0.3])
@@ -52,7 +52,7 @@ def test_leaders_apart_come_together_no_faster_than_their_own_coupling(coupling)
     assert found.slowest == -found.rate and found.tube.arrival is None
     assert f"decay at {coupling} 1/s or faster" in found.sentence()
     # Leaders that start alike leave the rate to their followers.
-    alike = promise(formation(0.0, coupling), ech.Settings(horizon=2.0, dt=0.02))
+    alike = guarantee(formation(0.0, coupling), ech.Settings(horizon=2.0, dt=0.02))
     assert alike.rate == pytest.approx(4.0) and alike.tube.arrival is not None
 
 

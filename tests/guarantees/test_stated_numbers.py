@@ -151,7 +151,7 @@ def robust():
     gain = ech.synthesize(model, graph, ech.gains.RobustLQR({"angle": 0.5}))
     laws = ech.Laws(TrimInput(), ech.laws.Consensus(gain))
     parts = ech.Parts(model, graph, ech.Formation(np.zeros((4, 2))), laws)
-    found = ech.promise(parts, ech.Settings(horizon=2.0, dt=0.01))
+    found = ech.guarantee(parts, ech.Settings(horizon=2.0, dt=0.01))
     assert found.theorem is Theorem.T1
     return found
 
@@ -209,7 +209,7 @@ def test_a_guarantee_in_single_precision_says_that_it_ignores_its_rounding():
     said = "The guarantee ignores that numbers have single precision."
     for precision, left_out in (("float64", False), ("float32", True)):
         chosen = ech.Settings(horizon=6.0, dt=0.01, precision=precision)
-        found, result = ech.promise(parts, chosen), ech.simulate(parts, chosen)
+        found, result = ech.guarantee(parts, chosen), ech.simulate(parts, chosen)
         assert found.promised and (said in found.sentence()) is left_out
         late = result.times >= found.tube.arrival
         assert (result.formation_errors[late].max() > 0.02) == left_out

@@ -12,13 +12,13 @@ import scipy.integrate
 import scipy.linalg
 
 import echelon as ech
-from echelon.agents.models.chains import Chains, chains_of, differentiate, flatten, look_for_chains
+from echelon.agents.models.chains import Chains, chains_of, differentiate, look_for_chains, to_flat
 from echelon.core.digits import at_least
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem, Verdict
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.stopping.borders import Push, clearance_of
 from echelon.guarantees.stopping.chain_response import Chain, largest_between, spread_between, value
 from echelon.guarantees.stopping.stopping_run import stopping_run_of
@@ -220,8 +220,8 @@ def test_a_quadrotors_flat_coordinates_are_its_derivatives_along_its_motion():
     # By finite differences of the motion itself, which share nothing with the formulas.
     draw, chains = np.random.default_rng(1), chains_of(QUADROTOR)
     with precision("float64"):
-        one = jax.jit(lambda x, e: flatten(QUADROTOR, chains, x, e).values)
-        invert = jax.jit(lambda x, e, tops: flatten(QUADROTOR, chains, x, e).invert(tops))
+        one = jax.jit(lambda x, e: to_flat(QUADROTOR, chains, x, e).values)
+        invert = jax.jit(lambda x, e, tops: to_flat(QUADROTOR, chains, x, e).invert(tops))
         move = jax.jit(lambda x, u: QUADROTOR.velocity(x, u))
         for _ in range(5):
             x, e = draw.uniform(-0.7, 0.7, 12), draw.uniform(-2.0, 2.0, 2)
@@ -254,7 +254,7 @@ def test_flat_coordinates_are_those_of_automatic_differentiation(name):
         for _ in range(3):
             sizes = (0.7, len(model.state_names)), (2.0, 2), (5.0, len(chains.degrees))
             x, e, tops = (jnp.asarray(draw.uniform(-most, most, n)) for most, n in sizes)
-            ours, theirs = (f(model, chains, x, e) for f in (flatten, differentiate))
+            ours, theirs = (f(model, chains, x, e) for f in (to_flat, differentiate))
             np.testing.assert_allclose(ours.values, theirs.values, atol=1e-12)
             np.testing.assert_allclose(ours.invert(tops), theirs.invert(tops), atol=1e-10)
 
@@ -352,7 +352,7 @@ def test_native_steps_are_those_of_jax(graph, law):
 
 
 def promised(parts, **settings):
-    return promise(parts, ech.Settings(**{"horizon": 10.0, "dt": 0.01, **settings}))
+    return guarantee(parts, ech.Settings(**{"horizon": 10.0, "dt": 0.01, **settings}))
 
 
 def outside(result):
@@ -458,7 +458,7 @@ def test_graphs_that_take_turns_are_there_in_time_or_are_told_none(told):
 
 
 def test_a_vehicle_is_promised_as_far_as_its_thrust_reaches(tmp_path):
-    found = promise(*ech.build(override()))
+    found = guarantee(*ech.build(override()))
     assert found.claimed and found.kind is Kind.PROOF and found.theorem is Theorem.T5
     assert found.tube.left == pytest.approx(3.770, abs=1e-3)
     assert found.tube.steepest == pytest.approx(5.6, abs=0.05)
@@ -508,7 +508,7 @@ UNHELD = {
 @pytest.mark.parametrize("change", UNHELD)
 def test_what_the_tube_does_not_hold_is_told_with_what_would(change):
     line, text = UNHELD[change]
-    found = promise(*ech.build(override(change)))
+    found = guarantee(*ech.build(override(change)))
     assert not found.promised and found.theorem is None
     assert found.hypotheses[line].verdict is Verdict.FAILS
     assert text in found.sentence()
@@ -529,7 +529,7 @@ def drifting(model, plant, reference, speed):
     goals, world = ech.Formation(np.zeros((2, len(model.state_names)))), ech.World(plant=plant)
     parts = ech.Parts(model, ech.Graph([(0, 1)]), goals, drive, initial=None, world=world)
     settings = ech.Settings(horizon=40.0, dt=0.01, limits=False)
-    result, found = ech.simulate(parts, settings), promise(parts, settings)
+    result, found = ech.simulate(parts, settings), guarantee(parts, settings)
     place = list(model.position_indices())
     off = np.linalg.norm((result.states[:, 0] - result.reference)[:, place], axis=1)
     middle = len(off) // 2
@@ -688,7 +688,7 @@ def least_lift(loop, starts, steps):
         def on(_, done):
             now, least = done
             x, e = now.states[loop.followers], now.follower_memory.chain
-            lift = jax.vmap(lambda x, e: flatten(QUADROTOR, chains, x, e).values[2, 2])(x, e)
+            lift = jax.vmap(lambda x, e: to_flat(QUADROTOR, chains, x, e).values[2, 2])(x, e)
             return step(loop, now), jnp.minimum(least, lift)
 
         start = begin(loop, x), jnp.full(len(loop.followers), jnp.inf)

@@ -22,16 +22,16 @@ def test_held_steps_fall_on_all_graphs_in_any_order(seed):
     A, B = agent(rng)
     model = ech.models.Linear(A, B)
 
-    def promise(dt):
+    def guarantee(dt):
         stretches, period = [(k * dt, x) for k, x in enumerate(graphs)], dt * len(graphs)
         graph = ech.Graph.switching(stretches, directed=directed, period=period)
         gain = ech.synthesize(model, graph, ech.gains.Riccati())
         drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
         goals, settings = ech.Formation(np.zeros((agents, len(A)))), ech.Settings(40 * dt, dt)
-        return ech.promise(ech.Parts(model, graph, goals, drive), settings), gain, settings
+        return ech.guarantee(ech.Parts(model, graph, goals, drive), settings), gain, settings
 
     try:
-        found, gain, settings = promise(1e-3)
+        found, gain, settings = guarantee(1e-3)
     except ech.EchelonError:
         return  # no one sum falls on these graphs
     longest = found.longest_step(settings)
@@ -43,10 +43,10 @@ def test_held_steps_fall_on_all_graphs_in_any_order(seed):
 
     for share in (0.5, 0.99):
         maps = whole_steps(A, B, K, laplacians, share * longest)
-        found, *_ = promise(share * longest)
+        found, *_ = guarantee(share * longest)
         assert found.promised and norm(maps) <= 1.0 + 1e-12
         most = np.exp(-found.rate * share * longest) * (1.0 + 1e-9)
         assert worst_growth(maps, 6) < min(most, 1.0)
-    found, *_ = promise(1.01 * longest)
+    found, *_ = guarantee(1.01 * longest)
     assert found.hypotheses[Hypothesis.SAMPLING].verdict is Verdict.FAILS
     assert norm(whole_steps(A, B, K, laplacians, 1.01 * longest)) > 1.0

@@ -78,7 +78,7 @@ def parts_of(law, leader=None):
 @pytest.mark.parametrize("name", LAWS)
 def test_nothing_is_said_of_a_law_that_echelon_does_not_know(name):
     parts = parts_of(LAWS[name])
-    found = ech.promise(parts, SETTINGS)
+    found = ech.guarantee(parts, SETTINGS)
     told = found.as_mapping()
     assert UNKNOWN in found.sentence() and str(found.verdict) == told["verdict"] == "none"
     assert not found.promised and not found.claimed
@@ -136,7 +136,7 @@ def test_what_is_proved_of_laws_is_not_of_their_subclasses(network):
     for laws, promised in ((known, True), (own, False)):
         for pair in laws:
             parts = parts_of(*pair).replace(world=ech.World(network=network))
-            found = ech.promise(parts, SETTINGS)
+            found = ech.guarantee(parts, SETTINGS)
             assert found.promised == promised != (UNKNOWN in found.sentence())
 
 

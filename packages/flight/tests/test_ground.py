@@ -11,7 +11,7 @@ from virtual_flight import Network, VirtualClock
 
 from echelon_flight.ground import Ground, page_of
 from echelon_flight.mission import NumberFile
-from echelon_flight.wire import GROUND, DatagramKind, Drop, Letter, Report, Wire
+from echelon_flight.wire import GROUND, DatagramKind, Drop, Message, Report, Wire
 
 KEY, BOOT = b"k" * 32, 1_800_000_000_000
 REPORT = Report(1, 0, 0, 0.0, math.nan, 0.0, 0.0, 1.0, 0.0, 2e-4, 0.01, math.nan, (0,) * len(Drop))
@@ -22,8 +22,6 @@ def wire(number, key=KEY, boot=BOOT, **options):
 
 
 class Station:
-    """The ground station, and the socket of all others."""
-
     def __init__(self, monkeypatch):
         self.clock = VirtualClock(monkeypatch, 1e-3 * BOOT)
         self.network = Network(self.clock)
@@ -33,13 +31,11 @@ class Station:
         return Ground(self.network.socket(), wire(GROUND, **options), 2)
 
     def say(self, write, *more):
-        """Let an agent send a datagram that it writes at a time, and the station hear it."""
         self.agents.send(write(self.clock.time(), *more))
         self.ground.round()
         self.clock.now += 0.02
 
     def obeyed(self, agent):
-        """The kinds of the commands that an agent obeys within a second."""
         found = set()
         for _ in range(50):
             self.say(agent.report, REPORT)
@@ -131,6 +127,6 @@ MISTAKES = {
 
 @pytest.mark.parametrize("sentence", MISTAKES)
 def test_whose_datagrams_are_dropped_is_shown(sentence, station):
-    station.say(lambda now: wire(0).letter(Letter(0, 99.0, 0, (0.0,), None)))
+    station.say(lambda now: wire(0).letter(Message(0, 99.0, 0, (0.0,), None)))
     station.say(MISTAKES[sentence])
     assert station.ground.state()["dropped"] == [sentence]

@@ -12,7 +12,7 @@ from agent_scene import KEY, Scene
 from echelon_flight import FlightError
 from echelon_flight.mission import NumberFile
 from echelon_flight.supervisor import Fault
-from echelon_flight.wire import GROUND, DatagramKind, Drop, Letter, Packet, Report, Wire
+from echelon_flight.wire import GROUND, DatagramKind, Drop, LeaderPacket, Message, Report, Wire
 
 WALL, BOOT, MARK = 1.8e9, 1_800_000_000_000, "ab" * 32
 TIMES = [0.02 * k for k in range(1, 200)]
@@ -23,8 +23,8 @@ def wire(number, highest=0, boot=BOOT):
     return Wire(KEY, MARK, number, 3, (1, 1), boot, highest)
 
 
-def letter(sender, t, epoch=0):
-    return Letter(sender, t, 0, (0.0,), Packet(sender, t, (0.0,), epoch))
+def letter(sender, t, term=0):
+    return Message(sender, t, 0, (0.0,), LeaderPacket(sender, t, (0.0,), term))
 
 
 def join(ground, agent):
@@ -41,23 +41,22 @@ class Recorded:
     """A flight in which agent 2 took the lead, and the station stopped all: what was in the air."""
 
     def __init__(self):
-        self.ground, self.leader, self.heir, self.agent = map(wire, (GROUND, 0, 2, 1))
+        self.ground, self.leader, self.backup, self.agent = map(wire, (GROUND, 0, 2, 1))
         self.ground.begin(self.ground.next_flight(WALL))
-        assert all(join(self.ground, each) for each in (self.leader, self.heir, self.agent))
+        assert all(join(self.ground, each) for each in (self.leader, self.backup, self.agent))
         self.letters = [(t, self.leader.letter(letter(0, t))) for t in TIMES]
-        self.letters += [(t, self.heir.letter(letter(2, t, epoch=1))) for t in TIMES]
+        self.letters += [(t, self.backup.letter(letter(2, t, term=1))) for t in TIMES]
         self.ground.challenges[1] = self.agent.challenge
         self.commands = [self.ground.start(WALL, WALL + 1.0, to) for to in (0, 1, 2, 0xFFFE)]
         self.ground.highest = self.ground.next_flight(WALL + 60.0)
         self.commands += [self.ground.stop(WALL, to) for to in (0, 1, 2, 0xFFFE)]
-        self.commands += [self.heir.stop(WALL)]
+        self.commands += [self.backup.stop(WALL)]
 
 
 RECEIVERS = {"fresh": 0, "restarted": BOOT}
 
 
 def used(receiver, recorded):
-    """How many recorded letters and commands a receiver uses, at the times of the recording."""
     plans = [*recorded.letters, *((None, command) for command in recorded.commands)]
     opened = [receiver.open(datagram, t, WALL) for t, datagram in plans]
     real = [x for x in opened if not isinstance(x, Drop)]
@@ -123,23 +122,12 @@ def test_a_restarted_process_comes_back_and_its_start_is_no_other_s():
 
 
 def test_a_recorded_start_for_others_keeps_no_genuine_one_out():
-    """The station that was recorded began later, by its clock."""
     ground, agent, ahead = wire(GROUND), wire(1), wire(GROUND, boot=BOOT + 900)
     ahead.begin(BOOT)
     for to in (0, 0xFFFE):
         assert agent.open(ahead.start(WALL, WALL + 1.0, to), None, WALL).body is None
     ground.begin(ground.next_flight(WALL))
     assert join(ground, agent)
-
-
-def test_an_agent_s_letter_tells_no_flight():
-    agent, leader = wire(1), wire(0)
-    leader.begin(BOOT + 7)
-    assert agent.open(leader.letter(letter(0, 0.5)), None, WALL) is Drop.EARLY
-    assert agent.flight == agent.highest == 0
-
-
-# ---- stop ----------------------------------------------------------------------------------------
 
 
 def stops(ground, agent, wall=WALL, to=0xFFFE):
@@ -177,32 +165,28 @@ def test_a_stop_ends_one_flight_and_not_the_next(tmp_path):
         assert not isinstance(agent.open(stop, None, WALL), Drop)
 
 
-# ---- whole processes -----------------------------------------------------------------------------
-
-
-def replay(scene, other, epoch, count=40):
-    """Send letters of another flight between those of the leader."""
+def replay(scene, other, term, count=40):
     for k in range(count):
         t = scene.context.clock.now
         if k % 4 == 0:
             scene.air.send(scene.leader.letter(letter(0, t)))
-        packet = Packet(2, t - 0.9, (0.0,), epoch)
-        scene.air.send(other.letter(Letter(0, t, 0, (0.0,), packet)))
+        packet = LeaderPacket(2, t - 0.9, (0.0,), term)
+        scene.air.send(other.letter(Message(0, t, 0, (0.0,), packet)))
         scene.rounds(1)
 
 
-@pytest.mark.parametrize("heirs", [None, [2], [2, 1]])
-def test_replayed_letters_let_nobody_take_the_lead(heirs, monkeypatch):
-    leadership = heirs and {"heirs": heirs, "timeout": 0.3}
+@pytest.mark.parametrize("backups", [None, [2], [2, 1]])
+def test_replayed_letters_let_nobody_take_the_lead(backups, monkeypatch):
+    leadership = backups and {"backups": backups, "timeout": 0.3}
     scene = Scene(monkeypatch, leadership)
     earlier = scene.wire(0)
     scene.start()
     earlier.begin(scene.ground.flight - 86_400_000)
     scene.air.send(scene.leader.letter(letter(0, scene.context.clock.now)))
     scene.rounds(2)
-    for epoch in (0, 1, 7):
-        replay(scene, earlier, epoch)
-        assert scene.process.pilot.leader == 0 and not scene.process.pilot.box.packet.epoch
+    for term in (0, 1, 7):
+        replay(scene, earlier, term)
+        assert scene.process.pilot.leader == 0 and not scene.process.pilot.box.packet.term
     assert scene.context.wire.dropped == {Drop.FLIGHT: 120} and scene.fault is Fault.NONE
 
 
@@ -256,31 +240,11 @@ def test_a_number_that_cannot_be_stored_keeps_a_vehicle_on_the_ground(monkeypatc
     assert said.endswith("); make its folder writable.\n")
 
 
-# ---- the file ------------------------------------------------------------------------------------
-
-
-def test_the_number_survives_and_each_process_has_its_own(tmp_path):
-    own, other = (NumberFile(tmp_path / "key", name) for name in ("agent-1", "agent-2"))
-    assert own.read() == other.read() == 0
-    own.write(BOOT)
-    assert NumberFile(tmp_path / "key", "agent-1").read() == BOOT and other.read() == 0
-    assert sorted(x.name for x in tmp_path.iterdir()) == [
-        "key.agent-1.flight",
-        "key.agent-2.flight",
-    ]
-
-
-@pytest.mark.parametrize("text", ["", "abc", "-5", "1.5", "9" * 30, "12 13", "\xff"])
-def test_a_damaged_number_is_refused(text, tmp_path):
-    (tmp_path / "key.agent-1.flight").write_bytes(text.encode("latin-1"))
-    with pytest.raises(FlightError, match="must be a whole number below 2") as info:
-        NumberFile(tmp_path / "key", "agent-1").read()
-    assert "\n" not in str(info.value)
-
-
-def test_a_number_that_cannot_be_read_or_written_is_refused(tmp_path):
-    (tmp_path / "key.agent-1.flight").mkdir()
-    with pytest.raises(FlightError, match=r"cannot be read \(is a directory\)"):
-        NumberFile(tmp_path / "key", "agent-1").read()
+def test_a_number_that_is_damaged_or_has_no_place_is_refused(tmp_path):
+    for text in ("", "abc", "-5", "1.5", "9" * 30, "12 13", "\xff"):
+        (tmp_path / "key.agent-1.flight").write_bytes(text.encode("latin-1"))
+        with pytest.raises(FlightError, match="must be a whole number below 2") as info:
+            NumberFile(tmp_path / "key", "agent-1").read()
+        assert "\n" not in str(info.value)
     with pytest.raises(FlightError, match=r"cannot be stored in `/proc/self/key"):
         NumberFile(Path("/proc/self/key"), "agent-1").read()
