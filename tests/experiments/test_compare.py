@@ -108,8 +108,8 @@ def test_a_number_of_the_table_is_in_every_table_that_it_names(planar, monkeypat
     def largest(run):
         return float(np.abs(run.result.states).max())
 
-    column = {"column": "largest\nstate", "of": largest, "shown": run_numbers.Appearance.COMPARISON}
-    number = run_numbers.Quantity("largest state", "m", **column)
+    column = {"column": "largest\nstate", "shown": run_numbers.Appearance.COMPARISON}
+    number = run_numbers.Quantity("largest state", "m", of=largest, **column)
     monkeypatch.setitem(run_numbers.RUN_NUMBERS, "largest_state", number)
     rows = comparison_mapping(planar)["methods"]
     for label, result in flown(planar).items():

@@ -220,9 +220,6 @@ def test_a_start_that_a_law_refuses_is_refused_among_many():
     assert both == [type(each) for each in [*easy, *strict]]
 
 
-# ---- what is promised ----
-
-
 def test_runs_with_noise_and_runs_without_fly_in_one_sweep():
     scenario = ech.load_scenario("van-der-pol", [*SHORT, "simulation.engine=native"])
     noise = {f"disturbance.input_rms.{ech.models.VanDerPol.input_names[0]}": [0.0, 0.05]}
