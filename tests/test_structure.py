@@ -16,8 +16,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from echelon.apps.cli.fly_command import CONTAINED
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.named_class import resolve
@@ -126,19 +124,26 @@ def loads(module: str) -> set[str]:
 
 def functions() -> list[tuple[str, int]]:
     """Every function with its number of lines, docstring aside."""
-    return [
-        (f"{PATHS[module].relative_to(ROOT)}:{node.lineno} {node.name}", lines(node))
+    found = []
+    for module, path in PATHS.items():
+        for node in ast.walk(tree(module)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                text = node.body[0] if ast.get_docstring(node) is not None else None
+                size = node.end_lineno - node.lineno + 1
+                size -= text.end_lineno - text.lineno + 1 if text else 0
+                found.append((f"{path.relative_to(ROOT)}:{node.lineno} {node.name}", size))
+    return found
+
+
+def imported(of_flight: bool = False) -> set[tuple[str, str]]:
+    """Each module of echelon, or of flight, with each absolute name that it may load."""
+    return {
+        (module, name)
         for module in PATHS
-        for node in ast.walk(tree(module))
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-    ]
-
-
-def lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    total = node.end_lineno - node.lineno + 1
-    if ast.get_docstring(node) is None:
-        return total
-    return total - (node.body[0].end_lineno - node.body[0].lineno + 1)
+        if is_flight(module) is of_flight
+        for node in statements(tree(module))
+        for name in targets(module, node)
+    }
 
 
 @cache
@@ -189,14 +194,10 @@ def test_the_top_folder_holds_the_entry_points_alone():
     assert files == {"__init__.py", "__init__.pyi", "__main__.py", "py.typed"}
 
 
-def test_no_import_cycle():
-    sorter = graphlib.TopologicalSorter({module: loads(module) for module in PATHS})
-    assert set(sorter.static_order()) == set(PATHS)
-
-
-def test_no_cycle_even_among_imports_for_annotations():
-    sorter = graphlib.TopologicalSorter({module: mentions(module) for module in PATHS})
-    assert set(sorter.static_order()) == set(PATHS)
+def test_no_import_cycle_not_even_among_imports_for_annotations():
+    for edges in (loads, mentions):
+        sorter = graphlib.TopologicalSorter({module: edges(module) for module in PATHS})
+        assert set(sorter.static_order()) == set(PATHS)
 
 
 def test_no_import_goes_up_not_even_for_annotations():
@@ -211,30 +212,16 @@ def test_no_import_goes_up_not_even_for_annotations():
 
 def test_flight_needs_the_standard_library_alone():
     """Import contracts name libraries; here all others count too, but for those of links."""
-    found = {
-        (module.rpartition(".")[2], name.split(".")[0])
-        for module in filter(is_flight, PATHS)
-        for node in statements(tree(module))
-        for name in targets(module, node)
-    }
+    pairs = {(m.rpartition(".")[2], name.split(".")[0]) for m, name in imported(of_flight=True)}
     own = {FLIGHT.name, *sys.stdlib_module_names}
-    assert {each for each in found if each[1] not in own} == {
-        ("crazyflie", "cflib"),
-        ("px4", "pymavlink"),
-    }
+    found = {each for each in pairs if each[1] not in own}
+    assert found == {("crazyflie", "cflib"), ("px4", "pymavlink")}
 
 
 def test_echelon_knows_five_names_of_flight_and_its_version():
-    found = {
-        name
-        for module in PATHS
-        if not is_flight(module)
-        for node in statements(tree(module))
-        for name in targets(module, node)
-        if is_flight(name)
-    }
     flight = importlib.import_module(FLIGHT.name)
-    assert {name.removeprefix(f"{FLIGHT.name}.") for name in found} == {
+    found = {name.removeprefix(f"{FLIGHT.name}.") for _, name in imported() if is_flight(name)}
+    assert found == {
         *("FlightError", "__version__"),
         *("mission.check_options", "page_server.Handler", "wire.Packet"),
     }
@@ -246,17 +233,17 @@ def test_folders_are_layers_and_packages():
     assert max(len(path.relative_to(FLIGHT).parts) for path in FLIGHT.rglob("*.py")) <= 2
 
 
-@pytest.mark.parametrize("of_flight", [False, True], ids=["echelon", "flight"])
-def test_the_names_of_files_and_classes_are_unique(of_flight):
-    modules = [module for module in PATHS if is_flight(module) is of_flight]
-    stems = Counter(PATHS[m].stem for m in modules if not PATHS[m].stem.startswith("__"))
-    classes = Counter(
-        node.name
-        for module in modules
-        for node in ast.walk(tree(module))
-        if isinstance(node, ast.ClassDef)
+def test_the_names_of_files_and_classes_are_unique():
+    names = Counter(
+        (is_flight(module), name)
+        for module in PATHS
+        for name in [
+            PATHS[module].stem,
+            *(node.name for node in ast.walk(tree(module)) if isinstance(node, ast.ClassDef)),
+        ]
+        if not name.startswith("__")
     )
-    assert [name for names in (stems, classes) for name in names if names[name] > 1] == []
+    assert [name for name, count in names.items() if count > 1] == []
 
 
 def test_functions_are_short():
@@ -287,57 +274,51 @@ def test_only_the_tables_and_the_verifier_name_laws_and_methods():
         (node.value, module)
         for module in PATHS
         if module not in tables and not module.startswith("guarantees.verifier")
-        for node in literals(tree(module))
-        if node.value in names
+        for node in ast.walk(tree(module))
+        if isinstance(node, ast.Constant) and node.value in names
+        if not any(node.value == word and part in module for word, part in others)
     }
     # A method says its own name, which gain files hold.
-    own = {(resolve(entry).name, module_of_entry(entry)) for entry in registry.METHODS.values()}
-    found -= {
-        each for each in found for word, part in others if each[0] == word and part in each[1]
-    }
-    assert found == own
-
-
-def literals(node: ast.AST) -> list[ast.Constant]:
-    return [each for each in ast.walk(node) if isinstance(each, ast.Constant)]
-
-
-def module_of_entry(entry: registry.Entry) -> str:
-    return resolve(entry).__module__.removeprefix("echelon.")
+    methods = map(resolve, registry.METHODS.values())
+    assert found == {(each.name, each.__module__.removeprefix("echelon.")) for each in methods}
 
 
 def test_numbers_of_guarantees_are_rounded_by_the_three_functions_for_it():
     """`core/digits.py` has them; a format such as `:.3g` may state more than is known."""
-    for module, path in PATHS.items():
-        of_guarantees = module.startswith(("guarantees.", "experiments.studies."))
-        if of_guarantees and module != "experiments.studies.doctor":
-            assert not re.findall(r":\.\d[efg]\}", path.read_text("utf-8")), module
+    faults = [
+        module
+        for module, path in PATHS.items()
+        if module.startswith(("guarantees.", "experiments.studies."))
+        if re.search(r":\.\d[efg]\}", path.read_text("utf-8"))
+    ]
+    assert faults == ["experiments.studies.doctor"]
 
 
-def test_importing_echelon_loads_nothing_heavy():
-    assert loaded_after("import echelon") == set()
+EVERY_NAME = "import echelon\nfor name in echelon.__all__: getattr(echelon, name)\n"
+HELP = """import sys
+from echelon.apps.cli.app import main
+sys.argv = ["echelon", "--help"]
+try:
+    main()
+except SystemExit as end:
+    assert not end.code, end.code"""
+UNLOADED = {
+    "import echelon": {*HEAVY},
+    "from echelon.experiments.scenario import registry, scenario, yaml": {"jax"},
+    EVERY_NAME: {"cvxpy", "casadi"},
+    HELP: {"jax", "equinox", "scipy", "matplotlib", "xarray"},
+}
+"""Code, and the libraries that it does not load."""
 
 
-def test_the_texts_and_the_schema_load_no_jax():
-    assert "jax" not in loaded_after(
-        "from echelon.experiments.scenario import registry, scenario, yaml"
-    )
-
-
-def test_using_the_library_loads_no_optional_part():
-    every_name = "import echelon\nfor name in echelon.__all__: getattr(echelon, name)"
-    assert not {"cvxpy", "casadi"} & loaded_after(every_name)
-
-
-def test_help_loads_no_jax():
-    code = "import sys\nfrom echelon.apps.cli.app import main\nsys.argv = ['echelon', '--help']\n"
-    call = "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code"
-    assert not {"jax", "equinox", "scipy", "matplotlib", "xarray"} & loaded_after(code + call)
+def test_what_needs_no_heavy_library_loads_none():
+    faults = {code: loaded_after(code) & names for code, names in UNLOADED.items()}
+    assert faults == dict.fromkeys(UNLOADED, set())
 
 
 def test_echelon_leaves_the_precision_of_jax_alone():
-    code = "import jax, echelon\nfor name in echelon.__all__: getattr(echelon, name)\n"
-    assert fresh(code + "print(jax.config.jax_enable_x64)").split() == ["False"]
+    code = f"import jax\n{EVERY_NAME}print(jax.config.jax_enable_x64)"
+    assert fresh(code).split() == ["False"]
 
 
 def test_every_public_name_is_there_and_listed():
@@ -347,30 +328,21 @@ def test_every_public_name_is_there_and_listed():
     assert not hasattr(echelon, "no_such_name")
 
 
-def test_every_dependency_is_pinned_and_no_index_is_named():
+def test_every_dependency_is_pinned_imported_or_has_its_reason():
     text = (ROOT / "constraints.txt").read_text("utf-8")
-    extras = project()["optional-dependencies"].values()
-    required = {plain(name) for name in itertools.chain(project()["dependencies"], *extras)}
+    extras = project()["optional-dependencies"]
+    required = {
+        plain(name) for name in itertools.chain(project()["dependencies"], *extras.values())
+    }
     pinned = {plain(line) for line in text.splitlines() if "==" in line}
     assert required - pinned == {project()["name"]}
     assert "://" not in text and "\n-" not in text
-
-
-def test_every_dependency_is_imported_or_has_its_reason():
-    not_imported = {
-        "pyarrow": "what pandas writes Parquet with",
-    }
-    extras = project()["optional-dependencies"]
     optional = ("certify", "cluster", "crazyflie", "fast", "optimal", "parquet", "px4", "video")
     names = [*project()["dependencies"], *itertools.chain(*(extras[name] for name in optional))]
+    used = {name.split(".")[0] for _, name in imported() | imported(of_flight=True)}
+    # What pandas writes Parquet with.
     required = {re.match(r"[\w-]+", name)[0].replace("-", "_") for name in names}
-    found = {
-        target.split(".")[0]
-        for module in PATHS
-        for node in statements(tree(module))
-        for target in targets(module, node)
-    }
-    assert required - found == set(not_imported)
+    assert required - used == {"pyarrow"}
     # What shows notebooks is a program of its own.
     assert set(extras) == {*optional, "notebook", "all", "dev"}
 
@@ -426,13 +398,10 @@ def test_set_up_names_no_host():
     assert [name for name, text in texts.items() if "://" in text] == []
 
 
-def test_dev_needs_the_standard_library_alone():
+def test_dev_needs_the_standard_library_alone_and_refuses_a_verb_it_does_not_have():
     nodes = statements(ast.parse((ROOT / "dev.py").read_text("utf-8")))
     names = {name.split(".")[0] for node in nodes for name in targets("", node)}
     assert names <= sys.stdlib_module_names
-
-
-def test_dev_refuses_a_verb_it_does_not_have():
     command = [sys.executable, str(ROOT / "dev.py"), "dmeo"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2

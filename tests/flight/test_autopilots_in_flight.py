@@ -6,7 +6,6 @@ They need the extras `crazyflie` and `px4`. Over real radios and vehicles nothin
 import contextlib
 import importlib
 import json
-import math
 import os
 import subprocess
 import sys
@@ -19,10 +18,9 @@ from fake_vehicles import MELLINGER
 
 import echelon as ech
 from echelon.agents.models import CrazyflieAttitude
-from echelon.output.archive.flight_folder import flight_files, law_files, save_flight
+from echelon.output.archive.flight_folder import flight_files, save_flight
 from echelon_flight.datagram_socket import DatagramSocket, ports_of
 from echelon_flight.ground import Ground
-from echelon_flight.links.crazyflie import CflibLink
 from echelon_flight.mission import Mission, make_key
 from echelon_flight.wire import GROUND
 
@@ -60,14 +58,6 @@ def formation(model, laws=consensus, network=None):
     return ech.Parts(model, GRAPH, places, laws(model), world=ech.World(network=network))
 
 
-def facts(model, agent):
-    """What a link needs of law.json."""
-    inputs = dict(zip(model.input_names, model.input_units, strict=True))
-    states = dict(zip(model.state_names, model.state_units, strict=True))
-    trim = dict(zip(model.input_names, model.trim[1], strict=True))
-    return {"agent": agent, "dt": DT, "states": states, "inputs": inputs, "trim": trim}
-
-
 @contextlib.contextmanager
 def served(script, **settings):
     """A process that serves vehicles while the block runs."""
@@ -80,47 +70,6 @@ def served(script, **settings):
             process.stdin.close()
             # A test may have killed it.
             assert process.wait(10) in (0, -9)
-
-
-class Flown:
-    """One agent: its exported law, its link, its state and its memory."""
-
-    def __init__(self, parts, agent, link):
-        files = law_files(parts, ech.Settings(horizon=SECONDS, dt=DT), agent, "")
-        self.facts, self.law, self.link = json.loads(files["law.json"]), {}, link
-        exec(files["law.py"], self.law)
-        self.x = link.read(5.0).x
-        self.memory = self.law["begin"](self.x)
-
-    def hello(self, t):
-        if (reading := self.link.read(0.0)) is not None:
-            self.x = reading.x
-        return self.law["signal"](t, self.x, self.memory)
-
-    def act(self, t, signals, forward):
-        """Take a step; returns what the agent feeds forward."""
-        hears, weights = self.facts["hears"], self.facts["weights"]
-        gaps = [self.law["difference"](t, self.x, self.memory, signals[k]) for k in hears]
-        size = range(len(self.facts["signal"]))
-        z = [sum(w * gap[n] for w, gap in zip(weights, gaps, strict=True)) for n in size]
-        u, self.memory, _, message, valid = self.law["tick"](t, self.x, z, forward, self.memory)
-        assert valid
-        self.link.send(u)
-        return message
-
-
-def fly(parts, links):
-    """Fly a formation in real time, all in this thread; returns when it began."""
-    agents = [Flown(parts, k, link) for k, link in enumerate(links)]
-    begin = time.monotonic()
-    for step in range(int(SECONDS / DT)):
-        time.sleep(max(0.0, begin + step * DT / SPEED - time.monotonic()))
-        t = (time.monotonic() - begin) * SPEED
-        signals = [agent.hello(t) for agent in agents]
-        forward = agents[0].act(t, signals, [math.nan] * 4)
-        for agent in agents[1:]:
-            agent.act(t, signals, forward)
-    return begin
 
 
 @contextlib.contextmanager
@@ -196,25 +145,6 @@ VEHICLES = {
 }
 
 
-@pytest.mark.parametrize("name", VEHICLES)
-def test_a_swarm_of_cflib_flies_a_formation(tmp_path, name, capsys):
-    crtp, swarm = extra("cflib.crtp", "crazyflie"), extra("cflib.crazyflie.swarm", "crazyflie")
-    crtp.CLASSES or crtp.init_drivers()
-    model, vehicle = VEHICLES[name]
-    file = str(tmp_path / "flown.npz")
-    uris = [f"udp://127.0.0.1:{19850 + k}" for k in range(4)]
-    parts = formation(model)
-    with served("fake_crazyflie.py", port=19850, starts=starts(), file=file, **vehicle):
-        with swarm.Swarm(uris) as crazyflies:
-            crazyflies.parallel_safe(lambda each: each.wait_for_params())
-            each = [crazyflies._cfs[uri].cf for uri in uris]
-            links = [CflibLink("", facts(model, k), each[k]) for k in range(4)]
-            begin = fly(parts, links)
-    beside, leader = errors(file, begin)
-    say(capsys, name, beside, leader)
-    assert beside <= 0.015 and leader <= 0.05
-
-
 SCRIPTS = {
     "cflib": ("cflib.crtp", "crazyflie", "fake_crazyflie.py", "cflib://udp://127.0.0.1:{}"),
     "px4": ("pymavlink.mavutil", "px4", "fake_px4.py", "px4://udpin:127.0.0.1:{}"),
@@ -241,36 +171,6 @@ def test_four_processes_fly_a_formation_and_land(tmp_path, name, vehicle, laws, 
     say(capsys, f"four processes, {name}, {vehicle}, {laws.__name__}", beside, leader)
     assert beside <= most and leader <= 0.05
     assert np.load(file)["places"][-1, :, 2].max() < 0.06
-
-
-def test_a_crazyflie_whose_process_is_killed_levels_and_stops(tmp_path):
-    extra("cflib.crtp", "crazyflie")
-    file = str(tmp_path / "flown.npz")
-    start = [[0.6, 0.0, 1.0]]
-    with served("fake_crazyflie.py", port=19870, starts=start, file=file, speed=1.0):
-        code = [
-            "from test_autopilots_in_flight import *",
-            "link = CflibLink('udp://127.0.0.1:19870', facts(CrazyflieAttitude(), 0))",
-            "while True:",
-            "    link.send([0.2, 0.0, 0.0, 0.3206])",
-            "    print('flies', flush=True); time.sleep(0.01)",
-        ]
-        places = [HERE, STAND_INS, *sys.path]
-        path = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, places))}
-        with subprocess.Popen(
-            [sys.executable, "-c", "\n".join(code)], stdout=-1, env=path
-        ) as process:
-            assert process.stdout.readline() == b"flies\n"
-            time.sleep(0.3)
-            process.kill()
-            killed = time.monotonic()
-        time.sleep(3.0)
-    flown = np.load(file)
-    t, places = flown["times"] - killed, flown["places"][:, 0]
-    speed = np.gradient(places[:, 1], t)
-    # Tilted until half a second after the last command, then level, then without motors.
-    level = speed[(t > 0.9) & (t < 1.5)]
-    assert np.ptp(level) < 0.05 and abs(level.mean()) > 0.3 and places[-1, 2] < 0.05
 
 
 # A cut in s of the plan; 0: the vehicle's program is killed.

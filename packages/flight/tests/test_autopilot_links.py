@@ -27,47 +27,6 @@ def facts(*inputs):
     }  # fmt: skip
 
 
-# ---- the fake's packets ----
-
-
-def test_the_fake_tells_its_variables_and_parameters():
-    fake = Crazyflie()
-    [count] = fake.answer(b"\x5c\x03", 0.0)
-    assert struct.unpack("<BHI", count[1:])[:2] == (3, 11) and count[0] == 0x5C
-    [entry] = fake.answer(b"\x5c\x02" + struct.pack("<H", 6), 0.0)
-    assert entry[1:] == b"\x02\x06\x00\x03stateEstimateZ\0quat\0"
-    [value] = fake.answer(b"\x2d\x00\x00", 0.0)
-    assert value == b"\x2d\x00\x00\x00\x01"
-    assert fake.answer(b"\x2e\x00\x00\x02", 0.0) == [b"\x2e\x00\x00\x02"]
-    assert fake.parameters["stabilizer.controller"] == 2
-    assert fake.answer(b"\xfd\x00", 0.0)[0][1:].startswith(b"Bitcraze Crazyflie\0")
-    assert fake.answer(b"\xdd\x00", 0.0) == [b"\xdd\x00\x0c"]
-    assert fake.answer(b"\x4c\x01", 0.0) == [b"\x4c\x01\x00"]
-
-
-def test_the_fake_logs_at_the_period_that_was_asked_for():
-    fake = Crazyflie()
-    block = b"\x06\x07" + b"".join(struct.pack("<BH", 0x55, k) for k in (2, 8))
-    assert fake.answer(b"\x5d" + block, 0.0) == [b"\x5d\x06\x07\x00"]
-    assert fake.answer(b"\x5d\x03\x07\x01", 0.0) == [b"\x5d\x03\x07\x00"]
-    state = (0.0, 0.0, 1.25), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0), (0.0, 0.5, 0.0)
-    packets = [fake.logged(*state, 0.004 * k) for k in range(1, 26)]
-    assert sum(map(len, packets)) == 10
-    assert packets[2][0] == b"\x5e\x07\x0c\x00\x00" + struct.pack("<hh", 1250, -500)
-
-
-def test_the_fake_locks_thrust_turns_the_old_yaw_rate_and_levels_by_itself():
-    fake = Crazyflie()
-    fake.answer(b"\x3c" + struct.pack("<fffH", 10.0, -5.0, 20.0, 30000), 1.0)
-    assert fake.acting(1.0)[3] == 0.0
-    fake.answer(b"\x3c" + struct.pack("<fffH", 0.0, 0.0, 0.0, 0), 1.0)
-    fake.answer(b"\x3c" + struct.pack("<fffH", 10.0, -5.0, 20.0, 30000), 1.0)
-    tilt = [math.radians(angle) for angle in (10.0, 5.0, -20.0)]
-    assert fake.acting(1.4) == pytest.approx([*tilt, 30000 / 65535 * 0.48])
-    assert fake.acting(1.6) == pytest.approx([0.0, 0.0, 0.0, 30000 / 65535 * 0.48])
-    assert fake.acting(3.1) == [0.0] * 4
-
-
 # ---- a Crazyflie ----
 
 
@@ -208,21 +167,21 @@ def test_a_descent_is_level_and_ends_with_the_motors_off_at_the_ground_or_in_tim
 
 
 REFUSED = {
-    ("thrust", "torque_x", "torque_y", "torque_z"): "the law commands torques, which a Crazyflie "
-    "would keep when the law stops; use the model `crazyflie-attitude`",
-    ("vx", "vy"): "the law has the inputs `vx`, `vy`, and a Crazyflie takes `roll_command`, ",
+    ("cflib", "thrust", "torque_x", "torque_y", "torque_z"): "the law commands torques, which a "
+    "Crazyflie would keep when the law stops; use the model `crazyflie-attitude`",
+    (
+        "cflib",
+        "vx",
+        "vy",
+    ): "the law has the inputs `vx`, `vy`, and a Crazyflie takes ",
+    ("px4", "thrust", "torque_x"): "the link `px4` sends `roll_command`, ",
 }
 
 
-@pytest.mark.parametrize("inputs", REFUSED)
-def test_a_crazyflie_refuses_torques_and_unknown_inputs_before_it_connects(inputs):
-    with pytest.raises(FlightError, match=REFUSED[inputs]):
-        open_link("cflib://udp://127.0.0.1:19850", facts(*inputs))
-
-
-def test_px4_refuses_torques_before_it_connects():
-    with pytest.raises(FlightError, match="the link `px4` sends `roll_command`, "):
-        open_link("px4://udpin:127.0.0.1:14540", facts("thrust", "torque_x"))
+def test_links_refuse_torques_and_unknown_inputs_before_they_connect():
+    for (link, *inputs), sentence in REFUSED.items():
+        with pytest.raises(FlightError, match=sentence):
+            open_link(f"{link}://udp://127.0.0.1:19850", facts(*inputs))
 
 
 def test_a_full_thrust_is_a_number():
@@ -231,14 +190,12 @@ def test_a_full_thrust_is_a_number():
             CflibLink(f"radio://0/80/2M#{text}", facts(), Stub())
 
 
-@pytest.mark.parametrize(
-    ("link", "library"), [(CflibLink, "cflib"), (Px4Link, "pymavlink")], ids=["cflib", "px4"]
-)
-def test_a_missing_library_is_named(monkeypatch, link, library):
+def test_a_missing_library_is_named(monkeypatch):
     for name in ("cflib", "cflib.crtp", "pymavlink"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(MissingLibraryError, match=rf"pip install '{library}>="):
-        link("udp://127.0.0.1:19850", facts())
+    for link, library in ((CflibLink, "cflib"), (Px4Link, "pymavlink")):
+        with pytest.raises(MissingLibraryError, match=rf"pip install '{library}>="):
+            link("udp://127.0.0.1:19850", facts())
 
 
 # ---- PX4 ----
@@ -322,16 +279,16 @@ def test_px4_is_read_and_commanded_in_its_own_frames(px4):
     assert wire.closed
 
 
-@pytest.mark.parametrize("error", [ImportError("No module named 'serial'"), OSError("no port")])
-def test_an_address_that_cannot_be_opened_is_one_sentence(px4, monkeypatch, error):
+def test_an_address_that_cannot_be_opened_is_one_sentence(px4, monkeypatch):
     px4(HOVER)
+    for error in (ImportError("No module named 'serial'"), OSError("no port")):
 
-    def refuse(_, dialect):
-        raise error
+        def refuse(_, dialect, error=error):
+            raise error
 
-    monkeypatch.setattr(sys.modules["pymavlink"].mavutil, "mavlink_connection", refuse)
-    with pytest.raises(FlightError, match=f"`px4://rubbish` cannot be opened: {error}"):
-        Px4Link("rubbish", facts())
+        monkeypatch.setattr(sys.modules["pymavlink"].mavutil, "mavlink_connection", refuse)
+        with pytest.raises(FlightError, match=f"`px4://rubbish` cannot be opened: {error}"):
+            Px4Link("rubbish", facts())
 
 
 def test_a_missing_library_ends_a_process_with_a_sentence_and_its_code(monkeypatch, capsys):

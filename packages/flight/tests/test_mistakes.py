@@ -68,15 +68,6 @@ def test_a_port_in_use(tmp_path, monkeypatch, capsys):
     ground.close()
 
 
-def test_a_key_that_is_missing_or_readable_by_others(tmp_path, monkeypatch, capsys):
-    two_points.write(tmp_path)
-    (tmp_path / "open").write_bytes(b"k" * 32)
-    (tmp_path / "open").chmod(0o640)
-    for key, sentence in (("none", "cannot be read"), ("open", "has mode 0640")):
-        words = [tmp_path, "--agent", 1, "--key", tmp_path / key]
-        assert sentence in refused(monkeypatch, capsys, *words)
-
-
 def test_a_flight_number_that_is_damaged_or_cannot_be_stored(tmp_path, monkeypatch, capsys):
     two_points.write(tmp_path)
     make_key(tmp_path / "key")
@@ -155,32 +146,12 @@ def test_an_agent_that_is_unlike_the_others_stays_on_the_ground(flight, tmp_path
     flight.agents[1].interrupt()
     flight.fly(0.1)
     said = capsys.readouterr().err
-    assert f"agent 1: a datagram of the ground {why}.\n" in said and "it never flew" in said
+    assert said.count(f"agent 1: a datagram of the ground {why}.\n") == 1
+    assert "it never flew" in said
     assert flight.ended == {1: Fault.SIGNAL} and row(flight, 0)["mode"] == "flies"
 
 
-def test_a_clock_that_is_half_a_second_off_keeps_an_agent_on_the_ground(flight):
-    flight.start_agent(0)
-    flight.start_agent(1, skew=0.5)
-    flight.take_off(0, 1)
-    flight.fly(2.0)
-    sentence = "a datagram of the ground gives the start by a clock that differs from this one"
-    assert any(sentence in note for note in notes(flight.ground.state()))
-    assert [row(flight, k)["mode"] for k in (0, 1)] == ["flies", "ready"]
-
-
 # ---- an agent that descends ----------------------------------------------------------------------
-
-
-def lands(flight, capsys, sentence, fault):
-    """Agent 1 descends and says why; the other one flies on and ends as planned."""
-    flight.wait(lambda state: sentence in (state["agents"][1].get("why") or ""), 4.0)
-    assert row(flight, 0)["mode"] == "flies"
-    flight.wait(lambda state: len(flight.ended) == 2)
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("agent 1")]
-    assert len([line for line in said if line.endswith("the vehicle levels and descends.")]) == 1
-    assert sentence in said[0] and flight.ended == {0: Fault.END, 1: fault}
-    assert [vehicle.x[2] for vehicle in flight.vehicles] == [0.0, 0.0]
 
 
 def test_a_law_that_overruns_its_period(flight, capsys):
@@ -193,7 +164,15 @@ def test_a_law_that_overruns_its_period(flight, capsys):
     flight.start_agent(0)
     flight.start_agent(1, law=types.SimpleNamespace(**vars(law) | {"tick": tick}))
     flight.take_off(0, 1)
-    lands(flight, capsys, "of its period, more than half", Fault.OVERRUN)
+    sentence = "of its period, more than half"
+    flight.wait(lambda state: sentence in (state["agents"][1].get("why") or ""), 4.0)
+    # The other one flies on and ends as planned.
+    assert row(flight, 0)["mode"] == "flies"
+    flight.wait(lambda state: len(flight.ended) == 2)
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("agent 1")]
+    assert len([line for line in said if line.endswith("the vehicle levels and descends.")]) == 1
+    assert sentence in said[0] and flight.ended == {0: Fault.END, 1: Fault.OVERRUN}
+    assert [vehicle.x[2] for vehicle in flight.vehicles] == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("step", [0.03, 0.04])
