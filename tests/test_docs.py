@@ -28,25 +28,20 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 
 
-def slow(*pages):
-    return pytest.param(pages, marks=pytest.mark.slow, id=pages[0])
-
-
+# What is read one after the other, in one folder; all but the first page takes long.
 FIRST = ("start", "agents", "graphs", "formations", "promises", "laws", "runs", "datasets")
-# What is read one after the other, in one folder.
+LONG = [
+    ("extending",),
+    (*FIRST, "troubleshooting"),
+    ("recipes", "sweeps", "comparing"),
+    *((name,) for name in ("networks", "events", "learning", "crazyflie", "autopilots")),
+    *((name,) for name in ("matlab", "onboard")),
+]
 JOURNEYS = [
     pytest.param(("README",), id="README"),
-    slow("extending"),
-    slow(*FIRST, "troubleshooting"),
-    slow("recipes", "sweeps", "comparing"),
-    slow("networks"),
-    slow("events"),
-    slow("learning"),
-    slow("crazyflie"),
-    slow("autopilots"),
-    slow("matlab"),
-    slow("onboard"),
+    *(pytest.param(pages, marks=pytest.mark.slow, id=pages[0]) for pages in LONG),
 ]
+
 
 FENCE = re.compile(
     r"^(?P<mark><!-- (?:not executed|needs (?P<needs>\w+)) -->\s+)?"
@@ -249,16 +244,16 @@ def test_every_scenario_on_the_pages_is_one(folder):
     assert seen >= 3
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
-def test_relative_links_and_images_lead_somewhere(path):
+def test_relative_links_and_images_lead_somewhere():
     dead = []
-    for target in LINK.findall(prose(path)):
-        if "://" in target or target.startswith("mailto:"):
-            continue
-        place, _, anchor = target.partition("#")
-        goal = (path.parent / place).resolve() if place else path
-        if not goal.exists() or (anchor and anchor not in anchors(goal)):
-            dead.append(target)
+    for path in PAGES:
+        for target in LINK.findall(prose(path)):
+            if "://" in target or target.startswith("mailto:"):
+                continue
+            place, _, anchor = target.partition("#")
+            goal = (path.parent / place).resolve() if place else path
+            if not goal.exists() or (anchor and anchor not in anchors(goal)):
+                dead.append((path.name, target))
     assert dead == []
 
 
@@ -291,21 +286,17 @@ def test_the_reference_has_every_public_name_once():
     texts = "\n".join(path.read_text("utf-8") for path in (DOCS / "api").glob("*.md"))
     named = re.findall(r"^::: (echelon\.\S+)$", texts, re.MULTILINE)
     shown = [id(operator.attrgetter(name.removeprefix("echelon."))(ech)) for name in named]
-    families = [getattr(ech, name) for name in ech.__all__ if is_module(getattr(ech, name))]
-    public = {
-        id(getattr(family, name)): f"{family.__name__}.{name}"
-        for family in [*families, ech]
-        for name in getattr(family, "__all__", [])
-        if not is_module(getattr(family, name))
-    }
+    values = {f"echelon.{name}": getattr(ech, name) for name in ech.__all__}
+    families = [value for value in values.values() if isinstance(value, types.ModuleType)]
+    for family in families:
+        values |= {
+            f"{family.__name__}.{x}": getattr(family, x) for x in getattr(family, "__all__", [])
+        }
     assert len(shown) == len(set(shown))
     listed = re.findall(r"`(\w+)`", page("api.md").read_text("utf-8").partition("| page |")[2])
     assert sorted(listed) == sorted(name.rpartition(".")[2] for name in named)
-    assert [name for each, name in public.items() if each not in shown] == []
-
-
-def is_module(value):
-    return isinstance(value, types.ModuleType)
+    missing = [name for name, value in values.items() if id(value) not in shown]
+    assert [name for name in missing if not isinstance(values[name], types.ModuleType)] == []
 
 
 def test_every_page_is_in_the_navigation_and_is_there():

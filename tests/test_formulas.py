@@ -10,48 +10,34 @@ import pytest
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
-def loaded():
-    """The extension, which is no part of the package."""
-    spec = importlib.util.spec_from_file_location("formulas", DOCS / "formulas.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+spec = importlib.util.spec_from_file_location("formulas", DOCS / "formulas.py")
+formulas = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(formulas)
 
 
-formulas = loaded()
+MEANS = {
+    "xdot = f(x) + g(x) u": r"\dot{x} = f(x) + g(x) u",
+    "δ' (L_g ⊗ P) δ": r"\delta^{\prime} (L_{g} \otimes P) \delta",
+    "c >= 1/(2 λ_min)": r"c \ge 1/(2 \lambda_{\mathrm{min}})",
+    "1/2 z'z": r"\tfrac{1}{2} z^{\prime} z",
+    "|exp(A t) x|_P": r"| \operatorname{exp}(A t) x |_{P}",
+    "ζ~_i' = -σ(c z_i)": r"\tilde{\zeta}_{i}^{\prime} = -\sigma(c z_{i})",
+    "δ^ = D'δ": r"\hat{\delta} = D^{\prime} \delta",
+    "y^(r) = e^(-ρt)": r"y^{(r)} = e^{-\rho t}",
+    "x / sqrt(1 + (x/s)²)": r"x / \sqrt{1 + (x/s)^{2}}",
+    "f(x*) + g(x*) u* = 0": r"f(x^{*}) + g(x^{*}) u^{*} = 0",
+    "c_(k+1)' - c_k": r"c_{k+1}^{\prime} - c_{k}",
+    "R^-1/2 1e-9": r"R^{-\tfrac{1}{2}} 10^{-9}",
+}
+CODE = ["stopping-point", "Graph.spectrum", "max", "T2", "python x.py", "x = 'a'", "sqrt(x"]
 
 
-def squeezed(text):
-    return re.sub(r"\s+", "", text)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("xdot = f(x) + g(x) u", r"\dot{x} = f(x) + g(x) u"),
-        ("δ' (L_g ⊗ P) δ", r"\delta^{\prime} (L_{g} \otimes P) \delta"),
-        ("c >= 1/(2 λ_min)", r"c \ge 1/(2 \lambda_{\mathrm{min}})"),
-        ("1/2 z'z", r"\tfrac{1}{2} z^{\prime} z"),
-        ("|exp(A t) x|_P", r"| \operatorname{exp}(A t) x |_{P}"),
-        ("ζ~_i' = -σ(c z_i)", r"\tilde{\zeta}_{i}^{\prime} = -\sigma(c z_{i})"),
-        ("δ^ = D'δ", r"\hat{\delta} = D^{\prime} \delta"),
-        ("y^(r) = e^(-ρt)", r"y^{(r)} = e^{-\rho t}"),
-        ("x / sqrt(1 + (x/s)²)", r"x / \sqrt{1 + (x/s)^{2}}"),
-        ("f(x*) + g(x*) u* = 0", r"f(x^{*}) + g(x^{*}) u^{*} = 0"),
-        ("c_(k+1)' - c_k", r"c_{k+1}^{\prime} - c_{k}"),
-        ("R^-1/2 1e-9", r"R^{-\tfrac{1}{2}} 10^{-9}"),
-    ],
-)
-def test_plain_text_becomes_what_it_means(text, expected):
-    assert squeezed(formulas.tex(text)) == squeezed(expected)
-
-
-@pytest.mark.parametrize(
-    "text", ["stopping-point", "Graph.spectrum", "max", "T2", "python x.py", "x = 'a'", "sqrt(x"]
-)
-def test_code_stays_code(text):
-    with pytest.raises(formulas.NotMath):
-        formulas.tex(text)
+def test_plain_text_becomes_what_it_means_and_code_stays_code():
+    found = {text: re.sub(r"\s+", "", formulas.tex(text)) for text in MEANS}
+    assert found == {text: re.sub(r"\s+", "", means) for text, means in MEANS.items()}
+    for text in CODE:
+        with pytest.raises(formulas.NotMath):
+            formulas.tex(text)
 
 
 PAGE = """# Page

@@ -58,30 +58,6 @@ def test_odd_overrides_are_laid_over_or_refused_in_whole_sentences(tmp_path_fact
     judge(lambda: load_scenario(file, words))
 
 
-@pytest.mark.parametrize(
-    ("ending", "faults"),
-    [
-        ((0, "", ""), []),
-        ((2, "", "echelon: this is wrong.\n"), []),
-        ((2, "", "Usage: echelon run\nError: no such option\n"), []),
-        ((2, "", ""), ["it refuses without a word"]),
-        ((2, "", "echelon: this is wrong\n"), ["no full stop: echelon: this is wrong"]),
-        ((2, "", "wrong.\n"), ["its sentence does not begin with `echelon: `"]),
-        ((70, "", "echelon: a fault of its own.\n"), ["its exit code is 70"]),
-        ((-11, "", ""), ["its exit code is -11"]),
-        ((-9, "", ""), ["it does not end within 20 s"]),
-        ((5, "", ""), []),
-        ((0, "", "x.py:1: RuntimeWarning: overflow\n"), ["it shows a library's warning"]),
-        (
-            (1, "", "Traceback (most recent call last):\nValueError\n"),
-            ["it shows a traceback"],
-        ),
-    ],
-)
-def test_what_is_wrong_with_an_ending_is_said(ending, faults):
-    assert list(FUZZ.judged(*ending)) == faults
-
-
 @pytest.mark.slow
 def test_a_hundred_command_lines_of_nonsense_end_well(tmp_path):
     command = [sys.executable, str(SCRIPT), "400", "--cases", "100", "--seed", "0"]

@@ -6,10 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from processes import without_status
-from runs import simulate
 
 import echelon as ech
 from echelon.apps.cli import app
@@ -118,7 +118,8 @@ def left_by_reader(here, *arguments):
 
 def test_a_reader_that_has_left_is_no_fault(tmp_path):
     assert left_by_reader(tmp_path, "list") == (141, "")
-    assert left_by_reader(tmp_path, "check", "integrators") == (141, "")
+    # What was found is told by the exit code, which needs no pipe.
+    assert left_by_reader(tmp_path, "check", "integrators", "--set", "follower.law=passive")[0] == 1
 
 
 @pytest.mark.study
@@ -158,54 +159,45 @@ def test_a_screen_that_was_never_there_is_no_fault():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_verdict_stands_whoever_reads(tmp_path):
-    """What was found is told by the exit code, which needs no pipe."""
-    assert left_by_reader(tmp_path, "check", "integrators", "--set", "follower.law=passive")[0] == 1
-
-
 def test_numbers_beyond_all_squares_say_nothing_on_the_screen(recwarn):
     agent, graph = ech.models.Linear([[50.0]], [[1.0]]), ech.Graph.path(3)
-    run = simulate(
-        agent,
-        graph,
-        ech.Formation.from_offsets(agent, graph, {}),
-        leader=ech.laws.TrimInput(),
-        follower=ech.laws.TrimInput(),
-        initial={"x1": 1.0},
-        horizon=8.0,
-        dt=0.01,
-    )
+    places = ech.Formation.from_offsets(agent, graph, {})
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
+    parts = ech.Parts(agent, graph, places, laws, initial={"x1": 1.0})
+    run = ech.simulate(parts, ech.Settings(horizon=8.0, dt=0.01))
     assert run.outcome is Outcome.COMPLETED and np.abs(run.states).max() > 1e160
     assert "grows" in ech.report(run)
     assert not [each for each in recwarn if each.category is RuntimeWarning]
 
 
+MATRIX = np.array([[0.0, 1.0], [-1.0, -0.5]])
+
+
+@jax.jit
+def compiled_drift(x):
+    return MATRIX @ x
+
+
+class Constant(ech.ControlAffine):
+    """Its matrix is of NumPy, and its drift compiled."""
+
+    state_names = ("a", "b")
+    input_names = ("u",)
+
+    def drift(self, x):
+        return compiled_drift(x)
+
+    def input_map(self, x):
+        return np.array([[0.0], [1.0]]) + 0.0 * x[:, None]
+
+
 def test_numpy_constants_serve_in_any_precision():
-    import jax
-
-    matrix = np.array([[0.0, 1.0], [-1.0, -0.5]])
-
-    @jax.jit
-    def drift(x):
-        return matrix @ x
-
-    class Constant(ech.ControlAffine):
-        state_names = ("a", "b")
-        input_names = ("u",)
-
-        def drift(self, x):
-            return drift(x)
-
-        def input_map(self, x):
-            return np.array([[0.0], [1.0]]) + 0.0 * x[:, None]
-
     agent, graph = Constant(), ech.Graph.path(2)
-    leaders = {"leader": ech.laws.TrimInput(), "follower": ech.laws.TrimInput()}
-    formation = ech.Formation.from_offsets(agent, graph, {})
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
+    places = ech.Formation.from_offsets(agent, graph, {})
+    parts = ech.Parts(agent, graph, places, laws, initial={"a": 1.0})
     wide, narrow, again = (
-        simulate(
-            agent, graph, formation, **leaders, initial={"a": 1.0}, horizon=1.0, dt=0.1, precision=p
-        ).states[-1]
+        ech.simulate(parts, ech.Settings(horizon=1.0, dt=0.1, precision=p)).states[-1]
         for p in ("float64", "float32", "float64")
     )
     assert np.abs(wide - narrow).max() < 1e-5 and np.array_equal(wide, again)

@@ -106,10 +106,9 @@ def wandering(**settings):
     "settings",
     [
         {"store_every": 7},
-        pytest.param({"store_every": 3000}, marks=pytest.mark.study),
         pytest.param({"precision": "float32"}, marks=pytest.mark.slow),
     ],
-    ids=["frames", "rare frames", "float32"],
+    ids=["frames", "float32"],
 )
 def test_a_run_that_goes_on_ends_with_the_bits_of_one_that_never_ended(settings, monkeypatch):
     monkeypatch.setattr(engine, "_SECONDS", 0.0)
@@ -202,29 +201,12 @@ def test_interrupting_keeps_what_was_computed(here, echelon):
     assert code == 0 and json.loads(out)["outcome"]["name"] == "completed"
 
 
-@pytest.mark.slow
-def test_sigterm_is_an_interrupt(here):
-    code, out, told = interrupted(here, signal.SIGTERM)
-    assert code == 143 and "stopping and saving results" in told
-    assert "was interrupted at t = " in out and (here / "o" / "run.nc").exists()
-
-
 @pytest.mark.study
 def test_a_second_interrupt_ends_at_once_and_keeps_the_chunks(here, echelon):
     code, out, _ = interrupted(here, signal.SIGINT, presses=2)
     # Shells report this as 130.
     assert code == -signal.SIGINT and ech.load("o").outcome is ech.Outcome.STOPPED
     assert echelon("run", "--resume", "o", "--no-figures")[0] == 0
-
-
-@pytest.mark.study
-def test_a_signal_before_anything_is_computed_leaves_no_trace(here):
-    with started(EAGER, "run", "mine.yaml", "--out", "o") as process:
-        time.sleep(0.5)
-        process.send_signal(signal.SIGTERM)
-        process.communicate()
-    assert process.returncode in (143, -signal.SIGTERM)
-    assert not (here / "o").exists()
 
 
 # ---- a disk that takes no more ----
@@ -270,27 +252,6 @@ def test_where_nothing_could_be_kept_nothing_is_said_to_be(here, echelon, monkey
     told = run_on_a_full_disk(echelon, monkeypatch, np.inf)
     assert told.endswith("File too large; no results could be saved.\n")
     assert not (here / "o").exists()
-
-
-@pytest.mark.slow
-def test_a_disk_that_fills_while_a_run_lasts_ends_it_and_it_goes_on_later(
-    here, echelon, monkeypatch
-):
-    monkeypatch.setattr(engine, "_SECONDS", 0.0)
-    write, written = Chunks.write, []
-
-    def fill(self, stretch):
-        written.append(stretch)
-        under(100 if len(written) > 5 else resource.RLIM_INFINITY, write, self, stretch)
-
-    monkeypatch.setattr(Chunks, "write", fill)
-    code, out, err = echelon("run", "mine.yaml", *FRAMES, "--out", "o")
-    assert code == 2 and "cannot be written: File too large" in out and "continues" in err
-    assert len(list(here.glob("o/chunks/*.npz"))) == 5
-    monkeypatch.setattr(Chunks, "write", write)
-    assert echelon("run", "--resume", "o", "--no-figures")[0] == 0
-    assert echelon("run", "mine.yaml", *FRAMES, "--out", "whole")[0] == 0
-    assert_same(here / "o", here / "whole")
 
 
 def test_a_file_that_cannot_be_written_is_what_it_was(here):
