@@ -77,7 +77,6 @@ def opened(browser, address, width=1280, height=720, **options):
 
 
 def until(true, seconds=30.0):
-    """Wait for something to become true."""
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "it did not happen"

@@ -85,7 +85,6 @@ OWN = {
 
 
 def shares_fixtures(item):
-    """Whether a test uses a fixture of its file, which other tests may use too."""
     parameters = getattr(item, "callspec", None)
     return bool(set(item.fixturenames) - OWN - set(parameters.params if parameters else ()))
 
@@ -98,7 +97,6 @@ def processor_time():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item):
-    """Record how much of a processor a test takes, and whether it is marked as a long one."""
     begin = processor_time()
     result = yield
     spent = processor_time() - begin
@@ -107,7 +105,6 @@ def pytest_runtest_call(item):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Name the tests that take long and have no mark; how long depends on the machine."""
     reports = terminalreporter.getreports("passed")
     facts = [(report.nodeid, dict(report.user_properties)) for report in reports]
     keep_durations({name: x["processor_time"] for name, x in facts if x})

@@ -35,7 +35,6 @@ def at(value, path):
 
 
 def replaced(document, path, value):
-    """A copy with another value at a path."""
     if not path:
         return value
     result = copy.deepcopy(document)

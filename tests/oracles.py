@@ -17,7 +17,6 @@ def rotation(zeta):
 
 
 def spd(rng, size):
-    """A random symmetric positive definite matrix."""
     root = rng.normal(size=(size, size))
     return root @ root.T + 0.05 * np.eye(size)
 

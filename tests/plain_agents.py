@@ -15,17 +15,12 @@ FAR = 2**30
 
 
 def as_python(functions, folder=None):
-    """Functions as plain Python."""
     scope = {}
     exec(python_text(functions, "A law.", {}), scope)
     return {f.name: scope[f.name] for f in functions}
 
 
-# ---- in the ideal network ------------------------------------------------------------------------
-
-
 def receive(agent, draws):
-    """Send an agent random signals, and a feed-forward, and return both."""
     own = agent.own_law
     names, forward_names = own.signal_names, own.forward_names
     signals = [0.3 * draws.normal(size=len(names)) for _ in own.neighbours]
@@ -77,9 +72,6 @@ def compare(agent, runs, steps, dt, size=0.1, atol=1e-14):
             for got, value, scale in zip(results, expected, scales, strict=True):
                 np.testing.assert_allclose(got, value, rtol=0, atol=atol * scale)
     return memories
-
-
-# ---- over networks that are late -----------------------------------------------------------------
 
 
 class Plain:

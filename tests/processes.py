@@ -29,7 +29,6 @@ def started(code, *arguments):
 
 
 def wait_for(process, condition):
-    """Wait until something is so, while a process goes on."""
     while not condition():
         assert process.poll() is None, process.communicate()
         time.sleep(0.005)

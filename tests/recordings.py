@@ -42,7 +42,6 @@ def flown(agents=4, seconds=6.0, rate=50.0, leaders=(0,), **changes):
 
 
 def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position=(0, 1, 2), **more):
-    """A recording with the rest made to fit."""
     agents = states.shape[1]
     nearest = np.array([max(k for k in leaders if k <= i) for i in range(agents)])
     y = states - offsets
@@ -98,12 +97,10 @@ def separated(run):
 
 
 def with_errors(run, errors):
-    """A recording with these deviations from the goals, zero for leaders."""
     return dataclasses.replace(run, states=errors, offsets=np.zeros_like(run.offsets))
 
 
 def tracked(run):
-    """A tracking error that shrinks, for the leaders of a recording."""
     shrinks = np.exp(-run.times)[:, None, None] * np.ones((1, len(run.leaders), 2))
     return TrackingErrors(shrinks, ("x", "yaw"), ("m", "rad"))
 

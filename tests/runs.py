@@ -37,7 +37,6 @@ def run(model, graph, formation, drive, **more):
 
 
 def simulate(model, graph, formation, *, leader, follower, **more):
-    """Simulate under laws."""
     return run(model, graph, formation, ech.Laws(leader, follower), **more)
 
 

@@ -48,8 +48,6 @@ TABLES["GAIN_KEYS"] = GainSpec.model_fields
 
 
 class Own(ech.Method):
-    """A gain method that returns what it is given."""
-
     answer: Any
     name = "own"
 
@@ -58,8 +56,6 @@ class Own(ech.Method):
 
 
 class Flat(ech.Reference):
-    """A reference in the plane alone."""
-
     def __call__(self, t):
         return jnp.stack([t, t])
 
@@ -94,7 +90,6 @@ def run(model=ech.models.SingleIntegrator(1), graph=None, **options):
 
 
 def gain_of(model, graph=None, **options):
-    """The gain of the method `given` with these options."""
     return ech.synthesize(model, graph or ech.Graph.path(2), ech.gains.FixedGain(**options))
 
 
@@ -108,7 +103,6 @@ NAMES = {
 
 
 def of_python(text):
-    """The error that an expression raises."""
     try:
         eval(text, dict(NAMES))
     except EchelonError as error:
@@ -131,7 +125,6 @@ def of_scenario(text):
 
 
 def of_command(text):
-    """What a command prints, with its exit code."""
     from echelon.apps.cli.app import main
 
     arguments, sys.argv = sys.argv, shlex.split(text)
@@ -165,7 +158,6 @@ def answer(title, text):
 
 
 def write():
-    """Write the file with the answers of today."""
     text = ""
     for title, body in [*groups()]:
         text += f"# {title}\n\n" if title else body

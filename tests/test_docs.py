@@ -54,8 +54,6 @@ NUMBER = re.compile(r"(?<![\w.^-])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*\w)")
 
 
 class Block(NamedTuple):
-    """A fenced block of a page."""
-
     language: str
     title: str | None
     code: str
@@ -84,12 +82,10 @@ def blocks(path):
 
 
 def prose(path):
-    """The text without its fenced blocks."""
     return FENCE.sub("", path.read_text("utf-8"))
 
 
 def anchors(path):
-    """The anchors of a page's headings, as the site and the code hosts make them."""
     titles = re.findall(r"^#+ (.+)$", prose(path), re.MULTILINE)
     plain = [re.sub(r"[^\w\s-]", "", title.replace("`", "")).strip().lower() for title in titles]
     return {re.sub(r"[-\s]+", "-", title) for title in plain}
@@ -272,7 +268,6 @@ def test_the_first_page_quotes_the_measured_numbers():
 
 
 def rows(text):
-    """The cells of every line of a table."""
     lines = (line for line in text.splitlines() if line.startswith("|"))
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 

@@ -17,7 +17,6 @@ SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "fuzz.py"
 
 
 def study():
-    """The grammar of nonsense, which the study draws from for minutes."""
     spec = importlib.util.spec_from_file_location("fuzz", SCRIPT)
     module = importlib.util.module_from_spec(spec)
     sys.modules["fuzz"] = module
@@ -29,7 +28,6 @@ FUZZ = study()
 
 
 def judge(load):
-    """Load a scenario; if it is refused, then in whole sentences."""
     try:
         load()
     except EchelonError as error:

@@ -25,7 +25,6 @@ WORDS = [
 
 
 def heads(table):
-    """The names of a table's columns, without units, spans and footnotes."""
     names = (" ".join(str(column.header).split()) for column in table.columns)
     return [re.sub(r"( from)?,.*| \(.*\)| \d+ s$| last .*", "", name) for name in names]
 

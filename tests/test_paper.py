@@ -48,7 +48,6 @@ def fly(model, graph, places, leader, follower, horizon=60.0, dt=0.05, **more):
 
 
 def literal(model, graph, **options):
-    """The law as printed: P = I, and no feed-forward."""
     return Consensus(synthesize(model, graph, FixedGain()), "none", **options)
 
 
@@ -386,7 +385,6 @@ def test_algorithm_1_without_a_step_has_a_spectral_radius_above_three():
 
 @pytest.fixture(scope="module")
 def flights():
-    """The paper's scenario with the Riccati gain, three seeds."""
     law = Consensus(synthesize(QUAD, TREE, Riccati()), feedforward="relay")
     more = {"initial": INITIAL, "start_error": START_ERROR, "store_every": 10}
     return [

@@ -69,7 +69,6 @@ def statements(node: ast.AST):
 
 
 def origin(module: str, node: ast.ImportFrom) -> str:
-    """The absolute name of what a `from` statement imports from."""
     if not node.level:
         return node.module or ""
     here = ["echelon", *module.split(".")] if module else ["echelon"]
@@ -148,7 +147,6 @@ def imported(of_flight: bool = False) -> set[tuple[str, str]]:
 
 @cache
 def classes() -> list[type]:
-    """Every class that a module of `PATHS` defines."""
     names = [module if is_flight(module) else f"echelon.{module}".rstrip(".") for module in PATHS]
     members = [vars(importlib.import_module(name)) for name in names]
     found = [value for values in members for value in values.values() if inspect.isclass(value)]
@@ -371,12 +369,10 @@ def test_the_version_is_the_same_everywhere():
 
 
 def project() -> dict[str, Any]:
-    """The table `project` of pyproject.toml."""
     return tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 
 
 def plain(requirement: str) -> str:
-    """The name of a requirement as installers compare it."""
     return re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower()
 
 

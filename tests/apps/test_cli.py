@@ -181,18 +181,6 @@ def test_a_diverging_run_is_a_result(here, echelon):
         assert len(data.time) > 10 and bool(np.isfinite(data.states).all())
 
 
-def test_list_names_everything_in_one_line_each(echelon):
-    code, out, _ = echelon("list")
-    assert code == 0
-    for name in ("paper-literal", "van-der-pol", "quadrotor", "lemniscate", "consensus", "riccati"):
-        assert any(line.split()[:1] == [name] for line in out.splitlines())
+def test_list_has_every_family_for_programs(echelon):
     code, out, _ = echelon("list", "--json")
-    assert set(json.loads(out)) >= {"scenarios", "models", "follower laws"}
-
-
-@pytest.mark.slow
-def test_doctor_passes_on_this_machine(echelon):
-    code, out, _ = echelon("doctor", "--json")
-    told = json.loads(out)
-    assert code == 0 and {"jax", "devices"} <= set(told["facts"])
-    assert len(told["checks"]) >= 7 and all(check["holds"] for check in told["checks"])
+    assert code == 0 and set(json.loads(out)) >= {"scenarios", "models", "follower laws"}

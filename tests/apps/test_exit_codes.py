@@ -122,23 +122,6 @@ def test_a_reader_that_has_left_is_no_fault(tmp_path):
     assert left_by_reader(tmp_path, "check", "integrators", "--set", "follower.law=passive")[0] == 1
 
 
-@pytest.mark.study
-def test_every_command_goes_on_without_its_reader(tmp_path, echelon):
-    assert echelon("design", "integrators", "--out", tmp_path / "gain.json")[0] == 0
-    lines = [
-        "--help",
-        "check integrators --json",
-        "design integrators --out again.json",
-        "verify gain.json",
-        "compare integrators --horizon 0.5 --no-figures --out compared",
-        "schema",
-        "doctor",
-    ]
-    codes = {line: left_by_reader(tmp_path, *line.split()) for line in lines}
-    assert codes == dict.fromkeys(lines, (141, ""))
-    assert (tmp_path / "again.json").exists() and (tmp_path / "compared").exists()
-
-
 def test_a_run_is_written_whole_whoever_reads(tmp_path):
     """Both streams go to one pipe, as with `2>&1 | head -0`."""
     words = "run integrators --set simulation.horizon=0.1 --no-figures --out kept".split()

@@ -68,8 +68,6 @@ def test_what_cannot_be_exported_is_refused_in_one_sentence(tmp_path, echelon):
 
 
 class Bends(ech.laws.Law):
-    """Uses what has no scalar operations."""
-
     def update(self, model, view, memory):
         return jax.scipy.special.erfinv(view.disagreement)[:1] * 0.0, memory
 

@@ -34,7 +34,6 @@ from echelon.output.reports.glossary import explain_term, glossary
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
-    """A stored run of four quadrotors."""
     path = tmp_path_factory.mktemp("stored") / "run.nc"
     run = dataclasses.replace(flown(seconds=1.0, rate=25.0), bounds=None)
     path.write_bytes(as_file(run))
@@ -222,7 +221,6 @@ def ffmpeg(tmp_path_factory, monkeypatch):
 
 
 def told_of(name):
-    """Size, pictures a second and number of the RGBA pictures that the stand-in was given."""
     *words, received = Path(name).read_text().split()
     size, rate = words[words.index("-s") + 1], float(words[words.index("-framerate") + 1])
     width, height = map(int, size.split("x"))

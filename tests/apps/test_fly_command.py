@@ -26,7 +26,6 @@ class Replaced(Exception):
 
 @pytest.fixture
 def taken_over(monkeypatch):
-    """The words of the program that takes over."""
     words = []
 
     def execv(program, given):

@@ -62,7 +62,6 @@ def swarm(panel):
 
 @pytest.fixture(scope="module")
 def native(panel):
-    """The same loop by code for this machine."""
     parts, settings = panel.experiment
     made = LiveLoop(parts, settings._replace(engine="native"), panel.live)
     assert (made.engine, LiveLoop(parts, settings, panel.live).engine) == ("native", "jax")
@@ -79,7 +78,6 @@ def session(panel, swarm):
 
 
 def flown(swarm, pictures=10):
-    """The states after each of some pictures from the start."""
     swarm.restart()
     return np.stack([swarm.advance().states for _ in range(pictures)])
 
@@ -619,7 +617,6 @@ def test_the_badge_of_distances_is_green_while_hulls_are_apart_whatever_the_erro
 
 @pytest.fixture(scope="module")
 def page():
-    """A session that runs, and where its page is."""
     # A quick loop, since it is watched in real time.
     follower = {"law": "consensus", "gain": {"method": "riccati", "R": [0.02, 0.02]}}
     session, html = live(scenario(follower=follower))
@@ -685,7 +682,6 @@ def test_a_cut_link_disappears_the_error_reacts_and_the_page_says_why(browser, p
 
 
 def click_link(shown, i, j):
-    """Click the middle of a link, wherever it is now."""
     shown.evaluate("echelon.ask('pause', true)")
     until(lambda: shown.evaluate("echelon.live.paused"))
     ends = np.array([shown.evaluate(f"echelon.whereOnScreen({k})") for k in (i, j)])

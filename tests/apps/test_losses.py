@@ -77,8 +77,6 @@ def assert_same(one, other):
 
 
 class Wandering(Law):
-    """Remembers a number, a counter and a random key."""
-
     def init(self):
         return jnp.zeros(()), jnp.zeros((), jnp.int32), jax.random.key(3)
 
@@ -176,15 +174,13 @@ def test_a_killed_run_opens_as_stopped_and_goes_on_to_the_same_bits(here, echelo
     assert code == 0 and "is complete; nothing to do" in out
 
 
-def interrupted(here, number, presses=1):
+def interrupted(here, number):
     with started(EAGER, "run", "mine.yaml", *LONG, "--no-figures", "--out", "o") as process:
         wait_for(process, lambda: list(here.glob("o/chunks/*.npz")))
         process.send_signal(number)
         told = process.stderr.readline()
         while told and "stopping and saving results" not in told:
             told = process.stderr.readline()
-        for _ in range(presses - 1):
-            process.send_signal(number)
         out, err = process.communicate()
     return process.returncode, out, told
 
@@ -199,14 +195,6 @@ def test_interrupting_keeps_what_was_computed(here, echelon):
     assert len(stored(here / "o")["states"]) > 1
     code, out, _ = echelon("run", "--resume", "o", "--no-figures", "--json")
     assert code == 0 and json.loads(out)["outcome"]["name"] == "completed"
-
-
-@pytest.mark.study
-def test_a_second_interrupt_ends_at_once_and_keeps_the_chunks(here, echelon):
-    code, out, _ = interrupted(here, signal.SIGINT, presses=2)
-    # Shells report this as 130.
-    assert code == -signal.SIGINT and ech.load("o").outcome is ech.Outcome.STOPPED
-    assert echelon("run", "--resume", "o", "--no-figures")[0] == 0
 
 
 # ---- a disk that takes no more ----
@@ -285,17 +273,6 @@ def test_of_two_runs_into_one_folder_one_is_refused(here, echelon):
         code, _, err = echelon("run", "--resume", "o")
         assert code == 2 and "another run is writing into the folder `o`" in err
         assert process.poll() is None
-
-
-def test_a_folder_is_taken_by_one_alone(here):
-    from echelon.output.archive.folder import claim_folder
-
-    (here / "o").mkdir()
-    claim_folder("mine", here / "o", force=False)
-    (here / "p").mkdir()
-    (here / "p" / "chunks").mkdir()
-    with pytest.raises(ech.EchelonError, match="is not empty"):
-        claim_folder("mine", here / "p", force=False)
 
 
 def test_force_takes_nothing_that_echelon_did_not_write(here, echelon):

@@ -84,7 +84,6 @@ def forgery(change):
 
 @forgery
 def in_json(folder, name, change):
-    """Change the mapping in a file of a run."""
     document = json.loads((folder / name).read_text())
     change(document)
     (folder / name).write_text(json.dumps(document))
@@ -96,7 +95,6 @@ def in_summary(change):
 
 @forgery
 def in_text(folder, name, old, new):
-    """Replace a text in a file of a run, once."""
     text = (folder / name).read_text()
     assert old in text
     (folder / name).write_text(text.replace(old, new, 1))
@@ -112,7 +110,6 @@ def data_of(folder):
 
 @forgery
 def in_data(folder, **attributes):
-    """Change attributes of the dataset of a run."""
     with data_of(folder) as data:
         for name, change in attributes.items():
             data.attrs[name] = change(data.attrs.get(name))
@@ -127,7 +124,6 @@ def in_both(folder, old, new):
 
 @forgery
 def scaled(folder, name):
-    """Halve the last numbers of a variable in the dataset of a run."""
     with data_of(folder) as data:
         data[name][-1:] *= 0.5
 
@@ -141,7 +137,6 @@ def moved(folder, name, by=0.5):
 
 @forgery
 def marked(folder, place, name, value):
-    """Add an attribute to a variable or group in the dataset of a run, or change it."""
     with data_of(folder) as data:
         data[place].attrs[name] = value
 
@@ -168,13 +163,11 @@ def retyped(folder, name):
 
 @forgery
 def without(folder, name):
-    """Remove a variable from the dataset of a run."""
     with data_of(folder) as data:
         del data[name]
 
 
 def dimension(folder):
-    """Add a dimension that no variable has to the dataset of a run."""
     with h5netcdf.File(folder / "run.nc", "r+") as data:
         data.dimensions["trial"] = 3
 
@@ -198,7 +191,6 @@ def hide(document):
 
 
 def doubled(folder):
-    """A gain that is doubled in all files."""
     in_json("gain.json", lambda d: d.update(R=[[4 * x for x in row] for row in d["R"]]))(folder)
     in_summary(lambda d: d["gain"].update(coupling=9.0))(folder)
 

@@ -51,8 +51,6 @@ def file(run, tmp_path_factory):
 
 @pytest.fixture
 def drawn(browser, tmp_path):
-    """Opens the page of recordings."""
-
     def open_page(*runs, **options):
         path = tmp_path / "run.html"
         path.write_text(replay_page(*runs), "utf-8")
@@ -460,7 +458,6 @@ def test_nothing_is_cut_off_on_narrow_and_wide_screens(browser, file):
 
 
 def parts_of(run, cuts):
-    """The stretches of a run between frames."""
     names = ("times", "states", "inputs", "lyapunov", "reference")
     for a, b in itertools.pairwise(cuts):
         yield dataclasses.replace(run, **{name: getattr(run, name)[a:b] for name in names})
@@ -616,7 +613,6 @@ def test_a_run_without_frames_is_refused(run):
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
-    """A run on disk, of one second."""
     from runs import simulate
 
     import echelon as ech

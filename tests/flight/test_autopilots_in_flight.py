@@ -36,7 +36,6 @@ SPEED = float(os.environ.get("FLIGHT_SPEED", "1"))  # below 1 on a machine that 
 
 
 def extra(library, name):
-    """A library that the study needs."""
     try:
         return importlib.import_module(library)
     except ImportError:
@@ -53,14 +52,12 @@ def stopping(_):
 
 
 def formation(model, laws=consensus, network=None):
-    """Four of a model, behind a leader on a circle."""
     places = ech.Formation.from_offsets(model, GRAPH, OFFSETS)
     return ech.Parts(model, GRAPH, places, laws(model), world=ech.World(network=network))
 
 
 @contextlib.contextmanager
 def served(script, **settings):
-    """A process that serves vehicles while the block runs."""
     command = [sys.executable, STAND_INS / script, json.dumps({"speed": SPEED} | settings)]
     with subprocess.Popen(command, stdin=-1, stdout=-1, text=True) as process:
         assert process.stdout.readline() == "ready\n"
@@ -208,7 +205,6 @@ def test_a_link_that_breaks_in_the_air(tmp_path, name, cut):
 
 
 def check_landing(flown, since, name, cut):
-    """Check that a vehicle whose link broke at a time (s) is soon level, and then on the ground."""
     times = np.arange(0.0, 12.0, 0.05)
     t = (flown["times"] - since) * SPEED
     tilts, heights = (

@@ -14,7 +14,6 @@ CARTS, DT, SECONDS = ech.models.DoubleIntegrator(), 0.02, 8.0
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A turning formation of three carts."""
     graph = ech.Graph([(0, 1), (1, 2)], directed=True)
     places = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.0), 2: (1.0, 0.8)})
     places = places.moving(CARTS, graph, [Rotate(0.4)])

@@ -20,7 +20,6 @@ SAME = {
 
 
 def draw(draws, clock):
-    """A letter from any time, of anybody, with a packet of anybody or none."""
     time = clock + draws.choice((draws.uniform(-2.0, 0.2), -0.5, 0.0))
     said = time + draws.choice((draws.uniform(-1.0, 0.2), -0.25))
     packet = Packet(draws.choice((0, 0, 1, 2)), said, (draws.random(), 0.0))

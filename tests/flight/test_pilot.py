@@ -53,7 +53,6 @@ def pilot_of(agent, **options):
 
 
 def draw(draws, facts, sender, t):
-    """A letter of any age up to .3 s."""
     time = max(0.0, t - draws.uniform(0.0, 0.3))
     said = tuple((0.1 * draws.normal(size=facts["network"]["content"])).tolist())
     packet = Packet(0, max(0.0, time - draws.uniform(0.0, 0.9)), said)

@@ -54,7 +54,6 @@ class Crazyflie:
         self.acceleration = None
 
     def answer(self, packet, now):
-        """The packets that answer one."""
         port, channel, data = packet[0] >> 4, packet[0] & 3, packet[1:]
         if packet[0] == 0xFF:
             return [packet]
@@ -78,7 +77,6 @@ class Crazyflie:
         return [bytes([0x81, 1, 1])] if data[0] == 1 else []
 
     def contents(self, data, names):
-        """Of a table of contents: its size, or an entry."""
         if data[0] == 3:
             return [struct.pack("<BHI", 3, len(names), 0x1234)]
         number = struct.unpack_from("<H", data, 1)[0]
@@ -145,7 +143,6 @@ class Crazyflie:
         return [0.0, 0.0, 0.0, self.command[3]] if now - self.heard > LEVEL else self.command
 
     def logged(self, p, v, q, w, now):
-        """The packets of the log that are due in a state; q with w first."""
         millis = [int(1e3 * number) for number in (*p, *v)]
         rates = [int(1e3 * number) for number in (w[0], -w[1], w[2])]
         values = [*millis, packed((*q[1:], q[0])), *rates, 3.9]

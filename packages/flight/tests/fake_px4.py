@@ -38,8 +38,6 @@ def matrix(q):
 
 
 class Px4:
-    """One vehicle's messages."""
-
     def __init__(self, port, weight):
         where = f"udpout:127.0.0.1:{port}"
         self.wire = mavutil.mavlink_connection(where, dialect="common", source_system=1)

@@ -30,7 +30,6 @@ def turned(q, v):
 
 
 def angles(q):
-    """Roll, pitch, yaw (N, 3)."""
     w, x, y, z = q.T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
@@ -38,8 +37,6 @@ def angles(q):
 
 
 class Recorder:
-    """Times (s), places (N, 3) and tilts (N,) in degrees, of one step after the other."""
-
     def __init__(self):
         self.times, self.places, self.tilts = [], [], []
 
@@ -60,7 +57,6 @@ class Radio:
         self.until = [-np.inf] * count
 
     def open(self, k, now):
-        """Whether a vehicle is reached at a time (s)."""
         return now >= self.until[k]
 
     def ends(self, now):
@@ -90,7 +86,6 @@ class Vehicles:
         self.held = np.ones(count, bool)
 
     def responding(self):
-        """The forces that answer the command by `response`."""
         zeta, at = angles(self.q), self.response
         turn = -at["damp"] * self.w
         turn[:, :2] += at["command"] * self.command[:, :2] - at["stiff"] * zeta[:, :2]
@@ -99,7 +94,6 @@ class Vehicles:
         return np.concatenate([self.gain * self.command[:, 3:], torque], 1) @ PULL
 
     def step(self, dt):
-        """Advance by dt (s)."""
         on = self.command[:, 3:] > 0.0
         asked = np.where(on, np.clip(self.controller(self), 0.0, self.motor), 0.0)
         share = 1.0 if self.lag == 0.0 else 1.0 - np.exp(-dt / self.lag)

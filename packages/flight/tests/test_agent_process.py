@@ -89,7 +89,6 @@ def test_a_vehicle_that_says_nothing_is_not_taken_for_one_that_rests(scene, caps
 
 
 def report(scene, number=1, earlier=0):
-    """A report of another process of the same number, as it is sent, maybe in an earlier flight."""
     nothing, wire = Report(*[0] * 12, dropped=(0,) * len(Drop)), scene.wire(number)
     wire.begin(scene.context.wire.flight - earlier)
     return wire.report(scene.clock.time(), nothing)
@@ -124,7 +123,6 @@ def test_who_descends_already_still_says_that_its_number_is_used_twice(scene):
 
 
 def notes(scene):
-    """What the process says to the ground, meanwhile."""
     wire = scene.wire(GROUND)
     opened = [wire.open(each, None, scene.clock.time()) for each in scene.air.receive()]
     return {x.body for x in opened if not isinstance(x, Drop) and x.kind is DatagramKind.NOTE}

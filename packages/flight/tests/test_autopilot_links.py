@@ -27,9 +27,6 @@ def facts(*inputs):
     }  # fmt: skip
 
 
-# ---- a Crazyflie ----
-
-
 class Commander:
     """Writes packets as cflib 0.1.34 does, for the fake."""
 
@@ -198,12 +195,7 @@ def test_a_missing_library_is_named(monkeypatch):
             link("udp://127.0.0.1:19850", facts())
 
 
-# ---- PX4 ----
-
-
 class Mav:
-    """What was sent, by name."""
-
     def __init__(self):
         self.sent = []
 

@@ -24,7 +24,6 @@ ANGLES = rng.uniform([-1.2, -1.2, -3.0], [1.2, 1.2, 3.0], (20, 3))
 
 
 def first(quaternion):
-    """With w first and positive."""
     w_first = np.roll(np.asarray(quaternion), 1)
     return w_first * np.sign(w_first[0])
 
@@ -57,9 +56,6 @@ def test_states_have_the_names_of_models_and_others_are_refused():
     assert attitude.check_states({"x": "m", "yaw": "rad"}) == ("x", "yaw")
     with pytest.raises(FlightError, match="the law has the state `charge`, which no autopilot"):
         attitude.check_states({"x": "m", "charge": "C"})
-
-
-# ---- Crazyflie ----
 
 
 def test_quaternions_of_32_bits_by_hand():
@@ -109,9 +105,6 @@ def test_full_states_keep_place_and_speed_and_ask_for_an_acceleration():
     assert q == pytest.approx([0.0, 0.0, math.sin(0.5), math.cos(0.5)]) and rates == [0.0] * 3
     # Thousandths of what is given, in the two bytes that the firmware reads as mrad/s.
     assert struct.pack("<h", int(1.5 * 1000)) == struct.pack("<h", 1500)
-
-
-# ---- PX4 ----
 
 
 def ned_of(zeta):

@@ -17,7 +17,6 @@ from echelon_flight.datagram_socket import (
 
 
 def heard(air):
-    """What arrives within a second, until something does."""
     for _ in range(100):
         if datagrams := list(air.receive()):
             return datagrams

@@ -22,8 +22,6 @@ def wire(number, key=KEY, boot=BOOT, **options):
 
 
 class Station:
-    """The ground station, and the socket of all others."""
-
     def __init__(self, monkeypatch):
         self.clock = VirtualClock(monkeypatch, 1e-3 * BOOT)
         self.network = Network(self.clock)
@@ -33,13 +31,11 @@ class Station:
         return Ground(self.network.socket(), wire(GROUND, **options), 2)
 
     def say(self, write, *more):
-        """Let an agent send a datagram that it writes at a time, and the station hear it."""
         self.agents.send(write(self.clock.time(), *more))
         self.ground.round()
         self.clock.now += 0.02
 
     def obeyed(self, agent):
-        """The kinds of the commands that an agent obeys within a second."""
         found = set()
         for _ in range(50):
             self.say(agent.report, REPORT)

@@ -26,7 +26,6 @@ def wire(number, key=b"k" * 32):
 
 
 def report(leader, fault=Fault.NONE, amount=0.0):
-    """What an agent says that has dropped 12 old datagrams."""
     dropped = tuple(12 * (why is Drop.OLD) for why in Drop)
     number, mode = list(Fault).index(fault), 1 + (fault is not Fault.NONE)
     place = 1.0, -0.25, math.nan

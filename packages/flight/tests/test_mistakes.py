@@ -4,7 +4,6 @@ Agents, station and vehicles fly in this process under a clock that stands still
 """
 
 import json
-import shutil
 import sys
 import time
 import types
@@ -12,14 +11,14 @@ import types
 import pytest
 import two_points
 from free_port import free_port
-from virtual_flight import VirtualClock, VirtualFlight
+from virtual_flight import VirtualFlight
 
 from echelon_flight import __main__ as process
 from echelon_flight.datagram_socket import DatagramSocket, bound, ports_of
 from echelon_flight.ground import Ground
 from echelon_flight.mission import Mission, make_key
 from echelon_flight.supervisor import Fault
-from echelon_flight.wire import GROUND, is_letter, sender_of
+from echelon_flight.wire import GROUND
 
 
 @pytest.fixture
@@ -36,11 +35,7 @@ def row(flight, number=1):
     return flight.ground.state()["agents"][number]
 
 
-# ---- a process that does not begin ---------------------------------------------------------------
-
-
 def refused(monkeypatch, capsys, *words):
-    """What the program says that ends with the exit code 2."""
     monkeypatch.setattr(sys, "argv", ["echelon_flight", *map(str, words)])
     with pytest.raises(SystemExit) as left:
         process.main()
@@ -78,43 +73,7 @@ def test_a_flight_number_that_is_damaged_or_cannot_be_stored(tmp_path, monkeypat
         assert sentence in refused(monkeypatch, capsys, *words)
 
 
-# ---- an agent that stays on the ground -----------------------------------------------------------
-
-
-def test_a_recorded_flight_starts_no_process_whose_clock_is_that_of_its_day(
-    flight, tmp_path, monkeypatch, capsys
-):
-    """The start and the letters of the leader, into a process that is new and one that flew."""
-    for k in (0, 1):
-        flight.start_agent(k)
-    flight.take_off(0, 1)
-    flight.fly(2.0)
-    assert row(flight)["mode"] == "flies"
-    recorded = [x for x in flight.network.recorded if sender_of(x[1]) != 1]
-    assert any(is_letter(datagram) for _, datagram in recorded)
-    for k in (0, 1):
-        flight.kill(k)
-    capsys.readouterr()
-    # Beside this one there is no number.
-    shutil.copy(tmp_path / "key", tmp_path / "new")
-    for key in ("key", "new"):
-        clock = flight.clock = flight.network.clock = VirtualClock(monkeypatch)
-        flight.start_agent(1, key=tmp_path / key)
-        others, start = flight.network.socket(), recorded[0][0] - clock.time()
-        for at, datagram in recorded:
-            clock.now = max(clock.now, 100.0 + at - recorded[0][0] + start)
-            others.send(datagram)
-            flight.agents[1].round()
-        assert not flight.agents[1].context.clock.started
-        flight.agents[1].interrupt()
-        assert flight.agents[1].over() and flight.agents[1].end() is Fault.SIGNAL
-        flight.kill(1)
-        said = capsys.readouterr().err
-        assert "it never flew" in said and "clock" not in said
-
-
 def unlike(flight, tmp_path, why):
-    """What agent 1 is started with."""
     if "key" in why:
         make_key(tmp_path / "another key")
         return {"key": tmp_path / "another key"}
@@ -149,9 +108,6 @@ def test_an_agent_that_is_unlike_the_others_stays_on_the_ground(flight, tmp_path
     assert said.count(f"agent 1: a datagram of the ground {why}.\n") == 1
     assert "it never flew" in said
     assert flight.ended == {1: Fault.SIGNAL} and row(flight, 0)["mode"] == "flies"
-
-
-# ---- an agent that descends ----------------------------------------------------------------------
 
 
 def test_a_law_that_overruns_its_period(flight, capsys):
@@ -190,19 +146,6 @@ def test_a_link_with_another_step_than_the_law(flight, step):
         return
     flight.wait(lambda state: all(told in notes(state, k) for k in (0, 1)))
     assert [row(flight, k)["mode"] for k in (0, 1)] == ["flies", "flies"]
-
-
-def test_two_agents_with_one_number(flight, capsys):
-    for k in (0, 1):
-        flight.start_agent(k)
-    flight.take_off(0, 1)
-    flight.fly(1.5)
-    flight.start_agent(1, name="again")
-    sentence = "two agents have the number 1"
-    flight.wait(lambda state: sentence in (*notes(state), state["agents"][1].get("why")))
-    flight.wait(lambda state: len(flight.ended) == 3)
-    assert f"{sentence}; the vehicle levels and descends." in capsys.readouterr().err
-    assert flight.ended[0] is Fault.END and flight.ended[1] is Fault.TWIN
 
 
 def test_vehicles_that_vanish_in_the_air(flight):

@@ -57,7 +57,6 @@ RECEIVERS = {"fresh": 0, "restarted": BOOT}
 
 
 def used(receiver, recorded):
-    """How many recorded letters and commands a receiver uses, at the times of the recording."""
     plans = [*recorded.letters, *((None, command) for command in recorded.commands)]
     opened = [receiver.open(datagram, t, WALL) for t, datagram in plans]
     real = [x for x in opened if not isinstance(x, Drop)]
@@ -123,16 +122,12 @@ def test_a_restarted_process_comes_back_and_its_start_is_no_other_s():
 
 
 def test_a_recorded_start_for_others_keeps_no_genuine_one_out():
-    """The station that was recorded began later, by its clock."""
     ground, agent, ahead = wire(GROUND), wire(1), wire(GROUND, boot=BOOT + 900)
     ahead.begin(BOOT)
     for to in (0, 0xFFFE):
         assert agent.open(ahead.start(WALL, WALL + 1.0, to), None, WALL).body is None
     ground.begin(ground.next_flight(WALL))
     assert join(ground, agent)
-
-
-# ---- stop ----------------------------------------------------------------------------------------
 
 
 def stops(ground, agent, wall=WALL, to=0xFFFE):
@@ -170,11 +165,7 @@ def test_a_stop_ends_one_flight_and_not_the_next(tmp_path):
         assert not isinstance(agent.open(stop, None, WALL), Drop)
 
 
-# ---- whole processes -----------------------------------------------------------------------------
-
-
 def replay(scene, other, epoch, count=40):
-    """Send letters of another flight between those of the leader."""
     for k in range(count):
         t = scene.context.clock.now
         if k % 4 == 0:
@@ -247,9 +238,6 @@ def test_a_number_that_cannot_be_stored_keeps_a_vehicle_on_the_ground(monkeypatc
     assert not scene.context.clock.started and not scene.link.sent and said.count("\n") == 1
     assert said.startswith("agent 1: the flight number cannot be stored in `/proc/self/key.agent-1")
     assert said.endswith("); make its folder writable.\n")
-
-
-# ---- the file ------------------------------------------------------------------------------------
 
 
 def test_a_number_that_is_damaged_or_has_no_place_is_refused(tmp_path):

@@ -18,7 +18,6 @@ FLIGHT = BOOT + 5
 
 
 def wire(number=1, key=KEY, formation=FORMATION, boot=BOOT, flight=FLIGHT):
-    """What signs for a process in a flight, or for one that waits for the start."""
     one = Wire(key, formation, number, AGENTS, SIZES, boot, 0)
     if flight:
         one.begin(flight)
@@ -152,7 +151,6 @@ def test_only_the_ground_starts_a_plan():
 
 
 def test_no_forged_datagram_is_used():
-    """Forged, replayed, broken, late and random ones."""
     draws, receiver = random.Random(0), wire(2)
     good = [signed(body_of(), count=k) for k in range(1, 50)]
     for each in good:

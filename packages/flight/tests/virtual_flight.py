@@ -70,8 +70,6 @@ class Network:
 
 
 class MemorySocket:
-    """What a `DatagramSocket` is to a process."""
-
     def __init__(self, network):
         self.network, self.queue = network, []
 
@@ -89,8 +87,6 @@ class MemorySocket:
 
 
 class VehicleLink(Link):
-    """To a simulated vehicle in this process."""
-
     watchdog = True
 
     def __init__(self, vehicle, clock):
@@ -134,7 +130,6 @@ class VirtualFlight:
         self.ground = Ground(self.network.socket(), wire, self.mission.agents)
 
     def start_agent(self, number, mission=None, key=None, skew=0.0, name=None, law=None):
-        """Start the process of an agent, maybe with a mistake."""
         name, self.clock.skew = number if name is None else name, skew
         mission = mission or self.mission
         module, facts = mission.law(number)
@@ -147,7 +142,6 @@ class VirtualFlight:
         self.clock.skew = 0.0
 
     def kill(self, name):
-        """End a process without a word."""
         self.agents.pop(name).context.socket.close()
 
     def take_off(self, *ready):
@@ -164,7 +158,6 @@ class VirtualFlight:
         return state
 
     def fly(self, seconds):
-        """Let time pass."""
         for _ in range(round(seconds / self.part)):
             self.clock.now += self.part
             for vehicle in self.vehicles:
@@ -176,7 +169,6 @@ class VirtualFlight:
             self.ground.round()
 
     def _tell(self):
-        """Let states arrive that are due."""
         if self.clock.now < self._told + self.step - 1e-9 or self.silent:
             return
         self._told = self.clock.now
