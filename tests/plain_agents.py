@@ -1,6 +1,7 @@
 """Agents under exported laws in plain Python, beside `Agent`: the same messages, the same steps."""
 
 import math
+import types
 
 import jax
 import numpy as np
@@ -9,9 +10,8 @@ import echelon as ech
 from echelon.output.archive.flight_folder import network_facts
 from echelon.simulation.onboard.law_functions import law_functions
 from echelon.simulation.onboard.source_code import python_text
-from echelon_flight.wire import Packet
-
-FAR = 2**30
+from echelon_flight.pilot import NOBODY, Letterbox, Pilot, TickResult
+from echelon_flight.wire import Letter, Packet
 
 
 def as_python(functions, folder=None):
@@ -74,140 +74,99 @@ def compare(agent, runs, steps, dt, size=0.1, atol=1e-14):
     return memories
 
 
-class Plain:
-    """An agent's process: its law as plain Python, and the rules about messages."""
+def pilot_of(agent, dt, **options):
+    """A pilot with the exported law of an agent, and the facts that it is given."""
+    own = agent.own_law
+    functions = law_functions(own)
+    facts = {
+        "agent": agent.number,
+        "dt": dt,
+        "leads": own.leads,
+        "hears": list(own.neighbours),
+        "weights": own.weights[0].tolist(),
+        "signal": own.signal_names,
+        "message": own.forward_names,
+        "network": network_facts(own, dt, functions),
+    }
+    law = types.SimpleNamespace(**as_python(functions.values()))
+    states = facts["network"]["messages"] == "state"
+    return (StatePilot if states else Pilot)(law, facts, **options), facts
 
-    def __init__(self, own, dt):
-        functions = law_functions(own)
-        self.law, self.own = as_python(functions.values()), own
-        self.facts = network_facts(own, dt, functions)
-        self.heard, self.packet, self.memory, self.estimate = {}, None, None, None
 
-    def receive(self, message):
-        last = self.heard.get(message.sender)
-        if last is None or message.time > last.time:
-            self.heard[message.sender] = message
-        packet = message.packet
-        if packet is None or self.own.leads and packet.leader >= self.own.number:
-            return
-        mine = self.packet
-        if mine is None or (-packet.leader, packet.time) > (-mine.leader, mine.time):
-            self.packet = packet
+class StatePilot:
+    """A follower that hears leaderward, over a network whose messages contain states.
 
-    def step(self, t, y):
-        """Take a step at a state, or at a measurement where the agent estimates its state."""
-        if "measure" not in self.law:
-            return self.act(t, y)
-        before = self.law["estimate"](y) if self.estimate is None else self.estimate
-        x, estimate, valid = self.law["measure"](y, before)
-        assert valid
-        u, *rest = self.act(t, x)
-        self.estimate = self.law["deliver"](u, estimate)
-        return u, *rest
+    Pilots refuse such messages; docs/onboard.md has the rules.
+    """
 
-    def act(self, t, x):
-        law, facts = self.law, self.facts
-        state, leaderward = facts["messages"] == "state", facts["uses"] == "leaderward"
-        memory = law["begin"](x) if self.memory is None else self.memory
-        signal = law["signal"](t, x, memory)
+    def __init__(self, law, facts):
+        assert facts["network"]["uses"] == "leaderward" and not facts["leads"]
+        self.law, self.facts, self.memory = law, facts, None
+        self.box = Letterbox(facts["hears"], facts["network"]["leaders"], None)
 
-        def away_from(other):
-            return law["difference"](t, x, memory, other)
-
-        ready = self.own.leads or self.packet is not None
-        leader, forward, valid = signal, [0.0] * len(self.own.forward_names), True
-        if self.packet is not None:
-            leader, forward, valid = self.expected(t, signal)
-        messages = [self.heard.get(k) for k in self.own.neighbours]
-        ages = [math.inf if m is None else max(0.0, t - m.time) for m in messages]
-        hops = [FAR if m is None else m.hops for m in messages]
-        own_hops = self.hops(ages, hops)
-        total, z = 0.0, [0.0] * len(signal)
-        for weight, m, age, of_sender in zip(
-            self.own.weights[0].tolist(), messages, ages, hops, strict=True
-        ):
-            fresh = age < math.inf if state else age <= facts["forget"]
-            used = age < math.inf if state else ready
-            if not used:
-                continue
-            value = list(m.signal[1]) if fresh else [0.0] * len(signal)
-            other = value if state else [a + b for a, b in zip(leader, value, strict=True)]
-            if leaderward and not ((fresh or of_sender == 0) and of_sender < own_hops):
-                continue
-            z = [a + weight * b for a, b in zip(z, away_from(other), strict=True)]
-            total += weight
-        if leaderward and total > 0.0:
-            z = [a / total for a in z]
-        elif leaderward:
-            z = away_from(leader) if ready else z
-        forward = [0.0] * len(forward) if self.own.leads else forward
-        u, self.memory, _, _, *content, fine = law["tick"](t, x, z, forward, memory)
-        assert valid and fine
-        packet = self.packet
-        if self.own.leads and packet is None:
-            packet = self.own.number, t, content[0]
-        value = signal if state else away_from(leader)
-        return u, value, own_hops, packet
-
-    def expected(self, t, signal):
-        if self.facts["messages"] == "state":
-            return signal, list(self.packet.content), True
-        content, age = list(self.packet.content), max(0.0, t - self.packet.time)
-        if "carry" in self.law:
-            rounds, duration = self.law["pace"](age)
-            for _ in range(int(rounds)):
-                content, fine = self.law["carry"](content, duration)
-                assert fine
-        return self.law["expected"](t, content, age)
-
-    def hops(self, ages, hops):
-        if self.own.leads:
-            return 0
-        lasting = [h for a, h in zip(ages, hops, strict=True) if a <= self.facts["forget_hops"]]
-        hops = min([FAR, *lasting]) + 1
-        return hops if hops < self.facts["agents"] else FAR
+    def tick(self, t, x):
+        law, facts, letters = self.law, self.facts, [*self.box.letters.values()]
+        memory = law.begin(x) if self.memory is None else self.memory
+        forget, agents = facts["network"]["forget_hops"], facts["network"]["agents"]
+        hops = min((m.hops for m in letters if m and t - m.time <= forget), default=NOBODY) + 1
+        hops = hops if hops < agents else NOBODY
+        used = [(w, m) for w, m in zip(facts["weights"], letters) if m and m.hops < hops]
+        gaps = [np.multiply(w, law.difference(t, x, memory, m.value)) for w, m in used]
+        z = sum(gaps, np.zeros(len(facts["signal"]))) / (sum(w for w, _ in used) or 1.0)
+        packet = self.box.packet
+        forward = [0.0] * len(facts["message"]) if packet is None else list(packet.content)
+        u, after, signal, _, valid = law.tick(t, x, z.tolist(), forward, memory)
+        self.memory = after
+        return TickResult(u, Letter(facts["agent"], t, hops, tuple(signal), packet), valid)
 
 
 def compare_late(agent, dt, steps, size=0.1):
-    """Let an agent and its exported law take the same steps on the same random messages."""
+    """Let an agent and a pilot with its law take the same steps on the same random messages."""
     own, draws = agent.own_law, np.random.default_rng(1)
-    plain = Plain(own, dt)
-    trim = np.array(own.loop.model.trim[0], float)
-    sent = 0
+    pilot, facts = pilot_of(agent, dt)
+    trim, sent = np.array(own.loop.model.trim[0], float), 0
     for k in range(steps):
         t = k * dt
         for sender in own.neighbours:
             # Lost or late, some for long, and none at first.
             if k > 5 and (k // 60) % 3 != 2 and draws.random() < 0.3:
                 time = max(0.0, t - draws.uniform(0.0, 0.3))
-                message = letter(own, plain.facts, sender, time, draws)
-                agent.receive(message)
-                plain.receive(message)
+                letter = draw_letter(own, facts, sender, time, draws)
+                answer = agent.receive(as_message(letter, own.signal_names))
+                assert (pilot.box.receive(letter, t) is None) == (str(answer) == "taken")
         x = trim + size * draws.normal(size=len(trim))
         u, message = agent.step(t, x)
-        ours, value, hops, packet = plain.step(t, x.tolist())
+        ours, letter, valid = pilot.tick(t, x.tolist())
         # The input is a sum of terms as large as the own deviation.
         terms = [*u, *([] if message is None else message.signal.values)]
         np.testing.assert_allclose(ours, u, rtol=0, atol=1e-13 * max(1.0, np.abs(terms).max()))
-        if message is None:
-            continue
-        sent += 1
-        assert message.hops == hops
-        np.testing.assert_allclose(value, message.signal.values, rtol=0, atol=1e-12)
-        if packet is not None:
-            assert packet[:2] == message.packet[:2]
-            np.testing.assert_allclose(packet[2], message.packet.content, rtol=0, atol=1e-12)
+        assert valid and (message is None) == (letter is None)
+        if message is not None:
+            sent += 1
+            assert letter.hops == min(message.hops, NOBODY) and letter.time == message.time
+            np.testing.assert_allclose(letter.value, message.signal.values, rtol=0, atol=1e-12)
+            if letter.packet is not None:
+                content = message.packet.content
+                assert letter.packet[:2] == message.packet[:2]
+                np.testing.assert_allclose(letter.packet.content, content, rtol=0, atol=1e-12)
     assert sent > steps // 2
 
 
-def letter(own, facts, sender, time, draws):
+def draw_letter(own, facts, sender, time, draws):
+    network = facts["network"]
     values = 0.2 * draws.normal(size=len(own.signal_names))
-    leader, hops = facts["leaders"][0], int(draws.choice([0, 1, 2, FAR]))
-    said = 0.1 * draws.normal(size=facts["content"])
-    if facts["prediction"] == "packet":
+    hops = int(draws.choice([0, 1, 2, NOBODY]))
+    said = 0.1 * draws.normal(size=network["content"])
+    if network["prediction"] == "packet":
         # In the vehicle's units: a torque of .1 N m would turn it by 10^4 rad/s^2.
         units = np.abs(np.diag(own.loop.model.input_scale))
         said[-len(units) :] *= units
     said = tuple(said.tolist())
-    packet = Packet(leader, max(0.0, time - draws.uniform(0.0, 0.9)), said)
-    return ech.Message(sender, (own.signal_names, values), None, time, hops, packet)
+    packet = Packet(network["leaders"][0], max(0.0, time - draws.uniform(0.0, 0.9)), said)
+    return Letter(sender, time, hops, tuple(values.tolist()), packet)
+
+
+def as_message(letter, names):
+    hops = 2**30 if letter.hops == NOBODY else letter.hops
+    signal = names, letter.value
+    return ech.Message(letter.sender, signal, None, letter.time, hops, letter.packet)

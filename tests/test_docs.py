@@ -171,6 +171,21 @@ graph: {name: path, agents: 5}
 follower: {gain: {method: decay, weight: 2.0}}
 simulation: {horizon: 1.0, dt: 0.01}
 """
+DESIGNS = """
+import contextlib, io, json, sys
+from echelon.apps.cli.app import main
+
+said = []
+for words in ["--json"], ["--set", "follower.gain.Q=[1, 1]"], ["--set", "follower.gain.wait=1"]:
+    sys.argv = ["echelon", "design", "pushed.yaml", *words]
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as end:
+            said.append([end.code or 0, out.getvalue(), err.getvalue()])
+json.dump(said, sys.stdout)
+"""
 
 
 def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
@@ -194,27 +209,23 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
         (package / file).write_text(text.replace(above, f"{above}\n{line}"), "utf-8")
     (tmp_path / "pushed.yaml").write_text(PENDULUM)
 
-    def call(*arguments):
-        command = [sys.executable, "-m", "echelon", "design", "pushed.yaml", *arguments]
-        given = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
-        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=given)
-
-    done = call("--json")
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    given = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": path}}
+    command = [sys.executable, "-c", DESIGNS]
+    done = subprocess.run(command, capture_output=True, text=True, **given)
     assert done.returncode == 0, done.stderr
-    rows = {row["method"]: row for row in json.loads(done.stdout)["methods"]}
-    assert {*rows} == {*METHODS, "decay"} - {"given"}
+    (code, designs, _), taken, unknown = json.loads(done.stdout)
+    rows = {row["method"]: row for row in json.loads(designs)["methods"]}
+    assert code == 0 and {*rows} == {*METHODS, "decay"} - {"given"}
     assert (rows["decay"]["coupling"], rows["decay"]["edge"]) == (1.0, 0.0)
     assert rows["decay"]["slowest_mode"] < 0.0
     assert rows["contraction"]["reason"] == (
         "set `follower.gain={method: contraction, domain: {angle: HALF_WIDTH, ...}}` to try it"
     )
-    refused = call("--set", "follower.gain.Q=[1, 1]")
-    assert refused.returncode == 2
-    said = "got a key that `decay` does not take, allowed are `coupling`, `weight`."
-    assert refused.stderr.strip().endswith(f"--set follower.gain.Q=[1, 1]: {said}")
-    refused = call("--set", "follower.gain.wait=1")
-    assert "follower.gain.wait=1: got an unknown key" in refused.stderr
-    assert refused.stderr.strip().endswith("(did you mean `weight`?).")
+    said = "got a key that `decay` does not take, allowed are `coupling`, `weight`.\n"
+    assert taken[0] == 2 and taken[2].endswith(f"--set follower.gain.Q=[1, 1]: {said}")
+    assert "follower.gain.wait=1: got an unknown key" in unknown[2]
+    assert unknown[2].endswith("(did you mean `weight`?).\n")
 
 
 def test_few_blocks_are_left_out():

@@ -186,12 +186,6 @@ def test_packages_keep_their_import_contracts():
     assert done.returncode == 0, done.stdout
 
 
-def test_the_top_folder_holds_the_entry_points_alone():
-    named = {path.name for path in PACKAGE.iterdir() if not path.name.startswith("__pycache__")}
-    files = {name for name in named if not (PACKAGE / name).is_dir()}
-    assert files == {"__init__.py", "__init__.pyi", "__main__.py", "py.typed"}
-
-
 def test_no_import_cycle_not_even_among_imports_for_annotations():
     for edges in (loads, mentions):
         sorter = graphlib.TopologicalSorter({module: edges(module) for module in PATHS})
@@ -226,9 +220,11 @@ def test_echelon_knows_five_names_of_flight_and_its_version():
     assert flight.__version__ == CONTAINED
 
 
-def test_folders_are_layers_and_packages():
+def test_folders_are_layers_and_packages_and_the_top_holds_the_entry_points_alone():
     assert max(len(path.relative_to(PACKAGE).parts) for path in FILES) <= 3
     assert max(len(path.relative_to(FLIGHT).parts) for path in FLIGHT.rglob("*.py")) <= 2
+    files = {path.name for path in PACKAGE.iterdir() if path.is_file()}
+    assert files == {"__init__.py", "__init__.pyi", "__main__.py", "py.typed"}
 
 
 def test_the_names_of_files_and_classes_are_unique():

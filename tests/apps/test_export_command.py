@@ -81,15 +81,15 @@ def test_a_law_without_scalar_operations_is_refused_with_its_line():
         law_files(parts, ech.Settings(horizon=1.0, dt=0.01), 1, "")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (("--to", "law"), "`--to law` needs `--agent`, the number of an agent."),
-        (("--agent", 1, "--to", "csv"), "`--agent` is of a law, and `--to` is `csv`; use `law`"),
-        (("--set", "seed=1"), "`--set` is of a scenario, and a run is written as it is"),
-        ((), "`integrators` does not exist; give the folder of a run, or its `run.nc`."),
-    ],
-)
-def test_a_run_and_a_law_are_not_confused(echelon, arguments, sentence):
-    code, _, errors = echelon("export", "integrators", *arguments)
-    assert code == 2 and sentence in errors and errors.count("\n") == 1
+CONFUSED = {
+    "--to law": "`--to law` needs `--agent`, the number of an agent.",
+    "--agent 1 --to csv": "`--agent` is of a law, and `--to` is `csv`; use `law`",
+    "--set seed=1": "`--set` is of a scenario, and a run is written as it is",
+    "": "`integrators` does not exist; give the folder of a run, or its `run.nc`.",
+}
+
+
+def test_a_run_and_a_law_are_not_confused(echelon):
+    for words, sentence in CONFUSED.items():
+        code, _, errors = echelon("export", "integrators", *words.split())
+        assert code == 2 and sentence in errors and errors.count("\n") == 1
