@@ -560,7 +560,7 @@ def test_a_growing_mode_is_told_at_once(panel):
 HELD = {"state": "holds", "short": "promised", "whole": "Promised.", "rate": 1.0, "causes": []}
 
 
-def badges_of(model, errors, pitch=None, begins=None, apart=None):
+def badges_of(errors, model=ech.models.DoubleIntegrator(), pitch=None, begins=None, apart=None):
     """What the badge tells over time (s) of errors, one a second, of a leader and a follower."""
     told, names = [], model.state_names
     status = GuaranteeStatus(model, ech.Graph.path(2), told.append)
@@ -574,38 +574,36 @@ def badges_of(model, errors, pitch=None, begins=None, apart=None):
             states[1, names.index("pitch")] = pitch[second]
         size, none = np.array([0.0, error]), np.zeros(2, bool)
         rows = float(second), states, states, size, states, None, np.nan, none
-        near = np.inf if apart is None else apart[second]
-        status.look(Picture(*rows, apart=near))
+        status.look(Picture(*rows, apart=np.inf if apart is None else apart[second]))
     return told
 
 
+def states_of(badges):
+    return [each["state"] for each in badges]
+
+
 def test_the_badge_is_green_only_where_what_is_promised_reaches():
-    grown = badges_of(
-        ech.models.DoubleIntegrator(), [1.0, 1.5, 1.0, 2.9, 3.1, 4.0, 3.0, 2.1, 2.0, 1.0]
-    )
-    assert [each["state"] for each in grown] == ["holds", "lost", "holds"]
+    grown = badges_of([1.0, 1.5, 1.0, 2.9, 3.1, 4.0, 3.0, 2.1, 2.0, 1.0])
+    assert states_of(grown) == ["holds", "lost", "holds"]
     assert "does not cover this run" in grown[1]["causes"][0]
-    out = badges_of(
-        ech.models.Quadrotor(), [2.0, 8.0, 8.0, 5.0, 4.0], pitch=[0.0, 1.6, 0.0, 0.0, 0.0]
-    )
-    assert [each["state"] for each in out] == ["holds", "lost", "holds"]
+    errors, pitch = [2.0, 8.0, 8.0, 5.0, 4.0], [0.0, 1.6, 0.0, 0.0, 0.0]
+    out = badges_of(errors, ech.models.Quadrotor(), pitch)
+    assert states_of(out) == ["holds", "lost", "holds"]
     assert "Agent 1 left the domain of its equations at t = 1.00 s: `pitch`" in out[1]["causes"][1]
 
 
 def test_a_first_swing_and_errors_of_no_size_take_no_promise_back():
     for errors in ([0.0, 0.5, 1.0, 1.9, 1.0], [1e-9, 1e-9, 1e-9, 1e-3, 9e-3]):
-        assert len(badges_of(ech.models.DoubleIntegrator(), errors)) == 1
+        assert len(badges_of(errors)) == 1
     # What is done has a swing of its own, and errors without equal are doubted until they halve.
-    model = ech.models.DoubleIntegrator()
-    assert len(badges_of(model, [0.5, 1e-9, 1e-9, 1e-9, 0.5, 0.9], begins=4)) == 1
-    fallen = badges_of(model, [0.5, 0.1, 0.1, 1.1, 9.0, 9.5, 4.7, 2.0], begins=4)
-    assert [each["state"] for each in fallen] == ["holds", "lost", "edge", "holds"]
+    assert len(badges_of([0.5, 1e-9, 1e-9, 1e-9, 0.5, 0.9], begins=4)) == 1
+    fallen = badges_of([0.5, 0.1, 0.1, 1.1, 9.0, 9.5, 4.7, 2.0], begins=4)
+    assert states_of(fallen) == ["holds", "lost", "edge", "holds"]
 
 
 def test_the_badge_of_distances_is_green_while_hulls_are_apart_whatever_the_errors():
-    errors, apart = [1.0, 9.0, 9.0, 9.0, 1.0], [0.4, 0.3, 0.28, 0.1, 0.3]
-    told = badges_of(ech.models.DoubleIntegrator(), errors, begins=1, apart=apart)
-    assert [each["state"] for each in told] == ["holds", "lost", "holds"]
+    told = badges_of([1.0, 9.0, 9.0, 9.0, 1.0], begins=1, apart=[0.4, 0.3, 0.28, 0.1, 0.3])
+    assert states_of(told) == ["holds", "lost", "holds"]
     assert told[1]["causes"] == [
         "The hulls of two agents are 0.28 m apart, scaled, as after a kick; from 0.3 m on it is "
         "guaranteed again that agents stay apart."

@@ -16,11 +16,13 @@ from processes import started, wait_for
 from runs import OWN_PENDULUM
 
 import echelon as ech
+from echelon.apps.cli.terminal import STOP
 from echelon.core import files
 from echelon.core.files import write_atomic
 from echelon.experiments.results.labelled import read_labelled
 from echelon.laws.law import Law
 from echelon.output.archive.chunks import Chunks
+from echelon.output.archive.study_folder import Flights
 from echelon.simulation.engine import simulate as engine
 from echelon.simulation.engine.chunk_grid import ChunkGrid
 from echelon.simulation.engine.simulate import reassemble
@@ -341,9 +343,6 @@ def test_design_overwrites_nothing(here, echelon):
 
 
 def test_a_comparison_that_is_interrupted_keeps_what_was_flown(here, echelon, monkeypatch):
-    from echelon.apps.cli.terminal import STOP
-    from echelon.output.archive.study_folder import Flights
-
     kept = Flights.write
 
     def write(self, row):

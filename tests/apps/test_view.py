@@ -3,9 +3,11 @@
 import dataclasses
 import itertools
 import json
+import os
 import struct
 import zlib
 
+import h5py
 import numpy as np
 import pytest
 from browser import chromium, opened, until
@@ -13,6 +15,7 @@ from oracles import rotation
 from recordings import flown, separated, swinging
 from scipy.spatial.transform import Rotation
 
+import echelon as ech
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
 from echelon.experiments.results.recording import recording_of
@@ -580,13 +583,15 @@ def test_frames_are_at_most_50_a_second_and_end_with_the_last(run):
     assert list(frames_of(run)) == list(range(301))
 
 
-def test_four_agents_for_a_minute_take_less_than_half_a_megabyte():
-    assert len(replay_page(flown(seconds=60.0))) <= 0.5e6
+SIZES = [
+    (4, 60.0, (0,), 0.5e6),
+    pytest.param(1000, 20.0, tuple(range(0, 1000, 25)), 3e6, marks=pytest.mark.slow),
+]
 
 
-@pytest.mark.slow
-def test_a_thousand_agents_for_20_s_take_less_than_three_megabytes():
-    assert len(replay_page(flown(1000, 20.0, leaders=tuple(range(0, 1000, 25))))) <= 3e6
+@pytest.mark.parametrize(("agents", "seconds", "leaders", "most"), SIZES)
+def test_a_page_is_small(agents, seconds, leaders, most):
+    assert len(replay_page(flown(agents, seconds, leaders=leaders))) <= most
 
 
 def test_agents_that_fly_away_spoil_neither_the_scale_nor_the_rest():
@@ -613,23 +618,12 @@ def test_a_run_without_frames_is_refused(run):
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
-    from runs import simulate
-
-    import echelon as ech
-
-    graph = ech.Graph.path(3)
-    model = ech.models.SingleIntegrator(dimension=2)
-    gain = ech.gains.FixedGain("identity", coupling=2.0)
-    result = simulate(
-        model,
-        graph,
-        ech.Formation.from_offsets(model, graph, {1: [1, 0], 2: [2, 0]}),
-        leader=ech.laws.TrimInput(),
-        follower=ech.laws.Consensus(ech.synthesize(model, graph, gain), "relay"),
-        initial={"position": 1.0},
-        horizon=1.0,
-        dt=0.01,
-    )
+    model, graph = ech.models.SingleIntegrator(dimension=2), ech.Graph.path(3)
+    gain = ech.synthesize(model, graph, ech.gains.FixedGain("identity", coupling=2.0))
+    places = ech.Formation.from_offsets(model, graph, {1: [1, 0], 2: [2, 0]})
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, "relay"))
+    parts = ech.Parts(model, graph, places, laws, {"position": 1.0})
+    result = ech.simulate(parts, ech.Settings(horizon=1.0, dt=0.01))
     path = tmp_path_factory.mktemp("stored") / "run.nc"
     ech.save_dataset(result, path)
     return result, path
@@ -658,8 +652,6 @@ def test_view_writes_one_file_and_replaces_none_unasked(echelon, stored):
 
 
 def test_view_without_a_run_takes_the_newest_and_at_most_two(echelon, here, stored):
-    import os
-
     code, _, fault = echelon("view", "--html", "out.html")
     assert code == 2 and fault == (
         "echelon: there is no run in `runs/`; give the folder of a run.\n"
@@ -680,8 +672,6 @@ def test_view_without_a_run_takes_the_newest_and_at_most_two(echelon, here, stor
 
 
 def test_what_is_no_run_is_refused_in_a_sentence(echelon, here, stored):
-    import h5py
-
     (here / "junk.nc").write_bytes(stored[1].read_bytes()[:3000])
     (here / "old.nc").write_bytes(stored[1].read_bytes())
     with h5py.File(here / "old.nc", "r+") as old:
