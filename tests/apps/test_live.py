@@ -119,11 +119,10 @@ def test_radio_and_noise_are_knobs_in_gusts_and_with_motors_that_lag():
     swarm = LiveLoop(*panel.experiment, panel.live)
     assert {"delay", "loss", "outages", "noise"} <= {*panel.ranges}
     knobs = panel.start._replace(delay=0.06, loss=0.5, outages=0.2, noise=3.0)
-    for each in (panel.start, knobs):
-        parts, settings = build(panel.scenario_at(each))
-        run = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
-        swarm.apply(each)
-        np.testing.assert_allclose(flown(swarm), run.states[1:], atol=1e-11)
+    parts, settings = build(panel.scenario_at(knobs))
+    run = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
+    swarm.apply(knobs)
+    np.testing.assert_allclose(flown(swarm), run.states[1:], atol=1e-11)
     # A link is as fresh as its oldest message, but for what arrives at the frame itself.
     traffic, heard = run.traffic, run.parts.receives
     fresh = link_shades(traffic.ages[-1], np.zeros(heard.shape), 0.3, heard)
