@@ -176,20 +176,15 @@ def test_a_killed_run_opens_as_stopped_and_goes_on_to_the_same_bits(here, echelo
     assert code == 0 and "is complete; nothing to do" in out
 
 
-def interrupted(here, number):
+def test_interrupting_keeps_what_was_computed(here, echelon):
     with started(EAGER, "run", "mine.yaml", *LONG, "--no-figures", "--out", "o") as process:
         wait_for(process, lambda: list(here.glob("o/chunks/*.npz")))
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
         told = process.stderr.readline()
         while told and "stopping and saving results" not in told:
             told = process.stderr.readline()
-        out, err = process.communicate()
-    return process.returncode, out, told
-
-
-def test_interrupting_keeps_what_was_computed(here, echelon):
-    code, out, told = interrupted(here, signal.SIGINT)
-    assert code == 130 and "stopping and saving results" in told
+        out, _ = process.communicate()
+    assert process.returncode == 130 and "stopping and saving results" in told
     summary = json.loads((here / "o" / "summary.json").read_text())
     assert summary["outcome"]["name"] == "interrupted" and "was interrupted at t = " in out
     # The head of the table says what ran and not what was asked.
