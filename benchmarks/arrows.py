@@ -23,7 +23,7 @@ import numpy as np
 import scipy.linalg
 
 import echelon as ech
-from echelon.agents.models.chains import chains_of, flatten
+from echelon.agents.models.chains import chains_of, to_flat
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.guarantees.stopping.stopping_run import stopping_run_of
@@ -66,8 +66,8 @@ def fly(loop: Any, weights: jax.Array, starts: jax.Array, dt: float) -> tuple[ja
 
     def flat(now: Any) -> tuple[jax.Array, jax.Array]:
         x, e = now.states[loop.followers], now.follower_memory.chain
-        values = jax.vmap(lambda x, e: flatten(model, chains, x, e).values)(x, e)
-        led = flatten(model, chains, now.states[0], now.leader_memory.chain[0]).values
+        values = jax.vmap(lambda x, e: to_flat(model, chains, x, e).values)(x, e)
+        led = to_flat(model, chains, now.states[0], now.leader_memory.chain[0]).values
         stops = jax.vmap(ready.stop)(values[:, : len(ready.weights)])
         return values[:, 2, 2], jnp.abs(stops - ready.stop(led[: len(ready.weights)])).max(axis=0)
 

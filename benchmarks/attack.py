@@ -36,7 +36,7 @@ _STARTS, _STEPS = (
 
 
 @dataclass(frozen=True)
-class Promise:
+class Guarantee:
     """What a certificate says, in the words of the attack.
 
     `grounded` is the follower block of the Laplacian; bounds are those of deviations from the trim
@@ -64,7 +64,7 @@ class Promise:
         low = float(np.linalg.eigvalsh(self.grounded)[0])
         return 0.0 if self.theorem is Theorem.A5 else 2.0 * self.coupling * low
 
-    def widened(self, factor: float) -> "Promise":
+    def widened(self, factor: float) -> "Guarantee":
         """Return the false promise of the same on a wider domain."""
         names = ("low", "high", "input_low", "input_high")
         wide = {name: factor * getattr(self, name) for name in names}
@@ -85,12 +85,12 @@ class Outcome:
     violations: list[str] = field(default_factory=list)
 
 
-def promise_of(system: System, gain: ech.Gain) -> Promise | None:
+def promise_of(system: System, gain: ech.Gain) -> Guarantee | None:
     """Return the promise on the system's domain that a gain carries, or None."""
     region, plant = gain.certificate.region, system.plant
     if region is None or region.kind not in (Kind.PROOF, Kind.VERTICES):
         return None
-    return Promise(
+    return Guarantee(
         kind=region.kind,
         theorem=region.theorem,
         rate=region.rate,
@@ -108,7 +108,7 @@ def promise_of(system: System, gain: ech.Gain) -> Promise | None:
     )
 
 
-def attack(promise: Promise, rng: np.random.Generator) -> Outcome:
+def attack(promise: Guarantee, rng: np.random.Generator) -> Outcome:
     """Search for a violation by gradients, then by simulation."""
     search = Search(promise)
     margin, tolerance, worst, points = search.run(rng)
@@ -131,7 +131,7 @@ class Search:
     the rate that is missing.
     """
 
-    def __init__(self, promise: Promise) -> None:
+    def __init__(self, promise: Guarantee) -> None:
         """Prepare the derivatives of drift and input map."""
         p, self.promise = promise.plant, promise
         n, self.m = p.B.shape
@@ -216,7 +216,7 @@ class Search:
 
 
 def simulate(
-    promise: Promise, worst: np.ndarray, size: float, rng: np.random.Generator, found: Outcome
+    promise: Guarantee, worst: np.ndarray, size: float, rng: np.random.Generator, found: Outcome
 ) -> None:
     """Run the closed loop where the promise speaks of it, and note what it breaks."""
     if promise.theorem is Theorem.T2:
@@ -227,7 +227,7 @@ def simulate(
             _moving(promise, worst, size, rng, found)
 
 
-def _starts(promise: Promise, worst: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _starts(promise: Guarantee, worst: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return deviations (S, N, n) with sum delta'P delta = 1, some of them the hardest known."""
     N, n = len(promise.grounded), len(promise.P)
     W, L = np.linalg.inv(promise.P), np.linalg.inv(np.linalg.cholesky(promise.P))
@@ -249,7 +249,7 @@ def _measure(delta: np.ndarray, P: np.ndarray) -> np.ndarray:
     return np.einsum("sia,ab,sib->s", delta, P, delta)
 
 
-def _pace(promise: Promise, size: float) -> float:
+def _pace(promise: Guarantee, size: float) -> float:
     """Return a step that resolves the fastest mode, or a third of the slowest time constant."""
     p, G = promise, promise.plant.B
     feedback = np.abs(np.linalg.eigvals(G @ np.linalg.solve(p.R, G.T @ p.P))).max()
@@ -276,7 +276,7 @@ def _runge_kutta(
     return np.stack(path)
 
 
-def _loop(promise: Promise) -> Field:
+def _loop(promise: Guarantee) -> Field:
     """Return xdot of leader and followers (S, 1 + N, n), the leader's input w (S, m) relayed."""
     p, plant, R_inverse = promise, promise.plant, np.linalg.inv(promise.R)
     L = np.zeros((len(p.grounded) + 1, len(p.grounded) + 1))
@@ -298,7 +298,7 @@ def _loop(promise: Promise) -> Field:
 
 
 def _resting(
-    p: Promise, worst: np.ndarray, size: float, rng: np.random.Generator, found: Outcome
+    p: Guarantee, worst: np.ndarray, size: float, rng: np.random.Generator, found: Outcome
 ) -> None:
     """Start on the boundary of the certified set, the leader at its trim."""
     start = (1.0 if p.radius is None else p.radius) * _starts(p, worst, rng)
@@ -308,7 +308,7 @@ def _resting(
 
 
 def _moving(
-    p: Promise, worst: np.ndarray, size: float, rng: np.random.Generator, found: Outcome
+    p: Guarantee, worst: np.ndarray, size: float, rng: np.random.Generator, found: Outcome
 ) -> None:
     """Start anywhere in the domain, the leader driven at random within the bounds of inputs."""
     low, high = np.maximum(p.low, -2.0), np.minimum(p.high, 2.0)
@@ -323,7 +323,7 @@ def _moving(
 
 
 def _compare(
-    p: Promise, x: np.ndarray, w: np.ndarray, dt: float, found: Outcome, stays: bool
+    p: Guarantee, x: np.ndarray, w: np.ndarray, dt: float, found: Outcome, stays: bool
 ) -> None:
     """Compare V along runs with the promise, while all agents are in the domain.
 
@@ -353,7 +353,7 @@ def _energy(delta: np.ndarray, weight: np.ndarray, P: np.ndarray) -> np.ndarray:
 
 
 def _decays(
-    p: Promise,
+    p: Guarantee,
     v: np.ndarray,
     rough: np.ndarray,
     dt: float,
@@ -376,7 +376,7 @@ def _decays(
 
 
 def _variational(
-    p: Promise, worst: np.ndarray, size: float, rng: np.random.Generator, found: Outcome
+    p: Guarantee, worst: np.ndarray, size: float, rng: np.random.Generator, found: Outcome
 ) -> None:
     """Integrate small errors behind a moving leader: what T2 speaks of."""
     low, high = np.maximum(p.low, -2.0), np.minimum(p.high, 2.0)

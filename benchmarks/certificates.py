@@ -160,10 +160,10 @@ def euler() -> list[Row]:
     at_edge = ech.gains.RobustLQR(bounds, coupling=0.5 / low)
     what = "robust LQR, 12 states, tilt 20, yaw 10 deg, +-2 m/s^2"
     return [
-        (f"{what}: promise", promise(gain), "0.2 1/s"),
+        (f"{what}: promise", guarantee(gain), "0.2 1/s"),
         (
             f"{what}: promise at the edge of the coupling, half of it",
-            promise(ech.synthesize(model, LINE, at_edge)),
+            guarantee(ech.synthesize(model, LINE, at_edge)),
             "-",
         ),
         (f"{what}: condition of P", f"{np.linalg.cond(gain.P):.0f}", "500"),
@@ -186,7 +186,7 @@ def thrust() -> list[Row]:
             rows.append(
                 (
                     f"{name}, 13 states, {where}: promise, condition of P, coupling, time in all",
-                    f"{promise(gain)}, {np.linalg.cond(gain.P):.0f}, {gain.coupling:.3g}, "
+                    f"{guarantee(gain)}, {np.linalg.cond(gain.P):.0f}, {gain.coupling:.3g}, "
                     f"{seconds:.1f} s",
                     "proof, 60 s",
                 )
@@ -194,7 +194,7 @@ def thrust() -> list[Row]:
     return rows
 
 
-def promise(gain: ech.Gain) -> str:
+def guarantee(gain: ech.Gain) -> str:
     """Return what a gain promises on its domain, in words."""
     region = gain.certificate.region
     return "none" if region is None else f"{region.rate:.3f} 1/s ({region.kind}, {region.theorem})"

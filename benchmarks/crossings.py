@@ -22,7 +22,7 @@ from echelon.agents.world.sensing import Sensing
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import Loop, Moment, assemble
+from echelon.simulation.step.loop import Loop, LoopState, assemble
 from echelon.simulation.step.sequence import begin, step
 
 MODEL = ech.models.Quadrotor.crazyflie()
@@ -125,7 +125,7 @@ def _fly(loop: Loop, states: Array, offsets: Array, frames: int) -> tuple[jax.Ar
     def one(states: jax.Array, offsets: jax.Array) -> tuple[jax.Array, jax.Array]:
         own = dataclasses.replace(loop, offsets=offsets)
 
-        def each(_: jax.Array, carry: tuple[Moment, jax.Array]) -> tuple[Moment, jax.Array]:
+        def each(_: jax.Array, carry: tuple[LoopState, jax.Array]) -> tuple[LoopState, jax.Array]:
             now = step(own, carry[0])
             places = now.states[:, :3] * scales
             squares = ((places[:, None] - places) ** 2).sum(axis=2)
@@ -133,8 +133,8 @@ def _fly(loop: Loop, states: Array, offsets: Array, frames: int) -> tuple[jax.Ar
             return now, jnp.minimum(carry[1], squares.min())
 
         def frame(
-            carry: tuple[Moment, jax.Array], _: None
-        ) -> tuple[tuple[Moment, jax.Array], jax.Array]:
+            carry: tuple[LoopState, jax.Array], _: None
+        ) -> tuple[tuple[LoopState, jax.Array], jax.Array]:
             now, least = jax.lax.fori_loop(0, _EVERY, each, carry)
             away = (now.states - offsets)[:, :3]
             return (now, least), jnp.linalg.norm(away - away[0], axis=1).max()

@@ -47,7 +47,7 @@ def drawn(network: ech.Network | None, seed: int) -> tuple[ech.Parts, int]:
     random, count = np.random.default_rng(seed), 0
     while True:
         count += 1
-        heirs = tuple(random.permutation(np.arange(1, AGENTS))[:3].tolist())
+        backups = tuple(random.permutation(np.arange(1, AGENTS))[:3].tolist())
         try:
             return (
                 ech.Parts(
@@ -58,7 +58,7 @@ def drawn(network: ech.Network | None, seed: int) -> tuple[ech.Parts, int]:
                     {"position": 1.0, "velocity": 0.3},
                     world=ech.World(network=network),
                     events=happenings(random),
-                    leadership=ech.Leadership(heirs),
+                    leadership=ech.Leadership(backups),
                 ),
                 count,
             )
@@ -70,7 +70,7 @@ def main(draws: int) -> int:
     """Print how the runs of each kind ended; return 1 if somebody did not converge."""
     failed = 0
     for name, network in KINDS.items():
-        last, heirs, again = list[float](), list[float](), 0
+        last, backups, again = list[float](), list[float](), 0
         for seed in range(draws):
             parts, count = drawn(network, seed)
             run = ech.simulate(parts, ech.Settings(horizon=HORIZON, dt=0.02, seed=seed))
@@ -79,8 +79,8 @@ def main(draws: int) -> int:
             leader = int(run.nearest_then[-1, 0])
             path = run.states[-1, leader] - run.reference[-1] - run.offsets[leader]
             last.append(float(run.formation_errors[-1].max()) if run.outcome.reached else np.inf)
-            heirs.append(float(np.abs(path[list(run.measured)]).max()))
-        worst, off = max(last), max(heirs)
+            backups.append(float(np.abs(path[list(run.measured)]).max()))
+        worst, off = max(last), max(backups)
         failed += sum(error > 0.01 for error in last)
         print(
             f"{name}: {draws} runs, {again} drawn again; at the end the largest error of a "

@@ -27,7 +27,7 @@ CASES = {
     "fast-everything": ("paper-everything", FAST, False),
     "plain-everything": ("paper-everything", ["sensing.estimator=none"], False),
     "kills": ("paper-radio", ["actuator.lag=0.03"], True),
-    "heir": ("paper-radio", ["actuator.lag=0.03", "leadership={heirs: [1, 2]}"], False),
+    "backup": ("paper-radio", ["actuator.lag=0.03", "leadership={backups: [1, 2]}"], False),
 }
 """Case -> scenario, changes, and whether each process is killed and started again."""
 HORIZON, DT, DEAD, APART = 15.0, 0.01, 0.5, 6.0
@@ -53,7 +53,7 @@ def fly(folder: Path, options: argparse.Namespace, kills: bool) -> None:
     own = [str(Path(__file__).resolve()), "--plant", str(folder)] if options.mujoco else []
     seconds = 2.0 + APART * mission.agents if kills else HORIZON
     flight = LocalFlight(mission, seconds, options.speed, 47300, vehicles=own)
-    falls, heir = list[float](), folder.name == "heir"
+    falls, backup = list[float](), folder.name == "backup"
     with flight:
         ready = max(flight.ready.values())
         memory = max(flight.memory(k) for k in range(mission.agents))
@@ -63,14 +63,14 @@ def fly(folder: Path, options: argparse.Namespace, kills: bool) -> None:
             flight.kill(k)
             wait(flight, falls[-1] + DEAD)
             flight.start_agent(k)
-        if heir:
+        if backup:
             hand_over(flight)
             # From now on its place is what the others' are measured from.
             mission.facts["leader"] = 1
         wait(flight, seconds - 0.1)
         errors = flight.errors()
     print(f"  ready after {ready:.2f} s at most, {memory:.1f} MB at most; late {errors.late} times")
-    followers = [k for k in range(heir, mission.agents) if k != mission.facts["leader"]]
+    followers = [k for k in range(backup, mission.agents) if k != mission.facts["leader"]]
     for k, fall in enumerate(falls):
         part = [row for t, row in zip(errors.times, errors.rows, strict=True) if fall <= t]
         far = max(row[j] for row in part[: round(APART / 0.011)] for j in followers)
@@ -88,7 +88,7 @@ def fly(folder: Path, options: argparse.Namespace, kills: bool) -> None:
 
 
 def hand_over(flight: Any) -> None:
-    """Kill the leader, and wait until an heir says that it leads."""
+    """Kill the leader, and wait until a backup leader says that it leads."""
     wait(flight, 6.0)
     fall = flight.time()
     flight.kill(0)

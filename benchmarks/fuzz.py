@@ -181,7 +181,7 @@ CHANGING: list[dict[str, Any]] = [
             {"at": 0.12, "lose": 3},
             {"at": 0.16, "join": 3},
         ],
-        "leadership": {"heirs": [1, 2], "timeout": 0.06},
+        "leadership": {"backups": [1, 2], "timeout": 0.06},
         "network": {"rate": 50.0, "delay": 0.02, "loss": 0.1},
         "initial": {"spread": {"position": 0.5}},
         "simulation": {"horizon": 0.2, "dt": 0.02},
@@ -247,7 +247,7 @@ SIZED += ["actuator.lag", "safety.reach", "follower.rate", "follower.coupling", 
 SIZED += ["safety.gain", "safety.margin", "safety.swirl", "events.0.at"]
 SIZED += ["formation.motion.0.rotate"]
 SIZED += ["formation.motion.1.rate", "formation.motion.2.at", "formation.motion.2.over"]
-SIZED += ["events.0.lose", "events.1.for", "leadership.timeout", "leadership.heirs.0"]
+SIZED += ["events.0.lose", "events.1.for", "leadership.timeout", "leadership.backups.0"]
 NUMBERS = [0, 1, 2, 3, 0.1, 1e-8, 1e-300, 1e16, 1e155, 1.7e308]
 MARKS = [b"{", b"]", b": ", b"\n", b"&a ", b"*a", b"\xff", b"- ", b"!!x "]
 WORDS = ["dt", "horizon", "gain", "name", "python", "file", "set", "0", "x", "position", "é", "*"]

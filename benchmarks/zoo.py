@@ -315,7 +315,7 @@ def study(seed: int, number: int) -> dict[str, Any]:
         flight = Flight(specimen, gain)
         # Flights know no held inputs: a step that no mode notices.
         dt = min(1e-4, 1e-3 / max(flight.fastest(), 1e-3))
-        promise = ech.promise(parts, ech.Settings(horizon=dt, dt=dt))
+        promise = ech.guarantee(parts, ech.Settings(horizon=dt, dt=dt))
     except ech.EchelonError as error:
         return {**found, "refused": str(error).split(";")[0][:90]}
     if not promise.promised:
@@ -345,7 +345,7 @@ def holds(flight: Flight, specimen: Specimen, rng: np.random.Generator) -> bool 
 
 
 def violations(
-    flight: Flight, specimen: Specimen, promise: ech.Promise, rng: np.random.Generator
+    flight: Flight, specimen: Specimen, promise: ech.Guarantee, rng: np.random.Generator
 ) -> Any:
     """Yield what runs show against a promise."""
     fast, rate = flight.fastest(), max(promise.rate or 0.0, 0.0)

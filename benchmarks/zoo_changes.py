@@ -76,10 +76,10 @@ def _before_and_after(rng: np.random.Generator) -> Finding:
 
     try:
         parts = ask()
-        ech.promise(parts, settings)
+        ech.guarantee(parts, settings)
         list(_CHANGES.values())[rng.integers(len(_CHANGES))](reader, closed, rng)
         parts = ask() if again else parts
-        answer = ech.promise(parts, settings)
+        answer = ech.guarantee(parts, settings)
     except ech.EchelonError as error:
         return silent(str(error))
     assert isinstance(parts.drive, ech.Laws) and parts.drive.gain is not None

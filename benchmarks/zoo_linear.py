@@ -67,7 +67,7 @@ def switching_steps(rng: np.random.Generator) -> Finding:
     A, B = _agent(rng)
     model = ech.models.Linear(A, B)
 
-    def ask(dt: float) -> tuple[ech.Promise, ech.Gain, float]:
+    def ask(dt: float) -> tuple[ech.Guarantee, ech.Gain, float]:
         if len(graphs) == 1:
             graph = ech.Graph(graphs[0], agents=agents, directed=directed)
         else:
@@ -75,7 +75,7 @@ def switching_steps(rng: np.random.Generator) -> Finding:
             graph = ech.Graph.switching(stretches, directed=directed, period=dt * len(graphs))
         gain = ech.synthesize(model, graph, ech.gains.Riccati())
         settings = ech.Settings(12 * dt, dt)
-        answer = ech.promise(consensus_parts(model, graph, gain), settings)
+        answer = ech.guarantee(consensus_parts(model, graph, gain), settings)
         return answer, gain, answer.longest_step(settings)
 
     try:
@@ -145,7 +145,7 @@ def _judge_star(A: Any, B: Any, P: Any, K: Any, weights: np.ndarray, dt: float) 
     try:
         gain = ech.synthesize(model, graph, ech.gains.FixedGain(P=P.tolist(), coupling=1.0))
         parts, settings = consensus_parts(model, graph, gain), ech.Settings(2.0 * dt, dt)
-        answer = ech.promise(parts, settings)
+        answer = ech.guarantee(parts, settings)
     except ech.EchelonError as error:
         return silent(str(error), holds)
     false = list[str]()
@@ -227,7 +227,7 @@ def _passive_leaders(
     try:
         gain = ech.synthesize(model, graph, method)
         parts = consensus_parts(model, graph, gain, initial=states)
-        answer = ech.promise(parts, ech.Settings(0.01, 1e-4))
+        answer = ech.guarantee(parts, ech.Settings(0.01, 1e-4))
     except ech.EchelonError as error:
         return silent(str(error))
     rest = list(range(1, graph.agents)) if apart else _free(graph)
@@ -254,7 +254,7 @@ def _stopping_leaders(
     goals = ech.Formation(np.zeros(states.shape))
     parts = ech.Parts(kind(2), graph, goals, drive, initial=states)
     try:
-        answer: Any = ech.promise(parts, ech.Settings(1.0, 1e-3))
+        answer: Any = ech.guarantee(parts, ech.Settings(1.0, 1e-3))
     except ech.EchelonError as error:
         return silent(str(error))
     rest = list(range(graph.agents)) if apart else _free(graph)
@@ -271,7 +271,7 @@ def _stopping_leaders(
     return finding
 
 
-def against(answer: ech.Promise, slowest: float) -> Finding:
+def against(answer: ech.Guarantee, slowest: float) -> Finding:
     """Judge a rate by the slowest mode in truth."""
     if not answer.promised:
         return silent(answer.reasons[0], bool(slowest < -1e-9))

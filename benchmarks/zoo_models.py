@@ -131,7 +131,7 @@ def any_difference(rng: np.random.Generator) -> Finding:
     model = dials.model()
     try:
         gain = ech.synthesize(model, graph, method)
-        answer = ech.promise(consensus_parts(model, graph, gain), ech.Settings(1e-3, 1e-4))
+        answer = ech.guarantee(consensus_parts(model, graph, gain), ech.Settings(1e-3, 1e-4))
     except ech.EchelonError as error:
         return silent(str(error))
     rate, n, N = dials.rate(L, gain), dials.order, graph.agents
@@ -154,7 +154,7 @@ def any_difference(rng: np.random.Generator) -> Finding:
 
 
 def _from_the_edge(
-    dials: Dials, rate: Any, gain: ech.Gain, answer: ech.Promise, away: np.ndarray, horizon: float
+    dials: Dials, rate: Any, gain: ech.Gain, answer: ech.Guarantee, away: np.ndarray, horizon: float
 ) -> list[str]:
     assert answer.certified is not None
     radius, N = answer.certified.radius, away.shape[1]
@@ -211,12 +211,12 @@ def other_units(rng: np.random.Generator) -> Finding:
     graph, L = drawn_graph(rng, 5)
     dt = 1e-4 / slow
 
-    def ask(D: np.ndarray) -> tuple[ech.Promise | None, Any]:
+    def ask(D: np.ndarray) -> tuple[ech.Guarantee | None, Any]:
         try:
             gain = ech.synthesize(model(D), graph, ech.gains.Riccati())
         except ech.EchelonError as error:
             return None, str(error)
-        return ech.promise(consensus_parts(model(D), graph, gain), ech.Settings(dt, dt)), gain
+        return ech.guarantee(consensus_parts(model(D), graph, gain), ech.Settings(dt, dt)), gain
 
     (base, gain), (scaled, other) = ask(np.ones(n)), ask(D)
     if base is None:
@@ -303,7 +303,7 @@ def leaders_inputs(rng: np.random.Generator) -> Finding:
         law = ech.laws.Consensus(gain, feedforward="relay")
         goals = ech.Formation(np.zeros((graph.agents, n)))
         parts = ech.Parts(model, graph, goals, ech.Laws(Swing(push, pace), law))
-        answer = ech.promise(parts, ech.Settings(horizon, 0.002))
+        answer = ech.guarantee(parts, ech.Settings(horizon, 0.002))
     except ech.EchelonError as error:
         return silent(str(error))
     covered = answer.promised and answer.theorem in (Theorem.T1, Theorem.T2)

@@ -80,7 +80,7 @@ def rough_paths(rng: np.random.Generator) -> Finding:
     model, graph = ech.models.DoubleIntegrator(2), ech.Graph.path(3)
     parts = ech.Parts(model, graph, ech.Formation(np.zeros((3, 4))), drive, initial={"x": 0.1})
     try:
-        answer = ech.promise(parts, ech.Settings(0.01 * np.ceil(100.0 * horizon), 0.01))
+        answer = ech.guarantee(parts, ech.Settings(0.01 * np.ceil(100.0 * horizon), 0.01))
     except ech.EchelonError as error:
         return silent(str(error), None if rough or unclear else True)
     if not answer.promised:
@@ -159,7 +159,7 @@ def other_plants(rng: np.random.Generator) -> Finding:
     goals = ech.Formation(np.zeros((3, 4)))
     parts = ech.Parts(model, graph, goals, drive, initial={"x": 0.5}, world=world)
     try:
-        answer = ech.promise(parts, ech.Settings(60.0, 0.01, limits=False))
+        answer = ech.guarantee(parts, ech.Settings(60.0, 0.01, limits=False))
     except ech.EchelonError as error:
         return silent(str(error))
 

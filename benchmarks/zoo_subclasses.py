@@ -140,7 +140,7 @@ def subclasses(rng: np.random.Generator) -> Finding:
         first = model.state_names[:2]
         parts = ech.Parts(model, graph, goals, drive, initial=dict.fromkeys(first, spread))
         settings = ech.Settings(10.0, _DT, seed=int(rng.integers(1000)))
-        answer: Any = ech.promise(parts, settings)
+        answer: Any = ech.guarantee(parts, settings)
     except ech.EchelonError as error:
         return silent(f"{name}, {change}: {error}")
     motors = stopping and answer.promised and answer.tube.motor_load is not None

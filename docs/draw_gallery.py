@@ -36,7 +36,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "video": ("crossing", 1.0),
     },
     "reshape": {"set": ("reference.amplitude=[1.0, 1.6]",), "video": ("reshape", 2.5)},
-    "leader-lost": {"figures": {"trajectories": "heir"}, "video": ("heir", 1.5)},
+    "leader-lost": {"figures": {"trajectories": "backup"}, "video": ("backup", 1.5)},
     "paper-far": {"set": ("simulation.horizon=20",), "figures": {"trajectories": "far"}},
     "flock.yaml": {
         "figures": {

@@ -1,7 +1,9 @@
 """Settings of every test: no silent broadcasting, checked shapes, repeatable draws, time limits."""
 
 import gc
+import hashlib
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -46,6 +48,13 @@ LIMIT = 5.0
 """Seconds of a processor from which on a test is `slow` or `study`; it fails from twice as many."""
 
 
+def pytest_addoption(parser):
+    told = (
+        "run the tests in an order that the commit chooses, until SECONDS of a processor are used"
+    )
+    parser.addoption("--until", type=float, metavar="SECONDS", help=told)
+
+
 def pytest_configure(config):
     """Let XLA compile quickly where studies are left out.
 
@@ -58,8 +67,11 @@ def pytest_configure(config):
         os.environ.setdefault("XLA_FLAGS", QUICKLY_COMPILED)  # which JAX reads when it first runs
 
 
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     """Mark what needs a browser, and keep in one process what shares fixtures or compiled code."""
+    if config.option.until:
+        told = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True)
+        items.sort(key=lambda item: hashlib.sha256((told.stdout + item.nodeid).encode()).digest())
     for item in items:
         if "browser" in item.fixturenames:
             item.add_marker("page")
@@ -93,6 +105,16 @@ def processor_time():
     """Seconds of processors that this process and the ended ones that it started have taken."""
     spent = os.times()
     return spent.user + spent.system + spent.children_user + spent.children_system
+
+
+BEGAN = processor_time()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item):
+    """Leave a test out where the time that was given is used up."""
+    until = item.config.option.until
+    return True if until and processor_time() - BEGAN > until else None
 
 
 @pytest.hookimpl(wrapper=True)

@@ -11,7 +11,7 @@ from echelon.output.archive.flight_folder import network_facts
 from echelon.simulation.onboard.law_functions import law_functions
 from echelon.simulation.onboard.source_code import python_text
 from echelon_flight.pilot import NOBODY, Letterbox, Pilot, TickResult
-from echelon_flight.wire import Letter, Packet
+from echelon_flight.wire import LeaderPacket, Letter
 
 
 def as_python(functions, folder=None):
@@ -162,7 +162,7 @@ def draw_letter(own, facts, sender, time, draws):
         units = np.abs(np.diag(own.loop.model.input_scale))
         said[-len(units) :] *= units
     said = tuple(said.tolist())
-    packet = Packet(network["leaders"][0], max(0.0, time - draws.uniform(0.0, 0.9)), said)
+    packet = LeaderPacket(network["leaders"][0], max(0.0, time - draws.uniform(0.0, 0.9)), said)
     return Letter(sender, time, hops, tuple(values.tolist()), packet)
 
 

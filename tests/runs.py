@@ -6,7 +6,7 @@ import numpy as np
 
 import echelon as ech
 from echelon.core.numerics import precision
-from echelon.simulation.step.meter import Meter, on_host
+from echelon.simulation.step.meter import RunStatistics, on_host
 
 OWN_PENDULUM = """
 import jax.numpy as jnp
@@ -69,7 +69,9 @@ def made_up(
         states=states,
         inputs=inputs,
         reference=reference,
-        sums=metered(Meter.of(model, graph, formation, settings), states, inputs, reference),
+        sums=metered(
+            RunStatistics.of(model, graph, formation, settings), states, inputs, reference
+        ),
         outcome=outcome,
         message=outcome.value,
         warnings=(),

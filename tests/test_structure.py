@@ -215,7 +215,7 @@ def test_echelon_knows_five_names_of_flight_and_its_version():
     found = {name.removeprefix(f"{FLIGHT.name}.") for _, name in imported() if is_flight(name)}
     assert found == {
         *("FlightError", "__version__"),
-        *("mission.check_options", "page_server.Handler", "wire.Packet"),
+        *("mission.check_options", "page_server.Handler", "wire.LeaderPacket"),
     }
     assert flight.__version__ == CONTAINED
 

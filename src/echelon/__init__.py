@@ -18,6 +18,13 @@ def __getattr__(name: str) -> Any:
     try:
         return _load(name)
     except AttributeError as error:
-        from echelon.core.gone import no_name
+        from echelon.core.gone import RENAMED, no_name
 
-        raise no_name(name) from error
+        if name not in RENAMED:
+            raise no_name(name) from error
+        import warnings
+
+        now = RENAMED[name]
+        text = f"`echelon.{name}` is now `echelon.{now}`, and goes with the next version."
+        warnings.warn(text, FutureWarning, stacklevel=2)
+        return _load(now)

@@ -54,8 +54,8 @@ from .experiments.studies.check import check as check
 from .experiments.studies.compare import compare as compare
 from .experiments.studies.design import design as design
 from .experiments.studies.state_space import state_space as state_space
-from .guarantees.promises.promise import Promise as Promise
-from .guarantees.promises.promise import promise as promise
+from .guarantees.promises.promise import Guarantee as Guarantee
+from .guarantees.promises.promise import guarantee as guarantee
 from .laws.law import Law as Law
 from .laws.safety import Safety as Safety
 from .output.archive.export import export as export

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.agents.models.chains import DECLARED, chains_of, declared_of, flatten
+from echelon.agents.models.chains import DECLARED, chains_of, declared_of, to_flat
 from echelon.agents.models.declarations import undeclared
 from echelon.agents.models.model import FlatChains, Limits
 from echelon.core.numerics import precision
 
 Quadrotor = ech.models.Quadrotor
-CHAINS = ("flat_chains", "flat_bounds", "flatten")
+CHAINS = ("flat_chains", "flat_bounds", "to_flat")
 
 
 class Dragged(Quadrotor):
@@ -80,7 +80,7 @@ def subclass(base, **changes):
         (Windy(), CHAINS[:2]),
         (subclass(Windy, strength=0.5), CHAINS[:2]),
         (subclass(Windy, drag=lambda self, v: v**3), ()),
-        (subclass(ech.models.Unicycle), ("flat_chains", "flat_bounds", "switch_on")),
+        (subclass(ech.models.Unicycle), ("flat_chains", "flat_bounds", "initial_integrators")),
         (subclass(ech.models.DoubleIntegrator, drag=1.0), ("flat_chains", "flat_bounds")),
     ],
 )
@@ -130,7 +130,7 @@ def test_an_inherited_map_to_flat_coordinates_is_not_that_of_another_motion():
     with precision("float64"):
         x = jnp.asarray(np.random.default_rng(0).uniform(-0.5, 0.5, 12))
         e, chains = jnp.array([0.3, -0.2]), chains_of(model)
-        values = flatten(model, chains, x, e).values
+        values = to_flat(model, chains, x, e).values
         motion = model.velocity(x, model.physical(chains.acting_input(e, jnp.zeros(4))))
     # The second derivative of the place is what the velocity changes by.
     assert np.allclose(values[1, :3], motion[:3]) and np.allclose(values[2, :3], motion[3:6])

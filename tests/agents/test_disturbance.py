@@ -11,51 +11,50 @@ import scipy.stats
 from oracles import laplacian
 from runs import simulate
 
-from echelon.agents.models import (
-    DoubleIntegrator,
-    Linear,
-    Pendulum,
-    PlanarQuadrotor,
-    PrintedQuadrotor,
-    Quadrotor,
+from echelon import (
+    Disturbance,
+    Formation,
+    Graph,
+    build,
+    dataset,
+    load_scenario,
+    lyapunov,
+    report,
+    scenario_from_mapping,
+    summary,
+    synthesize,
 )
-from echelon.agents.network.formation import Formation
-from echelon.agents.network.graph import Graph
+from echelon.agents import models
 from echelon.agents.references import Hover
-from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.world import differences, vary_parameters
 from echelon.core.errors import EchelonError, Outcome, ScenarioError
 from echelon.core.numerics import precision
-from echelon.experiments.results.dataset import dataset
-from echelon.experiments.results.lyapunov import lyapunov
-from echelon.experiments.results.summary import summary
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.named_class import resolve
-from echelon.experiments.scenario.scenario import load_scenario, scenario_from_mapping
 from echelon.laws import Consensus, Tracking, TrimInput
-from echelon.output.reports.run_report import report
 from echelon.synthesis.gains import FixedGain, Riccati
-from echelon.synthesis.gains.gain import synthesize
 
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
-CART = DoubleIntegrator(2)
+CART = models.DoubleIntegrator(2)
+STILL, ROW = Tracking(Hover((0, 0, 0))), {1: (1, 0), 2: (2, 0), 3: (3, 0)}
+ALLOWED = "got `0`, allowed is a number"
+
+
+def flown(model, graph, offsets, follower, leader=None, **more):
+    """Agents under two laws, of which the leader's is the trim unless given."""
+    formation, leader = Formation.from_offsets(model, graph, offsets), leader or TrimInput()
+    return simulate(model, graph, formation, leader=leader, follower=follower, **more)
 
 
 def drift(model=CART, agents=3, **options):
     """Agents that do nothing but what the wind does with them."""
-    graph = Graph.path(agents)
     settings = {"horizon": 2.0, "dt": 0.01} | options
-    nothing = Formation.from_offsets(model, graph, {})
-    return simulate(model, graph, nothing, leader=TrimInput(), follower=TrimInput(), **settings)
+    return flown(model, Graph.path(agents), {}, TrimInput(), **settings)
 
 
 def accelerations(run):
     """The wind of each step on carts, (steps, agents, 2)."""
     return np.diff(run.states[:, :, 2:], axis=0) / run.settings.dt
-
-
-# ---- the lasting part ----
 
 
 def test_a_constant_wind_alone_makes_a_parabola():
@@ -70,18 +69,10 @@ def test_a_constant_wind_alone_makes_a_parabola():
 @pytest.mark.parametrize("feedforward", ["none", "relay"])
 def test_under_a_constant_wind_carts_settle_where_statics_says(feedforward):
     gain = synthesize(CART, TREE, Riccati())
-    run = simulate(
-        CART,
-        TREE,
-        Formation.from_offsets(CART, TREE, {1: (1, 0), 2: (1, 0.8), 3: (1, -0.8)}),
-        leader=Tracking(Hover((0, 0, 0))),
-        follower=Consensus(gain, feedforward=feedforward),
-        initial={"position": 1.0},
-        disturbance=Disturbance(constant={"vx": 0.5, "vy": -0.2}),
-        horizon=60.0,
-        dt=0.02,
-        store_every=100,
-    )
+    offsets, law = {1: (1, 0), 2: (1, 0.8), 3: (1, -0.8)}, Consensus(gain, feedforward=feedforward)
+    wind = Disturbance(constant={"vx": 0.5, "vy": -0.2})
+    run = {"disturbance": wind, "horizon": 60.0, "dt": 0.02, "store_every": 100}
+    run = flown(CART, TREE, offsets, law, STILL, initial={"position": 1.0}, **run)
     # One axis of a double integrator with Q = R = I: P = [[sqrt 3, 1], [1, sqrt 3]], so u = -p - ..
     wind = np.array([0.5, -0.2])
     assert run.states[-1, 0, :2] == pytest.approx(wind, abs=1e-9)
@@ -96,49 +87,33 @@ def test_linear_agents_settle_where_the_linear_system_says():
     rng = np.random.default_rng(2)
     A, B = rng.normal(size=(3, 3)) - 3.5 * np.eye(3), rng.normal(size=(3, 1))
     assert np.linalg.eigvals(A).real.max() < -0.3
-    model = Linear(A, B, names=("a", "b", "c"))
+    model, leak = models.Linear(A, B, names=("a", "b", "c")), 1.04
     gain = synthesize(model, TREE, FixedGain(coupling=0.7))
-    force, leak = np.array([0.3, -0.1, 0.5]), 1.04
-    run = simulate(
-        model,
-        TREE,
-        Formation.from_offsets(model, TREE, {}),
-        leader=TrimInput(),
-        follower=Consensus(gain, "none"),
-        plant=vary_parameters(model, {}, {"B": leak}),
-        disturbance=Disturbance(constant={"a": 0.3, "b": -0.1, "c": 0.5}),
-        initial=rng.normal(size=(4, 3)),
-        horizon=80.0,
-        dt=0.02,
-        store_every=1000,
-    )
+    world = {
+        "plant": vary_parameters(model, {}, {"B": leak}),
+        "disturbance": Disturbance(constant={"a": 0.3, "b": -0.1, "c": 0.5}),
+    }
+    run = {"initial": rng.normal(size=(4, 3)), "horizon": 80.0, "dt": 0.02, "store_every": 1000}
+    run = flown(model, TREE, {}, Consensus(gain, "none"), **world, **run)
     L = laplacian(4, TREE.edges)
     L[0] = 0.0
     closed = np.kron(np.eye(4), A) - 0.7 * leak * np.kron(L, B @ B.T)
-    wanted = np.linalg.solve(closed, -np.tile(force, 4)).reshape(4, 3)
+    wanted = np.linalg.solve(closed, -np.tile([0.3, -0.1, 0.5], 4)).reshape(4, 3)
     assert run.states[-1] == pytest.approx(wanted, abs=1e-9)
 
 
-# ---- the random part ----
-
-
 def test_the_wind_has_its_rms_and_neither_time_nor_agents_repeat_it():
-    run = drift(
-        agents=40,
-        horizon=10.0,
-        dt=0.05,
-        disturbance=Disturbance(rms={"vx": 2.0, "vy": 0.5}, hold=0.25),
-    )
+    gusts = Disturbance(rms={"vx": 2.0, "vy": 0.5}, hold=0.25)
+    run = drift(agents=40, horizon=10.0, dt=0.05, disturbance=gusts)
     wind = accelerations(run).reshape(40, 5, 40, 2)
     assert np.abs(wind - wind[:, :1]).max() <= 1e-9, "held over 5 steps of 0.05 s"
     draws = wind[:, 0] / [2.0, 0.5]
     # 1600 draws of each: the standard deviation is known to 1 / sqrt(3200) = 1.8 %.
     assert draws.std(axis=(0, 1)) == pytest.approx([1.0, 1.0], rel=0.07)
     assert scipy.stats.kstest(draws.ravel(), "norm").pvalue > 1e-3
-    across = np.corrcoef(draws[:-1].ravel(), draws[1:].ravel())[0, 1]
-    between = np.corrcoef(draws[:, :-1].ravel(), draws[:, 1:].ravel())[0, 1]
-    axes = np.corrcoef(draws[..., 0].ravel(), draws[..., 1].ravel())[0, 1]
-    assert np.abs([across, between, axes]).max() < 0.1
+    pairs = (draws[:-1], draws[1:]), (draws[:, :-1], draws[:, 1:]), (draws[..., 0], draws[..., 1])
+    across = [np.corrcoef(one.ravel(), other.ravel())[0, 1] for one, other in pairs]
+    assert np.abs(across).max() < 0.1
 
 
 GUSTS = Disturbance(rms={"velocity": 1.0}, input_rms={"ax": 0.3}, hold=0.1)
@@ -146,7 +121,7 @@ GUSTS = Disturbance(rms={"velocity": 1.0}, input_rms={"ax": 0.3}, hold=0.1)
 
 @pytest.mark.study
 def test_the_same_scenario_has_the_same_wind_whatever_is_asked_of_the_run():
-    run = drift(disturbance=GUSTS)
+    run, start = drift(disturbance=GUSTS), {"initial": {"position": 1.0}}
     assert np.array_equal(run.states, drift(disturbance=GUSTS).states)
     assert np.array_equal(run.states[::7], drift(disturbance=GUSTS, store_every=7).states[:29])
     assert np.array_equal(run.states, drift(disturbance=GUSTS, agents=9).states[:, :3])
@@ -154,19 +129,10 @@ def test_the_same_scenario_has_the_same_wind_whatever_is_asked_of_the_run():
     assert np.abs(run.states - shorter.states[::2]).max() <= 1e-13
     single = drift(disturbance=GUSTS, precision="float32")
     assert np.abs(run.states - single.states).max() <= 1e-4
-    law = Consensus(synthesize(CART, Graph.path(3), Riccati()), feedforward="relay")
+    graph = Graph.path(3)
+    law = Consensus(synthesize(CART, graph, Riccati()), feedforward="relay")
     # With the input known, the rest of the acceleration is the wind.
-    formed = simulate(
-        CART,
-        Graph.path(3),
-        Formation.from_offsets(CART, Graph.path(3), {}),
-        leader=TrimInput(),
-        follower=law,
-        initial={"position": 1.0},
-        disturbance=GUSTS,
-        horizon=2.0,
-        dt=0.01,
-    )
+    formed = flown(CART, graph, {}, law, **start, disturbance=GUSTS, horizon=2.0, dt=0.01)
     wind = accelerations(formed) - formed.inputs[:-1]
     assert wind == pytest.approx(accelerations(run), abs=1e-9)
 
@@ -176,7 +142,7 @@ def test_the_same_scenario_has_the_same_wind_whatever_is_asked_of_the_run():
 )
 def test_a_draw_lasts_the_nearest_number_of_steps(hold, dt, steps):
     with precision("float64"):
-        wind = Disturbance(rms={"vx": 1.0}, hold=hold).prepared(DoubleIntegrator(1), dt, 0)
+        wind = Disturbance(rms={"vx": 1.0}, hold=hold).prepared(models.DoubleIntegrator(1), dt, 0)
         drawn = [float(wind.on_state(jnp.asarray(k), jnp.asarray(0))[1]) for k in range(3 * steps)]
     # 0.3 / 0.1 is a little less than 3.
     assert len(set(drawn)) == 3
@@ -184,28 +150,15 @@ def test_a_draw_lasts_the_nearest_number_of_steps(hold, dt, steps):
 
 
 def test_seeds_make_other_winds_and_the_disturbance_may_have_its_own():
-    def wind(seed=0, **changes):
-        run = drift(seed=seed, horizon=0.1, disturbance=dataclasses.replace(GUSTS, **changes))
-        return accelerations(run)
+    def states(own=None, **more):
+        return drift(horizon=0.1, disturbance=dataclasses.replace(GUSTS, seed=own), **more).states
 
-    once = wind()
-    assert np.abs(wind(seed=1) - once).max() > 0.1
-    assert np.array_equal(
-        drift(seed=5, disturbance=dataclasses.replace(GUSTS, seed=0)).states,
-        drift(seed=0, disturbance=GUSTS).states,
-    )
-
-
-def test_seeds_of_more_than_32_bits_are_told_apart_in_every_precision():
-    low, high = (
-        drift(horizon=0.1, disturbance=dataclasses.replace(GUSTS, seed=seed))
-        for seed in (3, 3 + 2**40)
-    )
-    assert np.abs(low.states - high.states).max() > 1e-3
-    single = drift(
-        horizon=0.1, disturbance=dataclasses.replace(GUSTS, seed=3 + 2**40), precision="float32"
-    )
-    assert np.abs(single.states - high.states).max() <= 1e-6
+    once, long = states(), states(3 + 2**40)
+    assert np.abs(states(seed=1) - once).max() > 1e-3
+    assert np.array_equal(states(0, seed=5), once)
+    # Seeds of more than 32 bits count in every precision.
+    assert np.abs(states(3) - long).max() > 1e-3
+    assert np.abs(states(3 + 2**40, precision="float32") - long).max() <= 1e-6
 
 
 def test_one_wind_for_all_pushes_all_alike_and_noise_stays_each_agent_s_own():
@@ -224,7 +177,7 @@ def test_twice_the_rms_is_twice_the_wind_and_other_states_keep_theirs():
 
 
 def test_noise_enters_by_the_normalized_input_behind_the_limits():
-    model = PlanarQuadrotor(motor_thrust=0.028 * 9.81 / 2)
+    model = models.PlanarQuadrotor(motor_thrust=0.028 * 9.81 / 2)
     noise = Disturbance(input_rms={"thrust": 3.0}, hold=0.05)
     run = drift(model, agents=20, horizon=1.0, dt=0.05, disturbance=noise)
     push = np.diff(run.states[:, :, 4], axis=0) / 0.05
@@ -237,16 +190,10 @@ def test_noise_enters_by_the_normalized_input_behind_the_limits():
 @pytest.mark.study
 def test_the_integrator_keeps_its_order_in_wind():
     wind = Disturbance(constant={"rate": 1.0}, rms={"rate": 3.0}, hold=0.2)
+    run = {"initial": np.tile([1.0, 0.5], (3, 1)), "disturbance": wind, "store_every": 10**6}
 
     def end(dt):
-        run = drift(
-            Pendulum(0.1),
-            initial=np.tile([1.0, 0.5], (3, 1)),
-            dt=dt,
-            disturbance=wind,
-            store_every=10**6,
-        )
-        return run.states[-1]
+        return drift(models.Pendulum(0.1), dt=dt, **run).states[-1]
 
     exact = end(0.00125)
     errors = [np.abs(end(dt) - exact).max() for dt in (0.04, 0.02, 0.01)]
@@ -254,52 +201,28 @@ def test_the_integrator_keeps_its_order_in_wind():
     assert 3.8 <= slope <= 4.4
 
 
-# ---- a plant that is not the model ----
-
-
-@pytest.mark.parametrize("model", [Quadrotor(), Linear([[0.0, 1.0], [-1.0, -0.2]], [[0.0], [1.0]])])
+@pytest.mark.parametrize(
+    "model", [models.Quadrotor(), models.Linear([[0.0, 1.0], [-1.0, -0.2]], [[0.0], [1.0]])]
+)
 def test_a_plant_like_the_model_changes_no_bit(model):
-    def fly(**more):
-        return simulate(
-            model,
-            TREE,
-            Formation.from_offsets(model, TREE, {}),
-            leader=TrimInput(),
-            follower=Consensus(synthesize(model, TREE, Riccati()), "none"),
-            initial=dict.fromkeys(model.state_names, 0.3),
-            horizon=1.0,
-            dt=0.01,
-            **more,
-        )
-
-    plain, same = fly(), fly(plant=vary_parameters(model, {}, {}))
+    law, start = Consensus(synthesize(model, TREE, Riccati()), "none"), model.state_names
+    run = {"initial": dict.fromkeys(start, 0.3), "horizon": 1.0, "dt": 0.01}
+    plain = flown(model, TREE, {}, law, **run)
+    same = flown(model, TREE, {}, law, **run, plant=vary_parameters(model, {}, {}))
     assert plain.world.plant is None and same.world.plant is not model
     assert np.array_equal(plain.states, same.states)
     assert np.array_equal(plain.inputs, same.inputs)
 
 
 def test_vehicles_heavier_than_their_model_sag_by_the_linear_solve():
-    model = PlanarQuadrotor()
+    model = models.PlanarQuadrotor()
     gain = synthesize(model, TREE, Riccati())
-    run = simulate(
-        model,
-        TREE,
-        Formation.from_offsets(model, TREE, {1: (1, 0), 2: (2, 0), 3: (3, 0)}),
-        leader=Tracking(Hover((0, 0, 0))),
-        follower=Consensus(gain, "none"),
-        plant=vary_parameters(model, {}, {"mass": 1.05, "inertia": 1.05}),
-        initial={"position": 0.3},
-        horizon=60.0,
-        dt=0.005,
-        store_every=400,
-    )
+    plant = vary_parameters(model, {}, {"mass": 1.05, "inertia": 1.05})
+    run = {"initial": {"position": 0.3}, "horizon": 60.0, "dt": 0.005, "store_every": 400}
+    run = flown(model, TREE, ROW, Consensus(gain, "none"), STILL, plant=plant, **run)
     # Thrust m (g + v) holds 1.05 m at v = 0.05 g. Height alone is a double integrator with the
     # default weights q = (1, 0.25) and r = 1/25, whose P has p12 = sqrt(q1 r): v = -p12 / r e.
-    stiffness = np.sqrt(1.0 * 25.0)
-    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-    P = scipy.linalg.solve_continuous_are(A, B, np.diag([1.0, 0.25]), [[1 / 25]])
-    assert 25.0 * P[0, 1] == pytest.approx(stiffness)
-    sag = -0.05 * 9.81 / stiffness
+    sag = -0.05 * 9.81 / np.sqrt(1.0 * 25.0)
     assert run.states[-1, 0] == pytest.approx([0, sag, 0, 0, 0, 0], abs=1e-9)
     lag = np.linalg.solve(laplacian(4, TREE.edges)[1:, 1:], np.ones(3)) / gain.coupling
     assert run.errors[-1, 1:, 1] == pytest.approx(sag * lag, abs=1e-9)
@@ -307,48 +230,31 @@ def test_vehicles_heavier_than_their_model_sag_by_the_linear_solve():
 
 
 def test_actuators_are_the_plant_s_and_what_is_relayed_is_what_they_delivered():
-    model = PlanarQuadrotor()
-    weak = dataclasses.replace(model, motor_thrust=0.2)
-    start = np.zeros((2, 6))
+    model, graph, start = models.PlanarQuadrotor(), Graph.path(2), np.zeros((2, 6))
     start[:, 1] = -8.0
-    graph = Graph.path(2)
-    run = simulate(
-        model,
-        graph,
-        Formation.from_offsets(model, graph, {}),
-        leader=Tracking(Hover((0, 0, 0))),
-        follower=Consensus(synthesize(model, graph, Riccati()), feedforward="relay"),
-        initial=start,
-        plant=weak,
-        horizon=0.5,
-        dt=0.005,
-    )
+    law = Consensus(synthesize(model, graph, Riccati()), feedforward="relay")
+    weak = dataclasses.replace(model, motor_thrust=0.2)
+    run = flown(model, graph, {}, law, STILL, initial=start, plant=weak, horizon=0.5, dt=0.005)
     assert run.inputs[..., 0].max() <= 0.4 + 1e-12 and run.saturated[0] > 0.1
     assert np.abs(run.states[:, 0] - run.states[:, 1]).max() <= 1e-12
 
 
 def test_a_law_made_for_another_class_of_the_same_states_flies_it():
-    printed = PrintedQuadrotor()
-    run = simulate(
-        printed,
-        TREE,
-        Formation.from_offsets(printed, TREE, {}),
-        leader=TrimInput(),
-        follower=TrimInput(),
-        plant=Quadrotor(),
-        horizon=1.0,
-        dt=0.01,
-    )
+    printed = models.PrintedQuadrotor()
+    run = drift(printed, plant=models.Quadrotor(), horizon=1.0)
     # The printed model has no gravity, so its trim is no thrust: the real one falls.
     assert run.states[-1, :, 2] == pytest.approx(-0.5 * 9.81, rel=1e-9)
-    assert differences(printed, Quadrotor()) == "`Quadrotor` for `PrintedQuadrotor`"
+    assert differences(printed, models.Quadrotor()) == "`Quadrotor` for `PrintedQuadrotor`"
 
 
 BUNDLED = {
     name: resolve(entry)
     for name, entry in registry.MODELS.items()
     if name not in ("linear", "quadrotor-printed")
-} | {"linear": lambda: Linear(-np.eye(2), np.eye(2)), "quadrotor-printed": PrintedQuadrotor}
+} | {
+    "linear": lambda: models.Linear(-np.eye(2), np.eye(2)),
+    "quadrotor-printed": models.PrintedQuadrotor,
+}
 
 
 @pytest.mark.parametrize("name", BUNDLED)
@@ -366,25 +272,15 @@ def test_every_number_of_every_bundled_model_can_be_scaled(name):
         assert differences(model, back).endswith("which equals the model")
 
 
-# ---- what is told ----
-
-
 def test_the_rate_of_v_is_its_derivative_in_wind_and_with_another_plant():
-    model = PlanarQuadrotor()
-    run = simulate(
-        model,
-        TREE,
-        Formation.from_offsets(model, TREE, {1: (1, 0), 2: (2, 0), 3: (3, 0)}),
-        leader=Tracking(Hover((0, 0, 0))),
-        follower=Consensus(synthesize(model, TREE, Riccati()), "none"),
-        plant=vary_parameters(model, {}, {"mass": 1.2, "inertia": 0.9}),
-        disturbance=Disturbance(
-            constant={"vy": 0.5}, rms={"velocity": 1.0}, input_rms={"torque": 3.0}, hold=0.05
-        ),
-        initial={"position": 0.5},
-        horizon=0.5,
-        dt=0.0005,
-    )
+    model = models.PlanarQuadrotor()
+    world = {
+        "plant": vary_parameters(model, {}, {"mass": 1.2, "inertia": 0.9}),
+        "disturbance": Disturbance({"vy": 0.5}, {"velocity": 1.0}, {"torque": 3.0}, hold=0.05),
+    }
+    law = Consensus(synthesize(model, TREE, Riccati()), "none")
+    run = {"initial": {"position": 0.5}, "horizon": 0.5, "dt": 0.0005}
+    run = flown(model, TREE, ROW, law, STILL, **world, **run)
     v = lyapunov(run)
     # Inputs are held, so V is smooth within a step and its difference is the rate half a step on.
     ahead = np.diff(v.value) / 0.0005
@@ -438,85 +334,72 @@ def test_a_plant_s_parameter_may_be_given_or_scaled():
     assert (plant.mass, plant.inertia) == (0.03, pytest.approx(2 * 16.571710e-6))
     named = load_scenario("paper", ["plant={scale: {inertia: 2.0}}"])
     doubled = build(named).parts.world.plant
-    assert np.asarray(doubled.inertia) == pytest.approx(2.0 * np.asarray(Quadrotor().inertia))
+    assert np.asarray(doubled.inertia) == pytest.approx(
+        2.0 * np.asarray(models.Quadrotor().inertia)
+    )
 
 
 @pytest.mark.parametrize(
-    ("section", "place", "sentence"),
+    ("section", "sentence"),
     [
         (
             {"plant": {"scale": {"mas": 2}}},
-            "plant",
-            "`mas` is no parameter of `PlanarQuadrotor`; it has `mass`, `inertia`, `gravity`, "
-            "`arm`, `motor_thrust` (did you mean `mass`?).",
-        ),
-        (
-            {"plant": {"scale": {"mass": 0}}},
-            "plant.scale.mass",
-            "got `0`, allowed is a number above 0.",
+            "plant: `mas` is no parameter of `PlanarQuadrotor`; it has `mass`, `inertia`, "
+            "`gravity`, `arm`, `motor_thrust` (did you mean `mass`?).",
         ),
         (
             {"plant": {"scale": {"mass": 2}, "parameters": {"mass": 2}}},
-            "plant",
-            "`mass` of the plant has a value and a factor; give one of them.",
+            "plant: `mass` of the plant has a value and a factor; give one of them.",
         ),
         (
             {"plant": {"parameters": {"mass": -1}}},
-            "plant",
-            "`mass` of `PlanarQuadrotor` is -1, and must be a positive finite number.",
+            "plant: `mass` of `PlanarQuadrotor` is -1, and must be a positive finite number.",
         ),
         (
             {"disturbance": {"rms": {"velocty": 1}}},
-            "disturbance.rms",
-            "`velocty` is no state or group of `PlanarQuadrotor`, which has `position`, "
-            "`velocity`, `attitude`, `rate`, `y`, `z`, `roll`, `vy`, `vz`, `roll_rate` "
-            "(did you mean `velocity`?).",
+            "disturbance.rms: `velocty` is no state or group of `PlanarQuadrotor`, which has "
+            "`position`, `velocity`, `attitude`, `rate`, `y`, `z`, `roll`, `vy`, `vz`, "
+            "`roll_rate` (did you mean `velocity`?).",
         ),
         (
             {"disturbance": {"input_rms": {"trust": 1}}},
-            "disturbance.input_rms",
-            "`trust` is no input of `PlanarQuadrotor`, which has `thrust`, `torque` "
-            "(did you mean `thrust`?).",
+            "disturbance.input_rms: `trust` is no input of `PlanarQuadrotor`, which has `thrust`, "
+            "`torque` (did you mean `thrust`?).",
         ),
+        ({"plant": {"scale": {"mass": 0}}}, f"plant.scale.mass: {ALLOWED} above 0."),
         (
             {"disturbance": {"rms": {"vy": -1}}},
-            "disturbance.rms.vy",
-            "got `-1`, allowed is a number of at least 0.",
+            "disturbance.rms.vy: got `-1`, allowed is a number of at least 0.",
         ),
-        (
-            {"disturbance": {"hold": 0}},
-            "disturbance.hold",
-            "got `0`, allowed is a number above 0.",
-        ),
+        ({"disturbance": {"hold": 0}}, f"disturbance.hold: {ALLOWED} above 0."),
     ],
 )
-def test_faults_of_plant_and_disturbance_are_told_with_their_place(section, place, sentence):
+def test_faults_of_plant_and_disturbance_are_told_with_their_place(section, sentence):
     with pytest.raises(ScenarioError) as caught:
         build(imperfect(**section))
-    assert str(caught.value) == f"mapping: {place}: {sentence}"
+    assert str(caught.value) == f"mapping: {sentence}"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("rms", {"vx": -1.0}, "-1.0 for `vx`, and must be finite and not negative."),
+        ("constant", {"vx": np.nan}, "nan for `vx`, and must be finite."),
+        ("hold", 0.0, "0.0, and must be a positive finite number of seconds."),
+        ("seed", -1, "-1, and must be a whole number from 0 on."),
+    ],
+)
+def test_bad_disturbances_are_refused_in_a_sentence(key, value, told):
+    with pytest.raises(EchelonError) as caught:
+        Disturbance(**{key: value})
+    assert str(caught.value) == f"`{key}` of the disturbance is {told}"
 
 
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
         (
-            lambda: Disturbance(rms={"vx": -1.0}),
-            "`rms` of the disturbance is -1.0 for `vx`, and must be finite and not negative.",
-        ),
-        (
-            lambda: Disturbance(constant={"vx": np.nan}),
-            "`constant` of the disturbance is nan for `vx`, and must be finite.",
-        ),
-        (
-            lambda: Disturbance(hold=0.0),
-            "`hold` of the disturbance is 0.0, and must be a positive finite number of seconds.",
-        ),
-        (
-            lambda: Disturbance(seed=-1),
-            "`seed` of the disturbance is -1, and must be a whole number from 0 on.",
-        ),
-        (
-            lambda: drift(plant=DoubleIntegrator(1)),
+            lambda: drift(plant=models.DoubleIntegrator(1)),
             "`state_names` of the plant `DoubleIntegrator` are `x`, `vx`, and must be those of "
             "the model `DoubleIntegrator`, `x`, `y`, `vx`, `vy`.",
         ),
@@ -529,12 +412,12 @@ def test_faults_of_plant_and_disturbance_are_told_with_their_place(section, plac
             "`disturbance` is a `dict`, and must be a `Disturbance`.",
         ),
         (
-            lambda: vary_parameters(Linear(np.eye(2), np.eye(2)), {}, {"names": 2.0}),
+            lambda: vary_parameters(models.Linear(np.eye(2), np.eye(2)), {}, {"names": 2.0}),
             "`names` of `Linear` is ('x1', 'x2'), and only numbers can be scaled by a factor.",
         ),
     ],
 )
-def test_bad_plants_and_disturbances_are_refused_in_a_sentence(make, sentence):
+def test_worlds_that_do_not_fit_are_refused_in_a_sentence(make, sentence):
     with pytest.raises(EchelonError) as caught:
         make()
     assert str(caught.value) == sentence

@@ -9,36 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import adjacency, disagreements
 
-from echelon.agents.models import (
-    ControlAffine,
-    DoubleIntegrator,
-    Linear,
-    Pendulum,
-    PlanarQuadrotor,
-    Quadrotor,
-    SingleIntegrator,
-    UnicyclePoint,
-    VanDerPol,
-)
-from echelon.agents.network.formation import Formation
-from echelon.agents.network.graph import Graph
+from echelon import Formation, Graph
+from echelon.agents import models
 from echelon.core import numerics
 
 DRAWN = {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)}
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
-QUAD = Quadrotor()
-PLANE = SingleIntegrator(2)
+QUAD = models.Quadrotor()
+PLANE = models.SingleIntegrator(2)
 
 
 def points(formation, axes=2):
     return formation.offsets[:, :axes]
-
-
-def spacings(where):
-    return sorted(np.linalg.norm(p - q) for p, q in itertools.combinations(where, 2))
-
-
-# ---- displacements ----
 
 
 def test_the_drawn_formation_has_the_distances_of_the_paper():
@@ -70,14 +52,6 @@ def test_displacements_point_from_an_agent_s_goal_to_its_neighbour_s(seed):
     assert z == pytest.approx(disagreements(A, x, xi), abs=1e-12)
 
 
-def test_agents_on_their_goals_have_no_disagreement_wherever_the_leader_is():
-    formation = Formation.from_offsets(QUAD, TREE, DRAWN)
-    there = np.tile(np.linspace(0.5, 3.0, 12), (4, 1)) + formation.offsets
-    with numerics.precision("float64"):
-        z = np.asarray(TREE.disagreement(jnp.asarray(there - formation.offsets)))
-    assert np.abs(z).max() <= 4e-15
-
-
 def test_offsets_may_be_given_over_all_states_and_are_kept_from_change():
     whole = np.arange(12.0)
     given_offsets = {2: whole, 3: [1, 2, 3]}
@@ -91,28 +65,12 @@ def test_offsets_may_be_given_over_all_states_and_are_kept_from_change():
 
 
 def test_offsets_of_a_position_in_the_middle_of_the_state_go_there():
-    class Cart(DoubleIntegratorLike):
+    class Cart(Carried):
         state_names = ("charge", "x", "speed", "y")
         position = ("x", "y")
 
     formation = Formation.from_offsets(Cart(), Graph.path(2), {1: (3, 4)})
     assert formation.offsets[1].tolist() == [0.0, 3.0, 0.0, 4.0]
-
-
-class DoubleIntegratorLike(ControlAffine):
-    """Any four states that do not matter here."""
-
-    state_names = ("a", "b", "c", "d")
-    input_names = ("u",)
-
-    def drift(self, x):
-        return jnp.zeros_like(x)
-
-    def input_map(self, x):
-        return jnp.ones((4, 1), x.dtype)
-
-
-# ---- drawn shapes ----
 
 
 def drawn(kind, agents, model=PLANE, **options):
@@ -129,38 +87,35 @@ def test_drawn_formations_start_at_the_leader_and_keep_their_spacing(kind, agent
     assert where[0].tolist() == [0.0, 0.0]
     if kind != "circle":
         assert where[:, 0].max() <= 0.0, "nobody stands before the leader"
-    gaps = spacings(where)
+    gaps = [np.linalg.norm(p - q) for p, q in itertools.combinations(where, 2)]
     # On a circle of many, neighbours on the ring are the nearest; of few, the hub is.
     ring = agents - 1
     hub = 1.5 if ring < 3 else 0.75 / np.sin(np.pi / ring)
-    assert gaps[0] == pytest.approx(min(1.5, hub) if kind == "circle" else 1.5)
+    assert min(gaps) == pytest.approx(min(1.5, hub) if kind == "circle" else 1.5)
     assert len(np.unique(where.round(9), axis=0)) == agents
+    # One metre unless said otherwise.
+    assert where == pytest.approx(1.5 * points(drawn(kind, agents)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_spacing_scales_a_drawn_formation(kind):
-    once, thrice = (points(drawn(kind, 8, spacing=s)) for s in (1.0, 3.0))
-    assert thrice == pytest.approx(3.0 * once)
+BACK, H = 2.0 * np.sqrt(0.75), np.sqrt(0.5)
 
 
-def test_a_triangle_is_filled_with_equilateral_ones():
-    where = points(drawn("triangle", 6, spacing=2.0))
-    back = 2.0 * np.sqrt(0.75)
-    rows = [[0, 0], [-back, -1], [-back, 1], [-2 * back, -2], [-2 * back, 0], [-2 * back, 2]]
-    assert where == pytest.approx(np.array(rows))
-    assert spacings(where)[:9] == pytest.approx([2.0] * 9)
-
-
-def test_a_line_trails_the_leader():
-    assert points(drawn("line", 4, spacing=0.5)).tolist() == [[0, 0], [-0.5, 0], [-1, 0], [-1.5, 0]]
-
-
-def test_a_wedge_has_two_arms_at_a_right_angle():
-    where = points(drawn("wedge", 5, spacing=1.0))
-    h = np.sqrt(0.5)
-    assert where == pytest.approx(
-        np.array([[0, 0], [-h, h], [-h, -h], [-2 * h, 2 * h], [-2 * h, -2 * h]])
-    )
+@pytest.mark.parametrize(
+    ("kind", "options", "rows"),
+    [
+        (
+            "triangle",
+            {"spacing": 2.0},
+            [[0, 0], [-BACK, -1], [-BACK, 1], [-2 * BACK, -2], [-2 * BACK, 0], [-2 * BACK, 2]],
+        ),
+        ("line", {"spacing": 0.5}, [[0, 0], [-0.5, 0], [-1, 0], [-1.5, 0]]),
+        ("wedge", {}, [[0, 0], [-H, H], [-H, -H], [-2 * H, 2 * H], [-2 * H, -2 * H]]),
+        ("grid", {"columns": 2}, [[0, 0], [0, 1], [-1, 0], [-1, 1], [-2, 0]]),
+        ("grid", {}, [[-(k // 3), k % 3] for k in range(9)]),
+    ],
+)
+def test_drawn_shapes_have_their_places(kind, options, rows):
+    assert points(drawn(kind, len(rows), **options)) == pytest.approx(np.array(rows))
 
 
 def test_a_circle_surrounds_the_leader_with_equal_chords():
@@ -170,22 +125,13 @@ def test_a_circle_surrounds_the_leader_with_equal_chords():
     assert chords == pytest.approx([2.0] * 6)
 
 
-def test_a_grid_has_as_many_columns_as_told():
-    where = points(drawn("grid", 5, columns=2))
-    assert where.tolist() == [[0, 0], [0, 1], [-1, 0], [-1, 1], [-2, 0]]
-    assert len(np.unique(points(drawn("grid", 9))[:, 1])) == 3
-
-
 def test_formations_are_drawn_on_the_first_two_position_coordinates():
     high = Formation.triangle(QUAD, TREE, spacing=2.0)
     assert not high.offsets[:, 2:].any()
-    upright = Formation.wedge(PlanarQuadrotor(), TREE)
+    upright = Formation.wedge(models.PlanarQuadrotor(), TREE)
     assert not upright.offsets[:, 2:].any() and upright.offsets[1, 1] != 0.0
-    single = Formation.line(SingleIntegrator(1), TREE, spacing=2.0)
+    single = Formation.line(models.SingleIntegrator(1), TREE, spacing=2.0)
     assert single.offsets.ravel().tolist() == [0.0, -2.0, -4.0, -6.0]
-
-
-# ---- rigidity ----
 
 
 def numeric_rigidity(where, edges):
@@ -229,25 +175,14 @@ def test_the_drawn_formation_is_not_rigid_and_a_complete_tetrahedron_is():
         ({1: (1, 0), 2: (1, 1), 3: (0, 1)}, [(0, 1), (1, 2), (2, 3), (0, 3), (0, 2)], True),
         ({1: (1, 0)}, [(0, 1)], True),
         ({}, [(0, 1)], False),
+        # Few agents in space have fewer motions to spare.
+        ({1: (1, 0, 0)}, [(0, 1)], True),
+        ({1: (1, 0, 0), 2: (0, 1, 0)}, [(0, 1), (1, 2), (0, 2)], True),
     ],
-    ids=["triangle", "flat triangle", "square", "braced square", "rod", "both in one place"],
 )
-def test_rigidity_in_the_plane(offsets, edges, rigid):
-    graph = Graph.from_edges(edges)
-    assert Formation.from_offsets(PLANE, graph, offsets).is_rigid(PLANE, graph) is rigid
-
-
-@pytest.mark.parametrize(
-    ("agents", "rigid"), [(2, True), (3, True)], ids=["rod in space", "triangle in space"]
-)
-def test_few_agents_in_space_have_fewer_motions_to_spare(agents, rigid):
-    graph, model = Graph.complete(agents), SingleIntegrator(3)
-    offsets = {1: (1, 0, 0), 2: (0, 1, 0)}
-    formation = Formation.from_offsets(model, graph, {k: offsets[k] for k in range(1, agents)})
-    assert formation.is_rigid(model, graph) is rigid
-
-
-# ---- coincident goals and symmetries ----
+def test_rigidity_is_that_of_rods_and_triangles(offsets, edges, rigid):
+    graph, model = Graph.from_edges(edges), models.SingleIntegrator(len(offsets.get(1, (0, 0))))
+    assert Formation.from_offsets(model, graph, offsets).is_rigid(model, graph) is rigid
 
 
 def test_agents_with_one_goal_are_named_in_pairs():
@@ -259,11 +194,11 @@ def test_agents_with_one_goal_are_named_in_pairs():
 
 SYMMETRIC = [
     (QUAD, (1.0, -2.0, 0.5)),
-    (PlanarQuadrotor(), (1.0, -2.0)),
-    (DoubleIntegrator(2, drag=0.3), (1.0, 2.0)),
-    (SingleIntegrator(3), (1.0, 2.0, 3.0)),
-    (UnicyclePoint(), (1.0, 2.0)),
-    (Linear([[0.0, 1.0], [0.0, -1.0]], [[0.0], [1.0]]), (5.0, 0.0)),
+    (models.PlanarQuadrotor(), (1.0, -2.0)),
+    (models.DoubleIntegrator(2, drag=0.3), (1.0, 2.0)),
+    (models.SingleIntegrator(3), (1.0, 2.0, 3.0)),
+    (models.UnicyclePoint(), (1.0, 2.0)),
+    (models.Linear([[0.0, 1.0], [0.0, -1.0]], [[0.0], [1.0]]), (5.0, 0.0)),
 ]
 
 
@@ -283,11 +218,11 @@ def over(names, **values):
     [
         (QUAD, "roll", "it changes the drift of `"),
         (QUAD, "vx", "it changes the drift of `x`"),
-        (PlanarQuadrotor(), "roll", "it changes the input map of `v"),
-        (DoubleIntegrator(2), "vy", "it changes the drift of `y`"),
-        (UnicyclePoint(), "heading", "it changes the input map of `"),
-        (VanDerPol(), "position", "it changes the drift of `velocity`"),
-        (Pendulum(), "angle", "it changes the drift of `rate`"),
+        (models.PlanarQuadrotor(), "roll", "it changes the input map of `v"),
+        (models.DoubleIntegrator(2), "vy", "it changes the drift of `y`"),
+        (models.UnicyclePoint(), "heading", "it changes the input map of `"),
+        (models.VanDerPol(), "position", "it changes the drift of `velocity`"),
+        (models.Pendulum(), "angle", "it changes the drift of `rate`"),
     ],
     ids=lambda v: v if isinstance(v, str) else type(v).__name__,
 )
@@ -300,31 +235,28 @@ def test_offsets_that_change_the_dynamics_are_named_with_agent_and_reason(model,
     assert not formation.is_invariant(model)
 
 
-def test_what_counts_is_the_offset_from_the_leader():
-    bad = over(QUAD.state_names, yaw=0.4)
-    together = Formation.from_offsets(QUAD, TREE, dict.fromkeys(range(4), bad))
-    assert together.is_invariant(QUAD)
+YAW = over(QUAD.state_names, yaw=0.4)
 
 
-def test_a_leader_s_own_offset_breaks_the_symmetry_of_all_who_do_not_share_it():
-    bad = over(QUAD.state_names, yaw=0.4)
-    formation = Formation.from_offsets(QUAD, TREE, {0: bad})
-    assert list(formation.broken_symmetries(QUAD)) == [1, 2, 3]
+@pytest.mark.parametrize(
+    ("offsets", "broken"),
+    [
+        # What counts is the offset from the leader, whose own breaks that of all others.
+        (dict.fromkeys(range(4), YAW), []),
+        ({0: YAW}, [1, 2, 3]),
+        # Zeros count whatever their sign bit.
+        ({1: (-0.0, 0.0, 0.0)}, []),
+        ({1: (1.0, 0.0, 0.0), 2: (1.0, -0.0, 0.0)}, []),
+        ({1: YAW, 2: [value or -0.0 for value in YAW]}, [1, 2]),
+    ],
+)
+def test_broken_symmetries_are_those_of_offsets_from_the_leader(offsets, broken):
+    formation = Formation.from_offsets(QUAD, TREE, offsets)
+    assert list(formation.broken_symmetries(QUAD)) == broken
+    assert formation.is_invariant(QUAD) is (not broken)
 
 
-def test_a_zero_offset_is_a_symmetry_whatever_its_sign_bit():
-    for offsets in ({1: (-0.0, 0.0, 0.0)}, {1: (1.0, 0.0, 0.0), 2: (1.0, -0.0, 0.0)}):
-        assert Formation.from_offsets(QUAD, TREE, offsets).is_invariant(QUAD)
-
-
-def test_all_agents_that_share_a_broken_offset_are_named_whatever_its_zeros():
-    offset = over(QUAD.state_names, yaw=0.4)
-    twin = [-0.0 if value == 0.0 else value for value in offset]
-    formation = Formation.from_offsets(QUAD, TREE, {1: offset, 2: twin})
-    assert list(formation.broken_symmetries(QUAD)) == [1, 2]
-
-
-class Carried(SingleIntegrator):
+class Carried(models.SingleIntegrator):
     """Points that a wind carries along x, and that push with some strength."""
 
     wind: object = staticmethod(jnp.zeros_like)
@@ -361,19 +293,8 @@ def test_small_changes_count_and_rounding_does_not(changes, fine):
 
 def test_a_whole_turn_is_a_symmetry_of_a_pendulum():
     # f(x + d) = f(x) for all x, which is all that the theorem needs.
-    formation = Formation.from_offsets(Pendulum(), TREE, {2: (2.0 * np.pi, 0.0)})
-    assert formation.is_invariant(Pendulum())
-
-
-@pytest.mark.parametrize("shape", ["line", "triangle", "wedge", "grid", "circle"])
-def test_drawn_neighbours_are_one_metre_apart_unless_said_otherwise(shape):
-    draw = getattr(Formation, shape)
-    for words, wanted in (({}, 1.0), ({"spacing": 2.5}, 2.5)):
-        places = draw(PLANE, Graph.path(6), **words).offsets[:, :2]
-        if shape == "circle":
-            places = places[1:]  # the leader stands in the middle
-        gaps = np.linalg.norm(places[:, None] - places, axis=-1)[~np.eye(len(places), dtype=bool)]
-        assert gaps.min() == pytest.approx(wanted)
+    formation = Formation.from_offsets(models.Pendulum(), TREE, {2: (2.0 * np.pi, 0.0)})
+    assert formation.is_invariant(models.Pendulum())
 
 
 def test_formations_of_the_same_offsets_are_equal_and_hash_alike():

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from echelon import Formation, Graph
 from echelon.agents.models import DoubleIntegrator, Pendulum, PlanarQuadrotor, Quadrotor, Unicycle
-from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import (
     OffsetMotion,
     Reshape,
@@ -17,7 +17,6 @@ from echelon.agents.network.formation_motion import (
     Scale,
     nearest_places,
 )
-from echelon.agents.network.graph import Graph
 from echelon.core.errors import FormationError
 
 MODEL, GRAPH = DoubleIntegrator(3), Graph.star(5)

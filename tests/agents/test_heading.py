@@ -1,7 +1,5 @@
 """Gains in axes that turn with the leader's heading: the law is the same at any heading."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,7 +19,7 @@ from echelon.experiments.results.lyapunov import lyapunov
 from echelon.guarantees.promises.modes import steady_turn
 from echelon.laws.law import LocalView
 
-QUADROTOR = ech.models.Quadrotor.crazyflie()
+QUADROTOR, PAIR = ech.models.Quadrotor.crazyflie(), ech.Graph.path(2)
 
 
 class Hovercraft(ech.ControlAffine):
@@ -93,14 +91,8 @@ def run():
     return flown(TURNING, {"x": 0.5, "y": 0.5, "yaw": 0.2}, horizon=30.0)
 
 
-BUNDLED = [
-    QUADROTOR,
-    ech.models.QuadrotorEuler(),
-    ech.models.QuadrotorThrust(),
-    ech.models.CrazyflieAttitude(),
-    ech.models.Unicycle(),
-    ech.models.UnicyclePoint(),
-]
+VEHICLES = "QuadrotorEuler", "QuadrotorThrust", "CrazyflieAttitude", "Unicycle", "UnicyclePoint"
+BUNDLED = [QUADROTOR, *(getattr(ech.models, name)() for name in VEHICLES)]
 
 
 @pytest.mark.parametrize("model", [*BUNDLED, Hovercraft(), Tug()], ids=lambda m: type(m).__name__)
@@ -117,46 +109,43 @@ def test_a_heading_that_is_none_is_refused():
 
     for model, why in ((Anchored(), "the motion turns with `yaw`"), (Misnamed(), "names `z`")):
         with pytest.raises(ModelError, match=why):
-            ech.synthesize(model, ech.Graph.path(2), ech.gains.Riccati())
-    gain = ech.synthesize(Hovercraft(), ech.Graph.path(2), ech.gains.Riccati())
+            ech.synthesize(model, PAIR, ech.gains.Riccati())
+    gain = ech.synthesize(Hovercraft(), PAIR, ech.gains.Riccati())
     with pytest.raises(LawError, match="`frame` is `north`, allowed are `world`, `heading`"):
         ech.laws.Consensus(gain, frame="north")
 
 
-def laws():
-    graph = ech.Graph.path(2)
-    riccati = ech.synthesize(QUADROTOR, graph, ech.gains.Riccati())
-    inner = ech.synthesize(QUADROTOR, graph, ech.gains.InnerLoop())
-    skew = ech.synthesize(Tug(), graph, ech.gains.Riccati(R=np.diag([1.0, 5.0, 2.0])))
-    return {
-        "riccati": (QUADROTOR, ech.laws.Consensus(riccati)),
-        "inner": (QUADROTOR, ech.laws.Consensus(inner)),
-        "velocity": (Tug(), ech.laws.Consensus(skew, feedforward="relay-velocity")),
-        "inputs": (Tug(), ech.laws.Consensus(skew)),
-    }
+def law_of(name, model):
+    """A law whose gain is that of Riccati, of an inner loop, or weighs inputs differently."""
+    if name == "inner":
+        return ech.laws.Consensus(ech.synthesize(model, PAIR, ech.gains.InnerLoop()))
+    R = np.diag([1.0, 5.0, 2.0]) if isinstance(model, Tug) else None
+    gain = ech.synthesize(model, PAIR, ech.gains.Riccati(R=R))
+    return ech.laws.Consensus(gain, feedforward="relay-velocity" if name == "velocity" else "relay")
 
 
-@pytest.mark.parametrize("name", ["riccati", "inner", "velocity", "inputs"])
-def test_a_law_does_at_any_heading_what_it_does_at_the_trim(name):
-    model, law = laws()[name]
-    draw, n = np.random.default_rng(1), len(model.state_names)
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [("riccati", QUADROTOR), ("inner", QUADROTOR), ("velocity", Tug()), ("inputs", Tug())],
+)
+def test_a_law_does_at_any_heading_what_it_does_at_the_trim(name, model):
+    law, draw, n = law_of(name, model), np.random.default_rng(1), len(model.state_names)
     D, E = state_turn(model), input_turn(model)
     with jax.enable_x64(True):
         x, z = (jnp.asarray(draw.uniform(-0.4, 0.4, n)) for _ in range(2))
         sent = jnp.asarray(draw.uniform(-1.0, 1.0, len(model.input_names)))
         if name == "velocity":
             sent = law.broadcast(model, x, sent)
+        view = LocalView(jnp.zeros(()), x, jnp.zeros(n), z, sent)
         for angle in map(jnp.asarray, (0.0, 1.0, -2.5, 7.0)):
             told = D(sent, angle) if name == "velocity" else E(sent, angle)
-            nothing = jnp.zeros(n)
-            view = LocalView(jnp.zeros(()), x, nothing, z, sent)
             there = rotate_state(model, x, angle)
-            there = LocalView(jnp.zeros(()), there, nothing, D(z, angle), told)
+            there = LocalView(jnp.zeros(()), there, jnp.zeros(n), D(z, angle), told)
             wanted = model.normalized(law.update(model, view, None)[0])
             found = model.normalized(law.facing(angle).update(model, there, None)[0])
             assert np.abs(E(wanted, angle) - found).max() < 1e-10 * np.abs(found).max()
-            at_rest = law.facing(jnp.zeros(())).update(model, view, None)[0]
-            assert np.array_equal(at_rest, law.update(model, view, None)[0])
+        at_rest = law.facing(jnp.zeros(())).update(model, view, None)[0]
+        assert np.array_equal(at_rest, law.update(model, view, None)[0])
 
 
 def test_a_formation_is_held_behind_a_leader_that_turns(run):
@@ -206,7 +195,7 @@ def test_what_is_promised_of_a_turn_is_the_rate_at_which_errors_shrink():
         for k, (place, share) in enumerate(zip(offsets, shares, strict=True))
     }
     run = flown(spin, starts, horizon=14.0)
-    found = ech.promise(run.parts, run.settings)
+    found = ech.guarantee(run.parts, run.settings)
     [line] = (x for x in found.hypotheses.values() if x.name == "law turns with the heading")
     sizes = np.linalg.norm(run.errors[:, 1:], axis=(1, 2))
     early, late = sizes[[400, 650]]
@@ -224,29 +213,27 @@ def test_a_steady_turn_moves_nothing_in_axes_that_turn():
 
 
 def test_behind_a_leader_that_keeps_its_heading_nothing_is_told():
-    model, law = laws()["riccati"]
-    still, turning = ech.references.Lemniscate(), ech.references.Lemniscate(yaw=0.1)
-    graph = ech.Graph.path(2)
-    told = [
-        ech.Laws(ech.laws.Tracking(path), law).prepare(model, graph) for path in (still, turning)
-    ]
-    assert [each.follower.turning for each in told] == [False, True]
-    assert "the heading that the leader follows" in told[1].information.follower
-    world = dataclasses.replace(law, frame=ech.laws.Consensus(law.gain, frame="world").frame)
-    assert not ech.Laws(ech.laws.Tracking(turning), world).prepare(model, graph).follower.turning
+    law = law_of("riccati", QUADROTOR)
+
+    def prepared(law, **yaw):
+        path = ech.references.Lemniscate(**yaw)
+        return ech.Laws(ech.laws.Tracking(path), law).prepare(QUADROTOR, PAIR)
+
+    turning = prepared(law, yaw=0.1)
+    assert turning.follower.turning and not prepared(law).follower.turning
+    assert "the heading that the leader follows" in turning.information.follower
+    world = ech.laws.Consensus(law.gain, frame="world")
     # A gain that no turn changes needs no heading.
     even = eqx.tree_at(lambda each: each.gain.P, law, np.eye(12))
-    assert not ech.Laws(ech.laws.Tracking(turning), even).prepare(model, graph).follower.turning
+    for other in (world, even):
+        assert not prepared(other, yaw=0.1).follower.turning
 
 
 @pytest.mark.slow
 def test_the_formation_of_yaw_turn_is_held_to_rounding():
-    from echelon.experiments.scenario.build import build
-
-    parts, settings = build(ech.load_scenario("yaw-turn"))
-    result = ech.simulate(parts, settings)
-    assert np.abs(result.errors[-1]).max() < 1e-14
-    promise = ech.promise(parts, settings)
+    parts, settings = ech.build(ech.load_scenario("yaw-turn"))
+    assert np.abs(ech.simulate(parts, settings).errors[-1]).max() < 1e-14
+    promise = ech.guarantee(parts, settings)
     assert promise.promised and promise.rate > 1.0
-    parts, settings = build(ech.load_scenario("yaw-turn", ["follower.frame=world"]))
-    assert "`yaw`" in ech.promise(parts, settings).sentence()
+    parts, settings = ech.build(ech.load_scenario("yaw-turn", ["follower.frame=world"]))
+    assert "`yaw`" in ech.guarantee(parts, settings).sentence()

@@ -15,28 +15,9 @@ from oracles import newton_euler, quadrotor_input_map, rotation
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-import echelon.agents.models
-from echelon.agents.models import (
-    ControlAffine,
-    CrazyflieAttitude,
-    DoubleIntegrator,
-    Heading,
-    Limits,
-    Linear,
-    Pendulum,
-    PlanarQuadrotor,
-    PrintedQuadrotor,
-    Quadrotor,
-    QuadrotorEuler,
-    QuadrotorThrust,
-    SingleIntegrator,
-    Unicycle,
-    UnicyclePoint,
-    VanDerPol,
-)
+from echelon.agents import models
 from echelon.agents.models.model_check import check_model
 from echelon.agents.models.quadrotor_euler import ATTITUDE_PARAMETERS
-from echelon.agents.models.rigid_body import body_rates, euler_rates, free_spin
 from echelon.core import numerics
 from echelon.core.errors import ModelError
 from echelon.core.numerics import precision
@@ -63,9 +44,6 @@ def state_and_input(model, seed=0):
     return draw, size * np.random.default_rng(seed + 1).uniform(-1.0, 1.0, len(size))
 
 
-# ---- the same equations, written again ----
-
-
 def planar(model, x, u):
     y, z, roll, vy, vz, rate = x
     push = u[0] / model.mass
@@ -79,37 +57,37 @@ def printed(model, x, u):
 
 
 EQUATIONS = {
-    SingleIntegrator: lambda m, x, u: u,
-    DoubleIntegrator: lambda m, x, u: [
+    models.SingleIntegrator: lambda m, x, u: u,
+    models.DoubleIntegrator: lambda m, x, u: [
         *x[m.dimension :],
         *(u[k] - m.drag * x[m.dimension + k] for k in range(m.dimension)),
     ],
-    Linear: lambda m, x, u: m.A @ x + m.B @ u,
-    VanDerPol: lambda m, x, u: [x[1], m.damping * (1 - x[0] * x[0]) * x[1] - x[0] + u[0]],
-    Pendulum: lambda m, x, u: [x[1], u[0] - m.stiffness * np.sin(x[0]) - m.damping * x[1]],
-    Unicycle: lambda m, x, u: [u[0] * np.cos(x[2]), u[0] * np.sin(x[2]), u[1]],
-    UnicyclePoint: lambda m, x, u: [
+    models.Linear: lambda m, x, u: m.A @ x + m.B @ u,
+    models.VanDerPol: lambda m, x, u: [x[1], m.damping * (1 - x[0] * x[0]) * x[1] - x[0] + u[0]],
+    models.Pendulum: lambda m, x, u: [x[1], u[0] - m.stiffness * np.sin(x[0]) - m.damping * x[1]],
+    models.Unicycle: lambda m, x, u: [u[0] * np.cos(x[2]), u[0] * np.sin(x[2]), u[1]],
+    models.UnicyclePoint: lambda m, x, u: [
         u[0] * np.cos(x[2]) - m.ahead * u[1] * np.sin(x[2]),
         u[0] * np.sin(x[2]) + m.ahead * u[1] * np.cos(x[2]),
         u[1],
     ],
-    PlanarQuadrotor: planar,
-    Quadrotor: lambda m, x, u: newton_euler(x, u, m.mass, m.inertia),
-    PrintedQuadrotor: printed,
-    QuadrotorEuler: lambda m, x, u: [
+    models.PlanarQuadrotor: planar,
+    models.Quadrotor: lambda m, x, u: newton_euler(x, u, m.mass, m.inertia),
+    models.PrintedQuadrotor: printed,
+    models.QuadrotorEuler: lambda m, x, u: [
         *x[3:6],
         *((m.gravity + u[0]) * rotation(x[6:9])[:, 2] - [0.0, 0.0, m.gravity]),
         *x[9:12],
         *u[1:],
     ],
-    QuadrotorThrust: lambda m, x, u: [
+    models.QuadrotorThrust: lambda m, x, u: [
         *x[3:6],
         *((m.gravity + x[12]) * rotation(x[6:9])[:, 2] - [0.0, 0.0, m.gravity]),
         *x[9:12],
         *u[1:],
         u[0],
     ],
-    CrazyflieAttitude: lambda m, x, u: [
+    models.CrazyflieAttitude: lambda m, x, u: [
         *x[3:6],
         *(m.thrust_gain * u[3] / m.mass * rotation(x[6:9])[:, 2] - [0.0, 0.0, m.gravity]),
         *x[9:12],
@@ -130,14 +108,14 @@ def test_drift_and_input_map_are_the_textbook_equations(model, seed):
 
 
 def test_the_family_of_these_tests_is_the_whole_family():
-    members = {getattr(echelon.agents.models, name) for name in echelon.agents.models.__all__}
-    members -= {Limits, Heading}
-    assert {type(model) for model in MODELS.values()} == members - {ControlAffine}
+    members = {getattr(models, name) for name in models.__all__}
+    members -= {models.Limits, models.Heading}
+    assert {type(model) for model in MODELS.values()} == members - {models.ControlAffine}
     registered = set()
     for entry in registry.MODELS.values():
         module, _, name = entry.target.partition(":")
         registered.add(getattr(importlib.import_module(module), name))
-    assert registered == members - {ControlAffine}
+    assert registered == members - {models.ControlAffine}
 
 
 positive = st.floats(0.05, 5.0)
@@ -151,7 +129,7 @@ def test_quadrotor_is_newton_euler_for_any_parameters(x, u, mass, sides, gravity
     # A box of any sides has an inertia that a rigid body can have.
     a, b, c = (side**2 for side in sides)
     inertia = (b + c, a + c, a + b)
-    model = Quadrotor(mass=mass, inertia=inertia, gravity=gravity)
+    model = models.Quadrotor(mass=mass, inertia=inertia, gravity=gravity)
     got = numpy(model.velocity, x, u)
     assert got == pytest.approx(newton_euler(x, u, mass, inertia, gravity), rel=1e-10, abs=1e-10)
     columns = quadrotor_input_map(x, mass, inertia)
@@ -162,30 +140,29 @@ def test_quadrotor_is_newton_euler_for_any_parameters(x, u, mass, sides, gravity
 
 
 @every_model
-def test_shapes_names_and_units_belong_together(model):
-    n, m, q = len(model.state_names), len(model.input_names), len(model.output_names)
-    x, u = state_and_input(model)
-    assert numpy(model.drift, x).shape == (n,) == numpy(model.difference, x, x).shape
-    assert numpy(model.input_map, x).shape == (n, m) == numpy(model.normalized_input_map, x).shape
-    assert numpy(model.output, x).shape == (q,)
-    assert numpy(model.limit, u).shape == (m,)
-    assert len(set(model.state_names)) == len(model.state_units) == n
-    assert len(set(model.input_names)) == len(model.input_units) == m
-    assert np.shape(model.trim[0]) == (n,) == np.shape(model.weights[0])
-    assert np.shape(model.trim[1]) == (m,) == np.shape(model.weights[1])
-    assert np.shape(model.input_scale) == (m, m)
-    assert min(*model.weights[0], *model.weights[1]) > 0.0
-    assert {name for group in model.state_groups.values() for name in group} <= {*model.state_names}
-    assert [model.state_names[k] for k in model.position_indices()] == [*model.position]
-    places = model.position_indices()
-    assert all(model.state_units[k] == "m" for k in places)
-
-
-@every_model
 def test_the_trim_is_an_equilibrium_within_the_limits(model):
     x, u = map(np.array, model.trim)
     assert np.abs(numpy(model.velocity, x, u)).max() <= 1e-12
     assert numpy(model.limit, u).tobytes() == u.tobytes()
+    assert min(*model.weights[0], *model.weights[1]) > 0.0
+    assert [model.state_names[k] for k in model.position_indices()] == [*model.position]
+    assert {model.state_units[k] for k in model.position_indices()} <= {"m"}
+
+
+def pushed(limits, states=2):
+    """A decaying agent with two limited inputs."""
+
+    class Pushed(models.ControlAffine):
+        state_names, input_names = ("x", "y")[:states], ("a", "b")
+        input_limits = limits
+
+        def drift(self, x):
+            return -x
+
+        def input_map(self, x):
+            return jnp.ones((states, 2), x.dtype)
+
+    return Pushed()
 
 
 @pytest.mark.slow
@@ -195,18 +172,8 @@ def test_the_trim_is_an_equilibrium_within_the_limits(model):
 )
 def test_limits_alone_say_what_is_delivered(matrix, wanted):
     assume(np.linalg.cond(matrix) < 1e3 and np.abs(matrix).max() > 1e-300)
-
-    class Pushed(ControlAffine):
-        state_names, input_names = ("x", "y"), ("a", "b")
-        input_limits = Limits(tuple(map(tuple, matrix.tolist())), (-1.0, -2.0), (3.0, 0.5))
-
-        def drift(self, x):
-            return -x
-
-        def input_map(self, x):
-            return jnp.eye(2, dtype=x.dtype)
-
-    delivered, rows = numpy(Pushed().limit, wanted), matrix @ wanted
+    model = pushed(models.Limits(tuple(map(tuple, matrix.tolist())), (-1.0, -2.0), (3.0, 0.5)))
+    delivered, rows = numpy(model.limit, wanted), matrix @ wanted
     nearest = np.clip(rows, [-1.0, -2.0], [3.0, 0.5])
     np.testing.assert_allclose(matrix @ delivered, nearest, rtol=0, atol=1e-9)
     if (rows == nearest).all():
@@ -215,18 +182,9 @@ def test_limits_alone_say_what_is_delivered(matrix, wanted):
 
 @pytest.mark.parametrize("size", [1e-313, 1e-310])
 def test_limits_that_floats_cannot_invert_are_refused(size):
-    class Tiny(ControlAffine):
-        state_names, input_names = ("x",), ("a", "b")
-        input_limits = Limits(((size, size), (size, 0.0)), (-1.0, -1.0), (1.0, 1.0))
-
-        def drift(self, x):
-            return -x
-
-        def input_map(self, x):
-            return jnp.ones((1, 2), x.dtype)
-
+    limits = models.Limits(((size, size), (size, 0.0)), (-1.0, -1.0), (1.0, 1.0))
     with pytest.raises(ModelError, match="does not define the input that is delivered"):
-        check_model(Tiny())
+        check_model(pushed(limits, 1))
 
 
 @every_model
@@ -272,10 +230,10 @@ def test_many_inputs_change_as_one_does_in_numpy_and_in_jax(model):
 
 
 def test_a_scale_that_depends_on_an_array_is_traced_with_it():
-    class Weighed(ControlAffine):
+    class Weighed(models.ControlAffine):
         mass: np.ndarray
         state_names, input_names = ("speed",), ("push",)
-        drift, input_map = SingleIntegrator.drift, SingleIntegrator.input_map
+        drift, input_map = models.SingleIntegrator.drift, models.SingleIntegrator.input_map
 
         @property
         def input_scale(self):
@@ -284,31 +242,6 @@ def test_a_scale_that_depends_on_an_array_is_traced_with_it():
     change = eqx.filter_jit(lambda model, u: model.normalized(u))
     for mass in (2.0, 4.0):
         assert change(Weighed(np.array([mass])), jnp.array([8.0])) == 8.0 / mass
-
-
-@every_model
-@pytest.mark.parametrize("name", ["float64", "float32"])
-def test_agents_compute_in_the_precision_that_is_asked_for(model, name):
-    x, u = state_and_input(model)
-    with numerics.precision(name):
-        a, b = jnp.asarray(x), jnp.asarray(u)
-        values = [model.drift(a), model.input_map(a), model.output(a), model.limit(b)]
-        values += [
-            model.physical(b),
-            model.normalized(b),
-            model.normalized_input_map(a),
-            model.difference(a, a),
-        ]
-        assert {str(value.dtype) for value in values} == {name}
-
-
-@every_model
-def test_states_are_found_by_name_and_by_group(model):
-    for k, name in enumerate(model.state_names):
-        if name not in model.state_groups:
-            assert model.states_called(name) == (k,)
-    for group, members in model.state_groups.items():
-        assert tuple(model.state_names[k] for k in model.states_called(group)) == tuple(members)
 
 
 @every_model
@@ -326,16 +259,9 @@ def test_a_state_has_its_own_number_else_its_group_s_else_the_default(model, dat
         model.per_state({"nothing": 1.0})
 
 
-@every_model
-def test_one_agent_and_a_batch_of_agents_move_alike(model):
-    pairs = [state_and_input(model, seed) for seed in range(4)]
-    x, u = map(np.stack, zip(*pairs, strict=True))
-    together = numpy(jax.vmap(model.velocity), x, u)
-    alone = np.stack([numpy(model.velocity, *pair) for pair in pairs])
-    assert together == pytest.approx(alone, rel=1e-13, abs=1e-13)
-
-
-@pytest.mark.parametrize("model", [Unicycle(), UnicyclePoint()], ids=["axle", "point"])
+@pytest.mark.parametrize(
+    "model", [models.Unicycle(), models.UnicyclePoint()], ids=["axle", "point"]
+)
 @given(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0))
 @settings(max_examples=30)
 def test_headings_differ_by_the_shorter_way_round(model, a, b):
@@ -441,17 +367,16 @@ def attitude_by_rotations(path, gravity, t):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_under_computed_torque_quadrotors_fly_what_rotations_and_differences_say(seed):
-    euler, thrust, t = MODELS["euler"], QuadrotorThrust(gravity=3.7), 0.4
+    euler, thrust, t = MODELS["euler"], models.QuadrotorThrust(gravity=3.7), 0.4
     # A yaw that keeps below half a turn, where a rotation has one name.
     path = Smooth(4, seed, drift=0.3)
     with precision("float64"):
-        rows = path.derivatives(t, 4)
         lift = [
             np.linalg.norm(np.asarray(path.derivatives(t + d, 2))[2, :3] + [0.0, 0.0, 3.7])
             for d in (-1e-5, 0.0, 1e-5)
         ]
         zeta, rate, bend = attitude_by_rotations(path, 3.7, t)
-        rows = jnp.asarray(rows)
+        rows = path.derivatives(t, 4)
         (x, u), (y, v) = (map(np.asarray, model.flat(rows)) for model in (euler, thrust))
     assert x[6:9] == pytest.approx(zeta, abs=1e-12) and x[9:12] == pytest.approx(rate, abs=1e-8)
     assert u[1:] == pytest.approx(bend, abs=1e-6) and u[0] == pytest.approx(lift[1] - 3.7, abs=1e-9)
@@ -460,10 +385,10 @@ def test_under_computed_torque_quadrotors_fly_what_rotations_and_differences_say
 
 
 def test_commands_fly_what_their_equations_ask_of_angles_and_thrust():
-    model, t = CrazyflieAttitude(), 0.4
+    model, t = models.CrazyflieAttitude(), 0.4
     path = Smooth(4, 2, drift=0.3)
     with precision("float64"):
-        rows = jnp.asarray(path.derivatives(t, 4))
+        rows = path.derivatives(t, 4)
         zeta, rate, bend = attitude_by_rotations(path, model.gravity, t)
         x, u = map(np.asarray, model.flat(rows))
     back = model.stiffness * zeta + model.rate_damping * rate
@@ -474,139 +399,16 @@ def test_commands_fly_what_their_equations_ask_of_angles_and_thrust():
     assert u[3] == pytest.approx(model.mass * lift / model.thrust_gain, rel=1e-12)
 
 
-# ---- physics ----
-
-
-def mechanical_energy(model, x):
-    spin = 0.5 * jnp.sum(jnp.asarray(model.inertia) * x[9:12] ** 2)
-    return model.mass * (0.5 * x[3:6] @ x[3:6] + model.gravity * x[2]) + spin
-
-
-@pytest.mark.parametrize("name", ["crazyflie", "big"])
-@pytest.mark.parametrize("seed", range(3))
-def test_power_is_thrust_times_climb_and_torque_times_spin(name, seed):
-    model = MODELS[name]
-    x, u = state_and_input(model, seed)
-
-    def power(x, u):
-        return jax.jvp(lambda x: mechanical_energy(model, x), (x,), (model.velocity(x, u),))[1]
-
-    wanted = u[0] * rotation(x[6:9])[:, 2] @ x[3:6] + u[1:] @ x[9:12]
-    assert numpy(power, x, u) == pytest.approx(wanted, rel=1e-12)
-
-
-def test_a_tumbling_body_keeps_energy_and_angular_momentum_in_free_fall():
-    model = MODELS["big"]
-    x0, _ = state_and_input(model, 3)
-    x0[9:12] = [0.9, 2.0, -1.1]
-    with numerics.precision("float64"):
-        fall = jax.jit(lambda x: model.velocity(x, jnp.zeros(4)))
-        solved = solve_ivp(
-            lambda t, x: np.asarray(fall(jnp.asarray(x))),
-            (0.0, 1.0),
-            x0,
-            "DOP853",
-            rtol=1e-12,
-            atol=1e-12,
-        )
-
-        def conserved(x):
-            spin = rotation(x[6:9]) @ (np.array(model.inertia) * x[9:12])
-            return [float(mechanical_energy(model, jnp.asarray(x))), *spin, *x[3:5]]
-
-        first, *rest = [conserved(x) for x in solved.y.T]
-    # It does turn, and far; the angles do not come near their singularity.
-    assert np.ptp(solved.y[6:9], axis=1).max() > 1.0
-    assert np.abs(solved.y[7]).max() < 1.4
-    assert np.array(rest) == pytest.approx(np.tile(first, (len(rest), 1)), rel=1e-9, abs=1e-11)
-
-
-def test_a_damped_pendulum_loses_energy_by_damping_and_gains_it_by_torque():
-    model = MODELS["pendulum"]
-    x, u = state_and_input(model, 2)
-
-    def energy(x):
-        return 0.5 * x[1] ** 2 - model.stiffness * jnp.cos(x[0])
-
-    def power(x, u):
-        return jax.jvp(energy, (x,), (model.velocity(x, u),))[1]
-
-    wanted = u[0] * x[1] - model.damping * x[1] ** 2
-    assert numpy(power, x, u) == pytest.approx(wanted, rel=1e-12)
-
-
-def test_the_planar_quadrotor_is_the_spatial_one_in_its_plane():
-    flat = PlanarQuadrotor(mass=1.2, inertia=0.011, arm=0.17, motor_thrust=12.0)
-    space = Quadrotor(mass=1.2, inertia=(0.011, 0.013, 0.02), arm=0.17, motor_thrust=6.0)
-    places = [space.state_names.index(name) for name in ("y", "z", "roll", "vy", "vz", "p")]
-    for seed in range(3):
-        x, u = state_and_input(flat, seed)
-        full = np.zeros(12)
-        full[places] = x
-        got = numpy(space.velocity, full, np.array([u[0], u[1], 0.0, 0.0]))
-        assert got[places] == pytest.approx(numpy(flat.velocity, x, u), rel=1e-13, abs=1e-13)
-        assert np.delete(got, places) == pytest.approx(np.zeros(6), abs=1e-13)
-
-
-def test_the_planar_limits_are_the_spatial_ones_in_their_plane():
-    flat = PlanarQuadrotor(mass=1.2, inertia=0.011, arm=0.17, motor_thrust=12.0)
-    space = Quadrotor(mass=1.2, inertia=(0.011, 0.013, 0.02), arm=0.17, motor_thrust=6.0)
-    for thrust in (-5.0, 3.0, 12.0, 30.0):
-        for torque in (-3.0, -1.0, 0.0, 0.5, 2.5):
-            small = numpy(flat.limit, np.array([thrust, torque]))
-            large = numpy(space.limit, np.array([thrust, torque, 0.0, 0.0]))
-            assert large == pytest.approx([*small, 0.0, 0.0], abs=1e-12)
-
-
-def test_the_point_ahead_of_a_unicycle_moves_as_its_axle_carries_it():
-    axle, point = Unicycle(), UnicyclePoint(ahead=0.3)
-
-    def seen_ahead(x):
-        return x + 0.3 * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]), jnp.zeros(())])
-
-    def carried(x, u):
-        return jax.jvp(seen_ahead, (x,), (axle.velocity(x, u),))[1]
-
-    for seed in range(3):
-        x, u = state_and_input(axle, seed)
-        wanted = numpy(carried, x, u)
-        assert numpy(point.velocity, numpy(seen_ahead, x), u) == pytest.approx(wanted, abs=1e-14)
-
-
 def test_normalized_inputs_move_the_point_of_a_unicycle_alike_in_every_heading():
-    model = UnicyclePoint(ahead=0.3)
+    model = models.UnicyclePoint(ahead=0.3)
     for heading in (0.0, 1.0, 2.5):
         g = numpy(model.normalized_input_map, np.array([1.0, 2.0, heading]))
         assert (g @ g.T)[:2, :2] == pytest.approx(np.eye(2), abs=1e-15)
 
 
-@pytest.mark.parametrize("model", [Quadrotor(), Unicycle()], ids=["quadrotor", "unicycle"])
-def test_the_world_has_no_preferred_compass_direction(model):
-    turn = 0.7
-    x, u = state_and_input(model)
-    last = {"Quadrotor": "yaw", "Unicycle": "heading"}[type(model).__name__]
-    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-
-    def turned(x):
-        y = x.copy()
-        y[:2] = R @ x[:2]
-        if "vx" in model.state_names:
-            y[3:5] = R @ x[3:5]
-        return y
-
-    y = turned(x)
-    y[model.state_names.index(last)] += turn
-    assert numpy(model.velocity, y, u) == pytest.approx(
-        turned(numpy(model.velocity, x, u)), rel=1e-12, abs=1e-12
-    )
-
-
-# ---- named quadrotors, and an agent of one's own ----
-
-
 def test_the_crazyflie_carries_the_identified_numbers():
-    model = Quadrotor.named("crazyflie")
-    assert model == Quadrotor.crazyflie() == Quadrotor()
+    model = models.Quadrotor.named("crazyflie")
+    assert model == models.Quadrotor.crazyflie() == models.Quadrotor()
     assert model.mass == 0.028
     assert model.inertia == (16.571710e-6, 16.655602e-6, 29.261652e-6)
     assert np.hypot(model.arm, model.arm) == pytest.approx(0.046, abs=5e-5)
@@ -623,10 +425,10 @@ def test_the_crazyflie_carries_the_identified_numbers():
     ],
 )
 def test_the_crazyflies_of_today_carry_the_firmware_s_numbers(name, grams, newtons, metres):
-    model = Quadrotor.named(name)
+    model = models.Quadrotor.named(name)
     assert (model.mass, model.motor_thrust) == (grams / 1000, newtons)
     assert model.torque_per_thrust == metres
-    assert model.inertia == Quadrotor.crazyflie().inertia
+    assert model.inertia == models.Quadrotor.crazyflie().inertia
     with numerics.precision("float64"):
         assert check_model(model) == ()  # hovering is within reach
         # Full yaw: the collective gives way, so two motors give all and two give nothing.
@@ -635,14 +437,14 @@ def test_the_crazyflies_of_today_carry_the_firmware_s_numbers(name, grams, newto
 
 
 def test_a_named_quadrotor_takes_changes():
-    model = Quadrotor.named("paper", allow_unphysical=True, mass=0.03)
+    model = models.Quadrotor.named("paper", allow_unphysical=True, mass=0.03)
     assert model.mass == 0.03
     assert model.inertia == (6.4893e-6, 16.4562e-6, 29.5435e-6)
 
 
 def test_the_firmware_s_gains_are_those_of_its_set():
     """Mellinger's attitude controller by hand: gains of 65535ths, an error of twice the angle."""
-    model = CrazyflieAttitude.named("firmware")
+    model = models.CrazyflieAttitude.named("firmware")
     motor = 0.12 / 65535
     tilt = 2 * 0.0325 * motor / 16.613656e-6  # rad/s^2 a unit; half of it goes to each motor
     slower = 1 + 200 * tilt  # its feedback of the angular acceleration
@@ -654,7 +456,7 @@ def test_the_firmware_s_gains_are_those_of_its_set():
 
 @pytest.mark.parametrize("name", ATTITUDE_PARAMETERS)
 def test_a_held_command_ends_in_a_steady_tilt_and_turn(name):
-    model = CrazyflieAttitude.named(name)
+    model = models.CrazyflieAttitude.named(name)
     u = np.array([0.1, -0.05, 0.4, model.trim[1][3]])
     with numerics.precision("float64"):
         flow = jax.jit(lambda x: model.velocity(x, jnp.asarray(u)))
@@ -664,97 +466,13 @@ def test_a_held_command_ends_in_a_steady_tilt_and_turn(name):
     assert end[11, -1] == pytest.approx(0.4, rel=1e-4)
 
 
-class Tank(ControlAffine):
-    """Two tanks in a row: two methods and two tuples of names."""
-
-    outflow: float = 0.4
-
-    state_names = ("upper", "lower")
-    input_names = ("inflow",)
-
-    def drift(self, x):
-        return jnp.stack([-self.outflow * x[0], self.outflow * (x[0] - x[1])])
-
-    def input_map(self, x):
-        return jnp.array([[1.0], [0.0]])
-
-
-def test_an_agent_of_ones_own_is_two_methods_and_two_tuples_of_names():
-    model = Tank(outflow=2.0)
-    x = np.array([0.5, 0.25])
-    assert numpy(model.velocity, x, np.array([3.0])) == pytest.approx([2.0, 0.5])
-    assert numpy(model.output, x) == pytest.approx(x)
-    assert model.output_names == model.state_names
-    assert model.state_units == ("", "") and model.input_units == ("",)
-    assert model.trim == ((0.0, 0.0), (0.0,))
-    assert model.weights == ((1.0, 1.0), (1.0,))
-    assert model.input_scale == ((1.0,),)
-    assert (model.position, model.flat_outputs, dict(model.state_groups)) == ((), (), {})
-
-
-def test_an_agent_of_ones_own_may_replace_any_default_by_attribute_property_or_method():
-    class Warm(Tank):
-        trim = ((1.0, 1.0), (0.4,))
-        state_units = ("K", "K")
-        weights = ((2.0, 3.0), (4.0,))
-
-        @property
-        def input_scale(self):
-            return ((self.outflow,),)
-
-        def difference(self, x, y):
-            return 2.0 * (x - y)
-
-    model = Warm()
-    assert model.trim == ((1.0, 1.0), (0.4,)) and model.weights == ((2.0, 3.0), (4.0,))
-    assert model.input_scale == ((0.4,),) and model.state_units == ("K", "K")
-    assert numpy(model.difference, np.ones(2), np.zeros(2)) == pytest.approx([2.0, 2.0])
-    assert numpy(model.physical, np.array([2.0])) == pytest.approx([1.2])
-
-
-def computed_torque(model, x, v):
-    """The thrust and torques of a quadrotor that realize an input of `QuadrotorEuler`."""
-    zeta, omega = x[6:9], x[9:12]
-    zeta_dot = euler_rates(zeta, omega)
-    # omega = W(zeta)^-1 zetadot, differentiated along (zetadot, zetaddot).
-    _, omega_dot = jax.jvp(body_rates, (zeta, zeta_dot), (zeta_dot, v[1:]))
-    torque = jnp.asarray(model.inertia) * (omega_dot - free_spin(model.inertia, omega))
-    return jnp.append(model.mass * (model.gravity + v[0]), torque)
-
-
-def test_computed_torque_turns_the_quadrotor_into_its_euler_form():
-    model, euler = MODELS["big"], QuadrotorEuler()
-    for _ in range(20):
-        x = rng.uniform(-1.0, 1.0, 12)
-        v = rng.uniform(-3.0, 3.0, 4)
-        with precision("float64"):
-            u = computed_torque(model, jnp.asarray(x), jnp.asarray(v))
-            xdot = model.velocity(jnp.asarray(x), u)
-            # The Euler-angle rates of the vehicle, and how they change along its motion.
-            rates, accelerations = jax.jvp(
-                lambda y: euler_rates(y[6:9], y[9:12]), (jnp.asarray(x),), (xdot,)
-            )
-            seen = euler.velocity(jnp.concatenate([jnp.asarray(x)[:9], rates]), jnp.asarray(v))
-        assert np.asarray(seen[:9]) == pytest.approx(np.asarray(xdot[:9]), abs=1e-12)
-        assert np.asarray(accelerations) == pytest.approx(v[1:], abs=1e-10)
-
-
-def test_a_thrust_that_is_a_state_changes_nothing_but_its_lag():
-    euler, thrust = QuadrotorEuler(), QuadrotorThrust()
-    for _ in range(20):
-        x, v = rng.uniform(-1.0, 1.0, 12), rng.uniform(-3.0, 3.0, 4)
-        slow = numpy(thrust.velocity, np.append(x, v[0]), np.append(0.5, v[1:]))
-        assert slow[:12] == pytest.approx(numpy(euler.velocity, x, v), abs=1e-12)
-        assert slow[12] == 0.5
-
-
 def test_a_property_that_fails_is_named_with_what_it_raises():
-    class Weak(SingleIntegrator):
+    class Weak(models.SingleIntegrator):
         most: float = 1.0
 
         @property
         def input_limits(self):
-            return Limits(np.eye(1), (-self.most,), (self.most,))
+            return models.Limits(np.eye(1), (-self.most,), (self.most,))
 
     with pytest.raises(ModelError, match="`input_limits` of `Weak` fails with TypeError"):
         check_model(Weak(dimension=1, most="fast"))

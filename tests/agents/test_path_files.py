@@ -108,37 +108,30 @@ def test_pieces_that_do_not_meet_smoothly_fly_without_a_proof():
 
 
 GOOD = "t,x,y,z,yaw\n0,0,0,1,0\n1,1,0,1,0\n"
-FAULTS = {
-    "column": ("t,x,y,yaw\n0,0,0,0\n", ":1` lacks `z`"),
-    "surplus": ("t,x,y,z,w\n0,0,0,0,0\n", ":1` has `w`"),
-    "text": (GOOD + "2,a lot,0,1,0\n", "`x` of the path at `{}:4` is `a lot`"),
-    "nan": (GOOD + "\n2,0,0,nan,0\n", "`z` of the path at `{}:5` is `nan`"),
-    "few": (GOOD + "2,0,0\n", ":4` has 3 numbers, and must have 5."),
-    "times": (GOOD + "1,0,0,1,0\n", "`t` of the path at `{}:4` is 1 s, and must be more"),
-    "empty": ("", "`{}:1` lacks `t`, `x`, `y`, `z`"),
-    "semicolons": ("t;x;y;z\n0;0;0;1\n", "once (`yaw` may be left out), separated by commas."),
-    "one": ("t,x,y,z\n0,0,0,1\n", "must have from 2 to 100000 lines of numbers, and has 1."),
-    "binary": ("t,x\0", "path"),
-}
+FAULTS = [
+    ("t,x,y,yaw\n0,0,0,0\n", ":1` lacks `z`"),
+    ("t,x,y,z,w\n0,0,0,0,0\n", ":1` has `w`"),
+    (GOOD + "2,a lot,0,1,0\n", "`x` of the path at `{}:4` is `a lot`"),
+    (GOOD + "\n2,0,0,nan,0\n", "`z` of the path at `{}:5` is `nan`"),
+    (GOOD + "2,0,0\n", ":4` has 3 numbers, and must have 5."),
+    (GOOD + "1,0,0,1,0\n", "`t` of the path at `{}:4` is 1 s, and must be more"),
+    ("", "`{}:1` lacks `t`, `x`, `y`, `z`"),
+    ("t;x;y;z\n0;0;0;1\n", "once (`yaw` may be left out), separated by commas."),
+    ("t,x,y,z\n0,0,0,1\n", "must have from 2 to 100000 lines of numbers, and has 1."),
+    ("t,x\0", "path"),
+    ("t,x,y,z\n" + "0,0,0,1\n" * 100_001, "and has more than 100000."),
+    (None, "path.csv` cannot be read: No such file"),
+]
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_wrong_line_is_named(tmp_path, fault):
-    text, said = FAULTS[fault]
-    (tmp_path / "path.csv").write_text(text, "utf-8")
+@pytest.mark.parametrize(("text", "said"), FAULTS, ids=range(len(FAULTS)))
+def test_a_wrong_line_is_named(tmp_path, text, said):
+    if text is not None:
+        (tmp_path / "path.csv").write_text(text, "utf-8")
     with pytest.raises(ech.errors.ReferenceError) as error:
         Waypoints.read(tmp_path / "path.csv")
     assert said.format(tmp_path / "path.csv") in str(error.value)
     assert str(error.value).count("\n") == 0
-
-
-def test_a_file_of_a_million_lines_and_none_at_all_are_refused_soon(tmp_path):
-    file = tmp_path / "long.csv"
-    file.write_text("t,x,y,z\n" + "".join(f"{k},0,0,1\n" for k in range(100_001)), "utf-8")
-    with pytest.raises(ech.errors.ReferenceError, match="and has more than 100000."):
-        Waypoints.read(file)
-    with pytest.raises(ech.errors.ReferenceError, match=r"none.csv` cannot be read: No such file"):
-        Waypoints.read(tmp_path / "none.csv")
 
 
 @pytest.mark.parametrize(
@@ -151,9 +144,8 @@ def test_a_file_of_a_million_lines_and_none_at_all_are_refused_soon(tmp_path):
 def test_a_wrong_piece_is_named(tmp_path, rows, said):
     file = tmp_path / "pieces.csv"
     file.write_text("\n".join([HEAD, *rows]), "utf-8")
-    with pytest.raises(ech.errors.ReferenceError, match="the piece of the path at") as error:
+    with pytest.raises(ech.errors.ReferenceError, match="the piece of the path at .*" + said):
         Polynomials.read(file)
-    assert said in str(error.value)
 
 
 SCENARIO = {
@@ -163,6 +155,7 @@ SCENARIO = {
     "reference": {"name": "waypoints", "file": "path.csv", "degrees": True},
     "simulation": {"horizon": 6.0, "dt": 0.01},
 }
+OFFSET = "formation.offsets={1: [1, 0.5, 0]}"
 
 
 def written(folder, **changes):
@@ -212,8 +205,7 @@ def test_verify_computes_the_guarantee_from_the_path_in_the_folder(tmp_path, ech
 def test_all_paths_are_written_with_the_file_of_crazyswarm2_that_lists_them(tmp_path, echelon):
     write_points(tmp_path)
     file, out = written(tmp_path), tmp_path / "swarm"
-    offset = "formation.offsets={1: [1, 0.5, 0]}"
-    code, said, _ = echelon("path", file, "--set", offset, "--all", "--out", out)
+    code, said, _ = echelon("path", file, "--set", OFFSET, "--all", "--out", out)
     assert code == 0 and f"Written to {out}: 2 paths of 3 pieces, 4 s." in said
     robots = YAML(typ="safe").load(out / "crazyflies.yaml")["robots"]
     begins = [at(Polynomials.read(out / f"{name}.csv"), [0.0])[0, 0] for name in robots]
@@ -231,19 +223,13 @@ def test_all_paths_are_written_with_the_file_of_crazyswarm2_that_lists_them(tmp_
 
 def test_the_command_writes_the_leaders_path_and_a_followers_goal(tmp_path, echelon):
     write_points(tmp_path)
-    file, out = written(tmp_path), tmp_path / "leader.csv"
+    file, out, one = written(tmp_path), tmp_path / "leader.csv", tmp_path / "one.csv"
     code, said, _ = echelon("path", file, "--out", out)
     assert code == 0 and "3 pieces" in said and "4 s" in said
     own = ech.build(ech.load_scenario(file)).parts.drive.leader.reference
     assert at(Polynomials.read(out), TIMES, 2) == pytest.approx(at(own, TIMES, 2), abs=1e-9)
-    assert (
-        echelon(
-            *("path", file, "--set", "formation.offsets={1: [1, 0.5, 0]}", "--agent", 1),
-            *("--out", tmp_path / "one.csv"),
-        )[0]
-        == 0
-    )
-    shift = at(Polynomials.read(tmp_path / "one.csv"), TIMES)[:, 0] - at(own, TIMES)[:, 0]
+    assert echelon("path", file, "--set", OFFSET, "--agent", 1, "--out", one)[0] == 0
+    shift = at(Polynomials.read(one), TIMES)[:, 0] - at(own, TIMES)[:, 0]
     assert shift == pytest.approx(np.tile([1.0, 0.5, 0.0, 0.0], (4, 1)))
     assert echelon("path", file, "--out", out)[0] == 2
     code, _, errors = echelon("path", file, "--agent", 7, "--out", tmp_path / "no.csv")
@@ -255,11 +241,9 @@ def test_the_command_writes_the_leaders_path_and_a_followers_goal(tmp_path, eche
 
 def test_a_misspelt_key_beside_a_file_is_named_with_the_right_one(tmp_path):
     write_points(tmp_path)
-    scenario = ech.load_scenario(
-        written(tmp_path, reference={"name": "waypoints", "file": "path.csv", "degres": 1})
-    )
+    wrong = {"name": "waypoints", "file": "path.csv", "degres": 1}
     with pytest.raises(ech.EchelonError, match="did you mean `degrees`"):
-        ech.build(scenario)
+        ech.build(ech.load_scenario(written(tmp_path, reference=wrong)))
 
 
 def test_the_time_at_which_a_path_exceeds_a_limit_is_named():

@@ -34,7 +34,7 @@ def test_the_files_state_whom_an_agent_hears_and_run_without_echelon(tmp_path, e
     assert stated["hears"] == list(agent.neighbours) and len(stated["weights"]) == len(
         agent.neighbours
     )
-    assert stated["guaranteed"] == ech.promise(parts, settings).sentence()
+    assert stated["guaranteed"] == ech.guarantee(parts, settings).sentence()
     for name, digest in stated["sha256"].items():
         assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
     x = [0.5] * len(stated["states"])

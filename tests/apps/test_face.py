@@ -46,7 +46,7 @@ def run(file):
 
 
 @pytest.fixture(scope="module")
-def heir():
+def backup():
     """Carts whose leader is lost after 1 s, and the first follower leads on."""
     cart, graph = ech.models.DoubleIntegrator(), ech.Graph([(0, 1), (1, 2)])
     laws = ech.Laws(
@@ -134,17 +134,17 @@ def test_a_row_is_of_an_agent_at_a_time(run):
     assert rows[rows.leader].agent.unique().tolist() == [0]
 
 
-def test_an_agent_that_is_absent_has_no_rows_and_an_heir_is_the_leader(heir):
-    rows = table(heir)
+def test_an_agent_that_is_absent_has_no_rows_and_a_backup_leader_is_the_leader(backup):
+    rows = table(backup)
     assert rows[rows.time < 1.0].agent.unique().tolist() == [0, 1, 2]
     late = rows[rows.time > 1.5]
     assert late.agent.unique().tolist() == [1, 2]
     assert late[late.leader].agent.unique().tolist() == [1]
 
 
-def test_a_run_has_the_poles_of_its_own_loop_or_none(heir):
+def test_a_run_has_the_poles_of_its_own_loop_or_none(backup):
     # Under `stopping-point` the loop of the promise has zeros where the law places roots.
-    assert recording_of(heir).modes is None
+    assert recording_of(backup).modes is None
 
 
 def test_a_run_without_frames_is_exported_to_no_file(here, run):
@@ -312,8 +312,8 @@ def points_of(line):
     return np.column_stack(line.get_data_3d() if hasattr(line, "get_data_3d") else line.get_data())
 
 
-def test_an_heir_is_drawn_as_the_leader_that_it_is(heir):
-    film = film_of(recording_of(heir))
+def test_a_backup_leader_is_drawn_as_the_leader_that_it_is(backup):
+    film = film_of(recording_of(backup))
     for time, leads in ((0.5, [0]), (1.5, [1])):
         film.show(time)
         assert np.flatnonzero(film.leaders(time)).tolist() == leads

@@ -209,7 +209,11 @@ def test_events_of_a_scenario_are_changes_of_a_live_loop():
 
 def test_nonsense_is_refused_in_a_sentence_and_a_knob_is_clamped(session):
     for name, agent, sentence in (
-        ("lose", 0, "agent 0 is lost, and nobody leads afterwards; name `heirs` in `leadership`."),
+        (
+            "lose",
+            0,
+            "agent 0 is lost, and nobody leads afterwards; name `backups` in `leadership`.",
+        ),
         ("join", 2, "agent 2 cannot join, since it is there."),
         ("lose", 99, "`lose` got `99`, and must be the number of an agent."),
     ):
@@ -473,7 +477,7 @@ LOOKS = [{"coupling": 0.3}, pytest.param({"cut": frozenset({3})}, marks=pytest.m
 def test_the_first_look_is_the_loop_that_the_promise_then_judges(panel, change):
     knobs = panel.start._replace(**change)
     parts, settings = build(panel.scenario_at(knobs))
-    found, seen = ech.promise(parts, settings).loop, panel.live.loop(knobs)
+    found, seen = ech.guarantee(parts, settings).loop, panel.live.loop(knobs)
     assert seen.slowest == pytest.approx(found.slowest, rel=1e-9)
     assert seen.radius(settings) == pytest.approx(found.radius(settings), rel=1e-9)
     rate = -np.log(found.radius(settings)) / settings.dt

@@ -351,7 +351,7 @@ def test_ellipsoids_are_marked_below_the_limit_and_the_chart_has_distance_and_ro
         assert page.evaluate("echelon.player.view.ellipsoids.shown.value") == 0
 
 
-def test_who_is_lost_vanishes_an_heir_leads_and_the_event_is_marked(drawn, run):
+def test_who_is_lost_vanishes_a_backup_leader_leads_and_the_event_is_marked(drawn, run):
     starts, weights = np.array([0.0, 2.0]), np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
     here = np.array([[True] * 4, [False, True, True, True]])
     schedule = Schedule(starts, weights, None, here, np.array([[0] * 4, [1] * 4]))
@@ -371,7 +371,7 @@ def test_who_is_lost_vanishes_an_heir_leads_and_the_event_is_marked(drawn, run):
         assert page.locator("footer .mark").get_attribute("title") == "agent 0 is lost"
         names = page.evaluate("[...document.querySelectorAll('.label')].map((x) => x.innerText)")
         assert names[1:] == ["leader", "2", "3"]
-        # Goals are relative to the heir, and errors are of those that are there.
+        # Goals are relative to the backup leader, and errors are of those that are there.
         goal = run.states[100, 1, :3] + run.offsets[2, :3] - run.offsets[1, :3]
         assert page.evaluate("echelon.goal(2)") == pytest.approx(goal, abs=1e-4)
         away = np.linalg.norm(run.states[100, 2, :3] - goal)

@@ -53,9 +53,13 @@ class Model(Spring):
     __init__ = Law.__init__
 
 
-def test_annotated_fields_may_be_set_by_an_own_init():
+def test_annotated_fields_may_be_set_by_an_own_init_and_not_changed_later():
     gain = ech.synthesize(Spring(1.5), ech.Graph.path(3), ech.gains.Riccati())
     assert gain.coupling > 0.0 and Spring(1.5).k == 2.25
+    spring, circle = Spring(1.0), ech.references.Circle()
+    for part, name in ((spring, "k"), (circle, "radius"), (ech.models.Pendulum(), "damping")):
+        with pytest.raises(ech.EchelonError, match=f"`{name}` of a `.*` cannot be changed; make"):
+            setattr(part, name, 3.0)
 
 
 def test_what_is_no_field_is_told_by_its_file_and_line():
@@ -68,10 +72,3 @@ def test_what_is_no_field_is_told_by_its_file_and_line():
             f"`stiffness: float` in `{cls.__name__}`."
         )
         assert isinstance(caught.value.__cause__, dataclasses.FrozenInstanceError)
-
-
-def test_a_complete_object_cannot_be_changed():
-    spring, circle = Spring(1.0), ech.references.Circle()
-    for part, name in ((spring, "k"), (circle, "radius"), (ech.models.Pendulum(), "damping")):
-        with pytest.raises(ech.EchelonError, match=f"`{name}` of a `.*` cannot be changed; make"):
-            setattr(part, name, 3.0)

@@ -23,17 +23,13 @@ def test_what_is_stated_is_on_the_safe_side_by_less_than_a_last_digit(x, digits)
     assert below <= read(x) <= above
     last = decimal.Decimal(1).scaleb(read(x).adjusted() - digits + 1) if x else 0
     assert above - below in (0, last)
+    assert float(above) == -float(at_most(-x, digits))
     # Short numbers are stated as they are.
     assert (below == above) == (len(read(x).normalize().as_tuple().digits) <= digits)
 
 
-@given(FINITE, DIGITS)
-def test_the_two_directions_mirror_each_other(x, digits):
-    assert float(at_least(x, digits)) == -float(at_most(-x, digits))
-    assert math.copysign(1.0, float(at_most(0.0, digits))) == 1.0
-
-
 def test_texts():
+    assert math.copysign(1.0, float(at_most(0.0, 3))) == 1.0
     rows = [
         (0.99999, 3, "0.999", "1", "1"),
         (-0.5858, 3, "-0.586", "-0.586", "-0.585"),

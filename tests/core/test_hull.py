@@ -19,7 +19,6 @@ from quadrotor_hulls import (
     euler_rate_quadrotor,
     quadrotor_box,
 )
-from scipy.optimize import linprog
 
 from echelon.agents.models import Pendulum, PlanarQuadrotor, Quadrotor, UnicyclePoint, VanDerPol
 from echelon.core.enclosure.atoms import (
@@ -32,12 +31,19 @@ from echelon.core.enclosure.atoms import (
     wave_points,
 )
 from echelon.core.enclosure.hull import Box, slope_hull, value_hull
-from echelon.core.enclosure.interval import ELEMENTARY, Interval, circle, pi, point, wave
+from echelon.core.enclosure.interval import ELEMENTARY, Interval, circle, pi, point
 from echelon.core.enclosure.slopes import JumpError
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
 from echelon.synthesis.certificates.jacobians import model_jacobian, velocity_of
 
+MODELS = {
+    "pendulum": Pendulum(),
+    "van-der-pol": VanDerPol(),
+    "planar-quadrotor": PlanarQuadrotor(),
+    "unicycle-point": UnicyclePoint(),
+    "body-rates": Quadrotor.crazyflie(),
+}
 SYSTEMS = {
     "pendulum": (model_jacobian(Pendulum()), Box([-1.2, -2], [0.4, 2]), about_zero(0), 2),
     "van-der-pol": (model_jacobian(VanDerPol()), Box([-1, -2], [3, 1]), about_zero(1), 6),
@@ -99,77 +105,24 @@ def assert_supported(hull, matrices, seed=0, rounding=1e-14):
     assert (over <= rounding * size * np.abs(C).sum(axis=1)).all()
 
 
-def distance_to_hull(hull, matrix):
-    """The largest entry that no convex combination of the vertices avoids (linear program)."""
-    flat = hull.vertices.reshape(len(hull.vertices), -1)
-    free = np.ptp(flat, axis=0) > 0
-    V, target = flat[:, free].T, matrix.ravel()[free]
-    k = V.shape[1]
-    ones = np.ones((len(V), 1))
-    solved = linprog(
-        np.r_[np.zeros(k), 1.0],
-        A_ub=np.block([[V, -ones], [-V, -ones]]),
-        b_ub=np.r_[target, -target],
-        A_eq=np.r_[np.ones(k), 0.0][None],
-        b_eq=[1.0],
-        options={"primal_feasibility_tolerance": 1e-10},
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_hull_holds_all_jacobians_by_as_many_vertices_as_its_polygons_have(hulls, name):
+    jacobian, states, inputs, vertices = SYSTEMS[name]
+    hull, matrices = (
+        hulls[name],
+        values(jacobian, states, inputs, points_of(states, inputs, seed=1)),
     )
-    weights = np.clip(solved.x[:k], 0.0, None)
-    return np.abs(flat.T @ (weights / weights.sum()) - matrix.ravel()).max()
-
-
-# --- what it must contain ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_no_functional_separates_a_jacobian_from_the_hull(hulls, name):
-    jacobian, states, inputs, _ = SYSTEMS[name]
-    matrices = values(jacobian, states, inputs, points_of(states, inputs, seed=1))
-    assert_supported(hulls[name], matrices)
-
-
-@pytest.mark.parametrize("name", [name for name in SYSTEMS if name != "body-rates"])
-def test_every_jacobian_is_a_convex_combination_of_vertices(hulls, name):
-    jacobian, states, inputs, _ = SYSTEMS[name]
-    for matrix in values(jacobian, states, inputs, points_of(states, inputs, seed=2, count=8)):
-        assert distance_to_hull(hulls[name], matrix) < 1e-8
-
-
-def test_the_linear_program_sees_what_is_outside(hulls):
-    outside = hulls["euler-rates"].vertices[0] + 1e-3
-    jacobian, *box, _ = SYSTEMS["euler-rates"]
-    tilted = values(jacobian, quadrotor_box(tilt=1.2 * TILT), NO_INPUTS, np.ones((1, 13)))[0]
-    assert distance_to_hull(hulls["euler-rates"], outside) > 1e-4
-    assert distance_to_hull(hulls["euler-rates"], tilted) > 1e-3
-
-
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_vertices_are_the_products_of_the_polygons(hulls, name):
-    assert len(hulls[name].vertices) == SYSTEMS[name][3]
-    assert math.prod(atom.vertices for atom in hulls[name].atoms) >= len(hulls[name].vertices)
-
-
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_structural_zeros_stay_zero(hulls, name):
-    jacobian, states, inputs, _ = SYSTEMS[name]
-    matrices = values(jacobian, states, inputs, points_of(states, inputs, seed=3))
+    assert_supported(hull, matrices)
+    assert math.prod(atom.vertices for atom in hull.atoms) >= len(hull.vertices) == vertices
     zero = (matrices == 0.0).all(axis=0)
     assert zero.any()
-    assert (hulls[name].vertices[:, zero] == 0.0).all()
-    assert (hulls[name].error[zero] == 0.0).all()
+    assert (hull.vertices[:, zero] == 0.0).all() and (hull.error[zero] == 0.0).all()
 
 
 def test_the_error_is_that_of_rounding(hulls):
     for hull in hulls.values():
         assert (hull.error <= 2.0**-53 * (1.0 + 2 * np.abs(hull.vertices).max(axis=0))).all()
     assert (hulls["van-der-pol"].error == 0.0).all()
-
-
-def test_the_error_is_the_distance_to_the_exact_vertices():
-    hull = value_hull(lambda x, v: 0.1 * x.reshape(1, 1), Box([0.3], [0.7]), NO_INPUTS)
-    exact = [Fraction(0.1) * Fraction(end) for end in (0.3, 0.7)]
-    found = [abs(Fraction(v) - e) for v, e in zip(hull.vertices.ravel(), exact, strict=True)]
-    assert 0 < max(found) <= Fraction(hull.error[0, 0]) <= max(found) * (1 + Fraction(1, 2**50))
 
 
 def test_the_error_is_no_less_than_what_was_rounded_away():
@@ -219,14 +172,6 @@ def test_the_quadrotor_is_made_of_three_arcs_and_an_interval(hulls):
         "yaw": ("arc", 4, YAW),
         "thrust": ("interval", 2, 3.0),
     }
-
-
-def test_a_single_wave_is_enclosed_by_its_range(hulls):
-    slopes = hulls["pendulum"].vertices[:, 1, 0]
-    np.testing.assert_allclose(np.sort(slopes), [-9.81, -9.81 * math.cos(1.2)], rtol=1e-15)
-
-
-# --- drifts at random -------------------------------------------------------------------------
 
 
 @st.composite
@@ -283,15 +228,15 @@ def test_waves_without_a_low_common_frequency_are_enclosed_apart(frequencies):
     assert_supported(hull, values(jacobian, box, NO_INPUTS, points_of(box, NO_INPUTS, 0)), 0)
 
 
-def test_too_many_waves_are_refused_and_not_counted_out():
+def test_too_many_waves_and_vertices_are_refused_and_not_counted_out(monkeypatch):
     def jacobian(x, v):
         return sum(jnp.cos(w * x[0]) + jnp.sin(w * x[0]) for w in np.sqrt(np.arange(2.0, 20.0)))
 
     with pytest.raises(GainError, match="has 65536 vertices"):
         value_hull(lambda x, v: jacobian(x, v)[None, None], Box([0.1], [0.5]), NO_INPUTS)
-
-
-# --- a smaller box has a smaller hull ---------------------------------------------------------
+    monkeypatch.setattr("echelon.core.enclosure.atoms.MOST_VERTICES", 100)
+    with pytest.raises(GainError, match="has 128 vertices, and may have 100"):
+        value_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -304,17 +249,6 @@ def test_a_box_shrunk_about_its_middle_has_a_hull_inside(hulls, name):
 
     inner = value_hull(jacobian, shrunk(states), shrunk(inputs))
     assert_supported(hulls[name], inner.vertices)
-
-
-@pytest.mark.parametrize("name", ["pendulum", "van-der-pol"])
-def test_any_box_inside_has_a_hull_inside_where_no_arc_is_cut(hulls, name):
-    jacobian, states, inputs, _ = SYSTEMS[name]
-    lower, upper = map(np.asarray, states)
-    inner = value_hull(jacobian, Box(lower + 0.5 * (upper - lower), upper), inputs)
-    assert_supported(hulls[name], inner.vertices)
-
-
-# --- the algebra ------------------------------------------------------------------------------
 
 
 def scalar_hull(function, low, high):
@@ -398,6 +332,12 @@ def test_a_choice_that_the_box_does_not_decide_holds_both():
     assert lower <= 0.0 and upper >= 2.0 + math.cos(0.5)
     assert scalar_hull(lambda x: 1.0 * (x > 0), -1.0, 1.0) == (0.0, 1.0)
 
+    def both(x):
+        return jnp.where(jnp.where(x > 1.5, x > 0.0, x > -1.0), x, 100.0)
+
+    assert scalar_hull(both, 1.0, 2.0) == (1.0, 2.0)
+    assert scalar_hull(lambda x: jnp.where(x > 1.5, x + 1.0, 1.0 + x), 1.0, 2.0) == (2.0, 3.0)
+
 
 CONDITIONS = [lambda x: x > 0.0, lambda x: x > 5.0, lambda x: x > 1.5]
 """On [1, 2]: true, false, and not decided."""
@@ -425,27 +365,16 @@ def test_conditions_that_are_joined_choose_what_is_chosen_somewhere(one, other, 
         assert (lower == 100.0) is (reached.min() == 100.0)
 
 
-def test_a_condition_is_joined_entry_by_entry():
+def test_a_condition_is_joined_and_a_number_cut_entry_by_entry():
     def chosen(x):
         # The first is decided and the second is not, so that neither is a constant of the trace.
         low, high = jnp.stack([x > 0.0, x > 1.5]), jnp.stack([x > 5.0, x > 1.5])
         return jnp.where(low & high, 100.0, x)[0]
 
     assert scalar_hull(chosen, 1.0, 2.0) == (1.0, 2.0)
-
-
-def test_a_number_that_is_none_of_the_state_is_cut_as_it_is():
     assert scalar_hull(lambda x: x * (x - x + 2.7).astype(int), 1.0, 2.0) == (2.0, 4.0)
     assert scalar_hull(lambda x: x * (x - x - 2.7).astype(int), 1.0, 2.0) == (-4.0, -2.0)
     assert scalar_hull(lambda x: x * (x - x + 2.7).astype(bool), 1.0, 2.0) == (1.0, 2.0)
-
-
-def test_a_choice_between_what_is_alike_is_no_choice():
-    def both(x):
-        return jnp.where(jnp.where(x > 1.5, x > 0.0, x > -1.0), x, 100.0)
-
-    assert scalar_hull(both, 1.0, 2.0) == (1.0, 2.0)
-    assert scalar_hull(lambda x: jnp.where(x > 1.5, x + 1.0, 1.0 + x), 1.0, 2.0) == (2.0, 3.0)
 
 
 @pytest.mark.parametrize(
@@ -472,11 +401,8 @@ def test_a_comparison_is_decided_exactly_where_it_can_be(name, other):
 
 
 SHUFFLES = {
-    "index": lambda x: x[jnp.array([2, 0, 1, 2])],
-    "set": lambda x: x.at[1].set(x[0] * x[2]),
-    "add": lambda x: x.at[jnp.array([0, 0, 3])].add(x[1:]),
-    "pad": lambda x: jnp.pad(x, (1, 2))[1:5],
-    "roll": lambda x: jnp.roll(x[::-1], 1),
+    "add": lambda x: x[jnp.array([2, 0, 1, 2])].at[jnp.array([0, 0, 3])].add(x[1:]),
+    "roll": lambda x: jnp.roll(jnp.pad(x[::-1], (1, 2))[1:5], 1).at[1].set(x[0] * x[2]),
     "cumsum": jnp.cumsum,
     "outer": lambda x: (x[:, None] * x[None, :]).sum(axis=1) - x.mean() * x.prod(),
     "matrix": lambda x: jnp.einsum("bij,bjk->bik", x.reshape(1, 2, 2), x.reshape(1, 2, 2)).ravel(),
@@ -498,14 +424,6 @@ def test_at_a_point_the_hull_is_the_jacobian(name):
     assert len(hull.vertices) == 1 and (hull.error < 1e-14).all()
     np.testing.assert_allclose(hull.vertices[0], expected, rtol=1e-14, atol=1e-15)
 
-
-def test_a_range_is_that_of_the_corners_where_terms_repeat():
-    atoms = Atoms()
-    x = atoms.variable("x", Interval(Fraction(-1), Fraction(1)))
-    assert atoms.range(constant(1) - x * x + x) == Interval(Fraction(-1), Fraction(2))
-
-
-# --- polygons around curves -------------------------------------------------------------------
 
 angles = st.floats(-7, 7, allow_subnormal=False)
 
@@ -555,9 +473,6 @@ def test_powers_lie_in_their_polygon(ends, degree, seed):
     C = np.random.default_rng(seed).normal(size=(degree, 50))
     assert len(points) == degree + 1
     assert ((curve @ C).max(axis=0) <= (P @ C).max(axis=0) + 1e-10).all()
-
-
-# --- elementary functions without rounding ----------------------------------------------------
 
 
 def test_pi_is_known_to_fifty_digits():
@@ -610,19 +525,6 @@ def test_inverse_functions_undo_each_other(x, y):
     ]:
         found = there_and_back(outer, inner, at)
         assert found.holds(Fraction(at)) and found.hi - found.lo < Fraction(1, 2**80)
-
-
-@given(ends=st.tuples(angles, angles), sine=st.booleans())
-def test_the_range_of_a_wave_is_exact(ends, sine):
-    low, high = sorted(ends)
-    found = wave(Interval(Fraction(low), Fraction(high)), sine)
-    t = np.linspace(low, high, 2001)
-    reached = np.sin(t) if sine else np.cos(t)
-    assert float(found.lo) - 1e-15 <= reached.min() <= float(found.lo) + 1e-4
-    assert float(found.hi) - 1e-4 <= reached.max() <= float(found.hi) + 1e-15
-
-
-# --- what it refuses --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("pitch", [math.pi / 2, 1.6])
@@ -683,26 +585,8 @@ def test_a_box_that_is_none_is_refused(states, words):
     with pytest.raises(GainError) as caught:
         value_hull(model_jacobian(Pendulum()), states, about_zero(1))
     assert words in str(caught.value)
-
-
-def test_other_faults_of_a_call_are_refused(monkeypatch):
-    box = about_zero(1, 1)
     with pytest.raises(GainError, match="has 2 entries, and must have 3"):
-        value_hull(model_jacobian(Pendulum()), box, about_zero(1), ["angle", "rate"])
-    monkeypatch.setattr("echelon.core.enclosure.atoms.MOST_VERTICES", 100)
-    with pytest.raises(GainError, match="has 128 vertices, and may have 100"):
-        value_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS)
-
-
-# --- slopes, found without JAX's derivatives ----------------------------------------------------
-
-MODELS = {
-    "pendulum": Pendulum(),
-    "van-der-pol": VanDerPol(),
-    "planar-quadrotor": PlanarQuadrotor(),
-    "unicycle-point": UnicyclePoint(),
-    "body-rates": Quadrotor.crazyflie(),
-}
+        value_hull(model_jacobian(Pendulum()), about_zero(1, 1), about_zero(1), ["angle", "rate"])
 
 
 def slopes(function, half=1.0, n=1):
@@ -833,13 +717,10 @@ def test_a_jump_in_what_no_slope_is_taken_in_leaves_both_slopes():
     assert both[0] <= -1.0 and both[1] >= 0.0
 
 
-@pytest.mark.parametrize("function", [jnp.floor, lambda x: jnp.argmax(jnp.stack([x, -x])) * x])
-def test_what_has_no_rule_has_no_slopes(function):
-    with pytest.raises(GainError, match="does not know"):
-        slopes(function)
-
-
-def test_a_root_has_no_slope_at_zero():
+def test_what_has_no_rule_and_a_root_at_zero_have_no_slopes():
+    for function in (jnp.floor, lambda x: jnp.argmax(jnp.stack([x, -x])) * x):
+        with pytest.raises(GainError, match="does not know"):
+            slopes(function)
     with pytest.raises(GainError, match="must be positive"):
         slope_hull(lambda x, v: jnp.sqrt(x), Box([0.0], [1.0]), NO_INPUTS)
 
@@ -873,7 +754,7 @@ def test_a_box_far_away_is_not_rounded_to_a_point():
     assert np.ptp(hull.vertices) == 4.0
 
 
-def test_division_of_polynomials_is_exact():
+def test_polynomials_divide_exactly_and_their_range_is_that_of_the_corners_where_terms_repeat():
     atoms = Atoms()
     x, y = (atoms.variable(n, Interval(Fraction(-1), Fraction(1))) for n in "xy")
     one = constant(1)
@@ -883,6 +764,9 @@ def test_division_of_polynomials_is_exact():
     sine = atoms.circle(x)[1]
     assert divides(sine - one, (sine - one) * constant(3)) and divides(y, y * sine)
     assert not divides(sine - one, sine + one) and not divides(x, sine)
+    atoms = Atoms()
+    x = atoms.variable("x", Interval(Fraction(-1), Fraction(1)))
+    assert atoms.range(constant(1) - x * x + x) == Interval(Fraction(-1), Fraction(2))
 
 
 @st.composite
@@ -908,15 +792,21 @@ def bent(draw):
     return (lambda x, v: jnp.stack([row(x) for row in rows])), draw(st.integers(0, 99))
 
 
-def assert_secants_lie_in_the_hull(function, box, hull, seed, pairs=400):
+@settings(max_examples=25)
+@given(system=bent())
+def test_secants_of_what_bends_lie_in_the_hull(system):
     """f(x) - f(y) is a matrix of the hull times x - y: no functional is larger than at a vertex."""
+    function, seed = system
+    lower, upper = box = about_zero(1.0, 1.5)
+    try:
+        hull = slope_hull(function, box, NO_INPUTS)
+    except JumpError:
+        # A choice between equal sizes is continuous, and no polynomial division shows it.
+        return
     rng = np.random.default_rng(seed)
-    lower, upper = map(np.asarray, box)
-    x = rng.uniform(lower, upper, (pairs, len(lower)))
+    x = rng.uniform(lower, upper, (400, 2))
     # Near and far partners: bends are felt by both, and jumps by the near ones.
-    y = np.clip(
-        x + rng.normal(size=x.shape) * 10.0 ** rng.uniform(-4, 0.5, (pairs, 1)), lower, upper
-    )
+    y = np.clip(x + rng.normal(size=x.shape) * 10.0 ** rng.uniform(-4, 0.5, (400, 1)), lower, upper)
     with precision("float64"):
         value = jax.jit(jax.vmap(lambda x: function(x, None)))
         moved = np.asarray(value(jnp.asarray(x))) - np.asarray(value(jnp.asarray(y)))
@@ -925,23 +815,3 @@ def assert_secants_lie_in_the_hull(function, box, hull, seed, pairs=400):
     reach = np.einsum("cr,krn,pn->cpk", C, hull.vertices, step).max(axis=2)
     slack = np.abs(C) @ hull.error @ np.abs(step).T + 1e-13
     assert (C @ moved.T <= reach + slack).all()
-
-
-@settings(max_examples=25)
-@given(system=bent())
-def test_secants_of_what_bends_lie_in_the_hull(system):
-    function, seed = system
-    box = about_zero(1.0, 1.5)
-    try:
-        hull = slope_hull(function, box, NO_INPUTS)
-    except JumpError:
-        # A choice between equal sizes is continuous, and no polynomial division shows it.
-        return
-    assert_secants_lie_in_the_hull(function, box, hull, seed)
-
-
-@pytest.mark.study
-@settings(max_examples=1000)
-@given(system=bent())
-def test_no_hull_of_a_thousand_is_left_by_a_secant(system):
-    test_secants_of_what_bends_lie_in_the_hull.hypothesis.inner_test(system)

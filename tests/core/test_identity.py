@@ -28,7 +28,7 @@ class Scaled(VanDerPol):
     factors: Any = eqx.field(static=True, default=1.0)
 
 
-def test_an_array_that_is_modified_in_place_is_another_value():
+def test_an_array_that_is_modified_in_place_and_a_zero_of_another_sign_are_other_values():
     # The larger one is hashed where it is.
     for size in (3, 5000):
         array = np.arange(float(size))
@@ -36,9 +36,6 @@ def test_an_array_that_is_modified_in_place_is_another_value():
         assert before == (digest([array.copy()]), process_key([array.copy()]))
         array[-1] = np.nextafter(array[-1], np.inf)
         assert digest([array]) != before[0] and process_key([array]) != before[1]
-
-
-def test_zeros_of_either_sign_differ_and_a_nan_is_itself():
     for wrap in (float, np.float64, np.asarray, jnp.asarray, lambda x: [1, (x,)]):
         zero, minus, nan = (digest(wrap(x)) for x in (0.0, -0.0, float("nan")))
         assert None not in (zero, minus, nan) and len({zero, minus, nan}) == 3
@@ -46,31 +43,22 @@ def test_zeros_of_either_sign_differ_and_a_nan_is_itself():
         assert process_key(wrap(-0.0)) != process_key(wrap(0.0))
 
 
-def test_the_type_and_the_shape_of_numbers_count():
-    array = np.array([1.0, 2.0])
-    others = [array.astype(np.float32), array[None], array.astype(int), array[::-1]]
-    values = [array, *others, jnp.asarray(array), [1.0, 2.0], (1.0, 2.0), 1, 1.0, True, "1", b"1"]
-    assert len({digest(value) for value in values}) == len(values)
+def test_types_shapes_frames_fields_and_members_count():
+    array, pendulum = np.array([1.0, 2.0]), Pendulum()
+    values = [array, array.astype(np.float32), array[None], array.astype(int), array[::-1]]
+    values += [jnp.asarray(array), [1.0, 2.0], (1.0, 2.0), 1, 1.0, True, "1", b"1", Fraction(1, 3)]
+    values += [Fraction(1), (1, (1,)), ((1,), 1), (1, 1), ("11",), ("1", "1"), {}, (), None]
+    values += [{"a": 1}, {"b": 1}, {"a": 1, "b": 2}, {"b": 2, "a": 1}, VanDerPol(), VanDerPol]
+    values += [pendulum, dataclasses.replace(pendulum, damping=0.2), jax.random.key(1)]
+    values += [jax.random.key(2), Feedforward.NONE, Feedforward.RELAY, Kind.PROOF, "none"]
+    found = [digest(value) for value in values]
+    assert len({*found}) == len(values) and found.count(None) == 0
+    assert digest(Pendulum()) == digest(pendulum)
+    assert digest(jax.random.key(1)) == digest(jax.random.key(1))
+    assert process_key(Fraction(1)) == process_key(Fraction(2, 2)) != process_key(1)
     # A view and its copy have the same numbers, whatever lies between them in memory.
     wide = np.arange(6.0)
     assert digest(wide[::2]) == digest(wide[::2].copy())
-
-
-def test_nested_values_are_framed():
-    values = [(1, (1,)), ((1,), 1), (1, 1), ("11",), ("1", "1"), {"a": 1}, {"b": 1}, {}, (), None]
-    assert len({digest(value) for value in values}) == len(values)
-    assert digest({"a": 1, "b": 2}) != digest({"b": 2, "a": 1})
-
-
-def test_each_field_of_a_model_counts():
-    values = [VanDerPol(), Pendulum(), VanDerPol, dataclasses.replace(Pendulum(), damping=0.2)]
-    assert None not in (found := [digest(value) for value in values]) and len(set(found)) == 4
-    assert digest(Pendulum()) == digest(Pendulum())
-
-
-def test_members_of_enumerations_are_told_apart_by_class_and_name():
-    values = [Feedforward.NONE, Feedforward.RELAY, Kind.PROOF, "none"]
-    assert len({digest(value) for value in values}) == len(values)
 
 
 @pytest.mark.filterwarnings("ignore:A JAX array is being set as static")
@@ -89,29 +77,15 @@ def test_what_is_not_echelon_s_own_has_no_digest_but_a_key_in_this_process():
         assert process_key(value) is not None and process_key(value) == process_key(value)
     for value in ({1}, np.array([object()]), (1, [np.array([object()])])):
         assert digest(value) is None and process_key(value) is None
-
-
-def test_a_user_s_class_that_is_defined_anew_is_another_one():
-    def define():
-        return type("Own", (VanDerPol,), {})
-
-    one, other = define(), define()
-    assert process_key(one()) == process_key(one()) != process_key(other())
-
-
-def test_numbers_that_are_equal_across_classes_are_told_apart():
-    assert process_key(Fraction(1)) != process_key(1) and digest(Fraction(1, 3)) is not None
-    assert process_key(Fraction(1)) == process_key(Fraction(2, 2))
-
-
-def test_keys_of_random_numbers_are_known_by_their_bits():
-    assert digest(jax.random.key(1)) == digest(jax.random.key(1)) != digest(jax.random.key(2))
-
-
-def test_what_is_traced_is_not_identified():
-    keys = []
+    # What is traced is not identified, a class that is defined anew is another one, and code that
+    # belongs to no module is foreign.
+    keys, names = [], {}
     jax.make_jaxpr(lambda x: keys.append((digest([x]), process_key([x]))))(1.0)
     assert keys == [(None, None)]
+    one, other = (type("Own", (VanDerPol,), {}) for _ in range(2))
+    assert process_key(one()) == process_key(one()) != process_key(other())
+    exec("def cost(sums):\n    return 2 * sums", names)
+    assert names["cost"].__module__ is None and foreign_key(names["cost"])
 
 
 def test_a_class_that_only_claims_to_be_echelon_s_own_is_foreign(monkeypatch):
@@ -128,9 +102,6 @@ def test_parts_of_a_run_are_identified_by_every_bit():
     assert first is not None
     assert first == digest((again.model, again.drive, again.world, settings))
     assert first != digest((parts.model, parts.drive, parts.world, settings._replace(seed=7)))
-
-
-# ---- results that are held ----
 
 
 def test_a_memoized_function_computes_anew_for_other_bits_alone():
@@ -154,14 +125,11 @@ def test_a_memoized_function_computes_anew_for_other_bits_alone():
     assert unhashable() is unhashable() is None and len(calls) == 6
 
 
-def test_a_cache_drops_what_was_not_used_for_longest():
+def test_a_cache_drops_what_was_not_used_for_longest_and_has_room_for_a_size():
     cache = BoundedCache(2)
     assert [cache.get_or_make(key, lambda key=key: key) for key in "abac"] == list("abac")
     assert len(cache) == 2 and cache.pop("b") is None and cache.pop("a") == "a"
     assert cache.get_or_make(None, lambda: "new") == "new" and len(cache) == 1
-
-
-def test_a_cache_has_room_for_a_size():
     cache = BoundedCache(9, len, 10)
     for text in ("four", "fives", "six"):
         cache.put(text, text)
@@ -169,15 +137,6 @@ def test_a_cache_has_room_for_a_size():
     cache.put("long", "longer than all")
     assert len(cache) == 0 == cache.total()
 
-
-def test_code_that_belongs_to_no_module_is_foreign():
-    names = {}
-    exec("def cost(sums):\n    return 2 * sums", names)
-    assert names["cost"].__module__ is None
-    assert foreign_key(names["cost"])
-
-
-# ---- what a user's code reads ----
 
 SPEED = 1.0
 MATRIX = np.array([[-1.0, 0.0], [0.0, -1.0]])
@@ -199,19 +158,6 @@ class Reader(ech.ControlAffine):
 
     def input_map(self, x):
         return jnp.array([[0.0], [1.0]])
-
-
-def closed_over(slope):
-    class Closed(ech.ControlAffine):
-        state_names, input_names = ("a", "b"), ("u",)
-
-        def drift(self, x):
-            return slope[0] * x
-
-        def input_map(self, x):
-            return jnp.array([[0.0], [1.0]])
-
-    return Closed()
 
 
 @cached_jit
@@ -245,10 +191,13 @@ def test_what_a_class_reads_is_part_of_what_is_remembered(monkeypatch):
 
 def test_what_a_function_closes_over_counts():
     slope = [-1.0]
-    model = closed_over(slope)
-    assert linearize(model).A[0, 0] == -1.0
+
+    def closed(x):
+        return slope[0] * x
+
+    assert called(closed)[0] == -1.0
     slope[0] = -2.0
-    assert linearize(model).A[0, 0] == -2.0
+    assert called(closed)[0] == -2.0
 
 
 def test_a_proof_is_not_that_of_numbers_that_changed(monkeypatch):
@@ -261,11 +210,11 @@ def test_a_proof_is_not_that_of_numbers_that_changed(monkeypatch):
         return ech.Parts(model, graph, ech.Formation(np.zeros((3, 2))), drive)
 
     first = parts()
-    slow = ech.promise(first, settings).rate
-    assert ech.promise(first, settings) is ech.promise(first, settings)
+    slow = ech.guarantee(first, settings).rate
+    assert ech.guarantee(first, settings) is ech.guarantee(first, settings)
     monkeypatch.setitem(globals(), "SPEED", 3.0)
-    assert ech.promise(first, settings).rate > slow + 0.5
-    assert ech.promise(parts(), settings).rate > slow + 0.5
+    assert ech.guarantee(first, settings).rate > slow + 0.5
+    assert ech.guarantee(parts(), settings).rate > slow + 0.5
 
 
 class Caller:

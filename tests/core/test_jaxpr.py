@@ -76,7 +76,7 @@ def test_the_walk_evaluates_in_the_algebra_that_it_is_given():
     assert faults == []
 
 
-def test_constants_literals_and_what_follows_from_them_are_lifted():
+def test_constants_are_lifted_and_own_rules_or_refusals_go_first():
     lifted = []
 
     def keep(numbers):
@@ -85,27 +85,16 @@ def test_constants_literals_and_what_follows_from_them_are_lifted():
 
     evaluate(lambda x: x * M[0] + 0.25, [fractions("1", "2")], FRACTIONS._replace(lift=keep))
     assert [1.0, 2.0] in lifted and 0.25 in lifted
-
-
-def test_rules_of_the_algebra_go_before_the_common_ones():
     closed = jax.make_jaxpr(lambda x: x + x)(np.zeros(1))
     swapped = FRACTIONS._replace(rules={"add": lambda params, a, b: a * b})
     assert list(walk(closed.jaxpr, closed.consts, [fractions("3")], swapped)[0]) == [Fraction(9)]
-
-
-def test_what_has_no_rule_and_what_lies_outside_is_for_the_algebra_to_say():
     with pytest.raises(LookupError, match="sin"):
         evaluate(lambda x: jax.jit(jnp.sin)(x), [fractions("1")], FRACTIONS)
     with pytest.raises(IndexError, match="outside"):
         evaluate(lambda x: x.at[jnp.array([3])].get(mode="fill"), [fractions("1")], FRACTIONS)
-
-
-def test_what_no_result_depends_on_is_not_evaluated():
     [found] = evaluate(lambda x: (jnp.sin(x), x + x)[1], [fractions("1/3")], FRACTIONS)
     assert found.tolist() == [Fraction(2, 3)]
 
-
-# ---- numbers ----
 
 X = np.random.default_rng(0).normal(size=(4, 5, 3))
 ROWS = np.array([3, 0, 2])

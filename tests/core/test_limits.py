@@ -1,5 +1,7 @@
 """Inputs too large for the memory are refused before allocation; errors name what would fit."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,6 +16,7 @@ from echelon.simulation.engine.batch import Batch
 from echelon.simulation.engine.prepare import check_memory
 
 HUGE = 10**23
+KINDS = ech.Graph.ring, ech.Graph.star, ech.Graph.complete
 
 
 def settings(**changes):
@@ -23,9 +26,7 @@ def settings(**changes):
 def test_what_does_not_fit_is_refused_before_it_is_made():
     cases = [
         (lambda: ech.Graph.path(HUGE), "1e+23 agents are asked for, and 1000000 fit"),
-        (lambda: ech.Graph.ring(HUGE), "1e+23 agents"),
-        (lambda: ech.Graph.star(HUGE), "1e+23 agents"),
-        (lambda: ech.Graph.complete(HUGE), "1e+23 agents"),
+        *((partial(kind, HUGE), "1e+23 agents") for kind in KINDS),
         (lambda: ech.Graph.grid(10**17, 10**11), "1e+28 agents"),
         (lambda: ech.Graph.geometric(HUGE, 0.1), "1e+23 agents"),
         (lambda: ech.Graph([(0, 1), (1, 999_999_999)]), "1000000000 agents are asked for"),
@@ -40,6 +41,14 @@ def test_what_does_not_fit_is_refused_before_it_is_made():
         (lambda: settings(store_every=HUGE).check(), "`store_every` is 1000000"),
         (lambda: settings(seed=HUGE).check(), "`seed` is 1000000"),
     ]
+    for window in (-1.0, 0.0, 1.1, np.nan, np.inf):
+        wrong = partial(settings, steady_window=window)
+        cases.append((lambda wrong=wrong: wrong().check(), f"`steady_window` is {window}"))
+    settings(steady_window=1.0).check()
+    # More columns than agents are one row.
+    agent, graph = ech.models.DoubleIntegrator(2), ech.Graph.path(5)
+    rows = [ech.Formation.grid(agent, graph, columns=count).offsets for count in (5, HUGE)]
+    np.testing.assert_array_equal(*rows)
     for make, said in cases:
         with pytest.raises(ech.EchelonError) as refused:
             make()
@@ -51,6 +60,7 @@ def test_a_run_that_stores_too_much_is_told_what_would_fit(monkeypatch):
     agent, graph = ech.models.DoubleIntegrator(2), ech.Graph.path(4)
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
     parts = ech.Parts(agent, graph, ech.Formation.from_offsets(agent, graph, {}), drive)
+    assert limits.memory() > 2**28
     monkeypatch.setattr(limits, "memory", lambda: 2**30)
     long = settings(horizon=1e7)
     with pytest.raises(ech.EchelonError, match="needs? .* GiB of memory, and 0.5 GiB fit") as no:
@@ -99,10 +109,6 @@ def test_a_run_without_room_is_refused_before_a_gain_is_made(monkeypatch):
         scenario_build.build(scenario)
 
 
-def test_this_machine_has_memory():
-    assert limits.memory() > 2**28
-
-
 @given(st.integers(1, MOST_STEPS), st.floats(1e-6, 1e3))
 def test_a_whole_number_of_steps_is_a_horizon(steps, dt):
     assert horizon_fault(steps * dt, dt) is None
@@ -114,16 +120,3 @@ def test_a_part_of_a_step_is_told_with_the_horizons_beside_it(steps, part, dt):
     said = horizon_fault((steps + part) * dt, dt)
     below, above = said.partition("such as ")[2].removesuffix(" s").split(" or ")
     assert [float(below), float(above)] == pytest.approx([steps * dt, (steps + 1) * dt], rel=1e-11)
-
-
-def test_a_steady_window_lies_within_the_run():
-    for window in (-1.0, 0.0, 1.1, np.nan, np.inf):
-        with pytest.raises(ech.EchelonError, match="`steady_window` is .* at most the horizon"):
-            settings(steady_window=window).check()
-    settings(steady_window=1.0).check()
-
-
-def test_more_columns_than_agents_are_one_row():
-    agent, graph = ech.models.DoubleIntegrator(2), ech.Graph.path(5)
-    made = [ech.Formation.grid(agent, graph, columns=count).offsets for count in (5, HUGE)]
-    np.testing.assert_array_equal(*made)

@@ -32,11 +32,13 @@ def process(code, *arguments, **environment):
     return done.returncode, done.stdout, without_status(done.stderr)
 
 
-def test_a_device_that_is_missing_is_named_with_its_variable():
+def test_a_device_that_is_missing_is_named_with_its_variable_or_setting():
     for variable in ("JAX_PLATFORMS", "JAX_DEFAULT_DEVICE"):
         code, out, err = process("", "check", "paper", **{variable: "gpu"})
         assert (code, out, err.count("\n")) == (2, "", 1)
         assert err.startswith(f"echelon: `{variable}` asks JAX for `gpu`, which this machine")
+    code = "import jax\njax.config.update('jax_platforms', 'none')" + GAIN + "print(coupling())"
+    assert process(code)[1].startswith("EchelonError: `jax_platforms` asks JAX for `none`, which")
 
 
 def test_doctor_reports_a_missing_device_as_a_finding():
@@ -44,11 +46,6 @@ def test_doctor_reports_a_missing_device_as_a_finding():
     assert code == 1 and not err
     assert "FAIL  JAX runs in this process (`JAX_PLATFORMS` asks JAX for `none`" in out
     assert "devices      none" in out
-
-
-def test_a_device_that_python_asks_for_is_named_with_its_setting():
-    code = "import jax\njax.config.update('jax_platforms', 'none')" + GAIN + "print(coupling())"
-    assert process(code)[1].startswith("EchelonError: `jax_platforms` asks JAX for `none`, which")
 
 
 def test_a_value_that_jax_refuses_is_no_internal_error():

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.core.compiled import cached_jit, compiled_for_one_call
-from echelon.core.numerics import precision
 from echelon.core.trace import call_once_traced, shared_traces
 
 DRIFTS, MAPS = itertools.count(), itertools.count()
@@ -56,19 +54,7 @@ def test_a_public_call_traces_a_model_once_and_a_second_time_to_find_clocks(bits
     # In single precision the checks of a law are in double, and so are theorems.
     traces = 1 if bits == "float64" else 2
     assert max(calls_of(lambda: ech.simulate(parts, settings))[1]) <= traces
-    assert max(calls_of(lambda: ech.promise(parts, settings))[1]) <= 2
-
-
-def test_an_array_that_is_changed_in_place_between_calls_counts():
-    pull = np.array([2.0])
-    agent, other = Counted(pull), Counted(np.array([3.0]))
-    gain = ech.synthesize(agent, GRAPH, ech.gains.Riccati())
-    settings = ech.Settings(horizon=1.0, dt=0.01)
-    first = ech.simulate(parts_of(agent, gain), settings).states
-    pull[0] = 3.0
-    then = ech.simulate(parts_of(agent, gain), settings).states
-    assert (then[-1] != first[-1]).any()
-    np.testing.assert_array_equal(then, ech.simulate(parts_of(other, gain), settings).states)
+    assert max(calls_of(lambda: ech.guarantee(parts, settings))[1]) <= 2
 
 
 def test_shared_traces_are_those_of_what_the_code_reads_now():
@@ -83,14 +69,3 @@ def test_shared_traces_are_those_of_what_the_code_reads_now():
             make = make_jaxpr(lambda x: call_once_traced(agent.drift, x))
             texts.append(make(x).jaxpr.pretty_print() + str(make(x).consts))
     assert texts[0] == texts[2] != texts[1]
-
-
-def test_a_program_for_one_call_computes_what_any_other_does():
-    def function(x):
-        return jnp.exp(jnp.sin(x)) @ jnp.cos(x) + jnp.sqrt(jnp.sum(x**2)) * x
-
-    x = np.random.default_rng(0).normal(size=12)
-    with precision("float64"):
-        once, other = (kind(function)(x) for kind in (compiled_for_one_call, cached_jit))
-    # A sum of 12 products, each function right to an ulp.
-    np.testing.assert_allclose(once, other, rtol=16 * np.finfo(float).eps)

@@ -1,9 +1,6 @@
 """Comparisons of methods: equal conditions except for the law, and correct reports."""
 
 import json
-import os
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -11,22 +8,15 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.apps.cli.app import app
 from echelon.experiments.results import run_numbers
 from echelon.experiments.results.metrics import RunNumbers
-from echelon.experiments.results.run_numbers import (
-    FollowerMetrics,
-    LeaderMetrics,
-    Metrics,
-    Quantity,
-    Shown,
-)
-from echelon.experiments.studies.compare import LABELS, Comparison, ComparisonRow
+from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.output.reports.comparison_report import comparison_mapping, comparison_report, verdict
 from echelon.output.reports.glossary import glossary
 
 LAWS = ("literal", "riccati-relay", "riccati", "inner-loop")
 SHORT = ["simulation.horizon=1.0"]
+LITERAL = "{gain: {method: given, P: identity}, feedforward: none, trim: false}"
 
 
 @pytest.fixture(scope="module")
@@ -44,33 +34,28 @@ def test_all_start_alike_and_have_the_same_limits(planar):
     for run in runs[1:]:
         np.testing.assert_array_equal(run.states[0], runs[0].states[0])
         assert run.settings == runs[0].settings
+    assert (planar.steady_window, planar.horizon) == (pytest.approx(0.2), 1.0)
+    for width in (40, 60, 200):  # labels are whole however narrow the output is
+        text = comparison_report(planar, width)
+        assert all(f"\n {label} " in text or f"\n{label} " in text for label in LAWS)
 
 
 @pytest.mark.parametrize(
     ("label", "changes"),
     [
-        ("riccati-relay", []),
-        ("riccati", ["follower.feedforward=none"]),
-        ("inner-loop", ["follower.gain.method=inner-loop"]),
+        ("riccati-relay", ""),
+        ("riccati", "follower.feedforward=none"),
+        ("inner-loop", "follower.gain.method=inner-loop"),
         (
             "literal",
-            [
-                "follower.gain={method: given, P: identity}",
-                "follower.feedforward=none",
-                "follower.trim=false",
-            ],
+            "follower={gain: {method: given, P: identity}, feedforward: none, trim: false}",
         ),
     ],
 )
 def test_each_row_is_the_run_that_its_label_names(planar, label, changes):
-    alone = ech.run(ech.load_scenario("planar-quadrotor", [*SHORT, *changes]))
+    alone = ech.run(ech.load_scenario("planar-quadrotor", [*SHORT, *filter(None, [changes])]))
     # The same numbers but for the compiler's order of operations.
     np.testing.assert_allclose(flown(planar)[label].states, alone.states, rtol=1e-9, atol=1e-9)
-
-
-def test_the_steady_window_is_shorter_than_the_run(planar):
-    assert planar.steady_window == pytest.approx(0.2)
-    assert planar.horizon == 1.0
 
 
 def test_the_paragraph_names_the_row_with_the_least_number(planar):
@@ -83,45 +68,48 @@ def test_the_paragraph_names_the_row_with_the_least_number(planar):
 
 def row_of(label, settles, effort, computing, unit="m"):
     """A method of one follower, with the numbers that the paragraph reads."""
-    follower = FollowerMetrics(1, 0.1, 0.1, settles, effort, 0.0)
-    numbers = Metrics((LeaderMetrics(None, None, {}),), (follower,), (), None, 0.0, 1.0)
+    follower = run_numbers.FollowerMetrics(1, 0.1, 0.1, settles, effort, 0.0)
+    leader = run_numbers.LeaderMetrics(None, None, {})
+    numbers = run_numbers.Metrics((leader,), (follower,), (), None, 0.0, 1.0)
     run = SimpleNamespace(length_unit=unit)
     return ComparisonRow(label, RunNumbers(run, numbers, None, computing))
 
 
+def said_of(*rows):
+    return " ".join(verdict(Comparison("mine", rows, 5.0, 1.0, ())))
+
+
 def test_what_is_said_of_those_that_settle_is_said_to_be_of_them():
-    rows = (
+    slow, a, b = (
         row_of("slow", None, 1.0, 1e-3),
         row_of("a", 2.0, 5.0, 2e-3),
         row_of("b", 3.0, 6.0, 9e-3),
     )
-    text = " ".join(verdict(Comparison("mine", rows, 5.0, 1.0, ())))
+    text = said_of(slow, a, b)
     assert "Of those that settle, a has the smallest effort (5; next b, 6)." in text
     assert "Of those that settle, a takes the least computing time, b 4 times as much." in text
-    text = " ".join(verdict(Comparison("mine", rows[1:], 5.0, 1.0, ())))
+    text = said_of(a, b)
     assert "Of those" not in text and "a has the smallest effort (5; next b, 6)." in text
     # One that settles is the best of nothing.
-    text = " ".join(verdict(Comparison("mine", rows[:2], 5.0, 1.0, ())))
+    text = said_of(slow, a)
     assert "a settles (2 s)." in text and "Of those" not in text and "effort" not in text
 
 
 @pytest.mark.parametrize(("unit", "within", "error"), [("m", "1 cm", "0.1 m"), ("", "0.01", "0.1")])
 def test_errors_have_metres_where_there_is_a_position_alone(unit, within, error):
-    rows = row_of("a", 2.0, 5.0, 2e-3, unit), row_of("b", None, 6.0, 9e-3, unit)
-    text = " ".join(verdict(Comparison("mine", rows, 5.0, 1.0, ())))
+    a, b = row_of("a", 2.0, 5.0, 2e-3, unit), row_of("b", None, 6.0, 9e-3, unit)
+    text = said_of(a, b)
     assert f"b does not bring every follower within {within}." in text
     assert f"a has the smallest error over the whole run ({error}; next b, 0.1)." in text
-    text = " ".join(verdict(Comparison("mine", rows[:1], 5.0, 1.0, ())))
-    assert text.startswith(f"a brings every follower within {within}.")
+    assert said_of(a).startswith(f"a brings every follower within {within}.")
 
 
 def test_a_number_of_the_table_is_in_every_table_that_it_names(planar, monkeypatch):
-    def fastest(run):
+    def largest(run):
         return float(np.abs(run.result.states).max())
 
-    number = Quantity(
-        "largest state", "m", column="largest\nstate", of=fastest, shown=Shown.COMPARISON
-    )
+    column = {"column": "largest\nstate", "of": largest, "shown": run_numbers.Appearance.COMPARISON}
+    number = run_numbers.Quantity("largest state", "m", **column)
     monkeypatch.setitem(run_numbers.RUN_NUMBERS, "largest_state", number)
     rows = comparison_mapping(planar)["methods"]
     for label, result in flown(planar).items():
@@ -133,10 +121,9 @@ def test_a_number_of_the_table_is_in_every_table_that_it_names(planar, monkeypat
 @pytest.mark.parametrize(
     ("changes", "labels"),
     [
-        ([], ["riccati-relay"]),
+        ([], []),
         (["follower.gain={method: inner-loop, coupling: 5.0}"], ["inner-loop-relay"]),
         (["follower.feedforward=parent"], ["riccati-parent"]),
-        (["follower.gain={method: given, P: identity}"], ["given-relay"]),
         (["follower.trim=false"], ["riccati-relay, own"]),
     ],
 )
@@ -144,14 +131,13 @@ def test_the_scenario_s_own_law_is_always_a_row(changes, labels):
     short = ["simulation.horizon=0.02", "report.steady_window=0.01"]
     scenario = ech.load_scenario("planar-quadrotor", [*short, *changes])
     found = ech.compare(scenario, only=("riccati-relay", "inner-loop", "own"))
-    assert [row.label for row in found.rows] == [
-        *("riccati-relay", "inner-loop"),
-        *(label for label in labels if label != "riccati-relay"),
-    ]
+    assert [row.label for row in found.rows] == ["riccati-relay", "inner-loop", *labels]
     told = comparison_mapping(found)["methods"]
     for row in found.rows:
         result = row.flight.result
-        assert told[row.label]["promise"] == ech.promise(result.parts, result.settings).as_mapping()
+        assert (
+            told[row.label]["promise"] == ech.guarantee(result.parts, result.settings).as_mapping()
+        )
 
 
 class Halved(ech.Law):
@@ -179,78 +165,31 @@ def test_the_row_of_a_law_of_ones_own_has_the_name_of_its_class():
     assert "Halved" in text and "riccati" not in text
 
 
-@pytest.mark.study
-def test_a_law_of_ones_own_flies_beside_the_methods():
-    given = {
-        "name": "pendulums",
-        "model": {"name": "pendulum"},
-        "graph": {"name": "path", "agents": 3},
-        "follower": {
-            "gain": {"method": "monotone", "domain": {"angle": 0.5}},
-            "feedforward": "relay",
-        },
-        "initial": {"spread": {"angle": 0.2}},
-        "simulation": {"horizon": 0.5, "dt": 0.01},
-    }
-    found = ech.compare(ech.scenario_from_mapping(given))
-    assert [row.label for row in found.rows] == [*LABELS, "monotone-relay"]
-    reasons = {row.label: row.reason for row in found.rows if row.flight is None}
-    assert "inner-loop" in reasons
-    assert all(reason.endswith(".") for reason in reasons.values())
-
-
-def test_labels_are_whole_however_narrow_the_output_is(planar):
-    for width in (40, 60, 200):
-        text = comparison_report(planar, width)
-        for label in LAWS:
-            assert f"\n {label} " in text or f"\n{label} " in text
-
-
-def test_the_command_writes_numbers_text_runs_and_figures(tmp_path, capsys):
-    out = tmp_path / "here"
-    arguments = ["compare", "planar-quadrotor", "--horizon", "0.5", "--out", str(out), "--json"]
-    for label in ("riccati", "riccati-relay"):
-        arguments += ["--method", label]
-    app(arguments, standalone_mode=False)
-    told = json.loads(capsys.readouterr().out)
-    assert told == json.loads((out / "comparison.json").read_text())
-    assert list(told["methods"]) == ["riccati-relay", "riccati"]
-    assert told["horizon_s"] == 0.5
-    assert (out / "comparison.txt").read_text().startswith("planar-quadrotor")
-    assert {path.name for path in (out / "runs").iterdir()} == {"riccati-relay.nc", "riccati.nc"}
+def test_the_command_writes_numbers_text_runs_and_figures(echelon, here):
+    call = ["compare", "planar-quadrotor", "--horizon", "0.5", "--out", "here", "--json"]
+    code, out, _ = echelon(*call, "--method", "riccati", "--method", "riccati-relay")
+    told = json.loads(out)
+    assert code == 0 and told == json.loads((here / "here" / "comparison.json").read_text())
+    assert list(told["methods"]) == ["riccati-relay", "riccati"] and told["horizon_s"] == 0.5
+    assert (here / "here" / "comparison.txt").read_text().startswith("planar-quadrotor")
+    runs, figures = ({x.name for x in (here / "here" / f).iterdir()} for f in ("runs", "figures"))
+    assert runs == {"riccati-relay.nc", "riccati.nc"}
     names = ("formation_error", "tracking_error", "approach")
-    assert {path.name for path in (out / "figures").iterdir()} == {
-        f"{name}.{kind}" for name in names for kind in ("png", "pdf")
-    }
+    assert figures == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
+    # Two scenarios get a folder each.
+    call = ["compare", "integrators", "van-der-pol", "--horizon", "0.1", "--no-figures"]
+    code, out, _ = echelon(*call, "--method", "riccati", "--out", "both")
+    assert code == 0 and "costs" in out
+    assert sorted(path.name for path in (here / "both").iterdir()) == ["integrators", "van-der-pol"]
 
 
-def test_two_scenarios_get_a_folder_each(tmp_path, capsys):
-    out = tmp_path / "both"
-    arguments = ["compare", "integrators", "van-der-pol", "--horizon", "0.1", "--no-figures"]
-    app([*arguments, "--method", "riccati", "--out", str(out)], standalone_mode=False)
-    assert sorted(path.name for path in out.iterdir()) == ["integrators", "van-der-pol"]
-    assert "costs" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["compare", "paper", "--method", "riccati-realy"], "did you mean `riccati-relay`"),
-        (["compare", "paper", "--horizon", "0"], "simulation.horizon"),
-        (["compare", "paper", "paper"], "two scenarios have the name `paper`"),
-        (["compare", "papr"], "no such file exists"),
-    ],
-)
-def test_bad_input_is_one_sentence_and_leaves_nothing(tmp_path, arguments, told):
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    done = subprocess.run(
-        [sys.executable, "-m", "echelon", *arguments],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        env=environment,
-    )
-    assert done.returncode == 2
-    assert told in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not list(tmp_path.iterdir())
+def test_bad_input_is_one_sentence_and_leaves_nothing(echelon, here):
+    for arguments, told in {
+        ("paper", "--method", "riccati-realy"): "did you mean `riccati-relay`",
+        ("paper", "--horizon", "0"): "simulation.horizon",
+        ("paper", "paper"): "two scenarios have the name `paper`",
+        ("papr",): "no such file exists",
+    }.items():
+        code, out, err = echelon("compare", *arguments)
+        assert (code, out) == (2, "") and told in err and err.count("\n") == 1
+        assert not list(here.iterdir())

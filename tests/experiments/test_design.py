@@ -1,27 +1,21 @@
 """`design`: the table of methods, the recommendation, and pictures that claim no more than it."""
 
 import json
+import re
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from runs import simulate
 
 import echelon as ech
 from echelon.core.digits import at_most
-from echelon.experiments.studies.basin import (
-    chosen_slice,
-    converged,
-    observed_radius,
-    side_of,
-    slice_of,
-    trial,
-)
+from echelon.experiments.studies import basin
 from echelon.experiments.studies.design import because, recommended
 from echelon.output.plots.study_figures import save_design_figures
 
 PATH = ech.Graph.path(4)
+EIGENVALUES = 2.0 - 2.0 * np.cos(np.pi * np.array([1.0, 3.0, 5.0]) / 7.0)
 
 
 class Cubic(ech.ControlAffine):
@@ -53,29 +47,17 @@ def echelon(echelon, here):
     return echelon
 
 
-def parts_of(scenario):
-    return ech.build(ech.load_scenario(scenario))
-
-
-# ---- the table ----
-
-
-def test_what_is_said_to_be_missing_is_accepted_where_it_is_said_to_go():
-    rows = {row.method: row for row in ech.design(ech.load_scenario("van-der-pol")).designs}
+@pytest.mark.parametrize("scenario", ["van-der-pol", "integrators"])
+def test_what_is_said_to_be_missing_is_accepted_where_it_is_said_to_go(scenario):
+    rows = {row.method: row for row in ech.design(ech.load_scenario(scenario)).designs}
     reason = rows["robust-lqr"].reason
-    assert reason == (
-        "set `follower.gain={method: robust-lqr, domain: {position: HALF_WIDTH, ...}}` to try it"
-    )
-    advice = reason.split("`")[1].replace("HALF_WIDTH, ...", "0.5")
-    gain = ech.load_scenario("van-der-pol", [advice]).follower.gain
-    assert gain.method == "robust-lqr" and gain.domain == {"position": 0.5}
-
-
-def test_a_law_without_a_gain_is_advised_one_that_takes_it():
-    rows = {row.method: row for row in ech.design(ech.load_scenario("integrators")).designs}
-    advice = rows["robust-lqr"].reason.split("`")[1].replace("HALF_WIDTH, ...", "0.5")
-    follower = ech.load_scenario("integrators", [advice]).follower
-    assert follower.law == "consensus" and follower.gain.method == "robust-lqr"
+    advice = reason.split("`")[1]
+    assert reason == f"set `{advice}` to try it" and "HALF_WIDTH, ...}" in advice
+    follower = ech.load_scenario(scenario, [advice.replace("HALF_WIDTH, ...", "0.5")]).follower
+    assert follower.law == "consensus"
+    assert follower.gain.method == "robust-lqr" and follower.gain.domain == {"position": 0.5}
+    # All states of an integrator are symmetric, and it has an inner loop too.
+    assert (rows["inner-loop"].reason == "") or scenario != "integrators"
 
 
 def test_a_scenario_whose_own_gain_cannot_be_made_has_the_other_methods_tried():
@@ -88,12 +70,9 @@ def test_a_scenario_whose_own_gain_cannot_be_made_has_the_other_methods_tried():
     rows = {row.method: row for row in found.designs}
     assert rows["robust-lqr"].gain is None and "unbounded" in rows["robust-lqr"].reason
     assert rows["riccati"].stable and found.recommended is rows["riccati"]
-
-
-def test_a_gain_file_that_is_missing_ends_a_design():
-    scenario = ech.load_scenario("van-der-pol", ["follower.gain={file: nowhere.json}"])
+    # A file that is missing ends it.
     with pytest.raises(ech.EchelonError, match=r"nowhere\.json"):
-        ech.design(scenario)
+        ech.design(ech.load_scenario("van-der-pol", ["follower.gain={file: nowhere.json}"]))
 
 
 def test_every_method_has_its_row_and_the_numbers_are_those_of_its_gain(echelon):
@@ -109,29 +88,21 @@ def test_every_method_has_its_row_and_the_numbers_are_those_of_its_gain(echelon)
     assert (row["kind"], row["theorem"]) == (str(region.kind), str(region.theorem))
     assert row["rate"] == region.rate and row["promise"]["hypotheses"]
     assert rows["inner-loop"]["reason"] and "coupling" not in rows["inner-loop"]
-    strongest = max(
-        ("proof", "vertices", "samples", None).index(row.get("kind"))
-        for row in rows.values() if row["method"] == told["recommended"]
-    )  # fmt: skip
-    assert strongest <= 1 and told["because"].startswith(f"Recommended: {told['recommended']}. ")
+    assert rows[told["recommended"]]["kind"] in ("proof", "vertices")
+    assert told["because"].startswith(f"Recommended: {told['recommended']}. ")
+    assert_longest_step(rows["riccati"]["longest_step"])
 
 
-def test_the_step_that_is_told_is_the_longest(echelon):
-    _, out, _ = echelon("design", "mine.yaml", "--method", "riccati", "--json")
-    (row,) = json.loads(out)["methods"]
-    gain = ech.synthesize(ech.models.Pendulum(), PATH, ech.gains.Riccati())
-    A, B = np.array([[0.0, 1.0], [-1.0, -0.5]]), np.array([[0.0], [1.0]])
-    A[1, 0], A[1, 1] = -ech.models.Pendulum().stiffness, -ech.models.Pendulum().damping
+def assert_longest_step(step):
+    """The exact flow of pendulums under inputs that are held grows at a longer step alone."""
+    model = ech.models.Pendulum()
+    gain = ech.synthesize(model, PATH, ech.gains.Riccati())
+    A, B = np.array([[0.0, 1.0], [-model.stiffness, -model.damping]]), np.array([[0.0], [1.0]])
     K = np.linalg.solve(gain.R, B.T @ gain.P)
-
-    def grows(dt):
-        radii = []
-        for k in gain.coupling * PATH.spectrum().eigenvalues:
-            flow = scipy.linalg.expm(dt * np.block([[A, B], [np.zeros((1, 3))]]))
-            radii.append(np.abs(np.linalg.eigvals(flow[:2, :2] - k * flow[:2, 2:] @ K)).max())
-        return max(radii) > 1.0
-
-    assert grows(1.001 * row["longest_step"]) and not grows(0.999 * row["longest_step"])
+    for dt, grows in ((1.001 * step, True), (0.999 * step, False)):
+        flow = scipy.linalg.expm(dt * np.block([[A, B], [np.zeros((1, 3))]]))[:2]
+        loops = [flow[:, :2] - k * gain.coupling * flow[:, 2:] @ K for k in EIGENVALUES]
+        assert (max(np.abs(np.linalg.eigvals(loop)).max() for loop in loops) > 1.0) == grows
 
 
 def test_the_table_and_its_sentence_are_whole(echelon):
@@ -144,62 +115,43 @@ def test_the_table_and_its_sentence_are_whole(echelon):
     assert sentence.startswith("Recommended: ") and sentence.endswith("is short enough.")
 
 
-def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to(echelon):
+def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to():
     tried = ech.design(ech.load_scenario("paper")).designs
     steps = {d.method: d.step for d in tried if d.gain is not None}
     assert steps["riccati"] < steps["inner-loop"]
     between = 0.5 * (steps["riccati"] + steps["inner-loop"])
-    assert recommended(tried, 0.005).method == "riccati"
-    best = recommended(tried, between)
-    assert best.method == "inner-loop"
-    assert "Of 2 stable designs only this one is stable at the scenario's step." in (
-        because(best, tried, between)
-    )
+    short, best, long = (recommended(tried, step) for step in (0.005, between, 1.0))
+    assert (short.method, best.method) == ("riccati", "inner-loop")
+    alone = "Of 2 stable designs only this one is stable at the scenario's step."
+    assert alone in because(best, tried, between)
     # The table has a faster one, and the sentence does not say otherwise.
     assert -best.promise.loop.slowest < max(-d.promise.loop.slowest for d in tried if d.stable)
-    rate = at_most(-recommended(tried, 0.005).promise.loop.slowest)
-    assert f"this one converges fastest ({rate} 1/s)" in (
-        because(recommended(tried, 0.005), tried, 0.005)
-    )
-    long = recommended(tried, 1.0)
+    fastest = f"this one converges fastest ({at_most(-short.promise.loop.slowest)} 1/s)"
+    assert fastest in because(short, tried, 0.005)
     assert "It needs a step below" in because(long, tried, 1.0)
-
-
-def test_agents_whose_states_are_all_symmetric_have_an_inner_loop_too(echelon):
-    code, out, _ = echelon("design", "integrators", "--json")
-    rows = {row["method"]: row for row in json.loads(out)["methods"]}
-    assert code == 0 and rows["inner-loop"]["reason"] == ""
-
-
-# ---- the slice ----
 
 
 @pytest.fixture(scope="module")
 def cubic():
     parts = resting(Cubic(), ech.gains.FixedGain(P=[1.0, 1.0]))
-    return trial(parts, ech.Settings(horizon=1.0, dt=0.01)), slice_of(parts, (0, 1))
+    return basin.trial(parts, ech.Settings(horizon=1.0, dt=0.01)), basin.slice_of(parts, (0, 1))
 
 
-def resting(model, method, feedforward="relay"):
-    """Agents on a path behind a leader that rests, all on their goals."""
-    gain = ech.synthesize(model, PATH, method)
-    follower = ech.laws.Consensus(gain, feedforward=feedforward)
-    goals = ech.Formation.from_offsets(model, PATH, {})
-    return ech.Parts(model, PATH, goals, ech.Laws(ech.laws.TrimInput(), follower))
+def resting(model, method, graph=PATH):
+    """Agents behind a leader that rests, all on their goals."""
+    follower = ech.laws.Consensus(ech.synthesize(model, graph, method), feedforward="relay")
+    goals = ech.Formation.from_offsets(model, graph, {})
+    return ech.Parts(model, graph, goals, ech.Laws(ech.laws.TrimInput(), follower))
 
 
 def test_a_known_basin_is_observed_and_not_overstated(cubic):
     run, plane = cubic
-    radius = observed_radius(run, plane)
+    radius = basin.observed_radius(run, plane)
     # Three followers alike: r^2 = 3 (x^2 + y^2), and only |x| < 1 returns.
-    ratio = 10.0 ** (3.0 / (side_of(3) - 1))
+    ratio = 10.0 ** (3.0 / (basin.side_of(3) - 1))
     assert 1.0 / ratio < plane.extents(radius)[0] < 1.0
     starts = np.array([[0.9, 0.0], [-0.9, 5.0], [1.1, 0.0], [0.0, 20.0], [-3.0, 0.0], [0.0, 0.0]])
-    assert converged(run, plane, starts).tolist() == [True, True, False, True, False, True]
-
-
-def test_the_ellipse_has_the_radius_that_it_says(cubic):
-    _, plane = cubic
+    assert basin.converged(run, plane, starts).tolist() == [True, True, False, True, False, True]
     points = plane.ellipse(2.0, 90)
     assert np.einsum("si,ij,sj->s", points, plane.form, points) == pytest.approx(4.0)
     assert np.abs(points).max(axis=0) == pytest.approx(plane.extents(2.0), rel=2e-3)
@@ -207,63 +159,44 @@ def test_the_ellipse_has_the_radius_that_it_says(cubic):
 
 def test_a_slice_stays_inside_the_chart():
     agent = ech.models.Quadrotor()
-    plane = slice_of(resting(agent, ech.gains.Riccati()), (0, agent.state_names.index("pitch")))
+    plane = basin.slice_of(
+        resting(agent, ech.gains.Riccati()), (0, agent.state_names.index("pitch"))
+    )
     assert plane.limits[1] < np.pi / 2 and plane.limits[0] == 30.0
 
 
 def test_a_slice_runs_the_loop_that_simulate_runs():
-    parts, settings = parts_of("planar-quadrotor")
-    gain, model = parts.drive.gain, parts.model
-    run = trial(parts, settings)
-    pair = chosen_slice(model, "y,roll")
+    parts, settings = ech.build(ech.load_scenario("planar-quadrotor"))
+    gain, followers = parts.drive.gain, list(parts.graph.followers)
+    run, pair = basin.trial(parts, settings), basin.chosen_slice(parts.model, "y,roll")
+    still = resting(parts.model, ech.gains.Riccati(), graph=parts.graph)
+    still = still.replace(drive=ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain)))
+    trim = np.array(parts.model.trim[0])
     for start in ([0.5, 0.2], [25.0, 1.0]):
-        states = np.zeros((parts.graph.agents, len(model.state_names))) + np.array(model.trim[0])
-        for follower in parts.graph.followers:
-            states[follower, pair] += start
-        result = simulate(
-            model,
-            parts.graph,
-            ech.Formation.from_offsets(model, parts.graph, {}),
-            leader=ech.laws.TrimInput(),
-            follower=ech.laws.Consensus(gain, feedforward="relay"),
-            initial=states,
-            horizon=run.horizon,
-            dt=0.005,
-            store_every=run.steps,
-        )
-        y = result.states[[0, -1]][:, list(parts.graph.followers)] - np.array(model.trim[0])
+        states = np.tile(trim, (parts.graph.agents, 1))
+        states[np.ix_(followers, pair)] += start
+        chosen = ech.Settings(run.horizon, 0.005, store_every=run.steps)
+        result = ech.simulate(still.replace(initial=states), chosen)
+        y = result.states[[0, -1]][:, followers] - trim
         first, last = np.sqrt(np.einsum("tfi,ij,tfj->t", y, gain.P, y))
-        plane = slice_of(parts, pair)
-        assert converged(run, plane, np.array([start]))[0] == (last <= run.decay * first)
+        found = basin.converged(run, basin.slice_of(parts, pair), np.array([start]))[0]
+        assert found == (last <= run.decay * first)
 
 
 def test_the_pair_is_the_one_asked_for_or_a_telling_one():
     quad, cart = ech.models.Quadrotor(), ech.models.VanDerPol()
-    assert chosen_slice(quad, " roll , y ") == (6, 1)
-    velocity, angle = chosen_slice(quad, None)
-    assert (quad.state_names[velocity], quad.state_names[angle]) in {
-        ("vx", "pitch"),
-        ("vy", "roll"),
-    }
-    assert chosen_slice(cart, None) == (0, 1)
-
-
-@pytest.mark.parametrize(
-    ("asked", "sentence"),
-    [
-        ("y,rol", "did you mean `roll`?"),
-        ("y", "allowed are two different states such as `y,roll`."),
-        ("y,y", "allowed are two different states such as `y,roll`."),
-        ("y,z,roll", "allowed are two different states such as `y,roll`."),
-    ],
-)
-def test_a_slice_that_is_none_is_one_sentence(asked, sentence):
-    with pytest.raises(ech.EchelonError) as caught:
-        chosen_slice(ech.models.Quadrotor(), asked)
-    assert sentence in str(caught.value) and "`--slice`" in str(caught.value)
-
-
-# ---- pictures ----
+    assert basin.chosen_slice(quad, " roll , y ") == (6, 1)
+    velocity, angle = (quad.state_names[k] for k in basin.chosen_slice(quad, None))
+    assert (velocity, angle) in {("vx", "pitch"), ("vy", "roll")}
+    assert basin.chosen_slice(cart, None) == (0, 1)
+    different = "allowed are two different states such as `y,roll`."
+    for asked, sentence in (
+        ("y,rol", "did you mean `roll`?"), ("y", different), ("y,y", different),
+        ("y,z,roll", different),
+    ):  # fmt: skip
+        with pytest.raises(ech.EchelonError, match=re.escape(sentence)) as caught:
+            basin.chosen_slice(quad, asked)
+        assert "`--slice`" in str(caught.value)
 
 
 @pytest.mark.slow
@@ -294,14 +227,6 @@ def test_where_nothing_is_certified_the_picture_says_so(tmp_path):
 
 
 def test_one_state_has_modes_and_no_slice(tmp_path):
-    scenario = ech.scenario_from_mapping(
-        {
-            "name": "one",
-            "model": {"name": "linear", "parameters": {"A": [[0.0]], "B": [[1.0]]}},
-            "graph": {"name": "path", "agents": 3},
-            "leader": {"law": "passive"},
-            "simulation": {"horizon": 1.0, "dt": 0.01},
-        }
-    )
-    paths, radii = save_design_figures(*ech.build(scenario), tmp_path)
+    parts = resting(ech.models.Linear([[0.0]], [[1.0]]), ech.gains.Riccati())
+    paths, radii = save_design_figures(parts, ech.Settings(horizon=1.0, dt=0.01), tmp_path)
     assert [path.name for path in paths] == ["modes.png", "modes.pdf"] and radii is None

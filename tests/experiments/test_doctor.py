@@ -23,20 +23,13 @@ def verdict(name):
         return getattr(doctor, name)()
 
 
-def test_every_listed_model_is_tried(monkeypatch):
+def test_every_listed_model_is_tried_and_a_broken_one_found(monkeypatch):
     tried = []
-
-    def remember(model):
-        tried.append(type(model))
-        return check_model(model)
-
-    monkeypatch.setattr(doctor, "check_model", remember)
-    found = verdict("_models")
+    with monkeypatch.context() as changed:
+        changed.setattr(doctor, "check_model", lambda x: (tried.append(type(x)), check_model(x)))
+        found = verdict("_models")
     assert found.holds and found.found == f"{len(registry.MODELS)} models"
     assert len(set(tried)) == len(registry.MODELS)
-
-
-def test_a_broken_model_fails_the_check_of_models(monkeypatch):
     # Another class: of a model that was checked before it is known what was found.
     broken = type("SingleIntegrator", (SingleIntegrator,), {"drift": lambda self, x: x[:1]})
     monkeypatch.setattr(sys.modules["echelon.agents.models"], "SingleIntegrator", broken)
@@ -45,27 +38,21 @@ def test_a_broken_model_fails_the_check_of_models(monkeypatch):
     assert found.found == "`drift` of `SingleIntegrator` has shape (1,), and must have shape (2,)."
 
 
-def test_a_verb_that_computes_in_single_precision_fails_the_check_of_precision(monkeypatch):
+def test_a_verb_that_loses_or_switches_precision_fails_the_check_of_precision(monkeypatch):
     assert verdict("_precision_kept").holds
     honest = doctor.linearize
-
-    def rounds(model):
-        return honest(Pendulum(damping=float(jax.numpy.float32(model.damping))))
-
-    monkeypatch.setattr(doctor, "linearize", rounds)
-    assert not verdict("_precision_kept").holds
-
-
-def test_a_verb_that_switches_precision_for_good_fails_the_check_of_precision(monkeypatch):
-    honest = doctor.linearize
     with contextlib.ExitStack() as left:
+
+        def rounds(model):
+            return honest(Pendulum(damping=float(jax.numpy.float32(model.damping))))
 
         def switches(model):
             left.enter_context(numerics.precision("float64"))
             return honest(model)
 
-        monkeypatch.setattr(doctor, "linearize", switches)
-        assert not verdict("_precision_kept").holds
+        for false in (rounds, switches):
+            monkeypatch.setattr(doctor, "linearize", false)
+            assert not verdict("_precision_kept").holds
 
 
 def test_versions_are_those_of_what_is_imported_and_of_the_checkout():

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from runs import made_up, simulate
+from runs import made_up
 
 import echelon as ech
 from echelon.core.errors import Outcome
@@ -77,23 +77,14 @@ def test_leader_error_by_output_with_the_heading_wound():
 def stored():
     """The same saturating flight, with all frames stored and with few."""
     model, graph = ech.models.PlanarQuadrotor(), ech.Graph.path(3)
-    gain = ech.synthesize(model, graph, ech.gains.Riccati())
-
-    def fly(store_every):
-        return simulate(
-            model,
-            graph,
-            ech.Formation.line(model, graph),
-            leader=ech.laws.Tracking(ech.references.Circle(radius=1.0, rate=0.5)),
-            follower=ech.laws.Consensus(gain, feedforward="relay"),
-            initial={"position": 2.0},
-            horizon=12.0,
-            dt=0.02,
-            store_every=store_every,
-            seed=1,
-        )
-
-    return [fly(store_every) for store_every in (1, 7, 200)]
+    follower = ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.Riccati()))
+    leader = ech.laws.Tracking(ech.references.Circle(radius=1.0, rate=0.5))
+    formation = ech.Formation.line(model, graph)
+    parts = ech.Parts(
+        model, graph, formation, ech.Laws(leader, follower), initial={"position": 2.0}
+    )
+    chosen = ech.Settings(horizon=4.0, dt=0.02, seed=1, steady_window=0.8)
+    return [ech.simulate(parts, chosen._replace(store_every=every)) for every in (1, 7, 100)]
 
 
 def test_no_mean_depends_on_the_frames_that_are_stored(stored):
@@ -102,33 +93,20 @@ def test_no_mean_depends_on_the_frames_that_are_stored(stored):
     for numbers in few:
         for one, other in zip(every.followers, numbers.followers, strict=True):
             assert one == pytest.approx(other, rel=1e-12)
-        assert every.leader[:2] == pytest.approx(numbers.leader[:2], rel=1e-12)
-        assert every.leader.rmse_by_output == pytest.approx(
-            numbers.leader.rmse_by_output, rel=1e-12
-        )
+        for one, other in zip(every.leader, numbers.leader, strict=True):
+            assert one == pytest.approx(other, rel=1e-12)
         edges = [edge.distance_rmse for edge in every.edges]
         assert edges == pytest.approx([edge.distance_rmse for edge in numbers.edges], rel=1e-12)
-
-
-def test_means_are_those_of_the_frames_where_every_step_is_stored(stored):
-    result, numbers = stored[0], metrics(stored[0])
-    errors = result.formation_errors[:-1]
-    rms = np.sqrt(np.mean(errors**2, axis=0))
-    assert [each.rmse for each in numbers.followers] == pytest.approx(rms[1:].tolist(), rel=1e-12)
+    # Where every step is stored they are those of the frames.
+    result = stored[0]
+    rms = np.sqrt(np.mean(result.formation_errors[:-1] ** 2, axis=0))
+    assert [each.rmse for each in every.followers] == pytest.approx(rms[1:].tolist(), rel=1e-12)
     trim, scale = result.model.trim[1], np.asarray(result.model.input_scale)
     v = np.linalg.solve(scale, (result.inputs[:-1, 1] - np.asarray(trim)).T)
     effort = np.sqrt(np.mean(np.sum(v**2, axis=0)))
-    assert numbers.followers[0].effort == pytest.approx(effort, rel=1e-12)
+    assert every.followers[0].effort == pytest.approx(effort, rel=1e-12)
     by_output = np.sqrt(np.mean(output_errors(result)[:-1] ** 2, axis=0))
-    assert list(numbers.leader.rmse_by_output.values()) == pytest.approx(by_output, rel=1e-9)
-
-
-def test_effort_is_of_the_normalized_input_about_the_trim():
-    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(2)
-    inputs = np.tile(np.asarray(model.trim[1]), (4, 2, 1))
-    inputs[:, 1] += np.asarray(model.input_scale) @ [3.0, 0.0, 4.0, 0.0]
-    result = made_up(np.zeros((4, 2, 12)), model, graph, inputs=inputs)
-    assert metrics(result).followers[0].effort == pytest.approx(5.0, rel=1e-12)
+    assert list(every.leader.rmse_by_output.values()) == pytest.approx(by_output, rel=1e-9)
 
 
 def test_what_does_not_exist_is_none():
@@ -139,9 +117,7 @@ def test_what_does_not_exist_is_none():
     numbers = metrics(diverged)
     assert all(each.rmse is None and each.settling_time is None for each in numbers.followers)
     assert numbers.worst_steady is None and numbers.edges[0].distance_rmse is None
-
-
-def test_a_run_without_a_frame_has_no_numbers():
+    # Nor has a run without a frame any number.
     model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(2)
     result = made_up(np.zeros((1, 2, 2)), model, graph, outcome=Outcome.INTERRUPTED)
     gone = {name: getattr(result, name)[:0] for name in ("times", "states", "inputs")}
@@ -149,30 +125,6 @@ def test_a_run_without_a_frame_has_no_numbers():
     numbers = metrics(nothing)
     assert numbers.followers[0].rmse is None and numbers.minimum_distance is None
     assert "interrupted" in ech.report(nothing)
-
-
-@pytest.mark.slow
-def test_the_relay_is_a_fixed_point_of_the_formation():
-    """Started on their goals, followers told the leader's input stay there to rounding."""
-    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(3)
-    formation = ech.Formation.from_offsets(model, graph, {1: (1, 0, 0), 2: (2, 0, 0)})
-    result = simulate(
-        model,
-        graph,
-        formation,
-        leader=ech.laws.Tracking(ech.references.Lemniscate()),
-        follower=ech.laws.Consensus(
-            ech.synthesize(model, graph, ech.gains.Riccati()), feedforward="relay"
-        ),
-        start_error={"x": -6.0, "y": 3.0},
-        horizon=2.0,
-        dt=0.01,
-    )
-    assert result.formation_errors.max() < 1e-13
-    assert result.saturated[0] > 0.0
-
-
-# ---- the smallest distance --------------------------------------------------------------------
 
 
 def passing(agents=12, offset=1e3):
@@ -200,31 +152,26 @@ def test_the_closest_pair_is_who_was_closest_and_when(agents):
     assert told["vehicle_radius"] == pytest.approx(0.07)
 
 
-def test_agents_whose_only_state_is_a_place_have_a_closest_pair():
+@pytest.mark.filterwarnings("error")
+def test_any_agents_with_a_place_have_a_closest_pair():
     model = ech.models.SingleIntegrator(dimension=1)
     states = np.array([[[0.0], [3.0], [5.0]], [[0.0], [3.0], [3.5]]])
     found = made_up(states, model, ech.Graph.path(3)).approaches()
-    assert [(pair.agents, pair.distance, pair.time) for pair in found] == [
-        ((1, 2), 2.0, 0.0),
-        ((1, 2), 0.5, 1.0),
+    assert [(*pair.agents, pair.distance, pair.time) for pair in found] == [
+        (1, 2, 2.0, 0.0),
+        (1, 2, 0.5, 1.0),
     ]
-
-
-def test_agents_in_one_place_and_frames_without_numbers_have_a_closest_pair_too():
-    model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(12)
-    states = np.zeros((3, 12, 2))
+    # In one place, with a frame without numbers.
+    model, states = ech.models.SingleIntegrator(2), np.zeros((3, 12, 2))
     states[0] = np.nan
-    result = made_up(states, model, graph)
+    result = made_up(states, model, ech.Graph.path(12))
     one, other = metrics(result).closest.agents
     assert one < other and metrics(result).closest[::2] == (0.0, 1.0)
     assert result.radius is None and not metrics(result).closest.touch(None)
-
-
-@pytest.mark.filterwarnings("error")
-def test_the_distance_of_agents_whose_squares_are_beyond_floats_is_known():
+    # So far off that squares are beyond floats.
     states = np.array([[[0.0, 0.0], [3e200, 4e200], [3e300, 0.0]]])
-    model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(3)
-    assert made_up(states, model, graph).closest_pair().distance == pytest.approx(5e200)
+    result = made_up(states, model, ech.Graph.path(3))
+    assert result.closest_pair().distance == pytest.approx(5e200)
 
 
 @pytest.mark.parametrize(("apart", "touch"), [(0.1399, True), (0.1401, False)])
@@ -237,14 +184,10 @@ def test_a_report_warns_of_agents_closer_than_two_radii(apart, touch):
     assert ("Smallest distance: 0.14 m, agents 0 and 1 at 0 s" in text) != touch
 
 
-@pytest.mark.parametrize(
-    "model", [ech.models.Quadrotor(arm=0.065), ech.models.PlanarQuadrotor(arm=0.065)]
-)
-def test_a_larger_vehicle_has_a_larger_radius(model):
-    assert model.radius == pytest.approx(0.14)
+def test_a_larger_vehicle_has_a_larger_radius_and_an_abstract_agent_none():
+    for model in (ech.models.Quadrotor(arm=0.065), ech.models.PlanarQuadrotor(arm=0.065)):
+        assert model.radius == pytest.approx(0.14)
 
-
-def test_an_abstract_agent_may_call_a_parameter_radius():
     class Wheel(ech.models.Pendulum):
         radius: float = -1.0
 

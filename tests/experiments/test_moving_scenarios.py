@@ -65,41 +65,37 @@ def test_a_motion_of_a_file_takes_its_parameters(tmp_path):
 LINE = {"name": "line"}
 
 
-@pytest.mark.parametrize(
-    ("motion", "message"),
-    [
+def reshape(at, over, shape=LINE):
+    return {"reshape": shape, "at": at, "over": over}
+
+
+def test_faults_of_motions_are_a_sentence_with_their_place():
+    beyond = {"offsets": {9: [1.0, 0.0]}}
+    for motion, message in (
         ([{}], "got none of `rotate`, `scale`, `reshape`, `python`, one is required"),
         ([{"rotate": 1.0, "scale": 0.1}], "got `rotate`, `scale`, allowed is one of"),
         ([{"scale": 0.1}], "rate: got nothing, `scale` needs this key"),
         ([{"rotate": 0.1, "at": 1.0}], "at: got a key that `rotate` does not take"),
         ([{"reshape": LINE, "at": 1.0}], "over: got nothing, `reshape` needs this key"),
-        ([{"reshape": LINE, "at": 1.0, "over": 0.0}], "over"),
+        ([reshape(1.0, 0.0)], "over"),
+        ([reshape(10.0, 1.0)], "at 10 s, allowed is a time before"),
         (
-            [{"reshape": LINE, "at": 10.0, "over": 1.0}],
-            "at 10 s, allowed is a time before",
-        ),
-        (
-            [{"reshape": LINE, "at": 1.0, "over": 3.0}, {"reshape": LINE, "at": 2.0, "over": 1.0}],
+            [reshape(1.0, 3.0), reshape(2.0, 1.0)],
             "the reshape at 2 s begins before that at 1 s ends, at 4 s",
         ),
         (
-            [{"reshape": {"offsets": {9: [1.0, 0.0]}}, "at": 1.0, "over": 3.0}],
+            [reshape(1.0, 3.0, beyond)],
             "an offset is given for agent 9, and agents are numbered from 0 to 2",
         ),
         (
-            [{"reshape": {"name": "line", "columns": 2}, "at": 1.0, "over": 3.0}],
+            [reshape(1.0, 3.0, LINE | {"columns": 2})],
             "columns: got a key that `line` does not take",
         ),
-    ],
-)
-def test_faults_of_motions_are_a_sentence_with_their_place(motion, message):
-    with pytest.raises(ScenarioError) as error:
-        built(*motion)
-    assert message in str(error.value) and "formation" in str(error.value)
-    assert len(str(error.value).splitlines()) == 1
-
-
-def test_an_assignment_without_starts_is_refused():
+    ):
+        with pytest.raises(ScenarioError) as error:
+            built(*motion)
+        assert message in str(error.value) and "formation" in str(error.value)
+        assert len(str(error.value).splitlines()) == 1
     with pytest.raises(ScenarioError, match="`assign: nearest` needs `initial.states`"):
         built(formation={"assign": "nearest"})
 
@@ -147,12 +143,3 @@ def test_check_states_that_a_reshape_passes_through_itself(echelon, here):
     safe = ["--set", "safety={radii: [0.1, 0.1, 0.1]}"]
     code, out, err = echelon("check", "through.yaml", *safe)
     assert code == 0 and err == "" and "in the reshape" not in out
-
-
-def test_errors_of_held_inputs_from_starts_at_the_goals_are_no_growth(tmp_path):
-    (tmp_path / "through.yaml").write_text(THROUGH)
-    run = ech.simulate(*ech.build(tmp_path / "through.yaml"))
-    assert 0.0 < run.formation_errors[-1].max() < 1e-2
-    text = " ".join(ech.report(run).split())
-    assert "All 2 followers stay within 0.01 m of their goals from " in text
-    assert "grows" not in text and "Cause" not in text

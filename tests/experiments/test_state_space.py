@@ -1,7 +1,5 @@
 """The closed loop as a linear system, and linear agents from MATLAB's files."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,19 +53,16 @@ def test_the_linear_system_answers_as_the_simulation(feedforward):
 
 def test_near_rest_a_quadrotor_moves_as_its_linear_system():
     model, graph = ech.models.PlanarQuadrotor(), ech.Graph.path(3, leaders=[0])
-    drive = ech.Laws(
-        ech.laws.Tracking(ech.references.Hover(position=(0.0, 0.0, 0.0))),
-        ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.Riccati())),
-    )
+    hover = ech.references.Hover(position=(0.0, 0.0, 0.0))
+    gain = ech.synthesize(model, graph, ech.gains.Riccati())
+    drive = ech.Laws(ech.laws.Tracking(hover), ech.laws.Consensus(gain))
     formation = ech.Formation.from_offsets(model, graph, {1: (1.0, 0.0), 2: (2.0, 0.0)})
-    off = 1e-4 * np.random.default_rng(1).normal(size=(2, 6))
-    initial = {k + 1: (row + formation.offsets[k + 1]).tolist() for k, row in enumerate(off)}
-    parts = ech.Parts(model, graph, formation, drive, initial=initial)
+    off = 1e-4 * np.random.default_rng(1).normal(size=(3, 6)) * [[0.0], [1.0], [1.0]]
+    parts = ech.Parts(model, graph, formation, drive, initial=off + formation.offsets)
     run = ech.simulate(parts, ech.Settings(horizon=1.0, dt=5e-4, store_every=400))
     A, _, C, _ = ech.state_space(parts)
-    first = (run.states[0] - formation.offsets).ravel()
     for t, x in zip(run.times, run.states, strict=True):
-        linear = C @ scipy.linalg.expm(A * t) @ first
+        linear = C @ scipy.linalg.expm(A * t) @ off.ravel()
         goals = x - formation.offsets
         assert np.abs(linear[6:] - (goals[1:] - goals[:1]).ravel()).max() < 2e-2 * np.abs(off).max()
     assert np.linalg.eigvals(A).real.max() < 0.0
@@ -88,28 +83,23 @@ def test_the_system_is_written_with_its_names(tmp_path):
     assert ech.state_space(alone).B.shape == (16, 0)
 
 
-@pytest.mark.parametrize(
-    ("name", "changes", "said"),
-    [
+def test_what_is_no_linear_system_is_refused():
+    large = "graph={name: path, agents: 500}"
+    for name, changes, said in (
         ("paper-global", [], "`StoppingLeader` has a memory"),
-        ("line-10", ["graph={name: path, agents: 500}"], "have 6000 states, and at most 2000"),
-    ],
-)
-def test_what_is_no_linear_system_is_refused(name, changes, said):
-    parts, _ = ech.build(ech.load_scenario(name, changes))
-    with pytest.raises(ech.EchelonError) as error:
-        ech.state_space(parts)
-    assert said in str(error.value)
+        ("line-10", [large], "have 6000 states, and at most 2000"),
+    ):
+        with pytest.raises(ech.EchelonError, match=said):
+            ech.state_space(ech.build(ech.load_scenario(name, changes)).parts)
 
 
-# ---- files of MATLAB ----
+FLOW = scipy.linalg.expm(0.1 * np.block([[*OSCILLATOR], [np.zeros((1, 3))]]))[:2]
 
 
 def test_a_discrete_model_is_repeated_at_its_samples():
-    A, B = OSCILLATOR
-    flow = scipy.linalg.expm(0.1 * np.block([[A, B], [np.zeros((1, 3))]]))
-    model = ech.models.Linear.discrete(flow[:2, :2], flow[:2, 2:], 0.1)
-    assert model.A == pytest.approx(A, abs=1e-12) and model.B == pytest.approx(B, abs=1e-12)
+    model = ech.models.Linear.discrete(FLOW[:, :2], FLOW[:, 2:], 0.1)
+    assert model.A == pytest.approx(OSCILLATOR[0], abs=1e-12)
+    assert model.B == pytest.approx(OSCILLATOR[1], abs=1e-12)
     # An integrator, whose eigenvalue 1 is repeated.
     model = ech.models.Linear.discrete([[1.0, 0.2], [0.0, 1.0]], [[0.02], [0.2]], 0.2)
     assert model.A == pytest.approx(np.array([[0.0, 1.0], [0.0, 0.0]]), abs=1e-12)
@@ -117,53 +107,44 @@ def test_a_discrete_model_is_repeated_at_its_samples():
 
 
 def test_a_run_repeats_a_sampled_loop_by_its_own_recursion(tmp_path):
-    A, B = OSCILLATOR
-    flow = scipy.linalg.expm(0.1 * np.block([[A, B], [np.zeros((1, 3))]]))
-    savemat(tmp_path / "plant.mat", {"A": flow[:2, :2], "B": flow[:2, 2:], "Ts": 0.1})
-    (tmp_path / "sampled.yaml").write_text(
-        json.dumps(
-            {
-                "name": "sampled",
-                "model": {"name": "linear", "file": "plant.mat"},
-                "graph": {"name": "path", "agents": 3},
-                "follower": {"gain": {"method": "riccati", "coupling": 1.2}},
-                "initial": {"spread": {"x1": 1.0, "x2": 1.0}},
-                "simulation": {"horizon": 3.0, "dt": 0.1, "substeps": 8},
-            }
-        )
-    )
-    result = ech.run(ech.load_scenario(tmp_path / "sampled.yaml"))
+    savemat(tmp_path / "plant.mat", {"A": FLOW[:, :2], "B": FLOW[:, 2:], "Ts": 0.1})
+    scenario = {
+        "name": "sampled",
+        "model": {"name": "linear", "file": "plant.mat"},
+        "graph": {"name": "path", "agents": 3},
+        "follower": {"gain": {"method": "riccati", "coupling": 1.2}},
+        "initial": {"spread": {"x1": 1.0, "x2": 1.0}},
+        "simulation": {"horizon": 3.0, "dt": 0.1, "substeps": 8},
+    }
+    result = ech.run(ech.scenario_from_mapping(scenario, tmp_path))
     gain = result.drive.gain
-    K = gain.coupling * np.linalg.inv(gain.R) @ (flow[:2, 2:] * 0 + B).T @ gain.P
+    K = gain.coupling * np.linalg.inv(gain.R) @ OSCILLATOR[1].T @ gain.P
     x, laplacian = result.states[0], result.graph.laplacian().toarray()
     for row in result.states[1:]:
         u = -(laplacian @ x) @ K.T
         u[0] = 0.0
-        x = x @ flow[:2, :2].T + u @ flow[:2, 2:].T
+        x = x @ FLOW[:, :2].T + u @ FLOW[:, 2:].T
         assert row == pytest.approx(x, abs=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        ({"B": np.eye(2)}, "lacks `A` and holds `B`; save the matrices by themselves"),
-        ({"A": np.eye(2), "B": np.eye(2), "D": np.eye(2)}, "`D` of `"),
-        ({"A": np.eye(2), "B": np.eye(3)}, "the shapes of `Linear` are A (2, 2), B (3, 3)"),
-        ({"A": np.array([["a"]]), "B": np.eye(1)}, "`A` of `Linear` "),
-        ({"A": np.diag([0.5, -0.5]), "B": np.eye(2), "Ts": 0.1}, "A has the eigenvalue -0.5"),
-        ({"A": np.eye(2), "B": np.eye(2), "Ts": -1.0}, "plant.mat` is -1.0, and must be one step"),
-        ({"A": np.eye(2), "B": np.eye(2), "Ts": [0.1, 0.2]}, "plant.mat` is 0.1 0.2, and must be"),
-        ({"A": 1j * np.eye(2), "B": np.eye(2)}, "`A` of `Linear` "),
-        (b"no matrices at all, but a text", "is not a MATLAB file that can be read"),
+def test_a_wrong_file_is_refused_in_one_sentence(tmp_path):
+    file, two = tmp_path / "plant.mat", {"A": np.eye(2), "B": np.eye(2)}
+    for content, said in (
         (None, "cannot be read: No such file"),
-    ],
-)
-def test_a_wrong_file_is_refused_in_one_sentence(tmp_path, content, said):
-    file = tmp_path / "plant.mat"
-    if isinstance(content, bytes):
-        file.write_bytes(content)
-    elif content is not None:
-        savemat(file, content)
-    with pytest.raises(ech.errors.ModelError) as error:
-        ech.models.Linear.read(file)
-    assert said in str(error.value) and "\n" not in str(error.value)
+        (b"no matrices at all, but a text", "is not a MATLAB file that can be read"),
+        ({"B": np.eye(2)}, "lacks `A` and holds `B`; save the matrices by themselves"),
+        (two | {"D": np.eye(2)}, "`D` of `"),
+        (two | {"B": np.eye(3)}, "the shapes of `Linear` are A (2, 2), B (3, 3)"),
+        ({"A": np.array([["a"]]), "B": np.eye(1)}, "`A` of `Linear` "),
+        (two | {"A": np.diag([0.5, -0.5]), "Ts": 0.1}, "A has the eigenvalue -0.5"),
+        (two | {"Ts": -1.0}, "plant.mat` is -1.0, and must be one step"),
+        (two | {"Ts": [0.1, 0.2]}, "plant.mat` is 0.1 0.2, and must be"),
+        (two | {"A": 1j * np.eye(2)}, "`A` of `Linear` "),
+    ):
+        if isinstance(content, bytes):
+            file.write_bytes(content)
+        elif content is not None:
+            savemat(file, content)
+        with pytest.raises(ech.errors.ModelError) as error:
+            ech.models.Linear.read(file)
+        assert said in str(error.value) and "\n" not in str(error.value)

@@ -1,10 +1,10 @@
 """Sweeps: each run has the bits that it has alone, and interrupted sweeps lose nothing."""
 
-import contextlib
 import json
 import os
+import pickle
+import shutil
 import signal
-import types
 from pathlib import Path
 
 import distributed
@@ -16,18 +16,15 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from processes import started, wait_for
-from typer.testing import CliRunner
 
 import echelon as ech
-from echelon.apps.cli.app import app
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps import workers as sweeps
 from echelon.experiments.sweeps.plan import Axis, Sweep, axes_of, read_axes
 from echelon.experiments.sweeps.sweep import _missing, compute
 from echelon.experiments.sweeps.sweep_dataset import columns_of, dataset_of, share_bounds, succeeded
 from echelon.experiments.sweeps.workers import SweepBatch
-from echelon.guarantees.promises.promise import promise, promises
-from echelon.output.plots import study_figures as sweep_plots
+from echelon.guarantees.promises.promise import guarantee, promises
 from echelon.output.plots.study_figures import sweep_figures
 from echelon.simulation.engine import batch, law_drive
 from echelon.simulation.engine.batch import Batch
@@ -70,41 +67,15 @@ def test_a_run_among_many_has_the_bits_that_it_has_alone(name, precision):
             check_same(found[k], ech.simulate(*runs[k]))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        "paper",
-        pytest.param("planar-quadrotor", marks=pytest.mark.study),
-        "paper-literal",
-        pytest.param("paper-line", marks=pytest.mark.study),
-    ],
-)
-def test_every_run_among_many_has_the_bits_that_it_has_alone(name):
-    runs = seeds(built(name), 20, engine="native", store_every=200)
-    found = list(Batch().fly(runs))
-    for k in (0, 19):
-        check_same(found[k], ech.simulate(*runs[k]))
-
-
-def parted(graph, model=None, leader=None, world=None, gains=(), **more):
-    """Yield parts of a formation, one for each coupling and weight of its gain."""
-    model = model or ech.models.DoubleIntegrator(dimension=2)
+def parted(graph, feedforward="relay", world=None, gains=()):
+    """Yield parts of double integrators, one for each coupling and weight of its gain."""
+    model = ech.models.DoubleIntegrator(dimension=2)
     formation = ech.Formation.line(model, graph, spacing=1.0)
     for coupling, weight in gains:
-        n = len(model.state_names)
-        gain = ech.synthesize(
-            model, graph, ech.gains.Riccati(coupling=coupling, Q=(weight * np.ones(n)).tolist())
-        )
-        follower = ech.laws.Consensus(gain, feedforward=more.get("feedforward", "relay"))
-        yield ech.Parts(
-            model,
-            graph,
-            formation,
-            ech.Laws(leader or ech.laws.TrimInput(), follower),
-            initial={"position": 1.0, "velocity": 0.3},
-            world=world or ech.World(),
-        )
+        method = ech.gains.Riccati(coupling=coupling, Q=[weight] * 4)
+        follower = ech.laws.Consensus(ech.synthesize(model, graph, method), feedforward)
+        laws, initial = ech.Laws(ech.laws.TrimInput(), follower), {"position": 1.0, "velocity": 0.3}
+        yield ech.Parts(model, graph, formation, laws, initial, world=world or ech.World())
 
 
 WIND = ech.World(disturbance=ech.Disturbance(rms={"velocity": 0.2}, hold=0.03))
@@ -122,9 +93,8 @@ OWN = [(1.0 + 0.1 * k, 1.0 + 0.2 * (k % 3)) for k in range(9)]
 def test_numbers_of_a_formations_own_are_its_own(name):
     graph, more = KINDS[name]
     chosen = ech.Settings(horizon=0.5, dt=0.01, store_every=10, engine="native")
-    runs = [
-        (parts, chosen._replace(seed=k)) for k, parts in enumerate(parted(graph, gains=OWN, **more))
-    ]
+    every = enumerate(parted(graph, gains=OWN, **more))
+    runs = [(parts, chosen._replace(seed=k)) for k, parts in every]
     found = list(Batch(1).fly(runs))
     assert len({r.states[-1].tobytes() for r in found}) == len(runs)
     for k in (0, 5):
@@ -133,13 +103,12 @@ def test_numbers_of_a_formations_own_are_its_own(name):
 
 
 def test_runs_that_no_program_shares_are_flown_by_themselves():
-    graph = ech.Graph.path(3)
-    [short] = parted(graph, gains=[(1.0, 1.0)])
+    [short] = parted(ech.Graph.path(3), gains=[(1.0, 1.0)])
     [longer] = parted(ech.Graph.path(4), gains=[(1.0, 1.0)])
     chosen = ech.Settings(horizon=0.5, dt=0.01, store_every=10, engine="native")
     runs = [(short, chosen), (longer, chosen), (short, chosen._replace(horizon=0.2))]
-    for one, (parts, each) in zip(Batch(1).fly(runs), runs, strict=True):
-        check_same(one, ech.simulate(parts, each))
+    for one, run in zip(Batch(1).fly(runs), runs, strict=True):
+        check_same(one, ech.simulate(*run))
 
 
 class Cubic(ech.ControlAffine):
@@ -156,11 +125,10 @@ class Cubic(ech.ControlAffine):
 
 def test_one_that_is_lost_is_told_as_alone_and_loses_no_other():
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
-    parts = ech.Parts(
-        Cubic(), ech.Graph.path(2), ech.Formation(np.zeros((2, 1))), drive, initial={"x": 0.8}
-    )
+    goals = ech.Formation(np.zeros((2, 1)))
+    parts = ech.Parts(Cubic(), ech.Graph.path(2), goals, drive, initial={"x": 0.8})
     chosen = ech.Settings(horizon=2.0, dt=0.01, store_every=5, engine="native")
-    runs = [(parts, chosen._replace(seed=k)) for k in range(10)]
+    runs = seeds((parts, chosen), 10)
     found = list(Batch(1).fly(runs))
     assert {r.outcome.name for r in found} == {"COMPLETED", "DIVERGED"}
     for one, run in zip(found, runs, strict=True):
@@ -173,14 +141,9 @@ def test_one_that_is_lost_is_told_as_alone_and_loses_no_other():
 def test_states_beyond_the_range_of_the_sines_go_on_by_jax():
     model, graph = ech.models.SingleIntegrator(dimension=1), ech.Graph.path(2)
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Agreement())
+    goals, chosen = ech.Formation(np.zeros((2, 1))), ech.Settings(0.1, 0.01, engine="native")
     starts = [np.array([[0.0], [far]]) for far in (1.0, 1e6, 2.0)]
-    runs = [
-        (
-            ech.Parts(model, graph, ech.Formation(np.zeros((2, 1))), drive, initial=start),
-            ech.Settings(horizon=0.1, dt=0.01, engine="native"),
-        )
-        for start in starts
-    ]
+    runs = [(ech.Parts(model, graph, goals, drive, initial=start), chosen) for start in starts]
     for one, run in zip(Batch(1).fly(runs), runs, strict=True):
         check_same(one, ech.simulate(*run))
 
@@ -188,16 +151,12 @@ def test_states_beyond_the_range_of_the_sines_go_on_by_jax():
 # ---- what has no native code ----
 
 
-@pytest.mark.parametrize("command", [["sweep", "--over", "seed=0..2"], ["compare"], ["run"]])
+@pytest.mark.parametrize("command", ["sweep", "compare", "run"])
 def test_native_code_over_a_network_is_refused_before_anything_is_made(echelon, here, command):
-    name, *more = command
-    native = [
-        "--set",
-        "simulation.engine=native",
-        "--set",
-        "network={rate: 50, prediction: packet}",
-    ]
-    code, out, err = echelon(name, "integrators", *more, *native, "--out", "o")
+    over = ("--over", "seed=0..2") if command == "sweep" else ()
+    network = "network={rate: 50, prediction: packet}"
+    changes = ("--set", network, "--set", "simulation.engine=native")
+    code, out, err = echelon(command, "integrators", *over, *changes, "--out", "o")
     assert (code, out) == (2, "") and not (here / "o").exists()
     assert "no native code for a network that is not ideal" in err and "simulating" not in err
 
@@ -212,20 +171,36 @@ class Bends(ech.laws.Law):
         return -self.gain * heard, memory
 
 
-WIND = ech.World(disturbance=ech.Disturbance(rms={"position": 0.3}, hold=0.05))
+GUSTS = ech.World(disturbance=ech.Disturbance(rms={"position": 0.3}, hold=0.05))
 
 
-@pytest.mark.parametrize(("gains", "world"), [((1.0, 0.5), WIND), ((1.0,), ech.World())])
+class Picky(ech.laws.Law):
+    """Refuses starts that are far out."""
+
+    most: float
+
+    def update(self, model, view, memory):
+        return -view.disagreement, memory
+
+    def refusals(self, model, states):
+        return [(k, "too far") for k in np.flatnonzero(np.abs(states).max(axis=1) > self.most)]
+
+
+def points_under(law, seeds, world=None, engine="auto"):
+    """Runs of three points under a law, one for each seed."""
+    model, graph = ech.models.SingleIntegrator(dimension=2), ech.Graph.path(3)
+    laws, formation = ech.Laws(ech.laws.TrimInput(), law), ech.Formation.line(model, graph)
+    initial, world = {"position": 1.0}, world or ech.World()
+    parts = ech.Parts(model, graph, formation, laws, initial=initial, world=world)
+    chosen = ech.Settings(horizon=0.5, dt=0.01, store_every=10, engine=engine)
+    return [(parts, chosen._replace(seed=k)) for k in seeds]
+
+
+@pytest.mark.parametrize(("gains", "world"), [((1.0, 0.5), GUSTS), ((1.0,), None)])
 def test_runs_without_native_code_are_stepped_side_by_side_and_say_why(monkeypatch, gains, world):
     for room in (law_drive, batch):
         monkeypatch.setattr(room, "is_long", lambda *_: True)
-    model, graph = ech.models.SingleIntegrator(dimension=2), ech.Graph.path(3)
-    chosen, runs = ech.Settings(horizon=0.5, dt=0.01, store_every=10), []
-    for gain in gains:
-        drive = ech.Laws(ech.laws.TrimInput(), Bends(gain))
-        formation = ech.Formation.line(model, graph)
-        parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0}, world=world)
-        runs += [(parts, chosen._replace(seed=k)) for k in (3, 4)]
+    runs = [run for gain in gains for run in points_under(Bends(gain), (3, 4), world)]
     alone = [ech.simulate(*run) for run in runs]
     monkeypatch.setattr(batch, "simulate", None)
     for one, other in zip(Batch(1).fly(runs), alone, strict=True):
@@ -235,22 +210,7 @@ def test_runs_without_native_code_are_stepped_side_by_side_and_say_why(monkeypat
 
 
 def test_a_start_that_a_law_refuses_is_refused_among_many():
-    class Picky(ech.laws.Law):
-        most: float
-
-        def update(self, model, view, memory):
-            return -view.disagreement, memory
-
-        def refusals(self, model, states):
-            return [(k, "too far") for k in np.flatnonzero(np.abs(states).max(axis=1) > self.most)]
-
-    model, graph = ech.models.SingleIntegrator(dimension=2), ech.Graph.path(3)
-    formation, runs = ech.Formation.line(model, graph), []
-    chosen = ech.Settings(horizon=0.5, dt=0.01, store_every=10, engine="native")
-    for most in (9.0, 2.6):
-        drive = ech.Laws(ech.laws.TrimInput(), Picky(most))
-        parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0})
-        runs.append([(parts, chosen._replace(seed=k)) for k in range(12)])
+    runs = [points_under(Picky(most), range(12), engine="native") for most in (9.0, 2.6)]
     easy, strict = (list(Batch(1).fly(some)) for some in runs)
     told = {str(each) for each in strict if isinstance(each, ech.EchelonError)}
     assert told == {"agent 2 starts where its law has no meaning: too far."}
@@ -261,18 +221,6 @@ def test_a_start_that_a_law_refuses_is_refused_among_many():
 
 
 # ---- what is promised ----
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "changes", [pytest.param([], marks=pytest.mark.study), ["simulation.dt=0.4"]]
-)
-def test_promises_of_many_seeds_are_those_of_each(changes):
-    experiment = built("van-der-pol", "simulation.horizon=4", "report.steady_window=1", *changes)
-    parts, chosen = experiment
-    asked = [chosen._replace(seed=k) for k in range(3)]
-    for one, each in zip(promises(parts, asked), asked, strict=True):
-        assert one.as_mapping() == promise(parts, each).as_mapping()
 
 
 def test_runs_with_noise_and_runs_without_fly_in_one_sweep():
@@ -289,11 +237,9 @@ def test_of_starts_that_no_tube_covers_none_is_promised_among_many():
     parts, chosen = built("paper-global", *far)
     asked = [chosen._replace(seed=k) for k in (0, 1)]
     first, second = promises(parts, asked)
-    assert [first.promised, second.promised] == [promise(parts, s).promised for s in asked]
+    for one, each in zip((first, second), asked, strict=True):
+        assert one.as_mapping() == guarantee(parts, each).as_mapping()
     assert first.tube is not second.tube
-
-
-# ---- the dataset ----
 
 
 def test_a_sweep_is_each_of_its_runs():
@@ -303,23 +249,18 @@ def test_a_sweep_is_each_of_its_runs():
     # Of oscillators, whose states have no common unit.
     assert "units" not in found["rmse"].attrs and "error_unit" not in found
     assert found["promise_rate"].attrs["units"] == "1/s"
-    for seed in (2,):
-        for coupling in (1.0, 2.0):
-            changes = [*SHORT, f"seed={seed}", f"follower.gain.coupling={coupling}"]
-            run = ech.run(ech.load_scenario("van-der-pol", changes))
-            here = found.sel({"seed": seed, "follower.gain.coupling": coupling})
-            told = ech.metrics(run)
-            followers = list(run.graph.followers)
-            np.testing.assert_allclose(
-                here["rmse"].values[followers], [f.rmse for f in told.followers], rtol=1e-9
-            )
-            assert np.isnan(here["rmse"].values[0])
-            last = np.linalg.norm(run.errors[-1], axis=1)
-            np.testing.assert_allclose(here["final_error"].values[followers], last[followers])
-            assert float(here["worst_final_error"]) == pytest.approx(last.max())
-            assert int(here["outcome"]) == 0 and int(here["promised"]) == int(
-                promise(run.parts, run.settings).promised
-            )
+    for coupling in (1.0, 2.0):
+        place = {"seed": 2, "follower.gain.coupling": coupling}
+        run = ech.run(scenario.with_(*(f"{key}={value}" for key, value in place.items())))
+        here, followers = found.sel(place), list(run.graph.followers)
+        rmse = [f.rmse for f in ech.metrics(run).followers]
+        np.testing.assert_allclose(here["rmse"].values[followers], rmse, rtol=1e-9)
+        assert np.isnan(here["rmse"].values[0])
+        last = np.linalg.norm(run.errors[-1], axis=1)
+        np.testing.assert_allclose(here["final_error"].values[followers], last[followers])
+        assert float(here["worst_final_error"]) == pytest.approx(last.max())
+        assert int(here["outcome"]) == 0
+        assert int(here["promised"]) == int(guarantee(run.parts, run.settings).promised)
 
 
 def test_formations_and_schedules_in_a_sweep_are_those_of_single_runs_by_jax():
@@ -346,15 +287,11 @@ def test_formations_and_schedules_in_a_sweep_are_those_of_single_runs_by_jax():
         np.testing.assert_allclose(errors[place][1:], alone[1:], rtol=1e-11)
 
 
-def test_what_cannot_be_made_is_refused_and_the_others_run():
+def test_agents_may_differ_in_number_and_what_cannot_be_made_is_refused():
     scenario = ech.load_scenario("van-der-pol", SHORT)
     found = ech.sweep(scenario, {"initial.states.1": [[0.0, 0.0], [1.0]]})
     assert found["outcome"].values.tolist() == [0, -1]
     assert "agent 1 has shape (1,)" in str(found["message"].values[1])
-
-
-def test_agents_may_differ_in_number():
-    scenario = ech.load_scenario("van-der-pol", SHORT)
     found = ech.sweep(scenario, {"graph.agents": [4, 6], "seed": [5]})
     assert found.sizes["agent"] == 6
     assert np.isnan(found["rmse"].values[0, 0, 4:]).all()
@@ -396,26 +333,22 @@ def test_what_is_missing_is_computed_once_in_the_batches_of_a_whole_sweep(cases,
     assert sum(count for _, count in whole) == runs
 
 
-@pytest.mark.parametrize(
-    "text, values",
-    [
-        ("seed=0..4", [0, 1, 2, 3, 4]),
-        ("a.b=1,2.5,4", [1, 2.5, 4]),
-        ("a.b=[1, 2],[3, 4]", [[1, 2], [3, 4]]),
-        ("graph.name=ring,path", ["ring", "path"]),
-        ("seed=7,10..12", [7, 10, 11, 12]),
-    ],
-)
-def test_values_are_read_and_written_as_on_the_command_line(text, values):
-    [axis] = read_axes([text])
-    assert list(axis.values) == values
-    assert [list(a.values) for a in read_axes([axis.text])] == [values]
+def test_values_are_read_and_written_as_on_the_command_line():
+    for text, values in {
+        "seed=0..4": [0, 1, 2, 3, 4],
+        "a.b=1,2.5,4": [1, 2.5, 4],
+        "a.b=[1, 2],[3, 4]": [[1, 2], [3, 4]],
+        "graph.name=ring,path": ["ring", "path"],
+        "seed=7,10..12": [7, 10, 11, 12],
+    }.items():
+        [axis] = read_axes([text])
+        assert list(axis.values) == values
+        assert [list(a.values) for a in read_axes([axis.text])] == [values]
 
 
 FAULTS = {
     "seed": "got no `key=values`, give them as in `seed=0..9`.",
     "seed=": "got no values, allowed are one or more.",
-    "seed=9..0": "got `9..0`, a range must ascend.",
     "seed=1,1": "got `1` twice, give each value once.",
     "seed=0..999999999999": "1e+12 runs are asked for, and 10000000 fit.",
     "follower.gain.couplng=1": "got an unknown key",
@@ -424,30 +357,22 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("text", FAULTS)
-def test_bad_axes_are_one_sentence_before_anything_runs(text, here):
-    done = CliRunner().invoke(app, ["sweep", "van-der-pol", "--over", text, "--out", "o"])
-    assert done.exit_code == 2 or done.exception is not None
-    said = str(done.exception)
-    assert said.startswith("--over ") and FAULTS[text] in said, said
-    assert not (here / "o").exists()
+def test_bad_axes_are_one_sentence_before_anything_runs(echelon, here):
+    for text, fault in FAULTS.items():
+        code, _, said = echelon("sweep", "van-der-pol", "--over", text, "--out", "o")
+        assert code == 2 and said.startswith("echelon: --over ") and fault in said, said
+        assert said.count("\n") == 1 and not (here / "o").exists()
 
 
 def test_too_many_runs_of_several_axes_and_of_many_agents_are_refused():
-    scenario = ech.load_scenario("van-der-pol")
-    with pytest.raises(
-        ech.errors.ScenarioError, match="^the sweep is too large: .* runs are asked"
+    many = {"seed": range(10**6)}
+    for changes, over, said in (
+        ([], {**many, "simulation.horizon": range(1, 100)}, "^the sweep is too large: .* are"),
+        (["graph.agents=2000"], many, "need .* of memory, and .* fit: .* runs"),
+        ([], {"initial": [{}], "initial.spread": [{}]}, "is inside `initial`, which varies too"),
     ):
-        ech.sweep(
-            scenario, {"seed": range(10**6), "simulation.horizon": [1.0 + k for k in range(99)]}
-        )
-    big = ech.load_scenario("van-der-pol", ["graph.agents=2000"])
-    with pytest.raises(ech.errors.ScenarioError, match="need .* of memory, and .* fit: .* runs"):
-        ech.sweep(big, {"seed": range(10**6)})
-    with pytest.raises(
-        ech.errors.ScenarioError, match="this key is inside `initial`, which varies too"
-    ):
-        axes_of({"initial": [{}], "initial.spread": [{}]})
+        with pytest.raises(ech.errors.ScenarioError, match=said):
+            ech.sweep(ech.load_scenario("van-der-pol", changes), over)
 
 
 def test_the_interval_of_a_share_is_wilsons():
@@ -459,10 +384,8 @@ def test_the_interval_of_a_share_is_wilsons():
 
 
 def test_figures_show_the_shares_that_the_batches_hold():
-    scenario = ech.load_scenario("van-der-pol", SHORT)
     over = {"follower.gain.coupling": [1.0, 2.0, 64.0], "simulation.dt": [0.01, 0.02]}
-    over["seed"] = [1, 2]
-    plan = Sweep(scenario, axes_of(over))
+    plan = Sweep(ech.load_scenario("van-der-pol", SHORT), axes_of({**over, "seed": [1, 2]}))
     rows = [
         {
             "outcome": 0,
@@ -473,9 +396,8 @@ def test_figures_show_the_shares_that_the_batches_hold():
         }
         for k in range(12)
     ]
-    data = dataset_of(
-        plan, [SweepBatch(0, columns_of(rows[:5])), SweepBatch(5, columns_of(rows[5:]))]
-    )
+    batches = [SweepBatch(0, columns_of(rows[:5])), SweepBatch(5, columns_of(rows[5:]))]
+    data = dataset_of(plan, batches)
     assert succeeded(data).sum("seed").values.tolist() == [[0, 0], [2, 2], [2, 2]]
     assert data["formation_rmse"].values.ravel().tolist() == [row["formation_rmse"] for row in rows]
     found = sweep_figures(data)
@@ -486,24 +408,12 @@ def test_figures_show_the_shares_that_the_batches_hold():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("coupling strength", "length of a step (s)")
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "linear")
     assert sorted(text.get_text() for text in ax.texts) == ["0/2"] * 2 + ["2/2"] * 4
-    shown = ax.collections[0].get_array()
-    assert shown.tolist() == [[0.0, 1.0, 1.0], [0.0, 1.0, 1.0]]
-    [left, _] = found["success"].axes
-    assert left.get_lines()[0].get_ydata().tolist() == [0.0, 1.0, 1.0]
-
-
-@pytest.mark.parametrize(
-    ("values", "scale", "ends"),
-    [
-        ([1.0, 2.0, 4.0, 8.0], "log", [0.5**0.5, 2**0.5, 8**0.5, 32**0.5, 128**0.5]),
-        ([1.0, 2.0, 3.0], "linear", [0.5, 1.5, 2.5, 3.5]),
-        ([0.0, 10.0, 100.0], "linear", [-5.0, 5.0, 55.0, 145.0]),
-        ([1.0, 100.0], "log", [0.1, 10.0, 1000.0]),
-    ],
-)
-def test_cells_of_a_map_end_half_way_between_values_on_their_axis(values, scale, ends):
-    assert sweep_plots._is_geometric(np.array(values)) == (scale == "log")
-    np.testing.assert_allclose(sweep_plots._cell_ends(np.array(values)), ends)
+    assert ax.collections[0].get_array().tolist() == [[0.0, 1.0, 1.0], [0.0, 1.0, 1.0]]
+    # Cells end half way between values on their axis.
+    ends = ax.collections[0].get_coordinates()
+    np.testing.assert_allclose(ends[0, :, 0], [0.5**0.5, 2**0.5, 128**0.5, 64 * 32**0.5])
+    np.testing.assert_allclose(ends[:, 0, 1], [0.005, 0.015, 0.025])
+    assert found["success"].axes[0].get_lines()[0].get_ydata().tolist() == [0.0, 1.0, 1.0]
 
 
 # ---- nothing is lost ----
@@ -528,29 +438,7 @@ def arrays(folder):
 
 
 def files(folder):
-    return {f.name: f.stat().st_mtime_ns for f in (folder / "batches").glob("*.npz")}
-
-
-@pytest.mark.slow
-def test_a_sweep_that_is_killed_goes_on_and_computes_nothing_again(here):
-    with started(SMALL, *SWEEP, "--out", here / "whole") as process:
-        assert process.wait(300) == 0, process.communicate()
-    with started(SMALL, *SWEEP, "--out", here / "cut") as process:
-        wait_for(process, lambda: len(files(here / "cut")) >= 2)
-        process.send_signal(signal.SIGKILL)
-        process.wait(10)
-    kept = files(here / "cut")
-    assert kept and not (here / "cut" / "sweep.nc").exists()
-    with started(SMALL, "sweep", "--resume", here / "cut", "--no-figures") as process:
-        wait_for(process, lambda: len(files(here / "cut")) > len(kept) or process.poll() == 0)
-        now = files(here / "cut")
-        assert all(now.get(name, stamp) == stamp for name, stamp in kept.items())
-        assert process.wait(300) == 0, process.communicate()
-    whole, cut = arrays(here / "whole"), arrays(here / "cut")
-    assert whole.keys() == cut.keys()
-    for name, values in whole.items():
-        np.testing.assert_array_equal(values, cut[name], err_msg=name)
-    assert not (here / "cut" / "batches").exists()
+    return list((folder / "batches").glob("*.npz"))
 
 
 @pytest.mark.slow
@@ -561,10 +449,9 @@ def test_ctrl_c_ends_a_sweep_soon_and_keeps_what_is_done(here):
         out, _ = process.communicate(timeout=60)
         assert process.returncode == 130
     told = json.loads(out)
-    assert told["outcomes"]["missing"] > 0
-    assert sum(told["outcomes"].values()) == told["runs"] == 192
     done = 192 - told["outcomes"]["missing"]
-    assert done and int((arrays(here / "cut")["outcome"] >= 0).sum()) == done
+    assert sum(told["outcomes"].values()) == told["runs"] == 192 and 0 < done < 192
+    assert int((arrays(here / "cut")["outcome"] >= 0).sum()) == done
 
 
 # In the middle of an instruction of Python that takes a minute, as a compilation does.
@@ -602,57 +489,156 @@ def test_a_sweep_that_is_stopped_before_its_first_batch_leaves_no_folder(echelon
     assert not Path("o").exists()
 
 
-def test_a_sweep_writes_its_folder_and_is_complete(here):
+def test_a_sweep_writes_its_folder_and_is_complete(echelon, here):
     call = ["sweep", "van-der-pol", "--over", "seed=0..2", "--out", "o"]
-    for change in SHORT:
-        call += ["--set", change]
-    done = CliRunner().invoke(app, call)
-    assert done.exit_code == 0, done.output
+    call += [word for change in SHORT for word in ("--set", change)]
+    assert echelon(*call)[0] == 0
     names = {"scenario.yaml", "inputs", "sweep.nc", "sweep.txt", "figures"}
     assert {path.name for path in (here / "o").iterdir()} == names
     told = (here / "o" / "sweep.txt").read_text()
     assert "3 runs: 3 completed." in told and "Settled to 0.01:" in told and " m;" not in told
-    again = CliRunner().invoke(app, ["sweep", "--resume", "o"])
-    assert again.exit_code == 0 and "nothing to do" in again.output
-    over = CliRunner().invoke(app, call)
-    assert "is not empty" in str(over.exception)
+    code, out, err = echelon("sweep", "--resume", "o")
+    assert code == 0 and "nothing to do" in out + err
+    assert "is not empty" in echelon(*call)[2]
+
+
+# ---- the states of runs ----
+
+OVER = {"seed": range(3), "follower.gain.coupling": [0.5, 1.0]}
+
+
+def oscillators(*changes):
+    return ech.load_scenario("van-der-pol", [*SHORT, *changes])
+
+
+def assert_states_of_single_runs(data):
+    assert data.states.dims == ("seed", "follower.gain.coupling", "time", "agent", "state")
+    assert data.inputs.dims[-1] == "input" and data.time.attrs["units"] == "s"
+    for seed, coupling in ((0, 0.5), (2, 1.0)):
+        place = {"seed": seed, "follower.gain.coupling": coupling}
+        changes = (f"{key}={value}" for key, value in place.items())
+        run = ech.run(oscillators("simulation.store_every=20", *changes))
+        np.testing.assert_allclose(data.time, run.times)
+        for name in ("states", "inputs"):
+            stored = data[name].sel(place)
+            np.testing.assert_allclose(stored, getattr(run, name), rtol=1e-9, atol=1e-12)
+
+
+def test_a_sweep_returns_the_states_of_its_runs():
+    data = ech.sweep(oscillators(), OVER, keep_states=20)
+    assert dict(data.sizes)["time"] == 4  # 0, 0.2, 0.4 and the end
+    assert_states_of_single_runs(data)
+    numbers = ech.sweep(oscillators(), OVER)
+    assert "states" not in numbers
+    # Sums are made between stored frames, and so round in another way.
+    xr.testing.assert_allclose(data[list(numbers)], numbers, rtol=1e-12)
+
+
+def test_the_command_writes_them_into_a_file_that_is_read_lazily(echelon, here):
+    call = ["sweep", "van-der-pol", "--over", "seed=0..2", "--over"]
+    call += ["follower.gain.coupling=0.5,1.0", "--no-figures", "--out", "o"]
+    call += [word for change in SHORT for word in ("--set", change)]
+    assert echelon(*call, "--keep-states", "20")[0] == 0
+    names = {"inputs", "scenario.yaml", "states.nc", "sweep.nc", "sweep.txt"}
+    assert {path.name for path in (here / "o").iterdir()} == names
+    with xr.open_dataset(here / "o" / "states.nc", engine="h5netcdf") as data:
+        assert not data.states._in_memory
+        assert data.states.encoding["chunksizes"] == (1, 1, 4, 6, 2)
+        assert_states_of_single_runs(data)
+        assert set(data.coords) >= {"time", "state_unit", "input_unit"}
+
+
+def test_a_killed_sweep_goes_on_with_the_same_bits_and_computes_nothing_again(
+    here, echelon, monkeypatch
+):
+    call = ["sweep", "integrators", "--over", "seed=0..31", "--keep-states", "25"]
+    call += ["--set", "simulation.horizon=1", "--no-figures", "--out"]
+    with started(SMALL.replace("_AGENT_STEPS = 1", "_MOST = 8"), *call, "o") as process:
+        wait_for(process, lambda: len(files(here / "o")) > 1)
+        process.send_signal(signal.SIGKILL)
+    kept, honest, computed = len(files(here / "o")), sweeps.Workers.batch, []
+    assert process.wait() != 0 and not (here / "o" / "states.nc").exists()
+
+    def batch(self, first, count, progress):
+        computed.append(count)
+        return honest(self, first, count, progress)
+
+    monkeypatch.setattr(sweeps, "_MOST", 8)
+    monkeypatch.setattr(sweeps.Workers, "batch", batch)
+    assert echelon("sweep", "--resume", "o", "--no-figures")[0] == 0
+    assert computed == [8] * (4 - kept) and not (here / "o" / "batches").exists()
+    assert echelon(*call, "whole")[0] == 0
+    assert (here / "o" / "states.nc").read_bytes() == (here / "whole" / "states.nc").read_bytes()
+    whole, cut = arrays(here / "whole"), arrays(here / "o")
+    assert whole.keys() == cut.keys()
+    for name, values in whole.items():
+        np.testing.assert_array_equal(values, cut[name], err_msg=name)
+
+
+def test_a_run_that_ends_early_has_no_states_after_that():
+    scenario = {
+        "name": "blowup",
+        "model": {"name": "linear", "parameters": {"A": [[50.0]], "B": [[1.0]]}},
+        "graph": {"name": "path", "agents": 3},
+        "follower": {"gain": {"method": "given", "P": "identity"}},
+        "initial": {"spread": {"x1": 1.0}},
+        "simulation": {"horizon": 40.0, "dt": 0.01},
+    }
+    data = ech.sweep(scenario, {"seed": range(2)}, keep_states=100)
+    finite = np.isfinite(data.states.values).all(axis=(2, 3))
+    assert finite[:, 0].all() and not finite[:, -1].any()
+    assert (np.diff(finite.astype(int)) <= 0).all()
+
+
+def test_what_cannot_be_stored_is_refused_before_anything_runs(echelon, here, monkeypatch):
+    for over, every, sentence in (
+        ({"graph.agents": [5, 6]}, 5, "--over graph.agents: its values change the agents"),
+        ({"simulation.horizon": [0.5, 1.0]}, 5, "--over simulation.horizon: its values change"),
+        ({"seed": range(10**6)}, 1, "the sweep is too large"),
+        ({"seed": [1]}, 0, "`keep_states` is 0"),
+    ):
+        with pytest.raises(ech.errors.ScenarioError, match=sentence):
+            ech.sweep(oscillators(), over, keep_states=every)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10, 10, 0))
+    code, _, fault = echelon("sweep", "integrators", "--over", "seed=0..9", "--keep-states", "1")
+    assert code == 2 and "store fewer, with a larger `--keep-states`" in fault
+    assert not list((here / "runs").iterdir())
+
+
+def test_a_plan_with_states_travels_without_its_parts():
+    plan = Sweep(oscillators(), axes_of({"seed": range(2)}), 10)
+    assert plan.frames is not None
+    again = pickle.loads(pickle.dumps(plan))
+    assert "first_built" not in vars(again) and again.frames == plan.frames
 
 
 # ---- on a cluster ----
 
 
 @pytest.mark.slow
-def test_a_cluster_gives_the_same_numbers_though_a_worker_is_killed():
+def test_a_cluster_gives_the_same_numbers_though_a_worker_is_killed(monkeypatch):
     scenario = ech.load_scenario("van-der-pol", SHORT)
     plan = Sweep(scenario, axes_of({"seed": range(80), "follower.gain.coupling": [1.0, 2.0]}))
     alone, shared = list[SweepBatch](), list[SweepBatch]()
     sweeps_of = {"n_workers": 2, "threads_per_worker": 1, "processes": True}
     with distributed.LocalCluster(**sweeps_of, dashboard_address=None) as cluster:
         workers = [nanny.pid for nanny in cluster.workers.values()]
-        with smaller_batches():
-            compute(plan, alone.append)
+        monkeypatch.setattr(sweeps, "_AGENT_STEPS", 1)
+        compute(plan, alone.append)
 
-            def keep(batch):
-                if not shared:
-                    os.kill(workers[0], signal.SIGKILL)
-                shared.append(batch)
+        def keep(batch):
+            if not shared:
+                os.kill(workers[0], signal.SIGKILL)
+            shared.append(batch)
 
-            compute(plan, keep, cluster=cluster.scheduler_address)
+        compute(plan, keep, cluster=cluster.scheduler_address)
     assert sum(batch.runs for batch in shared) == plan.count and len(shared) > 4
     one, two = dataset_of(plan, alone), dataset_of(plan, shared)
     for name in one:
         np.testing.assert_array_equal(one[name].values, two[name].values, err_msg=name)
 
 
-def smaller_batches():
-    patch = pytest.MonkeyPatch()
-    patch.setattr(sweeps, "_AGENT_STEPS", 1)
-    return contextlib.closing(types.SimpleNamespace(close=patch.undo))
-
-
 def test_a_cluster_that_does_not_answer_is_one_sentence():
     plan = Sweep(ech.load_scenario("van-der-pol", SHORT), axes_of({"seed": [1]}))
-    with pytest.raises(
-        ech.errors.OutputError, match=r"^the cluster at `nowhere:1` does not answer"
-    ):
+    with pytest.raises(ech.errors.OutputError, match="^the cluster at `nowhere:1` does not answer"):
         compute(plan, print, cluster="nowhere:1")

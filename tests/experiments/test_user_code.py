@@ -5,25 +5,19 @@ import pytest
 
 import echelon as ech
 
-MINE = '''
+MINE = """
 import jax.numpy as jnp
 import numpy as np
 import echelon as ech
 from echelon.synthesis.gains import Feedback
 
-
 class Pull(ech.Law):
-    """u = -strength z."""
-
     strength: float = 1.0
 
     def update(self, model, view, memory):
         return -self.strength * view.disagreement, memory
 
-
 class Steer(ech.Law):
-    """A leader at a constant velocity along its reference."""
-
     reference: ech.Reference
 
     def start(self, model):
@@ -32,10 +26,7 @@ class Steer(ech.Law):
     def update(self, model, view, memory):
         return jnp.asarray(self.reference.velocity, view.x.dtype), memory
 
-
 class Ray(ech.Reference):
-    """A straight line from the origin."""
-
     velocity: tuple = (1.0, 0.0)
 
     def __check_init__(self):
@@ -46,10 +37,7 @@ class Ray(ech.Reference):
         v = jnp.asarray(self.velocity, t.dtype)
         return jnp.concatenate([v * t, jnp.zeros(2, t.dtype)])
 
-
 class Heavy(ech.Method):
-    """P = weight I."""
-
     name = "heavy"
     weight: float = 1.0
 
@@ -57,11 +45,9 @@ class Heavy(ech.Method):
         n, m = linear.B.shape
         return Feedback(self.weight * np.eye(n), np.eye(m), None)
 
-
 class Fails(Heavy):
     def feedback(self, model, linear):
         return np.linalg.inv(np.zeros((2, 2)))
-
 
 class Restless(ech.Law):
     def prepared(self, model, graph):
@@ -69,7 +55,7 @@ class Restless(ech.Law):
 
     def update(self, model, view, memory):
         return view.x, memory
-'''
+"""
 
 SCENARIO = {
     "name": "own",
@@ -101,96 +87,63 @@ def test_a_law_a_reference_and_a_leader_of_ones_own_run(folder):
     assert run.inputs[0, 2] == pytest.approx([0.0, 0.2])
 
 
-def test_a_method_of_ones_own_makes_the_gain(folder):
+def test_a_method_of_ones_own_makes_the_gain_and_a_reference_leads_the_law_that_tracks(folder):
     follower = {"gain": {"python": "mine.py:Heavy", "weight": 3.0, "coupling": 0.5}}
     gain = ech.build(own(folder, follower=follower)).parts.drive.gain
     assert np.array_equal(gain.P, 3.0 * np.eye(2)) and gain.coupling == 0.5
     assert gain.method == "heavy"
-
-
-def test_a_reference_of_ones_own_leads_the_law_that_tracks(folder):
     run = ech.run(own(folder, leader=None, follower=None))
     assert run.states[-1, 0] == pytest.approx([0.5, 0.25])
 
 
+def law(name, **numbers):
+    return {"follower": {"law": {"python": f"mine.py:{name}"} | numbers}}
+
+
+def gain(method):
+    return {"follower": {"gain": {"python": method}}}
+
+
 SENTENCES = {
-    "a class that is not there": (
-        {"follower": {"law": {"python": "mine.py:Pul"}}},
-        "follower",
-        "`Pul` in `{folder}/mine.py` is not a `Law` class; it has `Pull`, `Steer`, `Restless` (did "
-        "you mean `Pull`?).",
-    ),
-    "a class of another kind": (
-        {"reference": {"python": "mine.py:Pull"}},
-        "reference",
-        "`Pull` in `{folder}/mine.py` is not a `Reference` class; it has `Ray`.",
-    ),
-    "a key that a law of one's own does not take": (
-        {"follower": {"law": {"python": "mine.py:Pull"}, "gain": {"method": "riccati"}}},
-        "follower.gain",
-        "got a key that the law `mine.py:Pull` does not take, allowed are the arguments "
-        "of its class.",
-    ),
-    "a file that is not there": (
-        {"follower": {"gain": {"python": "yours.py:Heavy"}}},
-        "follower.gain",
-        "the file `{folder}/yours.py` does not exist; a `python` path is relative to the scenario "
-        "file, and on the command line to the working folder.",
-    ),
-    "a key that the law lacks": (
-        {"follower": {"law": {"python": "mine.py:Pull", "strenght": 1.0}}},
-        "follower",
-        "got the parameter `strenght` of `mine.py:Pull`, allowed is `strength` (did you mean "
-        "`strength`?).",
-    ),
-    "a value that the reference refuses": (
-        {"reference": {"python": "mine.py:Ray", "velocity": [1, 2, 3]}},
-        "reference",
-        "`mine.py:Ray` refuses these parameters: ValueError: `velocity` must be two numbers.",
-    ),
-    "a reference that nobody takes": (
-        {"leader": {"law": {"python": "mine.py:Pull"}}},
-        "leader",
-        "got a `reference`, but the law `mine.py:Pull` takes none.",
-    ),
-    "a method that fails": (
-        {"follower": {"gain": {"python": "mine.py:Fails"}}},
-        "follower.gain",
-        "`mine.py:Fails` fails: LinAlgError: Singular matrix.",
-    ),
-    "a law that fails": (
-        {"follower": {"law": {"python": "mine.py:Restless"}}},
-        "follower",
-        "`mine.py:Restless` fails: KeyError: 'nothing'.",
-    ),
+    "follower: `Pul` in `{folder}/mine.py` is not a `Law` class; it has `Pull`, `Steer`, "
+    "`Restless` (did you mean `Pull`?).": law("Pul"),
+    "reference: `Pull` in `{folder}/mine.py` is not a `Reference` class; it has `Ray`.": {
+        "reference": {"python": "mine.py:Pull"}
+    },
+    "follower.gain: got a key that the law `mine.py:Pull` does not take, allowed are the "
+    "arguments of its class.": {
+        "follower": law("Pull")["follower"] | {"gain": {"method": "riccati"}}
+    },
+    "follower.gain: the file `{folder}/yours.py` does not exist; a `python` path is relative to "
+    "the scenario file, and on the command line to the working folder.": gain("yours.py:Heavy"),
+    "follower: got the parameter `strenght` of `mine.py:Pull`, allowed is `strength` (did you "
+    "mean `strength`?).": law("Pull", strenght=1.0),
+    "reference: `mine.py:Ray` refuses these parameters: ValueError: `velocity` must be two "
+    "numbers.": {"reference": {"python": "mine.py:Ray", "velocity": [1, 2, 3]}},
+    "leader: got a `reference`, but the law `mine.py:Pull` takes none.": {
+        "leader": law("Pull")["follower"]
+    },
+    "follower.gain: `mine.py:Fails` fails: LinAlgError: Singular matrix.": gain("mine.py:Fails"),
+    "follower: `mine.py:Restless` fails: KeyError: 'nothing'.": law("Restless"),
 }
 
 
-@pytest.mark.parametrize("name", SENTENCES)
-def test_each_fault_of_ones_own_code_has_its_sentence(folder, name):
-    sections, field, sentence = SENTENCES[name]
-    with pytest.raises(ech.EchelonError) as caught:
-        ech.build(own(folder, **sections))
-    said = sentence.replace("{folder}", str(folder))
-    assert str(caught.value) == f"mapping: {field}: {said}"
+def test_each_fault_of_ones_own_code_has_its_sentence(folder):
+    for sentence, sections in SENTENCES.items():
+        with pytest.raises(ech.EchelonError) as caught:
+            ech.build(own(folder, **sections))
+        assert str(caught.value) == "mapping: " + sentence.replace("{folder}", str(folder))
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("import sys; sys.exit()", "SystemExit: no message"),
-        ("1 / 0", "ZeroDivisionError: division by zero"),
-        ("def", "SyntaxError: invalid syntax"),
-    ],
-)
-def test_a_file_that_does_not_import_is_told(folder, text, said):
-    (folder / "mine.py").write_text(text)
-    with pytest.raises(ech.EchelonError) as caught:
-        ech.build(own(folder, reference=None, leader=None))
-    assert f"does not import: {said}" in str(caught.value)
-
-
-# ---- paths and keys that the command line sets ----
+def test_a_file_that_does_not_import_is_told(folder):
+    for text, said in {
+        "import sys; sys.exit()": "SystemExit: no message",
+        "1 / 0": "ZeroDivisionError: division by zero",
+        "def": "SyntaxError: invalid syntax",
+    }.items():
+        (folder / "mine.py").write_text(text)
+        with pytest.raises(ech.EchelonError, match=f"does not import: {said}"):
+            ech.build(own(folder, reference=None, leader=None))
 
 
 def test_a_path_on_the_command_line_is_relative_to_the_working_folder(folder, monkeypatch):
@@ -202,32 +155,27 @@ def test_a_path_on_the_command_line_is_relative_to_the_working_folder(folder, mo
     # Without a class it is no path, and stays as it was written.
     with pytest.raises(ech.EchelonError, match='got `"?mine.py"?`, allowed is a file and a class'):
         ech.load_scenario("paper", ["model.python=mine.py"])
-
-
-def test_a_gain_file_or_a_method_of_ones_own_takes_the_place_of_a_method(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    built = ech.build(ech.load_scenario("van-der-pol"))
-    ech.save_gain(built.parts.drive.gain, built.parts.model, built.parts.graph, folder / "g.json")
-    again = ech.load_scenario("van-der-pol", ["follower.gain.file=g.json"])
-    gain = ech.build(again).parts.drive.gain
-    assert np.array_equal(gain.P, built.parts.drive.gain.P)
-    mine = ech.load_scenario("van-der-pol", ["follower.gain.python=mine.py:Heavy"])
-    assert ech.build(mine).parts.drive.gain.method == "heavy"
-    # Both from the command line, neither gives way.
-    with pytest.raises(ech.EchelonError, match="got `file`, `python`, allowed is one of them"):
-        ech.load_scenario(
-            "van-der-pol", ["follower.gain.file=g.json", "follower.gain.python=mine.py:Heavy"]
-        )
-
-
-def test_a_model_of_ones_own_takes_the_place_of_a_named_one(folder, monkeypatch):
-    monkeypatch.chdir(folder)
+    # A model takes the place of a named one.
     (folder / "line.py").write_text(
         "import echelon as ech\n\n\nclass Line(ech.models.SingleIntegrator):\n    pass\n"
     )
     scenario = ech.load_scenario("integrators", ["model.python=line.py:Line"])
     assert scenario.model.name is None
     assert type(ech.build(scenario).parts.model).__name__ == "Line"
+
+
+def test_a_gain_file_or_a_method_of_ones_own_takes_the_place_of_a_method(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    parts = ech.build(ech.load_scenario("van-der-pol")).parts
+    ech.save_gain(parts.drive.gain, parts.model, parts.graph, folder / "g.json")
+    file, mine = "follower.gain.file=g.json", "follower.gain.python=mine.py:Heavy"
+    gain = ech.build(ech.load_scenario("van-der-pol", [file])).parts.drive.gain
+    assert np.array_equal(gain.P, parts.drive.gain.P)
+    gain = ech.build(ech.load_scenario("van-der-pol", [mine])).parts.drive.gain
+    assert gain.method == "heavy"
+    # Both from the command line, neither gives way.
+    with pytest.raises(ech.EchelonError, match="got `file`, `python`, allowed is one of them"):
+        ech.load_scenario("van-der-pol", [file, mine])
 
 
 def test_keys_that_only_another_law_takes_give_way_to_a_law_on_the_command_line():

@@ -8,12 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from echelon.core.errors import ScenarioError
-from echelon.experiments.scenario.yaml import (
-    apply_overrides,
-    dump_yaml,
-    inline_yaml,
-    read_yaml,
-)
+from echelon.experiments.scenario.yaml import apply_overrides, dump_yaml, inline_yaml, read_yaml
 
 WORDS = st.sampled_from(
     ["no", "null", "1e-3", "0x1F", ".5e3", "~", "- a", "a: b", "#", "é\x85\u2028"]
@@ -122,81 +117,54 @@ def test_words_mean_what_yaml_1_2_says(text, value):
     assert same(read(f"a: {text}"), {"a": value})
 
 
-def test_not_a_number_is_a_number():
+def test_not_a_number_is_a_number_and_whole_number_keys_stay():
     assert math.isnan(read(".nan")) and inline_yaml(math.nan) == ".nan"
+    keys = {1: "a", "2": "b", "1.5": "c", "true": "d"}
+    assert same(read("{1: a, '2': b, 1.5: c, true: d}"), keys)
 
 
-def test_whole_number_keys_stay_whole_numbers():
-    assert same(
-        read("{1: a, '2': b, 1.5: c, true: d}"), {1: "a", "2": "b", "1.5": "c", "true": "d"}
-    )
-
-
-def test_an_alias_stands_for_its_anchor():
+def test_an_alias_stands_for_its_anchor_and_a_missing_path_for_its_parent():
     document = read_yaml("a: &x\n  - 1\nb: *x\n", "f.yaml")
     assert document.data == {"a": [1], "b": [1]}
     assert document.place(("b",)) == "f.yaml:3" and document.place(("b", 0)) == "f.yaml:2"
+    assert document.place(("b", "c", 3)) == "f.yaml:3"
 
 
-def test_a_path_that_does_not_exist_has_the_place_of_its_parent():
-    document = read_yaml("a:\n  b: 1\n", "f.yaml")
-    assert document.place(("a", "c", 3)) == "f.yaml:1"
-
-
-def test_repeated_keys_are_told_with_both_lines():
-    document = read_yaml("a: 1\nb: {c: 1,\n  c: 2}\na: 3\n", "f.yaml")
-    assert [tuple(fault) for fault in document.faults] == [
+def test_repeated_keys_tags_and_keys_that_are_no_words_are_told():
+    document = read_yaml(
+        "a: 1\nb: {c: 1,\n  c: 2}\na: 3\nd: !!str 3\n? [1]\n: 2\ne: !!int x\n", "f.yaml"
+    )
+    assert sorted(tuple(fault) for fault in document.faults) == [
         ("f.yaml:3", "b.c", "got this key twice, the first is at f.yaml:2."),
         ("f.yaml:4", "a", "got this key twice, the first is at f.yaml:1."),
+        ("f.yaml:5", "d", "got the tag `!!str`, allowed are values without a tag."),
+        ("f.yaml:6", "", "got a list or mapping as a key, allowed is a word or a number."),
+        ("f.yaml:8", "e", "got the tag `!!int`, allowed are values without a tag."),
     ]
 
 
-def test_tags_and_keys_that_are_no_words_are_told():
-    document = read_yaml("a: !!str 3\n? [1]\n: 2\nb: !!int x\n", "f.yaml")
-    assert [tuple(fault) for fault in document.faults] == [
-        ("f.yaml:1", "a", "got the tag `!!str`, allowed are values without a tag."),
-        ("f.yaml:2", "", "got a list or mapping as a key, allowed is a word or a number."),
-        ("f.yaml:4", "b", "got the tag `!!int`, allowed are values without a tag."),
-    ]
+LETTERS = itertools.pairwise("abcdefgh")
+BOMB = "".join(f"- &{c} [{', '.join([f'*{b}'] * 9)}]\n" for b, c in LETTERS)
+NESTED = "got values nested too deep or within themselves, allowed is a plain tree."
+NOT_YAML = {
+    "a: 1\nb: [1, 2\nc: 3\n": "3: this is not YAML: expected ',' or ']', but got ':'.",
+    "a: 1\nb: c: d\n": "2: this is not YAML: mapping values are not allowed here.",
+    "a: 1\nb: \x07\n": "2: this is not YAML: the character 0x7 is not allowed.",
+    "a: *b\n": "1: this is not YAML: found undefined alias 'b'.",
+    "a: 1\n---\nb: 2\n": "2: this is not YAML: expected a single document in the stream, but found"
+    " another document.",
+    'a: "\\UFFFFFFFF"': "1: this is not YAML: it cannot be read.",
+    "a: &x [*x]\n": f"1: {NESTED}",
+    "[" * 5000: f"1: {NESTED}",
+    f"- &a [1, 1]\n{BOMB}": "1: got aliases for more than 10000 values, allowed is a plain tree.",
+}
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        (
-            "a: 1\nb: [1, 2\nc: 3\n",
-            "f.yaml:3: this is not YAML: expected ',' or ']', but got ':'.",
-        ),
-        ("a: 1\nb: c: d\n", "f.yaml:2: this is not YAML: mapping values are not allowed here."),
-        ("a: 1\nb: \x07\n", "f.yaml:2: this is not YAML: the character 0x7 is not allowed."),
-        ("a: *b\n", "f.yaml:1: this is not YAML: found undefined alias 'b'."),
-        (
-            "a: 1\n---\nb: 2\n",
-            "f.yaml:2: this is not YAML: expected a single document in the stream, but found"
-            " another document.",
-        ),
-        ('a: "\\UFFFFFFFF"', "f.yaml:1: this is not YAML: it cannot be read."),
-        (
-            "a: &x [*x]\n",
-            "f.yaml:1: got values nested too deep or within themselves, allowed is a plain tree.",
-        ),
-        (
-            "[" * 5000,
-            "f.yaml:1: got values nested too deep or within themselves, allowed is a plain tree.",
-        ),
-        (
-            "- &a [1, 1]\n"
-            + "".join(
-                f"- &{c} [{', '.join([f'*{b}'] * 9)}]\n" for b, c in itertools.pairwise("abcdefgh")
-            ),
-            "f.yaml:1: got aliases for more than 10000 values, allowed is a plain tree.",
-        ),
-    ],
-)
-def test_what_is_not_yaml_is_refused_with_its_line(text, sentence):
-    with pytest.raises(ScenarioError) as caught:
-        read_yaml(text, "f.yaml")
-    assert str(caught.value) == sentence
+def test_what_is_not_yaml_is_refused_with_its_line():
+    for text, sentence in NOT_YAML.items():
+        with pytest.raises(ScenarioError) as caught:
+            read_yaml(text, "f.yaml")
+        assert str(caught.value) == f"f.yaml:{sentence}"
 
 
 @pytest.mark.parametrize(
@@ -215,74 +183,43 @@ def test_an_override_is_a_path_and_a_value(text, data):
     assert same(apply_overrides(read_yaml("", "f.yaml"), [text]).data, data)
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("seed", "--set seed: got no `=`, allowed is `key=value`, as in `seed=7`."),
-        (
-            "=3",
-            "--set =3: got an empty key, allowed are keys joined by dots, as in"
-            " `simulation.dt=0.01`.",
-        ),
-        (
-            "a..b=3",
-            "--set a..b=3: got an empty key, allowed are keys joined by dots, as in"
-            " `simulation.dt=0.01`.",
-        ),
-        (
-            "a=[1,",
-            "--set a=[1,: this is not YAML: expected the node content, but found '<stream end>'.",
-        ),
-        (
-            "a={x: 1, x: 2}",
-            "--set a={x: 1, x: 2}: got this key twice, the first is at --set a={x: 1, x: 2}.",
-        ),
-        (
-            "s.x=1",
-            "--set s.x=1: got `x` inside `s`, allowed is a key inside a mapping or a list, but `s`"
-            " is `0`.",
-        ),
-        (
-            "l.2=1",
-            "--set l.2=1: got `2` inside `l`, allowed is an index of a list of 2, from 0.",
-        ),
-        (
-            "l.x=1",
-            "--set l.x=1: got `x` inside `l`, allowed is an index of a list of 2, from 0.",
-        ),
-    ],
-)
-def test_a_malformed_override_is_one_sentence(text, sentence):
-    with pytest.raises(ScenarioError) as caught:
-        apply_overrides(read_yaml("s: 0\nl: [1, 2]\n", "f.yaml"), [text])
-    assert str(caught.value) == sentence
+NO_KEY = "got an empty key, allowed are keys joined by dots, as in `simulation.dt=0.01`."
+NO_INDEX = "allowed is an index of a list of 2, from 0."
+MALFORMED = {
+    "seed": "got no `=`, allowed is `key=value`, as in `seed=7`.",
+    "=3": NO_KEY,
+    "a..b=3": NO_KEY,
+    "a=[1,": "this is not YAML: expected the node content, but found '<stream end>'.",
+    "a={x: 1, x: 2}": "got this key twice, the first is at --set a={x: 1, x: 2}.",
+    "s.x=1": "got `x` inside `s`, allowed is a key inside a mapping or a list, but `s` is `0`.",
+    "l.2=1": f"got `2` inside `l`, {NO_INDEX}",
+    "l.x=1": f"got `x` inside `l`, {NO_INDEX}",
+}
+
+
+def test_a_malformed_override_is_one_sentence():
+    for text, sentence in MALFORMED.items():
+        with pytest.raises(ScenarioError) as caught:
+            apply_overrides(read_yaml("s: 0\nl: [1, 2]\n", "f.yaml"), [text])
+        assert str(caught.value) == f"--set {text}: {sentence}"
 
 
 def test_overrides_replace_and_add_in_their_order():
     document = read_yaml("a: {1: [1, 2], '2': x, b: {c: 3}}\nn:\n", "f.yaml")
     texts = ["a.1.0=9", "a.2=y", "a.b.c=4", "a.3=[0]", "n.m.k=5", "a.b.c=6"]
-    done = apply_overrides(document, texts)
-    assert same(
-        done.data,
-        {"a": {1: [9, 2], "2": "y", "b": {"c": 6}, 3: [0]}, "n": {"m": {"k": 5}}},
-    )
+    done = {"a": {1: [9, 2], "2": "y", "b": {"c": 6}, 3: [0]}, "n": {"m": {"k": 5}}}
+    assert same(apply_overrides(document, texts).data, done)
     assert document.data["a"][1] == [1, 2]
 
 
 def test_the_place_of_an_overridden_value_is_the_override():
     document = read_yaml("a:\n  b: [1, 2]\n  c: 3\n", "f.yaml")
     done = apply_overrides(document, ["a.b=[7]", "x.y=1"])
-    assert {path: done.place(path) for path in [*document.places, ("x",), ("x", "y")]} == {
-        (): "f.yaml:1",
-        ("a",): "--set a.b=[7]",
-        ("a", "b"): "--set a.b=[7]",
-        ("a", "b", 0): "--set a.b=[7]",
-        ("a", "b", 1): "--set a.b=[7]",
-        ("a", "c"): "f.yaml:3",
-        ("x",): "--set x.y=1",
-        ("x", "y"): "--set x.y=1",
-    }
-    assert done.place(("a", "d")) == "--set a.b=[7]"
+    first, second = "--set a.b=[7]", "--set x.y=1"
+    places = {(): "f.yaml:1", ("a",): first, ("a", "b"): first, ("a", "b", 0): first}
+    places |= {("a", "b", 1): first, ("a", "c"): "f.yaml:3", ("x",): second, ("x", "y"): second}
+    found = {path: done.place(path) for path in [*document.places, ("x",), ("x", "y")]}
+    assert found == places and done.place(("a", "d")) == first
 
 
 @given(st.dictionaries(KEYS, DATA, max_size=3), DATA)

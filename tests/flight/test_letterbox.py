@@ -6,8 +6,9 @@ import random
 import numpy as np
 
 from echelon.agents.network.inbox import Inbox, Message, NamedValues, Received, Stamps
+from echelon_flight import wire
 from echelon_flight.pilot import Letterbox
-from echelon_flight.wire import Drop, Letter, Packet
+from echelon_flight.wire import Drop, LeaderPacket
 
 HEARS, LEADERS, NAMES = (0, 1, 3), (0, 1), ("x", "y")
 SAME = {
@@ -22,10 +23,12 @@ SAME = {
 def draw(draws, clock):
     time = clock + draws.choice((draws.uniform(-2.0, 0.2), -0.5, 0.0))
     said = time + draws.choice((draws.uniform(-1.0, 0.2), -0.25))
-    packet = Packet(draws.choice((0, 0, 1, 2)), said, (draws.random(), 0.0))
-    packet = draws.choice((packet, packet, packet, packet._replace(epoch=1), None))
+    packet = LeaderPacket(draws.choice((0, 0, 1, 2)), said, (draws.random(), 0.0))
+    packet = draws.choice((packet, packet, packet, packet._replace(term=1), None))
     value = draws.random(), draws.random()
-    return Letter(draws.choice((0, 1, 2, 3)), time, draws.choice((0, 1, 2, 0xFFFF)), value, packet)
+    return wire.Message(
+        draws.choice((0, 1, 2, 3)), time, draws.choice((0, 1, 2, 0xFFFF)), value, packet
+    )
 
 
 def as_message(letter):

@@ -54,11 +54,11 @@ def test_who_hears_nobody_flies_by_the_plan_and_then_holds(changes):
     assert min(speeds[60:100]) > 0.3 and max(speeds[350:]) < 1e-3
 
 
-def test_an_heir_leads_by_the_plan_when_its_leader_is_lost():
-    leadership = {"heirs": [1], "timeout": 0.3}
+def test_a_backup_leader_leads_by_the_plan_when_its_leader_is_lost():
+    leadership = {"backups": [1], "timeout": 0.3}
     agents = [ech.Agent(parts_of(), k, DT) for k in (0, 1, 2)]
     pilots = [pilot_of(agent, DT, leadership=leadership, hold=1.0)[0] for agent in agents]
-    x, places, epochs = [[0.0] * 4, [1.0, 0.0, 0.0, 0.0], [1.0, 0.8, 0.0, 0.0]], [], []
+    x, places, terms = [[0.0] * 4, [1.0, 0.0, 0.0, 0.0], [1.0, 0.8, 0.0, 0.0]], [], []
     for k in range(1_000):
         letters = []
         # The leader is lost after 3 s.
@@ -71,8 +71,8 @@ def test_an_heir_leads_by_the_plan_when_its_leader_is_lost():
             for pilot in pilots:
                 pilot.box.receive(letter, k * DT)
         places.append([p[:2] for p in x])
-        epochs.append(pilots[2].box.packet.epoch if k > 10 else 0)
-    assert epochs[330] == 0 and set(epochs[345:]) == {1}
+        terms.append(pilots[2].box.packet.term if k > 10 else 0)
+    assert terms[330] == 0 and set(terms[345:]) == {1}
     circle = ech.references.Circle(rate=0.5)
     for k in (700, 999):
         leader = np.asarray(circle(jnp.asarray(k * DT)))[:2]

@@ -26,14 +26,17 @@ class Cart(ech.models.DoubleIntegrator):
         return ech.models.Limits(np.eye(m), (-self.most,) * m, (self.most,) * m)
 
 
-def parts_of(model, kind, spread=1.0, **more):
+WIDE = {"position": 90.0, "velocity": 90.0}
+DOUBLE = ech.models.DoubleIntegrator(dimension=2)
+
+
+def parts_of(model, kind, spread=1.0, domain=WIDE, **more):
     """Parts under a law whose claim is that of a theorem."""
     formation = ech.Formation.line(model, GRAPH)
     if kind == "T5":
         circle = ech.references.Circle(radius=0.5, rate=0.2)
         laws = ech.Laws(ech.laws.StoppingLeader(reference=circle), ech.laws.StoppingPoint())
     else:
-        domain = {"position": 90.0, "velocity": 90.0}
         gain = ech.synthesize(model, GRAPH, ech.gains.RobustLQR(domain=domain))
         laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
     return ech.Parts(model, GRAPH, formation, laws, initial={"position": spread}, **more)
@@ -42,7 +45,7 @@ def parts_of(model, kind, spread=1.0, **more):
 @pytest.mark.parametrize("kind", ["T1", pytest.param("T5", marks=pytest.mark.slow)])
 def test_a_limit_leaves_a_claim_to_the_run(kind):
     weak, strong = (Cart(dimension=2, most=most) for most in (0.05, 1e3))
-    found = ech.promise(parts_of(weak, kind), SETTINGS)
+    found = ech.guarantee(parts_of(weak, kind), SETTINGS)
     told = found.as_mapping()
     assert found.verdict is GuaranteeVerdict.CONDITIONAL and not found.promised and found.claimed
     assert str(found.theorem) == kind == told["theorem"]
@@ -60,24 +63,18 @@ def test_a_limit_leaves_a_claim_to_the_run(kind):
 
 
 @pytest.mark.parametrize("kind", ["T1", "T5"])
-def test_without_limits_the_same_claim_is_guaranteed(kind):
-    free = ech.models.DoubleIntegrator(dimension=2)
+def test_a_claim_is_guaranteed_without_limits_of_the_model_and_of_every_plant(kind):
+    free, (wide, weak) = DOUBLE, (Cart(dimension=2, most=most) for most in (np.inf, 0.05))
     for parts, settings in (
         (parts_of(free, kind), SETTINGS),
-        (parts_of(Cart(dimension=2), kind), SETTINGS._replace(limits=False)),
+        (parts_of(weak, kind), SETTINGS._replace(limits=False)),
     ):
-        found = ech.promise(parts, settings)
+        found = ech.guarantee(parts, settings)
         assert found.verdict is GuaranteeVerdict.GUARANTEED and found.promised, found.sentence()
         assert found.sentence().startswith(("Proved", "Local guarantee"))
-
-
-@pytest.mark.parametrize("kind", ["T1", "T5"])
-@pytest.mark.parametrize("whose", ["all", "one"])
-def test_limits_of_a_plant_count_as_those_of_the_model(kind, whose):
-    wide, weak = (Cart(dimension=2, most=most) for most in (np.inf, 0.05))
-    world = ech.World(plant=weak) if whose == "all" else ech.World(plants={2: weak})
-    parts = parts_of(wide, kind, world=world)
-    assert ech.promise(parts, SETTINGS).verdict is GuaranteeVerdict.CONDITIONAL
+    for world in (ech.World(plant=weak), ech.World(plants={2: weak})):
+        found = ech.guarantee(parts_of(wide, kind, world=world), SETTINGS)
+        assert found.verdict is GuaranteeVerdict.CONDITIONAL
 
 
 def test_only_the_leader_at_its_limit_leaves_a_run_uncovered():
@@ -90,76 +87,58 @@ def test_only_the_leader_at_its_limit_leaves_a_run_uncovered():
     assert ech.summary(result)["covered"] is False
 
 
-def test_agents_that_keep_apart_with_too_weak_motors_are_conditional():
-    found = ech.promise(*ech.build(ech.load_scenario("crossing")))
+def test_the_badge_says_what_is_conditional_and_what_is_none():
+    found = ech.guarantee(*ech.build(ech.load_scenario("crossing")))
     assert found.verdict is GuaranteeVerdict.CONDITIONAL and str(found.theorem) == "T10"
     badge = promise_badge(found.as_mapping())
     assert badge["state"] == "edge" and WHILE in badge["short"]
-
-
-def test_what_claims_nothing_has_no_condition():
-    found = ech.promise(*ech.build(ech.load_scenario("leader-lost")))
+    found = ech.guarantee(*ech.build(ech.load_scenario("leader-lost")))
     assert found.verdict is GuaranteeVerdict.NONE and found.conditions == ()
     assert promise_badge(found.as_mapping())["short"] == "no guarantee"
 
 
-def test_one_agent_that_cannot_hold_its_trim_leaves_nothing_guaranteed():
-    change = "plant={agents: {2: {parameters: {motor_thrust: 0.06}}}}"
-    found = ech.promise(*ech.build(ech.load_scenario("paper", [change])))
-    assert not found.promised and "cannot hold the trim" in found.sentence()
+WEAK = "plant={agents: {2: {parameters: {motor_thrust: 0.06}}}}"
 
 
-@pytest.mark.parametrize(("minimum", "promised"), [(0.07, False), (0.03, True)])
-def test_motors_that_cannot_give_as_little_as_the_trim_leave_nothing_guaranteed(minimum, promised):
-    # A Crazyflie of 28 g hovers at 0.028 * 9.81 / 4 = 0.0687 N a motor.
-    change = f"actuator={{minimum: {minimum}}}"
-    found = ech.promise(*ech.build(ech.load_scenario("paper", [change])))
-    assert found.promised is promised
-    assert ("more than the trim needs" in found.sentence()) is not promised
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (WEAK, "cannot hold the trim"),
+        # A Crazyflie of 28 g hovers at 0.028 * 9.81 / 4 = 0.0687 N a motor.
+        ("actuator={minimum: 0.07}", "more than the trim needs"),
+        ("actuator={minimum: 0.03}", ""),
+    ],
+)
+def test_motors_that_cannot_give_what_the_trim_needs_leave_nothing_guaranteed(change, said):
+    found = ech.guarantee(*ech.build(ech.load_scenario("paper", [change])))
+    assert found.promised is (said == "") and said in found.sentence()
+    assert ("more than the trim" in found.sentence()) == ("0.07" in change)
 
 
 def test_a_domain_that_was_seen_at_stored_frames_alone_covers_no_run_from_outside_the_set():
-    model = ech.models.DoubleIntegrator(dimension=2)
-    gain = ech.synthesize(
-        model, GRAPH, ech.gains.RobustLQR(domain={"position": 1.0, "velocity": 4.0})
-    )
-    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
-    formation = ech.Formation.line(model, GRAPH)
-    starts = formation.offsets + np.array([[0, 0, 0, 0], [0.9, 0, 0, 0], [0.9, 0, 0, 0.0]])
-    parts = ech.Parts(model, GRAPH, formation, laws, initial=starts)
-    assert ech.promise(parts, SETTINGS).hypotheses[Hypothesis.STARTS].fails
+    parts = parts_of(DOUBLE, "T1", domain={"position": 1.0, "velocity": 4.0})
+    starts = parts.formation.offsets + np.array([[0, 0, 0, 0], [0.9, 0, 0, 0], [0.9, 0, 0, 0.0]])
+    parts = parts.replace(initial=starts)
+    assert ech.guarantee(parts, SETTINGS).hypotheses[Hypothesis.STARTS].fails
     for every, covered in ((1, True), (5, None)):
         result = ech.simulate(parts, SETTINGS._replace(store_every=every))
         assert ech.summary(result)["covered"] is covered
 
 
-# ---- every reader --------------------------------------------------------------------------------
-
-FILE = """
-import numpy as np
-import echelon as ech
-
-class Cart(ech.models.DoubleIntegrator):
-    most: float = 0.05
-    @property
-    def input_limits(self):
-        return ech.models.Limits(np.eye(2), (-self.most,) * 2, (self.most,) * 2)
-"""
-SCENARIO = """
+SCENARIO = f"""
 name: carts
-model: {python: "cart.py:Cart", parameters: {dimension: 2}}
-graph: {name: path, agents: 3}
-formation: {name: line}
-reference: {name: circle, radius: 0.5, rate: 0.2}
-follower: {law: stopping-point}
-initial: {spread: {position: 1.0}}
-simulation: {horizon: 2.0, dt: 0.01}
+model: {{python: "{__file__}:Cart", parameters: {{dimension: 2}}}}
+graph: {{name: path, agents: 3}}
+formation: {{name: line}}
+reference: {{name: circle, radius: 0.5, rate: 0.2}}
+follower: {{law: stopping-point}}
+initial: {{spread: {{position: 1.0}}}}
+simulation: {{horizon: 2.0, dt: 0.01}}
 """
 
 
 @pytest.mark.slow
 def test_check_run_sweep_verify_and_json_agree(echelon, tmp_path):
-    (tmp_path / "cart.py").write_text(FILE)
     (tmp_path / "carts.yaml").write_text(SCENARIO)
     code, out, _ = echelon("check", "carts.yaml")
     assert code == 1 and f"while {WHILE}" in " ".join(out.split())

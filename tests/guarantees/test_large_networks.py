@@ -1,19 +1,14 @@
 """Steps and margins of networks: true for every eigenvalue, by NumPy on drawn loops."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import scipy.linalg
+from held_loops import delayed_growth, growth, radii
 
 import echelon as ech
+from echelon.core.linear import discretize
 from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Verdict
-from echelon.synthesis.certificates.margins import ClosedLoop, delay_margin
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-from held_loops import delayed_growth, growth, radii  # noqa: E402
 
 STRENGTHS = np.geomspace(0.5, 5.0, 60)
 DT = 0.2
@@ -44,28 +39,35 @@ def lost_in_steps(A, B, K):
 
 
 def crowd(lost, count):
-    """A star of so many followers, one of which has a lost strength; its eigenvalues, ascending."""
+    """Weights of so many followers, one of which has a lost strength, ascending."""
     low, high = STRENGTHS[0], STRENGTHS[-1]
     near = np.geomspace(1.0, (lost[0] / low) ** 0.5, count // 2)
     far = np.geomspace(1.0, (high / lost[-1]) ** 0.5, count - 1 - len(near))
-    weights = np.sort(np.concatenate([low * near, [np.sqrt(lost[0] * lost[-1])], high / far]))
-    return ech.Graph([(0, k + 1, w) for k, w in enumerate(weights)]), weights
+    return np.sort(np.concatenate([low * near, [np.sqrt(lost[0] * lost[-1])], high / far]))
+
+
+def star(weights):
+    return ech.Graph([(0, k + 1, w) for k, w in enumerate(weights)])
 
 
 def parts_of(A, B, P, graph):
     model = ech.models.Linear(A, B)
     gain = ech.synthesize(model, graph, ech.gains.FixedGain(P=P.tolist(), coupling=1.0))
-    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
-    return ech.Parts(model, graph, ech.Formation(np.zeros((graph.agents, len(A)))), drive)
+    return parts_under(model, graph, gain)
 
 
-@pytest.mark.parametrize("count", [33, 61, 500])
+def parts_under(model, graph, gain, **more):
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    goals = ech.Formation(np.zeros((graph.agents, len(model.state_names))))
+    return ech.Parts(model, graph, goals, laws, **more)
+
+
+@pytest.mark.parametrize("count", [33, 500])
 def test_a_step_that_one_follower_in_the_midst_does_not_bear_is_refused(count):
     A, B, P, lost = lost_between(count, lost_in_steps)
-    graph, weights = crowd(lost, count)
+    weights, settings = crowd(lost, count), ech.Settings(2.0, DT)
     assert radii(A, B, B.T @ P, weights, DT).max() > 1.0
-    settings = ech.Settings(2.0, DT)
-    found = ech.promise(parts_of(A, B, P, graph), settings)
+    found = ech.guarantee(parts_of(A, B, P, star(weights)), settings)
     assert found.hypotheses[Hypothesis.SAMPLING].verdict is Verdict.FAILS
     longest = found.longest_step(settings)
     assert radii(A, B, B.T @ P, weights, 0.999 * longest).max() < 1.0
@@ -95,8 +97,7 @@ def test_margins_hold_inside_and_not_outside_for_every_follower(seed, count, hig
     K = B.T @ P
     low, top = within(A, K, B, lost, high)
     weights = np.sort(np.append([low, top], np.random.default_rng(0).uniform(low, top, count - 2)))
-    graph = ech.Graph([(0, k + 1, w) for k, w in enumerate(weights)])
-    found = ech.check(parts_of(A, B, P, graph), ech.Settings(1.0, 0.001)).lines
+    found = ech.check(parts_of(A, B, P, star(weights)), ech.Settings(1.0, 0.001)).lines
     lines = {line.statement: line for line in found}
     lower, upper = (float(x) for x in lines[Topic.GAIN].number_text.split(" to "))
     for factor, inside in ((lower, 1.01), (upper, 0.99)):
@@ -111,35 +112,85 @@ def test_margins_hold_inside_and_not_outside_for_every_follower(seed, count, hig
         assert (worst < 0.0) == decays or count > 150 and not decays
 
 
-@pytest.mark.parametrize("seed", range(30))
-def test_chains_of_integrators_with_two_inputs_have_a_delay_margin(seed):
-    rng = np.random.default_rng(seed)
-    orders = rng.integers(1, 5, 2)
-    n = int(orders.sum())
-    A, B = np.zeros((n, n)), np.zeros((n, 2))
-    for first, order, k in zip((0, orders[0]), orders, range(2)):
-        A[range(first, first + order - 1), range(first + 1, first + order)] = 1.0
-        B[first + order - 1, k] = 1.0
-    turn = rng.normal(size=(2, 2))
-    B = B @ turn
-    P = scipy.linalg.solve_continuous_are(A, B, np.diag(rng.uniform(0.1, 10.0, n)), np.eye(2))
-    lam = 2.0 - 2.0 * np.cos(np.pi * np.array([1.0, 3.0, 5.0]) / 7.0)
-    margin = delay_margin(ClosedLoop(A, B, P, np.eye(2), 0.6 / lam[0], lam))
-    G = 0.6 / lam[0] * B @ B.T @ P
-    for factor, decays in ((0.99, True), (1.01, False)):
-        worst = max(delayed_growth(A, k * G, factor * margin.delay, 12) for k in lam)
-        assert (worst < 0.0) == decays
-
-
-def test_the_slowest_mode_between_two_eigenvalues_is_none_too_fast():
-    # At strength 1 the modes nearly touch the axis, and at both ends they are far from it.
-    A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-0.5, -1.0, -1.0]])
-    A = A - 0.3 * np.eye(3)
+@pytest.mark.parametrize("shift", [0.3, 0.0])
+def test_the_slowest_mode_between_two_eigenvalues_is_none_too_fast(shift):
+    # At strength 1 modes nearly touch the axis, or pass it, and at both ends they are far from it.
+    A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-0.5, -1.0, -1.0]]) - shift * np.eye(3)
     B, P = np.array([[0.0], [0.0], [1.0]]), np.diag([40.0, 40.0, 1.0])
     P[2, :2] = P[:2, 2] = 4.0, 1.0
-    graph = ech.Graph.path(460)
-    loop = ech.promise(parts_of(A, B, P, graph), ech.Settings(1.0, 0.001)).loop
+    found = ech.guarantee(parts_of(A, B, P, ech.Graph.path(460)), ech.Settings(1.0, 0.001))
     eigenvalues = 2.0 - 2.0 * np.cos(np.pi * (2.0 * np.arange(1, 460) - 1.0) / 919.0)
-    worst = growth(A, B, B.T @ P, eigenvalues).max()
-    assert loop.closed.between and worst < 0.0
-    assert worst <= loop.slowest <= worst + 1e-3
+    loop, worst = found.loop, growth(A, B, B.T @ P, eigenvalues).max()
+    assert loop.closed.between and found.promised == (worst < 0.0) == (shift > 0.0)
+    assert loop.slowest > 0.0 if shift == 0.0 else worst <= loop.slowest <= worst + 1e-3
+
+
+# ---- the step with a held input: the integrator with its substeps beside the exact flow ----
+
+PATH = ech.Graph.path(4)
+
+
+def held_parts(A, B):
+    model = ech.models.Linear(A=A, B=B)
+    gain = ech.synthesize(model, PATH, ech.gains.Riccati())
+    return parts_under(model, PATH, gain, initial={model.state_names[0]: 0.1})
+
+
+def exact_radius(parts, dt):
+    """The spectral radius of the held loop, by SciPy's exponential and the path's own Laplacian."""
+    A, B = (np.array(part, float) for part in (parts.model.A, parts.model.B))
+    n, m = B.shape
+    block = scipy.linalg.expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)[:n]
+    S, gain = np.asarray(parts.model.input_scale, float), parts.drive.gain
+    K = gain.coupling * np.linalg.solve(gain.R, (B @ S).T @ gain.P)
+    L = np.diag([2.0, 2.0, 1.0]) - np.eye(3, k=1) - np.eye(3, k=-1)
+    F, G = block[:, :n], block[:, n:] @ S
+    return max(abs(np.linalg.eigvals(F - k * G @ K)).max() for k in np.linalg.eigvalsh(L))
+
+
+def sampling(parts, settings):
+    found = ech.guarantee(parts, settings)
+    return found, found.hypotheses[Hypothesis.SAMPLING]
+
+
+def test_an_integrator_that_damps_what_a_held_input_drives_guarantees_nothing():
+    parts = held_parts([[0.0, 1.0], [-400.0, 0.0]], [[0.0], [1.0]])
+    assert exact_radius(parts, 0.12) == pytest.approx(1.78, abs=0.01)
+    found, line = sampling(parts, ech.Settings(horizon=12.0, dt=0.12))
+    assert line.verdict is Verdict.FAILS and not found.promised
+    assert line.number == pytest.approx(exact_radius(parts, 0.12), rel=1e-6)
+    # What runs with enough substeps is the exact flow, and grows.
+    settings = ech.Settings(horizon=12.0, dt=0.12, substeps=50)
+    assert not ech.guarantee(parts, settings).promised
+    errors = np.abs(ech.simulate(parts, settings).errors).max(axis=(1, 2))
+    assert errors[-1] > 1e6 * errors[0]
+    found, _ = sampling(parts, ech.Settings(horizon=12.0, dt=0.02))
+    assert exact_radius(parts, 0.02) < 1.0 and found.promised
+
+
+def test_a_stiff_model_asks_for_substeps_and_not_for_a_weaker_gain():
+    A = [[0.0, 1.0, 0.0], [0.0, -20.0, 400.0], [0.0, -50.0, -50000.0]]
+    parts, settings = held_parts(A, [[0.0], [0.0], [1000.0]]), ech.Settings(horizon=3.0, dt=0.01)
+    assert exact_radius(parts, 0.01) < 1.0
+    found, line = sampling(parts, settings)
+    assert not found.promised and found.reasons == ("errors grow in steps of the integrator",)
+    assert "lower the gain" not in line.remedy
+    enough = int(line.remedy.partition("substeps: ")[2].partition("`")[0])
+    settings = settings._replace(substeps=enough)
+    more, line = sampling(parts, settings)
+    assert more.promised and line.verdict is Verdict.HOLDS
+    errors = np.abs(ech.simulate(parts, settings).errors).max(axis=(1, 2))
+    assert errors[-1] < errors[0]
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "euler"])
+@pytest.mark.parametrize("substeps", [1, 2, 7])
+def test_substeps_are_steps_of_the_integrator_one_after_another(integrator, substeps):
+    draws = np.random.default_rng(0)
+    A, B = draws.normal(size=(3, 3)), draws.normal(size=(3, 2))
+    F, G = discretize(A, B, 0.3 / substeps, integrator)
+    whole = np.eye(3), np.zeros((3, 2))
+    for _ in range(substeps):
+        whole = F @ whole[0], F @ whole[1] + G
+    for part, own in zip(discretize(A, B, 0.3, integrator, substeps), whole, strict=True):
+        np.testing.assert_allclose(part, own, atol=1e-14)

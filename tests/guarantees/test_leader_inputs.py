@@ -26,11 +26,12 @@ class Growing(ech.ControlAffine):
         return derivatives[0]
 
 
-def parts_of(domain, gain_of, leader):
-    model = Growing()
-    gain = ech.synthesize(model, LINE, gain_of(domain))
+def promised(leader, **inputs):
+    """The guarantee on half a unit of both axes and these inputs, behind a leader under a gain."""
+    model, settings = Growing(), ech.Settings(4.0, 0.01)
+    gain = ech.synthesize(model, LINE, ech.gains.RobustLQR({"x": 0.5, "y": 0.5, **inputs}))
     drive = ech.Laws(leader(gain), ech.laws.Consensus(gain, feedforward="relay"))
-    return ech.Parts(model, LINE, ech.Formation(np.zeros((4, 2))), drive)
+    return ech.guarantee(ech.Parts(model, LINE, ech.Formation(np.zeros((4, 2))), drive), settings)
 
 
 def pushed(gain, push):
@@ -41,24 +42,16 @@ def pushed(gain, push):
     for u in inputs[:-1]:
         x = states[-1]
         states.append(x + 0.01 * (-0.1 * x + (1.0 + 0.5 * x) * u))
-    path = ech.references.StatePath(times, states, inputs)
-    return ech.laws.Tracking(path, gain)
+    return ech.laws.Tracking(ech.references.StatePath(times, states, inputs), gain)
 
 
 @pytest.mark.parametrize("push", [0.9, 0.3])
 def test_small_errors_are_guaranteed_only_with_inputs_that_the_hull_covers(push):
-    chosen = ech.Settings(4.0, 0.01)
-    named = {"x": 0.5, "y": 0.5}
-
-    def promise(domain):
-        parts = parts_of(domain, ech.gains.RobustLQR, lambda gain: pushed(gain, push))
-        return ech.promise(parts, chosen)
-
-    bare = promise(named)
+    bare = promised(lambda gain: pushed(gain, push))
     assert bare.region is None or bare.theorem is not Theorem.T2
     line = " ".join(x.text for x in bare.hypotheses.values())
     assert "the leader's own input reaches" in line and ("`vy`" in line or "`vx`" in line)
-    covered = promise({**named, "vx": 0.5, "vy": 0.5})
+    covered = promised(lambda gain: pushed(gain, push), vx=0.5, vy=0.5)
     if push < 0.5:
         assert covered.theorem is Theorem.T2
         assert "vx in [-0.5, 0.5], vy in [-0.5, 0.5]" in covered.domain
@@ -67,9 +60,7 @@ def test_small_errors_are_guaranteed_only_with_inputs_that_the_hull_covers(push)
 
 
 def test_a_domain_says_which_inputs_stay_at_the_trim():
-    domain = {"x": 0.5, "y": 0.5, "vx": 0.5}
-    parts = parts_of(domain, ech.gains.RobustLQR, lambda _: ech.laws.TrimInput())
-    found = ech.promise(parts, ech.Settings(1.0, 0.01))
+    found = promised(lambda _: ech.laws.TrimInput(), vx=0.5)
     assert found.theorem is Theorem.T2
     assert "vx in [-0.5, 0.5], vy at its trim" in found.domain
     assert "vy at its trim" in found.sentence()

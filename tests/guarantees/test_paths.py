@@ -12,7 +12,7 @@ from echelon.agents.models.chains import chains_of
 from echelon.core.enclosure.taylor import enclose_derivatives
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.stopping.path_bounds import path_fault, pieces_of
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 
@@ -41,6 +41,9 @@ def shifted():
     line = jax.custom_jvp(lambda t: 1.0 * t)
     line.defjvp(lambda at, by: (1.0 * at[0], 2.0 * by[0]))
     return line
+
+
+QUADROTOR = ech.models.Quadrotor()
 
 
 KNOTS = np.arange(5.0)
@@ -115,28 +118,25 @@ def test_a_smooth_path_is_accepted_and_enclosed_with_its_derivatives(name):
 
 @pytest.mark.parametrize("reference", ["Lemniscate", "FigureEight", "Circle", "Hover", "Line"])
 def test_bundled_paths_are_smooth_for_any_horizon(reference):
-    quadrotor = chains_of(ech.models.Quadrotor())
     for horizon in (1e-3, 60.0, 1e6):
-        assert path_fault(getattr(ech.references, reference)(), quadrotor, horizon) == ""
+        path = getattr(ech.references, reference)()
+        assert path_fault(path, chains_of(QUADROTOR), horizon) == ""
 
 
 def test_waypoints_fit_together_as_their_class_says():
     times, points = [0.0, 2.0, 5.0], [(0.0, 0.0, 1.0), (1.0, 2.0, 1.0), (0.0, 1.0, 2.0)]
     path = ech.references.Waypoints(times, points)
-    assert path_fault(path, chains_of(ech.models.Quadrotor()), 10.0) == ""
-    # On both sides of each knot the derivatives up to the third are the same.
+    assert path_fault(path, chains_of(QUADROTOR), 10.0) == ""
     with precision("float64"):
+        # On both sides of each knot the derivatives up to the third are the same.
         for t in times:
-            sides = [
-                path.derivatives(jnp.asarray(t + s), 3, ("x", "y", "z")) for s in (-1e-9, 1e-9)
-            ]
+            before, after = jnp.asarray(t - 1e-9), jnp.asarray(t + 1e-9)
+            sides = [path.derivatives(side, 3, ("x", "y", "z")) for side in (before, after)]
             assert np.allclose(*sides, atol=1e-5)
-
-    # Its parts are the path, whatever the run's length.
-    for horizon in (1.0, 4.0, 9.0):
-        begin, parts = 0.0, path.parts(horizon)
-        assert parts[-1][0] == horizon
-        with precision("float64"):
+        # Its parts are the path, whatever the run's length.
+        for horizon in (1.0, 4.0, 9.0):
+            begin, parts = 0.0, path.parts(horizon)
+            assert parts[-1][0] == horizon
             for end, part in parts:
                 for t in map(jnp.asarray, np.linspace(begin, end, 5)):
                     assert np.allclose(part(t), path(t), rtol=0.0, atol=1e-12)
@@ -148,13 +148,21 @@ def test_waypoints_fit_together_as_their_class_says():
 
     assert "bounded derivatives" in path_fault(Cut(times, points), chains_of(MODEL), 10.0)
 
+    # Nor are derivatives of another making those of the path.
+    class Told(ech.references.Circle):
+        def derivatives(self, t, order, coordinates):
+            return 0.0 * super().derivatives(t, order, coordinates)
+
+    assert "replaces `derivatives`" in path_fault(Told(), chains_of(MODEL), 10.0)
+
 
 @pytest.mark.parametrize("horizon", [60.0, 1e5])
 def test_the_bounds_of_a_path_hold_between_samples_however_long_it_is(horizon):
     # A moment in a long rest, which no sample of a run of a day would meet.
     times, heights = [0.0, 20.0, 20.7, 21.4, 22.1, 40.0], [1.0, 1.0, 1.2, 1.0, 1.1, 1.0]
     path = ech.references.Waypoints(times, [(0.0, 0.0, z) for z in heights])
-    pieces = pieces_of(leader_on(path), ech.models.Quadrotor(), horizon, ("z",), 2)
+    leader = StoppingLeader(reference=path).prepared(QUADROTOR, ech.Graph([(0, 1)]))
+    pieces = pieces_of(leader, QUADROTOR, horizon, ("z",), 2)
     with precision("float64"):
         clock = jnp.linspace(0.0, 40.0, 4001)
         every = np.asarray(jax.vmap(lambda t: path.derivatives(t, 2, ("z",)))(clock))[:, :, 0]
@@ -167,25 +175,12 @@ def test_the_bounds_of_a_path_hold_between_samples_however_long_it_is(horizon):
     assert float(pieces.times[-1]) == horizon
 
 
-def leader_on(path):
-    """A leader under the law, prepared for a quadrotor."""
-    return StoppingLeader(reference=path).prepared(ech.models.Quadrotor(), ech.Graph([(0, 1)]))
-
-
-def test_derivatives_of_another_making_are_not_those_of_the_path():
-    class Told(ech.references.Circle):
-        def derivatives(self, t, order, coordinates):
-            return 0.0 * super().derivatives(t, order, coordinates)
-
-    assert "replaces `derivatives`" in path_fault(Told(), chains_of(MODEL), 10.0)
-
-
 @pytest.mark.parametrize("name", ["where", "root", "sine"])
 def test_behind_a_rough_path_nothing_is_guaranteed(name):
     drive = ech.Laws(StoppingLeader(reference=along((ROUGH | SMOOTH)[name])), StoppingPoint())
     graph = ech.Graph([(0, 1), (1, 2)])
     parts = ech.Parts(MODEL, graph, ech.Formation(np.zeros((3, 4))), drive, initial={"x": 1.0})
-    found = promise(parts, ech.Settings(horizon=10.0, dt=0.01))
+    found = guarantee(parts, ech.Settings(horizon=10.0, dt=0.01))
     assert found.promised == (name == "sine")
     if not found.promised:
         assert "`Along` is not known to have 2 bounded derivatives" in found.sentence()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.laws import Consensus, TrimInput
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 
@@ -28,12 +28,11 @@ class Sinking(ech.ControlAffine):
 
 def formation(apart, coupling):
     """Two leaders so far apart (m) and their followers under stopping points, on a line."""
-    model = ech.models.DoubleIntegrator(2)
     states = np.zeros((4, 4))
     states[1, :2], states[3, 0] = (1.0, 2.0), apart
     drive = ech.Laws(StoppingLeader(coupling=coupling), StoppingPoint())
     goals = ech.Formation(np.zeros((4, 4)))
-    return ech.Parts(model, LINE, goals, drive, initial=states)
+    return ech.Parts(ech.models.DoubleIntegrator(2), LINE, goals, drive, initial=states)
 
 
 def shrinking(parts, begin, end):
@@ -43,7 +42,7 @@ def shrinking(parts, begin, end):
     sizes = np.linalg.norm(result.errors.reshape(len(result.times), -1), axis=1)
     first, last = np.searchsorted(result.times, [begin, end])
     measured = np.log(sizes[first] / sizes[last]) / (result.times[last] - result.times[first])
-    return measured, promise(parts, settings)
+    return measured, guarantee(parts, settings)
 
 
 @pytest.mark.parametrize("coupling", [0.05, 0.3])
@@ -52,34 +51,28 @@ def test_leaders_apart_come_together_no_faster_than_their_own_coupling(coupling)
     assert found.rate == pytest.approx(coupling) and measured == pytest.approx(coupling, rel=1e-2)
     assert found.slowest == -found.rate and found.tube.arrival is None
     assert f"decay at {coupling} 1/s or faster" in found.sentence()
-
-
-def test_leaders_that_start_alike_leave_the_rate_to_their_followers():
-    found = shrinking(formation(0.0, 0.05), 1.0, 2.0)[1]
-    assert found.rate == pytest.approx(4.0) and found.tube.arrival is not None
+    # Leaders that start alike leave the rate to their followers.
+    alike = guarantee(formation(0.0, coupling), ech.Settings(horizon=2.0, dt=0.02))
+    assert alike.rate == pytest.approx(4.0) and alike.tube.arrival is not None
 
 
 def test_passive_leaders_apart_come_together_by_their_own_drift():
-    model = Sinking()
-    law = Consensus(ech.synthesize(model, LINE, ech.gains.Riccati()))
-    for leader, rate in ((1.0, 0.05), (0.0, None)):
+    model, goals = Sinking(), ech.Formation(np.zeros((4, 1)))
+    laws = ech.Laws(TrimInput(), Consensus(ech.synthesize(model, LINE, ech.gains.Riccati())))
+    for leader, rate, times in ((1.0, 0.05, (10.0, 20.0)), (0.0, None, (0.5, 1.0))):
         states = np.array([[0.0], [1.0], [2.0], [leader]])
-        parts = ech.Parts(
-            model, LINE, ech.Formation(np.zeros((4, 1))), ech.Laws(TrimInput(), law), initial=states
-        )
-        measured, found = shrinking(parts, *((10.0, 20.0) if rate else (0.5, 1.0)))
+        measured, found = shrinking(ech.Parts(model, LINE, goals, laws, initial=states), *times)
         assert found.rate == pytest.approx(rate or -found.loop.slowest)
         assert measured == pytest.approx(found.rate, rel=0.05) and found.slowest == -found.rate
 
 
 def test_agents_without_chains_are_promised_at_the_coupling_that_their_step_holds():
     # Twice the root over lambda_min is more than the step holds, so that c d_max dt is 1.
-    graph = ech.Graph.from_edges([(k, k + 1) for k in range(9)], agents=10)
-    model = ech.models.SingleIntegrator(2)
     states = np.zeros((10, 2))
     states[1:] = np.random.default_rng(0).uniform(-1.0, 1.0, (9, 2))
-    drive = ech.Laws(StoppingLeader(), StoppingPoint())
-    parts = ech.Parts(model, graph, ech.Formation(np.zeros((10, 2))), drive, initial=states)
+    drive, goals = ech.Laws(StoppingLeader(), StoppingPoint()), ech.Formation(np.zeros((10, 2)))
+    model = ech.models.SingleIntegrator(2)
+    parts = ech.Parts(model, ech.Graph.path(10), goals, drive, initial=states)
     measured, found = shrinking(parts, 0.0, 2.0)
     assert found.promised and found.coupling * 2.0 * 0.02 == pytest.approx(1.0)
     assert measured > 0.0

@@ -12,13 +12,13 @@ import scipy.integrate
 import scipy.linalg
 
 import echelon as ech
-from echelon.agents.models.chains import Chains, chains_of, differentiate, flatten, look_for_chains
+from echelon.agents.models.chains import Chains, chains_of, differentiate, look_for_chains, to_flat
 from echelon.core.digits import at_least
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Theorem, Verdict
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.stopping.borders import Push, clearance_of
 from echelon.guarantees.stopping.chain_response import Chain, largest_between, spread_between, value
 from echelon.guarantees.stopping.stopping_run import stopping_run_of
@@ -32,6 +32,7 @@ from echelon.simulation.step.sequence import begin, step
 SLOW_ROOTS, FAST_ROOTS = (2.0, 2.5, 3.0), (4.0, 4.5, 5.0)
 QUADROTOR = ech.models.Quadrotor()
 PAPER_TREE = ech.Graph([(0, 1), (1, 2), (1, 3)])
+LAWS = StoppingLeader, StoppingPoint
 
 
 # ---- the certificate -----------------------------------------------------------------------------
@@ -39,16 +40,14 @@ PAPER_TREE = ech.Graph([(0, 1), (1, 2), (1, 3)])
 
 def companion(roots):
     """xdot = A x + b w for x = (v, v', ..) of q(D) v = -k0 w."""
-    q = np.poly(-np.array(roots))
     A = np.eye(len(roots), k=1)
-    A[-1] = -q[:0:-1]
-    return A, np.eye(len(roots))[-1] * -q[-1]
+    A[-1] = -np.poly(-np.array(roots))[:0:-1]
+    return A, np.eye(len(roots))[-1] * A[-1, 0]
 
 
 def kernels(roots, times):
     """The responses of v, v', .. to an impulse of w, (T, p), by matrix exponentials."""
-    A, b = companion(roots)
-    return along(A, b, times)
+    return along(*companion(roots), times)
 
 
 def along(A, x, times):
@@ -59,17 +58,16 @@ def along(A, x, times):
     return np.stack(found)
 
 
+KNOWN_GAINS = {
+    SLOW_ROOTS: (1.0, 1.316872427983539, 3.712144786533218, 36.78897017202196),
+    FAST_ROOTS: (1.0, 2.415919104, 12.392482658350794, 221.20388078803998),
+}
+
+
 @pytest.mark.parametrize(
-    ("roots", "known"),
-    [
-        (SLOW_ROOTS, (1.0, 1.316872427983539, 3.712144786533218, 36.78897017202196)),
-        (FAST_ROOTS, (1.0, 2.415919104, 12.392482658350794, 221.20388078803998)),
-        ((1.0, 2.0), None),
-        ((3.0,), None),
-        ((0.7, 1.1, 1.9, 3.2), None),
-    ],
+    "roots", [SLOW_ROOTS, FAST_ROOTS, (1.0, 2.0), (3.0,), (0.7, 1.1, 1.9, 3.2)]
 )
-def test_gains_are_those_of_quadrature(roots, known):
+def test_gains_are_those_of_quadrature(roots):
     chain, p = Chain.of(roots), len(roots)
     gains = [float(chain.gain(k)) for k in range(p + 1)]
     times = np.linspace(0.0, 25.0 / min(roots), 20_001)
@@ -79,28 +77,16 @@ def test_gains_are_those_of_quadrature(roots, known):
     last = responses @ companion(roots)[0][-1]
     areas = np.append(areas, np.prod(roots) + scipy.integrate.trapezoid(np.abs(last), times))
     np.testing.assert_allclose(gains, areas, rtol=2e-5)
-    if known:
-        np.testing.assert_allclose(gains, known, rtol=1e-9)
-
-
-def test_gains_of_two_roots_have_a_closed_form():
-    # h' of k0/((s+a)(s+b)) changes sign once, where h is largest, at t* = ln(b/a)/(b-a).
-    a, b = 1.5, 4.0
-    here, there = (np.exp(-rate * np.log(b / a) / (b - a)) for rate in (a, b))
-    top = a * b / (b - a) * (here - there)
-    assert float(Chain.of((a, b)).gain(1)) == pytest.approx(2.0 * top, rel=1e-9)
+    np.testing.assert_allclose(gains, KNOWN_GAINS.get(roots, gains), rtol=1e-9)
 
 
 def test_bounds_of_polynomials_are_above_and_near():
     draw = np.random.default_rng(0)
     for _ in range(20):
-        p = {
-            int(n): Fraction(int(c))
-            for n, c in zip(draw.permutation(9)[:4] + 1, draw.integers(-9, 9, 4))
-        }
+        terms = zip(draw.permutation(9)[:4] + 1, draw.integers(-9, 9, 4), strict=True)
+        p = {int(n): Fraction(int(c)) for n, c in terms}
         low, high = sorted(Fraction(int(x), 16) for x in draw.permutation(17)[:2])
-        xs = [low + (high - low) * Fraction(k, 500) for k in range(501)]
-        values = [value(p, x) for x in xs]
+        values = [value(p, low + (high - low) * Fraction(k, 500)) for k in range(501)]
         assert 0 <= largest_between(p, low, high) - max(values) < Fraction(1, 50)
         moved = sum(abs(b - a) for a, b in itertools.pairwise(values))
         assert 0 <= spread_between(p, low, high) - moved < Fraction(1, 50)
@@ -143,11 +129,6 @@ def test_the_room_of_the_quadrotors_designs():
             start = (factor * room.steepest, Fraction(0), Fraction(0))
             pushes = (Push(start, Fraction(s)),)
             assert (clearance_of(Chain.of(roots), 1, pushes, g).fall < g) == fits
-
-
-def test_roots_without_a_common_unit_are_refused():
-    with pytest.raises(EchelonError, match="common unit"):
-        Chain.of((4.0123, 4.5, 5.0))
 
 
 def test_the_time_of_arrival_is_that_of_its_equation():
@@ -196,43 +177,20 @@ def test_agreement_does_on_random_graphs_what_the_theorem_says():
 # ---- flat coordinates ----------------------------------------------------------------------------
 
 
-MODELS = (
-    ech.models.SingleIntegrator(),
-    ech.models.DoubleIntegrator(),
-    ech.models.Pendulum(),
-    ech.models.VanDerPol(),
-    ech.models.Unicycle(),
+MODELS = ("SingleIntegrator", "DoubleIntegrator", "Pendulum", "VanDerPol", "Unicycle")
+VEHICLES = ("PlanarQuadrotor", "Quadrotor", "QuadrotorEuler", "QuadrotorThrust")
+
+
+@pytest.mark.parametrize(
+    "name", [*MODELS, *(pytest.param(name, marks=pytest.mark.study) for name in VEHICLES)]
 )
-LONG_MODELS = (
-    ech.models.PlanarQuadrotor(),
-    ech.models.Quadrotor(),
-    ech.models.QuadrotorEuler(),
-    ech.models.QuadrotorThrust(),
-)
-
-
-def name_of(model):
-    return type(model).__name__
-
-
-def check_chains(model):
-    """What a model states of its chains is what is found at samples."""
+def test_a_model_has_the_chains_that_it_states(name):
+    model = getattr(ech.models, name)()
     stated = chains_of(model)
     with precision("float64"):
         found = look_for_chains(model, stated.outputs, stated.integrators)
     assert isinstance(found, Chains) and found.degrees == stated.degrees
     assert sum(found.degrees) == len(model.state_names) + sum(found.integrators)
-
-
-@pytest.mark.parametrize("model", MODELS, ids=name_of)
-def test_a_model_has_the_chains_that_it_states(model):
-    check_chains(model)
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("model", LONG_MODELS, ids=name_of)
-def test_a_vehicle_has_the_chains_that_it_states(model):
-    check_chains(model)
 
 
 def test_chains_are_found_where_nothing_is_stated():
@@ -249,24 +207,21 @@ def test_chains_are_found_where_nothing_is_stated():
     assert chains_of(Cart())[1:] == ((1, 1), (0, 0), ())
 
 
-@pytest.mark.parametrize(
-    ("model", "why"),
-    [
+def test_a_model_without_chains_is_told_what_is_missing():
+    for model, why in (
         (ech.models.UnicyclePoint(), "hold 2 of 3 states"),
         (ech.models.PrintedQuadrotor(), "rank 2 of 4"),
-    ],
-)
-def test_a_model_without_chains_is_told_what_is_missing(model, why):
-    with pytest.raises(EchelonError, match=why):
-        StoppingPoint().prepared(model, PAPER_TREE)
+    ):
+        with pytest.raises(EchelonError, match=why):
+            StoppingPoint().prepared(model, PAPER_TREE)
 
 
 def test_a_quadrotors_flat_coordinates_are_its_derivatives_along_its_motion():
     # By finite differences of the motion itself, which share nothing with the formulas.
     draw, chains = np.random.default_rng(1), chains_of(QUADROTOR)
     with precision("float64"):
-        one = jax.jit(lambda x, e: flatten(QUADROTOR, chains, x, e).values)
-        invert = jax.jit(lambda x, e, tops: flatten(QUADROTOR, chains, x, e).invert(tops))
+        one = jax.jit(lambda x, e: to_flat(QUADROTOR, chains, x, e).values)
+        invert = jax.jit(lambda x, e, tops: to_flat(QUADROTOR, chains, x, e).invert(tops))
         move = jax.jit(lambda x, u: QUADROTOR.velocity(x, u))
         for _ in range(5):
             x, e = draw.uniform(-0.7, 0.7, 12), draw.uniform(-2.0, 2.0, 2)
@@ -291,17 +246,15 @@ def test_a_quadrotors_flat_coordinates_are_its_derivatives_along_its_motion():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", LONG_MODELS[:2], ids=name_of)
-def test_flat_coordinates_are_those_of_automatic_differentiation(model):
-    draw, chains = np.random.default_rng(1), chains_of(model)
+@pytest.mark.parametrize("name", VEHICLES[:2])
+def test_flat_coordinates_are_those_of_automatic_differentiation(name):
+    model, draw = getattr(ech.models, name)(), np.random.default_rng(1)
+    chains = chains_of(model)
     with precision("float64"):
         for _ in range(3):
-            x = jnp.asarray(draw.uniform(-0.7, 0.7, len(model.state_names)))
-            e, tops = (
-                jnp.asarray(draw.uniform(-2, 2, 2)),
-                jnp.asarray(draw.uniform(-5, 5, len(chains.degrees))),
-            )
-            ours, theirs = (f(model, chains, x, e) for f in (flatten, differentiate))
+            sizes = (0.7, len(model.state_names)), (2.0, 2), (5.0, len(chains.degrees))
+            x, e, tops = (jnp.asarray(draw.uniform(-most, most, n)) for most, n in sizes)
+            ours, theirs = (f(model, chains, x, e) for f in (to_flat, differentiate))
             np.testing.assert_allclose(ours.values, theirs.values, atol=1e-12)
             np.testing.assert_allclose(ours.invert(tops), theirs.invert(tops), atol=1e-10)
 
@@ -331,16 +284,6 @@ def gaps(result):
     return np.linalg.norm(result.errors[:, 1:, :2], axis=2)
 
 
-def test_double_integrators_agree_to_rounding_on_a_moving_leader():
-    result = fly(flight(rate=3.0))
-    assert gaps(result)[-1].max() <= 1e-12 and result.saturated.max() == 0.0
-    # From agreement on they keep the speed that agreement asks for, on top of the leader's.
-    speeds = np.linalg.norm(result.errors[:, 1:, 2:], axis=2)
-    assert (
-        speeds.max() <= 2.5 * np.sqrt(2.0) + np.linalg.norm(result.errors[0, 1:, 2:], axis=1).max()
-    )
-
-
 def test_without_any_chain_a_step_is_that_of_the_linear_law():
     # A velocity that is commanded is zeta' itself, so Euler makes e+ = (I - c dt L) e.
     model, c, dt, steps = ech.models.SingleIntegrator(2), 0.8, 0.05, 40
@@ -354,17 +297,15 @@ def test_without_any_chain_a_step_is_that_of_the_linear_law():
 @pytest.mark.parametrize("hears", ["leaderward", pytest.param("all", marks=pytest.mark.slow)])
 def test_the_farthest_stopping_point_never_moves_away(hears):
     graph = ech.Graph([(0, 1, 0.4), (1, 2, 2.5), (2, 3), (1, 3, 0.7), (3, 4, 1.9)])
-    parts = flight(graph, hears=hears, observer=False)
-    settings = ech.Settings(horizon=6.0, dt=0.01)
+    parts, settings = flight(graph, hears=hears, observer=False), ech.Settings(6.0, 0.01)
     prepared = prepare(parts, settings)
     result = fly(parts, 6.0)
     flat = [stopping_run_of(prepared.parts, settings, x).flat for x in result.states[::20]]
     weights = prepared.parts.drive.follower.loop.weights
     stops = np.stack([np.einsum("rm,nrm->nm", weights, each) for each in flat])
     away = np.abs(stops[:, 1:] - stops[:, :1]).max(axis=1)
-    assert (np.diff(away, axis=0) <= 1e-3 * away[0].max()).all() and away[-1].max() < 0.05 * away[
-        0
-    ].max()
+    assert (np.diff(away, axis=0) <= 1e-3 * away[0].max()).all()
+    assert away[-1].max() < 0.05 * away[0].max()
 
 
 @pytest.mark.study
@@ -382,58 +323,41 @@ def test_told_by_its_parent_each_link_is_alone():
     ends = []
     for links in (2, 8):
         graph = ech.Graph.path(links + 1)
-        parts = flight(graph, feedforward="parent", spread=0.0, observer=False)
         states = np.zeros((links + 1, 4))
         states[:, 0] = np.arange(links + 1)[::-1] * 1.0
-        parts = parts.replace(initial=states)
+        parts = flight(graph, feedforward="parent", observer=False).replace(initial=states)
         found = gaps(fly(parts, 8.0))
         ends.append(float((found < 0.01).all(axis=1).argmax()))
     assert ends[1] <= 1.4 * ends[0]
 
 
 def test_the_step_alone_limits_a_coupling_that_is_left_open():
-    graph, parts = ech.Graph.path(12), flight(ech.Graph.path(12))
-    prepared = prepare(parts, ech.Settings(horizon=1.0, dt=0.02)).parts
+    prepared = prepare(flight(ech.Graph.path(12)), ech.Settings(horizon=1.0, dt=0.02)).parts
     c = float(prepared.drive.follower.strength(0.02))
     # Of two neighbours, and with room for the root 4.
-    assert c == pytest.approx(1.0 / (2.0 * 0.02 * 1.08)) and graph.spectrum().low < 0.05
+    assert c == pytest.approx(1.0 / (2.0 * 0.02 * 1.08))
 
 
-@pytest.mark.slow
-def test_an_observer_takes_wind_away_and_is_silent_without():
-    wind = ech.World(disturbance=ech.Disturbance(constant={"vx": 1.0}))
-    ends = {}
-    for observer in (True, False):
-        lone = flight(ech.Graph([(0, 1)]), observer=observer, world=wind, spread=0.5)
-        result = fly(lone, 20.0)
-        off = result.states[-1, 0, :2] - result.reference[-1, :2]
-        ends[observer] = float(np.linalg.norm(off))
-    # d / (root c) is left without: 1 / (4 * 8).
-    assert ends[True] <= 1e-3
-    assert ends[False] == pytest.approx(1.0 / 32.0, rel=0.1)
-    calm = [fly(flight(observer=o, spread=0.5), 4.0).states for o in (True, False)]
-    assert np.abs(calm[0] - calm[1]).max() <= 1e-4
-
-
-@pytest.mark.slow
-def test_native_steps_are_those_of_jax():
-    runs = [fly(flight(rate=3.0), 2.0, engine=engine) for engine in ("native", "jax")]
+@pytest.mark.parametrize(
+    ("graph", "law"), [(PAPER_TREE, {"rate": 3.0}), (ech.Graph.path(5), {"feedforward": "parent"})]
+)
+def test_native_steps_are_those_of_jax(graph, law):
+    runs = [fly(flight(graph, **law), 1.0, engine=engine) for engine in ("native", "jax")]
     assert [run.engine for run in runs] == ["native", "jax"]
     np.testing.assert_allclose(runs[0].states, runs[1].states, atol=1e-11)
     np.testing.assert_allclose(runs[0].inputs, runs[1].inputs, atol=1e-9)
-
-
-def test_parents_are_told_alike_by_native_code():
-    parts = flight(ech.Graph.path(5), feedforward="parent")
-    runs = [fly(parts, 1.0, engine=engine) for engine in ("native", "jax")]
-    np.testing.assert_allclose(runs[0].states, runs[1].states, atol=1e-11)
 
 
 # ---- what is promised ----------------------------------------------------------------------------
 
 
 def promised(parts, **settings):
-    return promise(parts, ech.Settings(**{"horizon": 10.0, "dt": 0.01, **settings}))
+    return guarantee(parts, ech.Settings(**{"horizon": 10.0, "dt": 0.01, **settings}))
+
+
+def outside(result):
+    """The seconds after which all stay within 1 cm."""
+    return 0.01 * (np.flatnonzero((gaps(result) >= 0.01).any(axis=1))[-1] + 1)
 
 
 @pytest.mark.parametrize(
@@ -442,11 +366,9 @@ def promised(parts, **settings):
 )
 def test_integrators_are_promised_from_everywhere_and_arrive_in_time(graph, told):
     parts = flight(graph, rate=3.0, feedforward=told)
-    found = promised(parts)
+    found, flown = promised(parts), outside(fly(parts))
     assert found.theorem is Theorem.T5 and found.kind is Kind.PROOF
     assert "any state of any agent" in found.sentence()
-    outside = np.flatnonzero((gaps(fly(parts)) >= 0.01).any(axis=1))
-    flown = 0.01 * (outside[-1] + 1)
     assert flown <= found.tube.arrival + 0.02 <= 1.6 * flown
 
 
@@ -486,32 +408,34 @@ def test_a_switch_between_two_steps_counts_from_the_next_step_on():
     cut, chain, dt = [(1, 2), (2, 3)], [(0, 1), (1, 2), (2, 3)], 0.4
     late = ech.Graph.switching([(0.0, cut), (0.1, chain)], agents=4)
     run = {"rate": 1.0, "coupling": 0.5, "speed": np.inf}
-    flights = (flight(graph, **run) for graph in (late, late.in_steps(dt)))
-    arrivals = [promised(each, dt=dt, horizon=40.0).tube.arrival for each in flights]
-    assert arrivals[0] == arrivals[1] > 0.0
+    one, other = (
+        promised(flight(graph, **run), dt=dt, horizon=40.0).tube.arrival
+        for graph in (late, late.in_steps(dt))
+    )
+    assert one == other > 0.0
     assert late.in_steps(dt).schedule.starts.tolist() == [0.0, 0.4]
     assert late.in_steps(0.05) is late
 
 
 def test_stretches_that_no_step_reaches_are_not_counted_on():
     chain, cut = [(0, 1), (1, 2), (2, 3)], [(1, 2), (2, 3)]
-    graph = ech.Graph.switching([(0.0, cut), (0.002, chain)], agents=4, period=0.01)
-    steps, rows = graph.schedule.switches(0.01, 1.0)
+
+    def turning(begin, period):
+        rows = [(0.0, cut), (begin, chain)]
+        return flight(ech.Graph.switching(rows, agents=4, period=period), rate=3.0)
+
+    steps, rows = turning(0.002, 0.01).graph.schedule.switches(0.01, 1.0)
     assert set(rows[steps < 100].tolist()) == {0}
-    none = promised(flight(graph, rate=3.0))
+    none = promised(turning(0.002, 0.01))
     assert not none.promised and "rounded up to steps of 0.01 s" in none.sentence()
-    odd = ech.Graph.switching([(0.0, cut), (0.5, chain)], agents=4, period=float(np.pi))
-    assert not promised(flight(odd, rate=3.0)).promised
-    third = ech.Graph.switching([(0.0, cut), (0.1, chain)], agents=4, period=1 / 3)
-    found = promised(flight(third, rate=3.0))
-    assert found.promised
-    assert found.run.parts.graph.schedule.starts.tolist() == pytest.approx(
-        [0.0, 0.1, 0.34, 0.44, 0.67, 0.77]
-    )
-    assert found.run.parts.graph.schedule.period == pytest.approx(1.0)
+    assert not promised(turning(0.5, float(np.pi))).promised
+    found = promised(turning(0.1, 1 / 3))
+    schedule = found.run.parts.graph.schedule
+    assert found.promised and schedule.period == pytest.approx(1.0)
+    assert schedule.starts.tolist() == pytest.approx([0.0, 0.1, 0.34, 0.44, 0.67, 0.77])
 
 
-@pytest.mark.parametrize(("period", "coupling"), [(2.0, 1e7), (2.0, 1e75), (1e75, 1e75)])
+@pytest.mark.parametrize(("period", "coupling"), [(2.0, 1e75), (1e75, 1e75)])
 def test_large_couplings_and_periods_have_a_rate_that_is_no_more(period, coupling):
     chain, star = [(0, 1), (1, 2), (2, 3)], [(0, 1), (0, 2), (2, 3)]
     graph = ech.Graph.switching([(0.0, chain), (1.0, star)], period=period)
@@ -523,72 +447,68 @@ def test_large_couplings_and_periods_have_a_rate_that_is_no_more(period, couplin
 @pytest.mark.slow
 @pytest.mark.parametrize("told", [True, False])
 def test_graphs_that_take_turns_are_there_in_time_or_are_told_none(told):
-    chain, star = [(0, 1), (1, 2), (2, 3)], [(0, 1), (0, 2), (2, 3)]
-    cut = [(0, 3), (3, 2)]
-    graph = ech.Graph.switching([(0.0, chain), (1.0, star if told else cut)], period=2.0)
+    other = [(0, 1), (0, 2), (2, 3)] if told else [(0, 3), (3, 2)]
+    graph = ech.Graph.switching([(0.0, [(0, 1), (1, 2), (2, 3)]), (1.0, other)], period=2.0)
     parts = flight(graph, rate=3.0)
     found = promised(parts)
     assert found.promised and (found.tube.arrival is not None) == told
     if told:
-        outside = np.flatnonzero((gaps(fly(parts)) >= 0.01).any(axis=1))
-        assert 0.01 * (outside[-1] + 1) <= found.tube.arrival + 0.02 <= 0.04 * outside[-1]
+        flown = outside(fly(parts))
+        assert flown <= found.tube.arrival + 0.02 <= 4.0 * flown
 
 
-def test_a_vehicle_is_promised_as_far_as_its_thrust_reaches():
-    scenario = ech.load_scenario("paper-global")
-    found = promise(*ech.build(scenario))
+def test_a_vehicle_is_promised_as_far_as_its_thrust_reaches(tmp_path):
+    found = guarantee(*ech.build(override()))
     assert found.claimed and found.kind is Kind.PROOF and found.theorem is Theorem.T5
     assert found.tube.left == pytest.approx(3.770, abs=1e-3)
     assert found.tube.steepest == pytest.approx(5.6, abs=0.05)
     assert found.tube.gains == pytest.approx((1.0, 2.4159, 12.3925, 221.2039), rel=1e-4)
     assert found.tube.arrival < 3.3
     assert "roll and pitch within 90 deg" in found.sentence()
+    # What verifies it computes its tube again, and refuses a false one.
+    told, file = found.as_mapping(), tmp_path / "summary.json"
 
-
-def test_verify_recomputes_a_tube_and_refuses_a_false_one(tmp_path):
-    told = promise(*ech.build(ech.load_scenario("paper-global"))).as_mapping()
-    file = tmp_path / "summary.json"
-    file.write_text(json.dumps({"promise": told}))
-    found = verify(file)
-    assert found.verdict == "incomplete" and found.sentence.startswith("Incomplete: 6 claims hold")
-    [border] = told["anywhere"]["borders"]
-    for key, factor in (("left", 1.01), ("steepest", 1.2), ("speed", 1.6)):
-        was, border[key] = border[key], border[key] * factor
+    def verified():
         file.write_text(json.dumps({"promise": told}))
-        assert verify(file).verdict == "refused"
-        border[key] = was
-    border["gains"][2] *= 1.0001
-    file.write_text(json.dumps({"promise": told}))
-    assert verify(file).verdict == "refused"
+        return verify(file)
+
+    assert verified().verdict == "incomplete"
+    assert verified().sentence.startswith("Incomplete: 6 claims hold")
+    [border] = told["anywhere"]["borders"]
+    for place, key, factor in (
+        (border, "left", 1.01),
+        (border, "steepest", 1.2),
+        (border, "speed", 1.6),
+        (border["gains"], 2, 1.0001),
+    ):
+        was, place[key] = place[key], place[key] * factor
+        assert verified().verdict == "refused", key
+        place[key] = was
 
 
 def override(*changes):
     return ech.load_scenario("paper-global", overrides=list(changes))
 
 
-@pytest.mark.parametrize(
-    ("change", "line", "text"),
-    [
-        ("follower.coupling=100", Hypothesis.SAMPLING, "c d_max dt = 1.5 is above 1"),
-        (
-            "leader.coupling=3000",
-            Hypothesis.SAMPLING,
-            "the leader's step `dt` = 0.005 s is too long: c dt = 15 is above 1",
-        ),
-        ("follower.coupling=66.6", Hypothesis.SAMPLING, "lower `coupling` or `roots`"),
-        ("follower.speed=[1,1,5,1]", Hypothesis.SET, "lower the `speed` of `z` below 4.06"),
-        ("follower.speed=inf", Hypothesis.SET, "lower the `speed` of `z` below 4.06"),
-        ("initial.spread={vz: 40}", Hypothesis.STARTS, "is not proved to stay above -9.81"),
-        ("follower.roots=[4.0123, 4.5, 5]", Hypothesis.REGION, "common unit"),
-        (
-            "leader.start_error={z: 30, vz: 4}",
-            Hypothesis.STARTS,
-            "is not proved to stay above -9.81",
-        ),
-    ],
-)
-def test_what_the_tube_does_not_hold_is_told_with_what_would(change, line, text):
-    found = promise(*ech.build(override(change)))
+TOO_STEEP = "is not proved to stay above -9.81"
+LOWER = "lower the `speed` of `z` below 4.06"
+TOO_LONG = "the leader's step `dt` = 0.005 s is too long: c dt = 15 is above 1"
+UNHELD = {
+    "follower.coupling=100": (Hypothesis.SAMPLING, "c d_max dt = 1.5 is above 1"),
+    "leader.coupling=3000": (Hypothesis.SAMPLING, TOO_LONG),
+    "follower.coupling=66.6": (Hypothesis.SAMPLING, "lower `coupling` or `roots`"),
+    "follower.speed=[1,1,5,1]": (Hypothesis.SET, LOWER),
+    "follower.speed=inf": (Hypothesis.SET, LOWER),
+    "initial.spread={vz: 40}": (Hypothesis.STARTS, TOO_STEEP),
+    "follower.roots=[4.0123, 4.5, 5]": (Hypothesis.REGION, "common unit"),
+    "leader.start_error={z: 30, vz: 4}": (Hypothesis.STARTS, TOO_STEEP),
+}
+
+
+@pytest.mark.parametrize("change", UNHELD)
+def test_what_the_tube_does_not_hold_is_told_with_what_would(change):
+    line, text = UNHELD[change]
+    found = guarantee(*ech.build(override(change)))
     assert not found.promised and found.theorem is None
     assert found.hypotheses[line].verdict is Verdict.FAILS
     assert text in found.sentence()
@@ -604,16 +524,12 @@ def test_a_push_that_carries_the_leader_away_is_told():
 
 def drifting(model, plant, reference, speed):
     """How fast a leader alone is carried off its path in the end, m/s, and its promise."""
-    drive = ech.Laws(
-        StoppingLeader(reference=reference, observer=False, speed=speed),
-        StoppingPoint(observer=False),
-    )
-    goals = ech.Formation(np.zeros((2, len(model.state_names))))
-    parts = ech.Parts(
-        model, ech.Graph([(0, 1)]), goals, drive, initial=None, world=ech.World(plant=plant)
-    )
+    leader = StoppingLeader(reference=reference, observer=False, speed=speed)
+    drive = ech.Laws(leader, StoppingPoint(observer=False))
+    goals, world = ech.Formation(np.zeros((2, len(model.state_names)))), ech.World(plant=plant)
+    parts = ech.Parts(model, ech.Graph([(0, 1)]), goals, drive, initial=None, world=world)
     settings = ech.Settings(horizon=40.0, dt=0.01, limits=False)
-    result, found = ech.simulate(parts, settings), promise(parts, settings)
+    result, found = ech.simulate(parts, settings), guarantee(parts, settings)
     place = list(model.position_indices())
     off = np.linalg.norm((result.states[:, 0] - result.reference)[:, place], axis=1)
     middle = len(off) // 2
@@ -658,33 +574,27 @@ def test_a_current_that_carries_the_leader_away_is_told_with_an_observer_too(obs
         current = ech.World(disturbance=ech.Disturbance(constant={"x": push}))
         found = promised(flight(observer=observer, world=current))
         assert ("drift away for ever" in found.sentence()) == drifts != found.promised
-    assert (
-        "observer" not in found.sentence()
-        and "raise the leader's `speed` above 1.6" in found.sentence()
-    )
+    assert "observer" not in found.sentence()
+    assert "raise the leader's `speed` above 1.6" in found.sentence()
 
 
 def test_parents_add_their_speeds():
     chain = ech.Graph.path(4)
     offsets = {k: (0.1 * k, 0.0, 0.0) for k in range(1, 4)}
-    shown = {}
-    for speed in (0.8, 2.5):
-        law = StoppingPoint(feedforward="parent", speed=speed)
-        drive = ech.Laws(StoppingLeader(reference=ech.references.Hover()), law)
-        formation = ech.Formation.from_offsets(QUADROTOR, chain, offsets)
+    formation = ech.Formation.from_offsets(QUADROTOR, chain, offsets)
+    leader = StoppingLeader(reference=ech.references.Hover())
+    for speed, fits in ((0.8, True), (2.5, False)):
+        drive = ech.Laws(leader, StoppingPoint(feedforward="parent", speed=speed))
         found = promised(ech.Parts(QUADROTOR, chain, formation, drive))
-        shown[speed] = found.claimed, found.sentence()
-    assert shown[0.8][0] and not shown[2.5][0]
+        assert found.claimed is fits
     # 9.81 / 2.4159 / 3 links.
-    assert "below 1.35" in shown[2.5][1]
+    assert "below 1.35" in found.sentence()
 
 
 @pytest.mark.parametrize("roots", [SLOW_ROOTS, FAST_ROOTS])
 def test_speeds_that_are_left_out_are_what_the_thrust_bears(roots):
-    lead = StoppingLeader(roots=roots).prepared(QUADROTOR, PAPER_TREE)
-    most = QUADROTOR.gravity / float(Chain.of(roots).gain(1))
-    z = chains_of(QUADROTOR).outputs.index("z")
-    law = StoppingPoint(roots=roots).prepared(QUADROTOR, PAPER_TREE)
+    most, z = QUADROTOR.gravity / float(Chain.of(roots).gain(1)), 2
+    lead, law = (make(roots=roots).prepared(QUADROTOR, PAPER_TREE) for make in LAWS)
     assert 0.5 * most < law.speed_of(z) + lead.speed_of(z) < most or law.speed_of(z) == 2.5
     long = StoppingPoint(roots=roots, feedforward="parent")
     assert 0.9 * most < 29 * long.prepared(QUADROTOR, ech.Graph.path(30)).speed_of(z) < most
@@ -693,9 +603,8 @@ def test_speeds_that_are_left_out_are_what_the_thrust_bears(roots):
 # ---- bad input -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("law", "text"),
-    [
+def test_a_law_that_makes_no_loop_is_refused():
+    for law, text in (
         ({"roots": (4.0, 4.0, 5.0)}, "different from each other"),
         ({"roots": (-4.0, 4.0, 5.0)}, "must be a list of positive numbers"),
         ({"roots": (4.0, 5.0), "rate": 2.0}, "allowed is one of them"),
@@ -703,34 +612,24 @@ def test_speeds_that_are_left_out_are_what_the_thrust_bears(roots):
         ({"coupling": float("nan")}, "must be positive, at most"),
         ({"speed": -1.0}, "must be positive"),
         ({"feedforward": "none"}, "a leader that moves is lost"),
-    ],
-)
-def test_a_law_that_makes_no_loop_is_refused(law, text):
-    with pytest.raises(EchelonError, match=text):
-        StoppingPoint(**law)
+        # Numbers that do not fit the model.
+        ({"roots": (4.0, 5.0)}, "needs 3"),
+        ({"speed": (1.0, 2.0)}, "one for each of `x`, `y`, `z`"),
+    ):
+        with pytest.raises(EchelonError, match=text):
+            StoppingPoint(**law).prepared(QUADROTOR, PAPER_TREE)
 
 
-@pytest.mark.parametrize(
-    ("law", "text"),
-    [({"roots": (4.0, 5.0)}, "needs 3"), ({"speed": (1.0, 2.0)}, "one for each of `x`, `y`, `z`")],
-)
-def test_numbers_that_do_not_fit_the_model_are_refused(law, text):
-    with pytest.raises(EchelonError, match=text):
-        StoppingPoint(**law).prepared(QUADROTOR, PAPER_TREE)
-
-
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ("leader.law=tracking", "give the leader the law `stopping-point` too"),
-        ("leader.roots=[3,4,5]", "different `roots`"),
-        ("initial.states={2: [0,0,1,0,0,0,0,1.8,0,0,0,0]}", "agent 2 starts where its law has no"),
-        ("initial.states={1: [0,0,1,0,0,0,2.0,0,0,0,0,0]}", "roll and pitch within 90 deg"),
-    ],
-)
-def test_parts_that_do_not_fit_each_other_are_refused(change, text):
-    with pytest.raises(EchelonError, match=text):
-        prepare(*ech.build(override(change)))
+def test_parts_that_do_not_fit_each_other_are_refused():
+    start = "initial.states={%d: [0,0,1,0,0,0,%s,%s,0,0,0,0]}"
+    for change, text in {
+        "leader.law=tracking": "give the leader the law `stopping-point` too",
+        "leader.roots=[3,4,5]": "different `roots`",
+        start % (2, "0", "1.8"): "agent 2 starts where its law has no",
+        start % (1, "2.0", "0"): "roll and pitch within 90 deg",
+    }.items():
+        with pytest.raises(EchelonError, match=text):
+            prepare(*ech.build(override(change)))
 
 
 # ---- attacks -------------------------------------------------------------------------------------
@@ -772,12 +671,12 @@ def random_parts(draw):
     pairs = {tuple(sorted(pair)) for pair in [*pairs, *more]}
     graph = ech.Graph([(a, b, float(np.exp(draw.uniform(-1.2, 1.2)))) for a, b in sorted(pairs)])
     offsets = {k: tuple(draw.uniform(-3.0, 3.0, 3)) for k in range(1, 5)}
-    law = StoppingPoint(
-        roots=FAST_ROOTS, observer=False, hears=str(draw.choice(["all", "leaderward"]))
+    shared, hears = (
+        {"roots": FAST_ROOTS, "observer": False},
+        str(draw.choice(["all", "leaderward"])),
     )
-    drive = ech.Laws(
-        StoppingLeader(reference=ech.references.Lemniscate(), roots=FAST_ROOTS, observer=False), law
-    )
+    leader = StoppingLeader(reference=ech.references.Lemniscate(), **shared)
+    drive = ech.Laws(leader, StoppingPoint(hears=hears, **shared))
     return ech.Parts(QUADROTOR, graph, ech.Formation.from_offsets(QUADROTOR, graph, offsets), drive)
 
 
@@ -789,7 +688,7 @@ def least_lift(loop, starts, steps):
         def on(_, done):
             now, least = done
             x, e = now.states[loop.followers], now.follower_memory.chain
-            lift = jax.vmap(lambda x, e: flatten(QUADROTOR, chains, x, e).values[2, 2])(x, e)
+            lift = jax.vmap(lambda x, e: to_flat(QUADROTOR, chains, x, e).values[2, 2])(x, e)
             return step(loop, now), jnp.minimum(least, lift)
 
         start = begin(loop, x), jnp.full(len(loop.followers), jnp.inf)
@@ -807,10 +706,8 @@ def least_lift(loop, starts, steps):
     ],
 )
 def test_the_papers_starts_are_flown_without_a_limit_in_time(roots, speed, within, steady):
-    parts, settings = ech.build(
-        override(f"follower.roots={list(roots)}", f"follower.speed={list(speed)}")
-    )
-    times = []
+    changes = f"follower.roots={list(roots)}", f"follower.speed={list(speed)}"
+    (parts, settings), times = ech.build(override(*changes)), []
     for seed in range(5):
         result = ech.simulate(parts, settings._replace(seed=seed, store_every=1))
         assert result.saturated.max() == 0.0

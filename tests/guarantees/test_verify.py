@@ -1,52 +1,29 @@
 """The independent verifier of saved gains: accepted files, refused files, its own algebra."""
 
-import importlib.util
 import json
 import subprocess
 import sys
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
+import planted_faults as STUDY
 import pytest
-from forgeries import forged
+from forgeries import forged, places, replaced
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.named_class import resolve
+from echelon.guarantees.verifier import algebra
 from echelon.guarantees.verifier.agent_claims import farthest_outside
-from echelon.guarantees.verifier.algebra import (
-    ends_of_many,
-    first_unproved,
-    grounded_rows,
-    inverse,
-    is_positive_definite,
-    observable,
-    product,
-    rightmost,
-    rows_of,
-    spectrum,
-)
 from echelon.guarantees.verifier.findings import unchecked
 from echelon.guarantees.verifier.saved_gain import SavedGraph
 from echelon.guarantees.verifier.verify import judge
 
-ROOT = Path(__file__).resolve().parents[2]
 LINE = ech.Graph.path(4)
 
 
-def study():
-    """The catalogue of faults, which the benchmark plants in more and larger gains."""
-    path = ROOT / "benchmarks" / "planted_faults.py"
-    spec = importlib.util.spec_from_file_location("planted_faults", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-STUDY = study()
 FAST = [
     "given, linear",
     "inner loop, double integrator",
@@ -107,43 +84,38 @@ def test_no_perturbation_of_the_metric_passes(files, seed, size, tmp_path_factor
     assert STUDY.refused(told, tmp_path_factory.getbasetemp(), None)
 
 
+def verified(folder, model, graph, method, given=None):
+    ech.save_gain(ech.synthesize(model, graph, method), model, graph, folder / "gain.json")
+    return ech.verify(folder / "gain.json", given)
+
+
 @pytest.mark.parametrize("name", registry.MODELS)
 def test_every_bundled_model_is_made_again_from_its_file(name, tmp_path):
     kind = resolve(registry.MODELS[name])
     model = kind([[0.0, 1.0], [-2.0, 0.1]], [[0.0], [3.0]]) if name == "linear" else kind()
-    ech.save_gain(
-        ech.synthesize(model, LINE, ech.gains.FixedGain()), model, LINE, tmp_path / "gain.json"
-    )
-    found = ech.verify(tmp_path / "gain.json")
+    found = verified(tmp_path, model, LINE, ech.gains.FixedGain())
     assert found.holds, found.sentence
     assert {each.verdict for each in found.findings} == {"holds"}
 
 
-@pytest.mark.parametrize(
-    ("graph", "verdict"),
-    [(ech.Graph.path(501), "verified"), (ech.Graph.complete(80), "incomplete")],
-)
-def test_large_graphs_are_checked_as_far_as_their_edges_are_there(graph, verdict, tmp_path):
-    model = ech.models.DoubleIntegrator(1)
-    ech.save_gain(
-        ech.synthesize(model, graph, ech.gains.Riccati()), model, graph, tmp_path / "gain.json"
-    )
-    found = ech.verify(tmp_path / "gain.json")
-    open_ = [each.claim for each in found.findings if each.verdict == "not checked"]
-    assert found.verdict == verdict and found.holds is (verdict == "verified")
-    assert open_ == ([] if found.holds else ["graph spectrum"])
+def test_large_graphs_are_checked_as_far_as_their_edges_are_there(tmp_path):
+    model, method = ech.models.DoubleIntegrator(1), ech.gains.Riccati()
+    for graph, verdict, claims in (
+        (ech.Graph.path(501), "verified", []),
+        (ech.Graph.complete(80), "incomplete", ["graph spectrum"]),
+    ):
+        found = verified(tmp_path, model, graph, method)
+        assert found.verdict == verdict and found.holds is (claims == [])
+        assert [x.claim for x in found.findings if x.verdict == "not checked"] == claims
 
 
 def test_a_model_of_ones_own_must_be_given_and_is_never_imported(tmp_path):
     model, file = STUDY.Soft(), tmp_path / "gain.json"
-    ech.save_gain(ech.synthesize(model, LINE, ech.gains.Riccati()), model, LINE, file)
-    found = ech.verify(file)
+    found = verified(tmp_path, model, LINE, ech.gains.Riccati())
     verdicts = {each.claim: each.verdict for each in found.findings}
     assert not found.holds and verdicts["equations of the model"] == "not checked"
-    assert (
-        found.sentence
-        == "Incomplete: 14 claims hold as stored; not checked: equations of the model."
-    )
+    said = "Incomplete: 14 claims hold as stored; not checked: equations of the model."
+    assert found.sentence == said
     assert ech.verify(file, model).sentence.startswith("Verified:")
     assert not ech.verify(file, ech.models.Pendulum()).holds
     told = json.loads(file.read_text())
@@ -161,8 +133,8 @@ def test_a_proof_that_holds_is_found_again_at_its_rate_and_not_far_above(files):
     hull[:, rows, columns] = region["hull"]["values"]
     parts = (told["P"], told["model"]["B"], told["R"])
     parts = (*map(np.array, parts), hull, np.array(region["error"]), Fraction(region["strength"]))
-    assert first_unproved(*parts, region["rate"]) is None
-    assert first_unproved(*parts, region["rate"] * (1.0 + 1e-4)) is not None
+    assert algebra.first_unproved(*parts, region["rate"]) is None
+    assert algebra.first_unproved(*parts, region["rate"] * (1.0 + 1e-4)) is not None
 
 
 SAME = {
@@ -203,94 +175,75 @@ def test_a_method_of_ones_own_is_open(files, tmp_path):
     file = tmp_path / "gain.json"
     file.write_text(json.dumps(files["contraction, pendulum, proof"] | {"method": "contraction."}))
     found = ech.verify(file)
-    assert found.verdict == "incomplete" and [x.claim for x in found.findings if x.open] == [
-        "method"
-    ]
+    open_ = [x.claim for x in found.findings if x.open]
+    assert found.verdict == "incomplete" and open_ == ["method"]
 
 
 # ---- bad input ----
 
-BROKEN = {
-    "gain.json` must be a mapping.": lambda told: [told],
-    "`P` is missing": lambda told: {key: told[key] for key in told if key != "P"},
-    "`P` must be 2 x 2 finite numbers (to 1e50)": lambda told: told | {"P": [[1.0]]},
-    "`NaN` is not a finite number": lambda told: told | {"R": [[float("nan")]]},
-    "`Infinity` is not a finite number": lambda told: told | {"coupling": float("inf")},
-    "`R` must be 1 x 1 finite numbers": lambda told: told | {"R": [["1.0"]]},
-    "`coupling` must be a finite number (to 1e50)": lambda told: told | {"coupling": 1e60},
-    "`graph.directed` must be true or false": lambda told: (
-        told | {"graph": told["graph"] | {"directed": "false"}}
-    ),
-    "`model.parameters` must not hold numbers as text": lambda told: (
-        told | {"model": told["model"] | {"parameters": {"damping": "0.5"}}}
-    ),
-    "`promise` is unknown": lambda told: told | {"promise": {"anywhere": {}}},
-    "`coupl\\u0456ng` is unknown": lambda told: told | {"coupl\u0456ng": 1e9},
-    "`certificate.region.hull.theorem` is unknown": lambda told: changed(
-        told, hull=told["certificate"]["region"]["hull"] | {"theorem": "T1"}
-    ),
-    "`graph.agents` must be a whole number from 2 on (to 1e9)": lambda told: (
-        told | {"graph": told["graph"] | {"agents": True}}
-    ),
-    "`graph` must name agents from 0 to 3": lambda told: (
-        told | {"graph": told["graph"] | {"leaders": [7]}}
-    ),
-    "`graph.edges` must be null for more than 2000 edges": lambda told: (
-        told | {"graph": told["graph"] | {"edges": [[0, 1, 1.0]] * 2001}}
-    ),
-    "`certificate.region.kind` must be one of `proof`, `vertices`, `samples`": lambda told: changed(
-        told, kind="sure"
-    ),
-    "`certificate.region.hull` must be a mapping": lambda told: changed(told, hull=[]),
-    "`certificate.region.domain.lower` is missing": lambda told: changed(told, domain={}),
-    "its `format` must be `echelon gain 2`": lambda told: told | {"format": "echelon gain 1"},
-}
-
 
 def changed(told, **parts):
+    """A file with another region."""
     certificate = told["certificate"]
-    region = certificate["region"] | parts
-    return told | {"certificate": certificate | {"region": region}}
+    return told | {"certificate": certificate | {"region": certificate["region"] | parts}}
 
 
-@pytest.mark.parametrize("wanted", BROKEN)
-def test_what_is_no_gain_has_its_sentence(files, wanted, tmp_path):
+def with_graph(told, **parts):
+    return told | {"graph": told["graph"] | parts}
+
+
+def broken(told):
+    """Files that are no gain, and what is said of each."""
+    hull = told["certificate"]["region"]["hull"]
+    model = told["model"] | {"parameters": {"damping": "0.5"}}
+    no_text = "`model.parameters` must not hold numbers as text"
+    kinds = "`certificate.region.kind` must be one of `proof`, `vertices`, `samples`"
+    many = "`graph.edges` must be null for more than 2000 edges"
+    return {
+        "gain.json` must be a mapping.": [told],
+        "`P` is missing": {key: told[key] for key in told if key != "P"},
+        "`P` must be 2 x 2 finite numbers (to 1e50)": told | {"P": [[1.0]]},
+        "`NaN` is not a finite number": told | {"R": [[float("nan")]]},
+        "`Infinity` is not a finite number": told | {"coupling": float("inf")},
+        "`R` must be 1 x 1 finite numbers": told | {"R": [["1.0"]]},
+        "`coupling` must be a finite number (to 1e50)": told | {"coupling": 1e60},
+        "`graph.directed` must be true or false": with_graph(told, directed="false"),
+        no_text: told | {"model": model},
+        "`promise` is unknown": told | {"promise": {"anywhere": {}}},
+        "`coupl\\u0456ng` is unknown": told | {"coupl\u0456ng": 1e9},
+        "`certificate.region.hull.theorem` is unknown": changed(told, hull=hull | {"theorem": 1}),
+        "`graph.agents` must be a whole number from 2 on (to 1e9)": with_graph(told, agents=True),
+        "`graph` must name agents from 0 to 3": with_graph(told, leaders=[7]),
+        many: with_graph(told, edges=[[0, 1, 1.0]] * 2001),
+        kinds: changed(told, kind="sure"),
+        "`certificate.region.hull` must be a mapping": changed(told, hull=[]),
+        "`certificate.region.domain.lower` is missing": changed(told, domain={}),
+        "its `format` must be `echelon gain 2`": told | {"format": "echelon gain 1"},
+    }
+
+
+def test_what_is_no_gain_has_its_sentence(files, tmp_path):
     file = tmp_path / "gain.json"
-    file.write_text(json.dumps(BROKEN[wanted](files["contraction, pendulum, proof"])))
-    with pytest.raises(ech.EchelonError) as caught:
-        ech.verify(file)
-    assert wanted in str(caught.value)
-    assert str(caught.value).count("\n") == 0
-
-
-def places(told, path=()):
-    """The path to every part of a file."""
-    parts = told.items() if isinstance(told, dict) else enumerate(told) if path else ()
-    for key, part in parts:
-        yield (*path, key)
-        if isinstance(part, (dict, list)):
-            yield from places(part, (*path, key))
+    for wanted, content in broken(files["contraction, pendulum, proof"]).items():
+        file.write_text(json.dumps(content))
+        with pytest.raises(ech.EchelonError) as caught:
+            ech.verify(file)
+        assert wanted in str(caught.value)
+        assert str(caught.value).count("\n") == 0
 
 
 ODD = [None, 0, -1, 1e308, -1e50, 1e-320, 10**400, 10**9, "x", [], {}, True, [[1]], 2.5]
-ODD += [
-    "echelon.agents.models.oscillators:Nope",
-    "echelon.agents.models.model_check:check_model",
-    "echelon.agents.models._x:y",
-]
+ODD += [f"echelon.agents.models.{name}" for name in ("oscillators:Nope", "_x:y")]
+ODD += ["echelon.agents.models.model_check:check_model"]
 
 
 @settings(max_examples=60)
 @given(data=st.data())
 def test_whatever_stands_in_a_file_it_is_refused_in_words(files, data, tmp_path_factory):
-    told = json.loads(json.dumps(files[data.draw(st.sampled_from(FAST[:3]))]))
-    path = data.draw(st.sampled_from(list(places(told))))
-    value, part = data.draw(st.sampled_from(ODD)), told
-    for key in path[:-1]:
-        part = part[key]
-    part[path[-1]] = value
+    told = files[data.draw(st.sampled_from(FAST[:3]))]
+    path = data.draw(st.sampled_from(list(places(told))[1:]))
     file = tmp_path_factory.getbasetemp() / "odd.json"
-    file.write_text(json.dumps(told))
+    file.write_text(json.dumps(replaced(told, path, data.draw(st.sampled_from(ODD)))))
     try:
         found = ech.verify(file)
     except ech.EchelonError as error:
@@ -315,14 +268,10 @@ def test_the_command_prints_a_table_and_exits_by_what_holds(files, echelon, tmp_
     told = json.loads(out)
     assert code == 1 and not told["holds"]
     assert told["sentence"] == "Refused: radius does not hold as stored."
-    assert [each["claim"] for each in told["findings"] if each["verdict"] == "refused"] == [
-        "radius"
-    ]
+    assert [x["claim"] for x in told["findings"] if x["verdict"] == "refused"] == ["radius"]
     file.write_text("no JSON")
     code, out, err = echelon("verify", file)
     assert (code, out) == (2, "") and "is not valid JSON" in err and err.count("\n") == 1
-    code, _, err = echelon("verify", tmp_path / "nothing.json")
-    assert code == 2 and "does not exist" in err
 
 
 # ---- its algebra ----
@@ -335,40 +284,36 @@ def test_the_command_prints_a_table_and_exits_by_what_holds(files, echelon, tmp_
 )
 def test_a_gram_matrix_is_definite_exactly_when_its_rows_have_full_rank(rows):
     M = np.array(rows, float)
-    gram = rows_of(M.T @ M)
+    gram = algebra.rows_of(M.T @ M)
     full = np.linalg.matrix_rank(M) == M.shape[1]
-    assert is_positive_definite(gram) is bool(full)
+    assert algebra.is_positive_definite(gram) is bool(full)
     if full:
-        one = product(gram, inverse(gram))
+        one = algebra.product(gram, algebra.inverse(gram))
         assert all(x == (i == j) for i, row in enumerate(one) for j, x in enumerate(row))
 
 
 def test_the_sign_of_a_minor_is_not_a_matter_of_rounding():
     # det = (1 + e) - 1 with e half of what float64 can see beside 1, and its negative.
-    tiny = Fraction(1, 2**60)
-    assert is_positive_definite([[Fraction(1), Fraction(1)], [Fraction(1), 1 + tiny]])
-    assert not is_positive_definite([[Fraction(1), Fraction(1)], [Fraction(1), 1 - tiny]])
-    assert not is_positive_definite([[Fraction(1), Fraction(1)], [Fraction(1), Fraction(1)]])
-    assert not is_positive_definite([[Fraction(1), Fraction(0)], [tiny, Fraction(1)]])
+    one, tiny = Fraction(1), Fraction(1, 2**60)
+    for last, definite in ((1 + tiny, True), (1 - tiny, False), (one, False)):
+        assert algebra.is_positive_definite([[one, one], [one, last]]) is definite
+    # Of symmetric matrices to the last bit alone.
+    assert algebra.is_positive_definite([[2 * one, tiny], [tiny, 2 * one]])
+    assert not algebra.is_positive_definite([[2 * one, tiny], [0 * one, 2 * one]])
+    assert not algebra.is_positive_definite([[one, 0 * one], [tiny, one]])
 
 
 @pytest.mark.parametrize("followers", [3, 30, 450])
 def test_the_spectrum_of_a_chain_is_its_closed_form(followers):
     edges = np.array([(k, k + 1, 1.0) for k in range(followers)])
-    found, bound = spectrum(SavedGraph(followers + 1, (0,), edges, np.zeros(1)), edges)
+    found, bound = algebra.spectrum(SavedGraph(followers + 1, (0,), edges, np.zeros(1)), edges)
     k = np.arange(1, followers + 1)
     wanted = 4.0 * np.sin((2 * k - 1) * np.pi / (4 * followers + 2)) ** 2
     assert found == pytest.approx(wanted, rel=1e-11)
     assert found[0] == pytest.approx(wanted[0], rel=1e-13)
     assert wanted[0] * (1.0 - 1e-11) <= bound <= wanted[0]
     many = wanted if followers <= 400 else wanted[[0, -1]]
-    assert ends_of_many(found) == pytest.approx(many, rel=1e-11)
-
-
-def test_the_exact_laplacian_loses_no_weight():
-    edges = np.array([(0, 1, 0.1), (1, 2, 0.2), (0, 2, 0.7)])
-    rows = grounded_rows(SavedGraph(3, (0,), edges, np.zeros(1)), edges)
-    assert rows[0][0] == Fraction(0.1) + Fraction(0.2) and rows[0][1] == -Fraction(0.2)
+    assert algebra.ends_of_many(found) == pytest.approx(many, rel=1e-11)
 
 
 @given(st.integers(0, 10**6), st.integers(1, 5), st.integers(0, 3))
@@ -381,13 +326,16 @@ def test_the_rank_of_what_is_seen_is_that_of_the_part_that_is_built_in(seed, see
     A[seen:] = random.normal(size=(hidden, n))
     turn, _ = np.linalg.qr(random.normal(size=(n, n)))
     C = np.eye(n)[:1]
-    assert observable(turn @ A @ turn.T, C @ turn.T) == seen
+    assert algebra.observable(turn @ A @ turn.T, C @ turn.T) == seen
 
 
-def test_the_rightmost_eigenvalue_knows_how_well_it_is_known():
-    value, slack = rightmost(np.diag([-3.0, -1.0]))
+def test_the_exact_laplacian_loses_no_weight_and_eigenvalues_know_how_well_they_are_known():
+    edges = np.array([(0, 1, 0.1), (1, 2, 0.2), (0, 2, 0.7)])
+    rows = algebra.grounded_rows(SavedGraph(3, (0,), edges, np.zeros(1)), edges)
+    assert rows[0][0] == Fraction(0.1) + Fraction(0.2) and rows[0][1] == -Fraction(0.2)
+    value, slack = algebra.rightmost(np.diag([-3.0, -1.0]))
     assert value == -1.0 and slack < 1e-13
-    value, slack = rightmost(np.array([[-1.0, 1.0], [0.0, -1.0]]))
+    value, slack = algebra.rightmost(np.array([[-1.0, 1.0], [0.0, -1.0]]))
     assert value == pytest.approx(-1.0, abs=1e-7) and 1e-10 < slack
 
 
@@ -411,20 +359,17 @@ def test_combinations_lie_inside_and_points_beyond_a_corner_do_not(seed):
     assert farthest_outside(hull, error, off[None]) < 1e-9
 
 
-@pytest.mark.parametrize(
-    ("summary", "sentence"),
-    [
-        ('{"promise": {', "the file `run/summary.json` is not valid JSON: "),
-        ("[1]", "`run/summary.json` must be a mapping."),
-        ('{"gain": {"coupling": 1.0}}', "`run` has lost its `gain.json`; `echelon run run --out"),
-        ('{"gain": null}', "`run/summary.json` is damaged: it has no `promise`."),
-    ],
-)
-def test_a_run_without_what_it_promised_is_told_so(echelon, here, summary, sentence):
+def test_a_run_without_what_it_promised_is_told_so(echelon, here):
     (here / "run").mkdir()
-    (here / "run" / "summary.json").write_text(summary)
-    code, _, fault = echelon("verify", "run")
-    assert code == 2 and fault.startswith(f"echelon: {sentence}") and fault.count("\n") == 1
+    for summary, sentence in {
+        '{"promise": {': "the file `run/summary.json` is not valid JSON: ",
+        "[1]": "`run/summary.json` must be a mapping.",
+        '{"gain": {"coupling": 1.0}}': "`run` has lost its `gain.json`; `echelon run run --out",
+        '{"gain": null}': "`run/summary.json` is damaged: it has no `promise`.",
+    }.items():
+        (here / "run" / "summary.json").write_text(summary)
+        code, _, fault = echelon("verify", "run")
+        assert code == 2 and fault.startswith(f"echelon: {sentence}") and fault.count("\n") == 1
 
 
 def test_a_verdict_names_a_few_claims_that_are_open_and_counts_the_rest():

@@ -19,7 +19,7 @@ from echelon.simulation.onboard.source_code import python_text
 from echelon.synthesis.gains import FixedGain
 from echelon.synthesis.gains.gain import synthesize
 from echelon_flight.pilot import Pilot
-from echelon_flight.wire import Letter, Packet
+from echelon_flight.wire import LeaderPacket, Message
 
 TURN = 2.0 * math.pi
 PATH = ech.Graph.path(3)
@@ -98,7 +98,7 @@ WITH_HEADING.remove("printed")
 
 CHAINED = [name for name in WITH_HEADING if name not in ("unicycle", "point")]
 CASES = [(name, "consensus") for name in WITH_HEADING]
-# Without a `flatten` of their own their laws take long to trace.
+# Without a `to_flat` of their own their laws take long to trace.
 SLOW = {"euler": pytest.mark.slow, "thrust": pytest.mark.slow, "attitude": pytest.mark.slow}
 CASES += [pytest.param(name, "stopping-point", marks=SLOW.get(name, ())) for name in CHAINED]
 
@@ -143,8 +143,6 @@ def test_an_agent_by_itself_takes_one_heading_in_two_ways_for_one():
         np.testing.assert_allclose(other, u, atol=1e-12)
         np.testing.assert_allclose(also.signal.values, sent.signal.values, atol=1e-12)
 
-
-# ---- a run ---------------------------------------------------------------------------------------
 
 SETTINGS = ech.Settings(horizon=12.0, dt=0.02)
 ENGINES = ["jax", "native"]
@@ -205,7 +203,7 @@ def test_a_process_that_begins_late_does_not_make_up_for_turns(by):
     agent = ech.Agent(parts, 1, 0.02)
     own, x = agent.own_law, facing(Carrier(), t - 2.0 * TURN, -0.6)
     names, heading = own.signal_names, [0.0, 0.0, t]
-    packet = Packet(0, t - 0.02, (0.0, 0.0, 0.0))
+    packet = LeaderPacket(0, t - 0.02, (0.0, 0.0, 0.0))
     if by == "pilot":
         functions, law = law_functions(own), types.ModuleType("law")
         exec(python_text(functions.values(), "A law.", {}), vars(law))
@@ -213,7 +211,7 @@ def test_a_process_that_begins_late_does_not_make_up_for_turns(by):
         facts |= {"weights": own.weights[0].tolist(), "signal": names, "message": names}
         pilot = Pilot(law, facts | {"network": network_facts(own, 0.02, functions)})
         for k in own.neighbours:
-            pilot.box.receive(Letter(k, t - 0.02, k, (0.0, 0.0, 0.0), packet), t)
+            pilot.box.receive(Message(k, t - 0.02, k, (0.0, 0.0, 0.0), packet), t)
         u = pilot.tick(t, x).u
     else:
         if network is not None:  # which has no message before it
@@ -234,12 +232,9 @@ def test_what_is_guaranteed_of_a_start_is_that_of_its_nearest_turn():
         starts = np.array([facing(Carrier(), y, -0.6 * k) for k, y in enumerate((3.1, yaw, 3.1))])
         hover = ech.references.Hover(position=(0.0, 0.0, 0.0), yaw=3.1)
         parts = stopping(Carrier(), reference=hover, initial=starts)
-        sentences.add(ech.promise(parts, settings).sentence())
+        sentences.add(ech.guarantee(parts, settings).sentence())
     [sentence] = sentences
     assert "after 0 s" in sentence or "1 cm" in sentence
-
-
-# ---- inputs and normalized inputs ----------------------------------------------------------------
 
 
 def test_a_follower_that_is_fed_with_the_leaders_input_turns_as_fast():

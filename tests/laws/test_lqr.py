@@ -1,6 +1,5 @@
 """Time-varying LQR for leaders along feasible paths of states and inputs."""
 
-import json
 import textwrap
 
 import equinox as eqx
@@ -83,6 +82,9 @@ def test_it_leads_a_unicycle_which_no_gain_holds_at_its_trim():
     result = simulate_leader(model, law, start_error={"x": 0.3, "heading": 0.4})
     away = np.linalg.norm((result.states[:, 0] - result.reference)[:, :2], axis=1)
     assert away[0] == pytest.approx(0.3) and away[-1] < 2e-3
+    other = StatePath([0.0, 1.0], [[0.0], [1.0]], [[1.0], [1.0]])
+    with pytest.raises(LawError, match="has 1 states, and `Unicycle` has 3"):
+        simulate_leader(model, ech.laws.PathLQR(other, 1.0))
 
 
 def simulate_leader(model, law, **more):
@@ -90,8 +92,6 @@ def simulate_leader(model, law, **more):
     run = {"horizon": 8.0, "dt": 0.01, "leader": law, "follower": ech.laws.TrimInput()}
     return simulate(model, PAIR, formation, **run, **more)
 
-
-# ---- paths of states ----
 
 PENDULUM = Pendulum()
 
@@ -131,18 +131,11 @@ def test_a_path_of_states_goes_through_its_knots_with_the_model_s_slopes():
             (x, u), (slope, _) = jax.jvp(lambda t: path.follow(PENDULUM, t), (t,), (jnp.ones(()),))
             assert np.asarray(x) == pytest.approx(states[k], abs=1e-13)
             assert np.asarray(u) == pytest.approx(inputs[k], abs=1e-13)
-            if 0 < k < 30:
-                assert np.asarray(slope) == pytest.approx(
-                    np.asarray(PENDULUM.velocity(x, u)), abs=1e-9
-                )
-
-
-def test_an_angle_may_be_given_within_one_turn():
-    heading = np.array([3.0, 3.1, 3.2, 3.3])
-    wrapped = np.where(heading > np.pi, heading - 2.0 * np.pi, heading)
-    rows = np.stack([np.zeros(4), np.zeros(4), wrapped], axis=1)
-    turn = np.tile([0.0, 0.1], (4, 1))
-    path = StatePath(np.arange(4.0), rows, turn)
+            moved = np.asarray(PENDULUM.velocity(x, u))
+            assert k in (0, 30) or np.asarray(slope) == pytest.approx(moved, abs=1e-9)
+    # An angle may be given within one turn.
+    rows = np.pad([[3.0], [3.1], [3.2 - 2.0 * np.pi], [3.3 - 2.0 * np.pi]], ((0, 0), (2, 0)))
+    path = StatePath(np.arange(4.0), rows, np.tile([0.0, 0.1], (4, 1)))
     with precision("float64"):
         x, _ = path.follow(Unicycle(), jnp.asarray(1.5))
     assert float(x[2]) == pytest.approx(3.15)
@@ -150,7 +143,10 @@ def test_an_angle_may_be_given_within_one_turn():
 
 def test_how_far_a_path_is_from_a_motion_is_said_with_its_number():
     times, states, inputs = swing(61)
-    assert reference_demand(PENDULUM, StatePath(times, states, inputs), 6.0).defect < 0.02
+    path = StatePath(times, states, inputs)
+    assert reference_demand(PENDULUM, path, 6.0).defect < 0.02
+    # A path that ends on the way is held where nothing would hold it.
+    assert not reference_demand(PENDULUM, path, 8.0).feasible
     # Without its torque the rate is off by the torque, where it is largest.
     still = StatePath(times, states, 0.0 * inputs)
     found = reference_demand(PENDULUM, still, 6.0)
@@ -158,19 +154,16 @@ def test_how_far_a_path_is_from_a_motion_is_said_with_its_number():
     (told,) = reference_warnings(PENDULUM, still, 6.0)
     assert "the reference `StatePath` is no motion of `Pendulum`: at t = " in told
     assert f"the rate of `rate` is {found.off[1]:.3g} off f + g u" in told
-    # A path that ends on the way is held where nothing would hold it.
-    assert not reference_demand(PENDULUM, StatePath(times, states, inputs), 8.0).feasible
 
 
 def test_a_check_says_what_the_reference_asks(tmp_path, echelon):
     file = write_swing(tmp_path)
     assert "reference, what it asks" in echelon("check", file)[1]
-    drift = {"name": "line", "velocity": [250, 0, 0]}
-    checked = ech.check(*ech.build(ech.load_scenario("paper", [f"reference={json.dumps(drift)}"])))
+    drift = "reference={name: line, velocity: [250, 0, 0]}"
+    checked = ech.check(*ech.build(ech.load_scenario("paper", [drift])))
     (line,) = [line for line in checked.lines if line.name == "reference, what it asks"]
-    assert line.verdict is Verdict.HOLDS and line.number_text.startswith(
-        "250 m/s, 0 m/s^2, 0 % of the"
-    )
+    assert line.verdict is Verdict.HOLDS
+    assert line.number_text.startswith("250 m/s, 0 m/s^2, 0 % of the")
 
 
 SCENARIO = """
@@ -216,9 +209,6 @@ def test_faults_of_a_path_are_told(tmp_path, change, said):
     assert said in str(found.value)
 
 
-def test_a_path_of_another_model_is_refused():
-    path = StatePath([0.0, 1.0], [[0.0], [1.0]], [[1.0], [1.0]])
-    with pytest.raises(LawError, match="has 1 states, and `Unicycle` has 3"):
-        simulate_leader(Unicycle(), ech.laws.PathLQR(path, 1.0))
+def test_inputs_of_a_path_are_as_many_as_its_states():
     with pytest.raises(ReferenceError, match=r"`inputs` of `StatePath` has shape \(1, 1\)"):
         StatePath([0.0, 1.0], [[0.0], [1.0]], [[1.0]])

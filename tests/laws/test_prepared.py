@@ -6,7 +6,7 @@ import pytest
 import echelon as ech
 from echelon.core.identity import process_key
 from echelon.core.numerics import precision
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.simulation.engine.prepare import prepare
 
 LIGHT, HEAVY = ech.models.DoubleIntegrator(3), ech.models.DoubleIntegrator(3, drag=0.4)
@@ -77,7 +77,7 @@ def test_a_run_on_another_graph_has_the_guarantee_of_that_graph(graph):
     goals = ech.Formation(np.zeros((5, 6)))
     parts = ech.Parts(LIGHT, LINE, goals, ech.Laws(leader, ech.laws.StoppingPoint()))
     ready = prepare(parts, SETTINGS).parts
-    fresh, again = (promise(each.replace(graph=graph), SETTINGS) for each in (parts, ready))
+    fresh, again = (guarantee(each.replace(graph=graph), SETTINGS) for each in (parts, ready))
     assert again.as_mapping() == fresh.as_mapping()
     assert (again.coupling, again.hold) == (fresh.coupling, fresh.hold)
-    assert again.coupling != promise(parts, SETTINGS).coupling
+    assert again.coupling != guarantee(parts, SETTINGS).coupling

@@ -1,25 +1,21 @@
 """The text of a check fits a terminal, and puts the verdict on this scenario first."""
 
+from types import SimpleNamespace
+
 import pytest
 
 import echelon as ech
 from echelon.core.statement import Hypothesis, Topic, fails, holds, unneeded
 from echelon.core.words import Kind
-from echelon.experiments.scenario.scenario import bundled_scenarios
 from echelon.output.reports.check_report import HEIGHT, WIDTH, check_report, grouped
 
-QUICK = ("paper", "integrators")
-# Those with the most lines and the longest; the others are a study.
+# Those with the most lines and the longest.
 LONG = ("paper-everything", "crossing", "paper-far")
 
 
-def marked(name):
-    """A scenario, as a study where others say as much."""
-    mark = pytest.mark.slow if name in LONG else pytest.mark.study
-    return name if name in QUICK else pytest.param(name, marks=mark)
-
-
-@pytest.mark.parametrize("name", [marked(name) for name in bundled_scenarios()])
+@pytest.mark.parametrize(
+    "name", ["paper", "integrators", *(pytest.param(x, marks=pytest.mark.slow) for x in LONG)]
+)
 def test_a_check_of_a_bundled_scenario_fits_a_terminal(name):
     found = ech.check(*ech.build(ech.load_scenario(name)))
     text = check_report(found)
@@ -37,21 +33,11 @@ def test_a_check_of_a_bundled_scenario_fits_a_terminal(name):
     assert sum(k > printed for k in rows) == sum(line.fails for line in papers)
 
 
-class Promised:
-    """A promise with a long sentence."""
-
-    def sentence(self):
-        return "Local guarantee: " + "word " * 60
-
-
-class Found:
-    """A check with as many lines as there are, each made by a function."""
-
-    warnings = ()
-
-    def __init__(self, make):
-        self.promise = Promised()
-        self.lines = tuple(map(make, (*Hypothesis, *Topic)))
+def found_of(make):
+    """A check with a long sentence and all lines that there are, each made by a function."""
+    promise = SimpleNamespace(sentence=lambda: "Local guarantee: " + "word " * 60)
+    lines = tuple(map(make, (*Hypothesis, *Topic)))
+    return SimpleNamespace(promise=promise, lines=lines, warnings=())
 
 
 @pytest.mark.parametrize(
@@ -63,21 +49,18 @@ class Found:
     ],
 )
 def test_what_holds_makes_room(make):
-    lines = check_report(Found(make)).splitlines()
+    lines = check_report(found_of(make)).splitlines()
     assert len(lines) <= HEIGHT and max(map(len, lines)) <= WIDTH
 
 
-def test_what_fails_is_never_left_out():
-    found = Found(lambda line: fails(line, Kind.PROOF, "x", remedy=f"change {line.name}"))
+def test_what_fails_is_never_left_out_and_every_line_is_in_one_group():
+    found = found_of(lambda line: fails(line, Kind.PROOF, "x", remedy=f"change {line.name}"))
     text = check_report(found)
     for line in found.lines:
         assert f" {line.name} " in text
         papers = line in grouped(found.lines)[list(grouped(found.lines))[-1]]
         assert (f"-> {line.remedy}" in text) != papers
     assert max(map(len, text.splitlines())) <= WIDTH
-
-
-def test_every_line_is_in_one_group():
-    lines = Found(lambda line: unneeded(line, Kind.PROOF, "text")).lines
+    lines = found_of(lambda line: unneeded(line, Kind.PROOF, "text")).lines
     groups = grouped(lines)
     assert sorted(x.name for part in groups.values() for x in part) == sorted(x.name for x in lines)

@@ -5,8 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from recordings import PROMISE, as_file, flown, swinging, tracked, with_errors
 
 from echelon.agents.network.switching import Schedule
@@ -59,31 +63,20 @@ def test_inputs_stand_in_percent_of_their_limits_which_are_drawn(run):
     low, high = figure.axes[0].get_ylim()
     assert low < 0.0 and high > 100.0
     assert figure.axes[0].get_xlim() == (0.0, 4.0)
-
-
-def test_inputs_without_limits_have_their_names_and_units(run):
-    free = dataclasses.replace(run, bounds=None)
-    figure = figures(free, ["inputs"])["inputs"]
-    assert [ax.get_ylabel() for ax in figure.axes] == ["u0 (N)", "u1 (N)", "u2 (N)", "u3 (N)"]
+    free = figures(dataclasses.replace(run, bounds=None), ["inputs"])["inputs"]
+    assert [ax.get_ylabel() for ax in free.axes] == ["u0 (N)", "u1 (N)", "u2 (N)", "u3 (N)"]
 
 
 def test_the_slope_that_is_promised_is_drawn_from_the_largest_error_on(run):
     worst = run.formation_errors.max(axis=1)
-    (t0, first), (t1, last) = lines_of(figures(run, ["formation"])["formation"])[
-        "guaranteed slope: \u22120.5 1/s"
-    ]
-    assert first == worst.max() and t0 == run.times[worst.argmax()]
-    assert np.log(last / first) == pytest.approx(-0.5 * (t1 - t0))
-    (t0, first), (t1, last) = lines_of(figures(run, ["lyapunov"])["lyapunov"])[
-        "guaranteed slope: \u22121 1/s"
-    ]
-    assert np.log(last / first) == pytest.approx(-1.0 * (t1 - t0))
-
-
-def test_nothing_is_drawn_of_a_promise_that_is_none(run):
+    for name, rate in (("formation", -0.5), ("lyapunov", -1.0)):
+        label = f"guaranteed slope: \u2212{-rate:g} 1/s"
+        (t0, first), (t1, last) = lines_of(figures(run, [name])[name])[label]
+        assert name == "lyapunov" or (first == worst.max() and t0 == run.times[worst.argmax()])
+        assert np.log(last / first) == pytest.approx(rate * (t1 - t0))
     none = dataclasses.replace(run, promise=PROMISE | {"promised": False, "rate": None})
-    for name in ("formation", "lyapunov"):
-        assert not [k for k in lines_of(figures(none, [name])[name]) if "guaranteed" in k]
+    for name, figure in figures(none, ["formation", "lyapunov"]).items():
+        assert not [k for k in lines_of(figure) if "guaranteed" in k], name
 
 
 def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_so(run):
@@ -106,6 +99,11 @@ def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_s
     worst[0, 1] = block[:, :3] @ direction
     tight = with_errors(proved, shrink * worst)
     np.testing.assert_allclose(tight.error_bound(), tight.formation_errors[:, 1], rtol=1e-9)
+    proved = dataclasses.replace(run, metric=1e4 * np.diag([1.0] + [1e-4] * 11), promise=CERTIFIED)
+    bound = proved.error_bound()
+    (ax,) = figures(proved, ["formation"])["formation"].axes
+    assert bound[0] > 10.0 * run.formation_errors.max()
+    assert ax.get_ylim()[1] >= bound[0]
 
 
 @pytest.mark.parametrize(
@@ -125,7 +123,9 @@ def test_no_bound_is_drawn_that_is_not_promised_of_the_run(run, spoiled):
     assert dataclasses.replace(proved, **spoiled).error_bound() is None
 
 
-def test_distances_are_those_of_linked_agents_with_those_wanted(run):
+def test_distances_are_those_of_linked_agents_with_those_desired(
+    run,
+):
     figure = figures(run, ["distances"])["distances"]
     lines = lines_of(figure)
     i, j = run.edges[1]
@@ -135,9 +135,6 @@ def test_distances_are_those_of_linked_agents_with_those_wanted(run):
     away = np.linalg.norm(places[:, :, None] - places[:, None], axis=3) + 1e9 * np.eye(4)
     least = lines_of(figure, 1)["any two"][:, 1]
     np.testing.assert_allclose(least, away.min(axis=(1, 2)))
-
-
-def test_desired_distances_of_a_formation_that_moves_are_lines(run):
     moving = run.offsets * (1.0 + run.times[:, None, None])
     figure = figures(dataclasses.replace(run, moving=moving), "distances")["distances"]
     i, j = run.edges[0]
@@ -146,8 +143,6 @@ def test_desired_distances_of_a_formation_that_moves_are_lines(run):
 
 
 def test_settings_that_the_user_has_changed_apply_to_lines_and_legends(run):
-    import matplotlib
-
     with matplotlib.rc_context({"lines.linewidth": 3.0, "legend.fontsize": 14.0}):
         own = figures(run, "formation")["formation"]
     plain = figures(run, "formation")["formation"]
@@ -188,15 +183,7 @@ def test_a_graph_that_switches_has_the_links_of_each_time(run):
     np.testing.assert_allclose(np.array(grey[5].get_data_3d()).T[3], run.states[-1, 0, :3])
 
 
-def test_a_flock_is_bands_a_median_and_its_worst_by_name(flock):
-    lines = lines_of(figures(flock, ["formation"])["formation"])
-    errors = flock.formation_errors[:, list(flock.followers)]
-    np.testing.assert_allclose(lines["median follower"][:, 1], np.median(errors, axis=1))
-    worst = flock.followers[int((errors**2).sum(axis=0).argmax())]
-    assert f"worst: follower {worst}" in lines
-
-
-def test_quantiles_of_a_flock_count_those_whose_errors_are_rounding(flock):
+def test_the_worst_and_the_median_of_a_flock_count_the_steady_window_and_those_at_rounding(flock):
     errors = np.zeros_like(flock.errors)
     # Two thirds of the followers are at rounding from half of the run on.
     errors[:, list(flock.followers), 0] = 1.0
@@ -205,9 +192,6 @@ def test_quantiles_of_a_flock_count_those_whose_errors_are_rounding(flock):
     lines = lines_of(figures(with_errors(flock, errors), ["formation"])["formation"])
     median = lines["median follower"][:, 1]
     assert (median[flock.times < 1.0] == 1.0).all() and np.isnan(median[flock.times >= 1.0]).all()
-
-
-def test_the_worst_of_a_flock_is_that_of_the_steady_window_as_in_the_table(flock):
     errors = np.zeros_like(flock.errors)
     errors[:, 7, 0] = np.where(flock.times < 0.8 * flock.horizon - 1e-9, 9.0, 0.1)
     errors[:, 9, 0] = 1.0
@@ -218,18 +202,10 @@ def test_the_worst_of_a_flock_is_that_of_the_steady_window_as_in_the_table(flock
     assert "worst: follower 7" in lines_of(figures(early, ["formation"])["formation"])
 
 
-def test_an_error_of_zero_is_no_tiny_number(flock):
-    still = with_errors(flock, np.zeros_like(flock.errors))
-    (ax,) = figures(still, ["formation"])["formation"].axes
-    assert ax.get_ylim()[0] >= 1e-3
-
-
 @pytest.mark.parametrize(
     ("page", "width", "what"), [(ONE_COLUMN, 3.5, NAMES), (TWO_COLUMNS, 7.16, FEW)]
 )
 def test_figures_fit_the_columns_of_a_page_with_letters_of_8_points(run, flock, page, width, what):
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     for own, names in ((run, what), (flock, FEW)):
         made = figures(own, names, page)
         assert tuple(made) == names
@@ -246,8 +222,6 @@ def test_figures_fit_the_columns_of_a_page_with_letters_of_8_points(run, flock, 
 
 
 def test_the_last_time_stands_on_the_paper_whatever_style_draws_it(flock):
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     longer = dataclasses.replace(flock, times=7.5 * flock.times, horizon=15.0)
     figure = figures(longer, ["formation"], ONE_COLUMN)["formation"]
     renderer = FigureCanvasAgg(figure).get_renderer()
@@ -268,8 +242,6 @@ def test_a_link_that_would_hide_behind_an_agent_is_bent_around_it():
 
 
 def test_the_arrow_of_a_bent_link_lies_on_it(run):
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     offsets = np.zeros_like(run.offsets)
     offsets[:, :2] = [[0, 0], [1, 0], [2, 0], [1, 1]]
     edges = np.array([[2, 0], [0, 1], [1, 3]])
@@ -287,7 +259,7 @@ def test_the_arrow_of_a_bent_link_lies_on_it(run):
     assert np.linalg.norm(middle - 0.5 * (begin + end)) > 20.0
 
 
-def test_links_past_the_palette_are_dashed_and_what_is_wanted_has_no_links_colour(run):
+def test_links_past_the_palette_are_dashed_and_lines_that_have_names_differ_in_grey_too(run):
     edges = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3], [3, 1]])
     more = dataclasses.replace(
         run, edges=edges, weights=np.ones(7), heard=np.ones((7, 2), bool), schedule=None
@@ -299,14 +271,12 @@ def test_links_past_the_palette_are_dashed_and_what_is_wanted_has_no_links_colou
     }
     assert len(looks) == 7
     assert named["desired"].get_color() not in {colour for colour, _ in looks}
-
-
-def test_the_start_of_a_bound_stands_within_the_axes(run):
-    proved = dataclasses.replace(run, metric=1e4 * np.diag([1.0] + [1e-4] * 11), promise=CERTIFIED)
-    bound = proved.error_bound()
-    (ax,) = figures(proved, ["formation"])["formation"].axes
-    assert bound[0] > 10.0 * run.formation_errors.max()
-    assert ax.get_ylim()[1] >= bound[0]
+    looks = [pen(place, 10) for place in range(10)] + [leader_pen(0, 10)]
+    shades = [np.dot(to_rgb(look["color"]), (0.299, 0.587, 0.114)) for look in looks]
+    for i, one in enumerate(looks):
+        for j, other in enumerate(looks[:i]):
+            apart = abs(shades[i] - shades[j]) > 0.06
+            assert apart or one["linestyle"] != other["linestyle"], (i, j)
 
 
 def test_axes_of_derivatives_say_when_v_rises_between_frames_that_fall(run):
@@ -316,13 +286,6 @@ def test_axes_of_derivatives_say_when_v_rises_between_frames_that_fall(run):
     below = figures(rising, ["lyapunov"])["lyapunov"].axes[1]
     assert "V increases in between" in below.get_title(loc="right")
     assert not figures(run, ["lyapunov"])["lyapunov"].axes[1].get_title(loc="right")
-
-
-def test_a_figure_that_is_none_is_refused_with_a_guess(run):
-    with pytest.raises(
-        OutputError, match="the figure is `formaton`, allowed are .* .did you mean `formation`"
-    ):
-        figures(run, ["formaton"])
 
 
 def test_plot_draws_png_pdf_and_svg_from_the_file_and_loses_no_other(echelon, here):
@@ -347,13 +310,8 @@ def test_plot_draws_png_pdf_and_svg_from_the_file_and_loses_no_other(echelon, he
     assert code == 2 and "(did you mean `network`?)" in fault
 
 
-# ---- axes of the caller ----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["formation", "modes", "network", "trajectories"])
 def test_a_figure_of_one_axes_is_drawn_into_those_of_the_caller(run, name):
-    from matplotlib.figure import Figure
-
     own = Figure((9.0, 3.0))
     left, right = own.subplots(1, 2)
     shown = run if name != "trajectories" else swinging(("x", "y"), (0, 1), n=2)
@@ -366,17 +324,18 @@ def test_a_figure_of_one_axes_is_drawn_into_those_of_the_caller(run, name):
 
 
 @pytest.mark.parametrize(
-    ("what", "sentence"),
-    [("inputs", "has several axes"), ("leader_3d", "in space"), (("states", "modes"), "2 names")],
+    ("what", "ax", "sentence"),
+    [
+        ("inputs", Figure().add_subplot(), "has several axes"),
+        ("leader_3d", Figure().add_subplot(), "in space"),
+        (("states", "modes"), Figure().add_subplot(), "2 names"),
+        ("formation", 3, "^`ax` is a `int`, and must be axes of matplotlib\\.$"),
+        ("formaton", None, "the figure is `formaton`, allowed are .* .did you mean `formation`"),
+    ],
 )
-def test_other_figures_refuse_axes(run, what, sentence):
-    from matplotlib.figure import Figure
-
+def test_a_figure_that_is_none_and_axes_that_do_not_fit_are_refused(run, what, ax, sentence):
     with pytest.raises(OutputError, match=sentence):
-        figures(run, what, ax=Figure().add_subplot())
-
-
-# ---- what an editor asks for ------------------------------------------------------------------
+        figures(run, what, ax=ax)
 
 
 @pytest.fixture(scope="module")
@@ -389,7 +348,7 @@ def long():
 OVER_TIME = ("tracking", "formation", "inputs", "states", "distances", "lyapunov")
 
 
-def test_every_figure_over_time_has_its_start_enlarged_beside_the_whole(long):
+def test_figures_over_time_have_their_start_enlarged_unless_they_settle_late(run, long):
     for name, figure in figures(long, OVER_TIME).items():
         times = [ax.get_xlim() for ax in figure.axes]
         assert set(times) == {(0.0, 4.0), (0.0, 60.0)}, name
@@ -399,9 +358,6 @@ def test_every_figure_over_time_has_its_start_enlarged_beside_the_whole(long):
         # The start has its own points: as many as frames of it are stored.
         (line, *_) = (line for line in figure.axes[0].lines if len(line.get_xdata()) > 2)
         assert len(line.get_xdata()) == 41, name
-
-
-def test_what_settles_late_or_is_short_has_no_enlarged_start(run, long):
     assert len(figures(run, ["formation"])["formation"].axes) == 1
     slow = with_errors(long, np.ones_like(long.states))
     assert start_of(slow) == 3.0
@@ -470,17 +426,6 @@ def test_a_swarm_has_its_followers_in_the_legend_of_every_figure(flock):
         assert {"57 followers", "5 to 95 %"} & {*texts}, name
 
 
-def test_lines_that_have_names_differ_in_grey_too():
-    from matplotlib.colors import to_rgb
-
-    looks = [pen(place, 10) for place in range(10)] + [leader_pen(0, 10)]
-    shades = [np.dot(to_rgb(look["color"]), (0.299, 0.587, 0.114)) for look in looks]
-    for i, one in enumerate(looks):
-        for j, other in enumerate(looks[:i]):
-            apart = abs(shades[i] - shades[j]) > 0.06
-            assert apart or one["linestyle"] != other["linestyle"], (i, j)
-
-
 def test_a_lost_leader_has_no_values_after_its_loss(long):
     lost = dataclasses.replace(
         long,
@@ -498,17 +443,13 @@ def test_a_lost_leader_has_no_values_after_its_loss(long):
             assert np.array_equal(np.isfinite(values), times < 5.0)
 
 
-def test_axes_that_are_none_are_refused(run):
-    with pytest.raises(OutputError, match="^`ax` is a `int`, and must be axes of matplotlib\\.$"):
-        figures(run, "formation", ax=3)
-
-
 BACKEND = """
 import os, sys
 os.environ["MPLBACKEND"] = sys.argv[1]
 import echelon
 assert "matplotlib" not in sys.modules
-exec(sys.argv[3])
+from recordings import flown
+figure = echelon.figures(flown(seconds=0.1), "trajectories")["trajectories"]
 figure.savefig(sys.argv[2])
 import matplotlib
 assert os.environ["MPLBACKEND"] == sys.argv[1] and "matplotlib.pyplot" not in sys.modules
@@ -516,22 +457,10 @@ print(matplotlib.get_backend(auto_select=False))
 """
 
 
-SHEET = """
-from echelon.output.plots.style import sheet, style
-with style():
-    figure, _ = sheet(3.0)
-"""
-RUN = """
-from recordings import flown
-figure = echelon.figures(flown(seconds=0.1), "trajectories")["trajectories"]
-"""
-
-
-@pytest.mark.parametrize(("backend", "code"), [("module://nothing.installed", SHEET), ("svg", RUN)])
-def test_figures_are_drawn_whatever_backend_the_environment_names(backend, code, tmp_path):
+def test_figures_are_drawn_whatever_backend_the_environment_names(tmp_path):
     """Jupyter names its own one to child processes; a user's choice remains."""
-    file = tmp_path / "figure.png"
-    command = [sys.executable, "-c", BACKEND, backend, str(file), code]
+    file, backend = tmp_path / "figure.png", "module://nothing.installed"
+    command = [sys.executable, "-c", BACKEND, backend, str(file)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == backend

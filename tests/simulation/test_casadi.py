@@ -43,7 +43,16 @@ def assert_equal(pair):
         assert got == pytest.approx(wanted, rel=1e-12, abs=1e-12 * size)
 
 
-numbers = st.integers(0, 2**32 - 1).map(np.random.default_rng)
+def assert_equal_at_many(draw, *compared):
+    """Compare functions at arguments that `draw` makes of random numbers, one tuple for each."""
+
+    @given(st.integers(0, 2**32 - 1))
+    @settings(max_examples=20)
+    def check(seed):
+        for compare, arguments in zip(compared, draw(np.random.default_rng(seed)), strict=True):
+            assert_equal(compare(*arguments))
+
+    check()
 
 
 def state(model, rng):
@@ -59,37 +68,17 @@ def control(model, rng):
     return size * rng.uniform(-2.0, 2.0, len(size))
 
 
-every_model = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-
-
-@every_model
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_the_motion_of_every_model_is_jax_s_with_its_slopes(model):
-    compare = both(model.velocity, (len(model.state_names), len(model.input_names)))
-
-    @given(numbers)
-    @settings(max_examples=20)
-    def check(rng):
-        assert_equal(compare(state(model, rng), control(model, rng)))
-
-    check()
-
-
-@every_model
-def test_what_else_a_model_says_is_jax_s_with_its_slopes(model):
     n, m = len(model.state_names), len(model.input_names)
-    outputs, limits = both(model.output, (n,)), both(model.limit, (m,))
-    differences, maps = both(model.difference, (n, n)), both(model.input_map, (n,))
+    compared = [both(model.velocity, (n, m)), both(model.output, (n,)), both(model.limit, (m,))]
+    compared += [both(model.difference, (n, n)), both(model.input_map, (n,))]
 
-    @given(numbers)
-    @settings(max_examples=20)
-    def check(rng):
-        x = state(model, rng)
-        assert_equal(outputs(x))
-        assert_equal(maps(x))
-        assert_equal(differences(x, 5.0 * state(model, rng)))
-        assert_equal(limits(control(model, rng)))
+    def draw(rng):
+        x, y, u = state(model, rng), 5.0 * state(model, rng), control(model, rng)
+        return (x, u), (x,), (u,), (x, y), (x,)
 
-    check()
+    assert_equal_at_many(draw, *compared)
 
 
 @pytest.mark.parametrize("model", FLAT_MODELS.values(), ids=FLAT_MODELS)
@@ -99,17 +88,13 @@ def test_the_flat_state_and_input_are_jax_s_with_their_slopes(model):
     def flown(path):
         return jnp.concatenate(model.flat(path.reshape(rows, columns)))
 
-    compare = both(flown, (rows * columns,))
-
-    @given(numbers)
-    @settings(max_examples=20)
-    def check(rng):
+    def draw(rng):
         # Accelerations below gravity and speeds above zero, where flatness has its meaning.
         path = rng.uniform(-2.0, 2.0, (rows, columns))
         path[1] = 1.0 + rng.uniform(0.0, 1.0, columns)
-        assert_equal(compare(path.ravel()))
+        return [(path.ravel(),)]
 
-    check()
+    assert_equal_at_many(draw, both(flown, (rows * columns,)))
 
 
 FUNCTIONS = {
@@ -150,14 +135,7 @@ A = np.arange(9.0).reshape(3, 3) + 4.0 * np.eye(3)
 
 @pytest.mark.parametrize("function", FUNCTIONS.values(), ids=FUNCTIONS)
 def test_what_a_model_may_use_is_jax_s_with_its_slopes(function):
-    compare = both(function, (3,))
-
-    @given(numbers)
-    @settings(max_examples=20)
-    def check(rng):
-        assert_equal(compare(rng.uniform(-1.5, 1.5, 3)))
-
-    check()
+    assert_equal_at_many(lambda rng: [(rng.uniform(-1.5, 1.5, 3),)], both(function, (3,)))
 
 
 def test_halves_are_rounded_as_jax_rounds_them():

@@ -1,7 +1,5 @@
 """A network that is not ideal: which messages arrive when, and what agents make of them."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +10,10 @@ from hypothesis import strategies as st
 import echelon as ech
 from echelon.agents.network.channel import NEVER
 from echelon.core.errors import EchelonError, SimulationError
+from echelon.simulation.engine.batch import Batch
+from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.knowledge import hop_life
+from echelon.simulation.step.loop import assemble
 from echelon.simulation.step.sequence import begin, step
 
 DT = 0.01
@@ -56,20 +57,6 @@ def test_hop_counts_are_never_forgotten_where_forgetting_takes_ages(forget):
             ages = jax.jit(hop_life)(channel, DT)
             assert float(ages) >= 10.0 * min(forget, 1e6)
             assert ages.dtype == (np.float64 if bits else np.float32)
-
-
-@pytest.mark.parametrize(
-    ("network", "sentence"),
-    [
-        (ech.Network(jitter=1e12, forget=1e13), "`jitter` of the network is 1e\\+12 s"),
-        (ech.Network(rate=1e-300, forget=1e308), "`rate` of the network is 1e-300 Hz"),
-        (ech.Network(rate=1e-9, forget=1e12), "`rate` of the network is 1e-09 Hz"),
-        (ech.Network(rate=1e300), "`rate` of the network is 1e\\+300 Hz"),
-    ],
-)
-def test_numbers_that_no_count_of_steps_holds_are_refused(network, sentence):
-    with pytest.raises(SimulationError, match=sentence):
-        network.prepared(DT, 10.0, 0)
 
 
 @settings(max_examples=25, deadline=None)
@@ -139,8 +126,6 @@ def test_the_shares_of_loss_and_of_outages_are_those_asked_for():
         assert outages == pytest.approx(share, abs=0.04)
 
 
-# ---- in the closed loop --------------------------------------------------------------------------
-
 POINTS = ech.models.SingleIntegrator()
 GRAPH = ech.Graph([(0, 1), (1, 2, 0.5), (2, 3), (3, 1, 2.0)])
 STARTS = np.random.default_rng(4).normal(size=(4, len(POINTS.state_names)))
@@ -181,20 +166,8 @@ def test_messages_that_contain_states_are_received_as_they_were_sent(late):
     network = ech.Network(rate=1.0 / DT, delay=late * DT, messages="state")
     result = ech.simulate(parts(network), chosen())
     np.testing.assert_allclose(result.states, states_late(late), atol=1e-12)
-
-
-def formation(network=None, **overrides):
-    scenario = ech.load_scenario(
-        "integrators", ["simulation.horizon=12", *(f"{k}={v}" for k, v in overrides.items())]
-    )
-    built, settings = ech.build(scenario)
-    world = dataclasses.replace(built.world, network=network)
-    return built.replace(world=world), settings._replace(engine="jax")
-
-
-def errors_of(result):
-    y = result.states - result.formation.offsets
-    return np.abs(y[:, 1:] - y[:, :1])
+    with pytest.raises(EchelonError, match="a network that is not ideal"):
+        ech.simulate(parts(network), chosen(engine="native"))
 
 
 def test_a_run_continues_with_the_messages_that_are_under_way():
@@ -214,14 +187,7 @@ def test_a_run_continues_with_the_messages_that_are_under_way():
     np.testing.assert_array_equal(resumed.states, whole.states)
 
 
-def test_native_code_refuses_what_it_has_no_memory_for():
-    with pytest.raises(EchelonError, match="a network that is not ideal"):
-        ech.simulate(parts(ech.Network(messages="state")), chosen(engine="native"))
-
-
 def test_a_batch_draws_for_each_seed_what_a_run_alone_draws():
-    from echelon.simulation.engine.batch import Batch
-
     network = ech.Network(rate=100.0, loss=0.5, jitter=0.02, messages="state")
     runs = [(parts(network), chosen(seed=k)) for k in range(3)]
     alone = [ech.simulate(*run).states for run in runs]
@@ -245,12 +211,18 @@ def test_a_link_that_is_cut_carries_nothing_and_hops_heal():
         drive,
         world=ech.World(network=network),
     )
-    loop = assembled(made)
+    prepared = prepare(made, ech.Settings(horizon=2.0, dt=DT, engine="jax"))
+    drive = prepared.parts.drive
     with jax.enable_x64(True):
+        loop = assemble(prepared.problem, drive.leader, drive.follower)
+
+        def hops_of(now):
+            last = (now.step - 1) // loop.channel.every
+            return now.world.in_flight.content.hops[last % loop.channel.slots]
 
         def one(now, _):
             now = step(loop, now)
-            return now, hops_of(loop, now)
+            return now, hops_of(now)
 
         start = begin(loop, jnp.zeros((3, 4)))
         hops = np.asarray(jax.jit(lambda now: jax.lax.scan(one, now, length=200)[1])(start))
@@ -259,26 +231,13 @@ def test_a_link_that_is_cut_carries_nothing_and_hops_heal():
         assert hops[k].tolist() == expected
 
 
-def assembled(made):
-    from echelon.simulation.engine.prepare import prepare
-    from echelon.simulation.step.loop import assemble
-
-    prepared = prepare(made, ech.Settings(horizon=2.0, dt=DT, engine="jax"))
-    drive = prepared.parts.drive
-    with jax.enable_x64(True):
-        return assemble(prepared.problem, drive.leader, drive.follower)
-
-
-def hops_of(loop, now):
-    """The hops that agents sent last."""
-    posts = now.world.in_flight
-    last = (now.step - 1) // loop.channel.every
-    return posts.content.hops[last % loop.channel.slots]
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"jitter": 1e12, "forget": 1e13}, r"`jitter` of the network is 1e\+12 s"),
+        ({"rate": 1e-300, "forget": 1e308}, r"`rate` of the network is 1e-300 Hz"),
+        ({"rate": 1e-9, "forget": 1e12}, r"`rate` of the network is 1e-09 Hz"),
+        ({"rate": 1e300}, r"`rate` of the network is 1e\+300 Hz"),
         ({"rate": 30.0}, r"`rate` .* 30 Hz, .* control rate 100 Hz divided by a whole number"),
         ({"delay": 9.0, "forget": 10.0}, r"`delay` .* 9 s, .* at most the horizon, 0.4 s"),
         ({"loss": 1.5}, r"`loss` .* 1.5, .* from 0 to 1"),
@@ -294,36 +253,28 @@ def test_a_network_that_cannot_work_is_refused_in_one_sentence(change, message):
         ech.simulate(parts(ech.Network(**{"rate": 50.0, **change})), chosen())
 
 
-def drifting(prediction, dt=0.01):
-    """Carts over a radio, whose leader drifts without a plan: their errors at the end, m."""
-    cart, graph = ech.models.DoubleIntegrator(dimension=1), ech.Graph.path(3)
-    line = ech.Formation.from_offsets(cart, graph, {1: [1.0], 2: [2.0]})
-    gain = ech.synthesize(cart, graph, ech.gains.Riccati())
-    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
-    radio = ech.Network(rate=25.0, delay=0.1, loss=0.3, prediction=prediction)
-    parts = ech.Parts(
-        *(cart, graph, line, drive, {"position": 0.3}),
-        start_error={"vx": 0.8},
-        world=ech.World(network=radio),
-    )
-    result = ech.simulate(parts, ech.Settings(horizon=12.0, dt=dt, engine="jax"))
-    return result.formation_errors[-1].max()
+CART, ROW = ech.models.DoubleIntegrator(dimension=1), ech.Graph.path(3)
+
+
+def in_a_row(leader, radio, **more):
+    """Carts in a row under a law of states, over a radio."""
+    line = ech.Formation.from_offsets(CART, ROW, {1: [1.0], 2: [2.0]})
+    drive = ech.Laws(leader, ech.laws.Consensus(ech.synthesize(CART, ROW, ech.gains.Riccati())))
+    return ech.Parts(CART, ROW, line, drive, world=ech.World(network=radio), **more)
 
 
 def test_a_leader_without_a_plan_is_carried_on_by_the_model():
+    radio = ech.Network(rate=25.0, delay=0.1, loss=0.3, prediction="packet")
+    starts = {"initial": {"position": 0.3}, "start_error": {"vx": 0.8}}
+    parts, settings = in_a_row(ech.laws.TrimInput(), radio, **starts), ech.Settings(12.0, DT)
     # It drifts at .8 m/s, and what is heard of it is some .15 s old.
-    assert drifting("packet") < 1e-3
+    assert ech.simulate(parts, settings._replace(engine="jax")).formation_errors[-1].max() < 1e-3
     with pytest.raises(EchelonError, match="has no plan; use `packet`"):
-        drifting("preview")
+        ech.simulate(in_a_row(ech.laws.TrimInput(), ech.Network()), settings)
 
 
 def test_states_are_not_predicted_by_a_plan_of_stopping_points():
-    cart, graph = ech.models.DoubleIntegrator(dimension=1), ech.Graph.path(3)
-    gain = ech.synthesize(cart, graph, ech.gains.Riccati())
-    drive = ech.Laws(ech.laws.StoppingLeader(), ech.laws.Consensus(gain))
-    line = ech.Formation.from_offsets(cart, graph, {1: [1.0], 2: [2.0]})
-    mixed, short = ech.Parts(cart, graph, line, drive), ech.Settings(horizon=0.05, dt=0.01)
-    radio = ech.Network(prediction="packet")
+    leader, short = ech.laws.StoppingLeader(), ech.Settings(horizon=0.05, dt=DT)
     with pytest.raises(SimulationError, match="`Consensus` do not send what the plan .* `packet`"):
-        ech.simulate(mixed.replace(world=ech.World(network=ech.Network())), short)
-    assert ech.simulate(mixed.replace(world=ech.World(network=radio)), short).outcome.reached
+        ech.simulate(in_a_row(leader, ech.Network()), short)
+    assert ech.simulate(in_a_row(leader, ech.Network(prediction="packet")), short).outcome.reached

@@ -36,16 +36,12 @@ def test_an_agent_that_leaves_its_chart_is_named_with_the_time(start, first, sto
     assert ech.summary(run)["outcome"] == {"name": "left_chart", "message": run.message}
 
 
-def test_a_run_whose_agents_all_leave_their_chart_has_left_it():
+def test_a_run_whose_agents_all_leave_their_chart_has_left_it_and_others_complete():
     model, graph, rest = ech.models.Quadrotor(), ech.Graph.path(2), ech.laws.TrimInput()
-    still = ech.Formation(np.zeros((2, 12)))
-    states = np.zeros((2, 12))
+    still, states = ech.Formation(np.zeros((2, 12))), np.zeros((2, 12))
     states[:, 7] = 1.94
     parts = ech.Parts(model, graph, still, ech.Laws(rest, rest), initial=states)
     assert ech.simulate(parts, ech.Settings(0.05, 0.01)).outcome is Outcome.LEFT_CHART
-
-
-def test_inside_of_its_chart_a_run_completes():
     assert spinning((0.5, 0.1)).outcome is Outcome.COMPLETED
 
 
@@ -61,13 +57,8 @@ def test_inputs_that_alternate_between_their_limits_are_counted(strength, altern
     # x+ = x - dt sign(x) from dt / 2 for ever, where |k x| > 1; a weak gain decays.
     model, graph = Cut([[0.0]], [[1.0]]), ech.Graph.path(2)
     gain = ech.synthesize(model, graph, ech.gains.FixedGain([[strength]], coupling=1.0))
-    parts = ech.Parts(
-        model,
-        graph,
-        ech.Formation(np.zeros((2, 1))),
-        ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain)),
-        initial=np.array([[0.0], [0.05]]),
-    )
+    laws, starts = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain)), np.array([[0], [0.05]])
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((2, 1))), laws, initial=starts)
     for every in (1, 7):
         run = ech.simulate(parts, ech.Settings(10.0, 0.1, store_every=every))
         assert run.chatter.tolist() == [0, alternations]

@@ -80,13 +80,19 @@ def test_of_up_to_32_agents_all_steps_count_and_of_more_the_report_says_frames(e
     assert ech.summary(run)["minimum_distance_frames"] == 11
 
 
-def test_runs_of_a_batch_have_the_distances_of_each_alone():
+def test_runs_of_a_batch_have_the_distances_of_each_alone_and_absent_agents_are_near_to_nobody():
     runs = [built(many(5), seed=seed) for seed in range(9)]
     found = [result.closest for result in Batch(1).fly(runs)]
     alone = [ech.simulate(parts, settings._replace(store_every=1)) for parts, settings in runs]
     expected = [all_pairs(result)[0] for result in alone]
     np.testing.assert_allclose([pair.distance for pair in found], expected, rtol=1e-9)
     assert all(pair.frames is None for pair in found)
+    given = many(4) | {"events": [{"at": 1.0, "lose": 2}]}
+    parts, settings = built(given)
+    every = ech.simulate(parts, settings._replace(store_every=1))
+    assert ech.simulate(parts, settings).closest.distance == pytest.approx(
+        every.closest_pair().distance, rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("engine", ["jax", "native"])
@@ -126,19 +132,3 @@ def test_a_continued_run_has_the_same_smallest_distance(engine):
     again = ech.simulate(parts, settings, before=stretches)
     np.testing.assert_array_equal(again.sums.closest, whole.sums.closest)
     np.testing.assert_array_equal(again.sums.met, whole.sums.met)
-
-
-def test_agents_that_are_absent_are_near_to_nobody():
-    given = many(4) | {"events": [{"at": 1.0, "lose": 2}]}
-    parts, settings = built(given)
-    every = ech.simulate(parts, settings._replace(store_every=1))
-    assert ech.simulate(parts, settings).closest.distance == pytest.approx(
-        every.closest_pair().distance, rel=1e-9
-    )
-
-
-def test_a_distance_is_kept_on_disk(tmp_path):
-    times = SWAP["simulation"] | {"store_every": 40}
-    result = ech.run(ech.scenario_from_mapping(SWAP | {"simulation": times}))
-    ech.save_run(result, tmp_path / "run")
-    assert ech.load(tmp_path / "run").closest == result.closest

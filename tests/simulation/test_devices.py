@@ -7,12 +7,9 @@ import sys
 
 import numpy as np
 import pytest
-from runs import simulate
 
 import echelon as ech
-from echelon.agents.models import DoubleIntegrator
 from echelon.core.errors import SimulationError
-from echelon.laws import Consensus, TrimInput
 
 FLY = """
 import sys, os
@@ -22,15 +19,10 @@ if processes > 1:
     jax.distributed.initialize(f"127.0.0.1:{port}", processes, process)
 import numpy as np
 import echelon as ech
-model, graph = ech.models.DoubleIntegrator(), ech.Graph.path(4)
-law = ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.Riccati()))
-formation = ech.Formation(np.arange(16.0).reshape(4, 4) * [1, 1, 0, 0])
-parts = ech.Parts(
-    model, graph, formation, ech.Laws(ech.laws.TrimInput(), law), start_error={"position": 1.0},
-    world=ech.World(disturbance=ech.Disturbance(rms={"velocity": 0.5})),
-)
-settings = ech.Settings(0.5, 0.01, engine="jax", devices=devices, store_every=20, seed=1)
-result = ech.simulate(parts, settings)
+changes = ["simulation.horizon=0.5", "simulation.dt=0.01", "simulation.store_every=20", "seed=1"]
+changes += ["disturbance={rms: {x: 0.5}}", "simulation.engine=jax"]
+parts, settings = ech.build(ech.load_scenario("integrators", changes))
+result = ech.simulate(parts, settings._replace(devices=devices))
 if process == 0:
     np.savez(out, states=result.states, inputs=result.inputs, **result.sums._asdict())
 """
@@ -78,16 +70,6 @@ def test_two_devices_and_two_processes_have_the_bits_of_one(tmp_path):
     ],
 )
 def test_devices_that_there_are_not_are_refused(more, told):
-    model, graph = DoubleIntegrator(), ech.Graph.path(4)
-    gain = ech.synthesize(model, graph, ech.gains.Riccati())
+    parts, settings = ech.build(ech.load_scenario("integrators"))
     with pytest.raises(SimulationError, match=told):
-        simulate(
-            model,
-            graph,
-            ech.Formation(np.zeros((4, len(model.state_names)))),
-            leader=TrimInput(),
-            follower=Consensus(gain),
-            horizon=0.1,
-            dt=0.01,
-            **more,
-        )
+        ech.simulate(parts, settings._replace(**more))

@@ -1,4 +1,4 @@
-"""Agents that are lost or join, links that are cut, and heirs that take the lead."""
+"""Agents that are lost or join, links that are cut, and backup leaders that take the lead."""
 
 import dataclasses
 
@@ -14,6 +14,7 @@ from echelon.simulation.engine.prepare import prepare
 Cut, Join, Lose = ech.network.Cut, ech.network.Join, ech.network.Lose
 CART = ech.models.DoubleIntegrator()
 RING = ech.Graph([(0, 1), (1, 2), (2, 3), (3, 0), (1, 3)])
+TREE = ech.Graph([(0, 1), (1, 2), (1, 3)])
 CIRCLE = ech.references.Circle(radius=2.0, rate=0.7)
 STOPPING = ech.Laws(ech.laws.StoppingLeader(reference=CIRCLE), ech.laws.StoppingPoint())
 PLACES = {1: [1.0, 0.0], 2: [2.0, 0.0], 3: [0.0, 1.0]}
@@ -46,7 +47,7 @@ def test_a_cut_link_is_a_graph_that_switches():
     assert cut.engine == "native" and cut.presence is None
 
 
-def test_an_agent_is_there_until_it_is_lost_and_from_when_it_joins(lost):
+def test_an_agent_and_its_numbers_are_there_until_it_is_lost_and_from_when_it_joins(lost):
     steps = np.rint(lost.times / 0.02).astype(int)
     assert np.array_equal(lost.presence[:, 3], steps < 100)
     assert np.array_equal(lost.presence[:, 2], steps >= 150)
@@ -55,6 +56,12 @@ def test_an_agent_is_there_until_it_is_lost_and_from_when_it_joins(lost):
     assert np.ptp(lost.states[steps <= 150, 2], axis=0).max() == 0.0
     assert not lost.inputs[~lost.presence].any()
     assert not lost.errors[~lost.presence].any()
+    numbers = {row.agent: row for row in ech.metrics(lost).followers}
+    frames = lost.presence[:-1]
+    for agent in (1, 2, 3):
+        own = lost.formation_errors[:-1, agent][frames[:, agent]]
+        assert numbers[agent].rmse == pytest.approx(np.sqrt(np.mean(own**2)), rel=1e-9)
+    assert numbers[3].steady_rmse is None
 
 
 def test_those_who_remain_fly_as_in_a_graph_without_the_others(lost):
@@ -68,15 +75,6 @@ def test_those_who_remain_fly_as_in_a_graph_without_the_others(lost):
     assert gap.max() < 1e-12
 
 
-def test_numbers_are_of_the_steps_in_which_an_agent_is_there(lost):
-    numbers = {row.agent: row for row in ech.metrics(lost).followers}
-    frames = lost.presence[:-1]
-    for agent in (1, 2, 3):
-        own = lost.formation_errors[:-1, agent][frames[:, agent]]
-        assert numbers[agent].rmse == pytest.approx(np.sqrt(np.mean(own**2)), rel=1e-9)
-    assert numbers[3].steady_rmse is None
-
-
 def test_the_summary_states_each_event_and_what_followed(lost):
     summary = ech.summary(lost)
     assert [event["text"] for event in summary["events"]] == ["agent 3 is lost", "agent 2 joins"]
@@ -88,9 +86,6 @@ def test_the_summary_states_each_event_and_what_followed(lost):
     assert second["restored"] is None or second["restored"] > 3.0
     assert first["until"] == pytest.approx(2.98)
     assert "Agent 2 joins at 3 s" in ech.report(lost)
-
-
-def test_a_run_at_whose_end_no_follower_is_left_says_so():
     events = [Lose(agent, 0.1 + 0.1 * agent) for agent in (1, 2, 3)]
     run = ech.simulate(_parts(events=events), SETTINGS._replace(horizon=1.0))
     assert "No follower is there at the end." in ech.report(run)
@@ -105,24 +100,30 @@ def test_an_agent_that_returns_begins_anew():
     assert once.formation_errors[-1].max() < 0.02
 
 
+def of_states(graph, leader=None):
+    gain = ech.synthesize(CART, graph, ech.gains.Riccati())
+    return ech.Laws(leader or ech.laws.Tracking(CIRCLE), ech.laws.Consensus(gain, "relay"))
+
+
 @pytest.mark.parametrize(
     "network", [None, pytest.param(RADIO, marks=pytest.mark.slow)], ids=["ideal", "radio"]
 )
-def test_an_heir_leads_along_the_path(network):
-    parts = _parts(
-        network=network, events=[Lose(0, 3.0)], leadership=ech.Leadership((1, 2), timeout=0.3)
-    )
-    run = ech.simulate(parts, SETTINGS)
+def test_a_backup_leader_leads_along_the_path(network):
+    backups = {"events": [Lose(0, 3.0)], "leadership": ech.Leadership((1, 2), timeout=0.3)}
+    run = ech.simulate(_parts(network=network, **backups), SETTINGS)
     assert run.formation_errors[run.times > 3.0].max() < 1e-3
-    # The heir is where the leader's path and its own offset put it.
+    # The backup leader is where the leader's path and its own offset put it.
     gap = run.states[-1, 1] - run.reference[-1] - run.offsets[1]
     assert np.abs(gap).max() < 5e-3
     assert (run.nearest_then[run.times >= 3.0] == 1).all()
     agent, off = ech.summary(run)["event_outcomes"][0]["leader"]
     assert agent == 1 and off < 0.3
+    if network is None:
+        run = ech.simulate(_parts(drive=of_states(RING), **backups), SETTINGS)
+        assert run.formation_errors[-1].max() < 0.05
 
 
-def test_an_heir_leads_at_its_place_in_a_formation_that_turns():
+def test_a_backup_leader_leads_at_its_place_in_a_formation_that_turns():
     """Its place, and those of all others, are those of each time and not of the start."""
     parts = _parts(events=[Lose(0, 3.0)], leadership=ech.Leadership((1, 2), timeout=0.3))
     turning = parts.formation.moving(CART, RING, [ech.network.Rotate(0.8)])
@@ -135,12 +136,23 @@ def test_an_heir_leads_at_its_place_in_a_formation_that_turns():
     assert agent == 1 and off < 0.3
 
 
-def test_losses_that_are_covered_are_guaranteed():
+def test_losses_and_cuts_that_are_covered_are_guaranteed_and_others_until_a_leader_is_lost():
     parts = _parts(events=[Lose(3, 2.0), Cut((1, 2), 3.0, 1.0)])
-    guarantee = ech.promise(parts, SETTINGS)
+    guarantee = ech.guarantee(parts, SETTINGS)
     assert guarantee.promised and guarantee.rate is not None
     stated = events_in_words(parts, guarantee)
     assert [event["guarantee"]["kind"] for event in stated] == ["proof", "proof"]
+    parts = _parts(events=[Cut((1, 2), 1.0, 0.5), Lose(0, 3.01)], leadership=ech.Leadership((1,)))
+    guarantee = ech.guarantee(parts, SETTINGS)
+    without = ech.guarantee(
+        parts.replace(events=[Cut((1, 2), 1.0, 0.5)]), SETTINGS._replace(horizon=3.0)
+    )
+    assert guarantee.prefix.promise.sentence() == without.sentence()
+    assert "from 3.01 s on" in guarantee.sentence() and "Until 3.01 s: " in guarantee.sentence()
+    assert guarantee.as_mapping()["prefix"]["promise"]["promised"]
+    # At its first step nothing comes before it.
+    at_once = _parts(events=[Lose(0, 0.01)], leadership=ech.Leadership((1,)))
+    assert ech.guarantee(at_once, SETTINGS).prefix is None
 
 
 @pytest.mark.parametrize(
@@ -160,7 +172,7 @@ def test_an_event_is_not_covered_by_a_guarantee_that_ignores_how_messages_and_ag
 ):
     """As before the event: what the guarantee of the run leaves out, that of an event does too."""
     parts = _parts(events=[Lose(3, 2.0), Cut((1, 2), 3.0, 1.0)]).replace(world=world)
-    guarantee = ech.promise(parts, SETTINGS)
+    guarantee = ech.guarantee(parts, SETTINGS)
     assert ignored in guarantee.sentence()
     for event in events_in_words(parts, guarantee):
         stated = event["guarantee"]
@@ -170,13 +182,16 @@ def test_an_event_is_not_covered_by_a_guarantee_that_ignores_how_messages_and_ag
 
 
 @pytest.mark.parametrize(
-    "event", [Lose(3, 2.01), Cut((1, 2), 2.01), Cut((1, 2), 2.01, 1.003)], ids=str
+    ("event", "later"),
+    [
+        (Lose(3, 2.01), Lose(3, 2.02)),
+        (Cut((1, 2), 2.01), Cut((1, 2), 2.02)),
+        (Cut((1, 2), 2.01, 1.003), Cut((1, 2), 2.02, 1.0)),
+    ],
+    ids=str,
 )
-def test_an_event_between_two_steps_is_guaranteed_as_at_the_later_one(event):
-    later = dataclasses.replace(event, at=2.02)
-    if isinstance(event, Cut) and event.duration is not None:
-        later = dataclasses.replace(later, duration=1.0)
-    between, on = (ech.promise(_parts(events=[each]), SETTINGS) for each in (event, later))
+def test_an_event_between_two_steps_is_guaranteed_as_at_the_later_one(event, later):
+    between, on = (ech.guarantee(_parts(events=[each]), SETTINGS) for each in (event, later))
     assert on.promised and between.sentence() == on.sentence()
     assert between.rate == on.rate
 
@@ -193,25 +208,13 @@ def test_who_is_there_in_steps_is_who_is_there_in_a_run():
 
 
 @pytest.mark.parametrize(
-    "events", [[Join(2, 3.0)], [Lose(0, 3.0)]], ids=["one that joins", "a leader that is lost"]
+    ("network", "events"),
+    [(None, [Join(2, 3.0)]), (None, [Lose(0, 3.0)]), (RADIO, [])],
+    ids=["one that joins", "a leader that is lost", "backup leaders over a radio, at any time"],
 )
-def test_what_is_not_covered_is_not_guaranteed(events):
-    parts = _parts(events=events, leadership=ech.Leadership((1,)))
-    assert not ech.promise(parts, SETTINGS).promised
-
-
-def test_until_a_leader_is_lost_the_guarantee_is_that_without_the_loss():
-    parts = _parts(events=[Cut((1, 2), 1.0, 0.5), Lose(0, 3.01)], leadership=ech.Leadership((1,)))
-    guarantee = ech.promise(parts, SETTINGS)
-    without = ech.promise(
-        parts.replace(events=[Cut((1, 2), 1.0, 0.5)]), SETTINGS._replace(horizon=3.0)
-    )
-    assert guarantee.prefix.promise.sentence() == without.sentence()
-    assert "from 3.01 s on" in guarantee.sentence() and "Until 3.01 s: " in guarantee.sentence()
-    assert guarantee.as_mapping()["prefix"]["promise"]["promised"]
-    # At its first step nothing comes before it.
-    at_once = _parts(events=[Lose(0, 0.01)], leadership=ech.Leadership((1,)))
-    assert ech.promise(at_once, SETTINGS).prefix is None
+def test_what_is_not_covered_is_not_guaranteed(network, events):
+    parts = _parts(network=network, events=events, leadership=ech.Leadership((1,)))
+    assert not ech.guarantee(parts, SETTINGS).promised
 
 
 def test_who_hears_nearer_neighbours_alone_may_be_left_behind_by_an_event():
@@ -219,13 +222,13 @@ def test_who_hears_nearer_neighbours_alone_may_be_left_behind_by_an_event():
     ring, ward = ech.Graph.ring(5), ech.laws.StoppingPoint(hears="leaderward")
     drive = ech.Laws(STOPPING.leader, ward)
     for event in (Lose(1, 0.2), Cut((0, 1), 0.2)):
-        guarantee = ech.promise(_parts(ring, drive, events=[event]), SETTINGS)
+        guarantee = ech.guarantee(_parts(ring, drive, events=[event]), SETTINGS)
         assert not guarantee.promised and guarantee.rate is None
         assert "no path to the leader along neighbours that are nearer" in guarantee.sentence()
         # Truly: whoever hears nobody stays off.
         run = ech.simulate(_parts(ring, drive, events=[event]), SETTINGS)
         assert run.formation_errors[-1].max() > 0.1
-        assert ech.promise(_parts(ring, events=[event]), SETTINGS).promised
+        assert ech.guarantee(_parts(ring, events=[event]), SETTINGS).promised
 
 
 def test_a_link_that_no_step_has_makes_nobody_nearer():
@@ -234,43 +237,30 @@ def test_a_link_that_no_step_has_makes_nobody_nearer():
     turns = [(0.0, line), (1.011, [*line, (0, 3)]), (1.014, line)]
     graph, ward = ech.Graph.switching(turns, period=2.0), ech.laws.StoppingPoint(hears="leaderward")
     parts = _parts(graph, ech.Laws(STOPPING.leader, ward))
-    assert not ech.promise(parts, SETTINGS).promised
+    assert not ech.guarantee(parts, SETTINGS).promised
     assert ech.simulate(parts, SETTINGS).formation_errors[-1, 3] > 0.1
 
 
 def test_what_is_guaranteed_until_an_event_is_of_links_that_come_back():
     """The link is cut when the leader is lost: without the loss it would be restored."""
     line = ech.Graph.path(4)
-    cut, heirs = Cut((0, 1), 1.0, 3.0), ech.Leadership((1,))
-    guarantee = ech.promise(_parts(line, events=[cut, Lose(0, 2.0)], leadership=heirs), SETTINGS)
+    cut, backups = Cut((0, 1), 1.0, 3.0), ech.Leadership((1,))
+    guarantee = ech.guarantee(
+        _parts(line, events=[cut, Lose(0, 2.0)], leadership=backups), SETTINGS
+    )
     until = guarantee.prefix.promise
-    assert until.rate == ech.promise(_parts(line, events=[cut]), SETTINGS).rate > 1.0
+    assert until.rate == ech.guarantee(_parts(line, events=[cut]), SETTINGS).rate > 1.0
     # Between two steps as well, where somebody is away for good.
     later = [Cut((0, 1), 1.003, 3.0), Join(3, 2.0)]
-    assert ech.promise(_parts(line, events=later), SETTINGS).prefix.promise.rate > 1.0
-    # Where somebody is away whose messages others need, nothing is.
-    away = _parts(line, events=[Join(2, 2.0)])
-    assert ech.promise(away, SETTINGS).prefix is None
-
-
-def test_heirs_over_a_radio_may_take_the_lead_at_any_time():
-    parts = _parts(network=RADIO, leadership=ech.Leadership((1,)))
-    assert not ech.promise(parts, SETTINGS).promised
-
-
-TREE = ech.Graph([(0, 1), (1, 2), (1, 3)])
-
-
-def test_nothing_is_stated_until_an_event_that_brings_back_who_was_cut_off():
-    """Without the arrival of agent 1 agents 2 and 3 would have no path to the leader for ever."""
-    guarantee = ech.promise(_parts(TREE, events=[Lose(1, 2.0), Join(1, 3.0)]), SETTINGS)
-    assert not guarantee.promised and guarantee.prefix is None
+    assert ech.guarantee(_parts(line, events=later), SETTINGS).prefix.promise.rate > 1.0
+    # Where somebody is away, or comes back, whose messages others need, nothing is.
+    for graph, events in ((line, [Join(2, 2.0)]), (TREE, [Lose(1, 2.0), Join(1, 3.0)])):
+        away = ech.guarantee(_parts(graph, events=events), SETTINGS)
+        assert not away.promised and away.prefix is None
 
 
 def test_who_hears_no_leader_for_some_time_under_a_law_of_states_is_warned_of():
-    gain = ech.synthesize(CART, TREE, ech.gains.Riccati())
-    states = ech.Laws(ech.laws.Tracking(CIRCLE), ech.laws.Consensus(gain))
-    late = [Join(1, 3.0)]
+    states, late = of_states(TREE), [Join(1, 3.0)]
     (text,) = prepare(_parts(TREE, states, events=late), SETTINGS).warnings
     assert text.startswith("agents 2, 3 have no path to a leader from 0 to 3 s, in which the law ")
     assert "`Consensus`" in text and text.endswith("add links, or use `stopping-point`.")
@@ -298,34 +288,19 @@ def test_events_that_cannot_be_are_refused_in_a_sentence(graph, events, words):
         ech.simulate(_parts(graph, events=events), SETTINGS)
 
 
-@pytest.mark.parametrize(
-    ("heirs", "words"),
-    [((9,), "no agent"), ((0,), "leader itself"), ((1, 1), "twice"), ((), "empty")],
-)
-def test_heirs_that_cannot_be_are_refused(heirs, words):
-    with pytest.raises(EchelonError, match=words):
-        _parts(leadership=ech.Leadership(heirs))
-
-
-def test_heirs_that_cannot_wait_for_messages_are_refused():
-    parts = _parts(network=RADIO, leadership=ech.Leadership((1,), timeout=0.05))
-    with pytest.raises(EchelonError, match="at least two periods of the network"):
-        ech.simulate(parts, SETTINGS)
-
-
-def test_heirs_of_a_leader_without_a_plan_are_refused():
-    gain = ech.synthesize(CART, RING, ech.gains.Riccati())
-    passive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
-    with pytest.raises(EchelonError, match="no plan"):
-        ech.simulate(_parts(drive=passive, leadership=ech.Leadership((1,))), SETTINGS)
-
-
-def test_an_heir_of_a_leader_of_states_leads_too():
-    gain = ech.synthesize(CART, RING, ech.gains.Riccati())
-    drive = ech.Laws(ech.laws.Tracking(CIRCLE), ech.laws.Consensus(gain, feedforward="relay"))
-    parts = _parts(drive=drive, events=[Lose(0, 3.0)], leadership=ech.Leadership((1,)))
-    run = ech.simulate(parts, SETTINGS)
-    assert run.formation_errors[-1].max() < 0.05
+def test_backup_leaders_that_cannot_be_are_refused():
+    passive = of_states(RING, ech.laws.TrimInput())
+    for backups, timeout, more, words in (
+        ((9,), 0.3, {}, "no agent"),
+        ((0,), 0.3, {}, "leader itself"),
+        ((1, 1), 0.3, {}, "twice"),
+        ((), 0.3, {}, "empty"),
+        ((1,), 0.05, {"network": RADIO}, "at least two periods of the network"),
+        ((1,), 0.3, {"drive": passive}, "no plan"),
+    ):
+        with pytest.raises(EchelonError, match=words):
+            leadership = ech.Leadership(backups, timeout=timeout)
+            ech.simulate(_parts(leadership=leadership, **more), SETTINGS)
 
 
 @pytest.mark.slow
@@ -350,7 +325,7 @@ def test_a_run_with_events_is_stored_and_verified(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("prediction", ["preview", "packet"])
 def test_single_agents_hand_the_lead_over_as_in_a_run(prediction):
-    """Each with a queue of its own; the leader stops at 1 s, and an heir of it at 2 s."""
+    """Each with a queue of its own; the leader stops at 1 s, and a backup leader of it at 2 s."""
     dt, radio = 0.02, dataclasses.replace(RADIO, loss=0.0, prediction=prediction)
     events = [Lose(0, 1.0), Lose(1, 2.0)]
     parts = _parts(network=radio, events=events, leadership=ech.Leadership((1, 2), timeout=0.2))

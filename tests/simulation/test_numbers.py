@@ -27,7 +27,7 @@ PARTS = {
     "damping": lambda x: ech.models.VanDerPol(damping=x),
     "radius": lambda x: ech.references.Circle(radius=x),
     "gain": lambda x: ech.Safety(gain=x),
-    "timeout": lambda x: ech.Leadership(heirs=(1,), timeout=x),
+    "timeout": lambda x: ech.Leadership(backups=(1,), timeout=x),
     "spacing": lambda x: ech.Formation.line(MODEL, GRAPH, spacing=x),
     "domain": lambda x: Domain.about(PENDULUM, {"angle": x}),
 }
@@ -64,12 +64,14 @@ def test_a_run_in_whole_seconds_is_that_in_floats_to_the_bit(kind):
     assert np.array_equal(run.states, same.states)
 
 
-def test_counts_are_plain_integers_and_no_truth_values():
+def test_counts_are_plain_integers_and_settings_are_kept_through_trees():
     counts = ech.Settings(2.0, 1.0, store_every=np.int32(2), seed=np.uint64(3), substeps=np.int8(2))
     assert [type(x) for x in (counts.store_every, counts.seed, counts.substeps)] == [int] * 3
     for name in ("store_every", "seed", "substeps", "devices"):
         with pytest.raises(ech.EchelonError, match=f"`{name}` is True"):
             ech.Settings(2.0, 1.0, **{name: True})
+    leaves, tree = jax.tree.flatten(ech.Settings(4, 1))
+    assert jax.tree.unflatten(tree, leaves) == ech.Settings(4.0, 1.0)
 
 
 @pytest.mark.parametrize("value", [10**400, float("inf"), float("nan"), -1, 0])
@@ -77,8 +79,3 @@ def test_times_beyond_all_floats_are_told(value):
     for name in ("horizon", "dt"):
         with pytest.raises(ech.EchelonError, match=f"`{name}` is .*must be a positive finite"):
             ech.Settings(**{"horizon": 2.0, "dt": 1.0, name: value})
-
-
-def test_settings_are_kept_through_trees():
-    leaves, tree = jax.tree.flatten(ech.Settings(4, 1))
-    assert jax.tree.unflatten(tree, leaves) == ech.Settings(4.0, 1.0)

@@ -15,15 +15,12 @@ import echelon as ech
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.onboard.law_functions import LawFunction, law_functions, move_function
 from echelon.simulation.onboard.source_code import c_text, header_text
-from echelon.simulation.scalars import ScalarGraph, Unsupported
+from echelon.simulation.scalars import ScalarGraph
 from echelon.simulation.scalars.scalar_graph import OPERATIONS
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang") or "cc"
 """Of the studies; the other tests read the text of C, which needs none."""
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wdouble-promotion", "-Werror")
-
-
-# ---- three ways to run the text ------------------------------------------------------------------
 
 
 def as_read_c(functions, folder, bits=64):
@@ -91,18 +88,9 @@ def as_compiled_c(functions, folder, bits=64):
     real, place = (np.float64, ctypes.c_double) if bits == 64 else (np.float32, ctypes.c_float)
     (folder / "law.c").write_text(c_text(*both, "A law."))
     (folder / "law.h").write_text(header_text(functions, "A law.", {}))
-    options = [
-        *FLAGS,
-        *(["-DLAW_SINGLE"] if bits == 32 else []),
-        "-ffp-contract=off",
-        "-O2",
-        "-shared",
-        "-fPIC",
-        "-o",
-        "law.so",
-        "law.c",
-    ]
-    subprocess.run([COMPILER, *options, "-lm"], cwd=folder, check=True)
+    single = ["-DLAW_SINGLE"] if bits == 32 else []
+    options = [*FLAGS, *single, "-ffp-contract=off", "-O2", "-shared", "-fPIC", "-o", "law.so"]
+    subprocess.run([COMPILER, *options, "law.c", "-lm"], cwd=folder, check=True)
     library = ctypes.CDLL(str(folder / "law.so"))
     result = {}
     for f in functions:
@@ -142,8 +130,6 @@ all_ways = pytest.mark.parametrize(
     [pytest.param(WAYS, id="read"), pytest.param([*WAYS, as_compiled_c], id="all", marks=COMPILED)],
 )
 
-
-# ---- each operation ------------------------------------------------------------------------------
 
 SPECIAL = [0.0, -0.0, 0.5, -0.5, 1.5, 2.5, -2.5, 0.3, -7.7, 1e300, -1e300, 2.0**52 + 1.0]
 SPECIAL += [math.inf, -math.inf, math.nan]
@@ -213,8 +199,6 @@ def expectation(op, *values):
         return float(OPERATIONS[op](*numbers))
 
 
-# ---- against `Agent` -----------------------------------------------------------------------------
-
 OBSERVED = ["leader.observer={push: 16, scale: 2}", "follower.observer={push: 16, scale: 2}"]
 AGENTS = {"consensus": ("paper", [], 2), "stopping-point": ("paper-far", OBSERVED, 2)}
 AGENTS["its-leader"] = ("paper-far", OBSERVED, 0)
@@ -250,31 +234,6 @@ def test_what_is_not_finite_is_not_valid(agent, way, tmp_path):
         assert not run["tick"](0.0, *wrong.values())[-1], bad
 
 
-# ---- what has no code ----------------------------------------------------------------------------
-
-
-CARTS = ech.models.DoubleIntegrator()
-PAIR = ech.Graph.path(3)
-
-
-def carts(graph=PAIR, **more):
-    places = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.0), 2: (1.0, 0.8)})
-    circle = ech.references.Circle(radius=1.0, rate=0.6)
-    laws = ech.Laws(ech.laws.StoppingLeader(reference=circle), ech.laws.StoppingPoint(**more))
-    return ech.Parts(CARTS, graph, places, laws)
-
-
-APART = ech.Safety(radii=(0.085, 0.085, 0.085))
-
-
-def test_laws_that_keep_agents_apart_are_refused():
-    with pytest.raises(Unsupported, match="agents that keep away from each other"):
-        law_functions(ech.Agent(carts(safety=APART), 1, 0.01).own_law)
-
-
-# ---- single precision ----------------------------------------------------------------------------
-
-
 def test_single_precision_is_that_of_its_own_trace(agent, tmp_path):
     """The text in single precision, evaluated by NumPy's own, against double precision."""
     own, draws = agent.own_law, np.random.default_rng(2)
@@ -295,24 +254,6 @@ def test_single_precision_is_that_of_its_own_trace(agent, tmp_path):
             size = max(1.0, np.abs(value).max(initial=0.0))
             np.testing.assert_allclose(got, value, rtol=0, atol=3e-5 * size)
         memory = results[1]
-
-
-@COMPILED
-def test_single_precision_compiles_and_is_numpys_own_to_the_bit(agent, tmp_path):
-    own, draws = agent.own_law, np.random.default_rng(3)
-    single = law_functions(own, 32).values()
-    compiled, rounded = as_compiled_c(single, tmp_path, 32), as_read_c(single, tmp_path, 32)
-    trim = list(map(float, own.loop.model.trim[0]))
-    sizes = {f.name: f.inputs for f in single}["tick"]
-    memory = compiled["begin"](trim)
-    for k in range(10):
-        rows = [
-            0.1 * draws.normal(size=size).astype(np.float32)
-            for size in (sizes["z"], sizes["feed_forward"])
-        ]
-        x = (np.array(trim) + 0.1 * draws.normal(size=len(trim))).astype(np.float32)
-        inputs = np.float32(0.01 * k), x, *rows, memory
-        assert compiled["tick"](*inputs) == rounded["tick"](*inputs)
 
 
 def fly(agents, bits, moves, starts, steps, folder):

@@ -3,27 +3,10 @@
 import dataclasses
 
 import pytest
+from carts import carts
 from plain_agents import compare_late
 
 import echelon as ech
-
-CARTS = ech.models.DoubleIntegrator()
-TREE = ech.Graph([(0, 1), (1, 2), (1, 3)])
-
-
-def parts_of(law, **network):
-    offsets = {1: (1.0, 0.0), 2: (1.0, 0.8), 3: (1.0, -0.8)}
-    circle = ech.references.Circle(rate=0.5)
-    if law == "consensus":
-        gain = ech.synthesize(CARTS, TREE, ech.gains.Riccati())
-        drive = ech.Laws(ech.laws.Tracking(circle), ech.laws.Consensus(gain))
-    else:
-        leader = ech.laws.StoppingLeader(reference=circle)
-        drive = ech.Laws(leader, ech.laws.StoppingPoint())
-    places = ech.Formation.from_offsets(CARTS, TREE, offsets)
-    world = ech.World(network=ech.Network(rate=25.0, **network))
-    return ech.Parts(CARTS, TREE, places, drive, world=world)
-
 
 CASES = {
     "preview": ("stopping-point", 2, {}),
@@ -40,7 +23,8 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_a_plain_process_is_the_agent(case):
     law, number, network = CASES[case]
-    compare_late(ech.Agent(parts_of(law, **network), number, 0.01), 0.01, 400)
+    parts = carts(law, ech.Network(rate=25.0, **network))
+    compare_late(ech.Agent(parts, number, 0.01), 0.01, 400)
 
 
 @pytest.mark.slow

@@ -30,27 +30,24 @@ def flown(name):
     return ech.build(ech.load_scenario(scenario, changes))
 
 
-def compare_both(name, number, steps, atol=1e-14):
+LEADERS = ["paper", "paper-radio", "reshape without safety", "yaw-turn"]
+FOLLOWERS = [*sorted({*bundled_scenarios()} - {*REFUSED}), *CHANGES]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "leads"), [*((name, False) for name in FOLLOWERS), *((name, True) for name in LEADERS)]
+)
+def test_the_law_of_an_agent_is_the_agents(name, leads):
     parts, settings = flown(name)
+    number = 0 if leads else parts.graph.followers[-1]
     agent = ech.Agent(parts, number, settings.dt, settings.limits)
     if agent.own_law.loop.channel is not None:
-        compare_late(agent, settings.dt, max(steps, LATE_STEPS))
+        compare_late(agent, settings.dt, LATE_STEPS)
         return
     law = as_python(law_functions(agent.own_law).values())
     # Through all of the run, in few steps.
-    compare(agent, [law], steps, settings.horizon / steps, atol=atol)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [*sorted({*bundled_scenarios()} - {*REFUSED}), *CHANGES])
-def test_the_law_of_a_follower_is_the_agents(name):
-    compare_both(name, flown(name)[0].graph.followers[-1], STEPS)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["paper", "paper-radio", "reshape without safety", "yaw-turn"])
-def test_the_law_of_a_leader_is_the_agents(name):
-    compare_both(name, 0, STEPS)
+    compare(agent, [law], STEPS, settings.horizon / STEPS)
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -58,11 +55,3 @@ def test_what_has_no_law_by_itself_is_refused(name):
     parts, settings = flown(name)
     with pytest.raises(Unsupported, match=REFUSED[name]):
         law_functions(ech.Agent(parts, 1, settings.dt).own_law)
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("number", [0, 2])
-@pytest.mark.parametrize("name", ["paper", "paper-far", "paper-radio", "reshape without safety"])
-def test_ten_thousand_steps_of_a_law_are_the_agents(name, number):
-    # Offsets that change add five derivatives, whose terms are larger than their sum.
-    compare_both(name, number, 10_000, 3e-14 if name.startswith("reshape") else 1e-14)

@@ -1,7 +1,5 @@
 """The optimization baseline: pinned numbers, a second solver, effects of its defects."""
 
-import re
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -24,14 +22,14 @@ def path(t):
     return np.stack([y, np.sin(y)], axis=1)
 
 
-def trapezoid(steps, thrust_is_a_deviation=False):
+def trapezoid(steps, gravity=GRAVITY):
     """Positions as an affine map of all inputs: states (N, 6) for no input, and for unit inputs."""
     dt = 10.0 / steps
     A, B, fall = np.zeros((6, 6)), np.zeros((6, 2)), np.zeros(6)
     A[0, 1] = A[2, 3] = A[4, 5] = 1.0
     A[1, 4] = -GRAVITY
     B[3, 0], B[5, 1] = 1.0 / MASS, 1.0 / INERTIA
-    fall[3] = 0.0 if thrust_is_a_deviation else -GRAVITY
+    fall[3] = -gravity
     left, right = np.eye(6) - 0.5 * dt * A, np.eye(6) + 0.5 * dt * A
     x, free = np.array([-np.pi, 0, 0, 0, 0, 0]), []
     response, forced = np.zeros((6, 2 * (steps + 1))), []
@@ -55,10 +53,8 @@ def leader_by_least_squares(steps, terminal=True, **reading):
     rows = [weight[:, None] * forced[:, 0], weight[:, None] * forced[:, 2]]
     goals = [weight * (path(t) - free[:, [0, 2]])[:, axis] for axis in (0, 1)]
     rows.append(np.diag(np.repeat(weight, 2)))
-    goals.append(np.zeros(2 * steps + 2))
-    if terminal:
-        rows.append(forced[-1])
-        goals.append(-free[-1])
+    rows += [forced[-1]] if terminal else []
+    goals += [np.zeros(2 * steps + 2), *([-free[-1]] if terminal else [])]
     bound = np.tile([1.2 * MASS * GRAVITY, INERTIA * np.pi / 10.0], steps + 1)
     found = lsq_linear(np.vstack(rows) * bound, np.concatenate(goals), (-1, 1), "bvls", tol=1e-14)
     assert found.success
@@ -77,9 +73,6 @@ def leader(**changes):
     return baseline, found
 
 
-# ---- the leader ----
-
-
 @pytest.mark.parametrize(
     "changes, pinned",
     [
@@ -95,10 +88,9 @@ def test_the_leader_as_printed_deviates_by_what_was_found_for_it(changes, pinned
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("terminal", ["origin", pytest.param("none", marks=pytest.mark.study)])
-def test_a_solver_of_another_kind_finds_the_same_flight(terminal):
-    _, found = leader(terminal=terminal)
-    wanted = leader_by_least_squares(100, terminal == "origin")
+def test_a_solver_of_another_kind_finds_the_same_flight():
+    _, found = leader()
+    wanted = leader_by_least_squares(100)
     assert found.states[:, [0, 2]] == pytest.approx(wanted[:, [0, 2]], abs=2e-3)
     assert deviation(found.states) == pytest.approx(deviation(wanted), abs=1e-6)
 
@@ -106,7 +98,7 @@ def test_a_solver_of_another_kind_finds_the_same_flight(terminal):
 @pytest.mark.study
 def test_the_thrust_is_the_whole_thrust_since_as_a_deviation_it_deviates_by_something_else():
     # Weighing the whole thrust lets the agent sink a little; weighing its deviation does not.
-    as_deviation = leader_by_least_squares(100, False, thrust_is_a_deviation=True)
+    as_deviation = leader_by_least_squares(100, False, gravity=0.0)
     assert deviation(as_deviation) == pytest.approx(0.1787, abs=1e-4)
     assert deviation(leader_by_least_squares(100, False)) == pytest.approx(0.1809, abs=1e-4)
 
@@ -126,9 +118,6 @@ def test_the_reference_is_the_printed_curve_and_moves_as_its_states_say():
     assert rates == pytest.approx(baseline.reference[:, [1, 3]], abs=1e-4)
     # Its speed along y is constant, so that the linear agent follows it upright.
     assert not baseline.reference[:, 4:].any()
-
-
-# ---- the followers ----
 
 
 def distances(plans, pairs=((1, 0), (2, 1), (3, 1))):
@@ -172,15 +161,6 @@ def test_repaired_followers_keep_the_distance_and_arrive_with_their_neighbours()
     assert all((np.abs(plan.inputs) <= limit * (1 + 1e-6)).all() for plan in plans)
 
 
-@pytest.mark.study
-def test_a_squared_penalty_keeps_the_distance_nearly():
-    plans = PlanarBaseline.repaired(separation="penalty").plans(TREE, OFFSETS)
-    assert all(plan.solved for plan in plans)
-    assert np.abs(distances(plans) - 0.5).max() < 0.02
-    stiff = PlanarBaseline.repaired(separation="penalty", beta=100.0).plans(TREE, OFFSETS)
-    assert np.abs(distances(stiff) - 0.5).max() < 0.002
-
-
 def test_a_follower_of_two_neighbours_must_turn_with_them_which_its_torque_does_not_allow():
     triangle = ech.Graph.from_edges([(0, 1), (0, 2), (1, 2)])
     offsets = np.array([[0.0, 0.0], [-0.5, 0.0], [-0.25, TALL]])
@@ -194,9 +174,6 @@ def test_a_follower_of_two_neighbours_must_turn_with_them_which_its_torque_does_
     plans = PlanarBaseline.repaired(separation="penalty").plans(triangle, offsets)
     assert all(plan.solved for plan in plans)
     assert np.abs(distances(plans, [(1, 0), (2, 0), (2, 1)]) - 0.5).max() < 0.06
-
-
-# ---- the noise ----
 
 
 def test_an_open_loop_adds_up_the_noise():
@@ -214,9 +191,6 @@ def test_an_open_loop_adds_up_the_noise():
     assert not added[:, [2, 3]].any()
     assert (baseline.with_noise(found, seed=3) == baseline.with_noise(found, seed=3)).all()
     assert (baseline.with_noise(found, seed=4) != baseline.with_noise(found, seed=3)).any()
-
-
-# ---- the agent and bad input ----
 
 
 def test_the_agent_is_the_linearization_of_the_planar_quadrotor_at_hover():
@@ -247,11 +221,9 @@ def test_the_limits_of_the_agent_are_the_printed_ones():
 
 
 def test_bad_input_is_told():
-    said = "`terminal` is `start`, allowed are `origin`, `error`, `none`."
-    with pytest.raises(PlanError, match=f"^{re.escape(said)}$"):
+    with pytest.raises(PlanError, match="^`terminal` is `start`, allowed are `origin`"):
         PlanarBaseline.literal(terminal="start")
-    said = "`offsets` has shape (2, 2), and 4 agents need (4, 2)."
-    with pytest.raises(PlanError, match=f"^{re.escape(said)}$"):
+    with pytest.raises(PlanError, match=r"^`offsets` has shape \(2, 2\), and 4 agents need"):
         PlanarBaseline.repaired().plans(TREE, OFFSETS[:2])
     with pytest.raises(ModelError, match="`mass` of `LinearPlanarQuadrotor` is 0.0"):
         LinearPlanarQuadrotor(mass=0.0)

@@ -1,6 +1,5 @@
 """Plans of whole formations against other solutions of the same problems, and their replay."""
 
-import dataclasses
 import sys
 
 import casadi as ca
@@ -34,22 +33,10 @@ def starts(**moved):
     return states
 
 
-def planned(states, *, limits=True, horizon=1.0, dt=0.01, formation=DRAWN, graph=TREE, **how):
+def planned(states, *, limits=True, **how):
     planning = ech.optimal.TrackingOptions(**how)
-    times = grid(horizon, dt, planning.interval)
-    return plan_formation(
-        QUADROTOR,
-        graph,
-        formation,
-        states,
-        times,
-        reference=LOOP,
-        planning=planning,
-        limits=limits,
-    )
-
-
-# ---- other solutions of the same problem ----
+    times, how = grid(1.0, 0.01, planning.interval), {"planning": planning, "limits": limits}
+    return plan_formation(QUADROTOR, TREE, DRAWN, states, times, reference=LOOP, **how)
 
 
 def hand_written(x, v, mass, J):
@@ -122,7 +109,7 @@ def by_hand(start, wanted, inputs, steps, step, limited, weight):
 @pytest.mark.parametrize("limited", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_leader_s_plan_is_that_of_a_problem_written_by_hand(limited):
     states = starts()
-    made = planned(states, limits=limited, dt=0.01, input_weight=1e-3)
+    made = planned(states, limits=limited, input_weight=1e-3)
     times = made.grid.times
     law = ech.laws.Tracking(LOOP).prepared(QUADROTOR, TREE)
     with precision("float64"):
@@ -143,16 +130,12 @@ def test_on_linear_agents_the_plans_are_least_squares():
     graph = ech.Graph.from_edges([(0, 1), (1, 2), (0, 2, 3.0)], leaders=[0])
     formation = ech.Formation([[0, 0], [-1, 0], [-2, 0]])
     states = np.array([[0.5, 0.0], [0.0, 1.0], [-1.0, 0.3]])
-    made = plan_formation(
-        cart,
-        graph,
-        formation,
-        states,
+    planning, times = (
+        ech.optimal.TrackingOptions(interval=dt, input_weight=0.1),
         PlanTimes(steps, 1, dt),
-        reference=None,
-        planning=ech.optimal.TrackingOptions(interval=dt, input_weight=0.1),
-        limits=True,
     )
+    how = {"reference": None, "planning": planning, "limits": True}
+    made = plan_formation(cart, graph, formation, states, times, **how)
     A, B = np.array([[1, dt], [0, 1]]), np.array([dt**2 / 2, dt])
     powers = [np.linalg.matrix_power(A, k) for k in range(steps + 1)]
     reach = np.zeros((steps + 1, 2, steps))
@@ -186,9 +169,6 @@ def test_on_linear_agents_the_plans_are_least_squares():
         assert plan.inputs[:, 0] == pytest.approx(u, abs=1e-6)
 
 
-# ---- order, limits, specifications ----
-
-
 @pytest.mark.slow
 def test_an_agent_knows_the_plans_before_it_and_no_others():
     same, far = planned(starts()), planned(starts(a3=(0.1, -0.2, 0.1)))
@@ -199,18 +179,6 @@ def test_an_agent_knows_the_plans_before_it_and_no_others():
     assert np.array_equal(same.plans[0].states, moved.plans[0].states)
     for agent in (2, 3):
         assert not np.allclose(same.plans[agent].states, moved.plans[agent].states, atol=1e-3)
-
-
-@pytest.mark.study
-def test_plans_keep_to_the_motors_and_without_limits_do_better():
-    states = starts(a1=(-0.193, 0, 0))
-    within, free = planned(states), planned(states, limits=False)
-    G, low, high = (np.array(part) for part in QUADROTOR.input_limits)
-    for plan in within.plans:
-        thrusts = plan.inputs @ G.T
-        assert (thrusts >= low - 1e-9).all() and (thrusts <= high + 1e-9).all()
-    assert any(((p.inputs @ G.T > high) | (p.inputs @ G.T < low)).any() for p in free.plans)
-    assert free.plans[0].cost < within.plans[0].cost
 
 
 @pytest.mark.study
@@ -228,23 +196,12 @@ def test_followers_arrive_at_their_offsets_or_at_their_distances():
     assert np.abs(steps[-1, :3] - [0, -0.8, 0]).max() > 0.05
 
 
-# ---- the replay ----
-
-
 @pytest.mark.slow
 def test_the_replay_of_plans_is_the_plans():
     states = starts(a1=(-0.193, 0, 0))
     made = planned(states, limits=False)
-    result = simulate_plans(
-        QUADROTOR,
-        TREE,
-        DRAWN,
-        reference=LOOP,
-        initial=states,
-        limits=False,
-        store_every=5,
-        **SHORT,
-    )
+    given = {"reference": LOOP, "initial": states, "limits": False, "store_every": 5, **SHORT}
+    result = simulate_plans(QUADROTOR, TREE, DRAWN, **given)
     found = np.stack([plan.states for plan in made.plans], axis=1)
     assert result.states == pytest.approx(found, abs=1e-6)
     assert result.inputs[:-1] == pytest.approx(np.stack([p.inputs for p in made.plans], axis=1))
@@ -252,128 +209,49 @@ def test_the_replay_of_plans_is_the_plans():
     assert not result.saturated.any()
 
 
-@pytest.mark.study
-def test_a_replay_is_a_result_like_any_other(tmp_path):
-    states = starts(a1=(-0.193, 0, 0))
-    fast = ech.references.FigureEight(amplitude=(1.0, 0.5), rate=6.0)
-    result = simulate_plans(
-        QUADROTOR, TREE, DRAWN, reference=LOOP, initial=states, store_every=10, **SHORT
-    )
-    assert result.outcome is ech.Outcome.COMPLETED and len(result.times) == 11
-    assert ech.metrics(result).leader.rmse < 0.36
-    assert "Each follower is told" in ech.report(result)
-    ech.save_dataset(result, tmp_path / "run.nc")
-    figures = result.work
-    assert figures.method == "optimization" and figures.solves == 4 and figures.failures == 0
-    assert figures.seconds > 0.0 and figures.worst_ms >= figures.median_ms > 0.0
-    warned = simulate_plans(
-        QUADROTOR, TREE, DRAWN, reference=fast, horizon=0.2, dt=0.01, start_error={}
-    )
-    assert [w for w in warned.warnings if "times the range of the actuators" in w]
+VAN_DER_POL = ech.models.VanDerPol(), ech.Graph.path(2), ech.Formation(np.zeros((2, 2)))
+OPTIONS = ech.optimal.TrackingOptions
+REFUSED = [
+    (OPTIONS, {"interval": 0.0}, "`interval` is 0.0, and must be a positive finite number of sec"),
+    (
+        OPTIONS,
+        {"input_weight": -1.0},
+        "`input_weight` is -1.0, and must be finite and not negative",
+    ),
+    (OPTIONS, {"specification": "angle"}, "`specification` is `angle`, allowed are `offset`, `dis"),
+    (planned, {"states": starts(), "output_weight": [1.0, 2.0]}, "must be 4 finite numbers that "),
+    (grid, {"horizon": 0.001, "dt": 0.01, "interval": 0.05}, "`horizon` is 0.001 s, and must be "),
+    (simulate_plans, {"reference": LOOP}, "`VanDerPol` cannot be led along a reference"),
+    (
+        simulate_plans,
+        {"planning": OPTIONS(specification="distance")},
+        "`VanDerPol` has no position",
+    ),
+    (simulate_plans, {"reference": 1.0}, "`reference` is a `float`, and must be"),
+]
 
 
-@pytest.mark.study
-def test_open_loop_a_wrong_mass_and_wind_add_up():
-    states = starts()
-    still, heavy, windy = (
-        simulate_plans(QUADROTOR, TREE, DRAWN, reference=LOOP, initial=states, **SHORT, **more)
-        for more in (
-            {},
-            {"plant": dataclasses.replace(QUADROTOR, mass=0.0294)},
-            {"disturbance": ech.Disturbance(constant={"vx": 1.0})},
-        )
-    )
-    assert np.array_equal(still.inputs[0], windy.inputs[0])
-    # 1 m/s^2 for 1 s is 0.5 m; a mass 5 % up takes a 21st of the thrust.
-    assert windy.states[-1, :, 0] - still.states[-1, :, 0] == pytest.approx(np.full(4, 0.5), 1e-6)
-    assert (heavy.states[-1, :, 2] < still.states[-1, :, 2] - 0.1).all()
+@pytest.mark.parametrize(("call", "given", "sentence"), REFUSED)
+def test_what_cannot_be_planned_is_refused(call, given, sentence):
+    run = VAN_DER_POL if call is simulate_plans else ()
+    with pytest.raises(ech.EchelonError) as caught:
+        call(*run, **given, **(SHORT if run else {}))
+    assert sentence in str(caught.value)
 
 
-# ---- bad input ----
-
-
-@pytest.mark.parametrize(
-    ("how", "sentence"),
-    [
-        ({"interval": 0.0}, "`interval` is 0.0, and must be a positive finite number of seconds."),
-        ({"input_weight": -1.0}, "`input_weight` is -1.0, and must be finite and not negative."),
-        (
-            {"specification": "angle"},
-            "`specification` is `angle`, allowed are `offset`, `distance`.",
-        ),
-    ],
-)
-def test_a_planning_out_of_range_is_refused(how, sentence):
-    with pytest.raises(PlanError) as caught:
-        ech.optimal.TrackingOptions(**how)
-    assert str(caught.value) == sentence
-
-
-def test_weights_that_do_not_fit_are_refused():
-    with pytest.raises(PlanError, match=r"must be 4 finite numbers .* `x`, `y`, `z`, `yaw`\.$"):
-        planned(starts(), output_weight=[1.0, 2.0])
-
-
-def test_a_horizon_shorter_than_a_step_is_refused():
-    with pytest.raises(PlanError, match=r"`horizon` is 0.001 s, .* at least one step of 0.01 s\.$"):
-        grid(0.001, 0.01, 0.05)
-
-
-class Corridor(ech.ControlAffine):
+class Corridor(ech.models.DoubleIntegrator):
     """A cart with brakes in a corridor, whose equations end with it."""
 
-    state_names = ("x", "v")
-    input_names = ("force",)
     chart = {"x": (-1.0, 1.0)}
     input_limits = ech.models.Limits(((1.0,),), (-1.0,), (1.0,))
-
-    def drift(self, x):
-        return jnp.stack([x[1], jnp.zeros((), x.dtype)])
-
-    def input_map(self, x):
-        return jnp.array([[0.0], [1.0]], x.dtype)
-
-    def limit(self, u):
-        return jnp.clip(u, -1.0, 1.0)
 
 
 def test_a_problem_without_a_solution_says_which_constraint_and_by_how_much():
     # From 0.5 at a speed of 2 the brakes stop it at 2.5, and the plan's corridor ends at 0.9.
+    still = ech.Formation(np.zeros((2, 2)))
+    how = {"initial": np.array([[0.0, 0.0], [0.5, 2.0]]), "horizon": 2.0, "dt": 0.1}
     with pytest.raises(PlanError, match=r"^there is no plan for agent 1: .*`[\w ]+` by [\d.]+ at"):
-        simulate_plans(
-            Corridor(),
-            ech.Graph.path(2),
-            ech.Formation(np.zeros((2, 2))),
-            initial=np.array([[0.0, 0.0], [0.5, 2.0]]),
-            horizon=2.0,
-            dt=0.1,
-        )
-
-
-def test_a_model_without_a_flatness_map_is_led_along_no_reference():
-    graph, model = ech.Graph.path(2), ech.models.VanDerPol()
-    with pytest.raises(PlanError, match="`VanDerPol` cannot be led along a reference"):
-        simulate_plans(
-            model, graph, ech.Formation(np.zeros((2, 2))), reference=LOOP, horizon=1.0, dt=0.1
-        )
-
-
-def test_what_is_no_reference_is_refused():
-    with pytest.raises(ech.EchelonError, match="`reference` is a `float`, and must be"):
-        simulate_plans(QUADROTOR, TREE, DRAWN, reference=1.0, **SHORT)
-
-
-def test_a_distance_needs_a_position():
-    graph, model = ech.Graph.path(2), ech.models.VanDerPol()
-    with pytest.raises(PlanError, match="`VanDerPol` has no position"):
-        simulate_plans(
-            model,
-            graph,
-            ech.Formation(np.zeros((2, 2))),
-            planning=ech.optimal.TrackingOptions(specification="distance"),
-            horizon=1.0,
-            dt=0.1,
-        )
+        simulate_plans(Corridor(1), ech.Graph.path(2), still, **how)
 
 
 def test_a_missing_extra_is_told(monkeypatch):

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,46 +23,34 @@ from runs import simulate
 from scipy.integrate import solve_ivp
 
 import echelon as ech
-from echelon.agents.models import (
-    ControlAffine,
-    DoubleIntegrator,
-    Limits,
-    Linear,
-    Pendulum,
-    PlanarQuadrotor,
-    Quadrotor,
-    SingleIntegrator,
-    VanDerPol,
-)
-from echelon.agents.network.formation import Formation
-from echelon.agents.network.graph import Graph
+from echelon import Formation, Graph, Outcome, Settings, metrics, synthesize
+from echelon.agents.models import DoubleIntegrator, Linear, Pendulum, SingleIntegrator, VanDerPol
 from echelon.agents.references import Circle, Hover, Line
-from echelon.core.errors import Outcome
-from echelon.experiments.results.metrics import metrics
 from echelon.laws import Agreement, Consensus, Tracking, TrimInput
 from echelon.simulation.engine import jax_stepper
 from echelon.simulation.step.drive import Stopped
-from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains import FixedGain, Riccati
-from echelon.synthesis.gains.gain import synthesize
 
-QUAD = Quadrotor()
+QUAD = ech.models.Quadrotor()
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
 CHAIN = Graph.path(4)
 DRAWN = Formation.from_offsets(QUAD, TREE, {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)})
 
 
+def closed(model, graph, follower, leader=None, offsets=None, **options):
+    """Run agents under laws; all goals are at one place and the leader rests unless it is told."""
+    formation = Formation.from_offsets(model, graph, offsets or {})
+    laws = {"leader": leader or TrimInput(), "follower": follower}
+    return simulate(model, graph, formation, **laws, **options)
+
+
+def consensus(model, graph, method=None, feedforward="none"):
+    return Consensus(synthesize(model, graph, method or Riccati()), feedforward)
+
+
 def alone(model, x0, **options):
     """Two agents that do nothing but fall from the same start."""
-    graph = Graph.path(2)
-    start = np.tile(x0, (2, 1))
-    nothing = Formation.from_offsets(model, graph, {})
-    return simulate(
-        model, graph, nothing, leader=TrimInput(), follower=TrimInput(), initial=start, **options
-    )
-
-
-# ---- two oracles that share no code ----
+    return closed(model, Graph.path(2), TrimInput(), initial=np.tile(x0, (2, 1)), **options)
 
 
 @pytest.fixture(scope="module")
@@ -137,18 +126,8 @@ def test_linear_agents_with_held_inputs_follow_the_matrix_exponential():
     A, B = np.array([[0.0, 1.0], [-2.0, 0.3]]), np.array([[0.0], [1.5]])
     # Runge-Kutta leaves dt^5 / 120 |A|^5 a step and dt^4 in all: 1e-11 at this dt.
     model, dt = Linear(A, B), 0.0025
-    gain = synthesize(model, TREE, Riccati())
-    start = rng.normal(size=(4, 2))
-    run = simulate(
-        model,
-        TREE,
-        Formation.from_offsets(model, TREE, {}),
-        leader=TrimInput(),
-        follower=Consensus(gain, "none"),
-        initial=start,
-        horizon=3.0,
-        dt=dt,
-    )
+    law, start = consensus(model, TREE), rng.normal(size=(4, 2))
+    run, gain = closed(model, TREE, law, initial=start, horizon=3.0, dt=dt), law.gain
     step = scipy.linalg.expm(dt * np.block([[A, B], [np.zeros((1, 3))]]))
     Ad, Bd = step[:2, :2], step[:2, 2:]
     K = gain.coupling * gain.R_inverse @ B.T @ gain.P
@@ -163,52 +142,34 @@ def test_linear_agents_with_held_inputs_follow_the_matrix_exponential():
     assert run.states[-1, 0] == pytest.approx(leader, abs=1e-10)
 
 
-def order_of(errors, steps):
-    slope, _ = np.polyfit(np.log(steps), np.log(errors), 1)
-    return slope
+EQUATIONS = [
+    (VanDerPol(), lambda t, x: [x[1], (1 - x[0] ** 2) * x[1] - x[0]]),
+    (Pendulum(0.1), lambda t, x: [x[1], -9.81 * np.sin(x[0]) - 0.1 * x[1]]),
+]
 
 
 @pytest.mark.parametrize(
-    ("integrator", "least", "most"), [("rk4", 3.8, 4.4), ("euler", 0.9, 1.1)], ids=["rk4", "euler"]
+    ("integrator", "steps", "least", "most"),
+    [("rk4", [0.04, 0.02, 0.01], 3.8, 4.4), ("euler", [0.01, 0.005, 0.0025], 0.9, 1.1)],
+    ids=["rk4", "euler"],
 )
-@pytest.mark.parametrize("model", [VanDerPol(), Pendulum(0.1)], ids=["van der pol", "pendulum"])
-def test_measured_order_of_the_integrators(model, integrator, least, most):
-    x0, horizon = np.array([1.0, 0.5]), 2.0
-    equation = {
-        VanDerPol: lambda t, x: [x[1], (1 - x[0] ** 2) * x[1] - x[0]],
-        Pendulum: lambda t, x: [x[1], -9.81 * np.sin(x[0]) - 0.1 * x[1]],
-    }[type(model)]
-    solved = solve_ivp(equation, (0.0, horizon), x0, "DOP853", rtol=1e-13, atol=1e-13)
-    steps = [0.04, 0.02, 0.01] if integrator == "rk4" else [0.01, 0.005, 0.0025]
-    errors = [
-        np.abs(
-            alone(
-                model, x0, horizon=horizon, dt=dt, integrator=integrator, store_every=10**6
-            ).states[-1, 0]
-            - solved.y[:, -1]
-        ).max()
-        for dt in steps
-    ]
-    assert least <= order_of(errors, steps) <= most
-
-
-# ---- symmetries of a run ----
+@pytest.mark.parametrize(("model", "equation"), EQUATIONS, ids=["van der pol", "pendulum"])
+def test_measured_order_of_the_integrators(model, equation, integrator, steps, least, most):
+    x0, times = np.array([1.0, 0.5]), {"horizon": 2.0, "store_every": 10**6}
+    solved = solve_ivp(equation, (0.0, 2.0), x0, "DOP853", rtol=1e-13, atol=1e-13)
+    runs = [alone(model, x0, dt=dt, integrator=integrator, **times) for dt in steps]
+    errors = [np.abs(run.states[-1, 0] - solved.y[:, -1]).max() for run in runs]
+    order, _ = np.polyfit(np.log(steps), np.log(errors), 1)
+    assert least <= order <= most
 
 
 def carts(graph=TREE, start=None, path=None, **options):
     model = DoubleIntegrator(2, drag=0.2)
-    gain = synthesize(model, graph, Riccati())
-    formation = Formation.from_offsets(model, graph, {1: (1, 0), 2: (1, 0.8), 3: (1, -0.8)})
+    law, leader = consensus(model, graph, feedforward="relay"), path or Circle((0, 0, 0), 2.0, 0.4)
     settings = {"horizon": 3.0, "dt": 0.01} | options
-    return simulate(
-        model,
-        graph,
-        formation,
-        leader=Tracking(path or Circle((0, 0, 0), 2.0, 0.4)),
-        follower=Consensus(gain, feedforward="relay"),
-        initial={"position": 1.0} if start is None else start,
-        **settings,
-    )
+    start = {"position": 1.0} if start is None else start
+    offsets = {1: (1, 0), 2: (1, 0.8), 3: (1, -0.8)}
+    return closed(model, graph, law, Tracking(leader), offsets, initial=start, **settings)
 
 
 def test_moving_the_start_and_the_reference_moves_the_run():
@@ -219,41 +180,11 @@ def test_moving_the_start_and_the_reference_moves_the_run():
     assert there.inputs == pytest.approx(here.inputs, abs=1e-12)
 
 
-def test_moving_all_quadrotors_moves_the_run():
-    gain = synthesize(QUAD, TREE, Riccati())
-    start = DRAWN.offsets + np.random.default_rng(1).uniform(-0.3, 0.3, (4, 12))
-    shift = np.array([3.0, -2.0, 7.0, *[0.0] * 9])
-    here, there = (
-        simulate(
-            QUAD,
-            TREE,
-            DRAWN,
-            leader=TrimInput(),
-            follower=Consensus(gain, "none"),
-            initial=start + s,
-            horizon=2.0,
-            dt=0.01,
-        )
-        for s in (0.0, shift)
-    )
-    assert np.abs(there.states - shift - here.states).max() <= 1e-10
-    assert there.inputs == pytest.approx(here.inputs, abs=1e-10)
-    assert np.array_equal(there.saturated, here.saturated)
-
-
 def test_agents_that_are_alike_and_start_alike_stay_alike():
-    graph = Graph.star(4)
-    model = DoubleIntegrator(2)
-    run = simulate(
-        model,
-        graph,
-        Formation.from_offsets(model, graph, {}),
-        leader=Tracking(Circle()),
-        follower=Consensus(synthesize(model, graph, Riccati()), "none"),
-        initial={1: [1, 2, 3, 4], 2: [1, 2, 3, 4], 3: [1, 2, 3, 4]},
-        horizon=2.0,
-        dt=0.01,
-    )
+    model, graph, start = DoubleIntegrator(2), Graph.star(4), [1, 2, 3, 4]
+    law, settings = consensus(model, graph), {"horizon": 2.0, "dt": 0.01}
+    starts = {1: start, 2: start, 3: start}
+    run = closed(model, graph, law, Tracking(Circle()), initial=starts, **settings)
     assert np.array_equal(run.states[:, 1], run.states[:, 2])
     assert np.array_equal(run.states[:, 1], run.states[:, 3])
     assert np.ptp(run.states[:, 1], axis=0).min() > 0.1
@@ -266,36 +197,22 @@ def test_a_follower_behind_its_leader_s_input_stays_on_its_goal():
 
 def test_each_follower_hears_its_own_leader():
     """Two leaders, far apart and driven alike; the middle of the path hears both as neighbours."""
-    model = SingleIntegrator(1)
-    graph = Graph.path(5, leaders=[0, 4])
-    run = simulate(
-        model,
-        graph,
-        Formation(np.array([[0.0], [1.0], [2.0], [3.0], [4.0]])),
-        leader=Tracking(Line((0, 0, 0), (1, 0, 0))),
-        follower=Consensus(synthesize(model, graph, FixedGain()), feedforward="relay"),
-        initial={"x": 0.5},
-        horizon=40.0,
-        dt=0.02,
-        store_every=100,
+    model, graph = SingleIntegrator(1), Graph.path(5, leaders=[0, 4])
+    law, leader = (
+        consensus(model, graph, FixedGain(), "relay"),
+        Tracking(Line((0, 0, 0), (1, 0, 0))),
     )
+    row = {k: (float(k),) for k in range(5)}
+    times = {"horizon": 40.0, "dt": 0.02, "store_every": 100}
+    run = closed(model, graph, law, leader, row, initial={"x": 0.5}, **times)
     assert run.states[-1].ravel() == pytest.approx(40.0 + np.arange(5), abs=1e-9)
-
-
-# ---- single integrators on a chain ----
 
 
 def chain(**options):
     """Single integrators on the chain L-1-2-3 under the paper's law with P = 1."""
     model = SingleIntegrator(1)
-    return simulate(
-        model,
-        CHAIN,
-        Formation.from_offsets(model, CHAIN, {}),
-        follower=Consensus(synthesize(model, CHAIN, FixedGain()), "none"),
-        initial={"x": 1.0},
-        **options,
-    )
+    law = consensus(model, CHAIN, FixedGain())
+    return closed(model, CHAIN, law, initial={"x": 1.0}, **options)
 
 
 def test_integrators_behind_a_moving_leader_lag_three_five_and_six_metres():
@@ -316,9 +233,6 @@ def test_algorithm_1_as_printed_grows_by_its_spectral_radius():
     assert growth == pytest.approx(3.247, abs=5e-4)
 
 
-# ---- the lyapunov function of the paper ----
-
-
 def paper_v(run, P):
     """V = 1/2 z^T (M kron P) z with M = L^-1, at every frame."""
     graph, rows = run.graph, list(run.graph.followers)
@@ -328,7 +242,7 @@ def paper_v(run, P):
     return 0.5 * np.einsum("tia,ij,ab,tjb->t", z, M, P, z)
 
 
-class Pushed(ControlAffine):
+class Pushed(ech.ControlAffine):
     """A reach without friction and a speed with it, pushed by one input."""
 
     state_names = ("reach", "speed")
@@ -350,29 +264,16 @@ MONOTONE = {
 
 
 @pytest.mark.parametrize("name", MONOTONE)
-@pytest.mark.parametrize("seed", range(2))
-def test_v_never_rises_where_the_drift_is_monotone_for_p(name, seed):
+def test_v_never_rises_where_the_drift_is_monotone_for_p(name):
     model, P = MONOTONE[name]
     graph = Graph([(0, 1, 1.0), (1, 2, 0.5), (1, 3, 2.0), (2, 3, 1.0)])
-    run = simulate(
-        model,
-        graph,
-        Formation.from_offsets(model, graph, {}),
-        leader=TrimInput(),
-        follower=Consensus(synthesize(model, graph, FixedGain(P=P)), "none"),
-        initial=dict.fromkeys(model.state_names, 1.0),
-        horizon=60.0,
-        dt=0.01,
-        store_every=5,
-        seed=seed,
-    )
+    starts, times = dict.fromkeys(model.state_names, 1.0), {"horizon": 60.0, "dt": 0.01}
+    law = consensus(model, graph, FixedGain(P=P))
+    run = closed(model, graph, law, initial=starts, store_every=5, **times)
     V = paper_v(run, np.array(P))
     assert (np.diff(V) <= 1e-9 * V[:-1] + 1e-22 * V[0]).all()
     # Every state enters the input sooner or later (detectability), so V does not only not rise.
     assert V[-1] <= 1e-6 * V[0]
-
-
-# ---- frames ----
 
 
 def test_frames_are_those_of_a_run_that_stores_every_step():
@@ -388,20 +289,13 @@ def test_frames_are_those_of_a_run_that_stores_every_step():
 
 
 @pytest.mark.parametrize(
-    ("horizon", "dt", "every", "frames", "last"),
-    [
-        (1.0, 0.1, 1, 11, 1.0),
-        (1.0, 0.1, 3, 5, 1.0),
-        (1.0, 0.1, 10, 2, 1.0),
-        (1.0, 0.1, 1000, 2, 1.0),
-        (0.1, 0.1, 1, 2, 0.1),
-        (0.3, 0.1, 1, 4, 0.3),
-    ],
+    ("horizon", "every", "frames"),
+    [(1.0, 1, 11), (1.0, 3, 5), (1.0, 10, 2), (1.0, 1000, 2), (0.1, 1, 2), (0.3, 1, 4)],
 )
-def test_the_last_state_is_stored_whatever_divides(horizon, dt, every, frames, last):
-    run = alone(SingleIntegrator(1), [1.0], horizon=horizon, dt=dt, store_every=every)
+def test_the_last_state_is_stored_whatever_divides(horizon, every, frames):
+    run = alone(SingleIntegrator(1), [1.0], horizon=horizon, dt=0.1, store_every=every)
     assert len(run.times) == len(run.states) == len(run.inputs) == frames
-    assert run.times[0] == 0.0 and run.times[-1] == pytest.approx(last)
+    assert run.times[0] == 0.0 and run.times[-1] == pytest.approx(horizon)
     assert run.outcome is Outcome.COMPLETED
 
 
@@ -419,29 +313,19 @@ def test_a_run_says_what_ran_and_holds_float64():
     )
 
 
-# ---- starts ----
-
-
 def test_starts_are_goals_plus_a_spread_that_the_seed_draws():
-    model = DoubleIntegrator(2)
-    graph = Graph.star(200)
-    formation = Formation.from_offsets(model, graph, {k: (k, 0.0) for k in range(200)})
+    model, graph, leader = (
+        DoubleIntegrator(2),
+        Graph.star(200),
+        Tracking(Line((1, 2, 0), (0.5, 0, 0))),
+    )
+    row = {k: (k, 0.0) for k in range(200)}
 
-    def start(initial, seed=0, **more):
-        return simulate(
-            model,
-            graph,
-            formation,
-            leader=Tracking(Line((1, 2, 0), (0.5, 0, 0))),
-            follower=TrimInput(),
-            initial=initial,
-            seed=seed,
-            horizon=0.1,
-            dt=0.1,
-            **more,
-        ).states[0]
+    def start(initial, **more):
+        more |= {"initial": initial, "horizon": 0.1, "dt": 0.1}
+        return closed(model, graph, TrimInput(), leader, row, **more).states[0]
 
-    goal = np.array([1.0, 2.0, 0.5, 0.0]) + formation.offsets
+    goal = np.array([1.0, 2.0, 0.5, 0.0]) + np.arange(200.0)[:, None] * [1.0, 0.0, 0.0, 0.0]
     assert start(None) == pytest.approx(goal)
     off = start({"position": 2.0, "y": 0.5, "vx": 0.1}) - goal
     assert not off[0].any() and not off[:, 3].any()
@@ -455,42 +339,22 @@ def test_starts_are_goals_plus_a_spread_that_the_seed_draws():
     assert moved == pytest.approx(goal + [0.25, 0.25, -1.0, 0.0])
 
 
-def test_states_may_be_given_by_agent_and_the_rest_stay_on_their_goals():
+def test_states_may_be_given_by_agent_with_a_start_error_and_the_rest_stay_on_their_goals():
     run = carts(start={1: [1, 2, 3, 4], "position": 0.5}, horizon=0.1)
     assert run.states[0, 1].tolist() == [1.0, 2.0, 3.0, 4.0]
     again = carts(start={"position": 0.5}, horizon=0.1)
     assert np.array_equal(run.states[0, [0, 2, 3]], again.states[0, [0, 2, 3]])
-
-
-def test_a_start_error_is_added_to_a_given_start():
     run = carts(start=np.zeros((4, 4)), horizon=0.1, start_error={"x": 0.5})
     assert run.states[0, 0].tolist() == [0.5, 0.0, 0.0, 0.0]
     assert not run.states[0, 1:].any()
 
 
-# ---- limits ----
-
-
 def test_limits_act_and_are_counted_agent_by_agent():
-    model = PlanarQuadrotor()
-    graph = Graph.path(3)
-    start = np.zeros((3, 6))
+    model, graph, start = ech.models.PlanarQuadrotor(), Graph.path(3), np.zeros((3, 6))
     start[1, 0] = 8.0
-
-    def hover(limits):
-        return simulate(
-            model,
-            graph,
-            Formation.from_offsets(model, graph, {}),
-            leader=TrimInput(),
-            follower=Consensus(synthesize(model, graph, Riccati()), "none"),
-            initial=start,
-            horizon=0.5,
-            dt=0.005,
-            limits=limits,
-        )
-
-    held, free = hover(True), hover(False)
+    settings = {"initial": start, "horizon": 0.5, "dt": 0.005}
+    law = consensus(model, graph)
+    held, free = (closed(model, graph, law, limits=limits, **settings) for limits in (True, False))
     thrusts = held.inputs[..., :1] / 2 + held.inputs[..., 1:] / (2 * 0.0325) * [1.0, -1.0]
     assert thrusts.min() >= -1e-12 and thrusts.max() <= model.motor_thrust + 1e-12
     assert held.saturated[0] == 0.0 and 0.0 < held.saturated[1] <= 1.0
@@ -500,47 +364,25 @@ def test_limits_act_and_are_counted_agent_by_agent():
 
 def test_one_limited_input_of_several_is_enough_to_be_counted():
     class Boxed(SingleIntegrator):
-        input_limits = Limits(np.eye(2), -np.ones(2), np.ones(2))
+        input_limits = ech.models.Limits(np.eye(2), -np.ones(2), np.ones(2))
 
-    model = Boxed(2)
+    model, graph = Boxed(2), Graph.star(4)
     # Behind a leader at rest at 0, each asks for so much of either input.
     asked = np.array([[0.0, 0.0], [0.5, 0.5], [5.0, 0.5], [5.0, -5.0]])
-    law = Consensus(synthesize(model, Graph.star(4), FixedGain(coupling=1.0)))
-    run = simulate(
-        model,
-        Graph.star(4),
-        Formation(np.zeros((4, 2))),
-        leader=TrimInput(),
-        follower=law,
-        initial=-asked,
-        horizon=0.1,
-        dt=0.1,
-    )
+    law = consensus(model, graph, FixedGain(coupling=1.0), "relay")
+    run = closed(model, graph, law, initial=-asked, horizon=0.1, dt=0.1)
     assert run.inputs[0].tolist() == np.clip(asked, -1.0, 1.0).tolist()
     assert run.saturated.tolist() == [0.0, 0.0, 1.0, 1.0]
 
 
 def test_what_is_relayed_is_the_leader_s_input_after_its_limits():
-    model = PlanarQuadrotor()
-    graph = Graph.path(2)
-    start = np.zeros((2, 6))
+    model, graph, start = ech.models.PlanarQuadrotor(), Graph.path(2), np.zeros((2, 6))
     start[:, 0] = 8.0
-    run = simulate(
-        model,
-        graph,
-        Formation.from_offsets(model, graph, {}),
-        leader=Tracking(Hover((0, 0, 0))),
-        follower=Consensus(synthesize(model, graph, Riccati()), feedforward="relay"),
-        initial=start,
-        horizon=0.5,
-        dt=0.005,
-    )
+    law, leader = consensus(model, graph, feedforward="relay"), Tracking(Hover((0, 0, 0)))
+    run = closed(model, graph, law, leader, initial=start, horizon=0.5, dt=0.005)
     # The leader saturates; a follower that starts beside it is told what it did, and does it too.
     assert run.saturated[0] > 0.0
     assert np.abs(run.states[:, 0] - run.states[:, 1]).max() <= 1e-12
-
-
-# ---- precision ----
 
 
 def test_float32_by_choice_is_close_and_no_closer():
@@ -551,44 +393,19 @@ def test_float32_by_choice_is_close_and_no_closer():
     assert np.array_equal(single.states, single.states.astype(np.float32))
 
 
-def test_float32_flies_a_quadrotor():
-    gain = synthesize(QUAD, TREE, Riccati())
-    run = simulate(
-        QUAD,
-        TREE,
-        DRAWN,
-        leader=TrimInput(),
-        follower=Consensus(gain, "none"),
-        initial={"position": 0.1},
-        horizon=0.2,
-        dt=0.01,
-        precision="float32",
-    )
-    assert run.outcome is Outcome.COMPLETED
-
-
 FRESH = """
 import json, sys
 import jax
-import numpy as np
-from echelon import Formation, Graph, Laws, Parts, Settings, simulate, synthesize
-from echelon.synthesis.gains import Riccati
-from echelon.laws import Consensus, Tracking
-from echelon.agents.models import DoubleIntegrator
-from echelon.agents.references import Circle
-
 before = jax.config.jax_enable_x64
-model, graph = DoubleIntegrator(2, drag=0.2), Graph.from_edges([(0, 1), (1, 2), (1, 3)])
-gain = synthesize(model, graph, Riccati())
-formation = Formation.from_offsets(model, graph, {1: (1, 0), 2: (1, 0.8), 3: (1, -0.8)})
-drive = Laws(Tracking(Circle((0, 0, 0), 2.0, 0.4)), Consensus(gain, feedforward="relay"))
-parts = Parts(model, graph, formation, drive, initial={"position": 1.0})
-run = simulate(parts, Settings(horizon=3.0, dt=0.01))
+sys.path[:0] = sys.argv[1:]
+from test_simulate import carts
+
+run = carts()
 after = jax.config.jax_enable_x64
 print(json.dumps({
     "flags": [bool(before), bool(after)],
     "jax": str(jax.numpy.zeros(1).dtype),
-    "P": gain.P.tolist(), "states": run.states.tolist(), "inputs": run.inputs.tolist(),
+    "P": run.drive.gain.P.tolist(), "states": run.states.tolist(), "inputs": run.inputs.tolist(),
 }))
 """
 
@@ -598,7 +415,7 @@ def test_everything_is_float64_whatever_the_flags_of_the_process():
     plain = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
     processes = [
         subprocess.Popen(
-            [sys.executable, "-c", FRESH],
+            [sys.executable, "-c", FRESH, *map(str, Path(__file__).parents[:2])],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -622,32 +439,16 @@ def test_everything_is_float64_whatever_the_flags_of_the_process():
     assert unset["states"] == wide["states"]
 
 
-# ---- runs that end early ----
-
-
-def test_progress_counts_the_steps():
-    heard = []
-    alone(
-        SingleIntegrator(1),
-        [1.0],
-        horizon=25.0,
-        dt=0.1,
-        store_every=2,
-        progress=lambda run: heard.append((run.done, run.steps)),
-    )
-    done = [d for d, _ in heard]
-    assert done == sorted(done) and done[-1] == 250 and {of for _, of in heard} == {250}
-    assert 2 <= len(heard) <= 101
-
-
-def test_a_run_on_its_way_tells_the_states_and_the_numbers_that_the_whole_run_has():
-    heard = []
+def test_a_run_on_its_way_tells_the_steps_states_and_numbers_that_the_whole_run_has():
+    heard, done = [], []
 
     def look(run):
         heard.append((run.time, run.states, run.result()))
+        done.append((run.done, run.steps))
 
     whole = carts(horizon=3.0, progress=look)
-    assert len(heard) > 2
+    assert 2 < len(heard) <= 101 and done == sorted(done) and done[-1] == (300, 300)
+    assert {steps for _, steps in done} == {300}
     for time, states, result in heard[:-1]:
         count = len(result.times)
         assert count < len(whole.times) and result.message.startswith("The run goes on")
@@ -658,7 +459,9 @@ def test_a_run_on_its_way_tells_the_states_and_the_numbers_that_the_whole_run_ha
     assert last == metrics(whole) and heard[-1][2].outcome is whole.outcome
 
 
-def test_an_interrupt_keeps_what_was_computed():
+def test_an_interrupt_keeps_what_was_computed_be_it_nothing(
+    monkeypatch,
+):
     def stop(run):
         if run.done >= 100:
             raise KeyboardInterrupt
@@ -671,6 +474,15 @@ def test_an_interrupt_keeps_what_was_computed():
     assert run.reference.shape == (len(run.times), 4) and len(run.inputs) == len(run.times)
     last = run.times[-1]
     assert run.message == f"The run was interrupted at t = {last:.6g} s; what was computed is kept."
+
+    def stop_at_once(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jax_stepper, "advance", stop_at_once)
+    run = carts()
+    assert run.outcome is Outcome.INTERRUPTED
+    assert run.states.shape == (0, 4, 4) == run.errors.shape and run.inputs.shape == (0, 4, 2)
+    assert run.message == "The run was interrupted at t = 0 s; what was computed is kept."
 
 
 def test_who_keeps_a_run_may_end_it_with_a_reason():
@@ -686,38 +498,13 @@ def test_who_keeps_a_run_may_end_it_with_a_reason():
     assert run.outcome is Outcome.INTERRUPTED and len(run.times) == 11
 
 
-def test_an_interrupt_before_the_first_frame_leaves_an_empty_run(monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(jax_stepper, "advance", stop)
-    run = carts()
-    assert run.outcome is Outcome.INTERRUPTED
-    assert run.states.shape == (0, 4, 4) == run.errors.shape and run.inputs.shape == (0, 4, 2)
-    assert run.message == "The run was interrupted at t = 0 s; what was computed is kept."
-
-
-def diverging(**options):
-    model = Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
-    graph = Graph.path(3)
-    settings = {"horizon": 200.0, "dt": 0.1, "integrator": "euler"} | options
-    return simulate(
-        model,
-        graph,
-        Formation.from_offsets(model, graph, {}),
-        leader=TrimInput(),
-        follower=Consensus(
-            synthesize(model, graph, FixedGain(P=[1e3, 1e3], coupling=50.0)), "none"
-        ),
-        initial={"x1": 1.0, "x2": 1.0},
-        **settings,
-    )
-
-
 def test_a_run_that_diverges_names_time_and_agent_and_keeps_finite_data():
-    run = diverging()
+    model, graph = Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]), Graph.path(3)
+    law = consensus(model, graph, FixedGain(P=[1e3, 1e3], coupling=50.0))
+    settings = {"horizon": 200.0, "dt": 0.1, "integrator": "euler"}
+    run = closed(model, graph, law, initial={"x1": 1.0, "x2": 1.0}, **settings)
     assert run.outcome is Outcome.DIVERGED and run.outcome.exit_code == 3
-    assert 2 < len(run.times) < 2001
+    assert 2 < len(run.times) < 2001 and not run.saturated.any()
     assert np.isfinite(run.states).all() and np.isfinite(run.inputs).all()
     assert np.isfinite(run.errors).all()
     assert np.abs(run.states).max() > 1e100
@@ -725,10 +512,6 @@ def test_a_run_that_diverges_names_time_and_agent_and_keeps_finite_data():
     start = "The state of follower "
     assert run.message.startswith(start) and run.message[len(start)] in "12"
     assert run.message.endswith(f" stopped being finite by t = {when:.6g} s.")
-
-
-def test_a_model_without_limits_saturates_nothing_even_when_it_diverges():
-    assert not diverging().saturated.any()
 
 
 def test_a_leader_that_diverges_is_called_the_leader():
@@ -740,14 +523,7 @@ def test_a_leader_that_diverges_is_called_the_leader():
 
 
 def test_agents_with_one_goal_are_warned_of_and_synchronization_is_not():
-    run = simulate(
-        SingleIntegrator(1),
-        Graph.path(3),
-        Formation([[0.0], [1.0], [1.0]]),
-        leader=Agreement(),
-        follower=Agreement(),
-        horizon=0.1,
-        dt=0.1,
-    )
+    offsets, settings = {1: [1.0], 2: [1.0]}, {"horizon": 0.1, "dt": 0.1}
+    run = closed(SingleIntegrator(1), Graph.path(3), Agreement(), Agreement(), offsets, **settings)
     assert run.warnings == ("agents 1 and 2 have the same goal, and would collide there.",)
-    assert alone(Pendulum(), [0.0, 0.0], horizon=0.1, dt=0.1).warnings == ()
+    assert alone(Pendulum(), [0.0, 0.0], **settings).warnings == ()

@@ -4,7 +4,6 @@ Numbers are 0, denormal, tiny, huge, infinite, none, of both signs, in both prec
 """
 
 import itertools
-import random
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,6 @@ import pytest
 from jax import lax
 from lanes import run_with_exceptions
 
-import echelon as ech
 from echelon.core.numerics import precision
 from echelon.simulation.scalars import Unsupported
 
@@ -199,62 +197,3 @@ def test_a_function_sees_the_precision_of_its_run():
     columns = special(32)[None]
     [ours, _] = run_with_exceptions(function, columns, 32)
     np.testing.assert_array_equal(ours, by_jax(lambda x: function(x), columns, 32))
-
-
-# ---- drawn models --------------------------------------------------------------------------------
-
-ONE = [jnp.sin, jnp.tanh, jnp.abs, jnp.exp, jnp.arctan, jnp.sign, jnp.floor, jnp.cbrt, jnp.square]
-ONE += [lambda a: jnp.log1p(a * a), lambda a: jnp.sqrt(jnp.abs(a)), lambda a: a / (1.0 + a * a)]
-ONE += [lambda a: whole(a) % 3 * 0.1, lambda a: jnp.power(jnp.abs(a) + 0.1, 1.7), jax.nn.relu]
-ONE += [lambda a: jnp.interp(a, jnp.linspace(-1, 1, 5), jnp.arange(5.0)), lax.erfc, jnp.arcsinh]
-TWO = [jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.arctan2, jnp.hypot, jnp.copysign]
-TWO += [lambda a, b: jnp.where(a > b, a, 0.5 * b), lambda a, b: jnp.mod(a, 1.0 + b * b)]
-TWO += [lambda a, b: jnp.sort(jnp.stack([a, b, 0.1 * a]))[1], lambda a, b: a * (b > 0.2)]
-
-
-def drawn(draws, depth, size):
-    """Return a function of `size` numbers."""
-    if depth == 0 or draws.random() < 0.15:
-        k, number = draws.randrange(size + 1), draws.uniform(-2.0, 2.0)
-        return (lambda x: x[k]) if k < size else (lambda x: jnp.asarray(number, x.dtype))
-    if draws.random() < 0.5:
-        one, inner = draws.choice(ONE), drawn(draws, depth - 1, size)
-        return lambda x: one(inner(x))
-    two, a, b = draws.choice(TWO), *(drawn(draws, depth - 1, size) for _ in range(2))
-    return lambda x: two(a(x), b(x))
-
-
-def drawn_parts(seed):
-    """Return followers that move by drawn equations; a law may have kinks, and needs no trim."""
-    draws = random.Random(seed)
-    size = draws.randint(1, 4)
-    rates = [drawn(draws, 3, size) for _ in range(size)]
-
-    class Drawn(ech.laws.Law):
-        def update(self, model, view, memory):
-            rate = jnp.stack([jnp.asarray(rate(view.x), view.x.dtype) for rate in rates])
-            return jnp.tanh(rate) - 0.1 * view.x, memory
-
-    model, graph = ech.models.SingleIntegrator(dimension=size), ech.Graph.path(9)
-    start = np.random.default_rng(seed).normal(size=(9, size))
-    formation, drive = ech.Formation(np.zeros((9, size))), ech.Laws(ech.laws.TrimInput(), Drawn())
-    return ech.Parts(model, graph, formation, drive, initial=start)
-
-
-def rare(seed):
-    return pytest.mark.slow if seed < 4 else pytest.mark.study
-
-
-@pytest.mark.parametrize("bits", BITS)
-@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=rare(k)) for k in range(1, 20))])
-def test_drawn_models_move_as_by_jax(seed, bits):
-    parts, ends = drawn_parts(seed), []
-    for engine in ("native", "jax"):
-        settings = ech.Settings(0.2, 0.01, engine=engine, precision=f"float{bits}")
-        try:
-            ends.append(ech.simulate(parts, settings).states[-1])
-        except ech.errors.SimulationError as refused:
-            assert "there is no native code" in str(refused) and "line" in str(refused)
-            return
-    # A step that jumps makes a rounding large, but none of these starts is beside a jump.
-    np.testing.assert_allclose(*ends, rtol=0, atol=1e-11 if bits == 64 else 1e-4)

@@ -112,9 +112,15 @@ def test_frames_change_no_number_of_a_run():
     )
 
 
-def test_all_messages_lost_leave_no_age():
+def test_all_messages_lost_and_those_of_an_absent_sender_have_no_age():
     _, found = followed(ech.Network(loss=1.0))
     assert found.sent == found.lost > 0 and np.isnan(found.ages).all() and np.isnan(found.mean)
+    ages = np.array([[[0.1, 0.2], [0.3, 0.4]], [[0.5, 0.6], [0.7, 0.8]]])
+    found = Traffic(ages, np.zeros((2, 2, 2), int), 0, 0, 0, 0.8, 0.4)
+    edges = np.array([[0, 1], [1, 2]])
+    here = np.array([[True, True, True], [False, True, True]])
+    expected = [[0.1, 0.3, 0.4], [np.nan, 0.7, 0.8]]
+    np.testing.assert_array_equal(found.of_agents(edges, 3, here), expected)
 
 
 def test_a_run_reports_its_messages():
@@ -129,12 +135,3 @@ def test_a_run_reports_its_messages():
     ideal = ech.simulate(parts_of(None), ech.Settings(horizon=1.0, dt=DT))
     assert ideal.traffic is None and ech.summary(ideal)["messages_sent"] is None
     assert "age" not in ech.dataset(ideal) and "Messages" not in ech.report(ideal)
-
-
-def test_messages_of_an_absent_sender_have_no_age():
-    ages = np.array([[[0.1, 0.2], [0.3, 0.4]], [[0.5, 0.6], [0.7, 0.8]]])
-    found = Traffic(ages, np.zeros((2, 2, 2), int), 0, 0, 0, 0.8, 0.4)
-    edges = np.array([[0, 1], [1, 2]])
-    here = np.array([[True, True, True], [False, True, True]])
-    expected = [[0.1, 0.3, 0.4], [np.nan, 0.7, 0.8]]
-    np.testing.assert_array_equal(found.of_agents(edges, 3, here), expected)

@@ -11,7 +11,7 @@ from virtual_flight import Network, VirtualClock
 
 from echelon_flight.ground import Ground, page_of
 from echelon_flight.mission import NumberFile
-from echelon_flight.wire import GROUND, DatagramKind, Drop, Letter, Report, Wire
+from echelon_flight.wire import GROUND, DatagramKind, Drop, Message, Report, Wire
 
 KEY, BOOT = b"k" * 32, 1_800_000_000_000
 REPORT = Report(1, 0, 0, 0.0, math.nan, 0.0, 0.0, 1.0, 0.0, 2e-4, 0.01, math.nan, (0,) * len(Drop))
@@ -127,6 +127,6 @@ MISTAKES = {
 
 @pytest.mark.parametrize("sentence", MISTAKES)
 def test_whose_datagrams_are_dropped_is_shown(sentence, station):
-    station.say(lambda now: wire(0).letter(Letter(0, 99.0, 0, (0.0,), None)))
+    station.say(lambda now: wire(0).letter(Message(0, 99.0, 0, (0.0,), None)))
     station.say(MISTAKES[sentence])
     assert station.ground.state()["dropped"] == [sentence]

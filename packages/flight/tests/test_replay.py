@@ -12,7 +12,7 @@ from agent_scene import KEY, Scene
 from echelon_flight import FlightError
 from echelon_flight.mission import NumberFile
 from echelon_flight.supervisor import Fault
-from echelon_flight.wire import GROUND, DatagramKind, Drop, Letter, Packet, Report, Wire
+from echelon_flight.wire import GROUND, DatagramKind, Drop, LeaderPacket, Message, Report, Wire
 
 WALL, BOOT, MARK = 1.8e9, 1_800_000_000_000, "ab" * 32
 TIMES = [0.02 * k for k in range(1, 200)]
@@ -23,8 +23,8 @@ def wire(number, highest=0, boot=BOOT):
     return Wire(KEY, MARK, number, 3, (1, 1), boot, highest)
 
 
-def letter(sender, t, epoch=0):
-    return Letter(sender, t, 0, (0.0,), Packet(sender, t, (0.0,), epoch))
+def letter(sender, t, term=0):
+    return Message(sender, t, 0, (0.0,), LeaderPacket(sender, t, (0.0,), term))
 
 
 def join(ground, agent):
@@ -41,16 +41,16 @@ class Recorded:
     """A flight in which agent 2 took the lead, and the station stopped all: what was in the air."""
 
     def __init__(self):
-        self.ground, self.leader, self.heir, self.agent = map(wire, (GROUND, 0, 2, 1))
+        self.ground, self.leader, self.backup, self.agent = map(wire, (GROUND, 0, 2, 1))
         self.ground.begin(self.ground.next_flight(WALL))
-        assert all(join(self.ground, each) for each in (self.leader, self.heir, self.agent))
+        assert all(join(self.ground, each) for each in (self.leader, self.backup, self.agent))
         self.letters = [(t, self.leader.letter(letter(0, t))) for t in TIMES]
-        self.letters += [(t, self.heir.letter(letter(2, t, epoch=1))) for t in TIMES]
+        self.letters += [(t, self.backup.letter(letter(2, t, term=1))) for t in TIMES]
         self.ground.challenges[1] = self.agent.challenge
         self.commands = [self.ground.start(WALL, WALL + 1.0, to) for to in (0, 1, 2, 0xFFFE)]
         self.ground.highest = self.ground.next_flight(WALL + 60.0)
         self.commands += [self.ground.stop(WALL, to) for to in (0, 1, 2, 0xFFFE)]
-        self.commands += [self.heir.stop(WALL)]
+        self.commands += [self.backup.stop(WALL)]
 
 
 RECEIVERS = {"fresh": 0, "restarted": BOOT}
@@ -165,28 +165,28 @@ def test_a_stop_ends_one_flight_and_not_the_next(tmp_path):
         assert not isinstance(agent.open(stop, None, WALL), Drop)
 
 
-def replay(scene, other, epoch, count=40):
+def replay(scene, other, term, count=40):
     for k in range(count):
         t = scene.context.clock.now
         if k % 4 == 0:
             scene.air.send(scene.leader.letter(letter(0, t)))
-        packet = Packet(2, t - 0.9, (0.0,), epoch)
-        scene.air.send(other.letter(Letter(0, t, 0, (0.0,), packet)))
+        packet = LeaderPacket(2, t - 0.9, (0.0,), term)
+        scene.air.send(other.letter(Message(0, t, 0, (0.0,), packet)))
         scene.rounds(1)
 
 
-@pytest.mark.parametrize("heirs", [None, [2], [2, 1]])
-def test_replayed_letters_let_nobody_take_the_lead(heirs, monkeypatch):
-    leadership = heirs and {"heirs": heirs, "timeout": 0.3}
+@pytest.mark.parametrize("backups", [None, [2], [2, 1]])
+def test_replayed_letters_let_nobody_take_the_lead(backups, monkeypatch):
+    leadership = backups and {"backups": backups, "timeout": 0.3}
     scene = Scene(monkeypatch, leadership)
     earlier = scene.wire(0)
     scene.start()
     earlier.begin(scene.ground.flight - 86_400_000)
     scene.air.send(scene.leader.letter(letter(0, scene.context.clock.now)))
     scene.rounds(2)
-    for epoch in (0, 1, 7):
-        replay(scene, earlier, epoch)
-        assert scene.process.pilot.leader == 0 and not scene.process.pilot.box.packet.epoch
+    for term in (0, 1, 7):
+        replay(scene, earlier, term)
+        assert scene.process.pilot.leader == 0 and not scene.process.pilot.box.packet.term
     assert scene.context.wire.dropped == {Drop.FLIGHT: 120} and scene.fault is Fault.NONE
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from echelon_flight import FlightError
 from echelon_flight.mission import read_key
-from echelon_flight.wire import GROUND, DatagramKind, Drop, Letter, Packet, Report, Wire
+from echelon_flight.wire import GROUND, DatagramKind, Drop, LeaderPacket, Message, Report, Wire
 
 KEY, FORMATION, AGENTS, SIZES = b"k" * 32, "ab" * 32, 4, (4, 4)
 NOW, WALL, BOOT = 3.0, 1.8e9, 1_800_000_000_000
@@ -25,7 +25,7 @@ def wire(number=1, key=KEY, formation=FORMATION, boot=BOOT, flight=FLIGHT):
 
 
 def letter(time=NOW, sender=1, value=(0.1, -0.2, 0.3, 1e-9)):
-    return Letter(sender, time, 1, value, Packet(0, time - 0.02, (0.0, 1.0, -2.0, 0.5)))
+    return Message(sender, time, 1, value, LeaderPacket(0, time - 0.02, (0.0, 1.0, -2.0, 0.5)))
 
 
 def test_a_letter_is_read_as_it_was_written():

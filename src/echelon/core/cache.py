@@ -65,7 +65,6 @@ class BoundedCache(Generic[_V]):
     def __init__(
         self, most: int, size: Callable[[_V], int] | None = None, room: int = sys.maxsize
     ) -> None:
-        """Create an empty cache."""
         self._most, self._size, self._room = most, size, room
         self._values: OrderedDict[Hashable, _V] = OrderedDict()
         self._lock = threading.Lock()
@@ -236,10 +235,7 @@ def open_user_folder(environment: MutableMapping[str, str]) -> Path | None:
 
 
 def user_folder(environment: MutableMapping[str, str]) -> Path | None:
-    """Return the folder of compiled code: in `ECHELON_CACHE`, else among the user's caches.
-
-    None if `ECHELON_CACHE` is empty or `off`, or if the user has no home.
-    """
+    """Return the folder `ECHELON_CACHE` or one of the user's caches; None if `off`, or no home."""
     setting = environment.get("ECHELON_CACHE")
     if setting in ("", "off"):
         return None
@@ -402,10 +398,7 @@ def loaded_sources() -> bytes | None:
 
 
 def sources() -> bytes | None:
-    """Return a digest of echelon's source files; None if the loaded code may differ.
-
-    That is so if a file changed while this process ran, or if Python runs compiled files only.
-    """
+    """Return a digest of echelon's source files; None if the loaded code may differ from them."""
     home, hasher = Path(__file__).parents[1], hashlib.sha256()
     try:
         files = [(file, file.stat(), file.read_bytes()) for file in sorted(home.rglob("*.py"))]

@@ -106,7 +106,6 @@ def compiled_for_one_call(function: Callable[..., _R]) -> Callable[..., _R]:
 def _split(
     tree: PyTree, form: Callable[[jax.Array], object] = lambda _: None
 ) -> tuple[list[jax.Array], PyTree]:
-    """Return the arrays of a tree, and the tree with placeholders for them."""
     leaves, structure = jax.tree.flatten(tree)
     arrays = list[jax.Array]()
     for k, leaf in enumerate(leaves):
@@ -117,7 +116,6 @@ def _split(
 
 
 def _joined(tree: PyTree, arrays: Sequence[jax.Array]) -> PyTree:
-    """Return a tree with its placeholders replaced by arrays."""
     return jax.tree.map(
         lambda leaf: arrays[leaf.number] if isinstance(leaf, Placeholder) else leaf,
         tree,

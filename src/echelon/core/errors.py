@@ -21,10 +21,7 @@ class EchelonError(Exception):
 
 
 class ModelError(EchelonError):
-    """An agent's model is malformed.
-
-    It has a wrong shape, a non-finite value, a false trim or an impossible parameter.
-    """
+    """A model has a wrong shape, a non-finite value, a false trim or an impossible parameter."""
 
 
 class GraphError(EchelonError):
@@ -108,13 +105,7 @@ def listing(names: Iterable[str]) -> str:
 def check_name(
     what: str, name: object, allowed: Iterable[str], fault: type[EchelonError] = EchelonError
 ) -> None:
-    """Check that a name is one of those that are allowed.
-
-    `what` begins the message, as in "`method` is".
-
-    Raises:
-        EchelonError: it is not; of the class `fault`.
-    """
+    """Raise `fault` unless a name is allowed; `what` begins the message, as in "`method` is"."""
     names = list(allowed)
     if name not in names:
         raise fault(f"{what} `{name}`, allowed are {listing(names)}{did_you_mean(name, names)}.")
@@ -128,11 +119,7 @@ def is_number(value: object) -> TypeGuard[float]:
 def check_kind(
     place: str, part: object, kind: type, fault: type[EchelonError] = SimulationError
 ) -> None:
-    """Check that a part is an instance of a class.
-
-    Raises:
-        EchelonError: it is not; of the class `fault`.
-    """
+    """Raise `fault` unless a part is an instance of a class."""
     if isinstance(part, kind):
         return
     got = f"the class `{part.__name__}`" if isinstance(part, type) else f"a `{type(part).__name__}`"

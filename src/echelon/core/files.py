@@ -20,21 +20,13 @@ PART = ".part"
 
 
 def write_atomic(path: Path, content: bytes | str) -> None:
-    """Write a file completely; if that fails, its previous content remains.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a file completely, or raise `OSError` and leave its previous content."""
     data = content.encode() if isinstance(content, str) else content
     make_atomic(path, lambda part: _write(part, data))
 
 
 def make_atomic(path: Path, make: Callable[[Path], object]) -> None:
-    """Let `make` write a temporary file, and rename it when it is complete.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Let `make` write a temporary file, and rename it when it is complete; `OSError` if not."""
     if path.exists() and not path.is_file():
         # A pipe or a device cannot be replaced by a rename.
         make(path)
@@ -63,10 +55,7 @@ _PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy", "llvmlite")
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that compute.
-
-    In a checkout, `git` is the commit.
-    """
+    """Return the versions of Python and of the packages that compute, and a checkout's `git`."""
     result = {"python": platform.python_version(), "echelon": __version__}
     for package in _PACKAGES:
         try:
@@ -114,11 +103,9 @@ class CellPage:
     height: int
 
     def __repr__(self) -> str:
-        """Return what to do with it outside of a notebook."""
         return f"CellPage({len(self.text) / 1e6:.2g} MB of HTML in `text`; a notebook shows it)"
 
     def _repr_html_(self) -> str:
-        """Return the page in a frame of its own."""
         style = f"width: 100%; height: {self.height}px; border: 1px solid #8888; border-radius: 6px"
         return f'<iframe style="{style}" srcdoc="{html.escape(self.text)}"></iframe>'
 

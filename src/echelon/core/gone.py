@@ -5,6 +5,7 @@ echelon adds a line here, which stays for two minor versions.
 """
 
 KEYS: dict[str, str] = {
+    "leadership.heirs": "use `backups`",
     "leadership.waits": "make the leader's path slower, as by a smaller `rate` of `reference`",
     "live.gusts": "set `rms` of `disturbance` for the whole run",
     "live.lag": "set `lag` of `actuator` for the whole run",
@@ -32,6 +33,12 @@ NAMES: dict[str, str] = {
     "tune": "minimize the cost by `ech.gradient` and SciPy, as in docs/recipes.md",
 }
 """Public names below `echelon`."""
+
+RENAMED: dict[str, str] = {"Promise": "Guarantee", "promise": "guarantee"}
+"""Public names below `echelon` that still work, with a warning."""
+
+METHODS: dict[str, str] = {"flatten": "to_flat", "switch_on": "initial_integrators"}
+"""Methods of a model that a class may declare, and what they are called now."""
 
 
 def gone_key(*path: str | int) -> str:

@@ -40,10 +40,7 @@ def identify(value: object) -> tuple[bytes, Foreign]:
 
 
 def digest(value: object) -> bytes | None:
-    """Return a digest, equal only for values of the same classes and bits, in every process.
-
-    None if a part is of a class or function outside echelon and its dependencies.
-    """
+    """Return a digest, equal only for equal classes and bits; None if a part is foreign."""
     bits, foreign = identify(value)
     return None if foreign else bits
 
@@ -78,11 +75,7 @@ def key_of_foreign(bits: bytes, foreign: Foreign) -> Hashable:
 
 
 def array_bits(array: object) -> bytes:
-    """Return the bits of an array of NumPy or JAX; of a large one, such as a graph's, a digest.
-
-    Raises:
-        ValueError: its entries are objects, whose bits are addresses; or it is traced.
-    """
+    """Return an array's bits, of a large one a digest; `ValueError` if of objects or traced."""
     # Imported here, since the command line opens its cache before it needs them.
     import numpy as np
 
@@ -109,7 +102,6 @@ def _untraced(array: object) -> object:
 
 @functools.lru_cache(1024)
 def _fields(kind: type) -> tuple[str, ...] | None:
-    """Return the names of the fields of a dataclass; None of another class."""
     if not dataclasses.is_dataclass(kind):
         return None
     return tuple(field.name for field in dataclasses.fields(kind))
@@ -122,8 +114,6 @@ def _has_dict(kind: type) -> bool:
 
 @final
 class _Walk:
-    """A walk through a tree of values that collects its bits and its foreign parts."""
-
     def __init__(self) -> None:
         self.foreign: list[tuple[type, object]] = []
         self._bits: list[bytes] = []
@@ -170,7 +160,6 @@ class _Walk:
             self.visit(part)
 
     def _object(self, value: object, kind: type) -> None:
-        """Collect an object of unknown kind, and of a foreign one what it holds and reads."""
         ours = kind.__module__.partition(".")[0] in _TRUSTED or _is_installed(kind.__module__)
         if not ours and id(value) not in self._seen:
             self._seen.add(id(value))

@@ -64,17 +64,10 @@ def _window(
     axes: Sequence[int],
     batches: tuple[Sequence[int], Sequence[int]],
 ) -> tuple[list[np.ndarray], bool]:
-    """Return the places that windows of an array cover, and whether one was not within it.
+    """Return the places along each axis that windows cover, and whether one was not within it.
 
-    Args:
-        shape: of the array, k axes.
-        indices: (..., i), where each window begins along `axes`.
-        sizes: of a window along each axis.
-        axes: those that the indices are of.
-        batches: axes of the array that go along with axes of the indices.
-
-    Returns:
-        The places along each axis, which broadcast to (..., *sizes), clipped into the array.
+    Indices (..., i) are where each window begins along `axes`; `batches` are axes of the array that
+    go along with axes of the indices. Places broadcast to (..., *sizes), clipped into the array.
     """
     before, k = indices.shape[:-1], len(shape)
     starts = np.zeros((k, *before), int)
@@ -91,18 +84,13 @@ def _window(
     return places, outside
 
 
-def _is_filled(params: Params) -> bool:
-    return "FILL_OR_DROP" in str(params["mode"])
-
-
 def _gather(params: Params, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
-    """Return windows of an array."""
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     batches = numbers.operand_batching_dims, numbers.start_indices_batching_dims
     places, outside = _window(x.shape, indices, sizes, numbers.start_index_map, batches)
     before = indices.ndim - 1
     gone = {*numbers.collapsed_slice_dims, *numbers.operand_batching_dims}
-    if outside and _is_filled(params):
+    if outside and "FILL_OR_DROP" in str(params["mode"]):
         return None
     read = x[tuple(places)].squeeze(tuple(before + axis for axis in gone))
     offsets = numbers.offset_dims
@@ -112,7 +100,6 @@ def _gather(params: Params, x: np.ndarray, indices: np.ndarray) -> np.ndarray | 
 def _scatter(
     params: Params, x: np.ndarray, indices: np.ndarray, updates: np.ndarray
 ) -> np.ndarray | None:
-    """Return an array with windows of it replaced."""
     result = x.copy()
     if params["update_jaxpr"] is not None:
         return None
@@ -317,9 +304,9 @@ def used_leaves(function: Callable[..., PyTree], *arguments: PyTree) -> list[boo
 
 def apply(equation: JaxprEqn, operands: list[np.ndarray], algebra: Algebra) -> list[np.ndarray]:
     """Return the results of one equation for arrays of entries or of numbers."""
-    name = equation.primitive.name
+    name, params = equation.primitive.name, equation.params
     if name in INLINED:
-        inner = _inner_jaxpr(equation)
+        inner = next(params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in params)
         # `checkpoint` calls an open jaxpr, which has no constants of its own.
         closed = isinstance(inner, ClosedJaxpr)
         jaxpr, consts = (inner.jaxpr, inner.consts) if closed else (inner, ())
@@ -343,7 +330,7 @@ def apply(equation: JaxprEqn, operands: list[np.ndarray], algebra: Algebra) -> l
     rule = algebra.rules.get(name, COMMON.get(name))
     if rule is None:
         return algebra.unknown(equation, operands)
-    return [rule(equation.params, *operands)]
+    return [rule(params, *operands)]
 
 
 INLINED = {
@@ -384,13 +371,6 @@ _INDICES: dict[str, tuple[int, int | None]] = {
     "dynamic_update_slice": (2, None),
 }
 """Which operands say where: from the first number to before the second."""
-
-
-def _inner_jaxpr(equation: JaxprEqn) -> Jaxpr | ClosedJaxpr:
-    """Return the jaxpr, closed or not, that an equation of an `INLINED` primitive calls."""
-    return next(
-        equation.params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in equation.params
-    )
 
 
 def has_function(equation: JaxprEqn) -> bool:
@@ -476,7 +456,6 @@ def _add(
 
 
 def _alone(places: np.ndarray) -> np.ndarray:
-    """Return each place as a tuple of one, which adding joins."""
     entries = np.empty(places.size, object)
     entries[:] = [(int(place),) for place in places.flat]
     return entries.reshape(places.shape)

@@ -56,10 +56,7 @@ def excess_runs(runs: int, numbers: int = 0) -> str | None:
 
 
 def horizon_fault(horizon: float, dt: float) -> str | None:
-    """Return what is wrong with a horizon (s) for steps of dt (s), both positive and finite.
-
-    None if the horizon is a whole number of steps within the limit.
-    """
+    """Return what is wrong with a horizon (s), unless it is a whole number of few enough steps."""
     if horizon < dt:
         return f"must be at least one step `dt` = {dt:g} s"
     steps = horizon / dt
@@ -75,10 +72,7 @@ def horizon_fault(horizon: float, dt: float) -> str | None:
 
 
 def excess_frames(frames: int, numbers: int, every: int) -> str | None:
-    """Return why the frames, each of `numbers` numbers, do not fit in memory.
-
-    They may use half of the memory. `every` is the number of steps per frame.
-    """
+    """Return why frames of `numbers` numbers, one each `every` steps, exceed half of memory."""
     size, room = 8 * _COPIES * frames * numbers, memory() // 2
     if size <= room:
         return None

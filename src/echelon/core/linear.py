@@ -223,11 +223,7 @@ def observability_rank(A: np.ndarray, C: np.ndarray) -> int:
 
 
 def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """Return the stabilizing solution P of A'P + P A - P B R^-1 B'P + Q = 0.
-
-    Raises:
-        GainError: the equation has no stabilizing solution.
-    """
+    """Return the stabilizing P of A'P + P A - P B R^-1 B'P + Q = 0, else raise `GainError`."""
     # SciPy refuses empty matrices, and an integrator has no state that an inner loop must damp.
     if not len(A):
         return np.zeros((0, 0))
@@ -249,11 +245,7 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
 
 
 def _stabilizing(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """Return SciPy's solution, after checking that it stabilizes.
-
-    Raises:
-        LinAlgError: a mode is left on the imaginary axis.
-    """
+    """Return SciPy's solution, after checking that it stabilizes."""
     P = scipy.linalg.solve_continuous_are(A, B, Q, R)
     S = B @ np.linalg.solve(R, B.T)
     # The Hamiltonian's eigenvalues are those of A - S P and their mirror images. They are 0 where
@@ -277,11 +269,7 @@ Weight: TypeAlias = Sequence[float] | Sequence[Sequence[float]] | Array
 
 
 def check_definite(name: str, matrix: np.ndarray) -> None:
-    """Check that a matrix is finite, symmetric (to 1e-9 of its size) and positive definite.
-
-    Raises:
-        GainError: it is not.
-    """
+    """Raise `GainError` unless a matrix is finite, symmetric (to 1e-9 of its size) and definite."""
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise GainError(f"`{name}` has shape {matrix.shape}, and must be square.")
     if not np.isfinite(matrix).all():
@@ -300,11 +288,7 @@ def check_definite(name: str, matrix: np.ndarray) -> None:
 
 
 def check_eigenvalues(name: str, what: str, matrix: Array, bound: float) -> None:
-    """Check that the eigenvalues of a symmetric matrix exceed a bound, in any units of states.
-
-    Raises:
-        GainError: they do not, so that the matrix is not `what`.
-    """
+    """Raise `GainError` that a matrix is not `what` unless its eigenvalues exceed a bound."""
     scaled, raw = (np.linalg.eigvalsh(m)[0] for m in (with_unit_diagonal(matrix), matrix))
     if not scaled > bound:
         least = raw if raw < 0.0 else scaled
@@ -324,11 +308,7 @@ def with_unit_diagonal(matrix: Array) -> Array:
 
 
 def as_matrix(name: str, value: Weight, size: int) -> Array:
-    """Return a weight as a square matrix; a plain list of numbers is a diagonal.
-
-    Raises:
-        GainError: it is neither `size` numbers nor a `size` x `size` matrix.
-    """
+    """Return a weight as `size` x `size` matrix, a list as a diagonal; else raise `GainError`."""
     try:
         # A copy, so that no later change of the caller's own array changes a gain.
         array = np.array(value, dtype=np.float64)
@@ -347,7 +327,6 @@ def as_matrix(name: str, value: Weight, size: int) -> Array:
 
 
 def _check_size(name: str, matrix: Array) -> None:
-    """Check that the numbers of a weight can be computed with."""
     largest = np.abs(matrix).max(initial=0.0)
     if LARGEST <= largest < np.inf:
         raise GainError(f"`{name}` goes up to {largest:.3g}, and must stay below {LARGEST:g}.")

@@ -27,11 +27,7 @@ _forked = False
 
 
 def require_jax() -> None:
-    """Check that JAX can run; cheap after the first call.
-
-    Raises:
-        EchelonError: it cannot, and would fail or hang later without saying why.
-    """
+    """Raise `EchelonError` if JAX would fail or hang later without saying why."""
     if _forked:
         raise EchelonError(
             "JAX had started before this process was forked, and would hang in it; start processes"
@@ -89,11 +85,7 @@ _USUAL = (
 
 
 def precision(name: Precision) -> contextlib.AbstractContextManager[object]:
-    """Return a context in which JAX computes in `name`, whatever the user's own flags are.
-
-    Raises:
-        EchelonError: JAX cannot run in this process.
-    """
+    """Return a context in which JAX, if it can run, computes in `name`, whatever flags are set."""
     require_jax()
     if any(getattr(jax.config, setting) != usual for setting, usual in _USUAL):
         return _usual(name)

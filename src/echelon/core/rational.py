@@ -52,14 +52,7 @@ def norm_above(first: Fraction, *others: Fraction) -> Fraction:
 
 
 def bisect(holds: Callable[[_Real], bool], low: _Real, high: _Real, halvings: int) -> _Real:
-    """Return a number at which a condition holds, close to the border where it fails.
-
-    Args:
-        holds: the condition, assumed at `low`.
-        low: start of the search.
-        high: beyond the border, above or below `low`.
-        halvings: of the interval; the result is within its 2^-halvings of the border.
-    """
+    """Return a number near the border where `holds`, which is true at `low`, becomes false."""
     for _ in range(halvings):
         middle = (low + high) / 2
         low, high = (middle, high) if holds(middle) else (low, middle)

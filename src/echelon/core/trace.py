@@ -76,7 +76,6 @@ def _steps(jaxpr: Jaxpr | ClosedJaxpr) -> Iterator[tuple[str, list[bytes], bool]
 
 
 def _inner(values: Iterable[object]) -> Iterator[Any]:
-    """Yield the jaxprs among parameters of an equation, those in tuples too."""
     for value in values:
         if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
             yield value
@@ -97,11 +96,7 @@ def _shortens(equation: Any) -> bool:
 def check_array(
     fault: Callable[[str], Exception], what: str, value: Any, shape: tuple[int, ...]
 ) -> None:
-    """Check that what a trace returns is one array of a shape, of float64 or whole numbers.
-
-    Raises:
-        Exception: the one that `fault` makes.
-    """
+    """Raise `fault` unless a trace returns one array of a shape, of float64 or whole numbers."""
     if not hasattr(value, "shape"):
         raise fault(
             f"{what} has the type `{type(value).__name__}`, and must be one array, such as "

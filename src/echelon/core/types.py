@@ -43,11 +43,7 @@ class Declared(eqx.Module, abc.ABC):
     """An immutable object whose parameters are annotated fields."""
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Assign a field in `__init__`.
-
-        Raises:
-            EchelonError: there is no such field, or the object is complete.
-        """
+        """Assign a field in `__init__`; raise `EchelonError` for another name, or later."""
         try:
             super().__setattr__(name, value)
         except dataclasses.FrozenInstanceError as error:

@@ -18,27 +18,18 @@ class Word(enum.Enum):
     """A word with a meaning: its name stands in tables and files, its value is the meaning."""
 
     def __str__(self) -> str:
-        """Return the word as tables and files have it."""
         return self.name.lower().replace("_", "-")
 
     @classmethod
     def named(cls, name: object) -> Self:
-        """Return the member of a name; a member is returned as it is.
-
-        Raises:
-            KeyError: there is none.
-        """
+        """Return the member of a name, or a member itself; `KeyError` if there is none."""
         if isinstance(name, cls):
             return name
         return {str(member): member for member in cls}[str(name)]
 
     @classmethod
     def checked(cls, name: object, what: str) -> Self:
-        """Return the member of a name, as `named`; `what` has the name, such as "`a` of the b".
-
-        Raises:
-            SimulationError: there is none.
-        """
+        """Return `named`; raise `SimulationError` about `what`, such as "`a` of the b"."""
         check_name(f"{what} is", str(name), map(str, cls), SimulationError)
         return cls.named(name)
 
@@ -120,7 +111,6 @@ class Theorem(Word):
     T10 = "agents never touch, and each stays in its tube"
 
     def __str__(self) -> str:
-        """Return the theorem's name as the theory page has it."""
         return self.name
 
 
@@ -141,7 +131,6 @@ class Verdict(Word):
     VACUOUS = "vacuous"
 
     def __str__(self) -> str:
-        """Return the verdict."""
         return self.value
 
     @classmethod

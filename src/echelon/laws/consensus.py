@@ -1,6 +1,7 @@
 """The paper's follower law, with the coupling, input weight and feed-forward that make it work."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import TypeVar
 
 import equinox as eqx
@@ -23,17 +24,12 @@ from echelon.synthesis.gains.strings import string_growth
 _Word = TypeVar("_Word", bound=Word)
 
 
-def _member(key: str, kind: type[_Word], name: object) -> _Word:
-    check_name(f"`{key}` is", str(name), map(str, kind), LawError)
-    return kind.named(name)
+def _member(key: str, kind: type[_Word]) -> Callable[[object], _Word]:
+    def named(name: object) -> _Word:
+        check_name(f"`{key}` is", str(name), map(str, kind), LawError)
+        return kind.named(name)
 
-
-def _feedforward(name: object) -> Feedforward:
-    return _member("feedforward", Feedforward, name)
-
-
-def _frame(name: object) -> Frame:
-    return _member("frame", Frame, name)
+    return named
 
 
 class Consensus(Law):
@@ -58,15 +54,14 @@ class Consensus(Law):
     gain: Gain
     # Static: what is sent decides the structure of a step, so each choice is compiled for itself.
     feedforward: Feedforward = eqx.field(
-        default=DEFAULT_FEEDFORWARD, static=True, converter=_feedforward
+        default=DEFAULT_FEEDFORWARD, static=True, converter=_member("feedforward", Feedforward)
     )
     trim: bool = eqx.field(default=True, static=True)
-    frame: Frame = eqx.field(default=Frame.HEADING, static=True, converter=_frame)
+    frame: Frame = eqx.field(default=Frame.HEADING, static=True, converter=_member("frame", Frame))
     turning: bool = eqx.field(default=False, static=True)
     angle: Scalar | None = None
 
     def __check_init__(self) -> None:
-        """Check that the gain is one."""
         if not isinstance(self.gain, Gain):
             raise LawError(
                 f"`gain` of `Consensus` is {self.gain!r}, and must be a `Gain`, as `synthesize` "

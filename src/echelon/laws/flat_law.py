@@ -14,8 +14,8 @@ from echelon.agents.models.chains import (
     Chains,
     chains_of,
     check_bounds,
-    flatten,
-    switch_on,
+    initial_integrators,
+    to_flat,
 )
 from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.agents.network.formation_motion import OwnOffset
@@ -78,7 +78,6 @@ class FlatLaw(Law):
     speeds: Speed | None = None
 
     def __check_init__(self) -> None:
-        """Check that roots are distinct and positive, and other numbers positive."""
         if self.roots is not None and self.rate is not None:
             raise LawError("got `roots` and `rate`, allowed is one of them.")
         for name in ("rate", "coupling"):
@@ -93,7 +92,8 @@ class FlatLaw(Law):
         if len(set(roots)) < len(roots):
             raise LawError(f"`roots` are {list(roots)}, and must be different from each other.")
         speeds = self.speed if isinstance(self.speed, Sequence) else (self.speed,)
-        if self.speed is not None and not all(map(_moves, speeds)):
+        numbers = all(isinstance(speed, int | float) and speed > 0.0 for speed in speeds)
+        if self.speed is not None and not numbers:
             raise LawError(
                 f"`speed` is {self.speed}, and must be positive, or a list of such numbers."
             )
@@ -171,13 +171,7 @@ class FlatLaw(Law):
     ) -> Speed:
         """Return s as set by the user, or what bounds allow each link of the path from a leader.
 
-        Args:
-            model: the agent.
-            chains: of it.
-            most: of an output.
-            share: of what leads to the bound of an output.
-            links: whose speeds add up.
-            slowest: what the leader's path takes a bounded length to, at least.
+        `links` speeds add up; `slowest` gives what the path takes a bounded length to, at least.
         """
         if self.speed is not None:
             return self.speed
@@ -212,7 +206,7 @@ class FlatLaw(Law):
 
     def initial_memory(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x, with the derivatives of its reference."""
-        loop, e = self.ready, switch_on(model, self.ready.chains, x, ahead)
+        loop, e = self.ready, initial_integrators(model, self.ready.chains, x, ahead)
         # All take the turn that is next to one heading, so that it is a number like any other (T5).
         memory = loop.beside(loop.initial_memory(model, x, e), loop.stop(ahead))
         return self._counting(memory)
@@ -226,7 +220,6 @@ class FlatLaw(Law):
         return self._counting(self.ready.zero_memory())
 
     def _counting(self, memory: FlatMemory) -> FlatMemory:
-        """Return a memory that counts the rows that act, if there are any."""
         return memory if self.safety is None else memory._replace(active=0.0 * memory.half)
 
     def signal(
@@ -308,16 +301,12 @@ class FlatLaw(Law):
         places = np.array([chains.outputs.index(name) for name in bound.outputs])
 
         def one(x: State) -> jax.Array:
-            return flatten(model, chains, x, self.begin(model, x).chain).values
+            return to_flat(model, chains, x, self.begin(model, x).chain).values
 
         values = np.asarray(jax.vmap(one)(jnp.asarray(states)))[:, bound.derivative, places]
         names = listing(name + "'" * bound.derivative for name in bound.outputs)
         for k in np.flatnonzero(~(np.linalg.norm(values, axis=1) > bound.above + _REST)):
             yield int(k), f"{names} are 0 there, and allowed is {bound.within}"
-
-
-def _moves(speed: object) -> bool:
-    return isinstance(speed, int | float) and speed > 0.0
 
 
 def _left(roots: tuple[float, ...], bound: FlatBound, slowest: float) -> float:
@@ -342,10 +331,7 @@ def _positive(root: object) -> bool:
 def _outside(
     chains: Chains, model: ControlAffine, states: Array, bound: FlatBound
 ) -> Iterator[tuple[int, str]]:
-    """Yield the rows of states (K, n) beyond a bound of one output.
-
-    There the inputs push it the wrong way, or without integrators it is below.
-    """
+    """There the inputs push it the wrong way, or without integrators it is below."""
     output = chains.outputs.index(bound.outputs[0])
     if not chains.size:
         yield from _below(chains, model, states, bound)
@@ -365,11 +351,10 @@ def _outside(
 def _below(
     chains: Chains, model: ControlAffine, states: Array, bound: FlatBound
 ) -> Iterator[tuple[int, str]]:
-    """Yield the rows of states (K, n) at which the state alone is not above a bound."""
     output, order = chains.outputs.index(bound.outputs[0]), bound.derivative
 
     def one(x: State) -> jax.Array:
-        return flatten(model, chains, x, x[:0]).values[order, output]
+        return to_flat(model, chains, x, x[:0]).values[order, output]
 
     name = bound.outputs[0] + "'" * order
     for k, value in enumerate(np.asarray(jax.vmap(one)(jnp.asarray(states))).tolist()):
@@ -389,7 +374,7 @@ def _pushes(chains: Chains, model: ControlAffine, states: jax.Array, output: int
 
     def one(x: State) -> jax.Array:
         def derivative(e: jax.Array) -> jax.Array:
-            return flatten(model, chains, x, e).values[order, output]
+            return to_flat(model, chains, x, e).values[order, output]
 
         return jax.grad(derivative)(jnp.zeros(chains.size, x.dtype))[0]
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.chains import Chains, angles_among, flat_output, flatten
+from echelon.agents.models.chains import Chains, angles_among, flat_output, to_flat
 from echelon.agents.models.model import ControlAffine, wrap_angles
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.core.errors import LawError, listing
@@ -46,7 +46,6 @@ class Observer:
     scale: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check both numbers."""
         for name in ("push", "scale"):
             value = getattr(self, name)
             if isinstance(value, bool) or not (0.0 <= value < math.inf):
@@ -57,7 +56,6 @@ class Observer:
             raise LawError("`scale` of the observer needs its `push`, which is 0.")
 
     def __bool__(self) -> bool:
-        """Tell whether there is one."""
         return self.push > 0.0
 
     @classmethod
@@ -105,10 +103,8 @@ class FlatLoop(eqx.Module):
     """The inner loop of one agent.
 
     Attributes:
-        chains: of the model.
         weights: (r, m) k_l / k0 of each output, zero beyond its q.
         stiffness: (m,) k0.
-        observer: of the acceleration that the model lacks, which is compensated.
         thrust: the number of the input whose scale is estimated; None for none.
         angles: which outputs are angles, such as a yaw.
     """
@@ -211,7 +207,7 @@ class FlatLoop(eqx.Module):
 
     def flat_values(self, model: ControlAffine, x: State, memory: FlatMemory) -> jax.Array:
         """Return the flat coordinates (r, m), corrected by the observer."""
-        values = flatten(model, self.chains, x, memory.chain).values
+        values = to_flat(model, self.chains, x, memory.chain).values
         if not self.observer:
             return values
         push_rate = self.observer.gains[1] * self._speed_error(model, x, memory)
@@ -236,10 +232,8 @@ class FlatLoop(eqx.Module):
         The rate of the own offset (n,) is added to it.
         """
         x, period = view.x, view.period
-        flat, values = (
-            flatten(model, self.chains, x, memory.chain),
-            self.flat_values(model, x, memory),
-        )
+        flat = to_flat(model, self.chains, x, memory.chain)
+        values = self.flat_values(model, x, memory)
         degrees = np.array(self.chains.degrees)
         lower = np.arange(len(values))[:, None] < degrees - 1
         k = jnp.where(lower, jnp.asarray(self.weights, x.dtype), 0.0)
@@ -312,10 +306,7 @@ class FlatLoop(eqx.Module):
         period: Scalar | float,
         memory: FlatMemory,
     ) -> FlatMemory:
-        """Return the memory with a part of the push along the thrust ascribed to its scale.
-
-        Their sum stays: the scale times the thrust, and the push, do not jump.
-        """
+        """Their sum stays: the scale times the thrust, and the push, do not jump."""
         assert self.thrust is not None and memory.scale is not None
         v, rest = memory.delivered, _at_rest(model, memory.delivered)[self.thrust]
         # What one more unit of thrust adds to y'': inputs enter affinely.
@@ -336,10 +327,7 @@ class FlatLoop(eqx.Module):
         return wrap_angles(error, *jumps) if jumps else error
 
     def _observed(self, model: ControlAffine, x: State, v: Input) -> tuple[jax.Array, jax.Array]:
-        """Return what the observer measures of each output, and its rate under an input v, (m,).
-
-        It is the speed y', whose rate is y''; and of an output that an input moves at once, y.
-        """
+        """Return y' and its rate y'' under v, (m,); of an output that an input moves at once, y."""
         u = model.physical(v)
 
         def velocity(x: State) -> State:

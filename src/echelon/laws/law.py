@@ -16,7 +16,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.exchange import Near
 from echelon.agents.network.formation_motion import OwnOffset
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.reference import Guide
+from echelon.agents.references.reference import LeaderPath
 from echelon.core.errors import LawError
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Declared, Input, PyTree, Scalar, State
@@ -91,7 +91,7 @@ class Law(Declared):
         feedforward: which feed-forward the law needs, none unless replaced by a field, an
             attribute or a property.
         leaderward: whether followers use messages of neighbours nearer to a leader alone.
-        prover: the `Promise` of followers under the law, as `module:class`.
+        prover: the `Guarantee` of followers under the law, as `module:class`.
         turning: whether followers receive the heading that their leader follows.
         safety: how followers keep away from each other; None where they do not.
     """
@@ -357,10 +357,10 @@ def gain_of(law: Law) -> Gain | None:
     return next((gain for gain in named if isinstance(gain, Gain)), None)
 
 
-def reference_of(law: object) -> Guide | None:
+def reference_of(law: object) -> LeaderPath | None:
     """Return the `reference` of a law; None where it has none."""
     reference = getattr(law, "reference", None)
-    return reference if isinstance(reference, Guide) else None
+    return reference if isinstance(reference, LeaderPath) else None
 
 
 def without_certificates(law: Law) -> Law:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.flatness import reference_warnings
-from echelon.agents.references.reference import Guide, Reference
+from echelon.agents.references.reference import LeaderPath, Reference
 from echelon.core.cache import memoize
 from echelon.core.errors import LawError
 from echelon.core.jaxpr import used_leaves
@@ -54,7 +54,6 @@ def leader_warnings(
 
 @memoize
 def _check_law(law: Law, model: ControlAffine) -> None:
-    """Trace one agent of a law, and check what it returns; once for a law and a model."""
     name, m = type(law).__name__, len(model.input_names)
     if not isinstance(law.feedforward, Feedforward):
         raise LawError(
@@ -90,7 +89,6 @@ def traced_arguments(law: Law, model: ControlAffine) -> tuple[LocalView, Memory]
 
 
 def _memory(law: Law) -> Memory:
-    """Return the memory of one agent at the beginning, arrays all."""
     memory = law.init()
     try:
         return jax.tree.map(jnp.asarray, memory)
@@ -102,7 +100,6 @@ def _memory(law: Law) -> Memory:
 
 
 def _view(law: Law, model: ControlAffine) -> LocalView:
-    """Return a view of zeros in the shapes that the law uses."""
     x, forward = jnp.zeros(len(model.state_names)), jnp.zeros(len(model.input_names))
     signal = jax.eval_shape(lambda: law.signal(model, x, x, _memory(law)))
     z = x if signal is None else jnp.zeros(signal.shape)
@@ -148,17 +145,14 @@ def unknown_class(law: Law) -> str:
 
 def _parts(part: object) -> Iterator[object]:
     """Yield a law and all that is made of fields in it: its gain, for example."""
-    if dataclasses.is_dataclass(part) and not isinstance(part, type | Guide | ControlAffine):
+    if dataclasses.is_dataclass(part) and not isinstance(part, type | LeaderPath | ControlAffine):
         yield part
         for value in vars(part).values():
             yield from _parts(value)
 
 
 def _is_unknown(kind: type) -> bool:
-    """Tell whether code of a class is another than that of echelon's class of which it is a kind.
-
-    Of a name, the first class of the order of resolution counts.
-    """
+    """Tell whether code of a class differs from that of echelon's class of which it is a kind."""
     order, ours = kind.__mro__, [c for c in kind.__mro__ if c.__module__.startswith("echelon.")]
     known = {base for cls in ours for base in cls.__mro__}
     names = {name for cls in ours for name in vars(cls) if not name.startswith("__")} | _LOOKUPS

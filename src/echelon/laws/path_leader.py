@@ -18,7 +18,7 @@ from echelon.agents.references.flatness import (
     followed_states,
     without_heading,
 )
-from echelon.agents.references.reference import Guide, check_kind_of, check_reference
+from echelon.agents.references.reference import LeaderPath, check_kind_of, check_reference
 from echelon.core.cache import BoundedCache
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ReferenceError
@@ -41,11 +41,10 @@ class PathLeader(Law):
         fading: the rate (1/s) at which others expect its deviation to fade; set by `predictable`.
     """
 
-    reference: Guide
+    reference: LeaderPath
     fading: Array | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self) -> None:
-        """Check that the reference is one."""
         check_kind_of(self.reference)
 
     def start(self, model: ControlAffine) -> State:
@@ -77,12 +76,7 @@ class PathLeader(Law):
         return model.difference(x, self.reference.follow(model, t)[0] + offset)
 
     def expected(
-        self,
-        model: ControlAffine,
-        t: Scalar,
-        deviation: State,
-        age: Scalar,
-        period: Scalar | float,
+        self, model: ControlAffine, t: Scalar, deviation: State, age: Scalar, period: Scalar | float
     ) -> Expected:
         """Return the path with what is left of the deviation, at the leader's slowest mode."""
         left = deviation * jnp.exp(-jnp.asarray(self.fading, deviation.dtype) * age)
@@ -255,7 +249,7 @@ class PathLQR(PathLeader):
         return u - model.physical(v, trim=False), memory
 
 
-def sweep(model: ControlAffine, reference: Guide, horizon: float) -> tuple[Array, Array]:
+def sweep(model: ControlAffine, reference: LeaderPath, horizon: float) -> tuple[Array, Array]:
     """Return the gains K (N + 1, m, n) at equal times over a horizon (s), and the slowest decay.
 
     Along the linearization V = e'P e falls as V' = -e'(Q + K'R K) e, so that errors shrink at
@@ -277,7 +271,7 @@ def sweep(model: ControlAffine, reference: Guide, horizon: float) -> tuple[Array
         )
     held = np.append(np.arange(1, 2 * count, 2), 2 * count)
     push = B[held] @ np.linalg.solve(R, B[held].swapaxes(1, 2))
-    P = _backward(_flows(A[held], push, Q, horizon / count))
+    P = _backward(A[held], push, Q, horizon / count)
     if not np.isfinite(P).all():
         raise LawError(
             f"`lqr` cannot hold `{name}` on the reference `{path}`: no feedback keeps its "
@@ -287,10 +281,12 @@ def sweep(model: ControlAffine, reference: Guide, horizon: float) -> tuple[Array
     return K, _decay(P, Q + K.swapaxes(1, 2) @ R @ K)
 
 
-def _backward(flows: Array) -> Array:
-    """Return P (N + 1, n, n) at the ends of N intervals, from their flows and that of the end."""
-    n = flows.shape[-1] // 2
-    P = [np.zeros((n, n))]
+def _backward(A: Array, G: Array, Q: Array, span: float) -> Array:
+    """Return P (N + 1, n, n) at the ends of N intervals, from A and G in them and at the end."""
+    # [X; Y]' = H [X; Y] has P = Y X^-1 for the solution of the Riccati equation. With A and G held
+    # this is exact, where a Runge-Kutta step of fast modes would not be stable.
+    H = np.block([[A, -G], [np.broadcast_to(-Q, A.shape), -A.swapaxes(1, 2)]])
+    flows, P = scipy.linalg.expm(-span * H), [np.zeros(Q.shape)]
     # What overflows is rejected afterwards, by its NaN.
     with np.errstate(all="ignore"):
         for _ in range(max(len(flows) - 1, _HELD)):
@@ -300,19 +296,7 @@ def _backward(flows: Array) -> Array:
     return np.array(P[::-1])
 
 
-def _flows(A: Array, G: Array, Q: Array, span: float) -> Array:
-    """Return exp(-H span) for each Hamiltonian matrix H = [[A, -G], [-Q, -A']], (N, 2n, 2n).
-
-    [X; Y] with [X; Y]' = H [X; Y] has P = Y X^-1 for the Riccati equation's solution. With A and
-    G held this is exact at any length of a step, where a Runge-Kutta step of fast modes is not
-    stable.
-    """
-    H = np.block([[A, -G], [np.broadcast_to(-Q, A.shape), -A.swapaxes(1, 2)]])
-    return scipy.linalg.expm(-span * H)
-
-
 def _before(P: Array, flow: Array) -> Array:
-    """Return P one interval earlier."""
     n = len(P)
     X, Y = flow[:n, :n] + flow[:n, n:] @ P, flow[n:, :n] + flow[n:, n:] @ P
     # Rounding alone makes it asymmetric, and would grow with every interval.
@@ -328,7 +312,7 @@ def _decay(P: Array, W: Array) -> Array:
 
 @cached_jit
 def _slopes(
-    model: ControlAffine, reference: Guide, times: jax.Array
+    model: ControlAffine, reference: LeaderPath, times: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Return A (T, n, n) and B (T, n, m) of the deviation from a reference at times (T,)."""
 

@@ -145,7 +145,6 @@ class Safety:
     of_model: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check every number."""
         if self.radii is not None:
             radii = tuple(np.atleast_1d(np.asarray(self.radii, object)).tolist())
             object.__setattr__(self, "radii", radii)
@@ -217,14 +216,7 @@ class Safety:
     ) -> tuple[Float[jax.Array, " d"], jax.Array]:
         """Return the rate nearest to a desired one that lets no hull come too near.
 
-        Args:
-            rate: of the stopping point relative to the leader's, m/s.
-            near: the others.
-            scales: as by `scales`.
-            speeds: that the rate's entries may have.
-
-        Returns:
-            The rate (d,), and how many rows act on it.
+        Return also how many rows act on it; `speeds` are those that its entries may have.
         """
         corners = jnp.where(near.known[:, None, None], near.gaps, 0.0) * scales[None, None]
         nearest = nearest_point(corners)
@@ -236,8 +228,11 @@ class Safety:
         used = near.known & (far <= self.reach)
         short = jnp.where(used, low - normals @ (rate * scales), 0.0)
         u = rate * scales + self._aside(normals, short)
-        u = _shrunk(_projected(u, normals, low, used), normals, low, used) / scales
-        # Less of it still meets all rows that 0 meets.
+        u = _projected(u, normals, low, used)
+        # The largest part that meets all rows which 0 meets; less of it still meets them.
+        along = normals @ u
+        over = used & (low <= 0.0) & (along < low)
+        u = u * jnp.where(over, low / jnp.where(over, along, -1.0), 1.0).min(initial=1.0) / scales
         u = u * (speeds / jnp.maximum(jnp.abs(u), speeds)).min()
         active = (short > 0.0).sum()
         return jnp.where(active > 0, u, rate), active.astype(rate.dtype)
@@ -271,10 +266,7 @@ def _projected(
     low: Float[jax.Array, " K"],
     used: Bool[jax.Array, " K"],
 ) -> Float[jax.Array, " d"]:
-    """Return the vector with normals u >= low that is nearest, to rounding or nearly.
-
-    Hildreth's dual ascent: the row that is off most is corrected, again and again.
-    """
+    """Hildreth's dual ascent: the row that is off most is corrected, again and again."""
 
     def corrected(now: _Ascent) -> _Ascent:
         change = jnp.where(used, jnp.maximum(-now.pull, low - normals @ now.u), 0.0)
@@ -288,18 +280,6 @@ def _projected(
 
     start = _Ascent(jnp.zeros((), jnp.int32), u, 0.0 * low, jnp.full((), jnp.inf, u.dtype))
     return jax.lax.while_loop(off, corrected, start).u
-
-
-def _shrunk(
-    u: Float[jax.Array, " d"],
-    normals: Float[jax.Array, "K d"],
-    low: Float[jax.Array, " K"],
-    used: Bool[jax.Array, " K"],
-) -> Float[jax.Array, " d"]:
-    """Return the largest part of a vector that meets all rows which 0 meets."""
-    along = normals @ u
-    over = used & (low <= 0.0) & (along < low)
-    return u * jnp.where(over, low / jnp.where(over, along, -1.0), 1.0).min(initial=1.0)
 
 
 def hull_points(

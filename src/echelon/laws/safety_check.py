@@ -23,11 +23,7 @@ _ROUNDING = 1e-9
 
 
 def check_numbers(
-    law: FlatLaw,
-    model: ControlAffine,
-    graph: Graph,
-    offsets: Float[Array, "N n"],
-    period: float,
+    law: FlatLaw, model: ControlAffine, graph: Graph, offsets: Float[Array, "N n"], period: float
 ) -> None:
     """Check that a prepared follower's law with `safety` can keep agents apart, starts aside.
 
@@ -55,7 +51,6 @@ def check_numbers(
 def _check_space(
     safety: Safety, law: FlatLaw, model: ControlAffine, offsets: Float[Array, "N n"]
 ) -> None:
-    """Check that agents regard each other in time, and have goals that are apart."""
     scales = safety.scales(model)
     least = safety.needed_reach(np.array([law.speed_of(k) for k in law.places(model)]), scales)
     if safety.reach < least:

@@ -14,7 +14,7 @@ from echelon.agents.models.model import ControlAffine, FlatBound, wrap_angles
 from echelon.agents.network.exchange import Near
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.flatness import first_state, followed_states
-from echelon.agents.references.reference import Guide, Reference, check_reference
+from echelon.agents.references.reference import LeaderPath, Reference, check_reference
 from echelon.core.cache import memoize
 from echelon.core.errors import LawError, check_kind, listing
 from echelon.core.numerics import greater, lesser, precision
@@ -39,11 +39,7 @@ def saturated_decay(
 
     With v = c |x| / s the function F(v) = sqrt(1 + v^2) - arsinh(1/v) falls by c per second.
 
-    Args:
-        start: x at the beginning.
-        coupling: c, 1/s.
-        inverse: 1/s of each entry, 0 where sigma is linear.
-        age: the time, s.
+    `inverse` is 1/s of each entry, 0 where sigma is linear; `age` is in s.
     """
     v = coupling * jnp.abs(start) * inverse
     linear = v < _LINEAR
@@ -150,7 +146,6 @@ class StoppingPoint(FlatLaw):
     ahead: Array | None = None
 
     def __check_init__(self) -> None:
-        """Check that the feed-forward sends zeta'."""
         allowed = (Feedforward.RELAY, Feedforward.PARENT)
         if self.feedforward not in allowed:
             raise LawError(
@@ -284,7 +279,7 @@ class StoppingLeader(FlatLaw):
         reference: the path to follow; without one the trim's flat outputs are held.
     """
 
-    reference: Guide | None = None
+    reference: LeaderPath | None = None
 
     @property
     def information(self) -> tuple[str, ...]:
@@ -367,7 +362,7 @@ class StoppingLeader(FlatLaw):
     ) -> tuple[Input, FlatMemory]:
         """Return the leader's input."""
         if memory.active is not None:
-            # An heir that was held back when it took the lead gives way to nobody now.
+            # A backup leader that was held back when it took the lead gives way to nobody now.
             memory = memory._replace(active=0.0 * memory.half)
         away = self.deviation(model, view.t, view.x, view.offset, memory)
         rate = self._rate(model, view.t, away, view.period)

@@ -16,7 +16,16 @@ from echelon_flight.datagram_socket import DatagramSocket
 from echelon_flight.links import Link, Reading
 from echelon_flight.pilot import Pilot
 from echelon_flight.supervisor import Fault, Fence, Supervisor
-from echelon_flight.wire import DatagramKind, Drop, Letter, Opened, Report, Wire, name_of, sender_of
+from echelon_flight.wire import (
+    DatagramKind,
+    Drop,
+    Message,
+    Opened,
+    Report,
+    Wire,
+    name_of,
+    sender_of,
+)
 
 _REPORTS: Final = 0.1  # s between two
 _LONGEST: Final = 20.0  # s of a descent
@@ -228,7 +237,7 @@ class AgentProcess:
         self._due += (1 + missed) * self._dt
         return missed
 
-    def _act(self, u: list[float], letter: Letter | None, t: float) -> None:
+    def _act(self, u: list[float], letter: Message | None, t: float) -> None:
         try:
             self.context.link.send(u)
         except FlightError as error:
@@ -270,7 +279,7 @@ class AgentProcess:
             return None
         if opened.sender == self.context.wire.number:
             self._meet(opened)
-        elif isinstance(opened.body, Letter):
+        elif isinstance(opened.body, Message):
             return self.pilot.box.receive(opened.body, self.context.clock.now or 0.0)
         elif opened.kind is DatagramKind.START and isinstance(opened.body, float):
             return self._take_start(opened.body, opened.flight, time.time() - opened.stamp)

@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from types import ModuleType
 from typing import Any, Final, NamedTuple, final
 
-from echelon_flight.wire import Drop, Letter, Packet
+from echelon_flight.wire import Drop, LeaderPacket, Message
 
 NOBODY: Final = 0xFFFF
 """Hops of an agent that no leader reaches, and the leader of one that knows none, as datagrams have
@@ -26,7 +26,7 @@ class Letterbox:
         hears: the numbers of the neighbours.
         leaders: of those whose packets count; the lowest one first.
         own: the agent's number, if it leads.
-        heirs: of those that may lead later, with a higher epoch.
+        backups: of those that may lead later, with a higher term.
 
     Attributes:
         letters: of each neighbour; None before the first.
@@ -38,15 +38,15 @@ class Letterbox:
         hears: Sequence[int],
         leaders: Collection[int],
         own: int | None,
-        heirs: Collection[int] = (),
+        backups: Collection[int] = (),
     ) -> None:
         """Receive nothing yet."""
-        self.letters = dict[int, Letter | None].fromkeys(hears)
+        self.letters = dict[int, Message | None].fromkeys(hears)
         self._leaders, self._own = frozenset(leaders), own
-        self._heirs = frozenset(heirs)
-        self.packet: Packet | None = None
+        self._backups = frozenset(backups)
+        self.packet: LeaderPacket | None = None
 
-    def receive(self, letter: Letter, clock: float) -> Drop | None:
+    def receive(self, letter: Message, clock: float) -> Drop | None:
         """Store a letter at a time of the plan (s), or return why it is not used."""
         packet = letter.packet
         if letter.sender not in self.letters:
@@ -55,7 +55,7 @@ class Letterbox:
             return Drop.PACKET
         if max(letter.time, packet.time) > clock + _AHEAD:
             return Drop.AHEAD
-        if packet.leader not in (self._heirs if packet.epoch else self._leaders):
+        if packet.leader not in (self._backups if packet.term else self._leaders):
             return Drop.PACKET
         if self._wins(packet):
             self.packet = packet
@@ -66,9 +66,9 @@ class Letterbox:
         self.letters[letter.sender] = letter
         return None
 
-    def _wins(self, packet: Packet) -> bool:
-        """Tell whether a packet is of a later epoch, a leader with a lower number, or newer."""
-        if self._own is not None and packet.leader >= self._own and not packet.epoch:
+    def _wins(self, packet: LeaderPacket) -> bool:
+        """Tell whether a packet is of a later term, a leader with a lower number, or newer."""
+        if self._own is not None and packet.leader >= self._own and not packet.term:
             return False
         return self.packet is None or packet.rank > self.packet.rank
 
@@ -85,7 +85,7 @@ class TickResult(NamedTuple):
     """
 
     u: list[float]
-    letter: Letter | None
+    letter: Message | None
     valid: bool
 
 
@@ -96,7 +96,7 @@ class Pilot:
     Args:
         law: the module `law.py`.
         facts: the content of law.json.
-        leadership: `heirs`, who takes the lead in which order, and the `timeout` (s) of each; None
+        leadership: `backups`, who take the lead in this order, and the `timeout` (s) of each; None
             for nobody.
         hold: age (s) of the newest letter of anybody from which on a follower no longer flies by
             the plan, but holds the place where it would come to rest.
@@ -118,11 +118,11 @@ class Pilot:
         self._network = facts["network"]
         self._leaderward = self._network["uses"] == "leaderward"
         own = self._number if self.leads else None
-        heirs = [] if leadership is None else leadership["heirs"]
-        self.box = Letterbox(facts["hears"], self._network["leaders"], own, heirs)
+        backups = [] if leadership is None else leadership["backups"]
+        self.box = Letterbox(facts["hears"], self._network["leaders"], own, backups)
         self._patience = math.inf
-        if leadership is not None and self._number in heirs:
-            self._patience = leadership["timeout"] * (heirs.index(self._number) + 1)
+        if leadership is not None and self._number in backups:
+            self._patience = leadership["timeout"] * (backups.index(self._number) + 1)
         self._began: float | None = None
         self._late = False
         self._memory: list[float] | None = None
@@ -178,19 +178,19 @@ class Pilot:
 
     @property
     def _in_lead(self) -> bool:
-        """Whether it leads, from the beginning or as an heir."""
+        """Whether it leads, from the beginning or as a backup leader."""
         return self.leads or self.leader == self._number
 
     def _inherit(self, t: float) -> None:
-        """Take the lead by the plan, if it is an heir that has heard of no leader for long."""
+        """Take the lead by the plan, as a backup leader that has heard of no leader for long."""
         packet = self.box.packet
         self._began = t if self._began is None else self._began
         waited = t - (self._began if packet is None else packet.time)
         if self.leads or not (self._in_lead or waited > self._patience):
             return
-        epoch = 0 if packet is None else packet.epoch
+        term = 0 if packet is None else packet.term
         plan = (0.0,) * self._network["content"]
-        self.box.packet = Packet(self._number, t, plan, epoch if self._in_lead else epoch + 1)
+        self.box.packet = LeaderPacket(self._number, t, plan, term if self._in_lead else term + 1)
 
     def _expected(
         self, t: float, x: list[float], memory: list[float]
@@ -240,7 +240,7 @@ class Pilot:
                 place = [a + b for a, b in zip(leader, away, strict=True)]
                 terms.append((weight, self._law.difference(t, x, memory, place)))
         if self._in_lead and not self.leads:
-            # An heir follows the plan alone.
+            # A backup leader follows the plan alone.
             terms = [(sum(self._facts["weights"]), self._law.difference(t, x, memory, leader))]
         if not self._leaderward:
             return _weighted(terms, nothing)
@@ -257,17 +257,17 @@ class Pilot:
         leader: list[float] | None,
         hops: int,
         content: list[list[float]],
-    ) -> Letter | None:
+    ) -> Message | None:
         """Return what the agent says; None if it has heard of no leader."""
         packet = self.box.packet
         if packet is None and content:
-            packet = Packet(self._number, t, tuple(content[0]))
+            packet = LeaderPacket(self._number, t, tuple(content[0]))
         if packet is None or leader is None:
             return None
         own = packet.leader == self._number
         away = self._law.difference(t, x, memory, leader)
         value = [0.0] * len(away) if own else away
-        return Letter(self._number, t, hops, tuple(value), packet)
+        return Message(self._number, t, hops, tuple(value), packet)
 
 
 def _weighted(terms: Sequence[tuple[float, list[float]]], nothing: list[float]) -> list[float]:

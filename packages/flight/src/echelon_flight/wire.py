@@ -64,28 +64,28 @@ class Drop(enum.Enum):
     CHALLENGE = "answers an earlier process of this agent"
 
 
-class Packet(NamedTuple):
+class LeaderPacket(NamedTuple):
     """What a leader last said of itself, passed on unchanged.
 
     Attributes:
         leader: its number.
         time: of the plan, when it said so, s.
         content: its deviation from its plan, or what else the prediction needs (p,).
-        epoch: how often heirs took the lead over.
+        term: how often backup leaders took the lead over.
     """
 
     leader: int
     time: float
     content: tuple[float, ...]
-    epoch: int = 0
+    term: int = 0
 
     @property
     def rank(self) -> tuple[int, int, float]:
-        """By which the greater of two packets is used: later epoch, lower leader, newer."""
-        return self.epoch, -self.leader, self.time
+        """By which the greater of two packets is used: later term, lower leader, newer."""
+        return self.term, -self.leader, self.time
 
 
-class Letter(NamedTuple):
+class Message(NamedTuple):
     """What an agent sends to those that hear it.
 
     Attributes:
@@ -100,7 +100,7 @@ class Letter(NamedTuple):
     time: float
     hops: int
     value: tuple[float, ...]
-    packet: Packet | None
+    packet: LeaderPacket | None
 
 
 class Report(NamedTuple):
@@ -146,7 +146,7 @@ class Opened(NamedTuple):
     boot: int
     flight: int
     stamp: float
-    body: "Letter | Report | float | str | None"
+    body: "Message | Report | float | str | None"
 
 
 _FIELDS: Final = len(Report._fields) - 1
@@ -241,10 +241,10 @@ class Wire:
 
     # ---- writing ---------------------------------------------------------------------------------
 
-    def letter(self, letter: Letter) -> bytes:
+    def letter(self, letter: Message) -> bytes:
         """Return the datagram of a letter."""
-        packet = letter.packet or Packet(0, 0.0, (0.0,) * self._sizes[1])
-        head = packet.epoch, letter.hops, letter.packet is not None
+        packet = letter.packet or LeaderPacket(0, 0.0, (0.0,) * self._sizes[1])
+        head = packet.term, letter.hops, letter.packet is not None
         rest = packet.leader, packet.time, *packet.content
         return self._sign(
             DatagramKind.LETTER, letter.time, self._letter.pack(*head, *letter.value, *rest)
@@ -369,7 +369,7 @@ class Wire:
 
     def _body(
         self, kind: DatagramKind, sender: int, stamp: float, text: bytes
-    ) -> Drop | Letter | Report | float | str | None:
+    ) -> Drop | Message | Report | float | str | None:
         if not math.isfinite(stamp):
             return Drop.NOT_FINITE
         if kind in (DatagramKind.START, DatagramKind.STOP):
@@ -396,16 +396,16 @@ class Wire:
             return rest[0] if own else None
         return None if own else Drop.EARLY
 
-    def _read_letter(self, sender: int, stamp: float, text: bytes) -> Letter | Drop:
-        epoch, hops, has, *numbers = self._letter.unpack(text)
+    def _read_letter(self, sender: int, stamp: float, text: bytes) -> Message | Drop:
+        term, hops, has, *numbers = self._letter.unpack(text)
         split = self._sizes[0]
         value, (leader, said, *content) = numbers[:split], numbers[split:]
         if not all(map(math.isfinite, numbers)):
             return Drop.NOT_FINITE
         if max(map(abs, (*value, *content)), default=0.0) > LARGEST:
             return Drop.TOO_LARGE
-        packet = Packet(leader, said, tuple(content), epoch) if has else None
-        return Letter(sender, stamp, hops, tuple(value), packet)
+        packet = LeaderPacket(leader, said, tuple(content), term) if has else None
+        return Message(sender, stamp, hops, tuple(value), packet)
 
 
 def sender_of(datagram: bytes) -> int | None:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.agents.models.declarations import is_by_user, undeclared
-from echelon.agents.models.model import ControlAffine, FlatBound, Flattened
+from echelon.agents.models.model import ControlAffine, FlatBound, FlatCoordinates
 from echelon.core.cache import memoize
 from echelon.core.errors import ModelError, listing
 from echelon.core.numerics import precision
@@ -36,7 +36,7 @@ _MAX_CHOICES = 20
 """How many sets of outputs are tried."""
 
 
-DECLARED = ("flat_chains", "flat_bounds", "flatten", "switch_on")
+DECLARED = ("flat_chains", "flat_bounds", "to_flat", "initial_integrators")
 """What a model may declare of its flat coordinates."""
 
 
@@ -100,19 +100,21 @@ def angles_among(model: ControlAffine, outputs: tuple[str, ...]) -> tuple[int, .
     return tuple(found)
 
 
-def flatten(model: ControlAffine, chains: Chains, x: State, e: Float[jax.Array, " k"]) -> Flattened:
+def to_flat(
+    model: ControlAffine, chains: Chains, x: State, e: Float[jax.Array, " k"]
+) -> FlatCoordinates:
     """Return the flat coordinates of a state with its integrators, and the inverse for inputs."""
-    stated = model.flatten(x, e) if "flatten" in chains.declared else None
+    stated = model.to_flat(x, e) if "to_flat" in chains.declared else None
     return differentiate(model, chains, x, e) if stated is None else stated
 
 
-def differentiate(model: ControlAffine, chains: Chains, x: State, e: jax.Array) -> Flattened:
-    """Return the same by automatic differentiation, without the model's own `flatten`."""
+def differentiate(model: ControlAffine, chains: Chains, x: State, e: jax.Array) -> FlatCoordinates:
+    """Return the same by automatic differentiation, without the model's own `to_flat`."""
     values, alphas, betas = derivatives_of(model, chains, x, e, max(chains.degrees))
     last, m = np.array(chains.degrees) - 1, np.arange(len(chains.degrees))
     alpha, beta = alphas[last, m], betas[:, last, m].T
     inside = np.arange(len(values))[:, None] <= last
-    return Flattened(
+    return FlatCoordinates(
         jnp.where(inside, values, 0.0), lambda tops: jnp.linalg.solve(beta, tops - alpha)
     )
 
@@ -120,10 +122,7 @@ def differentiate(model: ControlAffine, chains: Chains, x: State, e: jax.Array) 
 def derivatives_of(
     model: ControlAffine, chains: Chains, x: State, e: jax.Array, order: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return y .. y^(order - 1), y' .. y^(order) at w = 0, and the effect of w on the latter.
-
-    Their shapes are (order, m), (order, m) and (m, order, m).
-    """
+    """Return y .. y^(order - 1), y' .. y^(order) at w = 0, both (order, m); d/dw (m, order, m)."""
     zero = jnp.zeros(len(model.input_names), x.dtype)
 
     def field(x: State, e: jax.Array, w: Input) -> tuple[State, jax.Array]:
@@ -149,13 +148,17 @@ def derivatives_of(
     return values, alphas, jax.vmap(lambda w: at_input(w)[1] - alphas)(jnp.eye(len(zero)))
 
 
-def switch_on(model: ControlAffine, chains: Chains, x: State, ahead: jax.Array) -> jax.Array:
+def initial_integrators(
+    model: ControlAffine, chains: Chains, x: State, ahead: jax.Array
+) -> jax.Array:
     """Return the initial states of the integrators, with which agents start level.
 
     Where the model bounds a derivative of a single flat output, the integrators start so that its
     derivatives are those of the path to follow, `ahead` (r, m); else they start at the trim.
     """
-    stated = model.switch_on(x, ahead) if "switch_on" in chains.declared else None
+    stated = (
+        model.initial_integrators(x, ahead) if "initial_integrators" in chains.declared else None
+    )
     e = jnp.zeros(chains.size, x.dtype)
     bound = next((b for b in model.flat_bounds or () if len(b.outputs) == 1), None)
     if stated is not None or bound is None:
@@ -166,7 +169,7 @@ def switch_on(model: ControlAffine, chains: Chains, x: State, ahead: jax.Array) 
             order = chains.degrees[k] - len(indices) + i
 
             def derivative(e: jax.Array) -> jax.Array:
-                return flatten(model, chains, x, e).values[order, k]
+                return to_flat(model, chains, x, e).values[order, k]
 
             # It is an affine function of e_i, and does not depend on later ones.
             one = jnp.zeros_like(e).at[index].set(1.0)
@@ -176,12 +179,7 @@ def switch_on(model: ControlAffine, chains: Chains, x: State, ahead: jax.Array) 
 
 
 def check_bounds(model: ControlAffine, chains: Chains) -> None:
-    """Check that each flat bound of a model has a form for which proofs exist.
-
-    Raises:
-        ModelError: its outputs do not end chains of the same length, its derivative is the output
-            itself or one that the inputs reach, or its value is no finite number.
-    """
+    """Raise `ModelError` unless each flat bound of a model has a form for which proofs exist."""
     name, bounds = f"`{type(model).__name__}`", model.flat_bounds
     if bounds is None:
         return
@@ -196,7 +194,6 @@ def check_bounds(model: ControlAffine, chains: Chains) -> None:
 
 
 def _fault_of(bound: FlatBound, chains: Chains) -> str:
-    """Return the fault of a bound in words; empty where there is none."""
     outputs, order = bound.outputs, bound.derivative
     named = isinstance(outputs, tuple | list) and all(n in chains.outputs for n in outputs)
     if not named or len(set(outputs)) != max(1, len(outputs)):
@@ -264,8 +261,7 @@ def _check_size(model: ControlAffine, chains: Chains) -> None:
 
 
 def _check_map(model: ControlAffine, chains: Chains) -> None:
-    """Check at samples that coordinates by a user's `flatten` are rates of each other."""
-    if "flatten" not in chains.declared or not is_by_user(model, "flatten"):
+    if "to_flat" not in chains.declared or not is_by_user(model, "to_flat"):
         return
     n, m, draw = len(model.state_names), len(chains.outputs), np.random.default_rng(0)
     x = np.asarray(model.trim[0], float) + draw.uniform(-0.5, 0.5, (_SAMPLES, n))
@@ -275,7 +271,7 @@ def _check_map(model: ControlAffine, chains: Chains) -> None:
     off = np.abs(np.asarray(moved - stated)).max() / (1.0 + np.abs(np.asarray(moved)).max())
     if not off <= _MATCHED:
         raise ModelError(
-            f"`flatten` of `{type(model).__name__}` is not of its motion: its values and what they "
+            f"`to_flat` of `{type(model).__name__}` is not of its motion: its values and what they "
             f"change by under `invert` differ by {100.0 * float(off):.3g} % at samples."
         )
 
@@ -283,11 +279,11 @@ def _check_map(model: ControlAffine, chains: Chains) -> None:
 def _rates_by_map(
     model: ControlAffine, chains: Chains, x: State, e: jax.Array, tops: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return outputs and the rates of flat coordinates, and the same as `flatten` states them."""
+    """Return outputs and the rates of flat coordinates, and the same as `to_flat` states them."""
     last = np.arange(max(chains.degrees))[:, None] == np.array(chains.degrees) - 1
-    w = model.flatten(x, e).invert(tops)  # pyright: ignore
+    w = model.to_flat(x, e).invert(tops)  # pyright: ignore
     field = model.velocity(x, model.physical(chains.acting_input(e, w))), chains.rate(e, w)
-    values, rates = jax.jvp(lambda x, e: model.flatten(x, e).values, (x, e), field)  # pyright: ignore
+    values, rates = jax.jvp(lambda x, e: model.to_flat(x, e).values, (x, e), field)  # pyright: ignore
     after = jnp.where(last, tops, jnp.concatenate([values[1:], 0.0 * values[:1]]))
     outputs = flat_output(model, chains.outputs, x)
     return jnp.concatenate([outputs[None], rates]), jnp.concatenate([values[:1], after])

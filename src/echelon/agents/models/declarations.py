@@ -23,8 +23,8 @@ _OF_CLASSES = "__", "_abc_"
 _ABOUT = {
     "flat_chains": set[str](),
     "flat_bounds": {"flat_chains"},
-    "flatten": {"flat_chains"},
-    "switch_on": {"flat_chains"},
+    "to_flat": {"flat_chains"},
+    "initial_integrators": {"flat_chains"},
     "airframe": _LIMITS,
 }
 """Declarations of a model, and what each is about beside the motion and the outputs."""
@@ -41,8 +41,8 @@ def undeclared(model: ControlAffine, *names: str) -> tuple[str, ...]:
 
     Args:
         model: the agent.
-        names: of `flat_chains`, `flat_bounds`, `flatten`, `switch_on` and `airframe`, those that a
-            theorem reads.
+        names: of `flat_chains`, `flat_bounds`, `to_flat`, `initial_integrators` and `airframe`,
+            those that a theorem reads.
     """
     return tuple(name for name in names if _is_about_another(model, name))
 
@@ -72,7 +72,6 @@ def _is_about_another(model: ControlAffine, name: str) -> bool:
 
 
 def _is_data(name: str, value: object) -> bool:
-    """Tell whether an attribute is plain data of a user's class, as parameters are."""
     plain = not callable(value) and not hasattr(type(value), "__get__")
     return plain and not hasattr(ControlAffine, name)
 
@@ -91,7 +90,6 @@ def _levels(model: ControlAffine) -> Iterator[Mapping[str, object]]:
 
 
 def _is_foreign(value: object, kind: type) -> bool:
-    """Tell whether a function was not written in the body of its class."""
     function = getattr(value, "fget", None) or getattr(value, "__func__", value)
     function = inspect.unwrap(function) if callable(function) else function
     if not isinstance(function, FunctionType):

@@ -55,11 +55,7 @@ def rotate_state(model: ControlAffine, x: State, angle: Scalar) -> State:
 
 
 def check_heading(model: ControlAffine) -> None:
-    """Check that f and g turn with the heading that a model states.
-
-    Raises:
-        ModelError: the heading names no state or input, or f and g do not turn with it.
-    """
+    """Raise `ModelError` unless f and g turn with the heading that a model states."""
     heading, name = model.heading, type(model).__name__
     if heading is None:
         return
@@ -85,10 +81,7 @@ def check_heading(model: ControlAffine) -> None:
 
 @memoize
 def heading_gap(model: ControlAffine) -> float:
-    """Return how far f and g are from turning with the heading, at samples, relative to their size.
-
-    The largest |f(T x) - D f(x)| and |g(T x) S E - D g(x) S| near the trim, over all angles.
-    """
+    """Return max |f(T x) - D f(x)|, |g(T x) S E - D g(x) S| near the trim, over their size."""
     draw = np.random.default_rng(0)
     trim = np.asarray(model.trim[0], float)
     x = trim + draw.uniform(-0.5, 0.5, (_SAMPLES, len(trim)))

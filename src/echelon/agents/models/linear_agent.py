@@ -2,6 +2,7 @@
 
 import numbers
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,8 +19,6 @@ from echelon.agents.models.model import (
 from echelon.core.errors import ModelError, listing
 from echelon.core.limits import excess_states
 from echelon.core.types import Array, Input, InputMap, Output, PathLike, State
-
-# ---- integrators ---------------------------------------------------------------------------------
 
 _PREFIXES = ("", "v", "a")
 _UNITS = ("m", "m/s", "m/s^2")
@@ -40,7 +39,6 @@ class Integrator(ControlAffine):
     dimension: int = eqx.field(default=2, static=True)
 
     def __check_init__(self) -> None:
-        """Refuse a dimension below one."""
         name, dimension = f"`dimension` of `{type(self).__name__}`", self.dimension
         # True is an integer to Python, and no dimension.
         integral = isinstance(dimension, numbers.Integral) and not isinstance(dimension, bool)
@@ -138,7 +136,6 @@ class DoubleIntegrator(Integrator):
     flat_chains, flat_bounds = _ONE_AN_AXIS, ()
 
     def __check_init__(self) -> None:
-        """Refuse a negative drag."""
         check_not_negative(self, drag=self.drag)
 
     def drift(self, x: State) -> State:
@@ -157,17 +154,11 @@ class DoubleIntegrator(Integrator):
         return jnp.concatenate([position, velocity]), acceleration + self.drag * velocity
 
 
-# ---- matrices in a MATLAB file -------------------------------------------------------------------
-
 _NAMES = ("A", "B", "C", "D", "Ts")
 
 
 def read_matrices(file: PathLike) -> dict[str, Array]:
-    """Return the matrices A and B of a `.mat` file, and C, D and Ts where it has them.
-
-    Raises:
-        ModelError: the file cannot be read, or lacks A or B.
-    """
+    """Return A and B of a `.mat` file, and C, D, Ts where it has them; else `ModelError`."""
     content = _content(file)
     names = [name for name in content if not name.startswith("__")]
     missing = [name for name in ("A", "B") if name not in names]
@@ -177,11 +168,12 @@ def read_matrices(file: PathLike) -> dict[str, Array]:
             f"`{file}` lacks {listing(missing)} and {held}; save the matrices by themselves, as in "
             "`save('plant.mat', 'A', 'B', 'C', 'D')`."
         )
-    return {name: _dense(content[name]) for name in _NAMES if name in names}
+    # MATLAB may have stored a matrix as a sparse one.
+    held = {name: content[name] for name in _NAMES if name in names}
+    return {k: np.asarray(m.toarray() if hasattr(m, "toarray") else m) for k, m in held.items()}
 
 
-def _content(file: PathLike) -> Mapping[str, object]:
-    """Return all that a MATLAB file holds, by name."""
+def _content(file: PathLike) -> Mapping[str, Any]:
     # Imported here: few models are in files, and SciPy's readers load slowly.
     from scipy.io import loadmat
 
@@ -196,14 +188,6 @@ def _content(file: PathLike) -> Mapping[str, object]:
     except Exception as error:  # SciPy raises whatever a damaged file causes
         raise ModelError(f"`{file}` is not a MATLAB file that can be read: {error}.") from None
 
-
-def _dense(value: object) -> Array:
-    """Return a matrix that MATLAB may have stored as a sparse one."""
-    to_array = getattr(value, "toarray", None)
-    return np.asarray(value if to_array is None else to_array())
-
-
-# ---- a linear agent ------------------------------------------------------------------------------
 
 _EXACT = 1e-9
 """Relative; what remains of a discrete-time model when it is sampled again."""
@@ -235,7 +219,6 @@ class Linear(ControlAffine):
         C: Sequence[Sequence[float]] | Array | None = None,
         names: Sequence[str] = (),
     ) -> None:
-        """Check and keep the matrices as float64."""
         # NumPy's float64: a JAX array made outside of an x64 context would already be rounded.
         self.A, self.B = _matrix("A", A), _matrix("B", B)
         n, m = len(self.A), self.B.shape[1]
@@ -339,11 +322,7 @@ class Linear(ControlAffine):
 
 
 def _continuous(A: Array, B: Array, step: float) -> tuple[Array, Array]:
-    """Return the continuous-time (A, B) that (A, B) sample with inputs held over a step (s).
-
-    Raises:
-        ModelError: there is none.
-    """
+    """Return the continuous-time (A, B) of which these are samples, inputs held a step (s)."""
     from scipy.linalg import expm, logm
 
     eigenvalues = np.linalg.eigvals(A)

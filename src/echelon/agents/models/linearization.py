@@ -23,11 +23,7 @@ class Linearization(NamedTuple):
     B: Array
 
     def with_inner(self, K: Array | None) -> "Linearization":
-        """Return A - B K and B, the system with the inner loop v = -K (x - x*) + w closed.
-
-        Args:
-            K: (m, n); None where there is no inner loop.
-        """
+        """Return A - B K and B, with an inner loop v = -K (x - x*) + w closed; K (m, n) or None."""
         return self if K is None else Linearization(self.A - self.B @ K, self.B)
 
 
@@ -38,7 +34,7 @@ class AtTrim(NamedTuple):
         drift, input_map, output: f (n,), g (n, m), h (q,).
         drift_slope, input_slope, output_slope: their Jacobians, with n as the last dimension more.
         delivered: the input that the actuators deliver for u*, (m,).
-        bends: (n, n) whether f + g u* has a kink in a state, by its values on both sides, or g
+        kinks: (n, n) whether f + g u* has a kink in a state, by its values on both sides, or g
             jumps there.
         gap: the entry of the drift or the input map whose derivative by JAX differs most clearly
             from the slope of its values; None where none does.
@@ -51,16 +47,13 @@ class AtTrim(NamedTuple):
     input_slope: Array
     output_slope: Array
     delivered: Array
-    bends: Array
+    kinks: Array
     gap: Gap | None
 
 
 @memoize
 def at_trim(model: ControlAffine) -> AtTrim:
-    """Return the functions of a model at its trim, compiled together and computed once.
-
-    Compiling is most of the cost. The precision is float64, whatever that of the caller.
-    """
+    """Return the functions of a model at its trim, in float64 whatever the caller's precision."""
     x, u = (np.asarray(part, float) for part in model.trim)
     # Gains are stored in files, so they must not depend on the precision of the run that uses them.
     with precision("float64"):
@@ -69,7 +62,7 @@ def at_trim(model: ControlAffine) -> AtTrim:
     derivatives = np.concatenate([values[3], values[4].reshape(-1, len(x))])
     slopes = sides(x, around)
     gap = slopes.gap(derivatives, units_at(x, units))
-    return AtTrim(*values, bends=_bends(slopes, u, len(x)), gap=gap)  # pyright: ignore
+    return AtTrim(*values, kinks=_kinks(slopes, u, len(x)), gap=gap)  # pyright: ignore
 
 
 def _units(model: ControlAffine) -> Array:
@@ -95,11 +88,11 @@ def _evaluate(model: ControlAffine, x: State, u: Input, points: States) -> list[
     return [*(function(x) for function in functions), *slopes, model.limit(u), around]
 
 
-def _bends(slopes: Sides, u: Array, n: int) -> Array:
+def _kinks(slopes: Sides, u: Array, n: int) -> Array:
     """Return (n, n) whether an entry of f + g u* has a kink, or one of g a jump, in each state."""
     motion = slopes.combine(np.hstack([np.eye(n), np.kron(np.eye(n), u)]))
     maps = slopes.combine(np.eye(n + n * len(u))[n:])
-    return motion.bends(n) | maps.jumps()[:, :n].reshape(n, -1, n).any(axis=1)
+    return motion.kinks(n) | maps.jumps()[:, :n].reshape(n, -1, n).any(axis=1)
 
 
 @memoize

@@ -14,8 +14,6 @@ from echelon.core.errors import ModelError, did_you_mean, is_number, listing
 from echelon.core.trace import call_once_traced
 from echelon.core.types import Array, Declared, Input, InputMap, Output, Scalar, State
 
-# ---- what a model may state of its motors --------------------------------------------------------
-
 
 class Airframe(NamedTuple):
     """A rigid body under four motors, whose thrusts and torques are all that moves it.
@@ -35,9 +33,6 @@ class Airframe(NamedTuple):
     arm: float
     torque_per_thrust: float
     motor_thrust: float
-
-
-# ---- what a model may state of its heading -------------------------------------------------------
 
 
 class Heading(NamedTuple):
@@ -90,10 +85,9 @@ class Turn(NamedTuple):
         return slope
 
 
-# ---- the interface -------------------------------------------------------------------------------
-# It is the agent of the paper's Definition 1. A user's model needs two methods and two tuples of
-# names; everything else has a default, which a class attribute, a property or a method of the same
-# name replaces.
+# `ControlAffine` is the agent of the paper's Definition 1. A user's model needs two methods and two
+# tuples of names; everything else has a default, which a class attribute, a property or a method of
+# the same name replaces.
 
 Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
@@ -109,7 +103,6 @@ class _Default(Generic[_T]):
 
     # Without `__set__` it gives way to a field of the instance, as a property would not.
     def __get__(self, instance: object, owner: type) -> "_T | _Default[_T]":
-        """Return the value for an instance."""
         return self if instance is None else self.make(instance)
 
 
@@ -172,7 +165,7 @@ class FlatBound(NamedTuple):
     within: str
 
 
-class Flattened(NamedTuple):
+class FlatCoordinates(NamedTuple):
     """A state in flat coordinates.
 
     Attributes:
@@ -301,14 +294,14 @@ class ControlAffine(Declared):
             "use the law `passive` for its leader, or add `flat_outputs`, `flat_order` and `flat`."
         )
 
-    def flatten(self, x: State, e: jax.Array) -> Flattened | None:
+    def to_flat(self, x: State, e: jax.Array) -> FlatCoordinates | None:
         """Return the flat coordinates of a state, e being the integrator states of `flat_chains`.
 
         Where it returns None they are computed by automatic differentiation.
         """
         return None
 
-    def switch_on(self, x: State, ahead: jax.Array) -> jax.Array | None:
+    def initial_integrators(self, x: State, ahead: jax.Array) -> jax.Array | None:
         """Return the initial states of the integrators before inputs; None leaves them open.
 
         `ahead` (r, m) are the flat outputs, with derivatives, of the path that the agent follows.
@@ -403,7 +396,6 @@ class ControlAffine(Declared):
 
 
 def _trim_input(model: ControlAffine, u: _Inputs) -> _Inputs:
-    """Return u* in the shape (..., m) and precision of u."""
     xp = u.__array_namespace__()
     return xp.broadcast_to(xp.asarray(model.trim[1], u.dtype), u.shape)
 
@@ -417,11 +409,7 @@ def wrap_angles(difference: State, *angles: int) -> State:
 
 
 def check_positive(owner: object, **values: float) -> None:
-    """Check that each named parameter is a finite positive number.
-
-    Raises:
-        ModelError: one is not.
-    """
+    """Raise `ModelError` unless each named parameter is a finite positive number."""
     # The comparisons are false for NaN, which is rejected too.
     for name, value in values.items():
         if not (is_number(value) and 0.0 < value < float("inf")):
@@ -432,11 +420,7 @@ def check_positive(owner: object, **values: float) -> None:
 
 
 def check_not_negative(owner: object, **values: float) -> None:
-    """Check that each named parameter is a finite number of at least zero.
-
-    Raises:
-        ModelError: one is not.
-    """
+    """Raise `ModelError` unless each named parameter is a finite number of at least zero."""
     for name, value in values.items():
         if not (is_number(value) and 0.0 <= value < float("inf")):
             raise ModelError(

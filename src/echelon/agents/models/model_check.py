@@ -13,6 +13,7 @@ from echelon.agents.models.model import ControlAffine, Limits
 from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import ModelError, did_you_mean, is_number, listing
+from echelon.core.gone import METHODS
 from echelon.core.numerics import precision
 from echelon.core.trace import checked_trace, error_summary
 from echelon.core.types import Array
@@ -49,7 +50,6 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
 
 @memoize
 def _warnings_of(model: ControlAffine, name: str) -> tuple[str, ...]:
-    """Return the warnings of a model after all checks; computed once for a model."""
     with precision("float64"):
         _check_names(model, name)
         x, u = _check_constants(model, name)
@@ -61,7 +61,6 @@ def _warnings_of(model: ControlAffine, name: str) -> tuple[str, ...]:
 
 
 def _check_kind(model: ControlAffine) -> str:
-    """Return the name of the model's class, after checking that it is a model."""
     if isinstance(model, list | tuple | dict):
         raise ModelError(
             f"the model is a {type(model).__name__} of {len(model)}, and must be one model, which "
@@ -71,6 +70,9 @@ def _check_kind(model: ControlAffine) -> str:
         raise ModelError(
             f"the model is {model!r}, and must be an instance of a `ControlAffine` class."
         )
+    for old, now in METHODS.items():
+        if hasattr(model, old):
+            raise ModelError(f"`{old}` of `{type(model).__name__}` is now `{now}`; rename it.")
     return type(model).__name__
 
 
@@ -99,7 +101,6 @@ _KINDS = (
 
 
 def _check_words(model: ControlAffine, name: str) -> None:
-    """Check that the names of states and inputs are tuples of text, and not empty."""
     for what, names in (("state_names", model.state_names), ("input_names", model.input_names)):
         # A text is a sequence of letters, so ("x") without its comma would be accepted by accident.
         if isinstance(names, str):
@@ -117,7 +118,6 @@ def _check_words(model: ControlAffine, name: str) -> None:
 
 
 def _check_names(model: ControlAffine, name: str) -> None:
-    """Check the names, and that groups, position and units refer to states that exist."""
     _check_words(model, name)
     for what, kind, text in _KINDS:
         value = getattr(model, what)
@@ -151,7 +151,6 @@ _CONSTANTS = "trim", "weights", "input_scale", "symmetry_inputs", "radius", "inp
 
 
 def _check_constants(model: ControlAffine, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the trim as arrays, after checking all constant data."""
     n, m = len(model.state_names), len(model.input_names)
     for what in _CONSTANTS:
         # A property may be anyone's code, of parameters that may be of any kind.
@@ -185,7 +184,6 @@ def _check_radius(model: ControlAffine, name: str) -> None:
 
 
 def _check_limits(model: ControlAffine, name: str, m: int) -> None:
-    """Check shapes and order of the actuators' inequalities low <= G u <= high."""
     limits = model.input_limits
     if limits is None:
         return
@@ -240,7 +238,6 @@ def _check_limit(model: ControlAffine, name: str, u: np.ndarray) -> None:
 
 
 def _pair(name: str, what: str, pair: object, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a pair (state, input) as arrays, after checking both."""
     if not isinstance(pair, (tuple, list)) or len(pair) != 2:
         raise ModelError(f"`{what}` of `{name}` is {pair}, and must be a pair (state, input).")
     return (
@@ -252,7 +249,6 @@ def _pair(name: str, what: str, pair: object, n: int, m: int) -> tuple[np.ndarra
 def _numbers(
     name: str, what: str, value: object, shape: tuple[int, ...], most: float = np.finfo(float).max
 ) -> np.ndarray:
-    """Return constant data as an array of a shape, finite unless `most` is infinite."""
     try:
         array = np.asarray(value, float)  # pyright: ignore
     except (TypeError, ValueError):
@@ -271,7 +267,6 @@ def _numbers(
 
 
 def _check_functions(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -> None:
-    """Check the shapes of f, g, h and limits, and that f, g and h are finite at the trim."""
     n, m, q = len(x), len(u), len(model.output_names)
     advice = "it must be written with `jax.numpy` and take one agent's state"
     shapes = {"drift": (n,), "input_map": (n, m), "output": (q,), "limit": (m,)}
@@ -327,10 +322,7 @@ def _check_trim(model: ControlAffine, name: str, u: np.ndarray) -> None:
 def trim_shortfall(
     model: ControlAffine, trim_input: Float[Array, " m"] | None = None
 ) -> dict[str, Shortfall]:
-    """Return the inputs of the trim that the actuators cut, by name.
-
-    `trim_input` is the trim of another model that these actuators are to hold.
-    """
+    """Return the inputs of the trim, or of another model's `trim_input`, that the actuators cut."""
     requested, delivered = np.asarray(model.trim[1], float), at_trim(model).delivered
     if trim_input is not None and (trim_input != requested).any():
         with precision("float64"):

@@ -10,8 +10,6 @@ from echelon.agents.models.model import (
 )
 from echelon.core.types import InputMap, State
 
-# ---- the pendulum --------------------------------------------------------------------------------
-
 
 class Pendulum(ControlAffine):
     """angledot = rate, ratedot = -stiffness sin(angle) - damping rate + u.
@@ -30,7 +28,6 @@ class Pendulum(ControlAffine):
     flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
 
     def __check_init__(self) -> None:
-        """Refuse a stiffness that is not positive or a negative damping."""
         check_positive(self, stiffness=self.stiffness)
         check_not_negative(self, damping=self.damping)
 
@@ -43,9 +40,6 @@ class Pendulum(ControlAffine):
         return jnp.array([[0.0], [1.0]], x.dtype)
 
 
-# ---- the Van der Pol oscillator ------------------------------------------------------------------
-
-
 class VanDerPol(ControlAffine):
     """x1dot = x2, x2dot = damping (1 - x1^2) x2 - x1 + u; dimensionless."""
 
@@ -56,7 +50,6 @@ class VanDerPol(ControlAffine):
     flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
 
     def __check_init__(self) -> None:
-        """Refuse a damping that is negative or not finite."""
         check_not_negative(self, damping=self.damping)
 
     def drift(self, x: State) -> State:

@@ -54,7 +54,6 @@ class PlanarQuadrotor(ControlAffine):
     flat_chains = FlatChains((4, 4), (2, 0))
 
     def __check_init__(self) -> None:
-        """Refuse parameters that are not positive."""
         names = ("mass", "inertia", "gravity", "arm", "motor_thrust")
         check_positive(self, **{name: getattr(self, name) for name in names})
 
@@ -135,9 +134,6 @@ class PlanarQuadrotor(ControlAffine):
         return jnp.where(fits(commanded, self.motor_thrust), u, delivered)
 
 
-# ---- linearized about hover ----------------------------------------------------------------------
-
-
 class LinearPlanarQuadrotor(ControlAffine):
     """yddot = -g roll, zddot = -g + u1 / m, rollddot = u2 / Ixx: hover's linearization.
 
@@ -158,20 +154,10 @@ class LinearPlanarQuadrotor(ControlAffine):
     position = ("y", "z")
     radius = 0.07  # of the Crazyflie with its propellers
     state_groups = {"position": ("y", "z"), "velocity": ("vy", "vz")}
+    trim, input_scale = PlanarQuadrotor.trim, PlanarQuadrotor.input_scale  # pyright: ignore
 
     def __check_init__(self) -> None:
-        """Refuse parameters that are not positive."""
         check_positive(self, mass=self.mass, inertia=self.inertia, gravity=self.gravity)
-
-    @property
-    def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Hover at the origin."""
-        return (0.0,) * 6, (self.mass * self.gravity, 0.0)
-
-    @property
-    def input_scale(self) -> tuple[tuple[float, ...], ...]:
-        """S = diag(m, Ixx)."""
-        return diagonal(self.mass, self.inertia)
 
     @property
     def input_limits(self) -> Limits:

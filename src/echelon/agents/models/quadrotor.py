@@ -11,7 +11,7 @@ import numpy as np
 from echelon.agents.models.model import (
     Airframe,
     ControlAffine,
-    Flattened,
+    FlatCoordinates,
     Limits,
     Rows,
     check_positive,
@@ -63,7 +63,6 @@ older ones and the thrust upgrade kit; their inertia is Foerster's."""
 def _with_rate(
     curve: Callable[[jax.Array], jax.Array], s: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return curve(s) and its derivative."""
     return jax.jvp(curve, (s,), (jnp.ones_like(s),))
 
 
@@ -204,10 +203,7 @@ class Quadrotor(RigidVehicle):
         return jnp.concatenate([nothing, lift, nothing, spin])
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
-        """Return the state and input that fly a path (x, y, z, yaw).
-
-        The path is given with its first four derivatives, (5, 4).
-        """
+        """Return the state and input that fly a path (x, y, z, yaw) with derivatives, (5, 4)."""
         position, velocity, acceleration = derivatives[:3, :3]
         up = jnp.array([0.0, 0.0, self.gravity], derivatives.dtype)
         attitude = attitude_along(derivatives, self.gravity)
@@ -227,7 +223,7 @@ class Quadrotor(RigidVehicle):
             jnp.concatenate([thrust[None], torque]),
         )
 
-    def flatten(self, x: State, e: jax.Array) -> Flattened:
+    def to_flat(self, x: State, e: jax.Array) -> FlatCoordinates:
         """Return position and yaw with derivatives; e is the thrust over mass minus g, its rate."""
         # With a = T/m, p^(2) = a R e3 - g e3, and R' = R [omega]x makes p^(3) = R (a q, -a p, a')
         # and p^(4) = R (2 a' q + a q' + a p r, -2 a' p - a p' + a q r, a'' - a (p^2 + q^2)).
@@ -251,7 +247,7 @@ class Quadrotor(RigidVehicle):
             spin = spin - free_spin(self.inertia, x[9:12])
             return jnp.concatenate([(snap[2] + a * (p**2 + q**2))[None], spin])
 
-        return Flattened(jnp.concatenate([path, heading[:, None]], axis=1), invert)
+        return FlatCoordinates(jnp.concatenate([path, heading[:, None]], axis=1), invert)
 
     def limit(self, u: Input) -> Input:
         """Return what four motors within [0, motor_thrust] deliver.
@@ -274,9 +270,6 @@ class Quadrotor(RigidVehicle):
         return jnp.where(fits(commanded, self.motor_thrust), u, delivered)
 
 
-# ---- as printed ----------------------------------------------------------------------------------
-
-
 class PrintedQuadrotor(ControlAffine):
     """The quadrotor as printed in the paper (literal).
 
@@ -297,20 +290,13 @@ class PrintedQuadrotor(ControlAffine):
     input_names, input_units = Quadrotor.input_names, Quadrotor.input_units
     output_names, position = Quadrotor.output_names, Quadrotor.position
     state_groups, chart = Quadrotor.state_groups, Quadrotor.chart
+    input_scale = Quadrotor.input_scale  # pyright: ignore - a property
     radius = 0.07  # of the Crazyflie with its propellers
 
     def __check_init__(self) -> None:
-        """Refuse a mass or inertia that is not positive.
-
-        The printed inertia itself is kept on purpose.
-        """
+        # The printed inertia itself is kept on purpose.
         check_positive(self, mass=self.mass)
         check_moments(self, self.inertia)
-
-    @property
-    def input_scale(self) -> tuple[tuple[float, ...], ...]:
-        """S = diag(m, Ixx, Iyy, Izz)."""
-        return diagonal(self.mass, *self.inertia)
 
     def drift(self, x: State) -> State:
         """Return f(x), without gravity as printed."""

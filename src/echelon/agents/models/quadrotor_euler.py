@@ -18,7 +18,6 @@ from echelon.core.errors import ModelError, check_name
 from echelon.core.numerics import derivatives as derivatives_of
 from echelon.core.types import Input, InputMap, Scalar, State
 
-# ---- computed torque -----------------------------------------------------------------------------
 # An inner loop on board cancels the attitude dynamics, so that Euler-angle accelerations become the
 # input. Gains made for these agents say what formation laws can promise above such a loop.
 
@@ -74,10 +73,7 @@ class QuadrotorEuler(RigidVehicle):
         return jnp.concatenate([nothing, lift, nothing, spin])
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
-        """Return the state and input that fly a path (x, y, z, yaw).
-
-        The path is given with its first four derivatives, (5, 4).
-        """
+        """Return the state and input that fly a path (x, y, z, yaw) with derivatives, (5, 4)."""
         x, thrust, bend = flown_along(derivatives, self.gravity)
         return x, jnp.append(thrust[0], bend)
 
@@ -114,15 +110,9 @@ class QuadrotorThrust(RigidVehicle):
         return jnp.concatenate([jnp.zeros((9, 4), x.dtype), spin, thrust])
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
-        """Return the state and input that fly a path (x, y, z, yaw).
-
-        The path is given with its first four derivatives, (5, 4).
-        """
+        """Return the state and input that fly a path (x, y, z, yaw) with derivatives, (5, 4)."""
         x, thrust, bend = flown_along(derivatives, self.gravity)
         return jnp.append(x, thrust[0]), jnp.append(thrust[1], bend)
-
-
-# ---- a Crazyflie under its own attitude controller -----------------------------------------------
 
 
 def _identified(mass: float, gain: float, stiffness: float, damping: float, command: float,
@@ -202,7 +192,6 @@ class CrazyflieAttitude(RigidVehicle):
         return cls(**{**sets[name], **changes})
 
     def __check_init__(self) -> None:
-        """Reject parameters that no vehicle can have."""
         names = ("mass", "thrust_gain", "stiffness", "rate_damping", "command_gain", "yaw_damping")
         limits = ("motor_thrust", "tilt_limit", "yaw_rate_limit")
         check_positive(self, **{name: getattr(self, name) for name in names + limits})
@@ -243,10 +232,7 @@ class CrazyflieAttitude(RigidVehicle):
         return jnp.concatenate([nothing, lift, nothing, turn])
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
-        """Return the state and input that fly a path (x, y, z, yaw).
-
-        The path is given with its first four derivatives, (5, 4).
-        """
+        """Return the state and input that fly a path (x, y, z, yaw) with derivatives, (5, 4)."""
         x, thrust, bend = flown_along(derivatives, self.gravity)
         back = self.stiffness * x[6:8] + self.rate_damping * x[9:11]
         tilt = (bend[:2] + back) / self.command_gain

@@ -21,18 +21,13 @@ from echelon.agents.models.model import (
 from echelon.core.errors import ModelError
 from echelon.core.types import Input, Output, Scalar, State
 
-# ---- the body ------------------------------------------------------------------------------------
 # Body to world is Rz(yaw) Ry(pitch) Rx(roll).
 
 Vector: TypeAlias = Float[jax.Array, " 3"]
 
 
 def check_moments(owner: object, inertia: tuple[float, ...]) -> None:
-    """Check that an inertia is three positive moments.
-
-    Raises:
-        ModelError: it is not.
-    """
+    """Raise `ModelError` unless an inertia is three positive moments."""
     if not isinstance(inertia, (tuple, list)) or len(inertia) != 3:
         raise ModelError(
             f"`inertia` of `{type(owner).__name__}` is {inertia}, and must be three moments "
@@ -42,11 +37,7 @@ def check_moments(owner: object, inertia: tuple[float, ...]) -> None:
 
 
 def check_inertia(inertia: tuple[float, float, float]) -> None:
-    """Check that a rigid body can have these principal moments of inertia, kg m^2.
-
-    Raises:
-        ModelError: one exceeds the sum of the other two, by more than rounding.
-    """
+    """Raise `ModelError` if a principal moment (kg m^2) exceeds the sum of the other two."""
     # Ixx + Iyy - Izz = int 2 z^2 dm >= 0 for each axis, with equality for a flat plate: hence the
     # slack.
     total = sum(inertia)
@@ -100,10 +91,7 @@ def body_rates(zeta: Vector, zeta_dot: Vector) -> Vector:
 
 
 def tilt_towards(direction: Vector, yaw: Scalar) -> Vector:
-    """Return the angles zeta with the given yaw whose thrust axis points along `direction`.
-
-    The length of `direction` does not matter.
-    """
+    """Return the angles zeta with the given yaw whose thrust axis points along `direction`."""
     sy, cy = jnp.sin(yaw), jnp.cos(yaw)
     # With the yaw undone R e3 is (cos roll sin pitch, -sin roll, cos roll cos pitch).
     forward = cy * direction[0] + sy * direction[1]
@@ -134,8 +122,6 @@ def attitude_along(path: jax.Array, gravity: float) -> Callable[[Scalar], Vector
     lift, yaw = lift_along(path, gravity), path[:3, 3]
     return lambda s: tilt_towards(lift(s), yaw[0] + s * yaw[1] + 0.5 * s**2 * yaw[2])
 
-
-# ---- vehicles under thrust -----------------------------------------------------------------------
 
 # z'' = (T/m) cos(roll) cos(pitch) - g, and none of the three factors passes 0 unless z'' passes -g.
 # Each vehicle declares bound and chains itself: a proof reads no declaration of a base class whose
@@ -169,7 +155,6 @@ class RigidVehicle(ControlAffine):
     flat_order = 4
 
     def __check_init__(self) -> None:
-        """Refuse a gravity that is not positive."""
         check_positive(self, gravity=self.gravity)
 
     def output(self, x: State) -> Output:
@@ -181,7 +166,6 @@ class RigidVehicle(ControlAffine):
         return wrap_angles(x - y, 6, 7, 8)
 
 
-# ---- motors with limits --------------------------------------------------------------------------
 # Clipping each motor by itself changes the torques and flips vehicles. Attitude-priority mixing
 # keeps the torques: the collective gives way first, then yaw, and roll and pitch are scaled only
 # when they alone do not fit.

@@ -120,21 +120,21 @@ class Sides(NamedTuple):
         slope = (0.5 * (axes.forward + axes.backward)[1] / units)[entry, variable]
         return Gap(float(derivative[entry, variable]), float(slope), int(entry), int(variable))
 
-    def bends(self, n: int) -> Array:
+    def kinks(self, n: int) -> Array:
         """Return (k, n) whether slopes of the two sides differ, or values, or they do not add up.
 
         What only bends between the axes is charged to the variable that moves first.
         """
         scale = _BENT * np.maximum(np.abs(self.forward), np.abs(self.backward))
-        bends = self._stays(self.forward - self.backward, scale) | self.jumps()
+        kinks = self._stays(self.forward - self.backward, scale) | self.jumps()
         axes, oblique = self.forward[..., :n], self.forward[..., n:]
         sums = axes @ _oblique(n).T
         size = _BENT * (np.abs(axes) @ np.abs(_oblique(n)).T)
         with np.errstate(invalid="ignore"):
             crooked = self._stays(oblique - sums, size)
         first = np.eye(n, dtype=bool)[0]
-        beside = np.any(bends[:, n:] | crooked, axis=1)
-        return bends[:, :n] | np.outer(beside, first)
+        beside = np.any(kinks[:, n:] | crooked, axis=1)
+        return kinks[:, :n] | np.outer(beside, first)
 
     def jumps(self) -> Array:
         """Return (k, q) whether values differ between the sides at any distance."""
@@ -150,7 +150,6 @@ class Sides(NamedTuple):
         return np.any(stays, axis=0)
 
     def _seen(self, slopes: Array) -> Array:
-        """Return whether slopes over the narrow steps are more than rounding."""
         return slopes > _NOISE * self.rounding[..., None] / _STEPS[1::2, None, None]
 
 
@@ -190,13 +189,7 @@ def sides(point: Float[Array, " n"], values: Float[Array, "K k"]) -> Sides:
 def find_gap(
     function: _Function, points: Float[Array, "K n"], units: Float[Array, " n"]
 ) -> Gap | None:
-    """Return where the derivative of a function by JAX is not its slope, or None.
-
-    Args:
-        function: (n,) -> (k,), traceable by JAX.
-        points: where the two are compared.
-        units: of each variable.
-    """
+    """Return where the derivative of a traceable function by JAX is not its slope, or None."""
     with precision("float64"):
         around = jnp.asarray(np.stack([stencil(point, units) for point in points]))
         values = np.asarray(jax.jit(jax.vmap(jax.vmap(function)))(around))

@@ -44,7 +44,7 @@ class Unicycle(ControlAffine):
     # Where (x', y') is not 0 it has the heading's direction and the speed for its length.
     flat_bounds = (FlatBound(("x", "y"), 1, 0.0, "a speed above 0"),)
 
-    def switch_on(self, x: State, ahead: jax.Array) -> jax.Array:
+    def initial_integrators(self, x: State, ahead: jax.Array) -> jax.Array:
         """Return the speed of what it follows."""
         return jnp.hypot(*ahead[1])[None]
 
@@ -89,7 +89,6 @@ class UnicyclePoint(ControlAffine):
     flat_order = 2
 
     def __check_init__(self) -> None:
-        """Refuse a point that is not ahead of the axle."""
         check_positive(self, ahead=self.ahead)
 
     @property

@@ -81,7 +81,6 @@ class Network:
     seed: int | None = None
 
     def __post_init__(self) -> None:
-        """Check every number, and take words for their members."""
         check_kind("bursts", self.bursts, Bursts)
         values = dataclasses.asdict(self)
         values |= {f"bursts.{name}": value for name, value in values.pop("bursts").items()}
@@ -153,7 +152,6 @@ class Network:
         return f"neighbours' deviations from where they expect the leader; {leader}; all late"
 
     def __str__(self) -> str:
-        """Return the network in words."""
         parts = [f"{self.rate:g} Hz", f"delay {1e3 * self.delay:g} ms"]
         parts += [f"jitter up to {1e3 * self.jitter:g} ms"] if self.jitter else []
         parts += [f"{100.0 * self.loss:g} % lost"] if self.loss else []
@@ -191,7 +189,7 @@ def _check_number(name: str, value: object, allowed: str, fits: Callable[[float]
         raise SimulationError(f"`{name}` of the network is {value}, and must be {allowed}.")
 
 
-class Posts(NamedTuple):
+class InFlight(NamedTuple):
     """The last R messages of each agent, and what becomes of them on each of K links.
 
     Attributes:
@@ -249,10 +247,10 @@ class Channel(eqx.Module):
     prediction: Prediction = eqx.field(static=True)
     hears: NeighbourChoice = eqx.field(static=True)
 
-    def begin(self, content: PyTree, links: int) -> Posts:
+    def begin(self, content: PyTree, links: int) -> InFlight:
         """Return posts before the first message, of which `content` (N, ...) is an example."""
         rows = jax.tree.map(lambda x: jnp.zeros((self.slots, *x.shape), x.dtype), content)
-        return Posts(
+        return InFlight(
             rows,
             jnp.full((self.slots, links), NEVER, jnp.int32),
             jnp.zeros(links, bool),
@@ -260,26 +258,23 @@ class Channel(eqx.Module):
 
     def post(
         self,
-        posts: Posts,
+        posts: InFlight,
         step: jax.Array,
         content: PyTree,
         sends: Bool[jax.Array, " K"],
         receivers: Array | jax.Array,
         senders: Array | jax.Array,
-    ) -> Posts:
-        """Return the posts after a step; agents send at every `every`-th one.
-
-        Links (K,) along which nothing is sent, such as cut ones, lose the message.
-        """
+    ) -> InFlight:
+        """Return the posts after a step; links (K,) that carry nothing lose the message."""
         number = step // self.every
         slot = number % self.slots
 
-        def put(posts: Posts) -> Posts:
+        def put(posts: InFlight) -> InFlight:
             lost, late, out = self._draw(number, step, posts.out, receivers, senders)
             arrives = step + self.delay + late
             arrival = jnp.where(lost | ~sends, NEVER, arrives)
             rows = jax.tree.map(lambda row, x: row.at[slot].set(x), posts.content, content)
-            return Posts(rows, posts.arrival.at[slot].set(arrival.astype(jnp.int32)), out)
+            return InFlight(rows, posts.arrival.at[slot].set(arrival.astype(jnp.int32)), out)
 
         return jax.lax.cond(step % self.every == 0, put, lambda posts: posts, posts)
 
@@ -308,7 +303,7 @@ class Channel(eqx.Module):
 
         return jax.vmap(one)(out, jnp.asarray(receivers), jnp.asarray(senders))
 
-    def arrivals(self, posts: Posts, step: jax.Array, newest: Int[jax.Array, " K"]) -> Arrival:
+    def arrivals(self, posts: InFlight, step: jax.Array, newest: Int[jax.Array, " K"]) -> Arrival:
         """Return what arrives at a step, of what is newer than the `newest` (K,) stamps."""
         # The number of the last message in each row, counted back from the last one sent.
         last = (step - 1) // self.every

@@ -28,7 +28,6 @@ def split_weights(edges: Iterable[Sequence[float]]) -> tuple[Array, Array]:
 
 
 def _whole(values: Sequence[Any] | Array, what: str) -> Array:
-    """Return agent numbers, or rows of them, as integers, after checking that they are whole."""
     if isinstance(values, np.ndarray) and np.issubdtype(values.dtype, np.signedinteger):
         return values.astype(np.int64)
     if not _are_whole(values):
@@ -93,18 +92,13 @@ def links(i: Array | int, j: Array) -> Array:
 
 
 def _ascending(pairs: Array) -> Array:
-    """Return pairs with the smaller number first."""
     # Three times as fast as sorting each pair.
     i, j = pairs.T
     return np.stack([np.minimum(i, j), np.maximum(i, j)], axis=1)
 
 
 def give_weights(edges: Iterable[Sequence[float]], weights: Sequence[float]) -> list[list[float]]:
-    """Return edges (i, j, weight) from edges (i, j) and a list of weights.
-
-    Raises:
-        GraphError: their numbers differ, or an edge has a weight already.
-    """
+    """Return edges (i, j, weight) from edges (i, j) and as many weights, else `GraphError`."""
     edges, weights = [list(edge) for edge in edges], list(weights)
     if len(edges) != len(weights):
         raise GraphError(
@@ -120,7 +114,6 @@ def give_weights(edges: Iterable[Sequence[float]], weights: Sequence[float]) -> 
 
 
 def _repeated(edges: Array, agents: int) -> Array:
-    """Return the indices of edges that occur more than once."""
     # One number per edge sorts ten times faster than rows, and large graphs have millions.
     number = edges[:, 0] * agents + edges[:, 1]
     ordered = np.sort(number)
@@ -152,10 +145,7 @@ def count_grid(rows: int, columns: int) -> int:
 
 
 def check_size(agents: int, least: int, kind: str, edges: int = 0, share: float = 0) -> None:
-    """Check that a kind of graph has enough agents, and that agents and edges fit into memory.
-
-    The number of edges is `edges`, plus about a `share` of all pairs.
-    """
+    """Check that agents are enough, and that `edges` plus a `share` of all pairs fit memory."""
     _check_whole(agents)
     if agents < least:
         raise GraphError(f"a {kind} needs at least {least} agents, and has {agents}.")
@@ -180,7 +170,6 @@ def name_agents(agents: np.ndarray) -> str:
 
 
 def _square(matrix: ArrayLike) -> Array:
-    """Return an adjacency matrix as numbers, after checking it."""
     try:
         weights = np.asarray(matrix, np.float64)
     except (TypeError, ValueError):
@@ -201,11 +190,7 @@ def _square(matrix: ArrayLike) -> Array:
 def edges_of_matrix(
     matrix: ArrayLike, leaders: Iterable[int], directed: bool | None
 ) -> tuple[list[list[float]], Iterable[int], int, bool]:
-    """Return edges, leaders, the number of agents and whether edges are directed, of an adjacency.
-
-    Raises:
-        GraphError: the matrix is not square, not finite, or not that of such a graph.
-    """
+    """Return edges, leaders, agents and whether directed, of an adjacency; else `GraphError`."""
     weights = _square(matrix)
     symmetric = bool((weights == weights.T).all())
     if directed is False and not symmetric:
@@ -247,11 +232,7 @@ def advising(points: Array, radius: float) -> Iterator[None]:
 
 
 def _advice(points: Array, radius: float) -> str:
-    """Return the smallest radius that connects the points, as a clause.
-
-    It is empty where they are connected, or too many to measure. The radius is the longest edge of
-    the shortest spanning tree.
-    """
+    """Return the least connecting radius, the shortest tree's longest edge, as a clause."""
     if len(points) > _MOST:
         return ""
     from scipy.sparse.csgraph import minimum_spanning_tree

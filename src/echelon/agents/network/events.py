@@ -1,4 +1,4 @@
-"""What happens during a run: agents are lost or join, links are cut, and heirs take the lead.
+"""What happens during a run: agents are lost or join, links are cut, backup leaders take the lead.
 
 All of it is stated before the run, so that a graph with events is one that switches.
 """
@@ -32,7 +32,6 @@ class Lose:
     at: float
 
     def __str__(self) -> str:
-        """Return what happens, in words."""
         return f"agent {self.agent} is lost"
 
 
@@ -50,7 +49,6 @@ class Join:
     at: float
 
     def __str__(self) -> str:
-        """Return what happens, in words."""
         return f"agent {self.agent} joins"
 
 
@@ -75,7 +73,6 @@ class Cut:
         return math.inf if self.duration is None else self.at + self.duration
 
     def __str__(self) -> str:
-        """Return what happens, in words."""
         i, j = self.link
         span = "for ever" if self.duration is None else f"for {self.duration:g} s"
         return f"the link between agents {i} and {j} is cut {span}"
@@ -89,22 +86,22 @@ def agents_of(event: Event) -> tuple[int, ...]:
     return tuple(event.link) if isinstance(event, Cut) else (event.agent,)
 
 
-def check_heirs(graph: GraphMatrices, heirs: Sequence[int]) -> None:
-    """Check who may lead after the leader of a graph.
-
-    Raises:
-        GraphError: one is no agent, leads already or is named twice, or there are several leaders.
-    """
-    for k, heir in enumerate(heirs):
-        if not _is_agent(heir, graph.agents):
+def check_backups(graph: GraphMatrices, backups: Sequence[int]) -> None:
+    """Raise `GraphError` unless these agents may lead after the only leader of a graph."""
+    for k, backup in enumerate(backups):
+        if not _is_agent(backup, graph.agents):
             last = graph.agents - 1
-            raise GraphError(f"heir {heir} is no agent; agents are numbered from 0 to {last}.")
-        if heir in graph.leaders:
-            raise GraphError(f"heir {heir} is the leader itself; name followers.")
-        if heir in heirs[:k]:
-            raise GraphError(f"heir {heir} is named twice.")
-    if heirs and len(graph.leaders) > 1:
-        raise GraphError(f"got heirs of {len(graph.leaders)} leaders, and there must be one.")
+            raise GraphError(
+                f"backup leader {backup} is no agent; agents are numbered from 0 to {last}."
+            )
+        if backup in graph.leaders:
+            raise GraphError(f"backup leader {backup} is the leader itself; name followers.")
+        if backup in backups[:k]:
+            raise GraphError(f"backup leader {backup} is named twice.")
+    if backups and len(graph.leaders) > 1:
+        raise GraphError(
+            f"got backup leaders of {len(graph.leaders)} leaders, and there must be one."
+        )
 
 
 class EventFault(NamedTuple):
@@ -115,23 +112,22 @@ class EventFault(NamedTuple):
 
 
 def event_faults(
-    graph: GraphMatrices, events: Sequence[Event], heirs: Sequence[int], horizon: float = math.inf
+    graph: GraphMatrices, events: Sequence[Event], backups: Sequence[int], horizon: float = math.inf
 ) -> Iterator[EventFault]:
     """Yield what is wrong with each event; of those alone in order, whom they cut off.
 
     Args:
         graph: without events.
         events: in any order.
-        heirs: who takes the lead when the leader is lost, the first that is present.
+        backups: who takes the lead when the leader is lost, the first that is present.
         horizon: of the run, s.
     """
     faults = [*_alone(graph, events, horizon)]
-    faults = faults or [*_in_order(graph, events, heirs)]
-    yield from faults or _cut_off(graph, events, heirs)
+    faults = faults or [*_in_order(graph, events, backups)]
+    yield from faults or _cut_off(graph, events, backups)
 
 
 def _alone(graph: GraphMatrices, events: Sequence[Event], horizon: float) -> Iterator[EventFault]:
-    """Yield wrong times, agents and links."""
     pairs = {frozenset(edge) for edge in graph.edges.tolist()}
     for k, event in enumerate(events):
         span = event.duration if isinstance(event, Cut) else None
@@ -156,9 +152,8 @@ def _is_agent(value: object, agents: int) -> bool:
 
 
 def _in_order(
-    graph: GraphMatrices, events: Sequence[Event], heirs: Sequence[int]
+    graph: GraphMatrices, events: Sequence[Event], backups: Sequence[int]
 ) -> Iterator[EventFault]:
-    """Yield who is lost or joins where that is not possible."""
     absent = {x for event in events for x in agents_of(event) if _joins_first(x, events)}
     if graph.schedule is not None and graph.schedule.period is not None and events:
         yield EventFault(0, "a graph with a `period` takes no events")
@@ -179,8 +174,8 @@ def _in_order(
             yield EventFault(k, f"{event}, and nobody leads before")
             return
         absent ^= {event.agent}
-        if {*graph.leaders} <= absent and {*heirs} <= absent:
-            remedy = "keep one of them" if heirs else "name `heirs` in `leadership`"
+        if {*graph.leaders} <= absent and {*backups} <= absent:
+            remedy = "keep one of them" if backups else "name `backups` in `leadership`"
             yield EventFault(k, f"{event}, and nobody leads afterwards; {remedy}")
             return
 
@@ -190,19 +185,18 @@ def _by_time(events: Sequence[Event]) -> list[int]:
 
 
 def _joins_first(agent: int, events: Sequence[Event]) -> bool:
-    """Tell whether an agent is absent until it joins."""
     own = [events[k] for k in _by_time(events) if agents_of(events[k]) == (agent,)]
     return bool(own) and isinstance(own[0], Join)
 
 
 def _cut_off(
-    graph: GraphMatrices, events: Sequence[Event], heirs: Sequence[int]
+    graph: GraphMatrices, events: Sequence[Event], backups: Sequence[int]
 ) -> Iterator[EventFault]:
     """Yield the event that cuts somebody off until the end."""
     order, cause = _by_time(events), None
     for count in range(len(order), 0, -1):
         so_far = [events[k] for k in order[:count]]
-        schedule = schedule_of(graph, so_far, heirs)
+        schedule = schedule_of(graph, so_far, backups)
         lost = unreached(graph, schedule, len(schedule.starts) - 1)
         if not len(lost):
             break
@@ -216,13 +210,10 @@ def _cut_off(
 def schedule_of(
     graph: GraphMatrices,
     events: Sequence[Event],
-    heirs: Sequence[int] = (),
+    backups: Sequence[int] = (),
     absent: Sequence[int] = (),
 ) -> Schedule:
-    """Return when which links of a graph hold, who is present, and whom each agent follows.
-
-    Who is `absent` is so until the end, whatever happens.
-    """
+    """Return the schedule of links, presence and leaders; `absent` agents are so until the end."""
     base = graph.schedule or Schedule(np.zeros(1), graph.weights[None], None)
     ends = [event.end for event in events if isinstance(event, Cut)]
     times = [*base.starts.tolist(), *(event.at for event in events), *ends]
@@ -239,7 +230,7 @@ def schedule_of(
     weights[~present[:, graph.edges].all(axis=2)] = 0.0
     nearest = np.tile(nearest_leaders(graph), (len(starts), 1))
     if len(graph.leaders) == 1:
-        nearest[:] = _acting(present, graph.leaders[0], heirs)[:, None]
+        nearest[:] = _acting(present, graph.leaders[0], backups)[:, None]
     for array in (starts, weights, present, nearest):
         array.setflags(write=False)
     return Schedule(starts, weights, None, present, nearest)
@@ -258,12 +249,12 @@ def _present(starts: Array, agents: int, events: Sequence[Event]) -> Array:
     return present
 
 
-def _acting(present: Array, leader: int, heirs: Sequence[int]) -> Array:
-    """Return who leads in each stretch, (S,): who did, or else the first heir that is present."""
+def _acting(present: Array, leader: int, backups: Sequence[int]) -> Array:
+    """Return who leads in each stretch, (S,): who did, or else the first backup leader there."""
     acting = list[int]()
     for here in present:
         # One that returns follows whoever leads by then.
         last = acting[-1] if acting else leader
-        left = [agent for agent in (last, *heirs) if here[agent]]
+        left = [agent for agent in (last, *backups) if here[agent]]
         acting.append(left[0] if left else last)
     return np.array(acting)

@@ -64,18 +64,12 @@ class Exchange(eqx.Module):
         alone: Float[jax.Array, "N s"],
         difference: Difference = operator.sub,
     ) -> Float[jax.Array, "N s"]:
-        """Return the weighted mean (N, s) of the differences along the links that are used (K,).
-
-        Of an agent without any it is `alone` (N, s).
-        """
+        """Return the mean differences (N, s) along used links (K,); `alone` (N, s) without any."""
         weights = jnp.where(used, jnp.asarray(self.weights, values.dtype), 0.0)
         chosen = Exchange(self.receivers, self.senders, weights)
         total = jax.ops.segment_sum(weights, self.receivers, num_segments=len(values))[:, None]
         z = chosen(values, received, difference)
         return jnp.where(total > 0.0, z / jnp.where(total > 0.0, total, 1.0), alone)
-
-
-# ---- others that may come near -------------------------------------------------------------------
 
 
 class Near(NamedTuple):

@@ -47,7 +47,6 @@ class Formation:
     def __init__(
         self, offsets: Sequence[Sequence[float]] | Array, motion: FormationMotion | None = None
     ) -> None:
-        """Store the offsets, read-only."""
         self.motion = motion
         self.offsets = np.array(offsets, dtype=np.float64)
         if self.offsets.ndim != 2 or not (np.abs(self.offsets) <= LARGEST).all():
@@ -58,7 +57,6 @@ class Formation:
         self.offsets.setflags(write=False)
 
     def __eq__(self, other: object) -> bool:
-        """Tell whether two formations have the same offsets."""
         return (
             isinstance(other, Formation)
             and np.array_equal(self.offsets, other.offsets)
@@ -66,7 +64,6 @@ class Formation:
         )
 
     def __repr__(self) -> str:
-        """Say the size and the largest offset."""
         agents, states = self.offsets.shape
         largest = np.abs(self.offsets).max(initial=0.0)
         moving = "" if self.motion is None else ", moving"
@@ -74,7 +71,6 @@ class Formation:
         return f"Formation({size}, offsets up to {largest:.4g}{moving})"
 
     def __hash__(self) -> int:
-        """Hash what `__eq__` compares."""
         # Where -0.0 is 0.0, which it equals.
         return hash((self.offsets.shape, (self.offsets + 0.0).tobytes()))
 
@@ -314,10 +310,7 @@ class Formation:
 
 
 def _distinct(rows: Array) -> tuple[Array, Array]:
-    """Return the first of each kind of equal rows, in their order, and which kind each is of.
-
-    `numpy.unique` takes some seconds for a million.
-    """
+    """Return each kind's first row and each row's kind; `numpy.unique` would take seconds."""
     varying = rows[:, np.ptp(rows, axis=0) > 0.0]
     order = np.lexsort(varying.T[::-1]) if varying.size else np.arange(len(rows))
     changed = (varying[order[1:]] != varying[order[:-1]]).any(axis=1)
@@ -327,7 +320,6 @@ def _distinct(rows: Array) -> tuple[Array, Array]:
 
 
 def _whole_state(model: ControlAffine, agent: int, offset: Iterable[float]) -> np.ndarray:
-    """Return an offset over all states, from one over the position or over all states."""
     values = np.atleast_1d(np.asarray(offset, dtype=np.float64))
     axes, n = model.position_indices(), len(model.state_names)
     if not np.isfinite(values).all():
@@ -381,7 +373,6 @@ def _offsets_at(
 
 @cached_jit
 def _local(model: ControlAffine, states: States) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """Return f and g at states (S, n), each with its Jacobian."""
     parts = {"drift": model.drift, "input map": model.input_map}
     return {
         name: (jax.vmap(part)(states), jax.vmap(jax.jacfwd(part))(states))

@@ -185,10 +185,7 @@ class FormationMotion(eqx.Module):
         return not self.bundled or bool(rows.any() if self.motions else np.ptp(rows, 1).any())
 
     def meetings(self) -> Iterator[tuple[float, int, int, float]]:
-        """Yield of each reshape when it begins (s), and the pair that comes nearest, with how near.
-
-        The ways are straight lines; of very many agents it is left out.
-        """
+        """Yield each reshape's begin (s) and nearest pair on straight ways, for few agents."""
         if not 2 <= len(self.places) <= _MOST_PAIRS:
             return
         i, j = np.triu_indices(len(self.places), 1)
@@ -232,9 +229,6 @@ def blend(u: jax.Array) -> jax.Array:
     return u**6 * share
 
 
-# ---- assignment ----------------------------------------------------------------------------------
-
-
 def nearest_places(
     leaders: Sequence[int], before: Float[Array, "N d"], after: Float[Array, "N d"]
 ) -> Int[Array, " N"]:
@@ -259,9 +253,6 @@ def nearest_places(
     ways = (before / size)[others][:, None] - (after / size)[others][None]
     order[others] = others[linear_sum_assignment((ways * ways).sum(axis=2))[1]]
     return order
-
-
-# ---- checks --------------------------------------------------------------------------------------
 
 
 def _check_reshapes(reshapes: Sequence[Reshape], shape: tuple[int, ...]) -> None:

@@ -23,7 +23,7 @@ from echelon.agents.network.edges import (
     pairs_within,
     split_weights,
 )
-from echelon.agents.network.events import Event, check_heirs, event_faults, schedule_of
+from echelon.agents.network.events import Event, check_backups, event_faults, schedule_of
 from echelon.agents.network.matrices import (
     GraphMatrices,
     check_reached,
@@ -74,7 +74,7 @@ class Graph(GraphMatrices):
         directed: whether edges carry information one way.
         schedule: when which weights hold; None where they never change.
         events: what happens to it, by time.
-        heirs: who leads when the leader is lost, the first that is present.
+        backups: who leads when the leader is lost, the first that is present.
         before: the graph without its events.
 
     Raises:
@@ -83,7 +83,7 @@ class Graph(GraphMatrices):
     """
 
     events: tuple[Event, ...]
-    heirs: tuple[int, ...]
+    backups: tuple[int, ...]
     before: "Graph"
 
     def __init__(
@@ -94,7 +94,6 @@ class Graph(GraphMatrices):
         directed: bool = False,
         weights: Sequence[float] | None = None,
     ) -> None:
-        """Check the edges, weights and leaders."""
         edges = edges if weights is None else give_weights(edges, weights)
         pairs, heavy = split_weights(edges)
         self.directed = bool(directed)
@@ -110,7 +109,7 @@ class Graph(GraphMatrices):
         schedule: Schedule | None,
     ) -> None:
         self.edges, self.weights, self.agents, self.schedule = edges, weights, agents, schedule
-        self.events, self.heirs, self.before = (), (), self
+        self.events, self.backups, self.before = (), (), self
         self.leaders = check_leaders(leaders, self.agents)
         self.followers = tuple(np.delete(np.arange(self.agents), self.leaders).tolist())
         if not self.followers:
@@ -207,25 +206,25 @@ class Graph(GraphMatrices):
         """Return the same graph with more edges."""
         return Graph([*self._triples(), *more], self.leaders, self.agents, self.directed)
 
-    def with_events(self, events: Sequence[Event], heirs: Sequence[int] = ()) -> "Graph":
+    def with_events(self, events: Sequence[Event], backups: Sequence[int] = ()) -> "Graph":
         """Return the same graph, to which something happens; other events are replaced.
 
         Args:
             events: losses and arrivals of agents, and cuts of links.
-            heirs: who leads when the leader is lost, the first that is present.
+            backups: who leads when the leader is lost, the first that is present.
 
         Raises:
             GraphError: an event is not possible, or leaves somebody without a path to the leader.
         """
-        before, events, heirs = self.before, tuple(events), tuple(heirs)
-        if (events, heirs) == (self.events, self.heirs):
+        before, events, backups = self.before, tuple(events), tuple(backups)
+        if (events, backups) == (self.events, self.backups):
             return self
-        check_heirs(before, heirs)
-        for fault in event_faults(before, events, heirs):
+        check_backups(before, backups)
+        for fault in event_faults(before, events, backups):
             raise GraphError(f"{fault.text}.")
         graph, events = copy.copy(before), tuple(sorted(events, key=lambda event: event.at))
-        graph.events, graph.heirs, graph.before, graph._spectrum = events, heirs, before, None
-        graph.schedule = schedule_of(before, events, heirs) if events else before.schedule
+        graph.events, graph.backups, graph.before, graph._spectrum = events, backups, before, None
+        graph.schedule = schedule_of(before, events, backups) if events else before.schedule
         return graph
 
     def until(self, at: float) -> "Graph":
@@ -235,7 +234,7 @@ class Graph(GraphMatrices):
         absent = [] if presence is None else np.flatnonzero(~presence[0]).tolist()
         graph.events, graph.schedule, graph._spectrum = events, before.schedule, None
         if events or absent:
-            graph.schedule = schedule_of(before, events, self.heirs, absent)
+            graph.schedule = schedule_of(before, events, self.backups, absent)
         return graph
 
     def _triples(self) -> list[list[float]]:
@@ -342,7 +341,6 @@ class Graph(GraphMatrices):
         return self._spectrum
 
     def _grounded(self) -> Grounded:
-        """Return the weights of the grounded Laplacian."""
         row = np.full(self.agents, -1)
         row[list(self.followers)] = np.arange(len(self.followers))
         ends = row[self.edges]
@@ -382,7 +380,6 @@ class Graph(GraphMatrices):
         return parents_of(self)
 
     def __eq__(self, other: object) -> bool:
-        """Tell whether two graphs have the same agents, leaders and edges in the same order."""
         return (
             isinstance(other, Graph)
             and self._constants == other._constants
@@ -391,16 +388,14 @@ class Graph(GraphMatrices):
         )
 
     def __hash__(self) -> int:
-        """Hash what `__eq__` compares."""
         return hash((self._constants, self.edges.tobytes(), self.weights.tobytes()))
 
     @property
     def _constants(self) -> tuple[object, ...]:
         schedule = self.schedule
         times = schedule and (*(x.tobytes() for x in schedule[:2]), schedule.period)
-        return self.agents, self.leaders, self.directed, times, self.events, self.heirs
+        return self.agents, self.leaders, self.directed, times, self.events, self.backups
 
     def __repr__(self) -> str:
-        """Say the size."""
         edges = amount(len(self.edges), f"{'directed ' * self.directed}edge")
         return f"Graph({self.agents} agents, {edges}, leaders {list(self.leaders)})"

@@ -26,13 +26,7 @@ def edges_of(graph: Graph, exchange: Exchange) -> tuple[Array, Array]:
 
 
 def heard_along(graph: Graph, leaderward: bool, leaders_hear: bool) -> Array:
-    """Return whether each end of each edge uses the messages of the other, (E, 2).
-
-    Args:
-        graph: the communication graph.
-        leaderward: whether agents use only neighbours that are nearer to a leader.
-        leaders_hear: whether leaders act on messages.
-    """
+    """Return (E, 2) whether each end of each edge uses the other's messages."""
     used = np.zeros((len(graph.edges), 2), bool)
     used[edges_of(graph, graph.exchange(leaderward))] = True
     return used & (leaders_hear | ~np.isin(graph.edges, graph.leaders))
@@ -68,7 +62,6 @@ def _nearest(graph: Graph) -> tuple[Array, Array, Array]:
 
 
 def _by_follower(graph: Graph, near: Array, before: Array) -> Iterator[str]:
-    """Yield which followers receive from which leaders, those with equal paths together."""
     groups: dict[str, list[int]] = {}
     for agent in graph.followers:
         direct = [other for other in graph.neighbours(agent) if other in graph.leaders]

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from echelon.core.types import Array
 from echelon.core.words import Word
-from echelon_flight.wire import Packet
+from echelon_flight.wire import LeaderPacket
 
 LARGEST = 1e12
 """Of a value, in its own unit: a product of some of them is still finite."""
@@ -55,7 +55,7 @@ class Message(NamedTuple):
     feedforward: NamedValues | None = None
     time: float | None = None
     hops: int = 0
-    packet: Packet | None = None
+    packet: LeaderPacket | None = None
     hull: NamedValues | None = None
 
 
@@ -86,7 +86,6 @@ class Inbox:
         forward_names: tuple[str, ...],
         stamps: "Stamps | None" = None,
     ) -> None:
-        """Receive nothing yet."""
         self._stamps = stamps
         self._senders, self._source = tuple(senders), source
         self._names, self._forward_names = names, forward_names
@@ -136,16 +135,12 @@ class Surroundings:
     time: Float[Array, " K"]
 
     def __init__(self, senders: Sequence[int], names: tuple[str, ...]) -> None:
-        """Receive nothing yet."""
         self._places, self.names = {who: k for k, who in enumerate(senders)}, names
         self.hulls = np.full((len(senders), len(names)), np.nan)
         self.time = np.full(len(senders), -np.inf)
 
     def take(self, message: object, clock: float | None) -> bool:
-        """Store the hull of a message, and tell whether it could be used.
-
-        `clock` is the receiver's time, s; None in the ideal network, where the last one is used.
-        """
+        """Store a hull, and tell whether it is of use; `clock` (s) is None in the ideal network."""
         if not isinstance(message, Message) or not isinstance(message.sender, numbers.Integral):
             return False
         place = self._places.get(int(message.sender))
@@ -171,7 +166,7 @@ class Stamps:
         size: of a packet's content.
         own: the agent's number, if it leads.
         needs_packet: whether a message says nothing without one.
-        heirs: of the leader, whose packets of later epochs count too.
+        backups: of the leader, whose packets of later terms count too.
 
     Attributes:
         time: (K,) when the last message of each neighbour was sent, s; -inf for none.
@@ -187,15 +182,14 @@ class Stamps:
         size: int,
         own: int | None,
         needs_packet: bool,
-        heirs: Sequence[int] = (),
+        backups: Sequence[int] = (),
     ) -> None:
-        """Store nothing yet."""
         self.needs_packet = needs_packet
         self.time, self.hops = np.full(links, -np.inf), np.full(links, _FAR)
-        self.packet: Packet | None = None
+        self.packet: LeaderPacket | None = None
         self.clock = 0.0
-        self._leaders, self._size, self._own = frozenset((*leaders, *heirs)), size, own
-        self._last_epoch, self._epoch = _FAR * bool(heirs), 0
+        self._leaders, self._size, self._own = frozenset((*leaders, *backups)), size, own
+        self._last_term, self._term = _FAR * bool(backups), 0
 
     @property
     def leads(self) -> bool:
@@ -203,19 +197,19 @@ class Stamps:
         return self._own is not None
 
     @property
-    def epoch(self) -> int:
-        """The epoch of the leader that it follows, or in which it leads."""
-        return self._epoch if self.leads or self.packet is None else self.packet.epoch
+    def term(self) -> int:
+        """The term of the leader that it follows, or in which it leads."""
+        return self._term if self.leads or self.packet is None else self.packet.term
 
     def take_lead(self, own: int) -> None:
-        """Lead from now on, in the next epoch."""
-        self._epoch, self._own = self.epoch + 1, own
-        self.packet = Packet(own, self.clock, (0.0,) * self._size, self._epoch)
+        """Lead from now on, in the next term."""
+        self._term, self._own = self.term + 1, own
+        self.packet = LeaderPacket(own, self.clock, (0.0,) * self._size, self._term)
 
     def take(self, message: Message, place: int) -> Received | None:
         """Store the time, hops and packet of a message; return why it is not used, if so."""
         packet = message.packet
-        if not (isinstance(packet, Packet) or packet is None and not self.needs_packet):
+        if not (isinstance(packet, LeaderPacket) or packet is None and not self.needs_packet):
             return Received.NO_MESSAGE
         times = [message.time, *([] if packet is None else [packet.time])]
         if not all(map(_is_time, times)) or not isinstance(message.hops, numbers.Integral):
@@ -235,11 +229,10 @@ class Stamps:
         self.hops[place] = min(max(int(message.hops), 0), _FAR)
         return None
 
-    def _read(self, packet: Packet) -> Packet | Received:
-        """Return a packet with floats of its own, or why it is not used."""
-        whole = all(isinstance(x, numbers.Integral) for x in (packet.leader, packet.epoch))
-        # Where nobody hands the lead over, a packet of a later epoch would win for ever.
-        fine = whole and packet.leader in self._leaders and 0 <= packet.epoch <= self._last_epoch
+    def _read(self, packet: LeaderPacket) -> LeaderPacket | Received:
+        whole = all(isinstance(x, numbers.Integral) for x in (packet.leader, packet.term))
+        # Where nobody hands the lead over, a packet of a later term would win for ever.
+        fine = whole and packet.leader in self._leaders and 0 <= packet.term <= self._last_term
         if not fine:
             return Received.NO_MESSAGE
         values = read_values((tuple(map(str, range(self._size))), packet.content))
@@ -247,13 +240,13 @@ class Stamps:
             return values
         return packet._replace(time=float(packet.time), content=tuple(values.values()))
 
-    def _wins(self, packet: Packet) -> bool:
-        """Tell whether a packet is of a later epoch, a leader with a lower number, or newer."""
+    def _wins(self, packet: LeaderPacket) -> bool:
+        """Tell whether a packet is of a later term, a leader with a lower number, or newer."""
         if self._own is not None:
-            if (packet.epoch, -packet.leader) <= (self._epoch, -self._own):
+            if (packet.term, -packet.leader) <= (self._term, -self._own):
                 return False
             # One of several leaders stays one.
-            self._own = None if self._last_epoch else self._own
+            self._own = None if self._last_term else self._own
         return self.packet is None or packet.rank > self.packet.rank
 
 

@@ -7,8 +7,6 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 from jaxtyping import Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from echelon.agents.network.edges import name_agents
 from echelon.agents.network.exchange import Exchange
@@ -18,10 +16,7 @@ from echelon.core.types import Array, States
 
 
 class GraphMatrices(abc.ABC):
-    """Weighted edges between agents 0 .. N-1, and the matrices that they make; abstract.
-
-    Its attributes are those of `Graph`.
-    """
+    """Weighted edges, and the matrices that they make; abstract, its attributes are `Graph`'s."""
 
     edges: Array
     weights: Array
@@ -53,10 +48,7 @@ class GraphMatrices(abc.ABC):
         return sp.csr_array(csgraph.laplacian(A, use_out_degree=self.directed))
 
     def grounded_laplacian(self) -> sp.csr_array:
-        """Return the follower block of the Laplacian, sparse and positive definite.
-
-        It is the paper's L of Lemma 1; of a directed graph it is not symmetric.
-        """
+        """Return the Laplacian's follower block, the paper's L of Lemma 1; sparse."""
         return self._grounded_laplacian(self.weights)
 
     def _grounded_laplacian(self, weights: Array, leaderward: bool = False) -> sp.csr_array:
@@ -78,7 +70,8 @@ class GraphMatrices(abc.ABC):
 
         With `leaderward` each agent uses only the neighbours that are nearer to a leader. Who is
         absent counts as one that hears the leader alone, with the largest weights of all, and so
-        does an heir that leads: nobody hears the one, and the other follows the leader's path.
+        does a backup leader that leads: nobody hears the one, and the other follows the leader's
+        path.
         """
         schedule, rows = self.schedule, self.weights[None]
         if schedule is None or schedule.present is None or schedule.nearest is None:
@@ -146,15 +139,8 @@ def _apart(L: sp.csr_array, out: Array, weight: float) -> sp.csr_array:
     return sp.csr_array(kept @ L + sp.diags_array(weight * out))
 
 
-# ---- order and parents ---------------------------------------------------------------------------
-
-
 def ordered_outward(graph: GraphMatrices) -> tuple[tuple[int, tuple[int, ...]], ...]:
-    """Return `Graph.outward`.
-
-    Raises:
-        GraphError: the graph switches.
-    """
+    """Return `Graph.outward`; raise `GraphError` if the graph switches."""
     if graph.schedule is not None:
         raise GraphError("the graph switches, and plans are made in one order for all times.")
     # Stable, so that agents at equal distance stay in the order of their numbers.
@@ -178,8 +164,8 @@ def outward_edges(graph: GraphMatrices) -> tuple[Array, Array]:
         raise GraphError("the graph switches, and no agent is nearer to a leader at all times.")
     exchange = graph.exchange(leaderward=True)
     edges = np.stack([exchange.senders, exchange.receivers], axis=1)
-    links = coo_array((np.ones(len(edges)), edges.T), (graph.agents, graph.agents))
-    if connected_components(links, directed=False)[0] > 1:
+    links = sp.coo_array((np.ones(len(edges)), edges.T), (graph.agents, graph.agents))
+    if csgraph.connected_components(links, directed=False)[0] > 1:
         raise GraphError(
             "the directed graph splits into one part for each leader: no agent receives from more "
             "than one of them; leave `directed` out, or give the edges."
@@ -188,11 +174,7 @@ def outward_edges(graph: GraphMatrices) -> tuple[Array, Array]:
 
 
 def parents_of(graph: GraphMatrices) -> tuple[int, ...]:
-    """Return `Graph.parents`.
-
-    Raises:
-        GraphError: as there.
-    """
+    """Return `Graph.parents`, or raise as it does."""
     if graph.schedule is not None:
         raise GraphError(
             "the graph switches, and an agent has no one parent for all times; the feed-forward "
@@ -226,15 +208,8 @@ def shares(graph: GraphMatrices, agent: int, earlier: tuple[int, ...]) -> Array:
     return weights / weights.sum()
 
 
-# ---- agents that leaders reach -------------------------------------------------------------------
-
-
 def check_reached(graph: GraphMatrices) -> None:
-    """Check that leaders reach every agent along all edges, and along the last ones for ever.
-
-    Raises:
-        GraphError: they do not.
-    """
+    """Raise `GraphError` unless leaders reach all along all edges, and along the last for ever."""
     schedule = graph.schedule
     periodic = schedule is not None and schedule.period is not None
     lost = lost_along(
@@ -260,7 +235,6 @@ def check_reached(graph: GraphMatrices) -> None:
 
 
 def _cut_off(graph: GraphMatrices, lost: Array) -> str:
-    """Return the error message about agents that no leader ever reaches."""
     who = f"{name_agents(lost)} no path to a leader ({_name_leaders(graph)})"
     if graph.schedule is not None and graph.schedule.period is not None:
         return (
@@ -276,10 +250,7 @@ def _cut_off(graph: GraphMatrices, lost: Array) -> str:
 
 
 def lost_along(graph: GraphMatrices, weights: Array, leaders: Sequence[int] | None = None) -> Array:
-    """Return the agents that no leader reaches along the edges that have a weight (E,).
-
-    The leaders are those of the graph where none are named.
-    """
+    """Return the agents that no leader, by default of the graph, reaches along weights (E,)."""
     leaders = graph.leaders if leaders is None else leaders
     if not graph.directed:
         # One direction of each edge is enough, which halves the time for millions of edges.

@@ -372,10 +372,7 @@ def _extremes(L: sp.csr_array) -> tuple[Array, Array]:
 
 
 def _spread(L: sp.csr_array, vector: Array) -> Array:
-    """Return an eigenvector with entries on all components into which leaders cut a network.
-
-    Inverse iteration supplies the entries of a component on which the eigenvector vanishes.
-    """
+    """Inverse iteration gives entries to components on which the eigenvector vanishes."""
     _, piece = csgraph.connected_components(L, directed=False)
     size = np.zeros(piece.max() + 1)
     np.maximum.at(size, piece, np.abs(vector))

@@ -51,10 +51,7 @@ class Schedule(NamedTuple):
         return np.searchsorted(self.starts, times, side="right") - 1
 
     def switches(self, dt: float, horizon: float, first: int = 0) -> tuple[Array, Array]:
-        """Return the first steps (K,) of rows and the rows (K,), in steps of dt (s).
-
-        They cover a horizon (s), starting with the period of number `first`.
-        """
+        """Return first steps (K,) and rows (K,) over a horizon (s), from period `first` on."""
         rounds = 1 if self.period is None else int(np.floor(horizon / self.period)) + 1
         begins = (first + np.arange(rounds)) * (self.period or 0.0)
         times = (begins[:, None] + self.starts).reshape(-1)
@@ -94,23 +91,10 @@ class Schedule(NamedTuple):
             yield f"from {start:g} s on" if end is None else f"from {start:g} to {end:g} s"
 
 
-class United(NamedTuple):
-    """All edges of the stretches: pairs (E, 2), the largest weight of each (E,), the schedule."""
-
-    pairs: Array
-    weights: Array
-    agents: int
-    schedule: Schedule
-
-
 def unite(
     stretches: Sequence[Stretch], agents: int | None, period: float | None, directed: bool
-) -> United:
-    """Return the edges of all stretches, each once, and their schedule.
-
-    Raises:
-        GraphError: a stretch has an invalid edge, or the times do not ascend from 0.
-    """
+) -> tuple[Array, Array, int, Schedule]:
+    """Return all edges (E, 2), largest weights (E,), agents, schedule; or raise `GraphError`."""
     starts = np.array([at for at, _ in stretches], float)
     _check_times(starts, period)
     read = [split_weights(edges) for _, edges in stretches]
@@ -126,7 +110,7 @@ def unite(
     rows.setflags(write=False)
     starts.setflags(write=False)
     pairs = np.array(list(places), np.int64).reshape(-1, 2)
-    return United(pairs, rows.max(axis=0), agents, Schedule(starts, rows, period))
+    return pairs, rows.max(axis=0), agents, Schedule(starts, rows, period)
 
 
 def _check_times(starts: Array, period: float | None) -> None:

@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.reference import Guide, Reference, check_reference
+from echelon.agents.references.reference import LeaderPath, Reference, check_reference
 from echelon.core.cache import memoize
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, PlanError
@@ -24,7 +24,7 @@ _FEW, _MANY = 512, 4096
 
 
 def follow_at(
-    model: ControlAffine, reference: Guide, times: Float[Array, " T"] | Float[jax.Array, " T"]
+    model: ControlAffine, reference: LeaderPath, times: Float[Array, " T"] | Float[jax.Array, " T"]
 ) -> tuple[Any, Any]:
     """Return the states (T, n) and inputs (T, m) that follow a reference exactly at times (T,)."""
     if isinstance(times, Tracer) or len(times) > _MANY:
@@ -37,20 +37,22 @@ def follow_at(
     return x, u
 
 
-def followed_states(model: ControlAffine, reference: Guide, times: Array | jax.Array) -> jax.Array:
+def followed_states(
+    model: ControlAffine, reference: LeaderPath, times: Array | jax.Array
+) -> jax.Array:
     """Return the states (T, n) that follow a reference exactly at times (T,)."""
     # `asarray` would compile a program of its own.
     return jax.device_put(follow_at(model, reference, times)[0])
 
 
-def first_state(model: ControlAffine, reference: Guide) -> State:
+def first_state(model: ControlAffine, reference: LeaderPath) -> State:
     """Return the state (n,) that follows a reference at time zero."""
     return jax.device_put(follow_at(model, reference, np.zeros(1))[0][0])
 
 
 @cached_jit
 def _follow_all(
-    model: ControlAffine, reference: Guide, times: Array | jax.Array
+    model: ControlAffine, reference: LeaderPath, times: Array | jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     return jax.vmap(lambda t: reference.follow(model, t))(times)
 
@@ -67,12 +69,8 @@ class Targets(NamedTuple):
     inputs: Array
 
 
-def reference_targets(model: ControlAffine, reference: Guide | None, times: Array) -> Targets:
-    """Return the targets of a leader: its reference by the model's flatness map, or its trim.
-
-    Raises:
-        PlanError: the model has no such map, or the reference is not finite.
-    """
+def reference_targets(model: ControlAffine, reference: LeaderPath | None, times: Array) -> Targets:
+    """Return a leader's targets: its reference by `flat`, or its trim; else raise `PlanError`."""
     # Without a reference a leader stays at rest, at its trim.
     if reference is None:
         x = np.tile(np.asarray(model.trim[0], float), (len(times), 1))
@@ -98,10 +96,7 @@ def shifted_targets(model: ControlAffine, targets: Targets, offset: Array) -> Ta
 
 
 def mean_targets(model: ControlAffine, states: Array, inputs: Array, share: Array) -> Targets:
-    """Return the mean of targets with states (J, T, n) and inputs (J, T, m), by shares (J,).
-
-    A sum of squared errors to several targets equals that to their mean plus a constant.
-    """
+    """Return the mean of targets (J, T, ..) by shares (J,); squared errors differ by a constant."""
     return _targets(model, np.tensordot(share, states, 1), np.tensordot(share, inputs, 1))
 
 
@@ -158,27 +153,20 @@ _NEAR = 1e-3
 @memoize
 @np.errstate(over="ignore", invalid="ignore")
 def reference_demand(
-    model: ControlAffine, reference: Guide, horizon: float, samples: int = _SAMPLES
+    model: ControlAffine, reference: LeaderPath, horizon: float
 ) -> ReferenceDemand:
-    """Return the demand of a reference on a model that can be led along it.
-
-    Args:
-        model: the agent.
-        reference: to be followed exactly.
-        horizon: s.
-        samples: number of times at which the demand is computed.
-    """
+    """Return the demand of a reference on a model that it can lead, over a horizon (s)."""
     near = min(_NEAR, 1e-2 * horizon)
-    times = np.linspace(near, horizon - near, samples)
+    times = np.linspace(near, horizon - near, _SAMPLES)
     with precision("float64"):
         x, u = follow_at(model, reference, np.concatenate([times - near, times, times + near]))
-        before, now, after = x.reshape(3, samples, -1)
-        inputs = u.reshape(3, samples, -1)[1]
-        rate = np.asarray(_rate(model, before, now, after, near))
-        velocities = np.asarray(_velocities(model, now, inputs))
+        x = x.reshape(3, _SAMPLES, -1)
+        inputs = u.reshape(3, _SAMPLES, -1)[1]
+        rate = np.asarray(_rate(model, *x, near))
+        velocities = np.asarray(_velocities(model, x[1], inputs))
     ratios = demand(model, inputs)
     k = int(np.argmax(ratios))
-    speed, acceleration = _motion(model, x.reshape(3, samples, -1), near)
+    speed, acceleration = _motion(model, x, near)
     root = np.sqrt(np.asarray(model.weights[0], float))
     away = root * np.abs(rate - velocities)
     j, i = np.unravel_index(int(away.argmax()), away.shape)
@@ -195,16 +183,9 @@ def reference_demand(
 
 
 def reference_warnings(
-    model: ControlAffine, reference: Guide, horizon: float, limits: bool = True
+    model: ControlAffine, reference: LeaderPath, horizon: float, limits: bool = True
 ) -> tuple[str, ...]:
-    """Return one sentence with its numbers for each fault of a reference.
-
-    Args:
-        model: the agent; it can be led along the reference.
-        reference: to be followed exactly.
-        horizon: s.
-        limits: whether the actuators' limits apply.
-    """
+    """Return one sentence with its numbers for each fault of a reference that leads a model."""
     required, model_name = reference_demand(model, reference, horizon), type(model).__name__
     name, warnings = type(reference).__name__, [*reference.remarks()]
     times = np.linspace(0.0, horizon, _SAMPLES)
@@ -229,7 +210,7 @@ def reference_warnings(
 
 
 def without_heading(
-    model: ControlAffine, reference: Guide, times: Float[Array, " T"]
+    model: ControlAffine, reference: LeaderPath, times: Float[Array, " T"]
 ) -> Bool[np.ndarray, " T"]:
     """Return when a path has speed 0, of a model that has no state at rest, such as a unicycle."""
     if not isinstance(reference, Reference) or model.flat_order < 1:
@@ -244,7 +225,7 @@ def without_heading(
     return np.linalg.norm(rates, axis=0) <= _AT_REST
 
 
-def _turned_over(model: ControlAffine, reference: Guide, horizon: float) -> Iterator[str]:
+def _turned_over(model: ControlAffine, reference: LeaderPath, horizon: float) -> Iterator[str]:
     """Yield where a derivative of a path passes a bound of the model, as a tilt beyond 90 deg."""
     # A bound on a length of several outputs is one on the speed, and holds at rest for no path.
     bounds = [bound for bound in model.flat_bounds or () if len(bound.outputs) == 1]
@@ -283,7 +264,7 @@ def infeasible(model: ControlAffine, required: ReferenceDemand) -> str:
     )
 
 
-def flat_inputs(model: ControlAffine, reference: Guide, times: Array) -> Array:
+def flat_inputs(model: ControlAffine, reference: LeaderPath, times: Array) -> Array:
     """Return the inputs (T, m) that follow a reference exactly, by the model's flatness map."""
     # Up to four nested derivatives of a path leave too few digits in float32 to judge limits.
     with precision("float64"):
@@ -291,10 +272,7 @@ def flat_inputs(model: ControlAffine, reference: Guide, times: Array) -> Array:
 
 
 def demand(model: ControlAffine, inputs: Array) -> Array:
-    """Return the share of the actuators' range about the trim that each input (T, m) uses, (T,).
-
-    One is the limit; without limits it is zero.
-    """
+    """Return the used share (T,) of the actuators' range about the trim; 0 without limits."""
     if model.input_limits is None:
         return np.zeros(len(inputs))
     G, low, high = (np.asarray(part, float) for part in model.input_limits)
@@ -326,7 +304,6 @@ def _velocities(model: ControlAffine, states: jax.Array, inputs: jax.Array) -> j
 def _derivative(
     reference: Reference, times: jax.Array, names: tuple[str, ...], order: int
 ) -> jax.Array:
-    """Return one derivative (T,) of one output of a path."""
     return jax.vmap(lambda t: reference.derivatives(t, order, names)[order, 0])(times)
 
 

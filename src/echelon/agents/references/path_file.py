@@ -85,7 +85,6 @@ def _columns(
 
 
 def _head(place: str, cells: list[str], names: Sequence[str], optional: Sequence[str]) -> list[str]:
-    """Return the names of a file's columns."""
     # NumPy writes its header as a comment, and other programs end lines with a comma.
     head = [cell.strip() for cell in ",".join(cells).lstrip("# ").rstrip(", ").split(",")]
     known = {name.lower(): name for name in names}
@@ -103,7 +102,6 @@ def _head(place: str, cells: list[str], names: Sequence[str], optional: Sequence
 
 
 def _row(place: str, head: Sequence[str], cells: Sequence[str]) -> list[float]:
-    """Return the numbers of a line."""
     cells = cells[:-1] if len(cells) == len(head) + 1 and not cells[-1].strip() else cells
     if len(cells) != len(head):
         raise ReferenceError(

@@ -6,10 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from echelon.agents.references.reference import Reference, check_finite, in_space, yaw_at
+from echelon.agents.references.reference import Reference, check_finite, in_space
 from echelon.core.types import Scalar
-
-# ---- straight ------------------------------------------------------------------------------------
 
 _Vector = tuple[float, ...]
 
@@ -22,13 +20,12 @@ class Hover(Reference):
     yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
-        """Refuse what is not finite."""
         check_finite(self, position=(self.position, 3), **_turning(self))
 
     def __call__(self, t: Scalar) -> jax.Array:
-        """Return the point."""
+        """Return the point at time t."""
         # In the precision of t, which is that of the run.
-        return in_space(jnp.asarray(self.position, t.dtype), yaw_at(self, t))
+        return in_space(jnp.asarray(self.position, t.dtype), self.yaw + self.yaw_rate * t)
 
 
 class Line(Reference):
@@ -40,22 +37,18 @@ class Line(Reference):
     yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
-        """Refuse what is not finite."""
         check_finite(self, start=(self.start, 3), velocity=(self.velocity, 3), **_turning(self))
 
     def __call__(self, t: Scalar) -> jax.Array:
         """Return the point at time t."""
         return in_space(
             jnp.asarray(self.start, t.dtype) + t * jnp.asarray(self.velocity, t.dtype),
-            yaw_at(self, t),
+            self.yaw + self.yaw_rate * t,
         )
 
 
 def _turning(path: Hover | Line) -> dict[str, object]:
     return {"yaw": (path.yaw, None), "yaw_rate": (path.yaw_rate, None)}
-
-
-# ---- periodic ------------------------------------------------------------------------------------
 
 
 class Periodic(Reference):
@@ -76,7 +69,6 @@ class Periodic(Reference):
         """Return the point (x, y) of the loop about the center at an angle (rad)."""
 
     def __check_init__(self) -> None:
-        """Reject numbers that are not finite."""
         names = ("rate", "phase", "yaw", "yaw_rate")
         check_finite(self, center=(self.center, 3), **{n: (getattr(self, n), None) for n in names})
 
@@ -86,7 +78,7 @@ class Periodic(Reference):
         cx, cy, cz = self.center
         # Plain numbers would stack in a type of their own, and not in that of t.
         zero = jnp.zeros_like(x)
-        return jnp.stack([cx + x, cy + y, cz + zero, yaw_at(self, t) + zero])
+        return jnp.stack([cx + x, cy + y, cz + zero, self.yaw + self.yaw_rate * t + zero])
 
 
 class Lemniscate(Periodic):
@@ -108,7 +100,6 @@ class Lemniscate(Periodic):
     yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
-        """Reject numbers that are not finite."""
         check_finite(self, amplitude=(self.amplitude, 2))
 
     def loop(self, angle: Scalar) -> tuple[Scalar, Scalar]:
@@ -134,7 +125,6 @@ class FigureEight(Periodic):
     yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
-        """Reject numbers that are not finite."""
         check_finite(self, amplitude=(self.amplitude, 2))
 
     def loop(self, angle: Scalar) -> tuple[Scalar, Scalar]:
@@ -158,7 +148,6 @@ class Circle(Periodic):
     yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
-        """Reject numbers that are not finite."""
         check_finite(self, radius=(self.radius, None))
 
     def loop(self, angle: Scalar) -> tuple[Scalar, Scalar]:

@@ -19,8 +19,6 @@ from echelon.core.errors import ReferenceError, check_kind
 from echelon.core.numerics import precision
 from echelon.core.types import Array, PathLike, Scalar
 
-# ---- the common base -----------------------------------------------------------------------------
-
 
 class PolynomialPath(Reference):
     """Polynomials of degree 7 between times, constant before and after; abstract.
@@ -77,9 +75,6 @@ def _horner(coefficients: Array | jax.Array, s: Scalar | float) -> Any:
     return value
 
 
-# ---- through timed points ------------------------------------------------------------------------
-
-
 class Waypoints(PolynomialPath):
     """The spline of degree 7 through `points` at `times`, at rest at both ends.
 
@@ -112,7 +107,6 @@ class Waypoints(PolynomialPath):
         yaw: float | Sequence[float] | Array = 0.0,
         degrees: bool = False,
     ) -> None:
-        """Fit the spline."""
         t, p = _checked_points(times, points)
         self.degrees = degrees
         self.knots, self.coefficients = t, _fit(t, np.column_stack([p, _yaws(yaw, degrees, t)]))
@@ -159,7 +153,6 @@ class Waypoints(PolynomialPath):
 def _checked_points(
     times: Sequence[float] | Array, points: Sequence[Sequence[float]] | Array
 ) -> tuple[Array, Array]:
-    """Return times (K,) and points (K, 3), after checking both."""
     t, p = numbers_of(times), numbers_of(points)
     if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
         listed = times.tolist() if isinstance(times, np.ndarray) else times
@@ -176,7 +169,6 @@ def _checked_points(
 
 
 def _yaws(yaw: float | Sequence[float] | Array, degrees: bool, times: Array) -> Float[Array, " K"]:
-    """Return the yaw (rad) at each time."""
     values = numbers_of(yaw)
     if values.shape not in ((), times.shape) or not np.isfinite(values).all():
         raise ReferenceError(
@@ -202,8 +194,6 @@ def _fit(times: Float[Array, " K"], points: Float[Array, "K 4"]) -> Float[Array,
     coefficients[:-1, :, (points == points[0]).all(axis=0)] = 0.0
     return coefficients
 
-
-# ---- pieces and their files ----------------------------------------------------------------------
 
 _COLUMNS = ("duration", *(f"{name}^{k}" for name in COORDINATES for k in range(8)))
 _ORDERS = 4
@@ -245,7 +235,6 @@ class Polynomials(PolynomialPath):
         durations: Sequence[float] | Array,
         coefficients: Sequence[Sequence[Sequence[float]]] | Array,
     ) -> None:
-        """Join the pieces."""
         spans, powers = _checked(durations, coefficients)
         for piece, fault in _faults(spans, powers):
             raise ReferenceError(f"piece {piece} of `Polynomials` {fault}.")
@@ -377,7 +366,6 @@ def _between(spans: Float[Array, " P"], ends: Float[Array, "P 2 4 4"]) -> Float[
 
 
 def _of_polynomials(path: PolynomialPath) -> Polynomials:
-    """Return the pieces of a path of polynomials from time 0 on."""
     knots, powers = path.knots, np.moveaxis(path.coefficients[::-1], 0, 2)
     ahead = knots[1:] > 0.0
     begin = np.maximum(knots[:-1], 0.0) - knots[:-1]

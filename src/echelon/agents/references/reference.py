@@ -3,7 +3,7 @@
 import abc
 import functools
 from collections.abc import Callable, Sequence
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,8 @@ from echelon.core.numerics import derivatives, precision
 from echelon.core.trace import call_once_traced, check_array, checked_trace
 from echelon.core.types import Array, Declared, Input, Scalar, State
 
-# ---- a motion of a model -------------------------------------------------------------------------
 
-
-class Guide(Declared):
+class LeaderPath(Declared):
     """The motion that a leader follows: a path in space, or one of states and inputs."""
 
     @abc.abstractmethod
@@ -46,29 +44,19 @@ class Guide(Declared):
 
     @abc.abstractmethod
     def check(self) -> None:
-        """Check the values that the reference returns.
-
-        Raises:
-            ReferenceError: it is malformed.
-        """
+        """Raise `ReferenceError` if the values that the reference returns are malformed."""
 
     @abc.abstractmethod
     def fit(self, model: ControlAffine) -> None:
-        """Check that a model can be led along it.
+        """Raise `LawError`, which says why, unless a model can be led along it."""
 
-        Raises:
-            LawError: it cannot; the message says why.
-        """
-
-
-# ---- a path in space -----------------------------------------------------------------------------
 
 COORDINATES = ("x", "y", "z", "yaw")
 _MAX_TIME = 10**9
 """s; thirty years, longer than any run."""
 
 
-class Reference(Guide):
+class Reference(LeaderPath):
     """A path t -> (x, y, z, yaw), in metres and radians; t in seconds."""
 
     joined: ClassVar[int] = 0
@@ -142,7 +130,6 @@ def _derivatives(path: Reference, chosen: tuple[int, ...], order: int, t: Scalar
 
 
 def _heading_coordinate(model: ControlAffine) -> int | None:
-    """Return the index of the coordinate that is the model's heading, if one is."""
     name = heading_of(model).state
     return COORDINATES.index(name) if name in COORDINATES and name in model.flat_outputs else None
 
@@ -164,7 +151,6 @@ def _turns(reference: Reference, index: int, rest: float) -> bool:
 
 @memoize
 def _check_map(model: ControlAffine) -> None:
-    """Trace the flatness map, and check the state and the input that it returns."""
     name, shapes = type(model).__name__, (len(model.state_names), len(model.input_names))
     with precision("float64"):
         returned = checked_trace(
@@ -208,43 +194,16 @@ def numbers_of(value: object) -> Array:
 
 
 def check_kind_of(reference: object) -> None:
-    """Check that a value is a reference.
-
-    Raises:
-        ReferenceError: it is not.
-    """
+    """Raise `ReferenceError` unless a value is a reference."""
     # A path of states is one too, but users know the name `Reference`.
-    kind = Guide if isinstance(reference, Guide) else Reference
+    kind = LeaderPath if isinstance(reference, LeaderPath) else Reference
     check_kind("reference", reference, kind, ReferenceError)
 
 
-def check_reference(reference: Guide) -> None:
-    """Check that a value is a reference, and the values that it returns.
-
-    Raises:
-        ReferenceError: it is none, or returns anything but (x, y, z, yaw).
-    """
+def check_reference(reference: LeaderPath) -> None:
+    """Raise `ReferenceError` unless a value is a reference, which returns what it must."""
     check_kind_of(reference)
     reference.check()
-
-
-class Yawing(Protocol):
-    """A path whose yaw (rad) grows at a constant rate (rad/s)."""
-
-    @property
-    def yaw(self) -> float:
-        """At time 0."""
-        ...
-
-    @property
-    def yaw_rate(self) -> float:
-        """Of its growth."""
-        ...
-
-
-def yaw_at(path: Yawing, t: Scalar) -> jax.Array:
-    """Return the yaw (rad) of a path at time t."""
-    return path.yaw + path.yaw_rate * t
 
 
 def in_space(point: jax.Array, yaw: float | jax.Array) -> jax.Array:

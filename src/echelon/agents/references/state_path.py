@@ -8,7 +8,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.path_file import read_columns
-from echelon.agents.references.reference import Guide, numbers_of
+from echelon.agents.references.reference import LeaderPath, numbers_of
 from echelon.core.errors import LawError, ReferenceError, listing
 from echelon.core.types import Array, Input, PathLike, Scalar, State
 
@@ -16,7 +16,7 @@ _Rows = Sequence[Sequence[float]]
 
 
 @final
-class StatePath(Guide):
+class StatePath(LeaderPath):
     """A path through states (K, n) with inputs (K, m) at times (K,), for any model.
 
     Between knots the input is linear and each state a cubic with slopes f + g u at the knots
@@ -38,7 +38,6 @@ class StatePath(Guide):
     inputs: Array
 
     def __init__(self, times: Sequence[float], states: _Rows, inputs: _Rows) -> None:
-        """Check the knots."""
         self.times = numbers_of(times)
         if self.times.ndim != 1 or len(self.times) < 2 or not (np.diff(self.times) > 0).all():
             raise ReferenceError(

@@ -36,7 +36,6 @@ class Actuator:
     minimum: float | None = None
 
     def __post_init__(self) -> None:
-        """Check every number."""
         for name, value in (("lag", self.lag), ("minimum", self.minimum or 0.0)):
             if not (is_number(value) and 0.0 <= float(value) < math.inf):
                 raise SimulationError(
@@ -79,7 +78,6 @@ class Actuator:
         return MotorArrays(lag, mixing, np.linalg.inv(mixing), low, least, step)
 
     def __str__(self) -> str:
-        """Return the actuators in words."""
         parts = [f"lag {1e3 * self.lag:g} ms"] if self.lag else []
         parts += [f"{self.levels} levels"] if self.levels else []
         parts += [f"at least {self.minimum:g} a motor"] if self.minimum is not None else []

@@ -58,7 +58,6 @@ class Disturbance:
     drag: float = 0.0
 
     def __post_init__(self) -> None:
-        """Reject numbers that are not finite, and negative ones where only positive are allowed."""
         for what in ("constant", "rms", "input_rms"):
             least = -math.inf if what == "constant" else 0.0
             for name, value in getattr(self, what).items():
@@ -102,7 +101,6 @@ class Disturbance:
             )
 
     def __str__(self) -> str:
-        """Return the disturbance in words."""
         parts = [
             f"{what} " + ", ".join(f"`{name}` {value:g}" for name, value in named.items())
             for what, named in (
@@ -240,7 +238,6 @@ def disturbed(
 
 
 def _by_input(model: ControlAffine, named: Mapping[str, float]) -> Array:
-    """Return a number for each input, (m,)."""
     for name in named:
         if name not in model.input_names:
             raise ModelError(

@@ -15,11 +15,10 @@ from jaxtyping import Float
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import SimulationError, is_number
+from echelon.core.linear import discretize
 from echelon.core.numerics import Draw, key_of, normals, rk4
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Estimation
-
-# ---- a filter with a constant gain ---------------------------------------------------------------
 
 _INPUT, _PUSH, _DRIFT = 0.1, 1.0, 0.01
 """Densities, by the root of a second: of what acts beside the inputs, in normalized ones; of how
@@ -63,20 +62,15 @@ class Estimator(eqx.Module):
 
     @classmethod
     def of(cls, model: ControlAffine, std: Float[Array, " n"], late: int, dt: float) -> "Estimator":
-        """Return the filter of a model whose states are measured with deviations (n,).
-
-        Raises:
-            SimulationError: the Riccati equation has no solution.
-        """
+        """Return the filter for measurements with deviations (n,), else raise `SimulationError`."""
         n, names = len(model.state_names), model.state_groups.get("velocity", ())
         pushed = tuple(model.state_names.index(name) for name in names)
         A, B = linearize(model)
         size, m = n + len(pushed), B.shape[1]
-        whole = np.zeros((size + m, size + m))
-        whole[:n, :n], whole[:n, size:] = A, B
-        whole[list(pushed), range(n, size)] = 1.0
-        step = scipy.linalg.expm(dt * whole)
-        F, G = step[:size, :size], step[:size, size:]
+        rates, entries = np.zeros((size, size)), np.zeros((size, m))
+        rates[:n, :n], entries[:n] = A, B
+        rates[list(pushed), range(n, size)] = 1.0
+        F, G = discretize(rates, entries, dt)
         drift = np.append(np.full(n, _DRIFT), np.full(len(pushed), _PUSH))
         Q = _INPUT**2 / dt * G @ G.T + np.diag(dt * drift**2)
         C, R = np.eye(n, size), np.diag(np.maximum(std, _EXACT) ** 2)
@@ -99,10 +93,7 @@ class Estimator(eqx.Module):
     def measure(
         self, model: ControlAffine, before: Estimate, y: State, first: jax.Array
     ) -> tuple[State, Estimate]:
-        """Return the state now, and the estimate as of a measurement y (n,).
-
-        The `first` one is taken as it is.
-        """
+        """Return the state now and the estimate at a measurement y (n,), the `first` as it is."""
         x = jnp.where(first, y, self._moved(model, before.x, before.push, before.inputs[0]))
         more = jnp.asarray(self.gain, x.dtype) @ model.difference(y, x)
         x, push = x + more[: len(x)], before.push + more[len(x) :]
@@ -116,15 +107,10 @@ class Estimator(eqx.Module):
         return estimate._replace(inputs=jnp.concatenate([estimate.inputs[1:], u[None]]))
 
     def _moved(self, model: ControlAffine, x: State, push: jax.Array, u: Input) -> State:
-        """Return the state a step later."""
-
         def velocity(x: State, u: Input) -> State:
             return model.velocity(x, u).at[np.array(self.pushed, int)].add(push)
 
         return rk4(velocity, x, u, self.dt)
-
-
-# ---- sensors -------------------------------------------------------------------------------------
 
 
 @final
@@ -151,7 +137,6 @@ class Sensing:
     estimator: Estimation = Estimation.NONE
 
     def __post_init__(self) -> None:
-        """Check every number."""
         for name, value in (("delay", self.delay), *self.noise.items()):
             if not (is_number(value) and 0.0 <= float(value) < math.inf):
                 what = "`delay`" if name == "delay" else f"`noise` of `{name}`"
@@ -194,7 +179,6 @@ class Sensing:
         return Sensors(std if std.any() else None, key, late, estimator)
 
     def __str__(self) -> str:
-        """Return the sensing in words."""
         parts = [f"{1e3 * self.delay:g} ms late"] if self.delay else []
         parts += ["noise " + ", ".join(f"`{k}` {v:g}" for k, v in self.noise.items())] * bool(
             self.noise

@@ -15,8 +15,6 @@ from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.sensing import Sensing
 from echelon.core.errors import ModelError, SimulationError, did_you_mean, listing
 
-# ---- agents that differ from the model -----------------------------------------------------------
-
 
 def vary_parameters(
     model: ControlAffine, parameters: Mapping[str, Any], scale: Mapping[str, float]
@@ -57,7 +55,6 @@ def vary_parameters(
 
 
 def _scale_value(value: Any, factor: float) -> Any:
-    """Return a number, an array, or nested tuples of numbers times a factor; None where neither."""
     # True is a number to Python, but a switch cannot be scaled.
     if isinstance(value, bool | str):
         return None
@@ -72,11 +69,7 @@ def _scale_value(value: Any, factor: float) -> Any:
 
 
 def check_plant(model: ControlAffine, plant: ControlAffine) -> None:
-    """Check that a plant has the states and inputs of the model.
-
-    Raises:
-        ModelError: it does not.
-    """
+    """Raise `ModelError` unless a plant has the states and inputs of the model."""
     for what in ("state_names", "input_names"):
         expected, got = getattr(model, what), getattr(plant, what)
         if expected != got:
@@ -101,21 +94,17 @@ def differences(model: ControlAffine, plant: ControlAffine) -> str:
 
 
 def _as_lists(value: Any) -> Any:
-    """Return lists for tuples and arrays."""
     # Arrays compare entry by entry, lists as a whole.
     value = value.tolist() if isinstance(value, np.ndarray) else value
     return list(map(_as_lists, value)) if isinstance(value, tuple | list) else value
 
 
 def _format_value(value: Any) -> str:
-    """Return a parameter as text with six digits."""
     value = _as_lists(value)
     if isinstance(value, list):
         return f"({', '.join(map(_format_value, value))})"
     return f"{value:.6g}" if isinstance(value, numbers.Real) else str(value)
 
-
-# ---- the world -----------------------------------------------------------------------------------
 
 LATE = "messages are late or lost"
 

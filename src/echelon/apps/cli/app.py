@@ -20,12 +20,10 @@ from typing import Annotated, Final
 import typer
 
 from echelon import __version__
-from echelon.apps.cli.export_command import export
+from echelon.apps.cli.export_command import export, path, report
 from echelon.apps.cli.fly_command import fly
 from echelon.apps.cli.list_command import doctor, explain, init, list_, schema
 from echelon.apps.cli.options import EchelonCommand, EchelonGroup
-from echelon.apps.cli.path_command import path
-from echelon.apps.cli.report_command import report
 from echelon.apps.cli.run_command import run, sweep
 from echelon.apps.cli.show_command import live, plot, video, view
 from echelon.apps.cli.study_command import check, compare, design

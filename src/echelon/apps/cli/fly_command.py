@@ -98,11 +98,7 @@ def _check_version() -> None:
 def _check(
     agent: int | None, every: bool, ground: bool, key: Path | None, link: str, out: Path | None
 ) -> None:
-    """Check what can be, before the laws are written, which takes long.
-
-    Raises:
-        FlightError: options do not fit each other, or echelon_flight refuses the link or the key.
-    """
+    """Check what can be, before the laws are written, which takes long."""
     from echelon_flight.mission import check_options
 
     tasks = [agent is not None, every, ground, out is not None]
@@ -112,7 +108,6 @@ def _check(
 
 
 def _prepare(scenario: str, changes: list[str], out: Path | None) -> Path:
-    """Write the folder of a flight, and return it."""
     from echelon.experiments.scenario.scenario import load_scenario
 
     loaded = load_scenario(scenario, changes)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def init(folder: Annotated[Path, typer.Argument(help="A new folder, such as my-swarm.")]) -> None:
     """Create a folder with a scenario, a model, a law and a notebook that run as they are."""
-    from echelon.output.archive.starter_folder import create_starter
+    from echelon.output.archive.folder import create_starter
 
     files = create_starter(folder)
     print(f"- Written to {folder}: {', '.join(file.name for file in files)}.")

@@ -28,8 +28,7 @@ ResumedFiguresOption = Annotated[
     ),
 ]
 FolderOption = Annotated[
-    Path | None,
-    typer.Option("--out", help="Output folder (default: a new folder in runs/)."),
+    Path | None, typer.Option("--out", help="Output folder (default: a new folder in runs/).")
 ]
 ForceOption = Annotated[
     bool, typer.Option("--force", help="Replace earlier output of echelon in --out.")
@@ -101,7 +100,6 @@ class EchelonCommand(TyperCommand):
 
 
 def _name_key(option: str, words: list[str], command: str) -> None:
-    """Raise an error with `--set KEY=VALUE` for an option that is a key of the scenario."""
     # Not above: pydantic takes long to load.
     from echelon.experiments.scenario.key_paths import places_of, sections_among
     from echelon.experiments.scenario.scenario import Scenario

@@ -25,22 +25,16 @@ if TYPE_CHECKING:
     from echelon.experiments.sweeps.workers import SweepBatch
     from echelon.output.archive.chunks import Chunks
     from echelon.output.archive.study_folder import Batches
-    from echelon.simulation.engine.record import Stretch
+    from echelon.simulation.engine.record import Segment
     from echelon.simulation.engine.result import Result
     from echelon.simulation.engine.simulate import RunSoFar
 
 
 @final
 class Job:
-    """Work of a command whose results are stored part by part.
-
-    Args:
-        command: that computes it.
-        chunks: the parts that are stored.
-    """
+    """Work of a command whose results are stored part by part."""
 
     def __init__(self, command: Literal["run", "sweep"], chunks: "Chunks") -> None:
-        """Store the parts in the folder of the chunks."""
         self.command, self.chunks = command, chunks
 
     @property
@@ -143,7 +137,6 @@ def run(
 def _new_run(
     name: str, changes: Sequence[str], out: Path | None, force: bool, quiet: bool, figures: bool
 ) -> "tuple[Scenario, Experiment, Job]":
-    """Return the scenario, its parts, and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
 
     scenario = load_scenario(name, changes)
@@ -162,7 +155,6 @@ def _new_run(
 
 
 def _unfinished_run(folder: Path) -> "tuple[Scenario, Experiment, Job]":
-    """Return the scenario, its parts, and the job in a folder."""
     from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
     from echelon.output.archive.chunks import Chunks
 
@@ -182,22 +174,21 @@ def _simulate(
     watched: "WatchedRun | None",
     quiet: bool,
 ) -> "Result":
-    """Return the run, which is stored and shown while it is computed."""
     from echelon.experiments.scenario import build
     from echelon.simulation.step.drive import Stopped
 
-    def store(stretch: "Stretch") -> None:
+    def store(segment: "Segment") -> None:
         if watched is not None:
-            watched.add(stretch)
+            watched.add(segment)
         try:
-            job.chunks.write(stretch)
+            job.chunks.write(segment)
         except OSError as error:
             raise Stopped(f"its folder cannot be written: {error.strerror or error},") from error
 
     stored = job.chunks.read()
     if watched is not None:
-        for stretch in stored:
-            watched.add(stretch)
+        for segment in stored:
+            watched.add(segment)
     horizon = f"{experiment.settings.horizon:g} s of {experiment.parts.graph.agents} agents"
     STATUS.begin(f"simulating {scenario.name}, {horizon}", not quiet)
     with job.cleanup():
@@ -242,39 +233,33 @@ def _write(job: Job, result: "Result", figures: bool, quiet: bool) -> None:
 
 @final
 class WatchedRun:
-    """A run whose page shows each part as soon as it is computed; a fault of the page ends nothing.
-
-    Args:
-        scenario: of the run.
-        experiment: that it describes.
-    """
+    """A run whose page shows each part once it is computed; a fault of the page ends nothing."""
 
     def __init__(self, scenario: "Scenario", experiment: "Experiment") -> None:
-        """Prepare the page, as far as it is known before the run."""
         from echelon.experiments.results.lyapunov import fixed_metric, potential
-        from echelon.experiments.results.recording import foreseen
-        from echelon.guarantees.promises.promise import promise
+        from echelon.experiments.results.recording import empty_recording
+        from echelon.guarantees.promises.promise import guarantee
         from echelon.output.viewer.replay import Growing
         from echelon.simulation.engine.prepare import prepare
 
         prepared = prepare(*experiment)
         parts, settings = prepared.parts, prepared.problem.settings
         self.formation = parts.formation
-        guarantee = promise(parts, settings).as_mapping()
-        self.run = foreseen(parts, settings, prepared.problem.states, scenario.name, guarantee)
+        stated = guarantee(parts, settings).as_mapping()
+        self.run = empty_recording(parts, settings, prepared.problem.states, scenario.name, stated)
         # The V of a P that turns is computed only at the end.
         P = None if parts.formation.motion is not None else fixed_metric(parts)
         self.potential = None if P is None else potential(parts.model, parts.graph, P)
         self.page = Growing(self.run)
 
-    def add(self, stretch: "Stretch") -> None:
+    def add(self, segment: "Segment") -> None:
         """Show a part that was computed."""
         from echelon.experiments.results.recording import so_far
 
         # An agent without finite numbers cannot be drawn; the page says so at the end.
-        if stretch.finite:
+        if segment.finite:
             with contextlib.suppress(OutputError):
-                self.page.add(so_far(self.run, stretch, self.potential, self.formation))
+                self.page.add(so_far(self.run, segment, self.potential, self.formation))
 
     def show_all(self, folder: Path) -> None:
         """Show the complete run until Ctrl-C."""
@@ -365,7 +350,6 @@ def _new_sweep(
     keep_states: int | None,
     quiet: bool,
 ) -> "tuple[Sweep, Batches, Job]":
-    """Return a sweep and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
 
     scenario = load_scenario(name, changes)
@@ -386,7 +370,6 @@ def _new_sweep(
 
 
 def _unfinished_sweep(folder: Path) -> "tuple[Sweep, Batches, Job]":
-    """Return the sweep and the job in a folder."""
     from echelon.output.archive.study_folder import Batches
 
     batches = Batches(folder)

@@ -210,7 +210,6 @@ def plot(
 
 
 def _drawings(run: Path, names: Sequence[str], paper: bool) -> "dict[str, Figure]":
-    """Return the figures of a run in all sizes, by the names of their files."""
     from echelon.output.archive.run_folder import load
     from echelon.output.plots.run_figures import figures
     from echelon.output.plots.style import ONE_COLUMN, SCREEN, TWO_COLUMNS
@@ -229,8 +228,7 @@ def video(
     file: Annotated[Path, typer.Argument(help="The video file, ending in .mp4 or .gif.")],
     speed: Annotated[float, typer.Option(help="Playback speed; 2 plays twice as fast.")] = 1.0,
     size: Annotated[
-        str | None,
-        typer.Option(metavar="WxH", help="Pixels (default: 960x540, of a GIF 640x360)."),
+        str | None, typer.Option(metavar="WxH", help="Pixels (default: 960x540, of a GIF 640x360).")
     ] = None,
     fps: Annotated[
         float | None, typer.Option(help="Pictures a second (default: 25, of a GIF 12.5).")
@@ -268,11 +266,6 @@ def video(
 
 
 def _pixels(size: str) -> tuple[int, int]:
-    """Return width and height.
-
-    Raises:
-        OutputError: the text is no size that a video can have.
-    """
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", size)
     width, height = map(int, found.groups()) if found else (0, 0)
     fits = _WIDTHS[0] <= width <= _WIDTHS[1] and width / 3 <= height <= 1.5 * width

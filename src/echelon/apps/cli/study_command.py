@@ -97,7 +97,6 @@ def design(
 
 
 def _draw(parts: "Parts", settings: "Settings", folder: Path, states: str | None) -> str | None:
-    """Draw a design's figures, and return a sentence on its radii if it has any."""
     from echelon.output.plots.study_figures import save_design_figures
 
     with write_errors(folder):
@@ -155,7 +154,6 @@ def _compare(
     figures: bool,
     quiet: bool,
 ) -> "Comparison":
-    """Simulate all methods on a scenario, print the results, and write them."""
     from echelon.experiments.studies.compare import compare as simulate
     from echelon.output.archive.study_folder import Flights, write_comparison
     from echelon.output.reports.comparison_report import (

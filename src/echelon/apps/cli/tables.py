@@ -176,11 +176,11 @@ def foretell(experiment: "Experiment", quiet: bool) -> None:
     if quiet or STATUS.silent:
         return
     from echelon.experiments.studies.design import forecast
-    from echelon.guarantees.promises.promise import promise
+    from echelon.guarantees.promises.promise import guarantee
     from echelon.simulation.engine.prepare import prepare
 
     warn(prepare(*experiment).warnings)
-    if sys.stderr.isatty() or not promise(*experiment).promised:
+    if sys.stderr.isatty() or not guarantee(*experiment).promised:
         print(f"echelon: {forecast(*experiment)}", file=sys.stderr, flush=True)
 
 

@@ -49,7 +49,6 @@ class Stop:
     """
 
     def __init__(self) -> None:
-        """Begin without a signal."""
         self.number: int | None = None
 
     @property
@@ -153,7 +152,6 @@ class Status:
     """
 
     def __init__(self) -> None:
-        """Begin without a stream."""
         self._stream: Stream | None = None
         self._text, self._drawn, self._written = "", False, 0.0
         self._first: tuple[float, float] | None = None

@@ -15,7 +15,7 @@ from echelon.apps.cli.terminal import STATUS
 
 if TYPE_CHECKING:
     from echelon.core.types import JsonObject
-    from echelon.guarantees.verifier.findings import Finding
+    from echelon.guarantees.verifier.findings import CheckResult
     from echelon.guarantees.verifier.verify import Verification
     from echelon.output.archive.verify_folder import ClaimFiles
 
@@ -77,7 +77,6 @@ def _advice(
     obstacle: str,
     scenario: str | None,
 ) -> "Iterator[str]":
-    """Yield how what is open can be checked, and what a refusal may come from."""
     from echelon.guarantees.verifier.agent_claims import MODEL
     from echelon.guarantees.verifier.verify import PROMISE
 
@@ -92,7 +91,6 @@ def _advice(
 
 
 def _other_version(file: Path, files: "ClaimFiles") -> "Iterator[str]":
-    """Yield that a run was written by another version, if its summary says so, and what to do."""
     if files.claims is None:
         return
     from echelon.core.files import versions
@@ -108,7 +106,6 @@ def _other_version(file: Path, files: "ClaimFiles") -> "Iterator[str]":
 
 
 def _as_mapping(verification: "Verification") -> "JsonObject":
-    """Return a verification ready for JSON."""
     return {
         "verdict": verification.verdict,
         "holds": verification.holds,
@@ -118,11 +115,8 @@ def _as_mapping(verification: "Verification") -> "JsonObject":
 
 
 def _print_verification(verification: "Verification", run: Path | None) -> None:
-    """Print what was checked by which means, the reasons of what is not verified, and the verdict.
-
-    `run` is the folder if the claims are of a whole run.
-    """
-    by = {"recomputed": list["Finding"](), "independent": list["Finding"]()}
+    """`run` is the folder if the claims are of a whole run."""
+    by = {"recomputed": list["CheckResult"](), "independent": list["CheckResult"]()}
     for finding in verification.findings:
         by["recomputed" if finding.by_scenario else "independent"].append(finding)
     _print_rows("By independent code", [x[:4] for x in by["independent"] if not x.open])
@@ -149,7 +143,7 @@ def _print_rows(title: str, rows: Iterable[Iterable[str]]) -> None:
         tables.console(_WIDTH).print(table)
 
 
-def _reasons(findings: Iterable["Finding"]) -> Iterator[str]:
+def _reasons(findings: Iterable["CheckResult"]) -> Iterator[str]:
     """Yield why claims are refused, each by itself, and then why others are open."""
     findings = list(findings)
     for each in findings:
@@ -159,7 +153,7 @@ def _reasons(findings: Iterable["Finding"]) -> Iterator[str]:
         yield f"not checked: {', '.join(x.claim for x in some)}; {reason}."
 
 
-def _summed(findings: Iterable["Finding"]) -> Iterator[tuple[str, ...]]:
+def _summed(findings: Iterable["CheckResult"]) -> Iterator[tuple[str, ...]]:
     """Yield rows, one for all values below a key that agree."""
     for key, some in groupby(findings, lambda x: _key(x.claim)):
         some = list(some)

@@ -13,7 +13,7 @@ from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, JsonObject
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.step.loop import Loop, Presence
+from echelon.simulation.step.loop import ActiveAgents, Loop
 
 KINDS = {"lose": Lose, "join": Join}
 """What may happen to an agent, by the name of the request."""
@@ -29,11 +29,8 @@ class Attendance(NamedTuple):
     """Who is there before the last event and after it, in three rows.
 
     Attributes:
-        weights: of the exchange.
-        present: whether an agent is there.
         nearest: whom it follows.
         since: since when it has been there, s.
-        step: of the event.
     """
 
     weights: Float[Array, "3 K"]
@@ -61,8 +58,8 @@ def attendance(graph: Graph, events: Sequence[Event], leaderward: bool, dt: floa
         weights = graph.before.exchange(leaderward).weights
         here = np.ones(graph.agents, bool), np.array(graph.nearest_leader()), np.zeros(graph.agents)
         return Attendance(*(np.tile(np.asarray(x), (3, 1)) for x in (weights, *here)), step=0)
-    after = graph.with_events(events, graph.heirs)
-    presence, weights = Presence.of(after), np.asarray(after.exchange(leaderward).weights)
+    after = graph.with_events(events, graph.backups)
+    presence, weights = ActiveAgents.of(after), np.asarray(after.exchange(leaderward).weights)
     assert presence is not None
     rows = (weights, presence.rows, presence.nearest, presence.since)
     return Attendance(*(row[[*_STRETCHES]] for row in rows), step=round(events[-1].at / dt))
@@ -87,7 +84,7 @@ def happened(
 
     Raises:
         SimulationError: it is of no agent.
-        GraphError: it is not possible, as the loss of a leader without heirs.
+        GraphError: it is not possible, as the loss of a leader without backup leaders.
     """
     if type(agent) is not int or not 0 <= agent < graph.agents:
         raise SimulationError(f"`{name}` got `{agent}`, and must be the number of an agent.")
@@ -97,7 +94,7 @@ def happened(
     if name == "join" and not (own and isinstance(own[-1], Lose)):
         raise SimulationError(f"agent {agent} cannot join, since it is there.")
     after = (*events, KINDS[name](agent, at))
-    graph.with_events(after, graph.heirs)
+    graph.with_events(after, graph.backups)
     return after
 
 

@@ -19,7 +19,7 @@ from echelon.core.types import JsonObject
 from echelon.experiments.results.metrics import ROUNDING
 from echelon.experiments.scenario.build import build
 from echelon.guarantees.promises.closed_loop import LinearLoop
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.output.reports.run_report import beyond
 from echelon.output.viewer.replay import promise_badge
 from echelon.simulation.step.meter import SETTLED, outside
@@ -32,14 +32,9 @@ _NEAR = 1.1
 
 @final
 class _Newest:
-    """A thread that works on requests; of several that wait only the last is worked on.
-
-    Args:
-        work: called with the request.
-    """
+    """A thread that works on requests; of several that wait only the last is worked on."""
 
     def __init__(self, work: Callable[["_Request"], None]) -> None:
-        """Start the thread, which waits for a request."""
         self.work = work
         self.request: _Request | None = None
         self.changed, self.ended = threading.Condition(), False
@@ -47,13 +42,11 @@ class _Newest:
         self.thread.start()
 
     def ask(self, request: "_Request") -> None:
-        """Replace the request that waits."""
         with self.changed:
             self.request = request
             self.changed.notify()
 
     def end(self) -> None:
-        """End the thread."""
         with self.changed:
             self.ended = True
             self.changed.notify()
@@ -95,13 +88,9 @@ class Promiser:
 
     A guarantee takes seconds. The first look at another position of the knobs does not wait for it:
     each has a thread, and no answer about an earlier position is given.
-
-    Args:
-        answer: called with the badge of the page.
     """
 
     def __init__(self, answer: Callable[[JsonObject], None]) -> None:
-        """Start the threads, which wait for a request."""
         self.answer, self.lock = answer, threading.Lock()
         self.number = self.complete = 0
         self.workers = _Newest(self._look), _Newest(self._judge)
@@ -150,36 +139,33 @@ def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
         return {"state": "lost", "short": "no guarantee", "whole": text, "causes": [text]}
     try:
         unchanged = knobs == panel.start
-        guarantee = promise(*(panel.experiment if unchanged else build(panel.scenario_at(knobs))))
+        found = guarantee(*(panel.experiment if unchanged else build(panel.scenario_at(knobs))))
     except EchelonError as error:
         # A scenario that is refused has no guarantee, such as one with a disconnected graph.
         cause = str(error).removeprefix("mapping: ")
         return {"state": "lost", "short": "no guarantee", "whole": cause, "causes": [cause]}
-    stated = guarantee.as_mapping()
+    stated = found.as_mapping()
     badge: JsonObject = promise_badge(stated)
     badge["apart"] = ((stated["anywhere"] or {}).get("separation") or {}).get("distance")
-    badge["causes"] = [cause.sentence() for cause in guarantee.causes]
-    badge["edge"], badge["end"] = guarantee.edge, _end(panel, knobs, guarantee.edge)
-    badge["above"] = None if guarantee.edge is None else at_least(guarantee.edge)
-    badge["rate"] = guarantee.rate if guarantee.promised else None
-    certified = guarantee.certified
+    badge["causes"] = [cause.sentence() for cause in found.causes]
+    badge["edge"], badge["end"] = found.edge, _end(panel, knobs, found.edge)
+    badge["above"] = None if found.edge is None else at_least(found.edge)
+    badge["rate"] = found.rate if found.promised else None
+    certified = found.certified
     badge["anywhere"] = certified is not None and certified.radius == float("inf")
     # Shown where the guarantee does not cover the state.
-    badge["beyond"] = [*beyond(0.0, guarantee)]
-    edge, c = guarantee.edge, knobs.coupling
-    if guarantee.promised and edge is not None and c is not None and c < _NEAR * edge:
+    badge["beyond"] = [*beyond(0.0, found)]
+    edge, c = found.edge, knobs.coupling
+    if found.promised and edge is not None and c is not None and c < _NEAR * edge:
         badge |= {"state": "edge", "short": f"{badge['short']}, near its edge"}
-    elif not guarantee.promised and guarantee.slowest is not None:
+    elif not found.promised and found.slowest is not None:
         growth = _growth(panel.live.loop(knobs), panel.experiment.settings)
         badge["short"] = growth or badge["short"]
     return badge
 
 
 def _end(panel: Panel, knobs: Knobs, edge: float | None) -> float | None:
-    """Return a coupling above the edge at which errors begin to grow in held steps.
-
-    None without an edge, and where they grow nowhere or everywhere on the slider.
-    """
+    """None without an edge, and where they grow nowhere or everywhere on the slider."""
     if edge is None or "coupling" not in panel.ranges:
         return None
     settings, highest = panel.experiment.settings, panel.ranges["coupling"].high
@@ -252,17 +238,11 @@ class GuaranteeStatus:
 
     It is restored once all agents are in their domain and errors have halved; of agents that keep
     apart, once their hulls are as far apart as they keep.
-
-    Args:
-        model: of the agents.
-        graph: of their communication.
-        show: called with each new badge.
     """
 
     def __init__(
         self, model: ControlAffine, graph: Graph, show: Callable[[JsonObject], None]
     ) -> None:
-        """Begin without a guarantee."""
         self.names, self.followers = [*model.chart], list(graph.followers)
         self.columns = [model.state_names.index(name) for name in self.names]
         self.chart = np.array([*model.chart.values()], float).reshape(-1, 2)
@@ -317,7 +297,6 @@ class GuaranteeStatus:
         self._follow_transient(picture.time, size, halved)
 
     def _follow_transient(self, time: float, size: float, halved: bool) -> None:
-        """Record the errors of the transient, and compare later errors with them."""
         rate = max(self.badge.get("rate") or 0.0, 1e-9)
         if time > self.since + min(_LONGEST, max(_SHORTEST, _TRANSIENT / rate)):
             limit = max(_GROWTH * self.transient, SETTLED)
@@ -327,7 +306,6 @@ class GuaranteeStatus:
         self.reference = self.transient if self.fresh else self.reference
 
     def _departure(self, picture: Picture) -> str:
-        """Return a sentence about an agent outside its domain; empty if all are inside."""
         out = outside(picture.states[:, self.columns], *self.chart.T)
         if not out.any():
             return ""
@@ -349,7 +327,6 @@ class GuaranteeStatus:
         return int(self.large and not self.badge.get("anywhere"))
 
     def _too_near(self) -> str:
-        """Return a sentence about hulls that are nearer than they keep; empty if none are."""
         kept = self.badge.get("apart")
         if kept is None or self.near >= kept - ROUNDING:
             return ""
@@ -359,7 +336,6 @@ class GuaranteeStatus:
         )
 
     def _current(self) -> JsonObject:
-        """Return the badge for the present state."""
         self.severity = self._severity()
         if self.severity == 0:
             return self.badge

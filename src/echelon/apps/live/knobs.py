@@ -55,7 +55,6 @@ class Knobs(NamedTuple):
         loss: share of messages lost.
         outages: share of the time that a link is out.
         noise: factor on the noise of measurements.
-        cut: indices of the cut edges.
         method: of the gain; None for the scenario's own.
         shape: of the formation; None for the scenario's own.
         events: agents that were lost and joined, by time.
@@ -96,15 +95,9 @@ class Knobs(NamedTuple):
 
 @final
 class LiveParts:
-    """The gain, formation, graph and wind of a loop at any position of the knobs.
-
-    Args:
-        scenario: without knobs.
-        experiment: that it describes.
-    """
+    """The gain, formation, graph and wind of a loop at any position of the knobs."""
 
     def __init__(self, scenario: Scenario, experiment: Experiment) -> None:
-        """Begin with the scenario's own parts."""
         self.scenario, self.parts = scenario, experiment.parts
         model = self.parts.model
         self.start = _start(experiment)
@@ -177,9 +170,7 @@ class LiveParts:
     def motion(self, knobs: Knobs, room: FormationMotion | None) -> FormationMotion | None:
         """Return how offsets change with time: the scenario's own, or to the shape of the knobs.
 
-        Args:
-            knobs: with the reshape that is under way, if any.
-            room: a motion with room for one; None where a loop has none.
+        `room` is a motion with room for one; None where a loop has none.
         """
         own = self.parts.formation.motion
         if own is not None or room is None:
@@ -256,40 +247,31 @@ class LiveParts:
 
 
 def _start(experiment: Experiment) -> Knobs:
-    """Return the positions at which the knobs have no effect."""
-    network, knobs = experiment.parts.world.network, Knobs(_coupling(experiment))
+    drive, network = experiment.parts.drive, experiment.parts.world.network
+    coupling = None if drive.gain is None else drive.gain.coupling
+    if drive.gain is None and isinstance(drive, Laws):
+        own = drive.follower.strength(experiment.settings.dt)
+        coupling = None if own is None else float(own)
+    knobs = Knobs(coupling)
     if network is None:
         return knobs
     return knobs._replace(delay=network.delay, loss=network.loss, outages=network.bursts.share)
 
 
-def _coupling(experiment: Experiment) -> float | None:
-    """Return the coupling of the followers' law; None of a law without one."""
-    drive, dt = experiment.parts.drive, experiment.settings.dt
-    if drive.gain is not None:
-        return drive.gain.coupling
-    coupling = drive.follower.strength(dt) if isinstance(drive, Laws) else None
-    return None if coupling is None else float(coupling)
-
-
 def shapes_of(parts: Parts) -> dict[str, Array]:
     """Return the offsets (N, n) of each shape that these agents can take, by its name."""
-    spacing, shapes = _spacing(parts), dict[str, Array]()
+    goals = parts.formation.offsets[:, list(parts.model.position_indices())]
+    i, j = parts.graph.edges.T
+    apart = np.linalg.norm(goals[i] - goals[j], axis=1)
+    # The median distance of neighbours' goals; 1 if all goals coincide.
+    spacing = float(np.median(apart[apart > 0.0])) if (apart > 0.0).any() else 1.0
+    shapes = dict[str, Array]()
     for name in registry.FORMATIONS:
         try:
             shapes[name] = getattr(Formation, name)(parts.model, parts.graph, spacing).offsets
         except EchelonError:
             continue
     return shapes
-
-
-def _spacing(parts: Parts) -> float:
-    """Return the median distance of neighbours' goals; 1 if all goals coincide."""
-    axes = list(parts.model.position_indices())
-    i, j = parts.graph.edges.T
-    goals = parts.formation.offsets[:, axes]
-    apart = np.linalg.norm(goals[i] - goals[j], axis=1)
-    return float(np.median(apart[apart > 0.0])) if (apart > 0.0).any() else 1.0
 
 
 # ---- sliders -------------------------------------------------------------------------------------

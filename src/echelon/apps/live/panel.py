@@ -9,14 +9,7 @@ import numpy as np
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import Reshape
 from echelon.apps.live.attendance import KINDS, RESHAPE, as_entries, happened
-from echelon.apps.live.knobs import (
-    SLIDERS,
-    Knobs,
-    LiveParts,
-    Reshaping,
-    ranges_of,
-    write_keys,
-)
+from echelon.apps.live.knobs import SLIDERS, Knobs, LiveParts, Reshaping, ranges_of, write_keys
 from echelon.core.errors import ScenarioError, SimulationError, did_you_mean, listing
 from echelon.core.types import JsonObject
 from echelon.experiments.scenario import registry
@@ -33,15 +26,9 @@ _METHODS = (Riccati.name, InnerLoop.name)
 
 @final
 class Panel:
-    """The controls that a scenario has, and the scenario at any position of the knobs.
-
-    Args:
-        scenario: without knobs.
-        experiment: that it describes.
-    """
+    """The controls that a scenario has, and the scenario at any position of the knobs."""
 
     def __init__(self, scenario: Scenario, experiment: Experiment) -> None:
-        """Collect the controls."""
         self.scenario, self.experiment = scenario, experiment
         self.live = LiveParts(scenario, experiment)
         self.start = self.live.start
@@ -112,7 +99,6 @@ class Panel:
         return self._moved(knobs, name, value)
 
     def _moved(self, knobs: Knobs, name: str, value: Any) -> Knobs:
-        """Return the knobs with another number for one of them, clamped to its range."""
         if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
             raise SimulationError(f"`{name}` got `{value}`, and must be a number.")
         gain = self.live.unweighted_gain(knobs)
@@ -137,12 +123,6 @@ class Panel:
         return changed._replace(weight=1.0, coupling=coupling)
 
     def _reshaped(self, knobs: Knobs, value: Any, at: float) -> Knobs:
-        """Return the knobs of a formation that begins to take another shape at a time (s).
-
-        Raises:
-            SimulationError: there is no such shape, or a reshape is under way.
-            LawError: with `safety`, a leader or an heir would move beside its path.
-        """
         check_choice("shape", value, (AS_GIVEN, *self.options["shape"]))
         under_way = knobs.reshaping
         if under_way is not None and at < under_way.end:
@@ -256,7 +236,6 @@ def under(scenario: Scenario, law: str) -> tuple[Scenario, Experiment]:
 
 
 def _with_law(scenario: Scenario, law: str, keep_leader: bool) -> Scenario:
-    """Return a scenario with another follower law and those of its keys that the law takes."""
     data = copy.deepcopy(scenario.data)
     data.pop("live", None)
     surplus = foreign_keys(FollowerSpec, law)

@@ -76,11 +76,6 @@ def with_changes(scenario: Scenario) -> Scenario:
 
 
 def _continue(swarm: LiveLoop, run: Recording) -> None:
-    """Let a loop start from the last state of a run.
-
-    Raises:
-        SimulationError: the run has no state of these agents.
-    """
     shape = np.shape(swarm.states)
     if not len(run.times) or run.states.shape[1:] != shape:
         got = "no state" if not len(run.times) else f"{run.agents} agents"
@@ -91,11 +86,6 @@ def _continue(swarm: LiveLoop, run: Recording) -> None:
 
 
 def _check_speed(swarm: LiveLoop) -> None:
-    """Check that a loop keeps up with real time.
-
-    Raises:
-        SimulationError: it does not; the message says how many agents could.
-    """
     swarm.advance()  # which compiles
     best = float("inf")
     for _ in range(3):
@@ -125,14 +115,12 @@ class _Live(Handler, abc.ABC):
     session: Session
 
     def do_GET(self) -> None:
-        """Send the page, or the stream until the page closes."""
         if self.path == "/stream" and self.allowed():
             self._stream()
         elif self.path != "/stream":
             super().do_GET()
 
     def do_POST(self) -> None:
-        """Apply the request of a page."""
         if not self.allowed():
             return
         try:

@@ -15,16 +15,10 @@ from echelon.apps.live.guarantee_status import GuaranteeStatus, Promiser, lost
 from echelon.apps.live.knobs import Knobs
 from echelon.apps.live.panel import Panel, check_choice, under
 from echelon.apps.live.swarm import LiveLoop, Picture
-from echelon.core.errors import (
-    EchelonError,
-    GraphError,
-    LawError,
-    ScenarioError,
-    SimulationError,
-)
+from echelon.core.errors import EchelonError, GraphError, LawError, ScenarioError, SimulationError
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import amount
-from echelon.experiments.results.recording import Recording, foreseen
+from echelon.experiments.results.recording import Recording, empty_recording
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.plots.space import Space, space_of
 from echelon.output.viewer.charts import distance_chart
@@ -34,25 +28,14 @@ from echelon.simulation.engine.frame_numbers import ClosestPair
 
 @final
 class LoopsByLaw:
-    """Loops by the followers' law, each also with agents that can be lost and join.
-
-    Args:
-        panel: of the first law.
-        swarm: its loop.
-        send: called with messages to the pages.
-    """
+    """Loops by the followers' law, each also with agents that can be lost and join."""
 
     def __init__(self, panel: Panel, swarm: LiveLoop, send: Callable[[JsonObject], None]) -> None:
-        """Begin with one loop."""
         self.first, self.send = panel, send
         self.ready = {(panel.law, swarm.eventful): (panel, swarm)}
 
     def prepare(self, law: str, eventful: bool) -> tuple[Panel, LiveLoop]:
         """Return the loop under a law with its panel, compiled if it is not yet.
-
-        Args:
-            law: of the followers.
-            eventful: whether agents can be lost and join.
 
         Raises:
             EchelonError: the law is unknown, or does not fit these agents.
@@ -65,7 +48,8 @@ class LoopsByLaw:
         what = "room for events" if eventful else f"the law `{law}`"
         self.send({"note": f"Compiling {what}; the loop continues meanwhile."})
         try:
-            panel = self._panel(law)
+            same = (panel for (name, _), (panel, _) in self.ready.items() if name == law)
+            panel = next(same, None) or Panel(*under(self.first.scenario, law))
             loop = LiveLoop(*panel.experiment, panel.live, eventful)
             # The first step compiles the rest.
             loop.advance()
@@ -73,12 +57,6 @@ class LoopsByLaw:
         finally:
             self.send({"note": ""})
         return self.ready[key]
-
-    def _panel(self, law: str) -> Panel:
-        for (name, _), (panel, _) in self.ready.items():
-            if name == law:
-                return panel
-        return Panel(*under(self.first.scenario, law))
 
 
 _AHEAD, _APART = 60.0, 0.1
@@ -127,7 +105,7 @@ def _path(swarm: LiveLoop, space: Space) -> list[list[float]]:
 
 def foreseen_of(swarm: LiveLoop, name: str) -> Recording:
     """Return a recording with all of a loop but its frames."""
-    return foreseen(swarm.parts, swarm.settings, np.asarray(swarm.states), name)
+    return empty_recording(swarm.parts, swarm.settings, np.asarray(swarm.states), name)
 
 
 _PICTURE, _MESSAGE = 0, 1
@@ -140,14 +118,10 @@ _KICK_SPEED, _KICK_DISTANCE = 2.0, 0.5  # m/s of a velocity, else of the first p
 class Session:
     """A loop that runs in a thread by the clock, as long as a page watches.
 
-    Args:
-        scenario: of the loop; the events of its `live` section are repeated.
-        panel: of its controls.
-        swarm: the loop.
+    The events of the scenario's `live` section are repeated.
     """
 
     def __init__(self, scenario: Scenario, panel: Panel, swarm: LiveLoop) -> None:
-        """Check the events of the scenario; nothing runs before `start`."""
         self.scenario, self.panel, self.swarm = scenario, panel, swarm
         self.knobs, self.paused, self.watchers, self.ended = panel.start, False, 0, False
         self.run = foreseen_of(swarm, "")
@@ -167,11 +141,7 @@ class Session:
         self.promiser = Promiser(self.status.update)
 
     def _check(self) -> None:
-        """Check the events of the scenario, and compile the laws that they choose.
-
-        Raises:
-            SimulationError: an event is not possible.
-        """
+        """Check the events of the scenario, and compile the laws that they choose."""
         panel, happened = self.panel, ()
         for event in self.future:
             try:
@@ -351,7 +321,6 @@ class Session:
         return {**state, "moments": moments, "nearest": self.swarm.nearest.tolist()}
 
     def _panel_message(self) -> JsonObject:
-        """Return the controls and the information flow of the present law."""
         panel, heard = self.panel, heard_by(self.swarm.parts.receives)
         return {"panel": panel.sliders(), "choices": panel.choices(), "heard": heard}
 
@@ -365,7 +334,8 @@ class Session:
         """
         name, value = request.get("name"), request.get("value")
         if name == "save":
-            return self._saved()
+            text = "A scenario begins at 0 s, so a continued run is not saved as one."
+            return {"fault": text} if self.swarm.first else {"text": self.first.saved(self.events)}
         if name in ("pause", "reset"):
             self._later(lambda: self._pause(bool(value)) if name == "pause" else self._reset())
             return {}
@@ -383,11 +353,6 @@ class Session:
             return {"fault": _without_place(error)}
         self._later(lambda: self.apply(event))
         return event
-
-    def _saved(self) -> JsonObject:
-        if self.swarm.first:
-            return {"fault": "A scenario begins at 0 s, so a continued run is not saved as one."}
-        return {"text": self.first.saved(self.events)}
 
     def _later(self, action: Callable[[], None]) -> None:
         with self.changed:
@@ -441,7 +406,6 @@ class Session:
             self._set(knobs)
 
     def _set(self, knobs: Knobs) -> None:
-        """Set all knobs, and compute what is guaranteed from now on."""
         self.knobs = knobs
         self.status.begin()
         self.swarm.apply(knobs)
@@ -472,7 +436,6 @@ class Session:
         self.send(self.state())
 
     def _reset(self) -> None:
-        """Restart from the initial states, with the knobs as they are."""
         # At the start nobody has been lost.
         self.knobs = self.knobs._replace(events=(), reshaping=None)
         self.swarm.apply(self.knobs)

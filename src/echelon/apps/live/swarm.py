@@ -33,7 +33,7 @@ from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.native import is_installed
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.scalars import Unsupported
-from echelon.simulation.step.loop import Loop, Moment, Switches, assemble
+from echelon.simulation.step.loop import Loop, LoopState, Switches, assemble
 from echelon.simulation.step.nearby import all_hulls
 from echelon.simulation.step.sequence import begin
 from echelon.simulation.step.settings import Settings
@@ -56,11 +56,7 @@ class LiveEngine(NamedTuple):
 def choose_stepper(loop: Loop, unlike: Loop, states: Array, settings: Settings) -> LiveEngine:
     """Return what steps a loop: native code wherever it can be made.
 
-    Args:
-        loop: to begin with.
-        unlike: one that differs from it in all numbers that will change.
-        states: (N, n) at the beginning.
-        settings: of the scenario.
+    `unlike` differs from it in all numbers that will change.
     """
     by_jax = LiveEngine(
         JaxStepper(loop, states), settings.precision if len(states) <= _MANY else "float32"
@@ -111,12 +107,7 @@ class Picture(NamedTuple):
 class LiveLoop:
     """Agents under laws that are simulated without an end time.
 
-    Args:
-        parts: of a scenario.
-        settings: of it.
-        panel: the numbers that its knobs set.
-        eventful: whether agents can be lost and join, and the formation can take other shapes,
-            which no native code steps.
+    With `eventful` agents can be lost and join, and shapes change, in no native code.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
@@ -125,7 +116,6 @@ class LiveLoop:
     def __init__(
         self, parts: Parts, settings: Settings, panel: LiveParts, eventful: bool = False
     ) -> None:
-        """Prepare the loop and its stepper."""
         disturbance = parts.world.disturbance or Disturbance()
         world = dataclasses.replace(parts.world, disturbance=disturbance)
         parts = room_for_events(parts, settings.dt) if eventful else parts
@@ -181,7 +171,6 @@ class LiveLoop:
         return loop.share, gain.coupling, gain.P, gain.R, gain.R_inverse, gain.inner
 
     def _look_ahead(self, step: int) -> None:
-        """Compute when the graph switches in the periods about a step."""
         schedule, dt = self.parts.graph.schedule, self.settings.dt
         if schedule is None or schedule.period is None or step in self.ahead:
             return
@@ -206,7 +195,7 @@ class LiveLoop:
         """Proceed from states at a step, with the same knobs; laws begin without memory."""
         with precision(self.precision):
             now = begin(self.loop, jnp.asarray(states))
-            self.now: Moment = now._replace(step=jnp.asarray(step, jnp.int32))
+            self.now: LoopState = now._replace(step=jnp.asarray(step, jnp.int32))
 
     def take_over(self, other: "LiveLoop") -> None:
         """Proceed from where another loop of the same laws is, with as much memory as fits."""
@@ -277,7 +266,6 @@ class LiveLoop:
         self.loop = dataclasses.replace(self.loop, moving=moving)
 
     def _count(self, knobs: Knobs) -> None:
-        """Let those be there who are after the events of the knobs."""
         if self.loop.presence is None:
             return
         law, graph = self.loop.follower, self.parts.graph
@@ -292,7 +280,6 @@ class LiveLoop:
         return dataclasses.replace(channel, slots=steps // int(channel.every) + 2, bursty=True)
 
     def _in_world(self, loop: Loop, knobs: Knobs) -> Loop:
-        """Return the loop with the network and the noise of the knobs."""
         network, settings = self.panel.network(knobs), self.settings
         if network is not None:
             channel = network.prepared(settings.dt, math.inf, settings.seed)
@@ -302,7 +289,6 @@ class LiveLoop:
         return loop
 
     def _numbers(self, knobs: Knobs) -> tuple[PyTree, ...]:
-        """Return the values of the adjustable numbers at these positions of the knobs."""
         share, gain = np.asarray(float(knobs.feedforward)), self.panel.gain(knobs)
         if knobs.coupling is None:
             return (share,)

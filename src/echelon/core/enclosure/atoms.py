@@ -49,7 +49,6 @@ def _wave_product(a: Wave, b: Wave) -> list[tuple[Fraction, Wave | None]]:
 
 
 def _monomial_product(a: Monomial, b: Monomial) -> list[tuple[Fraction, Monomial]]:
-    """Return the product of two monomials as a sum of monomials."""
     result: list[tuple[Fraction, dict[int, Exponent]]] = [(Fraction(1), dict(a))]
     # A monomial contains each atom once: powers are merged, products of waves become two terms.
     for atom, exponent in b:
@@ -239,10 +238,7 @@ def wave_points(arc: Interval, orders: Iterable[int]) -> list[dict[tuple[int, in
 
 
 def _cuts(arc: Interval) -> list[Gaussian]:
-    """Return directions at half the angles of the start, the cuts and the end of an arc.
-
-    Two pieces below 180 degrees, four above; the full circle if the ends nearly meet.
-    """
+    """Two pieces below 180 degrees, four above; the full circle if the ends nearly meet."""
     start, end = arc.lo / 2, arc.hi / 2
     if end - start >= pi().lo - Fraction(1, 1 << 40) or max(abs(start), abs(end)) > _FAR:
         return _FULL
@@ -328,11 +324,7 @@ class Atom:
 
     @property
     def reach(self) -> Interval:
-        """Return the range.
-
-        Raises:
-            OpenError: the atom has none.
-        """
+        """Return the range; raise `OpenError` if there is none."""
         if self.interval is None:
             raise OpenError(self.name)
         return self.interval
@@ -368,10 +360,7 @@ class Atoms:
         return Polynomial({((atom, 1),): Fraction(1)})
 
     def fresh(self, key: object, interval: Interval, *behind: Polynomial) -> Polynomial:
-        """Return a variable for a value of which only the range is known.
-
-        The same `key` gives the same variable; a range of one point gives a number.
-        """
+        """Return a variable of a known range, one for each `key`; a number if that is one point."""
         # A constant keeps polynomials short and does not double the vertices of a hull.
         if interval.lo == interval.hi:
             return constant(interval.lo)
@@ -436,11 +425,7 @@ class Atoms:
         return frozenset().union(*(self.known[atom].sources for atom in p.exponents()))
 
     def elementary(self, name: str, p: Polynomial) -> Polynomial:
-        """Return a function of `ELEMENTARY` of a polynomial.
-
-        Raises:
-            GainError: it is not defined on the whole box.
-        """
+        """Return a function of `ELEMENTARY`; `GainError` if it is not defined on the whole box."""
         function, interval = ELEMENTARY[name], self.range(p)
         if not function.defined(interval):
             verb = "divides by" if name == "reciprocal" else f"takes `{name}` of"
@@ -566,11 +551,7 @@ def _wave_corners(arc: Interval, waves: list[Wave]) -> list[dict[Exponent, Fract
 
 
 def check_count(count: int) -> None:
-    """Check the number of vertices of a hull.
-
-    Raises:
-        GainError: there are more than `MOST_VERTICES`.
-    """
+    """Raise `GainError` if a hull has more than `MOST_VERTICES` vertices."""
     if count > MOST_VERTICES:
         raise GainError(
             f"the hull of Jacobians has {count} vertices, and may have {MOST_VERTICES}; "

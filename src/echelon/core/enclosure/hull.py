@@ -131,14 +131,7 @@ def slope_hull(
 
 
 def slope_columns(function: _Function, states: Box, inputs: Box) -> tuple[int, ...]:
-    """Return the entries of x in which a function (x, v) -> (k,) has slope 0 on the whole box.
-
-    No vertices are built, so the number of other slopes does not matter.
-
-    Raises:
-        OpenError: the slopes depend on an entry that the box leaves open.
-        GainError: as in `slope_hull`.
-    """
+    """Return the entries of x in which a function (x, v) -> (k,) has slope 0; as `slope_hull`."""
     atoms = Atoms()
     x, v = _variables(atoms, states, inputs, ())
     values = _evaluate(function, _sloped(x), map_entries(number, v), atoms)
@@ -151,12 +144,10 @@ def _value(entry: Sloped) -> Polynomial:
 
 
 def _sloped(x: np.ndarray) -> np.ndarray:
-    """Return polynomials (n,) as slope variables."""
     return map_entries(variable, np.arange(len(x)), x)
 
 
 def _evaluate(function: _Function, x: np.ndarray, v: np.ndarray, atoms: Atoms) -> np.ndarray:
-    """Return the values of a function with their slopes."""
     [result] = evaluate(function, [x, v], slopes_in(atoms))
     return result if result.dtype == object else map_entries(number, result)
 
@@ -173,7 +164,6 @@ def _slopes(values: np.ndarray, n: int, atoms: Atoms) -> np.ndarray:
 def _variables(
     atoms: Atoms, states: Box, inputs: Box, names: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return x (n,) and v (m,) as variables with their ranges."""
     n, m = _count_bounds(states, "x"), _count_bounds(inputs, "v")
     called = list(names) or [f"x[{k}]" for k in range(n)] + [f"v[{k}]" for k in range(m)]
     if len(called) != n + m:
@@ -186,7 +176,6 @@ def _variables(
 
 
 def _interval(low: float | Fraction, high: float | Fraction) -> Interval | None:
-    """Return an exact range: every float is a rational number."""
     if math.isinf(low) or math.isinf(high):
         return None
     ends = (x if isinstance(x, Fraction) else Fraction(float(x)) for x in (low, high))
@@ -194,7 +183,6 @@ def _interval(low: float | Fraction, high: float | Fraction) -> Interval | None:
 
 
 def _count_bounds(box: Box, name: str) -> int:
-    """Return how many bounds a box has."""
     lower, upper = (list(side) for side in box)
     if len(lower) != len(upper):
         raise GainError(
@@ -211,7 +199,6 @@ def _count_bounds(box: Box, name: str) -> int:
 
 
 def _hull_of(entries: np.ndarray, atoms: Atoms) -> Hull:
-    """Return the hull of a matrix of polynomials."""
     # Common corners for all entries: separate ones would lose that entries share angles.
     used: dict[int, set[Exponent]] = {}
     for p in entries.flat:
@@ -256,7 +243,6 @@ def _expand_values(values: CornerValues, array: np.ndarray, counts: dict[int, in
 def _describe_atoms(
     atoms: Atoms, used: dict[int, set[Exponent]], counts: dict[int, int]
 ) -> tuple[HullAtom, ...]:
-    """Return the atoms of the hull in the order in which the model uses them."""
     result = []
     for atom, count in counts.items():
         source = atoms.known[atom]

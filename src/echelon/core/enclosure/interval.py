@@ -154,15 +154,11 @@ def _to_fixed_point(x: Fraction) -> int:
 
 
 def _within(total: int, margin: Fraction) -> Interval:
-    """Return an interval around a fixed-point sum whose error is at most `margin`."""
     return outward(Fraction(total, _ONE) - margin, Fraction(total, _ONE) + margin)
 
 
 def _exp(x: Fraction) -> Interval:
-    """Enclose exp x: a series of 40 terms for |y| <= 1/2, then squarings.
-
-    The remainder is below 2^-197, and the error of each term at most 3 units.
-    """
+    """40 terms for |y| <= 1/2, then squarings; remainder < 2^-197, each term within 3 units."""
     if x == 0:
         return point(1)
     # 0 is a valid lower bound; the exact one would be an extremely long fraction.
@@ -190,10 +186,7 @@ def _log(x: Fraction) -> Interval:
 
 
 def _twice_artanh(z: Fraction) -> Interval:
-    """Enclose 2 artanh z for |z| <= 1/3.
-
-    The remainder is below 3^-160, and the error of each term at most 6 units.
-    """
+    """For |z| <= 1/3: the remainder is below 3^-160, the error of each term at most 6 units."""
     if z == 0:
         return point(0)
     square, power, total = _to_fixed_point(z * z), _to_fixed_point(z), 0
@@ -204,10 +197,7 @@ def _twice_artanh(z: Fraction) -> Interval:
 
 
 def _atan(x: Fraction) -> Interval:
-    """Enclose arctan x by Euler's series, whose terms at least halve for |x| <= 1.
-
-    The remainder is below 2^-159, and the error of each term at most 6 units.
-    """
+    """Euler's series for |x| <= 1: remainder below 2^-159, error of each term at most 6 units."""
     if x == 0:
         return point(0)
     # arctan x = +-pi/2 - arctan(1/x).
@@ -267,7 +257,6 @@ def _sign(x: Interval) -> Interval:
 
 
 def _monotone_range(at: Callable[[Fraction], Interval]) -> Callable[[Interval], Interval]:
-    """Return the range of an increasing function."""
     return lambda x: Interval(at(x.lo).lo, at(x.hi).hi)
 
 

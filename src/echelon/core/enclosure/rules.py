@@ -75,11 +75,7 @@ def power(atoms: Atoms, p: Polynomial, exponent: Polynomial | int) -> Polynomial
 
 
 def atan2(atoms: Atoms, y: Polynomial, x: Polynomial) -> Polynomial:
-    """Return the angle of the point (x, y) for x > 0.
-
-    Raises:
-        GainError: x may be anything else.
-    """
+    """Return the angle of the point (x, y) for x > 0, else raise `GainError`."""
     reached = atoms.range(x)
     if reached.lo <= 0:
         raise GainError(

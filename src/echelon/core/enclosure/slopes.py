@@ -162,7 +162,7 @@ def atan2(atoms: Atoms, y: Sloped, x: Sloped) -> Sloped:
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Switch:
+class UndecidedComparison:
     """A comparison whose result varies on the box.
 
     Attributes:
@@ -176,16 +176,13 @@ class Switch:
     moves: bool
 
 
-_Entry: TypeAlias = Sloped | Switch | bool | int
+_Entry: TypeAlias = Sloped | UndecidedComparison | bool | int
 """What an array in this algebra holds: values, or answers to comparisons."""
-_ANSWERS = bool | np.bool_ | Switch
+_ANSWERS = bool | np.bool_ | UndecidedComparison
 
 
 def slopes_in(atoms: Atoms) -> Algebra:
-    """Return the algebra of values with their slopes.
-
-    Evaluating in it raises `GainError` where a function has no enclosure, or no slope.
-    """
+    """Return the algebra of values with slopes; it raises `GainError` where one is missing."""
     bound = {name: functools.partial(rule, atoms) for name, rule in _RULES.items()}
     return Algebra({**bound, **_SUMS}, number, _lift, rules.outside, _fold)
 
@@ -220,7 +217,6 @@ def _mixture(value: Polynomial, side: Polynomial, one: Sloped, other: Sloped) ->
 
 
 def _larger(atoms: Atoms, a: Sloped, b: Sloped) -> Sloped:
-    """Return max(a, b)."""
     difference = a.value - b.value
     reached = atoms.range(difference)
     if reached.lo >= 0 or reached.hi <= 0:
@@ -269,17 +265,16 @@ def _sign(atoms: Atoms, p: Sloped) -> Sloped:
 
 
 def _comparison(name: str) -> Rule:
-    """Return the rule of a comparison, by the range of the difference of its operands."""
     certain, never, chosen = _COMPARED[name]
 
-    def compare(atoms: Atoms, a: object, b: object) -> bool | Switch:
+    def compare(atoms: Atoms, a: object, b: object) -> bool | UndecidedComparison:
         if not (isinstance(a, Sloped) and isinstance(b, Sloped)):
             raise GainError("the model compares answers that the domain does not decide.")
         difference = a - b
         border, reached = difference.value, atoms.range(difference.value)
         if certain(reached) or never(reached):
             return certain(reached)
-        return Switch(chosen(atoms.side, border), (border,), bool(difference.slopes))
+        return UndecidedComparison(chosen(atoms.side, border), (border,), bool(difference.slopes))
 
     return _function(compare)
 
@@ -296,26 +291,34 @@ _COMPARED: dict[str, tuple[Callable[..., bool], Callable[..., bool], Callable[..
 """Per comparison: when it is certainly true, when certainly false, and otherwise its side."""
 
 
-def _not(atoms: Atoms, a: bool | Switch) -> bool | Switch:
-    return dataclasses.replace(a, chosen=constant(1) - a.chosen) if isinstance(a, Switch) else not a
+def _not(atoms: Atoms, a: bool | UndecidedComparison) -> bool | UndecidedComparison:
+    return (
+        dataclasses.replace(a, chosen=constant(1) - a.chosen)
+        if isinstance(a, UndecidedComparison)
+        else not a
+    )
 
 
-def _and(atoms: Atoms, a: bool | Switch, b: bool | Switch) -> bool | Switch:
-    if not isinstance(a, Switch):
+def _and(
+    atoms: Atoms, a: bool | UndecidedComparison, b: bool | UndecidedComparison
+) -> bool | UndecidedComparison:
+    if not isinstance(a, UndecidedComparison):
         return b if a else False
-    if not isinstance(b, Switch):
+    if not isinstance(b, UndecidedComparison):
         return a if b else False
-    return Switch(a.chosen * b.chosen, a.borders + b.borders, a.moves or b.moves)
+    return UndecidedComparison(a.chosen * b.chosen, a.borders + b.borders, a.moves or b.moves)
 
 
-def _or(atoms: Atoms, a: bool | Switch, b: bool | Switch) -> bool | Switch:
+def _or(
+    atoms: Atoms, a: bool | UndecidedComparison, b: bool | UndecidedComparison
+) -> bool | UndecidedComparison:
     # De Morgan: a single rule combines two undecided results.
     return _not(atoms, _and(atoms, _not(atoms, a), _not(atoms, b)))
 
 
-def _choose(atoms: Atoms, which: bool | Switch, *cases: _Entry) -> _Entry:
+def _choose(atoms: Atoms, which: bool | UndecidedComparison, *cases: _Entry) -> _Entry:
     """Return the chosen case, or an enclosure of both if the choice is undecided."""
-    if not isinstance(which, Switch):
+    if not isinstance(which, UndecidedComparison):
         return cases[int(which)]
     no, yes = cases
     if isinstance(no, Sloped) and isinstance(yes, Sloped):
@@ -323,12 +326,12 @@ def _choose(atoms: Atoms, which: bool | Switch, *cases: _Entry) -> _Entry:
     if not (isinstance(no, _ANSWERS) and isinstance(yes, _ANSWERS)):
         raise _jump(atoms, "a comparison picks a whole number", *which.borders)
     # Equal results need no decision.
-    if not any(isinstance(case, Switch) for case in cases) and no == yes:
+    if not any(isinstance(case, UndecidedComparison) for case in cases) and no == yes:
         return yes
     return _or(atoms, _and(atoms, which, yes), _and(atoms, _not(atoms, which), no))
 
 
-def _bend(atoms: Atoms, which: Switch, no: Sloped, yes: Sloped) -> Sloped:
+def _bend(atoms: Atoms, which: UndecidedComparison, no: Sloped, yes: Sloped) -> Sloped:
     """Return a choice between cases that agree wherever the choice switches."""
     difference = yes.value - no.value
     if not all(divides(border, difference) for border in which.borders):
@@ -346,7 +349,7 @@ def _bend(atoms: Atoms, which: Switch, no: Sloped, yes: Sloped) -> Sloped:
     return _mixture(value, which.chosen, yes, no)
 
 
-def _either(atoms: Atoms, which: Switch, no: Sloped, yes: Sloped) -> Sloped:
+def _either(atoms: Atoms, which: UndecidedComparison, no: Sloped, yes: Sloped) -> Sloped:
     """Return an enclosure of either case, the same at both ends of every secant."""
     reached = atoms.range(no.value).union(atoms.range(yes.value))
     # New unknowns: at a border, another choice between the same cases may differ.
@@ -355,7 +358,6 @@ def _either(atoms: Atoms, which: Switch, no: Sloped, yes: Sloped) -> Sloped:
 
 
 def _undecided(atoms: Atoms) -> Polynomial:
-    """Return an unknown between 0 and 1."""
     return atoms.fresh(("undecided", object()), Interval(Fraction(0), Fraction(1)))
 
 
@@ -365,23 +367,22 @@ def _convert(atoms: Atoms, params: Params, x: np.ndarray) -> np.ndarray:
     if kind not in "biu":
         return map_entries(functools.partial(_as_number, atoms), x)
     answers = map_entries(functools.partial(_as_integer, atoms, kind), x)
-    decided = not any(isinstance(entry, Switch) for entry in answers.flat)
+    decided = not any(isinstance(entry, UndecidedComparison) for entry in answers.flat)
     return answers.astype(params["new_dtype"]) if decided else answers
 
 
 def _as_number(atoms: Atoms, entry: _Entry) -> Sloped:
     if isinstance(entry, Sloped):
         return entry
-    if not isinstance(entry, Switch):
+    if not isinstance(entry, UndecidedComparison):
         return number(int(entry))
     if entry.moves:
         raise _jump(atoms, "a comparison becomes a number", *entry.borders)
     return number(_undecided(atoms))
 
 
-def _as_integer(atoms: Atoms, kind: str, entry: _Entry) -> bool | int | Switch:
-    """Return an entry as a boolean or as an integer, truncated towards 0."""
-    if isinstance(entry, Switch):
+def _as_integer(atoms: Atoms, kind: str, entry: _Entry) -> bool | int | UndecidedComparison:
+    if isinstance(entry, UndecidedComparison):
         if kind == "b":
             return entry
         raise _jump(atoms, "a comparison becomes a number", *entry.borders)

@@ -210,11 +210,6 @@ def _sqrt(x: Series) -> Series:
 
 
 def _applied(name: str, ends: Ends) -> Ends:
-    """Return the range of an elementary function.
-
-    Raises:
-        GainError: it is not defined there.
-    """
     elementary, x = ELEMENTARY[name], interval_of(ends)
     if not elementary.defined(x):
         raise GainError(
@@ -224,11 +219,7 @@ def _applied(name: str, ends: Ends) -> Ends:
 
 
 def power(x: Series, exponent: Series | int) -> Series:
-    """Return x to a constant exponent.
-
-    Raises:
-        GainError: the exponent varies.
-    """
+    """Return x to a constant exponent; raise `GainError` if it varies."""
     k = exponent if isinstance(exponent, Series) else number(int(exponent), x.order)
     if k.moves:
         raise GainError("a path has an exponent that varies in time, which has no enclosure.")
@@ -290,11 +281,7 @@ FUNCTIONS: dict[str, Callable[[Series], Series]] = {
 
 
 def _side(x: Series, name: str, edge: bool = True) -> bool:
-    """Return whether x >= 0, or x > 0 without the edge, all over the interval.
-
-    Raises:
-        GainError: it changes there.
-    """
+    """Return whether x >= 0, or x > 0 without the edge; raise where it changes on the interval."""
     low, high = x.parts[0]
     if low >= 0 if edge else low > 0:
         return True
@@ -356,8 +343,6 @@ def _clamped(params: Params, low: np.ndarray, x: np.ndarray, high: np.ndarray) -
 
 
 def _stairs(name: str, step: Callable[[Fraction], int]) -> Callable[[Series], Series]:
-    """Return a function that rises in steps, on one of them."""
-
     def function(x: Series) -> Series:
         low, high = (step(Fraction(end, UNIT)) for end in x.parts[0])
         if low != high:
@@ -475,11 +460,7 @@ class EnclosedPiece(NamedTuple):
 def enclose_finely(
     function: Callable[[jax.Array], jax.Array], times: Sequence[Fraction], order: int
 ) -> Iterator[EnclosedPiece]:
-    """Yield enclosures as `enclose_derivatives` does, of pieces halved where there are none.
-
-    Raises:
-        GainError: a piece of 0.1 ms has none, or so many pieces are not enough.
-    """
+    """Yield as `enclose_derivatives`, in pieces halved where there are none, to 0.1 ms."""
     spans, count = list(zip(times, times[1:], strict=False))[::-1], 0
     while spans:
         low, high = spans.pop()
@@ -504,7 +485,6 @@ def _near(middle: Ends, all_over: Ends, slope: Ends, half: int) -> Interval:
 
 
 def _scan(equation: JaxprEqn, operands: list[np.ndarray], algebra: Algebra) -> list[np.ndarray]:
-    """Return the results of a loop of known length, one turn after the other."""
     params, first = equation.params, equation.params["num_consts"]
     last = first + params["num_carry"]
     fixed, carry, rows = operands[:first], operands[first:last], operands[last:]
@@ -520,8 +500,6 @@ def _scan(equation: JaxprEqn, operands: list[np.ndarray], algebra: Algebra) -> l
 
 @functools.cache
 def _algebra(order: int) -> Algebra:
-    """Return the algebra of series up to an order."""
-
     def lift(array: np.ndarray) -> np.ndarray:
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise NoEnclosureError(

@@ -16,7 +16,7 @@ from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import avoidance, output_errors
 from echelon.guarantees.promises.hypotheses import as_mapping
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.settings import Settings
@@ -90,12 +90,7 @@ def save_dataset(run: "Result | xr.Dataset", path: PathLike) -> None:
 
 
 def run_file(result: Result, data: Labelled | None = None) -> bytes:
-    """Return `run.nc`: the dataset in groups, and the sums over all steps.
-
-    Args:
-        result: the run.
-        data: its labelled arrays, computed if None.
-    """
+    """Return `run.nc`: the dataset in groups, and the sums over all steps."""
     return with_sums(result, data).netcdf(_group_of)
 
 
@@ -127,7 +122,6 @@ def labelled(result: Result) -> Labelled:
 
 
 def _labelled(result: Result) -> Labelled:
-    """Return the labelled arrays of `dataset`, computed."""
     fixed, per_agent = labelled_parts(result.parts, result.settings), ("time", "agent", "state")
     variables: Variables = {
         "states": (per_agent, result.states),
@@ -156,7 +150,6 @@ def _labelled(result: Result) -> Labelled:
 
 
 def _followed(result: Result) -> Variables:
-    """Return the reference and the leaders' tracking errors; nothing without a reference."""
     if result.reference is None:
         return {}
     variables: Variables = {"reference": (("time", "state"), result.reference)}
@@ -168,7 +161,6 @@ def _followed(result: Result) -> Variables:
 
 
 def _messages(result: Result) -> Variables:
-    """Return the ages and losses of messages; nothing in the ideal network."""
     network, traffic = result.world.network, result.traffic
     if network is None or traffic is None:
         return {}
@@ -183,14 +175,11 @@ def _messages(result: Result) -> Variables:
 
 
 def _poles(result: Result) -> Variables:
-    """Return the poles of the linearized loop; nothing where laws have none.
-
-    The law `stopping-point` closes chains by its roots, and only their agreement is in the loop.
-    """
-    guarantee = promise(result.parts, result.settings)
-    if not guarantee.linear or guarantee.agreement is not None:
+    """The law `stopping-point` closes chains by its roots; the loop is their agreement alone."""
+    stated = guarantee(result.parts, result.settings)
+    if not stated.linear or stated.agreement is not None:
         return {}
-    poles, values = guarantee.loop.poles, guarantee.loop.eigenvalues
+    poles, values = stated.loop.poles, stated.loop.eigenvalues
     imaginary = {"mode_eigenvalue_imaginary": ("mode", np.imag(values))}
     return {
         "pole_real": (("mode", "pole"), np.real(poles)),
@@ -201,7 +190,6 @@ def _poles(result: Result) -> Variables:
 
 
 def _attributes(result: Result) -> JsonObject:
-    """Return how a run was computed and ended, as attributes that netCDF can hold."""
     solver = {} if result.work is None else {"solver": json.dumps(result.work._asdict())}
     return {
         **result.provenance,
@@ -211,7 +199,7 @@ def _attributes(result: Result) -> JsonObject:
         "outcome": result.outcome.name.lower(),
         "message": result.message,
         "warnings": "\n".join(result.warnings),
-        "promise": json.dumps(promise(result.parts, result.settings).as_mapping()),
+        "promise": json.dumps(guarantee(result.parts, result.settings).as_mapping()),
         **solver,
     }
 
@@ -223,12 +211,7 @@ def digest_of(files: Mapping[str, bytes]) -> str:
 
 
 def labelled_parts(parts: Parts, settings: Settings) -> Labelled:
-    """Return the arrays of `dataset` that do not depend on how a run went.
-
-    Args:
-        parts: of the run, with its drive completed.
-        settings: of the run.
-    """
+    """Return the arrays of `dataset` that do not depend on how a run went."""
     model, graph = parts.model, parts.graph
     agents, units = np.arange(graph.agents), dict(zip(model.state_names, model.state_units))
     variables: Variables = {
@@ -266,7 +249,6 @@ def labelled_parts(parts: Parts, settings: Settings) -> Labelled:
 
 
 def _attributes_of_parts(parts: Parts, settings: Settings) -> JsonObject:
-    """Return parts and settings as attributes that netCDF can hold."""
     numbers, model = {**settings._asdict(), "steady_window": settings.window}, parts.model
     radius = model.radius if model.position else None
     return {
@@ -287,7 +269,6 @@ def _attributes_of_parts(parts: Parts, settings: Settings) -> JsonObject:
 
 
 def _edges(parts: Parts) -> Variables:
-    """Return the edges of the graph, who receives along them, and their weights over time."""
     graph, schedule = parts.graph, parts.graph.schedule
     variables: Variables = {
         "edge_agents": (("edge", "end"), graph.edges),

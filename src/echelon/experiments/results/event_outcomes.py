@@ -7,7 +7,7 @@ from jaxtyping import Int
 
 from echelon.core.types import JsonObject
 from echelon.guarantees.promises.hypotheses import events_in_words
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.simulation.engine.result import Result, finite_or_none
 from echelon.simulation.step.meter import SETTLED
 
@@ -17,16 +17,13 @@ class EventOutcome(NamedTuple):
 
     Attributes:
         at: when it happened, s.
-        text: what happened, in words.
         peak: the largest error of a follower that is there; None without a frame.
         restored: from when on all of these stayed below 1 cm, s; None if they did not.
         until: of the last frame before the next event, s.
-        unit: of errors.
         leader: who leads from then on, and its largest distance from the path; None where that does
             not change, or nobody follows a path.
         near: the scaled distance to another agent at which one joins that keeps apart, m, where it
             is less than what they keep; else None.
-        guarantee: what is guaranteed through it, in words.
         sampled: whether there are steps between the frames.
     """
 
@@ -62,9 +59,8 @@ class EventOutcome(NamedTuple):
         seen = f"in the stored frames {seen}" if self.sampled else seen
         if self.leader is not None:
             agent, off = self.leader
-            seen += (
-                f"; agent {agent} leads, {off:.3g} {self.unit}".rstrip() + " off the path at most"
-            )
+            away = f"{off:.3g} {self.unit}".rstrip()
+            seen += f"; agent {agent} leads, {away} off the path at most"
         if self.near is not None:
             seen += f"; it joins {self.near:.3g} m from another agent, nearer than hulls keep"
         return f"{text}: {seen}. {self.guarantee}"
@@ -72,7 +68,7 @@ class EventOutcome(NamedTuple):
 
 def event_outcomes(result: Result) -> tuple[EventOutcome, ...]:
     """Return what followed each event of a run that it reached, by time."""
-    listed = events_in_words(result.parts, promise(result.parts, result.settings))
+    listed = events_in_words(result.parts, guarantee(result.parts, result.settings))
     ends = [*(event["at"] for event in listed), np.inf][1:]
     return tuple(
         _outcome(result, event, end)
@@ -82,7 +78,6 @@ def event_outcomes(result: Result) -> tuple[EventOutcome, ...]:
 
 
 def _outcome(result: Result, event: JsonObject, end: float) -> EventOutcome:
-    """Return what followed an event until another time."""
     late, times = 0.5 * result.settings.dt, result.times
     # A change acts from the first step on that does not begin before it.
     frames = np.flatnonzero((times >= event["at"] - late) & (times < end - late))
@@ -118,7 +113,6 @@ def _new_leader(result: Result, frames: Int[np.ndarray, " F"]) -> tuple[int, flo
 
 
 def _too_near(result: Result, event: JsonObject, frames: Int[np.ndarray, " F"]) -> float | None:
-    """Return how near to another an agent joins that keeps apart, if that is too near."""
     safety, here = result.drive.safety, result.presence
     if safety is None or here is None or event["what"] != "join" or not len(frames):
         return None

@@ -26,7 +26,6 @@ class Labelled(NamedTuple):
     Attributes:
         variables: name -> (dimensions, values) or (dimensions, values, attributes).
         coordinates: the same; one with the name of its only dimension may be values alone.
-        attributes: of the dataset.
     """
 
     variables: Variables
@@ -61,7 +60,6 @@ class Labelled(NamedTuple):
         return file.getvalue()
 
     def _split(self, group_of: "GroupOf") -> "dict[str, Labelled]":
-        """Return the arrays of each group, the root first."""
         groups, used = {"": Labelled({}, {}, self.attributes)}, dict[str, set[str]]()
         for name, part in self.variables.items():
             over = _whole(name, part)[0]
@@ -91,7 +89,6 @@ class Labelled(NamedTuple):
             place.attrs[name] = plain
 
     def _labels(self, dimensions: tuple[str, ...] | None = None) -> list[str]:
-        """Return the coordinates whose name is not that of their dimension, of these dimensions."""
         labels = {name: _whole(name, part)[0] for name, part in self.coordinates.items()}
         return [
             name
@@ -162,7 +159,6 @@ def _write(
     values: Array,
     attributes: JsonObject,
 ) -> None:
-    """Write one variable."""
     import h5py
 
     for dimension, size in zip(dimensions, values.shape, strict=True):

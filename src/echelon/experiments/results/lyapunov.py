@@ -21,8 +21,8 @@ from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
-from echelon.simulation.step.drive import Drive
-from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.drive import Controller
+from echelon.simulation.step.motion import PlantStep
 
 # Below this fraction of its largest value V is rounding, and an increase means nothing.
 _ROUNDING = 1e-20
@@ -111,7 +111,7 @@ def _lyapunov(result: Result) -> Lyapunov | None:
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
         x, u = result.states, result.inputs
         steps = np.rint(result.times / result.settings.dt).astype(np.int32)
-        motion = Motion.of(result.model, result.world, result.settings, graph.agents)
+        motion = PlantStep.of(result.model, result.world, result.settings, graph.agents)
         fields = _fields(result.drive, result.model, motion, graph.leaders[0], x, u, steps)
         now, after = (
             _in_metric_axes(result.model, field, np.asarray(field.states) - offsets)
@@ -170,11 +170,7 @@ def _rounding(result: Result, P: Array, value: Array) -> float:
 
 
 class _Fields(NamedTuple):
-    """States (T, N, n), the drift under the drive and xdot there, and the headings (T,).
-
-    The metric is in axes that turn with the headings; `rates` are those of the headings, rad/s.
-    Both are None where the axes do not turn.
-    """
+    """States, drift, xdot (T, N, n); headings (T,) and rates (rad/s), None if axes do not turn."""
 
     states: jax.Array
     drift: jax.Array
@@ -185,27 +181,22 @@ class _Fields(NamedTuple):
 
 @cached_jit
 def _fields(
-    drive: Drive,
+    drive: Controller,
     model: ControlAffine,
-    motion: Motion,
+    motion: PlantStep,
     leader: int,
     x: jax.Array,
     u: jax.Array,
     steps: jax.Array,
 ) -> tuple[_Fields, _Fields]:
-    """Return the fields at states x (T, N, n) under inputs u (T, N, m) at steps (T,), and after it.
-
-    The velocity is taken to be the same one step later.
-    """
+    """The velocity is taken to be the same one step later."""
 
     def velocity(x: jax.Array, u: jax.Array, agent: jax.Array, step: jax.Array) -> jax.Array:
         return disturbed(motion.plant, *draw(motion.wind, step, agent))(x, u)
 
     moving = jax.vmap(jax.vmap(velocity, in_axes=(0, 0, 0, None)), in_axes=(0, 0, None, 0))
-    later, xdot = (
-        jax.vmap(lambda *at: motion.advance(*at)[0])(x, u, steps),
-        moving(x, u, jnp.arange(x.shape[1]), steps),
-    )
+    later = jax.vmap(lambda *at: motion.advance(*at)[0])(x, u, steps)
+    xdot = moving(x, u, jnp.arange(x.shape[1]), steps)
 
     def heading(t: jax.Array, x: jax.Array) -> jax.Array | None:
         return drive.heading(model, t, x)
@@ -229,7 +220,6 @@ def _fields(
 def _in_metric_axes(
     model: ControlAffine, fields: _Fields, y: Float[Array, "T N n"]
 ) -> tuple[Float[Array, "T N n"], Float[Array, "T N n"], Float[Array, "T N n"]]:
-    """Return y, the drift and xdot in the axes of the metric."""
     f, xdot = np.asarray(fields.drift), np.asarray(fields.xdot)
     if fields.headings is None or fields.rates is None:
         return y, f, xdot
@@ -249,15 +239,9 @@ def _rotate_back(model: ControlAffine, values: jax.Array, angles: jax.Array) -> 
 
 @final
 class Deviations:
-    """Computes z and delta for a graph, whose Laplacian is factored once.
-
-    Args:
-        graph: the communication graph.
-        difference: of states (T, E, n).
-    """
+    """Computes z and delta for a graph, whose Laplacian is factored once."""
 
     def __init__(self, graph: Graph, difference: _Difference) -> None:
-        """Build the differences along the edges."""
         i, j = graph.edges.T
         edge = np.arange(len(i))
         signs = np.concatenate([graph.weights, -graph.weights])

@@ -22,13 +22,13 @@ from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.run_numbers import (
     AGENT_NUMBERS,
     RUN_NUMBERS,
+    Appearance,
     EdgeMetrics,
     FollowerMetrics,
     LeaderMetrics,
     Metrics,
-    Shown,
 )
-from echelon.guarantees.promises.promise import Promise, covered
+from echelon.guarantees.promises.promise import Guarantee, covered
 from echelon.simulation.engine.result import Result, finite_or_none
 from echelon.simulation.step.meter import SETTLED, output_error, steps_per_slice
 
@@ -72,7 +72,6 @@ def _output_errors(
 
 
 def _root_mean(total: float | np.floating, steps: float | np.floating) -> float | None:
-    """Return the root of a mean of squares, from their sum; None where there is no mean."""
     return finite_or_none(np.sqrt(total / steps)) if steps > 0 else None
 
 
@@ -118,10 +117,7 @@ def _followers(result: Result, exists: bool) -> tuple[FollowerMetrics, ...]:
 
 
 def _settling_time(result: Result, agent: int, last: float) -> float | None:
-    """Return the time after which the error stays below 1 cm, to a step, or None.
-
-    `last` is the error in the last stored frame, after the last step in the sums.
-    """
+    """`last` is the error in the last stored frame, after the last step in the sums."""
     if not last <= SETTLED:
         return None
     first, settings = float(result.sums.unsettled[agent]) + 1.0, result.settings
@@ -186,7 +182,6 @@ class Avoidance(NamedTuple):
         times: at which each slice begins, s.
         distance: the least distance between two agents in it, m.
         active: pairs of agents of which one changed the other's rate, each way, on average.
-        ellipsoid: about each agent.
     """
 
     times: Float[np.ndarray, " B"]
@@ -243,16 +238,13 @@ class RunNumbers:
     """A run with what its numbers are computed from.
 
     Attributes:
-        result: the run.
-        metrics: of the run.
-        promise: of its parts.
         computing: computing time (s) for one agent and one second of the run, without compilation;
             None if it was not measured.
     """
 
     result: Result
     metrics: Metrics
-    promise: Promise
+    promise: Guarantee
     computing: float | None = None
 
     def number(self, name: str) -> float | None:
@@ -265,7 +257,7 @@ class RunNumbers:
         value = None if compute is None else compute(self)
         return None if value is None or np.isnan(value).any() else value
 
-    def json(self, where: Shown) -> JsonObject:
+    def json(self, where: Appearance) -> JsonObject:
         """Return the numbers that appear somewhere, under their names in JSON."""
         return {
             quantity.key or name: self._value(name)

@@ -27,7 +27,7 @@ from echelon.experiments.results.labelled import Labelled, read_labelled
 from echelon.experiments.results.metrics import Avoidance, Ellipsoid
 from echelon.simulation.engine.frame_numbers import FrameChoice, FrameNumbers
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.engine.record import Stretch
+from echelon.simulation.engine.record import Segment
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.settings import Settings
 
@@ -100,12 +100,9 @@ class Recording(FrameNumbers):
         name: of the scenario, or of the model.
         model: the name of its class.
         times: s.
-        states: of all agents.
         inputs: as delivered by the actuators.
         reference: the leaders' reference state; None without one.
         offsets: each agent's goal relative to its leader; the first one where it moves.
-        leaders: their numbers.
-        nearest: each agent's nearest leader.
         edges: with `weights`; of a graph that switches, all edges that exist at some time.
         heard: whether each end of an edge receives from the other.
         schedule: the weights over time, and who is there; None where they are constant.
@@ -113,14 +110,13 @@ class Recording(FrameNumbers):
         position: indices of the coordinates that a picture shows; none of an abstract agent.
         bounds: of the inputs; None without limits.
         lyapunov: V; None where the law has none.
-        lyapunov_rate: its derivative.
         metric: P of V, where there is a gain; else None.
         saturated: fraction of steps in which a limit changed the agent's input.
         tracking: of the leaders; None without a reference.
         modes: None where the laws have no linearization.
         messages: over a network; None in the ideal one.
         avoidance: how agents kept apart, without slices before they did; None where they do not.
-        promise: as `Promise.as_mapping` returns it.
+        promise: as `Guarantee.as_mapping` returns it.
         horizon, dt: s.
         attributes: provenance and settings, as stored.
         events: what happened, by time: `at` (s), `what`, `agents`, `until` (s) and `text`.
@@ -164,7 +160,6 @@ class Recording(FrameNumbers):
     moving: Float[np.ndarray, "T N n"] | None = None
 
     def __repr__(self) -> str:
-        """Return the name and the sizes."""
         frames = amount(len(self.times), "frame")
         return f"Recording({self.name!r}, {self.agents} agents, {frames})"
 
@@ -374,9 +369,8 @@ def _bounds(values: Mapping[str, np.ndarray]) -> InputBounds | None:
 def _tracking(values: Mapping[str, np.ndarray]) -> TrackingErrors | None:
     if "tracking_error" not in values:
         return None
-    return TrackingErrors(
-        values["tracking_error"], _texts(values, "output"), _texts(values, "output_unit")
-    )
+    names, units = _texts(values, "output"), _texts(values, "output_unit")
+    return TrackingErrors(values["tracking_error"], names, units)
 
 
 def _modes(values: Mapping[str, np.ndarray]) -> LoopPoles | None:
@@ -389,13 +383,11 @@ def _modes(values: Mapping[str, np.ndarray]) -> LoopPoles | None:
 def _avoidance(values: Mapping[str, np.ndarray]) -> Avoidance | None:
     if "ellipsoid_radius" not in values:
         return None
-    radius, height, limit = (
-        float(values[name]) for name in ("ellipsoid_radius", "ellipsoid_height", "kept_distance")
-    )
-    times, distance, active = (
-        values.get(name, np.zeros(0)) for name in ("slice_start", "scaled_distance", "active_rows")
-    )
-    return Avoidance(times, distance, active, Ellipsoid(radius, height, limit))
+    names = "ellipsoid_radius", "ellipsoid_height", "kept_distance"
+    ellipsoid = Ellipsoid(*(float(values[name]) for name in names))
+    slices = "slice_start", "scaled_distance", "active_rows"
+    times, distance, active = (values.get(name, np.zeros(0)) for name in slices)
+    return Avoidance(times, distance, active, ellipsoid)
 
 
 def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:
@@ -405,22 +397,14 @@ def _messages(values: Mapping[str, np.ndarray]) -> MessageAges | None:
     return MessageAges(*rows, float(values["forget"]))
 
 
-def foreseen(
+def empty_recording(
     parts: Parts,
     settings: Settings,
     states: Float[Array, "N n"],
     name: str,
     promise: JsonObject = _NO_PROMISE,
 ) -> Recording:
-    """Return a recording of agents that stay at their goals, by which the scene is sized.
-
-    Args:
-        parts: of the run, with its drive completed.
-        settings: of the run.
-        states: at the beginning.
-        name: of the scenario.
-        promise: as `Promise.as_mapping` returns it; none by default.
-    """
+    """Return a recording of agents that stay at their goals, by which the scene is sized."""
     model, fixed = parts.model, labelled_parts(parts, settings)
     times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)
     ahead, reference = _ahead(parts, states, times)
@@ -442,7 +426,6 @@ def foreseen(
 def _ahead(
     parts: Parts, start: Float[Array, "N n"], times: Float[Array, " T"]
 ) -> tuple[Float[Array, "T N n"], Float[Array, "T n"] | None]:
-    """Return the states at the start and the goals from then on, and the reference if any."""
     with precision("float64"):
         path = parts.drive.reference_states(parts.model, jnp.asarray(times))
     if path is None:
@@ -455,33 +438,29 @@ def _ahead(
 
 def so_far(
     run: Recording,
-    stretch: Stretch,
+    segment: Segment,
     potential: Callable[[Array], Array] | None,
     formation: Formation,
 ) -> Recording:
     """Return a part of a run as a recording.
 
-    Args:
-        run: as returned by `foreseen`.
-        stretch: the part, with finite numbers.
-        potential: V (T,) of states minus offsets (T, N, n); None where there is none.
-        formation: of the run.
+    `run` is one of `empty_recording`; `potential` gives V (T,) of states minus offsets (T, N, n).
     """
-    moving = None if formation.motion is None else formation.offsets_at(stretch.times)
-    lyapunov, count = None, len(stretch.times)
+    moving = None if formation.motion is None else formation.offsets_at(segment.times)
+    lyapunov, count = None, len(segment.times)
     if potential is not None:
         # Block by block, the last one padded with copies.
-        y = stretch.states - run.offsets
+        y = segment.states - run.offsets
         whole = -(-count // _BLOCK) * _BLOCK
         padded = np.concatenate([y, np.repeat(y[-1:], whole - count, axis=0)])
         blocks = map(potential, np.split(padded, whole // _BLOCK))
         lyapunov = np.concatenate([*blocks])[:count]
     return dataclasses.replace(
         run,
-        times=stretch.times,
-        states=stretch.states,
-        inputs=stretch.inputs,
-        reference=stretch.reference,
+        times=segment.times,
+        states=segment.states,
+        inputs=segment.inputs,
+        reference=segment.reference,
         moving=moving,
         lyapunov=lyapunov,
     )

@@ -33,7 +33,7 @@ def settling_bound(unit: str) -> str:
 
 
 @final
-class Shown(enum.Flag):
+class Appearance(enum.Flag):
     """Where a number of a run appears, besides the glossary."""
 
     SWEEP = enum.auto()
@@ -56,7 +56,6 @@ class Quantity(NamedTuple):
         column: of a table; `{unit}`, `{window}` (s) and `{settled}` stand for those of the run.
         of: computes it from the `RunNumbers` of a run, for an agent's number those of all
             followers, (F,); None for what `metrics` computes of each agent.
-        shown: where it appears.
         key: in JSON; its name by default.
         scale: of the number in tables: 100 for a percentage.
         digits: most digits in tables.
@@ -68,7 +67,7 @@ class Quantity(NamedTuple):
     label: str = ""
     column: str = ""
     of: Callable[[Any], Any] | None = None
-    shown: Shown = Shown.SWEEP
+    shown: Appearance = Appearance.SWEEP
     key: str = ""
     scale: float = 1.0
     digits: int = 4
@@ -205,7 +204,7 @@ AGENT_NUMBERS: Mapping[str, Quantity] = quantities(FollowerMetrics) | {
         ERROR,
         column="error at the start{unit}",
         of=lambda run: run.first_and_last[0],
-        shown=Shown(0),
+        shown=Appearance(0),
     ),
     "final_error": Quantity(
         "formation error at the end",
@@ -214,14 +213,14 @@ AGENT_NUMBERS: Mapping[str, Quantity] = quantities(FollowerMetrics) | {
         of=lambda run: run.first_and_last[1],
     ),
 }
-_OF_NETWORK = Shown.SWEEP | Shown.COMPARISON | Shown.SUMMARY
+_OF_NETWORK = Appearance.SWEEP | Appearance.COMPARISON | Appearance.SUMMARY
 RUN_NUMBERS: Mapping[str, Quantity] = {
     "formation_rmse": Quantity(
         "root mean square of the followers' errors, over all steps and followers",
         ERROR,
         "formation RMSE",
         of=lambda run: run.root_mean("rmse"),
-        shown=Shown.SWEEP | Shown.DISTRIBUTION,
+        shown=Appearance.SWEEP | Appearance.DISTRIBUTION,
     ),
     "formation_steady_rmse": Quantity(
         "root mean square of the followers' errors in the steady window",
@@ -229,27 +228,27 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         of=lambda run: run.root_mean("steady_rmse"),
     ),
     "worst_rmse": Quantity(
-        "largest RMSE of a follower", ERROR, of=lambda run: run.worst("rmse"), shown=Shown(0)
+        "largest RMSE of a follower", ERROR, of=lambda run: run.worst("rmse"), shown=Appearance(0)
     ),
     "worst_steady_rmse": Quantity(
         "largest RMSE of a follower in the steady window",
         ERROR,
         of=lambda run: run.metrics.worst_steady,
-        shown=Shown(0),
+        shown=Appearance(0),
     ),
     "worst_final_error": Quantity(
         "error of the follower that is farthest from its goal at the end",
         ERROR,
         "worst final error",
         of=lambda run: run.worst("final_error"),
-        shown=Shown.SWEEP | Shown.DISTRIBUTION,
+        shown=Appearance.SWEEP | Appearance.DISTRIBUTION,
     ),
     "worst_settling_time": Quantity(
         "time after which the errors of all followers stay below 1 cm, or 0.01 without a position",
         "s",
         "settling time",
         of=lambda run: run.worst("settling_time"),
-        shown=Shown.SWEEP | Shown.DISTRIBUTION | Shown.COMPARISON,
+        shown=Appearance.SWEEP | Appearance.DISTRIBUTION | Appearance.COMPARISON,
         key="settling_time_s",
         absent="never",
     ),
@@ -257,26 +256,26 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         "root mean square of the first leader's error",
         ERROR,
         of=lambda run: run.metrics.leader.rmse,
-        shown=Shown.SWEEP | Shown.COMPARISON,
+        shown=Appearance.SWEEP | Appearance.COMPARISON,
     ),
     "leader_steady_rmse": Quantity(
         "root mean square of the first leader's error in the steady window",
         ERROR,
         of=lambda run: run.metrics.leader.steady_rmse,
-        shown=Shown.SWEEP | Shown.COMPARISON,
+        shown=Appearance.SWEEP | Appearance.COMPARISON,
     ),
     "effort": Quantity(
         "root mean square of the followers' normalized inputs about the trim",
         column="effort",
         # The mean of the squares: the root mean square of all inputs together.
         of=lambda run: run.root_mean("effort"),
-        shown=Shown.COMPARISON,
+        shown=Appearance.COMPARISON,
     ),
     "saturation_fraction": Quantity(
         "mean over all agents of `saturated`",
         column="saturated,\n% steps",
         of=lambda run: run.metrics.saturation_fraction,
-        shown=Shown.SWEEP | Shown.COMPARISON | Shown.SUMMARY,
+        shown=Appearance.SWEEP | Appearance.COMPARISON | Appearance.SUMMARY,
         scale=100.0,
         digits=3,
     ),
@@ -285,37 +284,37 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         "m",
         column="smallest\ndistance",
         of=lambda run: run.metrics.minimum_distance,
-        shown=Shown.COMPARISON | Shown.SUMMARY,
+        shown=Appearance.COMPARISON | Appearance.SUMMARY,
     ),
     "minimum_distance_time": Quantity(
         "time at which two agents were closest to each other",
         "s",
         of=lambda run: getattr(run.metrics.closest, "time", None),
-        shown=Shown.SUMMARY,
+        shown=Appearance.SUMMARY,
         key="minimum_distance_time_s",
     ),
     "minimum_distance_frames": Quantity(
         "in how many stored frames that distance was found; null: over all steps",
         of=lambda run: getattr(run.metrics.closest, "frames", None),
-        shown=Shown.SUMMARY,
+        shown=Appearance.SUMMARY,
     ),
     "closest_agents": Quantity(
         "the two agents that were closest to each other",
         of=lambda run: getattr(run.metrics.closest, "agents", None),
-        shown=Shown.SUMMARY,
+        shown=Appearance.SUMMARY,
     ),
     "vehicle_radius": Quantity(
         "radius of an agent; closer than twice of it, two agents touch",
         "m",
         of=lambda run: run.result.radius,
-        shown=Shown.SUMMARY,
+        shown=Appearance.SUMMARY,
     ),
     "computing": Quantity(
         "computing time for one agent and one second of the run",
         "s",
         column="computing,\nms per agent s",
         of=lambda run: run.computing,
-        shown=Shown.COMPARISON,
+        shown=Appearance.COMPARISON,
         key="computing_s_per_agent_s",
         scale=1e3,
     ),
@@ -355,13 +354,13 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
         "m",
         column="scaled\ndistance",
         of=lambda run: None if run.avoidance is None else run.avoidance.least,
-        shown=Shown.SWEEP | Shown.SUMMARY,
+        shown=Appearance.SWEEP | Appearance.SUMMARY,
     ),
     "held_back_until": Quantity(
         "time until which agents that keep apart held each other back",
         "s",
         of=lambda run: None if run.avoidance is None else run.avoidance.last,
-        shown=Shown.SWEEP | Shown.SUMMARY,
+        shown=Appearance.SWEEP | Appearance.SUMMARY,
     ),
     "promise_rate": Quantity(
         "rate at which errors are guaranteed to decay",
@@ -372,7 +371,7 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
     "covered": Quantity(
         "whether every step of the run kept to what its theorem rests on, limits included",
         of=lambda run: run.covered,
-        shown=Shown.SWEEP | Shown.SUMMARY,
+        shown=Appearance.SWEEP | Appearance.SUMMARY,
     ),
     "certified_radius": Quantity(
         "r of the certified set: sum_i delta_i'P delta_i <= r^2",
@@ -385,11 +384,11 @@ RUN_NUMBERS: Mapping[str, Quantity] = {
     "alternations": Quantity(
         "how many times an input of an agent jumped from one limit to the opposite one, at most",
         of=lambda run: int(run.result.chatter.max()),
-        shown=Shown.SUMMARY,
+        shown=Appearance.SUMMARY,
     ),
 }
 
 
-def shown_in(table: Mapping[str, Quantity], where: Shown) -> dict[str, Quantity]:
+def shown_in(table: Mapping[str, Quantity], where: Appearance) -> dict[str, Quantity]:
     """Return the numbers of a table that appear somewhere."""
     return {name: quantity for name, quantity in table.items() if where in quantity.shown}

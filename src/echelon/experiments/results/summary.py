@@ -12,20 +12,20 @@ from echelon.experiments.results.metrics import RunNumbers, metrics
 from echelon.experiments.results.run_numbers import (
     AGENT_NUMBERS,
     RUN_NUMBERS,
+    Appearance,
     EdgeMetrics,
     Metrics,
-    Shown,
     representatives,
     shown_in,
     steady_error,
 )
 from echelon.guarantees.promises.hypotheses import events_in_words
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.laws.law import gain_of
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain
 
@@ -47,8 +47,8 @@ def statement(parts: Parts, settings: Settings, name: str) -> JsonObject:
         **parts.world.describe(parts.model),
         "gain": _gain_numbers(gain),
         "leader_gain": _gain_numbers(leader_gain_of(parts.drive)),
-        "promise": promise(parts, settings).as_mapping(),
-        **({"events": events_in_words(parts, promise(parts, settings))} if parts.events else {}),
+        "promise": guarantee(parts, settings).as_mapping(),
+        **({"events": events_in_words(parts, guarantee(parts, settings))} if parts.events else {}),
         "lambda_min": spectrum.low,
         "lambda_max": spectrum.high,
     }
@@ -61,12 +61,12 @@ def _gain_numbers(gain: Gain | None) -> JsonObject | None:
     return {"method": gain.method, "coupling": gain.coupling, **numbers}
 
 
-def leader_gain_of(drive: Drive) -> Gain | None:
+def leader_gain_of(drive: Controller) -> Gain | None:
     """Return the leaders' own gain; None without one."""
     return gain_of(drive.leader) if isinstance(drive, Laws) else None
 
 
-_NUMBERS = tuple(x.key or name for name, x in shown_in(RUN_NUMBERS, Shown.SUMMARY).items())
+_NUMBERS = tuple(x.key or name for name, x in shown_in(RUN_NUMBERS, Appearance.SUMMARY).items())
 OBSERVED = ("outcome", "leader", "leaders", "followers", "edges", *_NUMBERS)
 OBSERVED += ("event_outcomes", "steady_window_s", "warnings", "engine", "wall_time_s", "versions")
 """The other entries of a summary, which only the run itself gives."""
@@ -80,7 +80,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
 
     numbers = metrics(result) if numbers is None else numbers
     name = result.provenance.get("scenario", "")
-    guarantee = promise(result.parts, result.settings)
+    stated = guarantee(result.parts, result.settings)
     keys = {name: quantity.key or name for name, quantity in AGENT_NUMBERS.items()}
     outcomes = [outcome.as_mapping() for outcome in event_outcomes(result)]
     return {
@@ -96,7 +96,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
             {"edge": list(row.edge), "distance_rmse": row.distance_rmse}
             for row in _listed(numbers.edges, distance_error)
         ],
-        **RunNumbers(result, numbers, guarantee).json(Shown.SUMMARY),
+        **RunNumbers(result, numbers, stated).json(Appearance.SUMMARY),
         **({"event_outcomes": outcomes} if result.parts.events else {}),
         "steady_window_s": numbers.steady_window,
         "warnings": list(result.warnings),

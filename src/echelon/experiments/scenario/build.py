@@ -9,11 +9,11 @@ from typing import Any, NamedTuple, TypeVar, cast, final
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.channel import Bursts, Network
-from echelon.agents.network.events import Cut, Event, Join, Lose, check_heirs, event_faults
+from echelon.agents.network.events import Cut, Event, Join, Lose, check_backups, event_faults
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
-from echelon.agents.references.reference import Guide, Reference, check_reference
+from echelon.agents.references.reference import LeaderPath, Reference, check_reference
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.sensing import Sensing
@@ -69,7 +69,7 @@ from echelon.laws.safety import Safety
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.prepare import check_engine, check_memory
-from echelon.simulation.engine.record import Stretch
+from echelon.simulation.engine.record import Segment
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import Keep, Progress, simulate
 from echelon.simulation.step.leadership import Leadership
@@ -117,7 +117,7 @@ def run(
     progress: Progress | None = None,
     built: Experiment | None = None,
     keep: Keep | None = None,
-    before: Sequence[Stretch] = (),
+    before: Sequence[Segment] = (),
 ) -> Result:
     """Simulate a scenario, and record in the result what it was computed from.
 
@@ -150,8 +150,6 @@ def origin_of(scenario: Scenario) -> dict[str, Any]:
 
 @final
 class _Builder:
-    """Builds the parts of a scenario, and collects their faults with the places of their keys."""
-
     def __init__(self, scenario: Scenario) -> None:
         """Build what all other parts need, whose faults they would report again."""
         self.scenario, self.faults = scenario, list[ScenarioFault]()
@@ -166,7 +164,6 @@ class _Builder:
 
     @contextlib.contextmanager
     def at(self, *path: str | int) -> Iterator[None]:
-        """Record an error that is raised inside, and continue."""
         try:
             yield
         except MissingExtraError:
@@ -189,7 +186,6 @@ class _Builder:
             refuse(self.faults)
 
     def check_run(self) -> None:
-        """Check that a scenario has no live events, and that its run fits in memory."""
         with self.at("live"):
             if self.scenario.live:
                 raise ScenarioError(
@@ -201,7 +197,6 @@ class _Builder:
         self.settle()
 
     def parts(self) -> Parts:
-        """Return all parts."""
         scenario, model = self.scenario, self.model
         world, leadership = self._world(), self._leadership()
         events = self._events(leadership)
@@ -230,7 +225,7 @@ class _Builder:
         with self.at("plant", "agents"):
             world.check_agents(model, self.graph.agents)
         with self.at("leadership"):
-            laws.check_heirs(parts.graph)
+            laws.check_backups(parts.graph)
             if leadership is not None:
                 leadership.check_network(world.network)
         with self.at("network"):
@@ -250,7 +245,6 @@ class _Builder:
         python: str | None,
         arguments: Mapping[str, object] = NOTHING,
     ) -> NamedClass:
-        """Return a member of a table, or a class in a file of the user."""
         if python is not None:
             cls = user_class(self.scenario.folder, python, kind)
             return NamedClass(cls, python, arguments, by_user=True)
@@ -276,7 +270,7 @@ class _Builder:
         check_model(model)
         return model
 
-    def _reference(self) -> Guide | None:
+    def _reference(self) -> LeaderPath | None:
         spec = self.scenario.reference
         # Files use the model's names, and a model that fails is reported by itself.
         if spec is None or self.model is None:
@@ -288,7 +282,6 @@ class _Builder:
         return reference
 
     def _formation(self) -> Formation:
-        """Return the formation, with its motion; its faults are noted."""
         spec, starts = self.scenario.formation, self.scenario.initial.states
         formation = self._shape(spec)
         if spec.assign == "nearest":
@@ -468,17 +461,16 @@ class _Builder:
     def _leadership(self) -> Leadership | None:
         spec, leadership = self.scenario.leadership, None
         if spec is not None:
-            with self.at("leadership", "heirs"):
-                check_heirs(self.graph, spec.heirs)
+            with self.at("leadership", "backups"):
+                check_backups(self.graph, spec.backups)
                 leadership = Leadership(**spec.model_dump())
             self.settle()
         return leadership
 
     def _events(self, leadership: Leadership | None) -> list[Event]:
-        """Return what happens during the run; a fault is noted at its event."""
         events = [_event(spec) for spec in self.scenario.events]
-        heirs = () if leadership is None else leadership.heirs
-        for k, text in event_faults(self.graph, events, heirs, self.scenario.simulation.horizon):
+        backups = () if leadership is None else leadership.backups
+        for k, text in event_faults(self.graph, events, backups, self.scenario.simulation.horizon):
             with self.at("events", k):
                 raise ScenarioError(f"{text}.")
         self.settle()
@@ -506,7 +498,6 @@ def _event(spec: EventSpec) -> Event:
 
 
 def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) -> ControlAffine:
-    """Return a model with a named set of parameters, some of them changed."""
     named = getattr(part.cls, "named", None)
     if named is None:
         raise ModelError(

@@ -82,13 +82,7 @@ def sections_among(places: Iterable[str], scenario: type[BaseModel]) -> set[str]
 
 
 def meant(wrong: tuple[str | int, ...], allowed: list[str], scenario: type[BaseModel]) -> str:
-    """Return ` (did you mean ...?)` with what an unknown key may mean; empty if nothing is close.
-
-    Args:
-        wrong: the path of the key that its section does not have.
-        allowed: the keys that the section has.
-        scenario: the class of the whole file.
-    """
+    """Return ` (did you mean ...?)` for an unknown key; empty if nothing is close."""
     before, colon, value = str(wrong[-1]).partition(":")
     if colon and value and before in allowed:
         return f" (did you mean `{before}: {value}`, with a space?)"

@@ -53,7 +53,6 @@ class NamedClass(NamedTuple):
     Attributes:
         cls: the class, or a function that returns an instance.
         name: what messages call it.
-        arguments: those that the scenario gives.
         by_user: whether it is in a file of the user.
     """
 
@@ -91,10 +90,7 @@ class NamedClass(NamedTuple):
 def user_class(folder: Path, target: str, kind: type[_T]) -> type[_T]:
     """Return a class of a kind from a user's file.
 
-    Args:
-        folder: to which the file is relative.
-        target: `file.py:Class`.
-        kind: the base class, such as `Law`.
+    `target` is `file.py:Class`, its file relative to `folder`.
 
     Raises:
         ScenarioError: there is no such file, it does not import, or it has no such class.

@@ -12,7 +12,6 @@ class Entry(NamedTuple):
 
     Attributes:
         target: `module:Attribute`.
-        summary: for lists.
         reference: of a leader law, whether it needs a reference, takes one, or takes none.
         leader: of a follower law, the leader law that goes with it by default; None where that
             depends on the reference alone.
@@ -25,7 +24,6 @@ class Entry(NamedTuple):
 
 
 def _family(module: str, **entries: tuple[str, str]) -> dict[str, Entry]:
-    """Return the entries of a family: classes of a module, each with its summary."""
     return {
         name.replace("_", "-"): Entry(f"echelon.{module}:{cls}", text)
         for name, (cls, text) in entries.items()
@@ -125,12 +123,7 @@ TRACKING_LAWS = [name for name, entry in LEADER_LAWS.items() if entry.reference 
 
 
 def default_leader_law(follower: object, reference: bool) -> str:
-    """Return the leader's law where the file names none.
-
-    Args:
-        follower: the followers' law, as the file names it.
-        reference: whether there is a reference.
-    """
+    """Return the leader's law where the file names none."""
     entry = FOLLOWER_LAWS.get(follower) if isinstance(follower, str) else None
     if entry is not None and entry.leader is not None:
         return entry.leader

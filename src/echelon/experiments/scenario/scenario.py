@@ -146,7 +146,6 @@ _ALLOWED = {
 
 
 def _section(path: KeyPath) -> type[Section] | None:
-    """Return the section at a path; None where there is none."""
     part: Any = Scenario
     for key in path:
         # The place in a list of sections has the keys of any other.
@@ -159,13 +158,11 @@ def _section(path: KeyPath) -> type[Section] | None:
 
 
 def _keys(path: KeyPath) -> list[str]:
-    """Return the keys that the section at a path takes; none where there is no section."""
     part = _section(path)
     return [] if part is None else [f.alias or key for key, f in part.model_fields.items()]
 
 
 def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
-    """Return the path and the sentence of a fault of the schema."""
     # Of a value that may also be a section, the path has the name of the section's class.
     path = tuple(k for k in error["loc"] if sections.ObserverSpec.__name__ not in str(k))
     kind, context = error["type"], error.get("ctx", {})
@@ -272,7 +269,6 @@ def bundled_scenarios() -> dict[str, str]:
 
 
 def _locate(source: str | Path) -> tuple[Path, str]:
-    """Return the file that `source` means, and its name in messages."""
     names = list(bundled_scenarios())
     if str(source) in names:
         return _BUNDLED / f"{source}.yaml", f"{source}.yaml"
@@ -317,10 +313,7 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
 
 
 def _settled(document: Document) -> Document:
-    """Return a document without the keys that its overrides exclude.
-
-    A path on the command line is relative to the working folder, and becomes absolute.
-    """
+    """A path on the command line is relative to the working folder, and becomes absolute."""
     # The document that was read is not changed.
     data = copy.deepcopy(document.data)
     set_ = [path for path, _ in document.overrides]

@@ -616,11 +616,11 @@ class EventSpec(Section, **either("lose", "cut", "join")):
 class LeadershipSpec(Section):
     """Who takes the lead when nobody hears of the leader any more."""
 
-    heirs: Agents
+    backups: Agents
     """Numbers of followers, in the order in which they take over."""
     timeout: Annotated[Positive, Unit("s")] = 0.3
-    """Time without news of a leader after which the first heir takes the lead, s; the second does
-    after twice that, and so on."""
+    """Time without news of a leader after which the first backup takes the lead, s; the second
+    does after twice that, and so on."""
 
 
 @final

@@ -178,7 +178,6 @@ def _square(value: tuple[Any, ...]) -> tuple[tuple[float, ...], ...]:
 
 
 def _numeric(value: object) -> object:
-    """Return a number or nested lists of numbers with lists as tuples."""
     if isinstance(value, list):
         return tuple(map(_numeric, value))
     if isinstance(value, bool) or not isinstance(value, int | float):

@@ -79,8 +79,6 @@ text; aliases of aliases multiply without bound."""
 
 @final
 class _Reading:
-    """Traverses the composed nodes, and collects the places of values and the faults."""
-
     def __init__(self, where: Where, text: str) -> None:
         self.where, self.most = where, len(text) + _ALIASED
         self.yaml = YAML(typ="safe", pure=True)
@@ -131,9 +129,8 @@ class _Reading:
 
     def key(self, node: Node, path: KeyPath) -> str | int:
         if not isinstance(node, ScalarNode):
-            self.add_fault(
-                node, path, "got a list or mapping as a key, allowed is a word or a number."
-            )
+            text = "got a list or mapping as a key, allowed is a word or a number."
+            self.add_fault(node, path, text)
             return "?"
         key = self.meaning(node)
         return key if type(key) is int else str(node.value)

@@ -23,10 +23,10 @@ from echelon.core.statement import Hypothesis, Statement, Topic, fails, holds, u
 from echelon.core.types import Array
 from echelon.core.words import Kind, Verdict, amount
 from echelon.guarantees.promises.hypotheses import goal_drifts
-from echelon.guarantees.promises.promise import Promise
+from echelon.guarantees.promises.promise import Guarantee
 from echelon.laws.law import Law, reference_of
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.lmi import obstacle
 
@@ -45,7 +45,6 @@ class FiniteCondition(NamedTuple):
     Attributes:
         verdict: vacuous where f is the same at all goals, so that every P >= I passes.
         largest: of (xi_i - xi_j)'P (f(xi_i) - f(xi_j)) over the pairs; at most 0 where it holds.
-        pair: the agents with that value.
         least: smallest eigenvalue of P; at least 1 where it holds.
         agents: how many agents' goals were compared: all up to a thousand.
     """
@@ -61,7 +60,7 @@ def finite_condition(
     P: Float[Array, "n n"],
     model: ControlAffine,
     formation: Formation,
-    law: Law | Drive | None = None,
+    law: Law | Controller | None = None,
 ) -> FiniteCondition:
     """Return whether P meets the finite condition at a formation's goals, the leaders' included.
 
@@ -106,7 +105,6 @@ def pair_values(P: Array, d: Array, f: Array) -> Array:
 def _largest(
     P: Float[Array, "n n"], offsets: Float[Array, "N n"], drifts: Float[Array, "N n"]
 ) -> tuple[float, tuple[int, int]]:
-    """Return the largest value over all pairs, and the pair."""
     best, at = -np.inf, (0, 0)
     for start in range(0, len(offsets), _ROWS):
         rows = slice(start, start + _ROWS)
@@ -174,7 +172,7 @@ def _other_graph(graph: Graph) -> str:
     return "; ".join(texts)
 
 
-def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
+def drift_lines(parts: Parts, settings: Settings, promise: Guarantee) -> Iterator[Statement]:
     """Yield the conditions on leader and drift: Assumptions 4 and 5, Lemma 4, conditions on P."""
     reference = reference_of(getattr(parts.drive, "leader", parts.drive))
     yield _leader_line(promise, reference is not None)
@@ -193,16 +191,15 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
     both = not promise.hypotheses[Hypothesis.SYMMETRY].fails
     both = both and monotone.verdict is Verdict.HOLDS
     text, remedy = "needs Assumption 5 and symmetric offsets", "see Assumption 5 and the offsets"
-    yield (
-        holds(Topic.DRIFT_ALONG_Z, _LINEAR, text)
-        if both
-        else fails(Topic.DRIFT_ALONG_Z, _LINEAR, text, remedy=remedy)
-    )
+    if both:
+        yield holds(Topic.DRIFT_ALONG_Z, _LINEAR, text)
+    else:
+        yield fails(Topic.DRIFT_ALONG_Z, _LINEAR, text, remedy=remedy)
     yield _printed_line(parts, promise)
     yield _finite_line(parts, promise)
 
 
-def _leader_line(promise: Promise, follows: bool) -> Statement:
+def _leader_line(promise: Guarantee, follows: bool) -> Statement:
     """Assumption 4: the leader tracks its reference, by linearization."""
     name, slow = Topic.LEADER_TRACKING, promise.leader_mode
     if slow is None:
@@ -219,7 +216,6 @@ def _leader_line(promise: Promise, follows: bool) -> Statement:
 
 
 def _reference_line(model: ControlAffine, demand: ReferenceDemand, settings: Settings) -> Statement:
-    """Return the reference's speed and acceleration, and whether the input limits suffice."""
     limited = settings.limits and model.input_limits is not None
     unit = position_unit(model) or "1"
     sizes = ((demand.speed, f"{unit}/s"), (demand.acceleration, f"{unit}/s^2"))
@@ -238,7 +234,7 @@ def _reference_line(model: ControlAffine, demand: ReferenceDemand, settings: Set
     return holds(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number)
 
 
-def _monotone_line(parts: Parts, promise: Promise) -> Statement:
+def _monotone_line(parts: Parts, promise: Guarantee) -> Statement:
     """Assumption 5 for the drift that the followers have, inner loop included, at the trim."""
     name = Topic.MONOTONE
     if not promise.linear:
@@ -261,7 +257,7 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     return fails(name, _LINEAR, text, *number, remedy=remedy)
 
 
-def _printed_line(parts: Parts, promise: Promise) -> Statement:
+def _printed_line(parts: Parts, promise: Guarantee) -> Statement:
     """Return the largest eigenvalue of the paper's LMI at this P, for up to four followers."""
     # It fails at any size: on (v, s X v) with a small s > 0, [[0, X], [X, Z]] is
     # 2 s |X v|^2 + O(s^2) > 0. Four followers suffice to show it, and the cost of eigenvalues grows
@@ -286,7 +282,7 @@ def _printed_line(parts: Parts, promise: Promise) -> Statement:
     return fails(Topic.LMI_AS_PRINTED, _PROOF, text, *number, remedy=remedy)
 
 
-def _finite_line(parts: Parts, promise: Promise) -> Statement:
+def _finite_line(parts: Parts, promise: Guarantee) -> Statement:
     """Return the condition (xi_i - xi_j)'P (f(xi_i) - f(xi_j)) <= 0 on pairs of goals."""
     P, name = promise.loop.closed.P, Topic.FINITE
     # The law is the same with a multiple of P and the coupling divided by it.

@@ -16,7 +16,7 @@ from echelon.core.digits import about, at_most
 from echelon.core.errors import GainError, check_name
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.laws.law import TrimInput
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
@@ -99,7 +99,7 @@ def trial(parts: Parts, settings: Settings) -> Trial:
     alone = Parts(model, graph, Formation(np.zeros_like(rest)), laws, initial=rest)
     prepared = prepare(alone, settings)
     loop = assemble(prepared.problem, laws.leader, laws.follower)
-    slow = -promise(parts, settings).loop.slowest
+    slow = -guarantee(parts, settings).loop.slowest
     # After six time constants the slowest mode has decayed to e^-6 = 1/400; e^-3 = 1/20 is
     # required, which allows for a transient.
     steps = int(np.clip(np.ceil(6.0 / (slow * dt)), 1, _STEPS))

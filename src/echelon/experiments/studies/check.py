@@ -15,7 +15,7 @@ from echelon.core.types import Array, JsonObject
 from echelon.core.words import Feedforward, Kind, amount
 from echelon.experiments.studies.assumptions import drift_lines, graph_lines
 from echelon.guarantees.promises.closed_loop import LinearLoop
-from echelon.guarantees.promises.promise import AgreementModes, Promise, promise
+from echelon.guarantees.promises.promise import AgreementModes, Guarantee, guarantee
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.settings import Settings
@@ -31,7 +31,7 @@ _STIFF = 1e10
 """Ratio of modes above which the slowest one has fewer than six digits."""
 
 
-def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
+def margin_lines(parts: Parts, promise: Guarantee) -> Iterator[Statement]:
     """Yield the margins of a stable loop."""
     loop = promise.loop
     if parts.graph.schedule is not None:
@@ -74,7 +74,7 @@ def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     yield from _string_line(parts, loop)
 
 
-def _switching_lines(promise: Promise) -> Iterator[Statement]:
+def _switching_lines(promise: Guarantee) -> Iterator[Statement]:
     """Yield the margins for switching graphs: the smallest factor on the coupling (T8)."""
     edge, lines = promise.edge, promise.hypotheses
     anywhere = promise.agreement is not None
@@ -89,11 +89,7 @@ def _switching_lines(promise: Promise) -> Iterator[Statement]:
 
 
 def _spread_line(low: float, high: float, delay: float, best: float) -> Statement:
-    """Return whether the ratio of the graph's eigenvalues reduces the delay margin much.
-
-    Couplings are chosen for lambda_min, and the delay margin of a mode decreases with c lambda;
-    `best` is the delay margin at lambda_min.
-    """
+    """Couplings are chosen for lambda_min; the delay margin of a mode decreases with c lambda."""
     ratio = high / low
     if not ratio > _WIDE:
         text = f"at most {_WIDE}, so the fastest mode reduces the delay margin little"
@@ -105,11 +101,7 @@ def _spread_line(low: float, high: float, delay: float, best: float) -> Statemen
 
 
 def _agreement_lines(agreement: AgreementModes) -> Iterator[Statement]:
-    """Yield the delay margin of zeta' = -c L zeta: (pi/2 - |arg lambda|) / (c |lambda|).
-
-    A root s = i w of s + c lambda e^(-s tau) has w = c |lambda|, and first reaches the axis at that
-    delay.
-    """
+    """A root s = i w of s + c lambda e^(-s tau) has w = c |lambda|, and a phase of pi/2."""
     c, values = agreement
     delays = (0.5 * np.pi - np.abs(np.angle(values))) / (c * np.abs(values))
     at, sizes = int(delays.argmin()), np.abs(values)
@@ -202,7 +194,7 @@ class CheckResult(NamedTuple):
     """All lines, including the hypotheses of the promise; the promise; warnings of the parts."""
 
     lines: tuple[Statement, ...]
-    promise: Promise
+    promise: Guarantee
     warnings: tuple[str, ...] = ()
 
     @property
@@ -224,12 +216,12 @@ def check(parts: Parts, settings: Settings) -> CheckResult:
         EchelonError: a part is malformed or does not fit the others.
     """
     parts, _, warnings = prepare(parts, settings)
-    guarantee = promise(parts, settings)
+    stated = guarantee(parts, settings)
     with precision("float64"):
         lines = (
             *graph_lines(parts),
-            *drift_lines(parts, settings, guarantee),
-            *guarantee.hypotheses.values(),
-            *margin_lines(parts, guarantee),
+            *drift_lines(parts, settings, stated),
+            *stated.hypotheses.values(),
+            *margin_lines(parts, stated),
         )
-    return CheckResult(lines, guarantee, warnings)
+    return CheckResult(lines, stated, warnings)

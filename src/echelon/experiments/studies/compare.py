@@ -13,14 +13,14 @@ from echelon.experiments.results.metrics import RunNumbers, metrics
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import ScenarioLike, as_scenario
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.laws.consensus import Consensus
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.simulate import RunSoFar, simulate
 from echelon.simulation.optimal.drives import Plans, RecedingHorizon
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import FixedGain, Gain, Method, synthesize
 from echelon.synthesis.gains.riccati import InnerLoop, Riccati
@@ -63,14 +63,13 @@ _LAW_NAMES = {
     entry.target.rpartition(":")[2]: name for name, entry in registry.FOLLOWER_LAWS.items()
 }
 
-DriveOf = Callable[[Parts], Drive]
+DriveOf = Callable[[Parts], Controller]
 """Returns the drive of a method for the parts of a scenario."""
 
 
 def _consensus(
     gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bool = True
 ) -> DriveOf:
-    """Return the drive with the consensus law under a gain and the scenario's leader."""
     return lambda parts: parts.drive.with_follower(
         Consensus(gain(parts), feedforward, trim, parts.drive.frame)
     )
@@ -89,7 +88,6 @@ def _riccati(parts: Parts) -> Gain:
 
 
 def _reference(parts: Parts) -> Any:
-    """Return the reference of the scenario's leader; None without one."""
     return getattr(getattr(parts.drive, "leader", None), "reference", None)
 
 
@@ -193,12 +191,11 @@ def _with_starts(parts: Parts, settings: Settings) -> Parts:
 
 
 def _fly(parts: Parts, settings: Settings, part: Callable[[float], None]) -> RunNumbers:
-    """Run a method, and measure the time of solving, or of the compiled steps."""
     watch = _Watch(part)
     result = simulate(parts, settings, watch)
     seconds = watch.seconds if result.work is None else result.work.seconds
     computing = seconds / (parts.graph.agents * settings.horizon)
-    return RunNumbers(result, metrics(result), promise(result.parts, settings), computing)
+    return RunNumbers(result, metrics(result), guarantee(result.parts, settings), computing)
 
 
 class _Watch:
@@ -227,14 +224,9 @@ def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
     if any(eqx.tree_equal(drive, other) for other in others):
         return None
     law, gain, feedforward = getattr(drive, "follower", drive), drive.gain, drive.feedforward
-    name = _law_name(drive) if gain is None else gain.method
+    kind = type(law).__name__
+    name = _LAW_NAMES.get(kind, kind) if gain is None else gain.method
     label = name if feedforward is Feedforward.NONE else f"{name}-{feedforward}"
     if not type(law).__module__.startswith("echelon."):
-        label = type(law).__name__
+        label = kind
     return f"{label}, own" if label in {row.label for row in rows} else label
-
-
-def _law_name(drive: Drive) -> str:
-    """Return the name of the followers' law in scenarios, or that of the drive's class."""
-    kind = type(getattr(drive, "follower", drive)).__name__
-    return _LAW_NAMES.get(kind, kind)

@@ -20,7 +20,7 @@ from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.sections import GainSpec
 from echelon.experiments.scenario.yaml import ScenarioFault
-from echelon.guarantees.promises.promise import Promise, promise
+from echelon.guarantees.promises.promise import Guarantee, guarantee
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
@@ -36,11 +36,8 @@ class Design(NamedTuple):
     """A method on the scenario: its gain with its properties, or the reason why there is none.
 
     Attributes:
-        method: its name.
         gain: None where the method fails, for the `reason`.
         parts: of the scenario with that gain.
-        promise: of these parts.
-        reason: empty where there is a gain.
         fastest: largest modulus of a pole of the loop, 1/s.
         step: the longest sampling period (s) for which all checked modes remain stable.
         factors: the interval of stable factors on the coupling; None if unstable.
@@ -51,7 +48,7 @@ class Design(NamedTuple):
     method: str
     gain: Gain | None
     parts: Parts | None = None
-    promise: Promise | None = None
+    promise: Guarantee | None = None
     reason: str = ""
     fastest: float | None = None
     step: float = 0.0
@@ -179,16 +176,14 @@ def because(best: Design, designs: tuple[Design, ...], dt: float) -> str:
 
 
 def _advantage(best: Design, others: list[Design], dt: float) -> str:
-    """Return the advantage of a design over those for which the step is equally suitable."""
     assert best.promise is not None
     _, *argument, rate = best.merit(dt)
     rivals = [d for d in others if (d.step > dt) == (best.step > dt)]
     if not others:
         return "It is the only stable design."
     if not rivals:
-        return (
-            f"Of {1 + len(others)} stable designs only this one is stable at the scenario's step."
-        )
+        text = f"Of {1 + len(others)} stable designs only this one is "
+        return f"{text}stable at the scenario's step."
     number = {1: "both"}.get(len(rivals), f"all {1 + len(rivals)}") + " stable designs"
     if len(rivals) < len(others):
         number += f" with a step {'above' if best.step > dt else 'below'} the scenario's"
@@ -216,13 +211,12 @@ def _design(method: type[Method], arguments: dict[str, Any], built: Experiment) 
     # Without the promise, whose computing time is the same for all.
     seconds = time.perf_counter() - began
     parts = with_gain(parts, gain)
-    guarantee = promise(parts, settings)
+    stated = guarantee(parts, settings)
     with precision("float64"):
-        return _evaluate(gain, parts, settings, guarantee)._replace(seconds=seconds)
+        return _evaluate(gain, parts, settings, stated)._replace(seconds=seconds)
 
 
 def _missing_keys(method: str, missing: list[str], parts: Parts) -> str:
-    """Return how to give a method its missing keys."""
     model = parts.model
     state = [*model.state_groups, *model.state_names][0]
     examples = {"domain": f"domain: {{{state}: HALF_WIDTH, ...}}"}
@@ -247,8 +241,7 @@ def with_gain(parts: Parts, gain: Gain) -> Parts:
     return parts.replace(drive=drive.with_follower(law))
 
 
-def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Promise) -> Design:
-    """Return the design of a gain, with its margins."""
+def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Guarantee) -> Design:
     loop = guarantee.loop
     (A, B), closed = loop.linear, loop.closed
     poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
@@ -263,7 +256,6 @@ def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Promise) 
 
 
 def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dict[str, Any]:
-    """Return the scenario's arguments of this method, and its domain if the method needs one."""
     if spec is not None and not spec.file and not spec.python and spec.method == method.name:
         return {**method.defaults, **spec.arguments}
     gain = parts.drive.gain
@@ -287,24 +279,24 @@ def forecast(parts: Parts, settings: Settings) -> str:
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
-    guarantee = promise(parts, settings)
+    stated = guarantee(parts, settings)
     hypotheses = Hypothesis.DISAGREEMENT_DECAY, Hypothesis.SAMPLING
     # A step that is too long for a short time only has no reason.
-    grows = any(guarantee.hypotheses[hypothesis].reason for hypothesis in hypotheses)
+    grows = any(stated.hypotheses[hypothesis].reason for hypothesis in hypotheses)
     changes = " or ".join(f"`--set {change}`" for change in _changes(parts, settings) if grows)
     if not changes:
-        return guarantee.sentence()
-    return f"{guarantee.sentence()} There is a guarantee with {changes}."
+        return stated.sentence()
+    return f"{stated.sentence()} There is a guarantee with {changes}."
 
 
 def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
     """Yield the changes of a scenario, quickly computed, under which something is guaranteed."""
-    step = promise(parts, settings).hypotheses[Hypothesis.SAMPLING]
+    step = guarantee(parts, settings).hypotheses[Hypothesis.SAMPLING]
     if step.fails:
-        longest = _SHARE * promise(parts, settings).longest_step(settings)
+        longest = _SHARE * guarantee(parts, settings).longest_step(settings)
         # With an integer fraction of the step, the horizon remains a whole number of steps.
         shorter = settings.dt / math.ceil(settings.dt / longest) if longest > 0.0 else settings.dt
-        if promise(parts, settings._replace(dt=shorter)).promised:
+        if guarantee(parts, settings._replace(dt=shorter)).promised:
             yield f"simulation.dt={at_most(shorter, 6)}"
     law = parts.drive.follower if isinstance(parts.drive, Laws) else None
     if not isinstance(law, Consensus):
@@ -315,5 +307,5 @@ def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
     except EchelonError:
         return
     drive = parts.drive.with_follower(Consensus(gain, law.feedforward, law.trim, law.frame))
-    if promise(parts.replace(drive=drive), settings).promised:
+    if guarantee(parts.replace(drive=drive), settings).promised:
         yield '"follower.gain={method: inner-loop}"'

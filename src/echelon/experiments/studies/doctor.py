@@ -94,7 +94,6 @@ def _precision_kept() -> Check:
 
 
 def _models() -> Check:
-    """Check every bundled model, with its default parameters if it has them."""
     parameters = {"linear": {"A": ((0.0, 1.0), (0.0, 0.0)), "B": ((0.0,), (1.0,))}}
     faults = []
     for name, entry in registry.MODELS.items():

@@ -22,8 +22,8 @@ from echelon.experiments.scenario.self_contained import without_folders
 from echelon.experiments.scenario.yaml import read_yaml
 from echelon.experiments.studies.check import check
 from echelon.experiments.studies.design import with_gain
-from echelon.guarantees.promises.promise import promise
-from echelon.guarantees.verifier.findings import Finding, decide
+from echelon.guarantees.promises.promise import guarantee
+from echelon.guarantees.verifier.findings import CheckResult, decide
 from echelon.guarantees.verifier.saved_gain import parse_json, read_json
 from echelon.guarantees.verifier.stored_values import Digits, compare_values
 from echelon.laws.consensus import Consensus
@@ -44,7 +44,7 @@ _WRITTEN = {"units": ("s", "m"), "_FillValue": ("nan",)}
 """Attributes of variables and their values in every format, beside the names of coordinates."""
 
 
-def compare_attributes(file: Path) -> Iterator[Finding]:
+def compare_attributes(file: Path) -> Iterator[CheckResult]:
     """Yield a refused finding for each attribute of a group or variable that echelon never writes.
 
     Those of the root are compared with the run, one by one.
@@ -57,7 +57,7 @@ def compare_attributes(file: Path) -> Iterator[Finding]:
                 yield decide(ascii(claim)[1:-1], False, value, text=text)._replace(by_scenario=True)
 
 
-def compare_structure(file: Path, again: bytes) -> Iterator[Finding]:
+def compare_structure(file: Path, again: bytes) -> Iterator[CheckResult]:
     """Compare groups, dimensions, variables, types and attributes with those of a file in memory.
 
     Sizes and numbers are compared with the arrays.
@@ -65,12 +65,11 @@ def compare_structure(file: Path, again: bytes) -> Iterator[Finding]:
     claim, stored, value = f"{file.name}: structure", _structure(file), _structure(again)
     findings = [*compare_values(claim, stored, value)]
     refused = [each for each in findings if each.verdict == "refused"]
-    same = Finding(claim, f"{len(stored)} parts", f"{len(value)} parts", "recomputed", "", True)
+    same = CheckResult(claim, f"{len(stored)} parts", f"{len(value)} parts", "recomputed", "", True)
     yield from refused or [same]
 
 
 def _structure(file: Path | bytes) -> dict[str, JsonObject]:
-    """Return dimensions, type and attributes of each group and variable as text, by its path."""
     # Here, since it is slow to load.
     import h5netcdf
 
@@ -105,7 +104,7 @@ SOLVED = Digits(1e-3)
 
 def experiment_of(
     scenario: Scenario, claims: Path | None, gain: Path | None
-) -> tuple[Experiment, list[Finding]]:
+) -> tuple[Experiment, list[CheckResult]]:
     """Return the parts of a run with the gains that its files state, and what is compared of them.
 
     Args:
@@ -117,7 +116,7 @@ def experiment_of(
         EchelonError: the scenario cannot be built, or a file cannot be read.
     """
     # As for a run: what is too large to have been run is refused.
-    experiment, findings = build(scenario, to_run=True), list[Finding]()
+    experiment, findings = build(scenario, to_run=True), list[CheckResult]()
     if gain is not None:
         findings += compare_gain(gain, experiment)
         with contextlib.suppress(GainError):
@@ -131,14 +130,10 @@ def experiment_of(
 
 def recompute(
     experiment: Experiment, scenario: Scenario, claims: Path | None, data: Path | None = None
-) -> Iterator[Finding]:
+) -> Iterator[CheckResult]:
     """Yield a finding for each value that a run's files state and its scenario gives.
 
-    Args:
-        experiment: of the run, as `experiment_of` returns it.
-        scenario: of the run.
-        claims: the run's `summary.json`, or the output of `check --json`.
-        data: the run's `run.nc`, of which the guarantee, the scenario and the starts are compared.
+    `claims` are as in `experiment_of`; of `run.nc` parts, guarantee and starts are compared.
 
     Raises:
         EchelonError: a file cannot be read.
@@ -166,7 +161,7 @@ def with_gain_of(experiment: Experiment, file: Path) -> Experiment:
     return experiment._replace(parts=with_gain(parts, gain))
 
 
-def compare_gain(file: Path, experiment: Experiment) -> Iterator[Finding]:
+def compare_gain(file: Path, experiment: Experiment) -> Iterator[CheckResult]:
     """Compare a gain file with the gain of a scenario; its certificate the verifier checks."""
     try:
         with_gain_of(experiment, file)
@@ -184,7 +179,7 @@ def compare_gain(file: Path, experiment: Experiment) -> Iterator[Finding]:
     yield from compare_values(f"{file.name}: model", stored, value)
 
 
-def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Iterator[Finding]:
+def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Iterator[CheckResult]:
     """Compare a summary, or the output of a check, with what a scenario of a name gives."""
     if "lines" in stored:
         value = check(*experiment).as_mapping()
@@ -194,7 +189,9 @@ def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Ite
     yield from compare_values("", stored, _as_json(value))
 
 
-def with_leader_gain(experiment: Experiment, stored: object) -> tuple[Experiment, list[Finding]]:
+def with_leader_gain(
+    experiment: Experiment, stored: object
+) -> tuple[Experiment, list[CheckResult]]:
     """Return the parts with the gain that a summary states of the leaders, and what is compared.
 
     It must be that of the scenario up to what differs between solvers.
@@ -215,7 +212,6 @@ def with_leader_gain(experiment: Experiment, stored: object) -> tuple[Experiment
 
 
 def _led_by(parts: Parts, gain: Gain) -> Parts:
-    """Return the parts with another gain of the leaders."""
     drive = parts.drive
     assert isinstance(drive, Laws)
     leader = drive.leader
@@ -223,11 +219,10 @@ def _led_by(parts: Parts, gain: Gain) -> Parts:
     return parts.replace(drive=Laws(leader, drive.follower).prepare(parts.model, parts.graph))
 
 
-def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
-    """Compare the guarantee, the scenario, the parts and the starts in a dataset."""
+def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[CheckResult]:
     (run, data), (parts, settings), name = read_recording(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
-    value = _as_json(promise(parts, settings).as_mapping())
+    value = _as_json(guarantee(parts, settings).as_mapping())
     yield from compare_values(f"{name}: promise", stored, value)
     text = read_yaml(str(run.attributes.get("scenario_text", "")), str(file))
     # A key twice is a fault; readers differ in which one they use.
@@ -247,8 +242,7 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
 
 def _compare_frames(
     run: Recording, data: Labelled, experiment: Experiment, name: str
-) -> Iterator[Finding]:
-    """Compare the times of the frames, who is there at each, and offsets that change with time."""
+) -> Iterator[CheckResult]:
     (parts, settings), stored = experiment, data.arrays()
     steps = np.minimum(np.arange(len(run.states)) * settings.store_every, settings.steps)
     times, schedule = steps * settings.dt, parts.graph.schedule

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.reference import Guide
+from echelon.agents.references.reference import LeaderPath
 from echelon.agents.world.world import World
 from echelon.core.digits import about
 from echelon.core.errors import LawError, OutputError, SimulationError, check_kind
@@ -43,7 +43,7 @@ class StateSpace(NamedTuple):
     D: Float[Array, "Nn k"]
 
 
-class _Momentary(Guide):
+class _Momentary(LeaderPath):
     """A leader's motion at one moment, by which the loop is differentiated."""
 
     state: State
@@ -104,11 +104,6 @@ def state_space(parts: Parts, file: PathLike | None = None) -> StateSpace:
 
 
 def _check(parts: Parts) -> None:
-    """Check what a linear system cannot have.
-
-    Raises:
-        SimulationError: the parts have it.
-    """
     size = parts.graph.agents * len(parts.model.state_names)
     fault = None
     if not isinstance(parts.drive, Laws):
@@ -119,7 +114,7 @@ def _check(parts: Parts) -> None:
         fault = "the formation changes with time, and a linear system has one"
     elif size > _MOST:
         fault = f"the agents have {size} states, and at most {_MOST} are allowed"
-    elif at_trim(parts.model).bends.any() or at_trim(parts.model).gap is not None:
+    elif at_trim(parts.model).kinks.any() or at_trim(parts.model).gap is not None:
         fault = f"`{type(parts.model).__name__}` is not smooth at its trim"
     if fault:
         raise SimulationError(f"the closed loop is no linear system: {fault}.")

@@ -55,11 +55,7 @@ def fly_on(
     A batch whose worker is lost is computed again by another, to the same bits. Workers must have
     echelon, and see the files that the scenario names.
 
-    Args:
-        address: of the scheduler, such as `tcp://host:8786`.
-        plan: the sweep.
-        todo: the batches.
-        progress: called several times a second; an error that it raises ends the sweep.
+    The address is such as `tcp://host:8786`; an error that `progress` raises ends the sweep.
 
     Raises:
         MissingExtraError: dask.distributed is not installed.

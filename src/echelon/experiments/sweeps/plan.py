@@ -12,7 +12,7 @@ import numpy as np
 
 from echelon.core.errors import ScenarioError
 from echelon.core.limits import excess_runs
-from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, Shown, shown_in
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, RUN_NUMBERS, Appearance, shown_in
 from echelon.experiments.scenario.scenario import Scenario, with_overrides
 from echelon.experiments.scenario.yaml import inline_yaml, read_yaml
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from echelon.experiments.scenario.build import Experiment
     from echelon.simulation.engine.result import Result
 
-RUN_COLUMNS = tuple(shown_in(RUN_NUMBERS, Shown.SWEEP))
-AGENT_COLUMNS = tuple(shown_in(AGENT_NUMBERS, Shown.SWEEP))
-SUMMARIZED = tuple(shown_in(RUN_NUMBERS, Shown.DISTRIBUTION))
+RUN_COLUMNS = tuple(shown_in(RUN_NUMBERS, Appearance.SWEEP))
+AGENT_COLUMNS = tuple(shown_in(AGENT_NUMBERS, Appearance.SWEEP))
+SUMMARIZED = tuple(shown_in(RUN_NUMBERS, Appearance.DISTRIBUTION))
 """The numbers that reports and figures show the distribution of."""
 UNIT = "error_unit"
 WORDS = (
@@ -102,7 +102,6 @@ def _checked(axes: list[Axis]) -> tuple[Axis, ...]:
 
 
 def _read(text: str) -> Axis:
-    """Return the axis of a text."""
     place = "--over " + " ".join(text.split())
     key, equals, values = text.partition("=")
     if not equals or not all(part.strip() for part in key.split(".")):
@@ -140,7 +139,6 @@ class FrameShape(NamedTuple):
     Attributes:
         times: (T,) s.
         states, inputs: names.
-        agents: their number N.
     """
 
     times: tuple[float, ...]
@@ -226,7 +224,6 @@ class Sweep:
     def __init__(
         self, scenario: Scenario, axes: tuple[Axis, ...], every: int | None = None
     ) -> None:
-        """Check all values, each with the first ones of the other axes."""
         self.scenario, self.axes, self.every = scenario, axes, every
         if every is not None and every < 1:
             raise ScenarioError(f"`keep_states` is {every}, and must be a whole number from 1 on.")
@@ -325,6 +322,5 @@ class Sweep:
                 self.frames.check(FrameShape.of(build(case), self.every), axis.key)
 
     def _columns(self) -> int:
-        """Return how many values are stored of a run, without its frames."""
         agents = self.first_built.parts.graph.agents
         return len(RUN_COLUMNS) + len(WORDS) + len(AGENT_COLUMNS) * agents

@@ -65,14 +65,7 @@ def compute(
 ) -> None:
     """Compute the runs of a sweep that are in no batch yet.
 
-    Args:
-        plan: the sweep.
-        keep: takes every batch.
-        progress: called several times a second; an error that it raises ends the sweep.
-        before: batches that were computed earlier.
-        threads: as in `sweep`.
-        cluster: address of a dask scheduler, whose workers compute the batches; by default this
-            process does.
+    `keep` takes every batch; an error that `progress` raises, called often, ends the sweep.
 
     Raises:
         KeyboardInterrupt: Ctrl-C; all batches that `keep` received are complete.
@@ -101,11 +94,7 @@ def compute(
 def _missing(
     runs: int, before: Sequence[SweepBatch], size: int, seeds: int = 1
 ) -> Iterator[tuple[int, int]]:
-    """Yield the batches (first, count) that are still to compute.
-
-    If a case has more seeds than a batch has runs, no batch contains two cases; otherwise all runs
-    of a case are in one batch.
-    """
+    """Cases with more seeds than a batch has runs share no batch; no batch splits other cases."""
     whole = seeds if seeds > size else size - size % seeds
     at = 0
     for first, end in [*sorted((b.first, b.first + b.runs) for b in before), (runs, runs)]:

@@ -12,12 +12,7 @@ from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.dataset import labelled_parts
 from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.metrics import RunNumbers, metrics
-from echelon.experiments.results.run_numbers import (
-    AGENT_NUMBERS,
-    ERROR,
-    RUN_NUMBERS,
-    Quantity,
-)
+from echelon.experiments.results.run_numbers import AGENT_NUMBERS, ERROR, RUN_NUMBERS, Quantity
 from echelon.experiments.scenario.scenario import key_label
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps.plan import (
@@ -31,7 +26,7 @@ from echelon.experiments.sweeps.plan import (
     StoredFrames,
     Sweep,
 )
-from echelon.guarantees.promises.promise import Promise
+from echelon.guarantees.promises.promise import Guarantee
 from echelon.simulation.engine.result import Result
 
 if TYPE_CHECKING:
@@ -40,7 +35,6 @@ if TYPE_CHECKING:
 REFUSED, MISSING = -1, -2
 """In place of an outcome: of a run whose parts cannot be built, and of one that is still to do."""
 OUTCOMES = {outcome: code for code, outcome in enumerate(Outcome)}
-
 
 Columns = Mapping[str, Array]
 """Of some runs: an array (runs,) for each number, and (runs, agents) for those of an agent."""
@@ -62,7 +56,7 @@ class SweepBatch(NamedTuple):
         return len(self.columns["outcome"])
 
 
-def numbers_of(result: Result, promise: Promise) -> JsonObject:
+def numbers_of(result: Result, promise: Guarantee) -> JsonObject:
     """Return the numbers of a run; what does not exist is NaN."""
     run = RunNumbers(result, metrics(result), promise)
     agents = {name: np.full(result.graph.agents, np.nan) for name in AGENT_COLUMNS}
@@ -198,11 +192,8 @@ def _arranged(plan: Sweep, whole: Array) -> Array:
 
 
 def _values(axis: Axis) -> Array:
-    """Return the values of an axis: numbers where all are, else text."""
-    if isinstance(axis.values, range):
-        return np.array(axis.values)
-    numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in axis.values)
-    if numbers:
+    numbers = (isinstance(v, int | float) and not isinstance(v, bool) for v in axis.values)
+    if isinstance(axis.values, range) or all(numbers):
         return np.array(axis.values)
     values = [v if isinstance(v, str) else inline_yaml(v) for v in axis.values]
     return np.array(values, object)
@@ -250,10 +241,7 @@ _CHUNK = 500_000
 def labelled_frames(plan: Sweep, axes: Variables, values: StoredFrames) -> Labelled:
     """Return arrays of all runs, with a dimension for each key, as a dataset.
 
-    Args:
-        plan: of the sweep.
-        axes: the values of each key.
-        values: `states` and `inputs` (key, .., time, agent, state / input).
+    `values` are `states` and `inputs` (key, .., time, agent, state or input).
     """
     assert plan.frames is not None
     fixed = labelled_parts(*plan.first_built).coordinates

@@ -9,7 +9,7 @@ from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.sweeps.plan import Sweep, SweepRun
 from echelon.experiments.sweeps.sweep_dataset import SweepBatch, columns_of, numbers_of, refused
-from echelon.guarantees.promises.promise import Promise, promises
+from echelon.guarantees.promises.promise import Guarantee, promises
 from echelon.simulation.engine.batch import Batch, StepCount
 from echelon.simulation.engine.result import Result
 from echelon.simulation.native import is_installed
@@ -26,15 +26,9 @@ _FRAMES = 20
 
 @final
 class Workers:
-    """Computes the runs of a sweep, batch by batch; a case is built once for its seeds.
-
-    Args:
-        plan: the sweep.
-        threads: as in `sweep`.
-    """
+    """Computes the runs of a sweep, batch by batch; a case is built once for its seeds."""
 
     def __init__(self, plan: Sweep, threads: int | None = None) -> None:
-        """Build the first case."""
         self.plan, self.runs = plan, Batch(threads)
         first = plan.first_built
         self._last: tuple[int, Experiment | str] = 0, first
@@ -58,7 +52,7 @@ class Workers:
         for run in runs:
             result = run if isinstance(run, str) else next(results)
             guarantee = None if isinstance(run, str) else next(guarantees)
-            if isinstance(result, Result) and isinstance(guarantee, Promise):
+            if isinstance(result, Result) and isinstance(guarantee, Guarantee):
                 if result.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
                     raise KeyboardInterrupt
                 rows.append(numbers_of(result, guarantee))
@@ -71,7 +65,6 @@ class Workers:
         return SweepBatch(first, columns_of(rows), frames)
 
     def _build(self, run: SweepRun) -> Experiment | str:
-        """Return the parts and settings of a run, or why they cannot be built."""
         if self._last[0] != run.case:
             try:
                 case: Experiment | str = build(self.plan.case(run.place))
@@ -87,7 +80,7 @@ class Workers:
         return Experiment(case.parts, settings._replace(store_every=every))
 
 
-def _promises(experiments: Sequence[Experiment]) -> Iterator[Promise | EchelonError]:
+def _promises(experiments: Sequence[Experiment]) -> Iterator[Guarantee | EchelonError]:
     """Yield the promises of runs; consecutive runs often differ only in the seed."""
     for _, same_parts in groupby(experiments, key=lambda experiment: id(experiment.parts)):
         runs = list(same_parts)

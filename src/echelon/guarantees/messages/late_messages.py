@@ -71,11 +71,6 @@ class AgeLimits(NamedTuple):
         """The age, in steps, to which hop counts are used."""
         return HOP_LIFE * (self.forgotten - 1)
 
-    @property
-    def hops_last(self) -> bool:
-        """Whether a link delivers before the hop counts that it delivered are forgotten."""
-        return self.arrived is not None and self.arrived <= self.hop_life
-
 
 def ages_of(channel: Channel, dt: float, steps: int, links: int, hops: int) -> AgeLimits:
     """Return the ages on a number of links in a run of so many steps (dt in s)."""
@@ -98,11 +93,6 @@ def losses_in_a_row(channel: Channel, links: int, messages: int) -> int | None:
     With pi the shares of a link that works or is out, P the chances of its next message and D the
     chances that one is lost, L + 1 given messages are lost with probability pi'D (P D)^L 1, and
     there are fewer places for them than messages on all links.
-
-    Args:
-        channel: of the run.
-        links: how many.
-        messages: on each of them.
     """
     starts, step = _outages(channel)
 
@@ -122,9 +112,8 @@ def losses_in_a_row(channel: Channel, links: int, messages: int) -> int | None:
 
 def _outages(channel: Channel) -> tuple[Array, Array]:
     """Return pi'D (2, 2), a row for each of two moments, and P D (2, 2) of the same."""
-    loss, share, begins, ends = (
-        float(x) for x in (channel.loss, channel.share, channel.begins, channel.ends)
-    )
+    numbers = channel.loss, channel.share, channel.begins, channel.ends
+    loss, share, begins, ends = map(float, numbers)
     if not channel.bursty:
         begins, share, ends = 0.0, 0.0, 1.0
     loss, stays = min(1.0, loss + _GRID * (loss > 0.0)), min(1.0, 1.0 - ends + _GRID)
@@ -157,10 +146,7 @@ class LateRate(NamedTuple):
 def late_rates(L: sp.csr_array, c: float, age: Fraction) -> tuple[LateRate, ...]:
     """Return rates at which stopping points agree, the fastest first; none where none is proved.
 
-    Args:
-        L: grounded Laplacian of the followers.
-        c: the coupling.
-        age: tau, s.
+    `L` is the grounded Laplacian of the followers, `age` is tau in s.
     """
     L, ones = sp.csr_array(L), np.ones_like(L.diagonal())
     own = sp.diags_array(L.diagonal())
@@ -236,8 +222,6 @@ class Uncovered(NamedTuple):
     """Why T9 does not cover a network, and what would help.
 
     Attributes:
-        text: the reason.
-        remedy: what to change.
         lost: whether no formation comes together, or not at its goals.
     """
 
@@ -250,13 +234,9 @@ class Following(NamedTuple):
     """What T9 asks of a run beside its network.
 
     Attributes:
-        graph: who receives from whom.
         leaderward: whether followers' law hears only those nearer to a leader.
-        coupling: c.
         speed: s of followers, the smallest of all outputs.
         still: whether the leader is where it stays from the start on.
-        apart: whether leaders start apart.
-        avoiding: whether followers keep away from each other.
     """
 
     graph: Graph
@@ -272,14 +252,12 @@ class LateMessages(NamedTuple):
     """What T9 says of stopping points over a network.
 
     Attributes:
-        ages: of messages.
         rate: at which stopping points agree in the end whatever is lost, 1/s.
         ways: (F,) links of the longest way to each follower, where all hear one way; else None.
         weights: (F,) of followers where all hear one way: w with m' = -sigma(c m) / max w.
         rates: where some hear each other: at which, and weights, all but a few runs agree.
         sums: (K,) d_i, the sums of weights that followers hear.
         spread: max w, w = L_g^-1 1.
-        coupling: c.
         speed: s of followers, the smallest of all outputs; 0 without one leader that has a plan.
         leaderward: whether neighbours with fewer hops alone are heard.
     """
@@ -366,15 +344,7 @@ class LateMessages(NamedTuple):
 def late_messages_of(
     network: Network | None, following: Following, dt: float, horizon: float, steps: int
 ) -> LateMessages | Uncovered | None:
-    """Return what T9 says of a run over a network, or why nothing; None for the ideal network.
-
-    Args:
-        network: of the run.
-        following: who follows how.
-        dt: a step, s.
-        horizon: of the run, s.
-        steps: their number.
-    """
+    """Return what T9 says of a run over a network, or why nothing; None for the ideal network."""
     if network is None:
         return None
     obstacle = _uncovered(network, following)
@@ -390,11 +360,10 @@ def late_messages_of(
     leaderward = network.hears is NeighbourChoice.LEADERWARD
     if leaderward and c * dt > 1.0 + 1e-12:
         # A mean has weights of sum 1, however small those of the graph are.
-        text = (
-            f"with `hears: leaderward` weights count as 1, and c dt = {at_least(c * dt)} is above 1"
-        )
+        text = "with `hears: leaderward` weights count as 1, "
+        text += f"and c dt = {at_least(c * dt)} is above 1"
         return Uncovered(text, f"lower `follower.coupling` to {at_most(1.0 / dt, 4)}", True)
-    if leaderward and not ages.hops_last:
+    if leaderward and (ages.arrived is None or ages.arrived > ages.hop_life):
         return _UNSETTLED
     if leaderward:
         # Of any part of the neighbours nearer to the leader the mean is taken.
@@ -428,7 +397,6 @@ _UNPROVED = Uncovered(
 
 
 def _uncovered(network: Network, following: Following) -> Uncovered | None:
-    """Return why T9 does not cover a network, whatever its ages."""
     if network.loss >= 1.0:
         return Uncovered("no message arrives", "set `loss` of the network below 1", True)
     if network.messages is MessageContent.STATE:
@@ -443,11 +411,8 @@ def _uncovered(network: Network, following: Following) -> Uncovered | None:
         text = "agents that keep apart do not always move as their messages ask"
         return Uncovered(text, "remove `safety` to see what is guaranteed without it", False)
     if following.graph.schedule is not None:
-        return Uncovered(
-            "the graph switches, and late messages are covered for one graph only",
-            "use a graph that does not switch",
-            False,
-        )
+        text = "the graph switches, and late messages are covered for one graph only"
+        return Uncovered(text, "use a graph that does not switch", False)
     return None
 
 
@@ -524,7 +489,6 @@ def bias_line(parts: Parts, settings: Settings) -> Statement | None:
 
 
 def _swinging_line(parts: Parts) -> Statement | None:
-    """Say that agents with motors that lag may swing if they hear each other late."""
     actuator, graph = parts.world.actuator, parts.graph
     lag = 0.0 if actuator is None else actuator.lag
     if parts.world.network is None or not lag or graph.directed:

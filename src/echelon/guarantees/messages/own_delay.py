@@ -4,7 +4,6 @@ One agent's step is linearized at the trim as it runs: law, memory, motors and i
 model as the law knows it.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -26,7 +25,7 @@ from echelon.laws.stopping_point import StoppingPoint
 from echelon.simulation.step.action import act
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.loop import Loop, assemble
-from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.motion import PlantStep
 
 # ---- a step of one agent that knows its own state late -------------------------------------------
 # With what it hears as an input h it is s+ = A s + B y + E z, z = d o - h, o = F y + G s, where y
@@ -154,12 +153,7 @@ def _angles(alone: Array) -> Array:
 
 
 def _turns(values: Array, own: Array) -> tuple[Array, Array]:
-    """Return the turns (K,) of the determinants along the circle, and the most of each step (K, T).
-
-    Args:
-        values: (T + 1, m) of T on half of the circle.
-        own: (K,) factors.
-    """
+    """Return the turns (K,) of determinants of T (T + 1, m), and the most of each step (K, T)."""
     turns, most = np.zeros(len(own)), np.zeros((len(own), len(values) - 1))
     for k in range(0, len(own), _CHUNK):
         # The other half is that of the conjugate factors.
@@ -173,10 +167,7 @@ def _turns(values: Array, own: Array) -> tuple[Array, Array]:
 
 
 def _joined(values: Array, own: Array) -> bool:
-    """Tell whether no factor between two neighbours of `own` puts a zero on the circle.
-
-    Each 1 - own * value is linear in the factor, so that it passes 0 only in half a turn.
-    """
+    """Each 1 - own * value is linear in the factor, so that it passes 0 only in half a turn."""
     each = 1.0 - own[:, None, None] * values
     return bool((np.abs(np.angle(each[1:] / each[:-1])) < 0.5 * np.pi).all())
 
@@ -197,9 +188,6 @@ class OwnCase(NamedTuple):
     """What the margin of own states is computed of.
 
     Attributes:
-        problem: prepared.
-        world: of the run.
-        law: of the followers.
         own: (K,) factors on z of single loops, real or complex: sums of weights over a network,
             eigenvalues of the graph on the ideal one.
         between: whether all real factors between the least and the largest count too.
@@ -258,21 +246,16 @@ def longest_delay(case: OwnCase, step: LateStep) -> int:
         # Every one at first, and then every tenth part of it.
         more = min(most, last + 1 + max(last, 0) // _EACH)
         if not _decays(case, step, more):
-            return bisect_whole(lambda k: _decays(case, step, k), last, more)
+            # The last one that decays, between one that does and one that does not.
+            while more - last > 1:
+                middle = (last + more) // 2
+                last, more = (middle, more) if _decays(case, step, middle) else (last, middle)
+            return last
         last = more
     return last
 
 
-def bisect_whole(fits: Callable[[int], bool], low: int, high: int) -> int:
-    """Return the last whole number that fits, of one that does and one that does not."""
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return low
-
-
 def _decays(case: OwnCase, step: LateStep, delay: int) -> bool:
-    """Tell whether every loop decays, and together those that hear each other."""
     # The loops of a conjugate pair mirror each other.
     own = np.unique(case.own[np.imag(case.own) >= 0.0])
     if len(own) > _FEW or case.between:
@@ -297,7 +280,7 @@ def late_step(problem: Problem, law: StoppingPoint, lag: float) -> LateStep | No
     settings, model = problem.settings, problem.model
     motors = MotorArrays(np.asarray(lag), *[None] * 5) if lag else None
     how = settings.dt, settings.integrator, settings.limits, settings.substeps, motors
-    loop = assemble(problem._replace(motion=Motion(model, None, *how)), law, law)
+    loop = assemble(problem._replace(motion=PlantStep(model, None, *how)), law, law)
     A, B, E, G, F = (np.asarray(part, float) for part in _slopes(loop, law))
     if not all(np.isfinite(part).all() for part in (A, B, E, G, F)):
         return None

@@ -17,15 +17,11 @@ from echelon.synthesis.certificates.certificate import RegionCertificate
 from echelon.synthesis.certificates.domain import Domain
 
 
-class Case(NamedTuple):
+class GuaranteeInputs(NamedTuple):
     """The data of a run from which its guarantee is computed.
 
     Attributes:
-        parts: prepared.
-        settings: of the run.
         loop: the closed loop near the trim.
-        leaders: what is known of them without a run.
-        region: the certificate on a domain; None without one.
         slopes: (K, n, n) the slopes of the drift on all sides of the trim, if it bends there and
             they are known; else None.
         frozen: the law along the leader's path and at the starts; None where it is not needed.
@@ -49,7 +45,7 @@ class Case(NamedTuple):
     @property
     def smooth(self) -> bool:
         """Whether the model has a linearization at its trim."""
-        return not at_trim(self.parts.model).bends.any()
+        return not at_trim(self.parts.model).kinks.any()
 
     @property
     def governed(self) -> bool:

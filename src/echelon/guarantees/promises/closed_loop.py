@@ -14,7 +14,7 @@ from echelon.core.rational import bisect
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import Certificate, certify
 from echelon.synthesis.certificates.lmi import falls, rate_of
@@ -35,7 +35,6 @@ class CommonMetric(NamedTuple):
     """The sum of all delta_i'P delta_i on graphs that take turns.
 
     Attributes:
-        gain: of which P is.
         laplacians: (F, F) of each graph, grounded; of one that is symmetric its extreme
             eigenvalues alone, (2,).
         weakest: s > 0 with L + L' >= 2 s for each of them; 0 where there is none.
@@ -111,7 +110,6 @@ class LinearLoop(NamedTuple):
         symmetric: whether they are of a symmetric matrix between followers' errors.
         every: whether the modes of all eigenvalues of the graph decay.
         slowest: real part of the slowest mode, 1/s; of an interval, of the modes looked at.
-        certificate: of the linearization.
         common: the sum of all delta_i'P delta_i near the trim on graphs that take turns (T8); None
             where the graph does not switch.
     """
@@ -245,7 +243,10 @@ def modes_of(parts: Parts) -> NetworkModes:
     if not all_alike(parts.drive, parts.model):
         return NetworkModes(graph.spectrum(), not graph.directed and graph.schedule is None)
     if graph.directed:
-        return NetworkModes(_of_all(graph), False)
+        # All eigenvalues but for one 0; another 0 is a mode that never ends.
+        values = np.linalg.eigvals(graph.laplacian().toarray()).astype(complex)
+        values = in_order(np.delete(values, np.abs(values).argmin()))
+        return NetworkModes(Spectrum(values, len(values), 0.0), False)
     if graph.agents <= _DENSE:
         whole = np.linalg.eigvalsh(graph.laplacian().toarray())[1:]
         return NetworkModes(Spectrum(whole, len(whole), graph.spectrum().proved), False)
@@ -254,31 +255,16 @@ def modes_of(parts: Parts) -> NetworkModes:
     return NetworkModes(Spectrum(ends, graph.agents - 1, graph.spectrum().proved), False)
 
 
-def _of_all(graph: Graph) -> Spectrum:
-    """Return the eigenvalues of the Laplacian of all agents of a directed graph, but for one 0.
-
-    The disagreement between agents has a mode for each of them; another 0 is one that never ends.
-    """
-    values = np.linalg.eigvals(graph.laplacian().toarray()).astype(complex)
-    values = in_order(np.delete(values, np.abs(values).argmin()))
-    return Spectrum(values, len(values), 0.0)
-
-
-def all_alike(drive: Drive, model: ControlAffine) -> bool:
+def all_alike(drive: Controller, model: ControlAffine) -> bool:
     """Tell whether the leaders obey the followers' law, with nothing fed forward."""
     leader, follower = getattr(drive, "leader", None), getattr(drive, "follower", None)
-    same = leader is not None and type(leader) is type(follower)
-    same = same and not drive.unknown
+    same = leader is not None and type(leader) is type(follower) and not drive.unknown
     silent = drive.feedforward is Feedforward.NONE and drive.metric(model) is not None
     return same and silent and bool(eqx.tree_equal(leader, follower))
 
 
 def _edge(gain: Gain, linear: Linearization, low: float) -> float | None:
-    """Return the coupling from which on the gain's own argument holds here; None without one.
-
-    The argument is P A + A'P - rho P B R^-1 B'P <= 0 at a strength rho = 2 c lambda that is the
-    gain's own; it is looked at again with this A and B.
-    """
+    """Return the coupling from which P A + A'P - rho P B R^-1 B'P <= 0 at the gain's own rho."""
     claim = gain.certificate
     if claim.edge is None or not low > 0.0:
         return None

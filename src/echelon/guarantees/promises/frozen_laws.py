@@ -49,7 +49,7 @@ class PathSamples(NamedTuple):
     rates: Array
 
 
-class LeaderPath(NamedTuple):
+class LeaderRun(NamedTuple):
     """Moments (K,), the leader's states (K, n) then, its normalized inputs (K, m), and its trim.
 
     A law that turns sees them in the axes of the headings (K,), which turn at rates (K,).
@@ -66,14 +66,6 @@ class LeaderPath(NamedTuple):
     def rows(self) -> PathSamples:
         """What followers at the leader's own states are asked with."""
         return PathSamples(self.times, self.states, self.inputs, self.states, self.rates)
-
-    def extreme_rates(self) -> tuple[float, ...]:
-        """Return the least and the largest rate, rad/s, once where they are one; no zero."""
-        if not len(self.rates):
-            return ()
-        # Flatness maps round: a heading that stays seems to turn at 1e-17.
-        known = np.round([self.rates.min(), self.rates.max()], 9)
-        return tuple(rate for rate in dict.fromkeys(known.tolist()) if rate)
 
     def own_headings(self, parts: Parts) -> Array:
         """Return how far a leader's own gain is turned in these axes, (K,)."""
@@ -94,7 +86,7 @@ class LeaderPath(NamedTuple):
         return first._replace(times=np.zeros(count), states=np.asarray(seen))
 
 
-def leader_path_of(parts: Parts, settings: Settings, leaders: Leaders) -> LeaderPath:
+def leader_run_of(parts: Parts, settings: Settings, leaders: Leaders) -> LeaderRun:
     """Return where the leader goes: its reference, or by itself where its input rests."""
     model, times = parts.model, np.linspace(0.0, settings.horizon, MOMENTS)
     trim, m = np.asarray(model.trim[0], float), len(model.input_names)
@@ -114,11 +106,10 @@ def leader_path_of(parts: Parts, settings: Settings, leaders: Leaders) -> Leader
     return _as_sensed(parts, times, paths[frames, 0], np.zeros((MOMENTS, m)))
 
 
-def _as_sensed(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderPath:
-    """Return a path as a law that turns with the heading sees it, or as it is."""
+def _as_sensed(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderRun:
     assert isinstance(parts.drive, Laws)
     model, still = parts.model, np.zeros(len(times))
-    path = LeaderPath(times, states, inputs, np.asarray(model.trim[0], float), still, still)
+    path = LeaderRun(times, states, inputs, np.asarray(model.trim[0], float), still, still)
     if not (parts.drive.follower.turning and len(times)):
         return path
     away = states[:, heading_index(model)] - rest_heading(model)
@@ -167,9 +158,6 @@ def _pushes(model: ControlAffine, now: States, soon: States) -> tuple[States, ja
 
 
 # ---- linearizations ------------------------------------------------------------------------------
-# Behind a leader at x(t) small errors obey delta' = (A - lambda B K) delta with A, B and K those of
-# x(t), and split by the eigenvalues of the graph as they do at the trim. What these do in turn,
-# each for as long as it is the nearest sample, is a sign and no proof.
 
 _STARTS = 64
 """Starts that are looked at, with the moments of the path one shape for the compiler."""
@@ -185,7 +173,6 @@ class Growth(NamedTuple):
         rate: at which they grow over all of it, 1/s; below 0 where they shrink.
         most: ln of how often they multiply in the part of it that is worst for them.
         when: s, where they grow fastest.
-        whose: errors they are.
     """
 
     rate: float
@@ -291,13 +278,11 @@ class FrozenLaws(NamedTuple):
     Attributes:
         path: the leader's; without any states where it rests at its trim or follows none that is
             known.
-        along: the followers' law along the leader's path.
         leader: the leader's own law there; None where it is not known.
-        starts: the followers' law where agents start.
         culprit: what takes the law out of where it stabilizes, in words; empty where nothing does.
     """
 
-    path: LeaderPath
+    path: LeaderRun
     along: ModeMatrices
     leader: ModeMatrices | None
     starts: ModeMatrices
@@ -310,11 +295,14 @@ class FrozenLaws(NamedTuple):
 
     @property
     def turns(self) -> tuple[float, ...]:
-        """The least and the largest rate of the heading along the path, rad/s.
+        """The least and the largest rate of the heading, rad/s, once where they are one; no zero.
 
         All slopes are in its axes; none where it does not turn, or the law does not.
         """
-        return self.path.extreme_rates()
+        rates = self.path.rates
+        # Flatness maps round: a heading that stays seems to turn at 1e-17.
+        known = np.round([rates.min(), rates.max()], 9).tolist() if len(rates) else ()
+        return tuple(rate for rate in dict.fromkeys(known) if rate)
 
     @property
     def on_path(self) -> tuple[ModeMatrices, ...]:
@@ -360,7 +348,7 @@ def frozen_of(
     trim, starts = np.asarray(parts.model.trim[0], float), states - parts.formation.offsets
     if not isinstance(parts.drive, Laws):
         return None
-    path = leader_path_of(parts, settings, leaders)
+    path = leader_run_of(parts, settings, leaders)
     if not len(path.times) and (starts == trim).all():
         return None
     starts_there = frozen_starts(parts, loop, path, states[None])
@@ -375,7 +363,7 @@ def frozen_of(
     return frozen._replace(culprit=_culprit(parts, loop, path, frozen))
 
 
-def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Array) -> ModeMatrices:
+def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderRun, states: Array) -> ModeMatrices:
     """Return the laws of prepared parts frozen where agents start, in many runs (S, N, n).
 
     It is the same number of each run after the other.
@@ -385,10 +373,8 @@ def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Arra
     starts = starts[:, few]
     rows = path.at_start(parts.model, starts.reshape(-1, starts.shape[2]))
     size = MOMENTS + _STARTS
-    parts_of = [
-        _followers(parts, loop, PathSamples._make(part[k : k + size] for part in rows))
-        for k in range(0, len(rows.times), size)
-    ]
+    slices = (slice(k, k + size) for k in range(0, len(rows.times), size))
+    parts_of = [_followers(parts, loop, PathSamples(*(x[each] for x in rows))) for each in slices]
     return ModeMatrices._make(map(np.concatenate, zip(*parts_of, strict=True)))
 
 
@@ -440,7 +426,6 @@ def _about(
 
 
 def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices | None:
-    """Return the leader's own law along its path; None where it has no gain."""
     assert isinstance(parts.drive, Laws)
     model, gain = parts.model, gain_of(parts.drive.leader)
     if gain is None:
@@ -453,8 +438,7 @@ def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices 
     return along._replace(gains=fed_back[:, None])
 
 
-def _culprit(parts: Parts, loop: LinearLoop, path: LeaderPath, frozen: FrozenLaws) -> str:
-    """Return the state whose return to the trim helps most where the law is worst, in words."""
+def _culprit(parts: Parts, loop: LinearLoop, path: LeaderRun, frozen: FrozenLaws) -> str:
     assert isinstance(parts.drive, Laws)
     model, trim = parts.model, np.asarray(parts.model.trim[0], float)
     n, k = len(trim), int(np.flatnonzero(path.times == frozen.growth().when)[0])

@@ -25,20 +25,20 @@ from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array, JsonObject, States
 from echelon.core.words import Kind
 from echelon.guarantees.messages.late_messages import bias_line
-from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.leaders import apart
 from echelon.guarantees.promises.modes import modes
-from echelon.guarantees.promises.promise import Promise
+from echelon.guarantees.promises.promise import Guarantee
 from echelon.laws.law import Law
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.jacobians import offsets_are_symmetries
 
 _LINEAR = Kind.LINEARIZATION
 
 
-def hypotheses(case: Case) -> Iterator[Statement]:
+def hypotheses(case: GuaranteeInputs) -> Iterator[Statement]:
     """Yield what any promise of the loop near the trim rests on."""
     yield from agent_lines(case)
     yield _symmetric(case)
@@ -49,7 +49,7 @@ def hypotheses(case: Case) -> Iterator[Statement]:
     yield from () if bias is None else (bias,)
 
 
-def agent_lines(case: Case) -> Iterator[Statement]:
+def agent_lines(case: GuaranteeInputs) -> Iterator[Statement]:
     """Yield what any promise asks of the agents and their leaders."""
     yield _trim_applied(case)
     yield trim_line(case.parts, case.settings)
@@ -61,7 +61,7 @@ def agent_lines(case: Case) -> Iterator[Statement]:
 # ---- the agents and their leaders ---------------------------------------------------------------
 
 
-def _trim_applied(case: Case) -> Statement:
+def _trim_applied(case: GuaranteeInputs) -> Statement:
     """Definition 1 wants f(0) = 0: about the trim it holds, if the law applies the trim input."""
     parts = case.parts
     there = np.zeros_like(parts.formation.offsets)
@@ -74,7 +74,7 @@ def _trim_applied(case: Case) -> Statement:
     return fails(Hypothesis.TRIM_APPLIED, Kind.PROOF, text, *number, remedy=remedy, reason=text)
 
 
-def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = None) -> Array:
+def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Controller | None = None) -> Array:
     """Return the drift at the goals about the trim, (N, n), with the law's inner loop if any."""
     with precision("float64"):
         goals = np.asarray(model.trim[0], float) + offsets
@@ -82,7 +82,7 @@ def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = 
 
 
 @compiled_for_one_call
-def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> jax.Array:
+def _drifts(model: ControlAffine, law: Law | Controller | None, states: States) -> jax.Array:
     if law is None:
         return jax.vmap(model.normalized_drift)(states)
     return jax.vmap(lambda x: law.drift(model, x))(states)
@@ -91,10 +91,8 @@ def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> ja
 def trim_line(parts: Parts, settings: Settings) -> Statement:
     """Say whether the actuators deliver the trim input, without which no agent holds its trim."""
     model, world, name = parts.model, parts.world, Hypothesis.TRIM_WITHIN_LIMITS
-    plants, trim = (
-        (world.plant_for(model), *world.plants.values()),
-        np.asarray(model.trim[1], float),
-    )
+    plants = (world.plant_for(model), *world.plants.values())
+    trim = np.asarray(model.trim[1], float)
     if any(_forced_off_trim(world.actuator, plant, trim) for plant in plants):
         text, remedy = "the motors' `minimum` is more than the trim needs", "lower `minimum`"
         return fails(name, Kind.PROOF, text, remedy=remedy, reason=f"{text}: no agent holds it")
@@ -133,7 +131,7 @@ def _forced_off_trim(actuator: Actuator | None, plant: ControlAffine, trim: Arra
     return not np.allclose(given, trim, rtol=1e-9, atol=1e-9 * float(np.abs(trim).max()))
 
 
-def _exact(case: Case) -> Statement:
+def _exact(case: GuaranteeInputs) -> Statement:
     """Assumption 3: states are known exactly, and nothing acts that no law asked for."""
     if not case.disturbed:
         text = "states are known exactly, and nothing disturbs the agents"
@@ -144,7 +142,7 @@ def _exact(case: Case) -> Statement:
     )
 
 
-def _agreement(case: Case) -> Statement:
+def _agreement(case: GuaranteeInputs) -> Statement:
     """Several leaders are one if they start alike and do the same; else nobody can follow all."""
     name, leaders = Hypothesis.LEADERS_AGREE, case.leaders
     if len(leaders.starts) == 1:
@@ -161,12 +159,8 @@ def _agreement(case: Case) -> Statement:
     return _drifting(case)
 
 
-def _drifting(case: Case) -> Statement:
-    """Say by how much free leaders drift apart, and what is left: containment.
-
-    Behind leaders that move freely, e = y_F + L_g^-1 L_FL y_L of linear agents obeys the modes of
-    the disagreement; the rows of -L_g^-1 L_FL are weights that add to one.
-    """
+def _drifting(case: GuaranteeInputs) -> Statement:
+    """Here e = y_F + L_g^-1 L_FL y_L of linear agents obeys the modes of the disagreement."""
     away = apart(case.parts, case.settings, case.leaders.starts)
     first, unit = case.parts.graph.leaders[0], f"{position_unit(case.parts.model)} ".lstrip()
     text = (
@@ -185,7 +179,7 @@ def _drifting(case: Case) -> Statement:
     )
 
 
-def _symmetric(case: Case) -> Statement:
+def _symmetric(case: GuaranteeInputs) -> Statement:
     """Offsets are tried near the trim, and proved on the domain that a region speaks of."""
     name, parts, domain = Hypothesis.SYMMETRY, case.parts, case.domain
     model, formation = parts.model, parts.formation
@@ -207,22 +201,20 @@ def _symmetric(case: Case) -> Statement:
     if not broken:
         return holds(name, kind, f"f and g are invariant under them{where}", 0, "0 broken")
     agent, why = next(iter(broken.items()))
-    text, remedy = (
-        f"the offset of agent {agent}: {why}{where}",
-        "offset only states that f and g do not use",
-    )
+    text = f"the offset of agent {agent}: {why}{where}"
+    remedy = "offset only states that f and g do not use"
     count, reason = len(broken), "an offset is no symmetry of the dynamics"
     return fails(name, kind, text, count, f"{count} broken", remedy=remedy, reason=reason)
 
 
-def _smooth(case: Case) -> Statement:
+def _smooth(case: GuaranteeInputs) -> Statement:
     """Lyapunov's first method wants slopes at the trim: one matrix A, whatever the side."""
     name, parts = Hypothesis.SMOOTH, case.parts
-    bends = at_trim(parts.model).bends
-    if not bends.any():
+    kinks = at_trim(parts.model).kinks
+    if not kinks.any():
         text = "the slopes of f and g on both sides of the trim agree with A"
         return holds(name, Kind.SAMPLES, text)
-    entry, variable = (parts.model.state_names[k] for k in np.argwhere(bends)[0])
+    entry, variable = (parts.model.state_names[k] for k in np.argwhere(kinks)[0])
     text = f"the rate of `{entry}` bends or jumps with `{variable}` at the trim"
     if case.region is not None and case.region.kind is not Kind.SAMPLES:
         return fails(
@@ -233,11 +225,10 @@ def _smooth(case: Case) -> Statement:
     return fails(name, Kind.SAMPLES, text, remedy=remedy, reason=reason)
 
 
-def _matched(case: Case) -> Statement:
+def _matched(case: GuaranteeInputs) -> Statement:
     name, leaders = Hypothesis.MATCHED_MOTION, case.leaders
-    remedy = (
-        "`feedforward: relay` removes the lag, but requires the leader's input at every follower"
-    )
+    remedy = "`feedforward: relay` removes the lag, "
+    remedy += "but requires the leader's input at every follower"
     if not case.matched and leaders.answer and case.governed:
         text = "the leader reacts to followers that do not know its input, and nothing is known "
         text += "of that loop"
@@ -251,9 +242,8 @@ def _matched(case: Case) -> Statement:
     elif case.fed_by_parents:
         text = "each follower is sent its parent's input"
     else:
-        text = (
-            "every follower receives the leader's input, which the paper's network does not provide"
-        )
+        text = "every follower receives the leader's input, "
+        text += "which the paper's network does not provide"
     return holds(name, Kind.PROOF, text)
 
 
@@ -267,8 +257,8 @@ _WITHOUT_EVENT = "remove the event to see what is guaranteed without it"
 def events_line(parts: Parts) -> Iterator[Statement]:
     """Yield whether a guarantee covers all events of a run; nothing without any."""
     graph, name = parts.graph, Hypothesis.EVENTS
-    if graph.heirs and parts.world.network is not None:
-        text = "an heir may take the lead whenever messages of the leader are lost for long"
+    if graph.backups and parts.world.network is not None:
+        text = "a backup leader may take the lead whenever messages of the leader are lost for long"
         remedy = "remove `leadership` to see what is guaranteed without it"
         yield fails(name, Kind.PROOF, text, remedy=remedy, reason=text)
         return
@@ -289,19 +279,20 @@ def uncovered(graph: Graph, event: Event) -> str:
     if isinstance(event, Join):
         return f"{event} at {event.at:g} s, and nothing bounds how far from its goal it is then"
     if not isinstance(event, Cut) and _leads(graph, event):
-        return f"{event} at {event.at:g} s while it leads, and until an heir takes over nobody does"
+        return (
+            f"{event} at {event.at:g} s while it leads, and until a backup takes over nobody does"
+        )
     return ""
 
 
 def _leads(graph: Graph, event: Event) -> bool:
-    """Tell whether an agent that is lost was followed until then."""
     schedule = graph.schedule
     assert schedule is not None and schedule.nearest is not None
     row = schedule.row(event.at)
     return bool((schedule.nearest[max(row - 1, 0)] == agents_of(event)[0]).any())
 
 
-def events_in_words(parts: Parts, guarantee: Promise) -> list[JsonObject]:
+def events_in_words(parts: Parts, guarantee: Guarantee) -> list[JsonObject]:
     """Return each event of a run, by time, and what is guaranteed through it, ready for JSON."""
     prefix = guarantee.prefix
     return [
@@ -322,8 +313,7 @@ def as_mapping(event: Event) -> JsonObject:
     }
 
 
-def _through(graph: Graph, event: Event, guarantee: Promise) -> JsonObject:
-    """Return what is guaranteed through an event: of which kind, and in words."""
+def _through(graph: Graph, event: Event, guarantee: Guarantee) -> JsonObject:
     why = uncovered(graph, event)
     if why or not guarantee.promised:
         text = f"Nothing is guaranteed through it: {why}." if why else "Nothing is guaranteed."

@@ -77,7 +77,6 @@ def leaders_of(parts: Parts, states: Array) -> Leaders:
 
 
 def _slowest(model: ControlAffine, law: object) -> float | None:
-    """Return the slowest mode of a leader that follows something, or is left alone."""
     A, B = linearize(model)
     if not isinstance(law, Law) or law.metric(model) is not None:
         return None

@@ -14,7 +14,7 @@ from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem, Verdict
-from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.closed_loop import LinearLoop, grounded_slowest, loop_of
 from echelon.guarantees.promises.frozen_laws import (
     ModeMatrices,
@@ -25,7 +25,7 @@ from echelon.guarantees.promises.frozen_laws import (
 from echelon.guarantees.promises.hypotheses import hypotheses, limits_line
 from echelon.guarantees.promises.leaders import leaders_of
 from echelon.guarantees.promises.modes import sampling_line, slowest_in_turns, turns_in_words
-from echelon.guarantees.promises.promise import Promise, Promises
+from echelon.guarantees.promises.promise import Guarantee, Promises
 from echelon.guarantees.promises.region import (
     adjacent_slopes,
     certified_set,
@@ -51,10 +51,7 @@ _ROUNDING = 1e-9  # of the fastest mode, in the slowest
 def claims_line(parts: Parts, loop: LinearLoop, region: RegionCertificate | None) -> Statement:
     """Return whether the certificate that a gain carries is of what runs.
 
-    Args:
-        parts: what runs.
-        loop: near the trim.
-        region: what the gain's metric promises here where the leader's input is relayed.
+    `region` is what the metric promises here where the leader's input is relayed.
     """
     gain, name, kind = parts.drive.gain, Hypothesis.CLAIMS, Kind.LINEARIZATION
     if gain is None:
@@ -68,15 +65,14 @@ def claims_line(parts: Parts, loop: LinearLoop, region: RegionCertificate | None
 def _difference(
     parts: Parts, gain: Gain, loop: LinearLoop, region: RegionCertificate | None
 ) -> str:
-    """Return the first difference in words; empty without any."""
     claim, low = gain.certificate, parts.graph.spectrum().low
     if abs(claim.lambda_min - low) > _SAME * low:
         ours, theirs = about(low, 4), about(claim.lambda_min, 4)
         return f"the gain was made for lambda_min {theirs}, and this graph has {ours}"
     slowest = grounded_slowest(gain, loop.linear, parts.graph)
     fastest = float(np.abs(np.linalg.eigvals(loop.linear.A - loop.linear.B @ loop.gains[-1])).max())
-    bends = at_trim(parts.model).bends.any()
-    if not bends and abs(claim.abscissa - slowest) > _SAME * abs(slowest) + _ROUNDING * fastest:
+    kinks = at_trim(parts.model).kinks.any()
+    if not kinks and abs(claim.abscissa - slowest) > _SAME * abs(slowest) + _ROUNDING * fastest:
         text = f"the gain says that its slowest mode is {about(claim.abscissa, 4)} 1/s, and this "
         text += f"model at coupling {about(gain.coupling, 4)} has {about(slowest, 4)} 1/s"
         return text
@@ -88,7 +84,6 @@ def _difference(
 
 
 def _rate(region: RegionCertificate | None) -> str:
-    """Return a promise on a domain in words, with the digits that are compared."""
     if region is None:
         return "nothing"
     kind, theorem = region.kind, region.theorem
@@ -100,16 +95,15 @@ def _rate(region: RegionCertificate | None) -> str:
 
 @final
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class MetricPromise(Promise):
+class MetricPromise(Guarantee):
     """What is guaranteed near the trim, and on a domain where a metric contracts there.
 
     Attributes:
-        case: what it was computed of.
         turns: what the leader's heading may do, in words; empty where the law does not turn.
         slowest_turn: the slowest mode in the steady turns of `turns`, 1/s.
     """
 
-    case: Case
+    case: GuaranteeInputs
     turns: str = ""
     slowest_turn: float = -math.inf
 
@@ -119,13 +113,13 @@ class MetricPromise(Promise):
         parts, states = prepared.parts, prepared.problem.states
         leaders, loop = leaders_of(parts, states), loop_of(parts)
         region = region_of(parts, settings, leaders)
-        case = Case(
+        case = GuaranteeInputs(
             parts,
             settings,
             loop,
             leaders,
             region.certificate,
-            adjacent_slopes(parts) if at_trim(parts.model).bends.any() else None,
+            adjacent_slopes(parts) if at_trim(parts.model).kinks.any() else None,
         )
         # What does not decay at the trim has nothing to lose elsewhere.
         if loop.every and case.governed:
@@ -156,7 +150,7 @@ class MetricPromise(Promise):
         case = self.case
         if case.loop.every and case.governed and case.frozen is None:
             # Nobody left the trim, and another seed may be what does.
-            yield from Promise.at(self, prepared, settings, brief)
+            yield from Guarantee.at(self, prepared, settings, brief)
             return
         with precision("float64"):
             states = Starts(prepared.parts).of([each.seed for each in settings])
@@ -172,7 +166,7 @@ class MetricPromise(Promise):
                 there = there._replace(frozen=case.frozen._replace(starts=own))
             yield self._from(there, states[k], bool(decays[k].all()))
 
-    def _from(self, case: Case, states: Array, decays: bool) -> "MetricPromise":
+    def _from(self, case: GuaranteeInputs, states: Array, decays: bool) -> "MetricPromise":
         """Return the same from states (N, n), about which held steps decay or may not."""
         lines = dict(self.hypotheses)
         # The line tells of where they start only if steps grow there.
@@ -232,7 +226,6 @@ class MetricPromise(Promise):
         return f"{text}. {self._regional(self.region)}"
 
     def _regional(self, region: RegionCertificate) -> str:
-        """Return what the region adds, as strong as its own argument and no stronger."""
         certified, condition, theorem = self.certified, self.condition, region.theorem
         by, what = self.kind.value, f"errors shrink at {at_most(region.rate)} 1/s or faster"
         what = "V does not increase" if theorem is Theorem.A5 else what

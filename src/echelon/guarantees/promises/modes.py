@@ -20,7 +20,7 @@ from echelon.core.rational import bisect
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded, vacuous
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem, amount
-from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.frozen_laws import longest_step
 from echelon.laws.law import gain_of
@@ -40,13 +40,13 @@ _ROUNDS, _RESIDUAL = 20, 1e-10
 _HALVINGS = 20
 
 
-def turns_with_heading(case: Case) -> bool:
+def turns_with_heading(case: GuaranteeInputs) -> bool:
     """Tell whether the followers' law turns."""
     drive = case.parts.drive
     return isinstance(drive, Laws) and drive.follower.turning
 
 
-def turning(case: Case) -> Iterator[Statement]:
+def turning(case: GuaranteeInputs) -> Iterator[Statement]:
     """Yield whether small errors shrink in turns as fast as the leader's; nothing without any."""
     if not turns_with_heading(case):
         return
@@ -68,13 +68,12 @@ def turning(case: Case) -> Iterator[Statement]:
     text = f"in a steady turn of {about(worst)} rad/s, as on the leader's path, the disagreement "
     text += "does not decay"
     fastest = _fastest(case, worst)
-    remedy = (
-        f"turn no faster than {at_most(fastest)} rad/s" if fastest > 0.0 else "use another gain"
-    )
+    remedy = "use another gain"
+    remedy = f"turn no faster than {at_most(fastest)} rad/s" if fastest > 0.0 else remedy
     yield fails(_NAME, kind, text, *number, remedy=remedy, reason=text)
 
 
-def turns_in_words(case: Case) -> str:
+def turns_in_words(case: GuaranteeInputs) -> str:
     """Return what the heading of the leader may do besides; nothing where no law turns."""
     if not turns_with_heading(case):
         return ""
@@ -83,7 +82,7 @@ def turns_in_words(case: Case) -> str:
     return f"{steady}, at any `{heading_of(case.parts.model).state}`"
 
 
-def slowest_in_turns(case: Case) -> dict[float, float]:
+def slowest_in_turns(case: GuaranteeInputs) -> dict[float, float]:
     """Return the slowest mode (1/s) in steady turns at the least and largest rate of the path.
 
     Of graphs that take turns it is what the sum of all delta'P delta promises, halved (T8).
@@ -95,7 +94,7 @@ def slowest_in_turns(case: Case) -> dict[float, float]:
     return {rate: slowest for rate, slowest in modes.items() if slowest is not None}
 
 
-def slowest_in_turn(case: Case, rate: float) -> float | None:
+def slowest_in_turn(case: GuaranteeInputs, rate: float) -> float | None:
     """Return the slowest mode in a steady turn (rad/s) about the trim, 1/s; None without a turn."""
     model, loop, gain = case.parts.model, case.loop, case.parts.drive.gain
     assert isinstance(case.parts.drive, Laws) and isinstance(gain, Gain)
@@ -156,7 +155,7 @@ def _slopes(model: ControlAffine, x: jax.Array, v: jax.Array) -> tuple[jax.Array
     return jax.jacfwd(motion, (0, 1))(x, v)
 
 
-def _fastest(case: Case, rate: float) -> float:
+def _fastest(case: GuaranteeInputs, rate: float) -> float:
     """Return up to which rate of a turn this way modes decay, rad/s, by halving."""
 
     def decays(size: float) -> bool:
@@ -181,12 +180,12 @@ _NOT_STABLE = "the disagreement does not decay at the trim"
 _BENT = "the model is not differentiable at the trim and has no modes there"
 
 
-def modes(case: Case) -> Iterator[Statement]:
+def modes(case: GuaranteeInputs) -> Iterator[Statement]:
     """Yield what a promise rests on near the trim, as the model has modes there or bends."""
     yield from _linear(case) if case.smooth or not case.governed else _bent(case)
 
 
-def _linear(case: Case) -> Iterator[Statement]:
+def _linear(case: GuaranteeInputs) -> Iterator[Statement]:
     yield _detectable(case)
     yield _coupled(case)
     yield _decaying(case)
@@ -200,8 +199,7 @@ def _linear(case: Case) -> Iterator[Statement]:
 # ---- where the model bends ----------------------------------------------------------------------
 
 
-def _bent(case: Case) -> Iterator[Statement]:
-    """Yield what is left of these lines where there is no linearization: what a region says."""
+def _bent(case: GuaranteeInputs) -> Iterator[Statement]:
     for name in (Hypothesis.DETECTABLE, Hypothesis.COUPLING, Hypothesis.ALONG_PATH):
         yield vacuous(name, _LINEAR, _BENT)
     region = case.region
@@ -214,7 +212,7 @@ def _bent(case: Case) -> Iterator[Statement]:
     yield _sampled_bend(case)
 
 
-def _sampled_bend(case: Case) -> Statement:
+def _sampled_bend(case: GuaranteeInputs) -> Statement:
     """Whether each side of a bend decays in steps of the integrator, as if it were all around."""
     name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     dt_text = f"dt {settings.dt:g} s"
@@ -235,7 +233,7 @@ def _sampled_bend(case: Case) -> Statement:
 # ---- where it has a linearization ---------------------------------------------------------------
 
 
-def _detectable(case: Case) -> Statement:
+def _detectable(case: GuaranteeInputs) -> Statement:
     model, loop, name = case.parts.model, case.loop, Hypothesis.DETECTABLE
     if not case.governed:
         return unneeded(name, _LINEAR, "the law has no P")
@@ -246,13 +244,12 @@ def _detectable(case: Case) -> Statement:
         return holds(name, _LINEAR, "z = 0 is reached", *number)
     names = sorted({k for mode in hidden for k in np.flatnonzero(np.abs(mode.direction) > 0.1)})
     along = ", ".join(f"`{model.state_names[k]}`" for k in names)
-    text = (
-        f"no input feels {n - rank} of {n} directions of disagreement, and along {along} it does "
-    )
-    return fails(name, _LINEAR, f"{text}not decay by itself", *number, remedy="choose another P")
+    text = f"no input feels {n - rank} of {n} directions of disagreement, and along {along} it "
+    text += "does not decay by itself"
+    return fails(name, _LINEAR, text, *number, remedy="choose another P")
 
 
-def _coupled(case: Case) -> Statement:
+def _coupled(case: GuaranteeInputs) -> Statement:
     edge, c = case.loop.certificate.edge, case.loop.closed.coupling
     if edge is None:
         return holds(Hypothesis.COUPLING, Kind.PROOF, "no edge is known", c, f"c {about(c, 4)}")
@@ -260,22 +257,19 @@ def _coupled(case: Case) -> Statement:
     if c >= edge:
         text = "from the edge on every mode decays: near the trim, and of linear agents anywhere"
         return holds(Hypothesis.COUPLING, Kind.PROOF, text, *number)
-    text = (
-        f"coupling {about(c, 4)} is below the edge {at_least(edge, 4)} of what this gain guarantees"
-    )
+    text = f"coupling {about(c, 4)} is below the edge {at_least(edge, 4)} "
+    text += "of what this gain guarantees"
     remedy = f"raise `coupling` to {at_least(edge, 4)} or more"
     return fails(Hypothesis.COUPLING, Kind.PROOF, text, *number, remedy=remedy)
 
 
-def _decaying(case: Case) -> Statement:
+def _decaying(case: GuaranteeInputs) -> Statement:
     """Whether every mode of the network decays; `every` covers what lies between extremes."""
     name, loop = Hypothesis.DISAGREEMENT_DECAY, case.loop
     if not case.governed:
         drive = case.parts.drive
-        text, remedy = (
-            f"no theorem covers `{type(drive).__name__}`",
-            "use laws that a theorem covers",
-        )
+        text = f"no theorem covers `{type(drive).__name__}`"
+        remedy = "use laws that a theorem covers"
         if isinstance(drive, Laws) and drive.metric(case.parts.model) is not None:
             text = "the model's `difference` of two states that are close is not x - y"
             remedy = "let `difference` wrap angles, and be x - y else"
@@ -298,22 +292,16 @@ def _decaying(case: Case) -> Statement:
     return fails(name, _LINEAR, text, *number, remedy=remedy, reason=reason)
 
 
-def _taking_turns(case: Case) -> Statement:
-    """Whether the disagreement decays however graphs take turns.
-
-    Stable modes of each do not say so; one sum of squares that falls on all of them does, whenever
-    they switch (theory page, T8).
-    """
+def _taking_turns(case: GuaranteeInputs) -> Statement:
+    """Stable modes of each do not say so; a sum of squares that falls on all of them does (T8)."""
     name, loop = Hypothesis.SWITCHING, case.loop
     edge, c, common = loop.certificate.edge, loop.closed.coupling, loop.common
     if not case.governed:
         text = "no theorem covers this law on switching graphs"
         return fails(name, _LINEAR, text, remedy="use `consensus`", reason=text)
     if _has_sum(loop) and common is not None:
-        text, rate = (
-            "sum_i delta_i'P delta_i increases on no graph, whenever they switch",
-            max(0.0, common.rate),
-        )
+        text = "sum_i delta_i'P delta_i increases on no graph, whenever they switch"
+        rate = max(0.0, common.rate)
         return holds(name, _LINEAR, text, rate, f"{at_most(rate)} 1/s")
     text = "no one P is known that serves all graphs of the schedule"
     remedy = "use the law `stopping-point`"
@@ -330,7 +318,7 @@ def _has_sum(loop: LinearLoop) -> bool:
     return enough and common is not None and common.weakest > 0.0
 
 
-def _along(case: Case) -> Statement:
+def _along(case: GuaranteeInputs) -> Statement:
     """Whether the laws are stable where the reference takes them, frozen there: no proof."""
     name, frozen = Hypothesis.ALONG_PATH, case.frozen
     if not (case.loop.every and case.governed):
@@ -341,10 +329,8 @@ def _along(case: Case) -> Statement:
     growth, states = frozen.growth(), len(frozen.times)
     number = growth.rate, f"{at_least(growth.rate)} 1/s"
     if not growth.lost:
-        text = (
-            f"small errors decay over {amount(states, 'state')} of it, each frozen until the next"
-        )
-        return holds(name, Kind.SAMPLES, text, *number)
+        text = f"small errors decay over {amount(states, 'state')} of it, "
+        return holds(name, Kind.SAMPLES, f"{text}each frozen until the next", *number)
     grown = f"{about(np.exp(min(growth.most, 99.0)), 2)}-fold on a part of it"
     grown = f"at {about(growth.rate)} 1/s" if growth.rate >= 0.0 else grown
     text = f"along the leader's path the {growth.whose} errors grow {grown}, fastest at "
@@ -353,17 +339,11 @@ def _along(case: Case) -> Statement:
     return fails(name, Kind.SAMPLES, text, *number, remedy=remedy, reason=text)
 
 
-def sampling_line(case: Case) -> Statement:
+def sampling_line(case: GuaranteeInputs) -> Statement:
     """Whether it still decays in steps of the integrator that runs, with the input held."""
     name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     if not (loop.every and case.governed):
-        return unneeded(
-            name,
-            _LINEAR,
-            _NOT_STABLE,
-            None,
-            f"dt {settings.dt:g} s",
-        )
+        return unneeded(name, _LINEAR, _NOT_STABLE, None, f"dt {settings.dt:g} s")
     radius, printed = loop.radius(settings), settings.integrator == "printed"
     goals = np.asarray(case.parts.model.trim[0], float) + case.parts.formation.offsets
     if printed and goals.any():
@@ -391,8 +371,7 @@ def sampling_line(case: Case) -> Statement:
     return _step_line(case, radii[where], text, "", reasons.get(where, _GROWS))
 
 
-def _by_substeps(case: Case) -> str:
-    """Return how many substeps of the integrator decay, as a remedy."""
+def _by_substeps(case: GuaranteeInputs) -> str:
     settings = case.settings
     tried = (settings._replace(substeps=k) for k in _SUBSTEPS if k > settings.substeps)
     enough = next((x.substeps for x in tried if case.loop.radius(x) < 1.0), None)
@@ -402,9 +381,8 @@ def _by_substeps(case: Case) -> str:
 
 
 def _step_line(
-    case: Case, radius: float, text: str, remedy: str, reason: str = _GROWS
+    case: GuaranteeInputs, radius: float, text: str, remedy: str, reason: str = _GROWS
 ) -> Statement:
-    """Return the line of a step from its spectral radius; the reason it is unstable, if it is."""
     dt = case.settings.dt
     number = radius, f"dt {dt:g} s"
     if radius < 1.0:

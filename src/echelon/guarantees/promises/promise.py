@@ -31,7 +31,7 @@ from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.prepare import Prepared, prepare
 from echelon.simulation.engine.result import Result
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate
 
@@ -66,7 +66,7 @@ class AgreementModes(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class Promise(abc.ABC):
+class Guarantee(abc.ABC):
     """What is guaranteed of a closed loop, and what that rests on.
 
     Attributes:
@@ -97,7 +97,7 @@ class Promise(abc.ABC):
 
     @classmethod
     @abc.abstractmethod
-    def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "Promise":
+    def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "Guarantee":
         """Return what is guaranteed of prepared parts; `brief` leaves out what takes long."""
 
     def at(self, prepared: Prepared, settings: Sequence[Settings], brief: bool) -> "Promises":
@@ -237,7 +237,9 @@ class Promise(abc.ABC):
 
     def sentence(self) -> str:
         """Return what is guaranteed, in sentences, and no more than that."""
-        text = self._claim() if self.claimed else self._against()
+        text = self.guarantee() if self.claimed else self._against()
+        if self.conditions:
+            text = f"Not guaranteed: this holds while {' and '.join(self.conditions)}. {text}"
         if self.claimed and self.without:
             text += f" {self.ignored()}"
         noted = (self.hypotheses.get(name) for name in _NOTED)
@@ -249,13 +251,6 @@ class Promise(abc.ABC):
         what = "claim" if self.conditions else "guarantee"
         return f"The {what} ignores that {self.without}." if self.without else ""
 
-    def _claim(self) -> str:
-        """Return what is claimed, after the conditions that are left to the run."""
-        if not self.conditions:
-            return self.guarantee()
-        text = f"Not guaranteed: this holds while {' and '.join(self.conditions)}."
-        return f"{text} {self.guarantee()}"
-
     def _against(self) -> str:
         """Return all that stands against a guarantee, and what would help."""
         against = (line for line in self.hypotheses.values() if line.fails and line.reason)
@@ -263,10 +258,8 @@ class Promise(abc.ABC):
         until = "" if self.prefix is None else f" {self.prefix.sentence()}"
         first = self.prefix if self.prefix and self.prefix.promise.promised else None
         which = "" if first is None else f" from {at_most(first.at, 6)} s on"
-        text = (
-            f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. What would help: {remedies}."
-        )
-        return text + until
+        text = f"Nothing is guaranteed{which}: {'; '.join(self.reasons)}. "
+        return f"{text}What would help: {remedies}.{until}"
 
     def as_mapping(self) -> dict[str, Any]:
         """Return it ready for JSON; what does not exist is None."""
@@ -297,7 +290,7 @@ class Prefix(NamedTuple):
     """What is guaranteed until a time (s), at which something happens that nothing covers."""
 
     at: float
-    promise: "Promise"
+    promise: "Guarantee"
 
     def as_mapping(self) -> dict[str, Any]:
         """Return it ready for JSON."""
@@ -308,12 +301,12 @@ class Prefix(NamedTuple):
         return f"Until {at_most(self.at, 6)} s: {self.promise.sentence()}"
 
 
-Promises: TypeAlias = Iterator[Promise | EchelonError]
-_cache: WeakKeyDictionary[Parts, dict[Hashable, dict[Settings, Promise]]] = WeakKeyDictionary()
+Promises: TypeAlias = Iterator[Guarantee | EchelonError]
+_cache: WeakKeyDictionary[Parts, dict[Hashable, dict[Settings, Guarantee]]] = WeakKeyDictionary()
 """By parts, by what foreign code in them reads now, and by settings."""
 
 
-def prover_of(drive: Drive) -> type[Promise]:
+def prover_of(drive: Controller) -> type[Guarantee]:
     """Return what proves the guarantees of a drive: of laws, what the followers' law names."""
     law = drive.follower if isinstance(drive, Laws) else Law
     # By name, since a law is below all that is proved of it.
@@ -324,7 +317,7 @@ def prover_of(drive: Drive) -> type[Promise]:
 
 
 @shared_traces()
-def promise(parts: Parts, settings: Settings) -> Promise:
+def guarantee(parts: Parts, settings: Settings) -> Guarantee:
     """Return what is guaranteed of parts under settings; computed once while the parts exist.
 
     Where a theorem certifies a set behind a leader that moves, and where free leaders start apart,
@@ -349,7 +342,7 @@ def guaranteed(parts: Parts, settings: Settings) -> str:
     plain = [x for x in fields if not isinstance(x, type(formation) | type(graph))]
     links = graph.edges, graph.weights, graph.agents, graph.leaders, graph.directed, graph.schedule
     rest = formation.offsets, formation.motion, links, settings
-    return load_or_compute(lambda: promise(parts, settings).sentence(), __name__, plain, rest)
+    return load_or_compute(lambda: guarantee(parts, settings).sentence(), __name__, plain, rest)
 
 
 def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) -> Promises:
@@ -370,8 +363,9 @@ def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) ->
         return
 
 
-def _computed(prepared: Prepared, parts: Parts, settings: Settings, brief: bool = False) -> Promise:
-    """Return what is guaranteed of parts, and store it if nothing was left out."""
+def _computed(
+    prepared: Prepared, parts: Parts, settings: Settings, brief: bool = False
+) -> Guarantee:
     with precision("float64"):
         computed = prover_of(prepared.parts.drive).of(prepared, settings, brief)
     if not brief:
@@ -382,8 +376,7 @@ def _computed(prepared: Prepared, parts: Parts, settings: Settings, brief: bool 
     return computed
 
 
-def _prefix_of(computed: Promise, parts: Parts, settings: Settings) -> Prefix | None:
-    """Return what is guaranteed until the first event that is not covered; None for nothing."""
+def _prefix_of(computed: Guarantee, parts: Parts, settings: Settings) -> Prefix | None:
     line = computed.hypotheses.get(Hypothesis.EVENTS)
     if line is None or not line.fails or line.number is None:
         return None
@@ -393,15 +386,14 @@ def _prefix_of(computed: Promise, parts: Parts, settings: Settings) -> Prefix | 
     graph = parts.graph.until(line.number)
     until = settings._replace(horizon=steps * settings.dt, steady_window=None)
     try:
-        first = promise(parts.replace(graph=graph, events=graph.events), until)
+        first = guarantee(parts.replace(graph=graph, events=graph.events), until)
     except EchelonError:
         # Without what happens later somebody has no path to a leader for ever.
         return None
     return Prefix(line.number, first) if first.claimed else None
 
 
-def _stored(parts: Parts) -> dict[Settings, Promise]:
-    """Return the guarantees of parts by settings, of what their code reads now."""
+def _stored(parts: Parts) -> dict[Settings, Guarantee]:
     # A formation is no dataclass, whose parts would be found.
     reads = foreign_key((parts, parts.formation.motion))
     return _cache.setdefault(parts, {}).setdefault(reads, {})
@@ -420,7 +412,7 @@ class Exit(NamedTuple):
     name: str
 
 
-def coverage(result: Result, promise: Promise) -> Iterator[str]:
+def coverage(result: Result, promise: Guarantee) -> Iterator[str]:
     """Say of a theorem's claim whether a run kept to what it rests on."""
     if promise.theorem is None or not len(result.times):
         return
@@ -436,7 +428,7 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
         yield f"The {what} covers this run: {promise.why_covered()}."
 
 
-def covered(result: Result, promise: Promise) -> bool | None:
+def covered(result: Result, promise: Guarantee) -> bool | None:
     """Return whether a run kept, in every step, to what a theorem's claim rests on.
 
     None where no theorem claims anything, and where the stored frames do not show it.
@@ -447,7 +439,7 @@ def covered(result: Result, promise: Promise) -> bool | None:
     return None if not against and _unseen(result, promise) else not against
 
 
-def _against(result: Result, promise: Promise) -> str:
+def _against(result: Result, promise: Guarantee) -> str:
     """Return why a claim does not cover a run; empty where it does."""
     left = None if promise.region is None else first_exit(result, promise)
     limited = float(result.saturated.max())
@@ -458,13 +450,13 @@ def _against(result: Result, promise: Promise) -> str:
     return promise.without
 
 
-def _unseen(result: Result, promise: Promise) -> bool:
+def _unseen(result: Result, promise: Guarantee) -> bool:
     """Tell whether stored frames alone show that agents stayed in the domain."""
     certified = not promise.hypotheses[Hypothesis.STARTS].fails and promise.theorem != Theorem.T2
     return promise.region is not None and not certified and result.settings.store_every > 1
 
 
-def first_exit(result: Result, promise: Promise) -> Exit | None:
+def first_exit(result: Result, promise: Guarantee) -> Exit | None:
     """Return who leaves the domain first, its offset aside; None where nobody does.
 
     T1 and A5 ask it of all agents. T2 asks it of the leaders, and of their inputs, with which the

@@ -41,6 +41,7 @@ from echelon.synthesis.certificates.lmi import falls
 from echelon.synthesis.gains.gain import Gain
 
 _NAME = Hypothesis.REGION
+_INNER = "the hull is of the drift without the gain's inner loop", "remove the inner loop"
 _ROUNDED = 1e-9  # of a normalized input
 _NEAR = 1e-3
 """How far about a trim the slopes of its sides are looked at, in units of each state."""
@@ -52,7 +53,6 @@ class Region(NamedTuple):
     Attributes:
         certificate: of the law that runs; None where nothing is promised.
         relayed: what the metric promises where the leader's input is relayed; None for nothing.
-        line: what was found.
     """
 
     certificate: RegionCertificate | None
@@ -63,7 +63,7 @@ class Region(NamedTuple):
 def region_of(parts: Parts, settings: Settings, leaders: Leaders) -> Region:
     """Return what is promised on the domain that the gain of prepared parts was made for."""
     gain = parts.drive.gain
-    if gain is not None and gain.certificate.region is None and at_trim(parts.model).bends.any():
+    if gain is not None and gain.certificate.region is None and at_trim(parts.model).kinks.any():
         return _region_at_bend(parts, settings, leaders, gain)
     if gain is None or gain.certificate.region is None:
         text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
@@ -79,17 +79,14 @@ def region_of(parts: Parts, settings: Settings, leaders: Leaders) -> Region:
         text = f"P does not contract on the domain at coupling {about(gain.coupling, 4)}, "
         text += f"2 c lambda_min = {about(_strength(parts, gain), 4)}"
         return Region(None, None, _lost(text, "raise `coupling`, or shrink the `domain`"))
-    text, remedy = _withheld(parts, settings, leaders, gain, certificate)
-    if text:
-        return Region(None, certificate, _lost(text, remedy))
+    why = _INNER if gain.inner is not None else _not_the_law(parts, settings, leaders, certificate)
+    if why[0]:
+        return Region(None, certificate, _lost(*why))
     return Region(certificate, certificate, _line(parts, certificate))
 
 
 def _region_at_bend(parts: Parts, settings: Settings, leaders: Leaders, gain: Gain) -> Region:
-    """Return what a metric promises about a trim at which the model bends.
-
-    It has no linearization there, but a hull holds the slopes of all its sides nearby.
-    """
+    """It has no linearization there, but a hull holds the slopes of all its sides nearby."""
     text = "the model is not differentiable at the trim, and its slopes there do not all contract"
     none = unneeded(_NAME, Kind.VERTICES, text, number_text="none")
     try:
@@ -134,13 +131,11 @@ def _with_inner(parts: Parts, gain: Gain, pairs: DomainPairs) -> DomainPairs | N
 def _contraction(
     parts: Parts, gain: Gain, pairs: DomainPairs, exact: bool
 ) -> RegionCertificate | None:
-    """Return what a gain's metric contracts at its coupling; None for nothing."""
     B, spectrum = linearize(parts.model).B, parts.graph.spectrum()
     return contracting_region(pairs, gain.P, B, gain.R, exact, gain.coupling, spectrum)
 
 
 def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCertificate | None:
-    """Return what the metric promises on the claim's domain behind a relayed input."""
     model, spectrum, exact = parts.model, parts.graph.spectrum(), claim.kind is Kind.PROOF
     domain = claim.domain.straight(model)
     if claim.theorem is Theorem.A5:
@@ -155,24 +150,13 @@ def _strength(parts: Parts, gain: Gain) -> float:
     return 2.0 * gain.coupling * parts.graph.spectrum().proved
 
 
-def _withheld(
-    parts: Parts, settings: Settings, leaders: Leaders, gain: Gain, certificate: RegionCertificate
-) -> tuple[str, str]:
-    """Return why the gain in the law that runs does not keep what the metric could, and a cure."""
-    if gain.inner is not None:
-        return "the hull is of the drift without the gain's inner loop", "remove the inner loop"
-    return _not_the_law(parts, settings, leaders, certificate)
-
-
 def _not_the_law(
     parts: Parts, settings: Settings, leaders: Leaders, certificate: RegionCertificate
 ) -> tuple[str, str]:
     """Return why what is fed forward takes away what the metric could keep, and what would not."""
     if _turns_away(parts, leaders):
-        text = (
-            f"the law turns with the leader's heading, and {certificate.theorem} needs fixed axes"
-        )
-        return text, "keep the leader's heading at the trim's"
+        text = f"the law turns with the leader's heading, and {certificate.theorem} needs fixed "
+        return f"{text}axes", "keep the leader's heading at the trim's"
     feedforward, theorem = parts.drive.feedforward, certificate.theorem
     # The parent of all is a leader where no agent is farther away, and what it sends is relayed.
     if feedforward is Feedforward.PARENT and parts.graph.depths().max() > 1:
@@ -183,10 +167,8 @@ def _not_the_law(
         return text, "set `feedforward: relay`"
     # A leader at its trim makes no velocity beyond it, and its raw input is that of the trim.
     if feedforward is Feedforward.RELAY_VELOCITY and theorem is Theorem.T2 and not leaders.rest:
-        text = (
-            "T2 covers the leader's raw input; what each agent computes from its velocity varies "
-        )
-        return f"{text}with g, and is not enclosed", "set `feedforward: relay`"
+        text = "T2 covers the leader's raw input; what each agent computes from its velocity "
+        return f"{text}varies with g, and is not enclosed", "set `feedforward: relay`"
     if not leaders.agree:
         return f"{theorem} covers one leader, or leaders that agree", "start them alike"
     return _uncovered_input(parts, settings, leaders, certificate.domain)
@@ -195,10 +177,7 @@ def _not_the_law(
 def _uncovered_input(
     parts: Parts, settings: Settings, leaders: Leaders, domain: Domain
 ) -> tuple[str, str]:
-    """Return which input of the leader is outside of a hull that inputs count in, and a cure.
-
-    The slopes of f + g u depend on u where g varies, and those in the hull are of the domain's u.
-    """
+    """Slopes of f + g u depend on u where g varies; those in the hull are of the domain's u."""
     model, count = parts.model, len(leaders.starts)
     varying = ~constant_inputs(model, domain)
     if leaders.rest or not varying.any():
@@ -277,8 +256,6 @@ class CertifiedSet(NamedTuple):
     Attributes:
         radius: 0 where the set is empty, infinite where the domain bounds nothing.
         kind: of the argument; samples where the leader's excursion is read off a run of its own.
-        why: what limits the radius, or why there is none.
-        remedy: what would make one; empty where there is one.
     """
 
     radius: float
@@ -331,9 +308,8 @@ def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> C
     j = int(np.argmin(radii))
     name, wide = model.state_names[j], margins[j]
     if radii[j] == 0.0:
-        text = (
-            f"the leader alone reaches {about(away[j])} in `{name}`, and the domain {about(wide)}"
-        )
+        text = f"the leader alone reaches {about(away[j])} in `{name}`, "
+        text += f"and the domain {about(wide)}"
         return CertifiedSet(0.0, kind, text, "widen the domain, or slow the reference")
     # On a directed graph a sum with weights falls, which one agent's share may exceed so much.
     shrink = 1.0 / np.sqrt(parts.graph.spectrum().skew)

@@ -8,7 +8,7 @@ from echelon.core.statement import Cause, Hypothesis, fails, unneeded
 from echelon.core.words import Kind
 from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import trim_line
-from echelon.guarantees.promises.promise import REQUIRED, Promise
+from echelon.guarantees.promises.promise import REQUIRED, Guarantee
 from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.settings import Settings
 
@@ -32,7 +32,7 @@ _REMEDY = "use a bundled law, or name a `prover` of your own"
 
 @final
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class UnknownLaw(Promise):
+class UnknownLaw(Guarantee):
     """What is said of a run under a law whose code is a user's own."""
 
     @classmethod

@@ -53,11 +53,7 @@ class Clearance(NamedTuple):
 def clearance_of(chain: Chain, order: int, pushes: Sequence[Push], allowed: Fraction) -> Clearance:
     """Return how far v^(order) falls under all pushes together, and the start that is left.
 
-    Args:
-        chain: of the output.
-        order: below the chain's last.
-        pushes: the leader's, and the agent's.
-        allowed: how far it may fall.
+    `order` is below the chain's last; `pushes` are the leader's, and the agent's.
     """
     left = [chain.derivative(chain.free(push.start), order) for push in pushes if push.start]
     free = add(*left) if left else Poly()
@@ -155,7 +151,6 @@ class Border(NamedTuple):
     """A border of the chart, and what is left to it.
 
     Attributes:
-        bound: what the model says of it.
         left: how far agents stay from it, at least.
         steepest: how far the outputs' speed may be off the leader's at the start.
         path: what the leader's path takes the bounded derivative to, at least.
@@ -163,7 +158,6 @@ class Border(NamedTuple):
         led: whether the leader starts on its path in these outputs, and so keeps to it.
         turn: by what angle (deg) a velocity as large as the leader's may be off it at the start;
             infinite where the bound is of no velocity.
-        data: what is claimed, and what it was computed of; ready for JSON.
         beside: whether offsets that change with time move agents in the bounded derivative.
     """
 
@@ -290,10 +284,7 @@ def _upward(case: _BorderCase) -> tuple[list[Clearance], dict[str, object]]:
         clearance_of(
             chain,
             case.bound.derivative - 1,
-            (
-                Push(_exact(lead[1 : p + 1]), case.own),
-                Push(_exact(start[1 : p + 1]), case.speed),
-            ),
+            (Push(_exact(lead[1 : p + 1]), case.own), Push(_exact(start[1 : p + 1]), case.speed)),
             case.allowed,
         )
         for lead in led
@@ -324,11 +315,7 @@ def _exact(values: Array) -> tuple[Fraction, ...]:
 
 
 def _few(starts: Array) -> Array:
-    """Return starts (K, r) that stand for all: the extreme ones where the speed alone differs.
-
-    Raises:
-        GainError: there are too many.
-    """
+    """Return starts (K, r) that stand for all: the extreme ones where the speed alone differs."""
     starts = starts.copy()
     starts[:, 0] = 0.0
     starts[np.abs(starts) < _LEVEL] = 0.0
@@ -339,11 +326,6 @@ def _few(starts: Array) -> Array:
 
 
 def _distinct(starts: Array) -> Array:
-    """Return each start once.
-
-    Raises:
-        GainError: there are too many.
-    """
     distinct = np.unique(starts, axis=0)
     if len(distinct) > _STARTS:
         raise GainError(

@@ -110,7 +110,6 @@ def _gain(chain: Chain, order: int) -> Fraction:
 
 
 def _solve(rows: list[list[Fraction]], right: list[Fraction]) -> list[Fraction]:
-    """Return the solution of linear equations, exactly."""
     n = len(right)
     table = [[*row, b] for row, b in zip(rows, right, strict=True)]
     for k in range(n):
@@ -169,11 +168,6 @@ def spread_between(p: Poly, low: Fraction, high: Fraction) -> Fraction:
             half = width / 2
             pieces += [(left, a, half), (right, a + half, half)]
     return total
-
-
-def bounds_on_pieces(p: Poly, halvings: int) -> list[Fraction]:
-    """Return a bound of |p| on each of 2^halvings equal pieces of [0, 1], ascending."""
-    return [max(map(abs, piece)) for piece in _pieces(p, halvings)]
 
 
 def spreads_on_pieces(p: Poly, halvings: int) -> list[Fraction]:
@@ -293,10 +287,8 @@ def _reaches(chain: Chain) -> list[DerivativeBounds]:
     orders = range(size + 1)
     units = [[Fraction(i == k) for i in range(size)] for k in range(size)]
     starts = [chain.free(unit) for unit in units]
-    free = [
-        [bounds_on_pieces(chain.derivative(p, order), _HALVINGS) for p in starts]
-        for order in orders
-    ]
+    pieces = [[_pieces(chain.derivative(p, order), _HALVINGS) for p in starts] for order in orders]
+    free = [[[max(map(abs, piece)) for piece in each] for each in row] for row in pieces]
     grown = [_grown(chain, order) for order in orders]
     return [
         DerivativeBounds(

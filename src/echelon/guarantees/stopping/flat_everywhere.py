@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from echelon.agents.models.chains import Chains, derivatives_of, flatten
+from echelon.agents.models.chains import Chains, derivatives_of, to_flat
 from echelon.agents.models.declarations import is_by_user
 from echelon.agents.models.model import Airframe, ControlAffine, FlatBound
 from echelon.agents.models.quadrotor import Quadrotor
@@ -83,7 +83,6 @@ def _on_segments(
 
 
 def _is_within(model: ControlAffine, chains: Chains, x: Array, values: Array) -> Bool[Array, "K L"]:
-    """Return whether points of segments are within the borders and the chart."""
     within = np.asarray(np.isfinite(values).all(axis=(2, 3)))
     for bound in model.flat_bounds or ():
         entries = values[:, :, bound.derivative, [chains.outputs.index(n) for n in bound.outputs]]
@@ -131,11 +130,10 @@ def airframe_fault(model: ControlAffine, chains: Chains, frame: Airframe) -> str
 def _inverted(
     model: ControlAffine, chains: Chains, x: jax.Array, e: jax.Array, tops: jax.Array
 ) -> tuple[Float[jax.Array, "K m"], Float[jax.Array, "K r m"]]:
-    """Return the inputs at states, and the derivatives of the outputs that they make."""
     top = np.arange(max(chains.degrees) + 1)[:, None] == np.array(chains.degrees)
 
     def one(x: State, e: jax.Array, tops: jax.Array) -> tuple[Input, jax.Array]:
-        flat = flatten(model, chains, x, e)
+        flat = to_flat(model, chains, x, e)
         u = model.physical(chains.acting_input(e, flat.invert(tops)))
         return u, jnp.where(top, tops, jnp.pad(flat.values, ((0, 1), (0, 0))))
 
@@ -160,9 +158,7 @@ class KnownBounds(NamedTuple):
     """The borders of a model's flat coordinates, and how they are known.
 
     Attributes:
-        bounds: None where they are not known.
         kind: of the argument: samples where somebody's class states them.
-        fault: why they are not known.
     """
 
     bounds: Sequence[FlatBound] | None
@@ -179,7 +175,7 @@ def bounds_of(model: ControlAffine, chains: Chains) -> KnownBounds:
     the inputs act by an invertible constant matrix.
     """
     by_user = {name for name in chains.declared if is_by_user(model, name)}
-    mapped = Kind.SAMPLES if "flatten" in by_user else Kind.PROOF
+    mapped = Kind.SAMPLES if "to_flat" in by_user else Kind.PROOF
     if not {*_STATED} <= {*chains.declared}:
         fault = f"`{type(model).__name__}` does not state where its flat coordinates end"
         everywhere = _is_everywhere(model, chains)
@@ -213,13 +209,7 @@ def _is_everywhere(model: ControlAffine, chains: Chains) -> bool:
 def _traced(
     model: ControlAffine, chains: Chains
 ) -> tuple[list[list[Fraction]], list[list[list[_Form]]]]:
-    """Return the slopes of the flat coordinates, and what inputs add to them [input][order][k].
-
-    Slopes are 0 throughout where a coordinate is no linear form of the states and integrators.
-
-    Raises:
-        Unsupported: the trace has what is no scalar operation, or not defined everywhere.
-    """
+    """Return slopes, 0 of what is no linear form, and what inputs add to them [input][order][k]."""
     graph, n = ScalarGraph(), len(model.state_names)
     leaves = [graph.leaf("row", place) for place in range(n + chains.size)]
     x, e = (np.array(part, object) for part in (leaves[:n], leaves[n:]))
@@ -265,7 +255,6 @@ def _sign(node: Node) -> float:
 
 
 def _form_of(node: Node) -> _Form:
-    """Return a node as a sum of multiples of others, as far down as it is one."""
     done = dict[int, _Form]()
     todo = [node]
     while todo:
@@ -302,7 +291,6 @@ def _tidy(form: _Form) -> _Form:
 
 
 def _is_invertible(rows: list[list[Fraction]]) -> bool:
-    """Tell whether a square matrix has no zero determinant, by elimination; others are not."""
     rows, n = [list(row) for row in rows], len(rows)
     if any(len(row) != n for row in rows):
         return False

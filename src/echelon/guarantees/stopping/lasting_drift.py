@@ -37,13 +37,7 @@ _FOLLOWED = 1e-6
 
 
 class _Missing(NamedTuple):
-    """What the model lacks while the plant follows the path, at times (T,) and of outputs (m,).
-
-    Attributes:
-        current: of the outputs' speeds, (T, m).
-        force: of their accelerations, (T, m).
-        left: by how much the plant does not follow the path, (T,).
-    """
+    """The model lacks speeds and accelerations (T, m); the plant leaves its path by `left` (T,)."""
 
     current: jax.Array
     force: jax.Array
@@ -86,23 +80,16 @@ def drift_line(run: StoppingRun) -> Statement | None:
 
 
 class _Lasting(NamedTuple):
-    """What the model lacks of an agent's motion in the mean, as speeds of its outputs, (m,).
-
-    Attributes:
-        current: what it lacks of the speed.
-        push: the speed that an acceleration which it lacks demands of agreement.
-    """
+    """What lasts, (m,), as speeds; `push` is what an acceleration demands of agreement."""
 
     current: Array
     push: Array
 
     @classmethod
     def none(cls, law: FlatLaw) -> "_Lasting":
-        """Return that of a model that lacks nothing."""
         return cls(*np.zeros((2, len(law.ready.chains.degrees))))
 
     def less(self, other: "_Lasting") -> "_Lasting":
-        """Return what is left of it beside another agent's."""
         return _Lasting(self.current - other.current, self.push - other.push)
 
 
@@ -120,7 +107,6 @@ def _lasting(run: StoppingRun, law: FlatLaw, plant: ControlAffine) -> _Lasting |
 
 
 def _drifts(agent: int, law: FlatLaw, whose: str, lasting: _Lasting) -> Statement | None:
-    """Return that an agent may drift away, by what a current and a push demand of agreement."""
     chains = law.ready.chains
     for k, (name, degree) in enumerate(zip(chains.outputs, chains.degrees, strict=True)):
         current, push, s = float(lasting.current[k]), float(lasting.push[k]), law.speed_of(k)
@@ -144,7 +130,6 @@ def _fails(text: str, remedy: str, number: float | None = None, shown: str = "")
 
 
 def _missing_on_path(run: StoppingRun, loop: FlatLoop, plant: ControlAffine) -> _Missing:
-    """Return what the model lacks of a plant along the leader's path until the horizon."""
     world, model, leader = run.parts.world, run.parts.model, run.leader
     push, air = np.zeros(len(model.state_names)), np.zeros((2, len(model.state_names)))
     if world.disturbance is not None:
@@ -187,12 +172,10 @@ class _Driven(NamedTuple):
         return jnp.concatenate([x, e, v])
 
     def parts(self, z: jax.Array) -> tuple[State, jax.Array, jax.Array]:
-        """Return x, e and w."""
         end = self.states + self.loop.chains.size
         return z[: self.states], z[self.states : end], z[end:]
 
     def input(self, z: jax.Array) -> jax.Array:
-        """Return the physical input."""
         _, e, w = self.parts(z)
         return self.model.physical(self.loop.chains.acting_input(e, w))
 
@@ -201,12 +184,10 @@ class _Driven(NamedTuple):
         return flat_output(self.model, self.loop.chains.outputs, x)
 
     def velocity(self, x: State, u: jax.Array) -> State:
-        """Return the rate of the state."""
         drag, wind = self.air
         return self.plant.velocity(x, u) + self.push + drag * (wind - x)
 
     def moved(self, z: jax.Array) -> jax.Array:
-        """Return the rate of z."""
         x, e, w = self.parts(z)
         return jnp.concatenate(
             [self.velocity(x, self.input(z)), self.loop.chains.rate(e, w), jnp.zeros_like(w)]

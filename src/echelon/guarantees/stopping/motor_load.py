@@ -100,11 +100,7 @@ def motors_of(
 ) -> Motors:
     """Return what the motors of an agent give on a path, pushed off it.
 
-    Args:
-        frame: of the agent.
-        slices: of time.
-        path: what is followed asks on each slice.
-        pushes: the leader's off its path, and the agent's off the leader; all add up.
+    `path` is what is followed, slice by slice; `pushes` (the leader's, the agent's) add up.
     """
     least, largest, slope = None, Fraction(0), Fraction(0)
     for piece, demand in zip(slices, path, strict=True):
@@ -222,8 +218,6 @@ class MotorLoad(NamedTuple):
         least, largest: of a motor's thrust, N.
         most: that it has, N.
         tilt: the steepest, rad.
-        alone: None where agents that start like the leader do not.
-        data: what it was computed of; ready for JSON.
     """
 
     least: float
@@ -249,17 +243,7 @@ class MotorLoad(NamedTuple):
 
 
 class _MotorCase(NamedTuple):
-    """What the motors of a run are asked for.
-
-    Attributes:
-        frame: of the agents.
-        chain: of their position.
-        demands: of that path, on each slice of time.
-        leader: its start off its path, and its speeds.
-        speeds: of the agents.
-        base: the demands of agents that start as their leader.
-        starts: of the agents.
-    """
+    """`demands` are of the leader's path on each slice, `base` those of agents that start as it."""
 
     frame: Airframe
     chain: Chain
@@ -271,7 +255,6 @@ class _MotorCase(NamedTuple):
 
     @classmethod
     def of(cls, run: StoppingRun, frame: Airframe) -> "_MotorCase":
-        """Return it of a run."""
         chain, graph = run.chain(0), run.parts.graph
         speeds = _speeds([run.speed(k) for k in range(4)])
         off = run.flat[list(graph.leaders)] - run.ahead
@@ -325,7 +308,6 @@ def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | No
 
 
 def _airframe(run: StoppingRun) -> tuple[Airframe | None, str]:
-    """Return the body under motors that a model declares of its motion and limits, or why not."""
     model, reason = run.parts.model, _beyond(run)
     frame = None if undeclared(model, "airframe") else model.airframe
     if frame is not None and not reason and is_by_user(model, "airframe"):
@@ -360,7 +342,6 @@ def _thrust_text(motors: Motors) -> str:
 def _path_demands(
     leader: StoppingLeader, model: ControlAffine, horizon: float, chain: Chain
 ) -> tuple[MotorDemand, ...]:
-    """Return the demands of a leader's path on each slice of time."""
     pieces = pieces_of(leader, model, horizon, _OUTPUTS, max(_DEGREES))
     spans = ((piece.begin, piece.end) for piece in slices_of(chain))
     return tuple(_demand(pieces, *span) for span in spans)
@@ -376,7 +357,6 @@ def _beside(run: StoppingRun, demand: MotorDemand) -> MotorDemand:
 
 
 def _demand(pieces: Pieces, begin: Fraction, end: Fraction | None) -> MotorDemand:
-    """Return the demand of a path in a stretch of time."""
     rows = pieces.between(begin, end)
 
     def most(order: int, *outputs: int) -> Fraction:
@@ -423,12 +403,10 @@ def _pushed(
 
 @memoize
 def _suffice_at_rest(frame: Airframe, chain: Chain, base: tuple[MotorDemand, ...]) -> bool:
-    """Tell whether the motors suffice for agents that start as their leader: the least demand."""
     return motors_suffice(frame, slices_of(chain), base, _STILL)
 
 
 def _from(case: _MotorCase) -> tuple[Motors, Sequence[Pushed]]:
-    """Return what motors give from any of the starts, and which are looked at for that."""
     frame, slices, starts = case.frame, slices_of(case.chain), case.starts
     largest = _largest(starts)
     whole = motors_of(frame, slices, case.base, (largest,))
@@ -443,15 +421,7 @@ def _from(case: _MotorCase) -> tuple[Motors, Sequence[Pushed]]:
 
 
 class _Ahead(NamedTuple):
-    """Sizes of how a leader's path begins, m and s.
-
-    Attributes:
-        speed, push, jerk: its horizontal velocity, and the derivatives of that.
-        rise: its vertical velocity.
-        lift: g and its vertical acceleration together.
-        climb: the rate of that.
-        turn: of its yaw.
-    """
+    """How a path begins, m and s: horizontal v, v', v''; v_z, g + v_z', v_z''; the yaw's rate."""
 
     speed: Fraction
     push: Fraction
@@ -503,7 +473,6 @@ def _alone(
 def _data(
     case: _MotorCase, roots: Sequence[float], starts: Sequence[Pushed], ahead: _Ahead
 ) -> dict[str, object]:
-    """Return what the load was computed of, ready for JSON."""
     return {
         "airframe": case.frame._asdict(),
         "roots": list(roots),

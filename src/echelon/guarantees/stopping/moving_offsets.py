@@ -91,7 +91,6 @@ def _lengths(motion: FormationMotion) -> tuple[list[Fraction], list[list[Fractio
 
 
 def _after(motion: OffsetMotion, sizes: Sequence[Sequence[Fraction]]) -> list[list[Fraction]]:
-    """Return the sizes after a motion of the whole shape."""
     scales = isinstance(motion, Scale)
     assert isinstance(motion, Rotate | Scale)
     rate, amplitude = abs(Fraction(motion.rate)), abs(Fraction(getattr(motion, "amplitude", 1.0)))
@@ -169,11 +168,6 @@ def offset_fault(motion: FormationMotion | None, order: int, horizon: float) -> 
 
 @memoize
 def _check(motion: FormationMotion, order: int, horizon: float) -> None:
-    """Check the motion of all places.
-
-    Raises:
-        GainError: it may lack a derivative, or there are too many places.
-    """
     rows = np.unique(motion.places, axis=0)
     if len(rows) > _MOST_PLACES:
         raise GainError(f"{len(rows)} places are different, and {_MOST_PLACES} are looked at")
@@ -207,7 +201,6 @@ class _Stretch(NamedTuple):
 
 
 def _pieces(motion: FormationMotion, rows: Array, horizon: float) -> Iterator[_Stretch]:
-    """Yield the pieces of a motion between the ends of its reshapes, until a horizon (s)."""
     ends = {*motion.begins.tolist(), *(motion.begins + motion.spans).tolist()}
     times = [0.0, *sorted(end for end in ends if 0.0 < end < horizon), horizon]
     for begin, end in zip(times, times[1:], strict=False):

@@ -11,7 +11,7 @@ import numpy as np
 
 from echelon.agents.models.chains import Chains
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.references.reference import COORDINATES, Guide, Reference
+from echelon.agents.references.reference import COORDINATES, LeaderPath, Reference
 from echelon.core.cache import memoize
 from echelon.core.digits import about
 from echelon.core.enclosure.interval import Interval, point
@@ -27,7 +27,6 @@ _FEW, _ALL = 20, 4000
 """Pieces of each part of a path that is joined of many, and about how many of all parts."""
 _EXACT = Fraction(1, 10**9)
 """Of the highest derivative; one that is known so well in one piece is constant."""
-
 
 _Rows: TypeAlias = tuple[tuple[Interval, ...], ...]
 
@@ -72,7 +71,7 @@ def pieces_of(
 
 
 @memoize
-def _pieces(reference: Guide, horizon: float, outputs: tuple[str, ...], order: int) -> Pieces:
+def _pieces(reference: LeaderPath, horizon: float, outputs: tuple[str, ...], order: int) -> Pieces:
     assert isinstance(reference, Reference)
     picked = np.array([COORDINATES.index(name) for name in outputs])
     times, values, parts = [Fraction(0)], list[_Rows](), reference.parts(horizon)
@@ -92,11 +91,7 @@ def _pieces(reference: Guide, horizon: float, outputs: tuple[str, ...], order: i
 
 
 def least_on_path(
-    leader: StoppingLeader,
-    model: ControlAffine,
-    horizon: float,
-    outputs: Sequence[int],
-    order: int,
+    leader: StoppingLeader, model: ControlAffine, horizon: float, outputs: Sequence[int], order: int
 ) -> float:
     """Return what a derivative on a leader's path is not below until the horizon.
 
@@ -125,7 +120,7 @@ _SAME = 1e-6
 """Relative; far more than floats leave of a derivative."""
 
 
-def path_fault(reference: Guide | None, chains: Chains, horizon: float) -> str:
+def path_fault(reference: LeaderPath | None, chains: Chains, horizon: float) -> str:
     """Return why a path is not known to have bounded derivatives; empty where it has.
 
     An output with a chain of r integrators needs r - 1 continuous derivatives until the horizon (s)
@@ -145,11 +140,6 @@ def path_fault(reference: Guide | None, chains: Chains, horizon: float) -> str:
 
 @memoize
 def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: float) -> None:
-    """Check a path.
-
-    Raises:
-        GainError: it may lack a derivative.
-    """
     if type(reference).derivatives is not Reference.derivatives:
         raise GainError("a path replaces `derivatives`, which may be those of another path")
     picked = np.array([COORDINATES.index(name) for name in outputs])
@@ -167,11 +157,7 @@ def _check(reference: Reference, outputs: tuple[str, ...], order: int, horizon: 
 
 
 def _check_joints(reference: Reference, order: int) -> None:
-    """Check that the class of a path says that its parts fit together.
-
-    Raises:
-        GainError: it does not.
-    """
+    """Check that the class of a path says that its parts fit together."""
     kinds = type(reference).__mro__
     joined, parts, path = (
         next(k for k, kind in enumerate(kinds) if name in vars(kind))

@@ -24,16 +24,12 @@ class Separation(NamedTuple):
     """What is guaranteed of the distances between the agents of a run.
 
     Attributes:
-        safety: its numbers.
         least: the smallest distance of two hulls at the start, scaled, m.
-        pair: whose it is.
         gap: (r, d) the points of the first one's hull less those of the other, m.
         scales: (d,) of the coordinates.
         speeds: (d,) of the followers in them.
-        axes: their names.
         step: for which inputs are held, s.
         ideal: whether the run is one that the theorem covers.
-        tube: of the agents' other states.
         kind: of the argument: that of the tube, or weaker.
     """
 

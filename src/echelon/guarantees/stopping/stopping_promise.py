@@ -10,11 +10,11 @@ from echelon.core.statement import Hypothesis, Statement, Topic, holds, unneeded
 from echelon.core.words import Kind
 from echelon.guarantees.messages.late_messages import messages_line
 from echelon.guarantees.messages.own_delay import OwnCase, own_delay_line
-from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import agent_lines
 from echelon.guarantees.promises.leaders import leaders_of
-from echelon.guarantees.promises.promise import AgreementModes, Promise
+from echelon.guarantees.promises.promise import AgreementModes, Guarantee
 from echelon.guarantees.stopping.lasting_drift import drift_line
 from echelon.guarantees.stopping.separation import Separation, separation_of
 from echelon.guarantees.stopping.stopping_run import (
@@ -34,15 +34,12 @@ _BETWEEN = 128
 
 @final
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class StoppingPromise(Promise):
+class StoppingPromise(Guarantee):
     """What T5 guarantees, and what that rests on.
 
     Attributes:
-        run: what it was computed of.
-        tube: what is guaranteed; None for nothing.
         strength: the coupling c.
         hold: the longest step (s) that keeps the largest stopping point from growing.
-        separation: what is guaranteed of distances; None where agents do not keep apart.
     """
 
     run: StoppingRun
@@ -56,7 +53,7 @@ class StoppingPromise(Promise):
         """Return what is guaranteed of prepared parts; `brief` leaves out arrival."""
         parts, states = prepared.parts, prepared.problem.states
         run, leaders = stopping_run_of(parts, settings, states), leaders_of(parts, states)
-        case = Case(parts, settings, loop_of(parts), leaders)._replace(
+        case = GuaranteeInputs(parts, settings, loop_of(parts), leaders)._replace(
             over_network=run.network is not None
         )
         (tube, tube_lines), drifts = tube_of(run, brief), drift_line(run)
@@ -149,7 +146,6 @@ class StoppingPromise(Promise):
 
 
 def _own_line(run: StoppingRun, problem: Problem) -> Statement | None:
-    """Return how late own states may be."""
     parts, law, network = run.parts, run.law, run.network
     if parts.graph.schedule is not None or network is None and parts.world.network is not None:
         # What is known of the ideal network is not true of one that no theorem covers.

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from echelon.agents.models.chains import Chains, flat_output, flatten
+from echelon.agents.models.chains import Chains, flat_output, to_flat
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.edges import name_agents
 from echelon.agents.network.formation_motion import FormationMotion
@@ -67,7 +67,7 @@ def flat_states_of(model: ControlAffine, chains: Chains) -> FlatStates:
     x, e = (np.array(part, object) for part in (leaves[:n], leaves[n:]))
 
     def above(x: jax.Array, e: jax.Array) -> jax.Array:
-        return flatten(model, chains, x, e).values[1:]
+        return to_flat(model, chains, x, e).values[1:]
 
     try:
         [found] = lower(lambda x: flat_output(model, chains.outputs, x), graph, [x])
@@ -131,7 +131,7 @@ def _flat(
 
     def one(x: jax.Array, offset: jax.Array) -> jax.Array:
         memory = law.begin(model, x)
-        values = flatten(model, chains, x, memory.chain).values
+        values = to_flat(model, chains, x, memory.chain).values
         shift = flat_output(model, chains.outputs, offset)
         values = values.at[0].add(flat_output(model, chains.outputs, 0.0 * offset) - shift)
         # The law takes the turn of a heading that is next to the beginning of the leader's path.
@@ -172,10 +172,7 @@ def switching_line(graph: Graph, leaderward: bool, left_out: str, rate: float) -
 
 
 def _left_behind(graph: Graph, leaderward: bool) -> str:
-    """Return whom the leader does not reach along the edges that are heard; empty for nobody.
-
-    Laws are made for a graph without its events, and nobody has asked this of a part of them yet.
-    """
+    """Laws are made for a graph without its events: of a part of them nobody has asked this."""
     schedule = graph.schedule
     assert schedule is not None
     since, lost = "in a period", np.array([], int)
@@ -205,8 +202,6 @@ class StoppingRun(NamedTuple):
     """A run under the law, as its theorem sees it.
 
     Attributes:
-        parts: prepared.
-        settings: how it is computed.
         states: (N, n) at the start.
         flat: (N, r, m) the same in flat coordinates, less the offsets and their derivatives.
         ahead: (r, m) of what the leader follows.
@@ -429,7 +424,6 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
 
 
 def _offsets_line(run: StoppingRun) -> Statement:
-    """Say whether all offsets are of flat outputs, and leave the errors of other states alone."""
     model = run.parts.model
     motion = run.parts.formation.motion
     names = [model.state_names[k] for k in np.flatnonzero(np.ptp(run.parts.formation.offsets, 0))]
@@ -453,9 +447,10 @@ def _offsets_line(run: StoppingRun) -> Statement:
 def _step_line(run: StoppingRun) -> Statement:
     """Return whether a held step keeps the largest stopping point from growing, c d_max dt <= 1."""
     name, dt, c = Hypothesis.SAMPLING, run.settings.dt, run.coupling
-    share = c * run.heaviest * dt
-    radius, share_text = _radius(run), f"c d_max dt = {at_least(share)}"
-    own = float(run.leader.strength(dt)) * dt
+    share, own = c * run.heaviest * dt, float(run.leader.strength(dt))
+    radius = _step_radius(run, run.law.ready, c * _strengths(run))
+    radius = max(radius, _step_radius(run, run.leader.ready, np.array([own])))
+    share_text, own = f"c d_max dt = {at_least(share)}", own * dt
     if own > 1.0 + 1e-12:
         # Its distance from its path would grow, on which the tube and the motors rest.
         text = f"the leader's step `dt` = {dt:g} s is too long: c dt = {at_least(own)} is above 1"
@@ -474,15 +469,11 @@ def _step_line(run: StoppingRun) -> Statement:
     return fails(name, Kind.LINEARIZATION, text, share, share_text, remedy=remedy, reason=text)
 
 
-def _radius(run: StoppingRun) -> float:
-    """Return the spectral radius of a step in flat coordinates, the highest derivatives held."""
-    own = np.array([run.leader.strength(run.settings.dt)])
-    followed = _step_radius(run, run.law.ready, run.coupling * _strengths(run))
-    return max(followed, _step_radius(run, run.leader.ready, own))
-
-
 def _step_radius(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:
-    """Return the same of agents that feel what is off by so much each (K,), 1/s."""
+    """Return the spectral radius of a step in flat coordinates, the highest derivatives held.
+
+    What is off is felt by so much in each mode (K,), 1/s.
+    """
     radius = 0.0
     for k, degree in enumerate(loop.chains.degrees):
         A, B = np.eye(degree, k=1), np.eye(degree)[:, -1:]
@@ -498,9 +489,8 @@ def _strengths(run: StoppingRun) -> Array:
     """Return eigenvalues of the followers' Laplacian that stand for all, (K,)."""
     graph, reach = run.parts.graph, run.law.reach
     assert reach is not None
-    network = (
-        run.network
-    )  # what is heard over it is late, and an agent answers to its own deviation
+    # What is heard over a network is late, and an agent answers to its own deviation.
+    network = run.network
     alone = np.array([]) if network is None else network.sums
     if network is not None and network.ways is not None:
         return alone

@@ -52,9 +52,7 @@ _SLACK = 1e-9
 def arrival_of(run: StoppingRun, position: Sequence[int]) -> float | None:
     """Return when (s) all followers are within 1 cm for good; None where it is not known.
 
-    Args:
-        run: under the law.
-        position: which outputs are one.
+    `position` says which outputs are one.
     """
     graph, law = run.parts.graph, run.law
     by_parents = law.feedforward is Feedforward.PARENT
@@ -136,7 +134,6 @@ def _along_links(
 def _in_turns(
     stops: Array, graph: Graph, law: StoppingPoint, c: float, speed: float, times: Array
 ) -> _Reach:
-    """Return how far stopping points (N,) are off of a graph that switches, stretch by stretch."""
     followers = list(graph.followers)
     off = np.abs(stops[followers] - stops[list(graph.nearest_leader())][followers])
     weights = [*map(_solved, graph.stretches(law.leaderward)), None]
@@ -184,10 +181,7 @@ def _late(
     speed: float,
     times: Array,
 ) -> _Reach:
-    """Return how far stopping points (N,) of an output are off over a network (T9).
-
-    Until everybody has a packet nobody is farther off than at the start and the leader's own way.
-    """
+    """Until all have a packet nobody is farther off than at the start and the leader's own way."""
     begin, followers, weights = network.ages.first_packet, list(graph.followers), network.weights
     ways = np.ones(len(followers), int) if network.ways is None else network.ways
     assert begin is not None  # or there is no such bound
@@ -267,7 +261,6 @@ def _left(roots: Array, starts: Array, times: Array) -> Array:
 
 _PROOF = Kind.PROOF
 
-
 _ANY = ("any graph in which the leader reaches every agent", "this graph")
 
 
@@ -282,11 +275,9 @@ class Tube(NamedTuple):
         steepest: how far the bounded output's speed may be off the leader's at the start.
         arrival: the time (s) from which on all followers are within 1 cm of their goals; None where
             it is not known, or was left out.
-        who: which starts are meant, in words.
         borders: what is claimed of each border, and of what it was computed; ready for JSON.
         motor_load: None where motors have no limits, may not suffice, or were left out.
         graphs: which graphs are meant, and this one, in words.
-        network: what T9 says; None for the ideal network.
         offsets: how they change with time, and bounds of that; None of constant ones.
         kind: of the argument: the chains' responses and the path are enclosed in rationals; what
             somebody's class states of its flat coordinates or its motors was seen at samples.
@@ -325,7 +316,6 @@ class Tube(NamedTuple):
         return f"{text}." if self.motor_load is None else f"{text}. {self.motor_load.sentence()}"
 
     def _received(self) -> str:
-        """Return what agents must receive, in words."""
         if self.network is None:
             return "zeta' is received at all times (T5)"
         text = "every agent receives one packet of a leader that follows its plan; all messages "
@@ -414,7 +404,6 @@ def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[St
 
 
 def _by(kind: Kind, model: ControlAffine, line: Statement) -> Statement:
-    """Return a line that rests on what a model states of its flat coordinates."""
     if kind is Kind.PROOF:
         return line
     text = f"{line.text}, if its borders are those that `{type(model).__name__}` states"
@@ -422,25 +411,20 @@ def _by(kind: Kind, model: ControlAffine, line: Statement) -> Statement:
 
 
 def _graphs(run: StoppingRun) -> tuple[str, str]:
-    """Return of which graphs T5 speaks, and how this one is called."""
     schedule, law = run.parts.graph.schedule, run.law
     if law.feedforward is Feedforward.PARENT:
         # The speeds of the links add up in the tube.
-        return (
-            f"any tree in which none is more than {amount(run.links, 'link')} from a leader",
-            "this one",
-        )
+        text = f"any tree in which none is more than {amount(run.links, 'link')} from a leader"
+        return text, "this one"
     if schedule is None:
         return _ANY
     every = "eventually" if schedule.period is None else "in every period"
     along = "along neighbours nearer to it " if law.leaderward else ""
-    return f"any switching graphs over which the leader reaches every agent {along}{every}", (
-        "these"
-    )
+    text = "any switching graphs over which the leader reaches every agent "
+    return f"{text}{along}{every}", "these"
 
 
 def _nothing(text: str, remedy: str, *before: Statement) -> tuple[None, list[Statement]]:
-    """Return that no tube is known, and why."""
     reason = f"{text}, so no tube is known"
     name = Hypothesis.SET if before else Hypothesis.REGION
     lines = [fails(name, _PROOF, text, None, "none", remedy=remedy, reason=reason)]
@@ -453,7 +437,6 @@ _NO_BORDER = "flat coordinates have no border"
 
 
 def _set_lines(run: StoppingRun, borders: Sequence[Border]) -> Iterator[Statement]:
-    """Yield what set of starts is certified, and whether this run's lie in it."""
     if not borders:
         text = "its flat coordinates have no border: any start is allowed"
         yield holds(Hypothesis.SET, _PROOF, text, math.inf, "everywhere")
@@ -478,7 +461,6 @@ def _set_lines(run: StoppingRun, borders: Sequence[Border]) -> Iterator[Statemen
 
 
 def _set_line(run: StoppingRun, border: Border) -> Statement:
-    """Say how far starts may be off behind a leader that keeps to its path."""
     bound, steepest = border.bound, border.steepest
     number = steepest, f"{at_most(steepest)} off"
     if border.fastest > 0.0 and steepest > 0.0:
@@ -503,7 +485,6 @@ def _set_line(run: StoppingRun, border: Border) -> Statement:
 
 
 def _who(run: StoppingRun, borders: Sequence[Border]) -> str:
-    """Return which starts are meant, in words."""
     if not borders:
         return "any state of any agent"
     within = " and ".join(b.bound.within for b in borders)

@@ -16,7 +16,14 @@ from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import at_least
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.guarantees.verifier.findings import ROUNDING, TIGHT, Facts, Finding, decide, unchecked
+from echelon.guarantees.verifier.findings import (
+    ROUNDING,
+    TIGHT,
+    CheckResult,
+    Recomputed,
+    decide,
+    unchecked,
+)
 from echelon.guarantees.verifier.region_claims import needs_constant, slowest
 from echelon.guarantees.verifier.saved_gain import SavedGain, SavedModel, SavedRegion
 
@@ -332,7 +339,7 @@ _ROUNDING = 256.0 * float(np.finfo(float).eps)
 """Rounding of a model's own arithmetic relative to its terms."""
 
 
-def check_equations(facts: Facts, user_model: ControlAffine | None) -> Iterator[Finding]:
+def check_equations(facts: Recomputed, user_model: ControlAffine | None) -> Iterator[CheckResult]:
     """Check the claims about the model; without `user_model` it is rebuilt from the file."""
     saved, claim = facts.saved.model, MODEL
     model = model_of(saved) if user_model is None else user_model
@@ -348,7 +355,7 @@ def check_equations(facts: Facts, user_model: ControlAffine | None) -> Iterator[
         yield decide(claim, False, saved.path, "", text)
 
 
-def _check_model(facts: Facts, model: ControlAffine) -> Iterator[Finding]:
+def _check_model(facts: Recomputed, model: ControlAffine) -> Iterator[CheckResult]:
     saved, name = facts.saved.model, type(model).__name__
     if (tuple(model.state_names), tuple(model.input_names)) != (
         saved.state_names,
@@ -371,8 +378,7 @@ def _is_close(stored: Array, expected: Array) -> bool:
     return fits and bool((np.abs(stored - expected) <= TIGHT * np.abs(expected)).all())
 
 
-def _check_trim(facts: Facts, model: ControlAffine) -> Iterator[Finding]:
-    """Check the equilibrium, A and B at the trim, and A also by difference quotients."""
+def _check_trim(facts: Recomputed, model: ControlAffine) -> Iterator[CheckResult]:
     saved, n = facts.saved.model, len(facts.saved.P)
     sizes = np.multiply.outer(_STEPS, np.maximum(1.0, np.abs(saved.state)))
     displaced = saved.state + np.stack([sizes, -sizes])[..., None] * np.eye(n)
@@ -393,16 +399,7 @@ def _check_trim(facts: Facts, model: ControlAffine) -> Iterator[Finding]:
 
 
 def _quotients_off(saved: SavedModel, at: Evaluated, steps: Array) -> float:
-    """Return the largest relative distance of A to its one-sided difference quotients.
-
-    For each entry the step with the least error counts: longer steps have curvature, shorter ones
-    rounding. At a kink one of the two sides differs, at a jump every step.
-
-    Args:
-        saved: the model as stored in the file.
-        at: the model at the trim and at each state displaced by each step.
-        steps: (2, J, n), for both sides.
-    """
+    """Of `steps` (2, J, n) the best counts: long ones have curvature, short ones rounding."""
     # Axes: side, step, displaced state, velocity.
     shape = (*steps.shape, -1)
     quotients = (at.velocities[1:] - at.velocities[0]).reshape(shape) / steps[..., None]
@@ -413,8 +410,9 @@ def _quotients_off(saved: SavedModel, at: Evaluated, steps: Array) -> float:
     return float((gaps / np.where(sizes > 0.0, sizes, 1.0)).max())
 
 
-def _check_domain(facts: Facts, region: SavedRegion, model: ControlAffine) -> Iterator[Finding]:
-    """Search the domain for states that contradict the guarantee."""
+def _check_domain(
+    facts: Recomputed, region: SavedRegion, model: ControlAffine
+) -> Iterator[CheckResult]:
     saved = facts.saved
     yield decide("the domain lies inside the chart", _is_inside_chart(saved.model, region, model))
     some = points(saved, region)
@@ -445,7 +443,6 @@ def _check_domain(facts: Facts, region: SavedRegion, model: ControlAffine) -> It
 
 
 def _is_inside_chart(saved: SavedModel, region: SavedRegion, model: ControlAffine) -> bool:
-    """Return whether all bounded states lie inside the chart of the model."""
     for name, (low, high) in model.chart.items():
         k = saved.state_names.index(name)
         least, most = saved.state[k] + region.lower[k], saved.state[k] + region.upper[k]
@@ -455,12 +452,9 @@ def _is_inside_chart(saved: SavedModel, region: SavedRegion, model: ControlAffin
 
 
 def _check_secants(
-    facts: Facts, region: SavedRegion, model: ControlAffine, some: Points
-) -> Finding:
-    """Check velocity differences of pairs of states against the hull or the rate.
-
-    This detects a discontinuous velocity and wrong derivatives.
-    """
+    facts: Recomputed, region: SavedRegion, model: ControlAffine, some: Points
+) -> CheckResult:
+    """Differences of velocities reveal a discontinuous velocity and wrong derivatives."""
     saved, at = facts.saved, pairs(facts.saved, region, some)
     x, y = saved.model.state + at.ones, saved.model.state + at.others
     steps = x - y
@@ -474,10 +468,8 @@ def _check_secants(
         normals, claim = steps @ saved.P, "pairs converge at the rate"
         bounds = _decay(facts, region, steps)
     else:
-        normals, claim = (
-            _normals(steps @ saved.P, np.abs(steps) @ slope.T),
-            "secants lie in the hull",
-        )
+        normals = _normals(steps @ saved.P, np.abs(steps) @ slope.T)
+        claim = "secants lie in the hull"
         bounds = support(region.hull[:, :, :n], region.error[:, :n], normals, steps)
     worst = steepest(velocity, x, y, normals, bounds)
     text = f"of {len(x)} pairs of states, relative"
@@ -493,17 +485,13 @@ def _normals(metric: Array, sizes: Array) -> Array:
     return np.where(which == 0, single, np.where(which == 1, mixed, metric))
 
 
-def _decay(facts: Facts, region: SavedRegion, steps: Array) -> SupportBounds:
-    """Return bounds of d'P (v(x) - v(y)) that follow from the rate and the strongest feedback.
-
-    They follow from P A + A'P - strength P W P + 2 rate P <= 0, integrated from y to x = y + d.
-    """
+def _decay(facts: Recomputed, region: SavedRegion, steps: Array) -> SupportBounds:
+    """By P A + A'P - strength P W P + 2 rate P <= 0, integrated from y to x = y + d."""
     saved, n = facts.saved, len(facts.saved.P)
     W = region.hull[:, :, n:] if region.theorem == "T2" else facts.weighted[None]
     metric_step, rate = steps @ saved.P, region.rate * (1.0 - _SAMPLED)
-    feedback = (
-        0.5 * region.strength * np.einsum("kn,hnm,km->kh", metric_step, W, metric_step).max(axis=1)
-    )
+    most = np.einsum("kn,hnm,km->kh", metric_step, W, metric_step).max(axis=1)
+    feedback = 0.5 * region.strength * most
     size = np.einsum("kn,kn->k", metric_step, steps)
     return SupportBounds(
         np.full(len(steps), -np.inf), feedback - rate * size, feedback + rate * size

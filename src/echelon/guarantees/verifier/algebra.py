@@ -50,13 +50,10 @@ def spectrum(graph: SavedGraph, edges: Array) -> CheckedSpectrum:
     (i, j), weights, selection = edges[:, :2].astype(int).T, edges[:, 2], followers(graph)
     W = np.zeros((graph.agents, graph.agents))
     np.add.at(W, (np.append(i, j), np.append(j, i)), np.append(weights, weights))
-    inner_weights, leader_weights = (
-        W[np.ix_(selection, selection)],
-        W[np.ix_(selection, graph.leaders)].sum(axis=1),
-    )
-    values = scipy.linalg.eigvalsh(
-        np.diag(inner_weights.sum(axis=1) + leader_weights) - inner_weights
-    )
+    inner_weights = W[np.ix_(selection, selection)]
+    leader_weights = W[np.ix_(selection, graph.leaders)].sum(axis=1)
+    L = np.diag(inner_weights.sum(axis=1) + leader_weights) - inner_weights
+    values = scipy.linalg.eigvalsh(L)
     values[0], bound = _least(inner_weights, leader_weights)
     return CheckedSpectrum(values, bound)
 
@@ -67,23 +64,14 @@ def ends_of_many(values: Array) -> Array:
 
 
 def _least(inner_weights: Array, leader_weights: Array) -> tuple[float, float]:
-    """Return the smallest eigenvalue of L = diag(apart 1 + led) - apart, and a lower bound of it.
-
-    L^-1 has no negative entries. It is applied by an elimination without subtractions, which loses
-    no digits for any range of weights (Grassmann, Taksar, Heyman). For every x > 0, no eigenvalue
-    of L^-1 exceeds the largest entry of L^-1 x / x (Collatz, Wielandt).
-    """
+    """Return lambda_min of L = diag(apart 1 + led) - apart and 1 / max(L^-1 x / x) <= it."""
     steps = eliminate(inner_weights, leader_weights)
     if steps is None:
         return 0.0, 0.0
     # Iteration alone converges too slowly if the next eigenvalue is close, hence this start. Its
     # small entries must be too large: from above, y / x decreases to the eigenvalue at once.
-    x = y = (
-        np.abs(
-            scipy.linalg.eigh(solve_by_elimination(*steps, np.eye(len(leader_weights))))[1][:, -1]
-        )
-        + 1e-8
-    )
+    whole = solve_by_elimination(*steps, np.eye(len(leader_weights)))
+    x = y = np.abs(scipy.linalg.eigh(whole)[1][:, -1]) + 1e-8
     for _ in range(_ITERATIONS):
         # Entries far from the slowest mode underflow, and the ratio y / x needs positive ones.
         x = np.maximum(y / np.linalg.norm(y), 1e-150)
@@ -96,11 +84,8 @@ def _least(inner_weights: Array, leader_weights: Array) -> tuple[float, float]:
 
 def eliminate(inner_weights: Array, leader_weights: Array) -> tuple[Array, Array] | None:
     """Return weights (N, N) and pivots (N,) of an elimination; None if an agent is cut off."""
-    W, leader_weights, pivots = (
-        inner_weights.copy(),
-        leader_weights.copy(),
-        np.zeros(len(leader_weights)),
-    )
+    W, leader_weights = inner_weights.copy(), leader_weights.copy()
+    pivots = np.zeros(len(leader_weights))
     for k in range(len(W)):
         pivots[k] = leader_weights[k] + W[k, k + 1 :].sum()
         if not pivots[k] > 0.0:
@@ -259,13 +244,7 @@ def _to_floats(matrix: Rows) -> Array:
 
 
 def first_unproved(
-    P: Array,
-    B: Array,
-    R: Array,
-    hull: Array,
-    error: Array,
-    strength: Fraction,
-    rate: float,
+    P: Array, B: Array, R: Array, hull: Array, error: Array, strength: Fraction, rate: float
 ) -> int | None:
     """Return the first vertex A at which the rate is not proved, or None if all are.
 
@@ -273,14 +252,7 @@ def first_unproved(
     within +- error of A. Such a change adds at most |P| error + its transpose, entry by entry; its
     row sums on the diagonal dominate it for any signs (Gershgorin).
 
-    Args:
-        P: (n, n), symmetric to the bit and positive definite.
-        B: (n, m).
-        R: (m, m), symmetric positive definite.
-        hull: (K, n, n).
-        error: (n, n).
-        strength: a lower bound of 2 c lambda_min.
-        rate: 1/s.
+    `hull` is (K, n, n), `error` (n, n); P must be symmetric to the bit, `strength` from below.
     """
     metric, change = rows_of(P), rows_of(abs(error))
     pull = product(metric, rows_of(B))
@@ -319,10 +291,8 @@ def directed_spectrum(graph: SavedGraph, edges: Array) -> tuple[Array, float, fl
     W, selection = np.zeros((graph.agents, graph.agents)), followers(graph)
     # On an edge (i, j), j receives from i.
     W[edges[:, 1].astype(int), edges[:, 0].astype(int)] = edges[:, 2]
-    inner_weights, leader_weights = (
-        W[np.ix_(selection, selection)],
-        W[np.ix_(selection, graph.leaders)].sum(axis=1),
-    )
+    inner_weights = W[np.ix_(selection, selection)]
+    leader_weights = W[np.ix_(selection, graph.leaders)].sum(axis=1)
     L = np.diag(inner_weights.sum(axis=1) + leader_weights) - inner_weights
     if not _reachable(inner_weights > 0.0, leader_weights > 0.0).all():
         return np.zeros(len(L), complex), 0.0, 0.0
@@ -337,7 +307,6 @@ def directed_spectrum(graph: SavedGraph, edges: Array) -> tuple[Array, float, fl
 
 
 def _reachable(is_neighbour: Array, leader_weights: Array) -> Array:
-    """Return which agents a leader reaches, directly or through others, (n,)."""
     reached = leader_weights.copy()
     for _ in range(len(leader_weights)):
         reached = reached | (is_neighbour & reached).any(axis=1)
@@ -345,7 +314,6 @@ def _reachable(is_neighbour: Array, leader_weights: Array) -> Array:
 
 
 def _strong_components(is_neighbour: Array) -> list[Array]:
-    """Return the strongly connected components, by powers of the adjacency matrix."""
     ways = np.eye(len(is_neighbour), dtype=bool) | is_neighbour
     for _ in range(max(1, int(np.ceil(np.log2(max(2, len(is_neighbour))))))):
         ways = (ways.astype(np.float32) @ ways.astype(np.float32)) > 0.0
@@ -358,11 +326,7 @@ def _strong_components(is_neighbour: Array) -> list[Array]:
 
 
 def _least_of_block(inside: Array, outside: Array) -> float:
-    """Return the smallest eigenvalue of diag(inside 1 + outside) - inside, of one component.
-
-    Inverse iteration by an elimination without subtractions; the eigenvalue lies between the least
-    and the largest x / L^-1 x (Collatz, Wielandt).
-    """
+    """Inverse iteration: it is between the least and largest x / L^-1 x (Collatz, Wielandt)."""
     steps = eliminate(inside, outside)
     if steps is None:
         return 0.0

@@ -16,12 +16,11 @@ ROUNDING = 1e-12
 DECIDED = 1e-6
 """A rate is undecided if its rounding exceeds this fraction of it."""
 
-
 VERDICTS = ("holds", "recomputed", "refused", "not checked")
 """Verified by code of its own; equal to what the code gives again that made it; false; open."""
 
 
-class Finding(NamedTuple):
+class CheckResult(NamedTuple):
     """A claim of the file with its stored and recomputed value, and one of the `VERDICTS`.
 
     `by_scenario` is true of what was computed from a scenario, and not by independent code.
@@ -54,31 +53,32 @@ class Finding(NamedTuple):
 
 def decide(
     claim: str, fine: bool, stored: object = "", value: object = "", text: str = ""
-) -> Finding:
+) -> CheckResult:
     """Return a finding with the verdict `holds` or `refused`."""
-    return Finding(claim, _text(stored), _text(value), "holds" if fine else "refused", text)
+    return CheckResult(claim, _text(stored), _text(value), "holds" if fine else "refused", text)
 
 
-def unchecked(claim: str, stored: object, text: str) -> Finding:
+def unchecked(claim: str, stored: object, text: str) -> CheckResult:
     """Return a finding for a claim that could not be checked."""
-    return Finding(claim, _text(stored), "", "not checked", text)
+    return CheckResult(claim, _text(stored), "", "not checked", text)
 
 
 def _text(value: object) -> str:
     return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
-def compare(claim: str, stored: float, value: float, slack: float = 0.0, text: str = "") -> Finding:
+def compare(
+    claim: str, stored: float, value: float, slack: float = 0.0, text: str = ""
+) -> CheckResult:
     """Compare two numbers with the relative tolerance `TIGHT` plus their rounding `slack`."""
     fine = abs(stored - value) <= TIGHT * max(abs(stored), abs(value)) + slack
     return decide(claim, fine, stored, value, text)
 
 
-class Facts(NamedTuple):
+class Recomputed(NamedTuple):
     """Recomputed quantities that several claims use.
 
     Attributes:
-        saved: the content of the file.
         eigenvalues: of the grounded Laplacian; the stored ones if the file has no edges.
         bound: a lower bound of lambda_min; for a directed graph, of the decay of its weighted sum.
         pull: R^-1 B' (m, n), rounded once.
@@ -110,7 +110,7 @@ class Facts(NamedTuple):
         return float(np.abs(self.eigenvalues).max())
 
 
-def facts(saved: SavedGain) -> Facts:
+def facts(saved: SavedGain) -> Recomputed:
     """Recompute the quantities that several claims use."""
     graph, B = saved.graph, saved.model.B
     edges = None if graph.switches else graph.edges
@@ -124,7 +124,7 @@ def facts(saved: SavedGain) -> Facts:
         values, bound = algebra.spectrum(graph, edges)
         low = float(values[0])
     closed = saved.model.A if saved.inner is None else saved.model.A - B @ saved.inner
-    return Facts(
+    return Recomputed(
         saved,
         values,
         bound,

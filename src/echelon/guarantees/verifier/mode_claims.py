@@ -11,8 +11,8 @@ from echelon.guarantees.verifier.findings import (
     DECIDED,
     ROUNDING,
     TIGHT,
-    Facts,
-    Finding,
+    CheckResult,
+    Recomputed,
     compare,
     decide,
     unchecked,
@@ -25,7 +25,7 @@ _LOOSE = 1e-6
 """Relative to the largest eigenvalue; those of a nonnormal L keep only half of their digits."""
 
 
-def check_graph(saved: SavedGain) -> Iterator[Finding]:
+def check_graph(saved: SavedGain) -> Iterator[CheckResult]:
     """Check the edges before the spectrum is computed."""
     graph = saved.graph
     followers = graph.agents - len(graph.leaders)
@@ -43,7 +43,7 @@ def check_graph(saved: SavedGain) -> Iterator[Finding]:
         yield decide("graph", False, text=text + " missing")
 
 
-def check_spectrum(facts: Facts) -> Iterator[Finding]:
+def check_spectrum(facts: Recomputed) -> Iterator[CheckResult]:
     """Check the stored spectrum."""
     saved, stored = facts.saved, facts.saved.graph.spectrum
     result, claim = facts.eigenvalues, "graph spectrum"
@@ -68,7 +68,7 @@ def check_spectrum(facts: Facts) -> Iterator[Finding]:
     yield compare("lambda_max", saved.lambda_max, high, ROUNDING * high)
 
 
-def _compare_complex(recomputed: Array, stored: Array, high: float) -> Finding:
+def _compare_complex(recomputed: Array, stored: Array, high: float) -> CheckResult:
     """Compare complex eigenvalues; each is paired with the nearest remaining one."""
     gap, left = 0.0, list(stored.astype(complex))
     for value in recomputed:
@@ -96,11 +96,13 @@ _MOST_MODES = 16
 _MODE_DECIDED = 1e-3
 
 
-def check_linearization(facts: Facts) -> Iterator[Finding]:
+def check_linearization(facts: Recomputed) -> Iterator[CheckResult]:
     """Check the claims about the linearization at the trim."""
     saved = facts.saved
     yield decide("kind of the slowest mode", saved.kind == "linearization", saved.kind)
-    result, slack = _slowest(facts, _checked_eigenvalues(facts))
+    every = saved.graph.directed or saved.graph.switches
+    values = facts.eigenvalues if every else algebra.ends_of_many(facts.eigenvalues)
+    result, slack = _slowest(facts, values)
     if saved.abscissa < 0.0 and slack > _MODE_DECIDED * abs(result):
         text = f"undecided: the rounding is {at_least(slack, 2)}"
         yield decide("slowest mode, 1/s", False, saved.abscissa, result, text)
@@ -114,28 +116,17 @@ def check_linearization(facts: Facts) -> Iterator[Finding]:
     yield decide("observability rank", saved.observable == rank, saved.observable, rank)
 
 
-def _check_between(facts: Facts) -> Iterator[Finding]:
-    """Check that the modes between the extreme eigenvalues decay."""
+def _check_between(facts: Recomputed) -> Iterator[CheckResult]:
     values, followers = facts.eigenvalues, facts.saved.graph.agents - len(facts.saved.graph.leaders)
     every = followers <= algebra.ALL_MODES or facts.saved.graph.directed
     if every or facts.saved.graph.switches or facts.saved.abscissa >= 0.0:
         return
-    values = (
-        values[1:-1] if len(values) > 2 else np.geomspace(values[0], values[-1], _BETWEEN)[1:-1]
-    )
+    values = values if len(values) > 2 else np.geomspace(values[0], values[-1], _BETWEEN)
     result, slack = _slowest(facts, values[1:-1])
     yield decide("all modes between decay", result + slack < 0.0, "", result)
 
 
-def _checked_eigenvalues(facts: Facts) -> Array:
-    """Return the eigenvalues whose modes the file covers."""
-    graph = facts.saved.graph
-    if graph.directed or graph.switches:
-        return facts.eigenvalues
-    return algebra.ends_of_many(facts.eigenvalues)
-
-
-def _slowest(facts: Facts, values: Array) -> tuple[float, float]:
+def _slowest(facts: Recomputed, values: Array) -> tuple[float, float]:
     """Return the slowest mode, 1/s, and its rounding."""
     K = facts.saved.coupling * facts.feedback
     modes = np.linalg.eigvals(facts.closed - values[:, None, None] * K).real.max(axis=1)
@@ -148,7 +139,7 @@ def _slowest(facts: Facts, values: Array) -> tuple[float, float]:
     return slowest, max(slack for value, slack in result if value >= slowest - slack)
 
 
-def _doubt(facts: Facts, K: Array, value: float) -> algebra.Doubt:
+def _doubt(facts: Recomputed, K: Array, value: float) -> algebra.Doubt:
     """Return a bound on the error of a mode due to solving with R and rounding of an eigenvalue."""
     saved, eps = facts.saved, float(np.finfo(float).eps)
     # The smallest eigenvalue is exact to all digits, the others relative to the largest.
@@ -163,7 +154,7 @@ def _doubt(facts: Facts, K: Array, value: float) -> algebra.Doubt:
     return bound
 
 
-def _check_edge(facts: Facts) -> Iterator[Finding]:
+def _check_edge(facts: Recomputed) -> Iterator[CheckResult]:
     """Check the smallest coupling with a guaranteed stable linearization."""
     saved, claim = facts.saved, "edge of the coupling"
     threshold = _EDGES.get(saved.method)

@@ -14,8 +14,8 @@ from echelon.guarantees.verifier.findings import (
     DECIDED,
     ROUNDING,
     TIGHT,
-    Facts,
-    Finding,
+    CheckResult,
+    Recomputed,
     compare,
     decide,
 )
@@ -25,7 +25,7 @@ from echelon.guarantees.verifier.saved_gain import SavedRegion
 _EXACT_FOLLOWERS = 60
 
 
-def check_region(facts: Facts) -> Iterator[Finding]:
+def check_region(facts: Recomputed) -> Iterator[CheckResult]:
     """Check the guarantee on a domain at the stored vertices."""
     saved, region = facts.saved, facts.saved.region
     if region is None:
@@ -52,7 +52,7 @@ def check_region(facts: Facts) -> Iterator[Finding]:
     yield from _check_rate(facts, region)
 
 
-def _check_strength(facts: Facts, region: SavedRegion) -> Finding:
+def _check_strength(facts: Recomputed, region: SavedRegion) -> CheckResult:
     """Compare with 2 c lambda_min; for a directed graph with the bound of its weighted sum."""
     saved = facts.saved
     if not saved.graph.directed:
@@ -62,7 +62,7 @@ def _check_strength(facts: Facts, region: SavedRegion) -> Finding:
     return decide("strength", fine, region.strength, most, "at most the bound of the weighted sum")
 
 
-def needs_constant(facts: Facts, region: SavedRegion) -> bool:
+def needs_constant(facts: Recomputed, region: SavedRegion) -> bool:
     """Return whether the guarantee requires a constant g."""
     if facts.saved.graph.directed and region.theorem == "A5":
         return True
@@ -71,7 +71,9 @@ def needs_constant(facts: Facts, region: SavedRegion) -> bool:
     return region.theorem == "T1" or region.theorem == "A5" and not cut
 
 
-def slowest(facts: Facts, region: SavedRegion, As: Array, Ws: Array) -> tuple[float, float, bool]:
+def slowest(
+    facts: Recomputed, region: SavedRegion, As: Array, Ws: Array
+) -> tuple[float, float, bool]:
     """Return the slowest rate over matrices, its rounding, and whether that decides the claim.
 
     A monotone drift has rate 0; rounding is then compared with the speed of the drift.
@@ -81,14 +83,14 @@ def slowest(facts: Facts, region: SavedRegion, As: Array, Ws: Array) -> tuple[fl
     return -0.5 * growth, 0.5 * slack, 0.5 * slack <= DECIDED * measure
 
 
-def _spread(facts: Facts) -> float:
+def _spread(facts: Recomputed) -> float:
     """Return the factor by which a varying g reduces the radius of a monotone drift."""
     # sum delta_i'P delta_i is bounded by V = delta'(L kron P) delta over lambda_min, and V by
     # lambda_max.
     return float(np.sqrt(facts.low / facts.high))
 
 
-def _check_radius(facts: Facts, region: SavedRegion) -> Finding:
+def _check_radius(facts: Recomputed, region: SavedRegion) -> CheckResult:
     """Compare with the largest r for which {x'P x <= r^2} lies inside the bounds."""
     widest, sums = _widest(facts.saved.P, region), facts.saved.graph.sums
     widest = widest if sums is None else widest / float(np.sqrt(sums.max() / sums.min()))
@@ -111,7 +113,7 @@ def _widest(P: Array, region: SavedRegion) -> float:
     return float((margins / reach).min())
 
 
-def _check_rate(facts: Facts, region: SavedRegion) -> Iterator[Finding]:
+def _check_rate(facts: Recomputed, region: SavedRegion) -> Iterator[CheckResult]:
     """Check the rate at every vertex: by exact minors for a proof, otherwise by eigenvalues."""
     result, slack, decided = slowest(facts, region, *_split_hull(facts, region.hull))
     claim = f"rate at {amount(len(region.hull), 'vertex', 'vertices')}, 1/s"
@@ -134,7 +136,7 @@ def _check_rate(facts: Facts, region: SavedRegion) -> Iterator[Finding]:
     yield decide("error of the vertices", fine, float(lost.max()), text="at most rounding")
 
 
-def _split_hull(facts: Facts, hull: Array) -> tuple[Array, Array]:
+def _split_hull(facts: Recomputed, hull: Array) -> tuple[Array, Array]:
     """Return A and g S R^-1 (g S)' of each vertex."""
     n = len(facts.saved.P)
     if hull.shape[2] == n:
@@ -142,8 +144,7 @@ def _split_hull(facts: Facts, hull: Array) -> tuple[Array, Array]:
     return hull[:, :, :n], hull[:, :, n:]
 
 
-def _proof(facts: Facts, region: SavedRegion) -> Iterator[Finding]:
-    """Check a proof in exact arithmetic: lambda_min first, then the inequality."""
+def _proof(facts: Recomputed, region: SavedRegion) -> Iterator[CheckResult]:
     saved, claim = facts.saved, "rate at the vertices, proved"
     if region.theorem == "T2" or not np.array_equal(saved.P, saved.P.T):
         text = "a proof requires a constant g and an exactly symmetric P"

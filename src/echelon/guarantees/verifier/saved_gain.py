@@ -168,7 +168,6 @@ class _Part:
         return GainError(f"`{self.file}` is not a gain file that can be verified: `{name}` {must}.")
 
     def entry(self, key: str) -> tuple[object, str]:
-        """Return an entry and its full name."""
         name = f"{self.name}.{key}" if self.name else key
         if key not in self.entries:
             raise self.fault(name, "is missing")
@@ -187,7 +186,6 @@ class _Part:
         return value is True
 
     def parameters(self, key: str) -> JsonObject | None:
-        """Return the parameters of a model; None where they could not be stored."""
         value, name = self.entry(key)
         if value is not None and not isinstance(value, dict):
             raise self.fault(name, "must be a mapping")
@@ -209,7 +207,6 @@ class _Part:
                 raise self.fault(name, "is unknown")
 
     def optional(self, key: str) -> bool:
-        """Return whether an entry is not null."""
         return self.entry(key)[0] is not None
 
     def number(self, key: str) -> float:

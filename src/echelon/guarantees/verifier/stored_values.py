@@ -12,7 +12,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.core.words import amount
-from echelon.guarantees.verifier.findings import Finding
+from echelon.guarantees.verifier.findings import CheckResult
 
 
 class Digits(NamedTuple):
@@ -35,15 +35,8 @@ _SHOWN = 60
 
 def compare_values(
     claim: str, stored: object, value: object, digits: Digits = _USUAL
-) -> Iterator[Finding]:
-    """Yield a finding for each number, matrix or text of a stored value.
-
-    Args:
-        claim: the name of the value.
-        stored: plain data of a file.
-        value: the same, computed again.
-        digits: to which numbers must agree.
-    """
+) -> Iterator[CheckResult]:
+    """Yield a finding for each number, matrix or text of a stored value."""
     arrays = _array(stored), _array(value)
     if isinstance(stored, dict) and isinstance(value, dict):
         for key in [*value, *(key for key in stored if key not in value)]:
@@ -66,7 +59,7 @@ def compare_values(
 
 def compare_arrays(
     claim: str, stored: Array | None, value: Array, digits: Digits = _USUAL
-) -> Finding:
+) -> CheckResult:
     """Return the finding for an array of numbers or words; NaN agrees with NaN."""
     if stored is None:
         return _differs(claim, "", _described(value), "it is missing")
@@ -80,16 +73,17 @@ def compare_arrays(
         fine = fine and (not value.size or _agree(theirs, ours, digits))
     if not fine:
         return _differs(*shown, "")
-    return Finding(*shown, "recomputed", "", True)
+    return CheckResult(*shown, "recomputed", "", True)
 
 
 def _described(array: Array) -> str:
     return f"{' x '.join(map(str, array.shape)) or 1} {'number' if array.size == 1 else 'numbers'}"
 
 
-def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> Finding:
+def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> CheckResult:
     if isinstance(stored, str) and isinstance(value, str):
-        fine, at = _same_text(stored, value), _first_difference(stored, value)
+        fine, pairs = _same_text(stored, value), enumerate(zip(stored, value))
+        at = next((k for k, (x, y) in pairs if x != y), min(len(stored), len(value)))
         shown = [ascii(text[at : at + _SHOWN])[1:-1] for text in (stored, value)]
         reason = f"from character {at} on `{shown[0]}` is stored, and computed is `{shown[1]}`"
         return _finding(claim, stored, value, fine, reason)
@@ -100,20 +94,21 @@ def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> 
     return _finding(claim, stored, value, type(stored) is type(value) and stored == value)
 
 
-def _finding(claim: str, stored: object, value: object, fine: bool, reason: str = "") -> Finding:
+def _finding(
+    claim: str, stored: object, value: object, fine: bool, reason: str = ""
+) -> CheckResult:
     if not fine:
         return _differs(claim, _shown(stored), _shown(value), reason)
-    return Finding(claim, _shown(stored), _shown(value), "recomputed", "", True)
+    return CheckResult(claim, _shown(stored), _shown(value), "recomputed", "", True)
 
 
-def _differs(claim: str, stored: str, value: str, reason: str) -> Finding:
-    return Finding(
+def _differs(claim: str, stored: str, value: str, reason: str) -> CheckResult:
+    return CheckResult(
         claim, stored, value, "refused", reason or "the scenario gives another value", True
     )
 
 
 def _shown(value: object) -> str:
-    """Return a value for a table; of a text or a list only what it is."""
     array = _array(value)
     if array is not None:
         return f"{' x '.join(map(str, array.shape))} number{'s' * (array.size != 1)}"
@@ -129,8 +124,6 @@ def _is_number(value: object) -> bool:
 
 
 def _array(value: object) -> Array | None:
-    """Return nested lists of numbers as an array, otherwise None."""
-
     def plain(x: object) -> bool:
         return all(map(plain, x)) if isinstance(x, list) else _is_number(x)
 
@@ -163,8 +156,3 @@ def _same_text(stored: str, value: str) -> bool:
         return False
     pairs = zip(_NUMBER.findall(stored), _NUMBER.findall(value), strict=True)
     return all(a == b or max(abs(float(a)), abs(float(b))) <= _USUAL.noise for a, b in pairs)
-
-
-def _first_difference(a: str, b: str) -> int:
-    pairs = enumerate(zip(a, b))
-    return next((k for k, (x, y) in pairs if x != y), min(len(a), len(b)))

@@ -15,7 +15,7 @@ from echelon.agents.models.quadrotor import Quadrotor
 from echelon.core.digits import at_most
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
-from echelon.guarantees.verifier.findings import Finding, compare, decide
+from echelon.guarantees.verifier.findings import CheckResult, compare, decide
 
 # ---- thrusts of the motors -----------------------------------------------------------------------
 # The certificate encloses time slices in rational arithmetic. Here responses are evaluated at
@@ -29,7 +29,7 @@ _TIMES, _MOTIONS = 24, 4000
 """Times of random motions (the least thrust of each interval), and motions per time."""
 
 
-def motor_findings(claims: JsonObject) -> Iterator[Finding]:
+def motor_findings(claims: JsonObject) -> Iterator[CheckResult]:
     """Yield a finding for each claim about the motors."""
     motion = _Motion.of(claims)
     demands = [_demands(motion, _start_bounds(start)) for start in claims["starts"]]
@@ -81,7 +81,6 @@ class _Motion(NamedTuple):
 
     @classmethod
     def of(cls, claims: JsonObject) -> "_Motion":
-        """Return the bounds for the stored claims."""
         rho = np.asarray(claims["roots"], float)
         times = np.linspace(0.0, 30.0 / rho.min(), _CELLS)
         (free, integrals), (first, turn_integral) = (
@@ -167,7 +166,6 @@ def _range(frame: JsonObject, demands: Array) -> tuple[Array, Array, Array]:
 def _random_motions(
     frame: JsonObject, demands: Array, ranges: tuple[Array, Array, Array]
 ) -> tuple[float, float]:
-    """Return the least and largest motor thrust of random motions at the hardest times."""
     cells = np.array_split(np.arange(demands.shape[1]), _TIMES)
     hardest = [cell[ranges[0][cell].argmin()] for cell in cells]
     draw = np.random.default_rng(0)
@@ -190,8 +188,7 @@ def _random_motions(
     return float(thrusts.min()), float(thrusts.max())
 
 
-def _check_single_starts(claims: JsonObject, motion: _Motion) -> Iterator[Finding]:
-    """Yield a finding for each other start from which the motors are claimed to suffice."""
+def _check_single_starts(claims: JsonObject, motion: _Motion) -> Iterator[CheckResult]:
     alone, ahead, most = claims["alone"], claims["ahead"], float(claims["most"])
     if alone is None:
         return
@@ -220,7 +217,7 @@ _CLOSE = 1e-6
 _BLEND = np.polynomial.Polynomial([0, 0, 0, 0, 0, 0, 462, -1980, 3465, -3080, 1386, -252])
 
 
-def offset_findings(claim: JsonObject) -> Iterator[Finding]:
+def offset_findings(claim: JsonObject) -> Iterator[CheckResult]:
     """Yield whether the bounds of offsets and their derivatives are those of their motion."""
     if claim["sizes"] is None:
         return
@@ -258,7 +255,7 @@ def _sizes(claim: JsonObject) -> Array:
 _SLACK = 1e-9
 
 
-def separation_findings(claim: JsonObject) -> Iterator[Finding]:
+def separation_findings(claim: JsonObject) -> Iterator[CheckResult]:
     """Yield a finding for each condition of the theorem."""
     width, _, height = claim["radii"]
     scales = np.array([width / height if axis == "z" else 1.0 for axis in claim["axes"]])
@@ -304,7 +301,7 @@ def tube_of(promise: JsonObject) -> JsonObject | None:
     return tube if isinstance(tube, dict) and tube.get("format") == FORMAT else None
 
 
-def tube_findings(tube: JsonObject) -> Iterator[Finding]:
+def tube_findings(tube: JsonObject) -> Iterator[CheckResult]:
     """Yield a finding for each claim of a tube."""
     for border in tube["borders"]:
         roots = [Fraction(str(root)) for root in border["roots"]]
@@ -323,8 +320,9 @@ def tube_findings(tube: JsonObject) -> Iterator[Finding]:
         yield from separation_findings(tube["separation"])
 
 
-def _check_margin(border: JsonObject, roots: Sequence[Fraction], name: str) -> Iterator[Finding]:
-    """Yield findings on the margin to a border and on the steepest admissible start."""
+def _check_margin(
+    border: JsonObject, roots: Sequence[Fraction], name: str
+) -> Iterator[CheckResult]:
     order = int(border["derivative"]) - 1
     allowed = float(border["path"]) - float(border["above"])
     total = float(border["speed"]) + float(border["leader_speed"])
@@ -346,7 +344,6 @@ def _check_margin(border: JsonObject, roots: Sequence[Fraction], name: str) -> I
 
 
 def _pad_start(start: Sequence[float], size: int) -> Array:
-    """Return a start padded with zeros to one entry per root."""
     return np.pad(np.asarray(start, float), (0, size - len(start)))
 
 
@@ -474,7 +471,6 @@ def _remainder(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
 
 
 def _variations(chain: list[list[Fraction]], x: Fraction) -> int:
-    """Return the number of sign changes of the sequence at x."""
     signs = []
     for part in chain:
         total = Fraction(0)

@@ -16,7 +16,7 @@ from echelon.core.types import JsonObject, PathLike
 from echelon.guarantees.verifier import algebra
 from echelon.guarantees.verifier.agent_claims import MODEL as MODEL
 from echelon.guarantees.verifier.agent_claims import check_equations
-from echelon.guarantees.verifier.findings import VERDICTS, Finding, decide, facts, unchecked
+from echelon.guarantees.verifier.findings import VERDICTS, CheckResult, decide, facts, unchecked
 from echelon.guarantees.verifier.mode_claims import check_graph, check_linearization, check_spectrum
 from echelon.guarantees.verifier.region_claims import check_region
 from echelon.guarantees.verifier.saved_gain import FORMAT, SavedGain, read, read_json
@@ -32,14 +32,12 @@ class Verification(NamedTuple):
     """All findings with their overall verdict.
 
     Attributes:
-        findings: one per claim.
         verdict: `refused` if a claim is false, `incomplete` if all checked claims hold and some
             could not be checked, otherwise `verified`.
-        sentence: the verdict as text.
         note: the end of the sentence, on a correct gain that is not stabilizing.
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[CheckResult, ...]
     verdict: Literal["verified", "incomplete", "refused"]
     sentence: str
     note: str = ""
@@ -66,7 +64,8 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verification:
     document = read_json(path)
     if states_gain(document):
         saved = read(document, path)
-        return judge(_collect(_findings(saved, model)), _no_decay_sentence(saved))
+        note = f" The gain guarantees no decay: the slowest mode is {about(saved.abscissa)} 1/s."
+        return judge(_collect(_findings(saved, model)), "" if saved.abscissa < 0.0 else note)
     return judge(_collect(_promise_findings(document["promise"])))
 
 
@@ -76,8 +75,7 @@ def states_gain(document: JsonObject) -> bool:
     return document.get("format") == FORMAT or "promise" not in document
 
 
-def _promise_findings(promise: object) -> Iterator[Finding]:
-    """Yield what can be checked of a run's guarantee by itself, and name the rest."""
+def _promise_findings(promise: object) -> Iterator[CheckResult]:
     if not isinstance(promise, dict):
         yield decide("promise", False, text="it must be a mapping")
         return
@@ -88,8 +86,8 @@ def _promise_findings(promise: object) -> Iterator[Finding]:
         yield unchecked(f"{PROMISE}{key}", "", "it follows from the run's scenario alone")
 
 
-def _collect(checks: Iterator[Finding]) -> tuple[Finding, ...]:
-    findings = list[Finding]()
+def _collect(checks: Iterator[CheckResult]) -> tuple[CheckResult, ...]:
+    findings = list[CheckResult]()
     # Numbers of a false file may overflow; comparisons with non-finite numbers then fail.
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -102,7 +100,7 @@ def _collect(checks: Iterator[Finding]) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[Finding]:
+def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[CheckResult]:
     first = [*_check_definite(saved), *check_graph(saved)]
     yield from first
     # All later claims assume a valid graph and positive definite matrices.
@@ -117,7 +115,7 @@ def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[Finding
         yield from check_equations(recomputed, model)
 
 
-def judge(findings: Sequence[Finding], note: str = "") -> Verification:
+def judge(findings: Sequence[CheckResult], note: str = "") -> Verification:
     """Return the verdict on findings, with a note; of nothing at all it is `incomplete`."""
     claims = {name: [x.claim for x in findings if x.verdict == name] for name in VERDICTS}
     held = [f"{len(claims['holds'])} claims hold as stored"] if claims["holds"] else []
@@ -136,14 +134,7 @@ def judge(findings: Sequence[Finding], note: str = "") -> Verification:
     return Verification(tuple(findings), "verified", f"Verified: {text}.{note}", note)
 
 
-def _no_decay_sentence(saved: SavedGain) -> str:
-    """Return the sentence that is added for a correct file whose gain is not stabilizing."""
-    if saved.abscissa < 0.0:
-        return ""
-    return f" The gain guarantees no decay: the slowest mode is {about(saved.abscissa)} 1/s."
-
-
-def _check_definite(saved: SavedGain) -> Iterator[Finding]:
+def _check_definite(saved: SavedGain) -> Iterator[CheckResult]:
     for name, matrix in (("P", saved.P), ("R", saved.R)):
         units = np.sqrt(np.abs(np.diag(matrix)))
         even = (np.abs(matrix - matrix.T) <= _SKEW * np.outer(units, units)).all()

@@ -19,7 +19,7 @@ from echelon.core.types import JsonObject
 from echelon.experiments.scenario.scenario import SCENARIO_FILE, Scenario
 from echelon.experiments.scenario.self_contained import self_contained
 from echelon.output.archive.folder import CHUNKS, write_errors
-from echelon.simulation.engine.record import Stretch
+from echelon.simulation.engine.record import Segment
 from echelon.simulation.step.meter import Sums
 
 _BEGUN = "begun.json"
@@ -32,14 +32,9 @@ class Chunks:
     """The stretches of one run in its folder, each in a file named by its first step.
 
     So stretches that two processes computed of the same run fit together.
-
-    Args:
-        folder: of the run.
-        by: the folder in it that holds them.
     """
 
     def __init__(self, folder: Path, by: str = CHUNKS) -> None:
-        """Use a folder, which may not exist yet."""
         self.folder, self.place = folder, folder / by
 
     @property
@@ -106,7 +101,6 @@ class Chunks:
         return bool(self._begun().get("figures", True))
 
     def _begun(self) -> JsonObject:
-        """Return what was written when the run began."""
         try:
             return json.loads((self.place / _BEGUN).read_text("utf-8"))
         except _DAMAGED as error:
@@ -115,7 +109,6 @@ class Chunks:
             ) from error
 
     def _digest(self) -> str:
-        """Return a digest of the scenario and of every file that it names."""
         files = [self.folder / SCENARIO_FILE, *sorted((self.folder / INPUTS).rglob("*"))]
         digest = hashlib.sha256()
         for file in (file for file in files if file.is_file()):
@@ -125,13 +118,13 @@ class Chunks:
             digest.update(hashlib.sha256(file.read_bytes()).digest())
         return digest.hexdigest()
 
-    def write(self, stretch: Stretch) -> None:
+    def write(self, segment: Segment) -> None:
         """Write a stretch completely or not at all.
 
         Raises:
             OSError: it cannot be written.
         """
-        self.store(stretch.first, _arrays(stretch))
+        self.store(segment.first, _arrays(segment))
 
     def store(self, first: int, arrays: Mapping[str, Any]) -> None:
         """Write arrays under a number, completely or not at all.
@@ -153,21 +146,21 @@ class Chunks:
         except _DAMAGED:
             return None
 
-    def read(self) -> list[Stretch]:
+    def read(self) -> list[Segment]:
         """Return the stretches in order, up to the first that is missing or damaged."""
         return list(self._read())
 
-    def _read(self) -> Iterator[Stretch]:
+    def _read(self) -> Iterator[Segment]:
         first, done = -1, 0
         while first != done:
             first = done
             stored = self.stored(first)
             try:
-                stretch = _stretch(first, stored or {})
+                segment = _segment(first, stored or {})
             except _DAMAGED:
                 return
-            yield stretch
-            done = stretch.done
+            yield segment
+            done = segment.done
 
     def remove(self) -> None:
         """Remove them all."""
@@ -185,23 +178,21 @@ class Chunks:
             self.folder.rmdir()
 
 
-def _arrays(stretch: Stretch) -> JsonObject:
-    """Return a stretch as named arrays."""
-    plain = {name: getattr(stretch, name) for name in _PLAIN}
-    sums = {f"sums_{name}": value for name, value in stretch.sums._asdict().items()}
-    moment = {f"moment_{k}": value for k, value in enumerate(stretch.moment)}
-    optional = {name: getattr(stretch, name) for name in ("reference", "stopped")}
+def _arrays(segment: Segment) -> JsonObject:
+    plain = {name: getattr(segment, name) for name in _PLAIN}
+    sums = {f"sums_{name}": value for name, value in segment.sums._asdict().items()}
+    moment = {f"moment_{k}": value for k, value in enumerate(segment.moment)}
+    optional = {name: getattr(segment, name) for name in ("reference", "stopped")}
     return {**plain, **sums, **moment, **{k: v for k, v in optional.items() if v is not None}}
 
 
 _PLAIN = ("done", "times", "states", "inputs", "seconds")
 
 
-def _stretch(first: int, stored: JsonObject) -> Stretch:
-    """Return the stretch of named arrays."""
+def _segment(first: int, stored: JsonObject) -> Segment:
     count = sum(name.startswith("moment_") for name in stored)
     stopped = stored.get("stopped")
-    return Stretch(
+    return Segment(
         first=first,
         done=int(stored["done"]),
         times=stored["times"],

@@ -134,7 +134,6 @@ def _parquet(run: "Result") -> bytes:
 
 
 def _arrays(run: "Result") -> "JsonObject":
-    """Return the arrays of a run by name."""
     from echelon.experiments.results.recording import recording_of
 
     data = recording_of(run)
@@ -204,7 +203,6 @@ _WRITERS: "dict[str, Callable[[Result], bytes]]" = {
     "nc": _netcdf,
     "html": _page,
 }
-
 
 _HEAD = """# For Crazyswarm2, by echelon. Edit the addresses. Before the start each vehicle
 # stands at its `initial_position`, below the first point of its CSV file.

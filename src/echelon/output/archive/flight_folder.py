@@ -55,11 +55,7 @@ _LATE = "other networks than `network`"
 def law_files(parts: Parts, settings: Settings, agent: int, formation: str) -> dict[str, str]:
     """Return the files of one agent's law by name.
 
-    Args:
-        parts: of the whole formation.
-        settings: the step `dt` and whether the actuators' limits act.
-        agent: its number.
-        formation: a text that is equal for all agents of the formation alone.
+    `formation` is a text that is equal for all agents of the formation alone.
 
     Raises:
         OutputError: the law has no scalar operations; with the file and line of a user's code.
@@ -98,7 +94,6 @@ def _traced(parts: Parts, settings: Settings, agent: int) -> tuple[OwnLaw, dict[
 
 
 def _head(settings: Settings, agent: int, formation: str) -> tuple[str, dict[str, float | str]]:
-    """Return the comment at the head of each file, and the constants."""
     mark = hashlib.sha256(f"{__version__}\n{settings.dt!r}\n{formation}".encode()).hexdigest()
     about = f"The law of agent {agent}, by echelon {__version__}; see law.json."
     return about, {"AGENT": agent, "DT": settings.dt, "FORMATION": mark}
@@ -111,7 +106,6 @@ def _facts(
     sentence: str,
     files: Mapping[str, str],
 ) -> str:
-    """Return law.json."""
     dt = float(constants["DT"])
     described = {
         "agent": constants["AGENT"],
@@ -135,13 +129,15 @@ def _sizes(functions: Mapping[str, LawFunction]) -> dict[str, int]:
 
 
 def _description(own: OwnLaw, functions: Mapping[str, LawFunction]) -> JsonObject:
-    """Return whom an agent hears, and the names and units of its numbers."""
-    model = own.loop.model
+    model, schedule, switching = own.loop.model, own.schedule, None
+    if schedule is not None:
+        starts, weights = schedule.starts.tolist(), own.weights.tolist()
+        switching = {"starts": starts, "weights": weights, "period": schedule.period}
     return {
         "leads": own.leads,
         "hears": list(own.neighbours),
         "weights": own.weights[0].tolist(),
-        "switching": _switching(own),
+        "switching": switching,
         "feed_forward_from": own.source,
         "states": dict(zip(model.state_names, model.state_units, strict=True)),
         "inputs": dict(zip(model.input_names, model.input_units, strict=True)),
@@ -154,14 +150,6 @@ def _description(own: OwnLaw, functions: Mapping[str, LawFunction]) -> JsonObjec
         "memory": len(functions["begin"].outputs["memory"]),
         "operations": {name: f.operations for name, f in functions.items()},
     }
-
-
-def _switching(own: OwnLaw) -> JsonObject | None:
-    """Return when which weights hold, of a graph that switches; a period repeats."""
-    if own.schedule is None:
-        return None
-    starts, weights = own.schedule.starts.tolist(), own.weights.tolist()
-    return {"starts": starts, "weights": weights, "period": own.schedule.period}
 
 
 def network_facts(
@@ -210,10 +198,7 @@ _SINKING = -0.5  # m/s
 def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, str]:
     """Return the files of a flight by name.
 
-    Args:
-        parts: of the formation; what they say of plants, wind and sensors is of simulated vehicles.
-        settings: of the run.
-        formation: a text that is equal for all agents of the formation alone.
+    What `parts` say of plants, wind and sensors is of simulated vehicles.
 
     Raises:
         FlightError: messages are not those that fly.
@@ -235,7 +220,7 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
         "horizon": settings.horizon,
         "sizes": [len(facts["signal"]), facts["network"]["content"]],
         "leader": min(parts.graph.leaders),
-        "leadership": rule and {"heirs": list(rule.heirs), "timeout": rule.timeout},
+        "leadership": rule and {"backups": list(rule.backups), "timeout": rule.timeout},
         "weather": {"delay": network.delay, "jitter": network.jitter, "loss": network.loss},
         **_places(parts.model),
         "fence": _fence(parts, settings),
@@ -246,7 +231,6 @@ def flight_files(parts: Parts, settings: Settings, formation: str) -> dict[str, 
 
 
 def _network(parts: Parts) -> Network:
-    """Return the network of parts that can fly."""
     network = parts.world.network
     if network is None or network.messages is not MessageContent.DEVIATION:
         got = "no `network`" if network is None else "`network.messages` `state`"
@@ -292,7 +276,6 @@ def _offsets(parts: Parts, settings: Settings) -> JsonObject:
 
 
 def _fence(parts: Parts, settings: Settings) -> JsonObject:
-    """Return a box about the starts and the plan, and a speed."""
     prepared = prepare(parts, settings)
     drive, model = prepared.parts.drive, parts.model
     assert isinstance(drive, Laws)
@@ -320,7 +303,6 @@ def _rounded(values: Array) -> list[float]:
 
 
 def _vehicles(parts: Parts, settings: Settings) -> tuple[JsonObject, dict[str, str]]:
-    """Return the simulated vehicles: their numbers, and the files of their motions."""
     prepared, model = prepare(parts, settings), parts.model
     motion, agents = prepared.problem.motion, parts.graph.agents
     about = "The motion of a simulated vehicle in a part of a control step."

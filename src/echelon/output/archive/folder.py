@@ -1,17 +1,19 @@
-"""The folder of a run's files: new or empty, and claimed before the run.
+"""The folders that commands write: new or empty, and claimed before a run.
 
 So no file is lost, and the files of two runs do not mix.
 """
 
 import contextlib
 import os
+import re
 import shutil
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from string import Template
 
 from echelon.core.errors import OutputError
-from echelon.core.files import INPUTS
+from echelon.core.files import INPUTS, write_atomic
 
 CHUNKS, RUNS, BATCHES = "chunks", "runs", "batches"
 DATA, GAIN, SUMMARY, FRAMES = "run.nc", "gain.json", "summary.json", "states.nc"
@@ -245,11 +247,7 @@ def _named_folder(out: Path, force: bool, by: str, how: str) -> Path:
 
 
 def _clear(out: Path, present: Sequence[str], names: Sequence[str]) -> None:
-    """Remove an earlier run or comparison, so that `names` are free.
-
-    Raises:
-        OutputError: one is being written, or a file of such a name is not from echelon.
-    """
+    """Refuse where one is being written, or a file of such a name is not from echelon."""
     earlier = {name for mark, files in _MARKS.items() if mark in present for name in files}
     foreign = [name for name in present if name in {*names} - earlier]
     if foreign:
@@ -275,3 +273,33 @@ def write_errors(place: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OutputError(f"`{place}` cannot be written: {error.strerror or error}.") from error
+
+
+# ---- the starter folder: a scenario, a model, a law and a notebook -------------------------------
+
+_START = Path(__file__).resolve().parent / "start"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+def create_starter(folder: Path) -> list[Path]:
+    """Write the folder of `echelon init`, which gives the scenario its name; return the files.
+
+    Raises:
+        OutputError: the folder is not empty, its name cannot name a scenario, or it cannot be
+            written.
+    """
+    name = folder.resolve().name
+    if not _NAME.fullmatch(name):
+        raise OutputError(
+            f"`{name}` cannot name a scenario; use letters, digits, `.`, `-` and `_` only."
+        )
+    check_empty(folder)
+    files = []
+    with write_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        for source in sorted(_START.iterdir()):
+            # Python files end in .txt here, so that nobody takes them for modules.
+            file = folder / source.name.removesuffix(".txt")
+            write_atomic(file, Template(source.read_text("utf-8")).safe_substitute(name=name))
+            files.append(file)
+    return files

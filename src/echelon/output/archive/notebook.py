@@ -8,9 +8,9 @@ from echelon.core.errors import OutputError
 from echelon.experiments.results.dataset import STORED
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import metrics
-from echelon.experiments.results.recording import Recording, foreseen, recording_of
+from echelon.experiments.results.recording import Recording, empty_recording, recording_of
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.output.plots.figure_files import html_image
 from echelon.output.plots.run_figures import figures
 from echelon.output.reports.run_report import ends_farther, grows, labelled, observations
@@ -34,7 +34,6 @@ def result_page(result: Result) -> str:
 
 
 def _name(result: Result) -> str:
-    """Return the name of the scenario, or of the model."""
     # The parts of a run from disk are not built, which executes code, only to display it.
     if result in STORED:
         return recording_of(result).name
@@ -57,14 +56,13 @@ def result_replay(result: Result) -> str:
 
 
 def _observed(result: Result) -> str:
-    """Return what was observed of growing errors as a list."""
     # A promise takes seconds to compute, so other runs do without.
     if not len(result.times) or not ends_farther(result):
         return ""
-    guarantee = promise(result.parts, result.settings)
-    if not grows(result, guarantee):
+    stated = guarantee(result.parts, result.settings)
+    if not grows(result, stated):
         return ""
-    sentences = observations(result, metrics(result), guarantee)
+    sentences = observations(result, metrics(result), stated)
     items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences)
     return f"<ul>{items}</ul>" if items else ""
 
@@ -82,7 +80,6 @@ def _table(result: Result) -> str:
 
 
 def _cells(result: Result) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of leaders and followers, with the labels of the report."""
     numbers = metrics(result)
     errors = result.goal_distances([0, -1] if len(result.times) else [])
     saturated = AGENT_NUMBERS["saturated"]
@@ -98,7 +95,7 @@ def _recorded(result: Result) -> Recording:
     if result in STORED:
         return recording_of(result)
     states, name = result.states, _name(result)
-    run = foreseen(result.parts, result.settings, states[0], name)
+    run = empty_recording(result.parts, result.settings, states[0], name)
     ended = {"outcome": result.outcome.name.lower(), "message": result.message}
     return dataclasses.replace(
         run,

@@ -36,7 +36,7 @@ from echelon.output.archive.folder import (
 from echelon.output.reports.run_report import report
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.engine.record import Stretch
+from echelon.simulation.engine.record import Segment
 from echelon.simulation.engine.result import Later, Result
 from echelon.simulation.engine.simulate import reassemble
 from echelon.simulation.step.meter import Sums
@@ -130,11 +130,11 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
     stored = _stored(path / DATA, parts) if (path / DATA).is_file() else None
     chunks = Chunks(path)
     if chunks.exist:
-        stretches = chunks.read()
-        done = stretches[-1].done if stretches else 0
+        segments = chunks.read()
+        done = segments[-1].done if segments else 0
         # A run that was stopped, continued and killed is longer in its chunks.
         if stored is None or done > int(stored.sums.steps[0]):
-            return _unfinished(path, stretches)
+            return _unfinished(path, segments)
     if stored is not None:
         return stored
     if (path / "comparison.json").is_file():
@@ -146,17 +146,15 @@ def load(place: PathLike, parts: Parts | None = None) -> Result:
     raise OutputError(f"the folder `{path}` holds no run: it has no `{DATA}`.")
 
 
-def _unfinished(folder: Path, stretches: list[Stretch]) -> Result:
-    """Return a run from the chunks in its folder."""
+def _unfinished(folder: Path, segments: list[Segment]) -> Result:
     if not (folder / SCENARIO_FILE).is_file():
         raise OutputError(f"the run in `{folder}` ended before any of it was stored.")
     scenario = load_scenario(folder / SCENARIO_FILE)
-    result = reassemble(*build(scenario), stretches)
+    result = reassemble(*build(scenario), segments)
     return dataclasses.replace(result, **origin_of(scenario))
 
 
 def _stored(file: Path, parts: Parts | None) -> Result:
-    """Return a run from its file, beside which its summary and its inputs may be."""
     _, data = read_recording(file)
     within = file.name == DATA
     names = sorted((file.parent / INPUTS).rglob("*")) if within else []
@@ -217,7 +215,6 @@ def _sums(file: Path, arrays: Mapping[str, Array]) -> Sums:
 def _built(
     file: Path, parts: Parts | None, digest: str, attributes: JsonObject, settings: Settings
 ) -> Parts:
-    """Return the parts of a run, built from its scenario unless they are given."""
     own = build(_scenario(file, digest, attributes)).parts if parts is None else parts
     return prepare(own, settings).parts
 

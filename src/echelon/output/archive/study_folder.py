@@ -24,14 +24,9 @@ _OVER = "over.json"
 
 @final
 class Batches:
-    """The batches of a sweep in its folder, each in a file named by its first run.
-
-    Args:
-        folder: of the sweep.
-    """
+    """The batches of a sweep in its folder, each in a file named by its first run."""
 
     def __init__(self, folder: Path) -> None:
-        """Use a folder, which may not exist yet."""
         self.folder, self.chunks = folder, Chunks(folder, BATCHES)
         self.frames = Chunks(folder, f"{BATCHES}/frames")
 
@@ -129,14 +124,9 @@ def write_sweep(data: "xr.Dataset", text: str, folder: Path, figures: bool = Tru
 
 @final
 class Flights:
-    """The datasets of a comparison, each written as soon as its run is complete.
-
-    Args:
-        folder: of the comparison.
-    """
+    """The datasets of a comparison, each written as soon as its run is complete."""
 
     def __init__(self, folder: Path) -> None:
-        """Begin without an error."""
         self.folder = folder
         self.error: OSError | None = None
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import Outcome, OutputError
-from echelon.core.types import JsonObject, PathLike
+from echelon.core.types import PathLike
 from echelon.experiments.results.dataset import SUM, labelled_parts, run_file, with_sums
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.recording import read_recording
@@ -28,9 +28,9 @@ from echelon.experiments.scenario.scenario import (
 )
 from echelon.experiments.scenario.self_contained import files_of, names_code, without_folders
 from echelon.experiments.studies.recomputation import compare_structure, experiment_of, recompute
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.verifier import verify as verifier
-from echelon.guarantees.verifier.findings import Finding, unchecked
+from echelon.guarantees.verifier.findings import CheckResult, unchecked
 from echelon.guarantees.verifier.saved_gain import read_json
 from echelon.guarantees.verifier.stored_values import Digits, compare_arrays, compare_values
 from echelon.guarantees.verifier.verify import PROMISE, Verification, judge, states_gain
@@ -67,14 +67,7 @@ scenario settles it by."""
 
 
 class ClaimFiles(NamedTuple):
-    """Files with claims about a run's gain or law, and what belongs to them; None for each absent.
-
-    Attributes:
-        gain: a gain file.
-        claims: the summary of a run, or the output of a check.
-        data: the dataset of the run.
-        scenario: the scenario of the run.
-    """
+    """Files with claims about a run's gain or law, and what belongs to them; None if absent."""
 
     gain: Path | None = None
     claims: Path | None = None
@@ -84,9 +77,6 @@ class ClaimFiles(NamedTuple):
 
 def claim_files(place: PathLike) -> ClaimFiles:
     """Return the files of a run that `verify` reads.
-
-    Args:
-        place: the folder of a run, its summary, a gain file, or the output of a check.
 
     Raises:
         GainError: a file cannot be read, or is no JSON.
@@ -111,7 +101,6 @@ def claim_files(place: PathLike) -> ClaimFiles:
 
 
 def _place(path: Path) -> Path:
-    """Return the folder or file that a path means, after checking that it may make claims."""
     if not path.exists():
         raise OutputError(f"`{path}` does not exist; give the folder of a run, or a gain file.")
     check_exists(path)
@@ -126,13 +115,10 @@ def _place(path: Path) -> Path:
 # ---- the run, computed again ---------------------------------------------------------------------
 
 
-def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -> Iterator[Finding]:
+def compare_run(
+    files: ClaimFiles, scenario: Scenario, experiment: Experiment
+) -> Iterator[CheckResult]:
     """Yield a finding for each array, number and text that only the run itself gives.
-
-    Args:
-        files: of the run.
-        scenario: of the run, which is simulated once more.
-        experiment: of it, with the gains that the files state.
 
     Raises:
         EchelonError: the run cannot be computed, or a file cannot be read.
@@ -149,7 +135,7 @@ def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -
         return
     result = dataclasses.replace(result, **origin_of(scenario))
     yield from compare_structure(files.data, run_file(result))
-    decided = bool(promise(*experiment).promised) and _converged(result)
+    decided = bool(guarantee(*experiment).promised) and _converged(result)
     for finding in _compare(files, data, result):
         differs = finding.verdict == "refused" and finding.stored and finding.value
         open_ = differs and not decided
@@ -157,10 +143,7 @@ def compare_run(files: ClaimFiles, scenario: Scenario, experiment: Experiment) -
 
 
 def _converged(result: Result) -> bool:
-    """Tell whether errors shrank or remained small: a local guarantee does not cover every start.
-
-    Where errors grow, so may the rounding of another processor, and a difference proves nothing.
-    """
+    """Where errors grow, so may another processor's rounding: a difference proves nothing."""
     if result.outcome in (Outcome.DIVERGED, Outcome.LEFT_CHART):
         return False
     first, last = sizes(result)
@@ -183,8 +166,7 @@ def _repeated(experiment: Experiment, data: Labelled, steps: int) -> Result | No
     return dataclasses.replace(result, outcome=stored) if same else None
 
 
-def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Finding]:
-    """Compare dataset, summary and report with those of the run computed again."""
+def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[CheckResult]:
     assert files.data is not None
     laws = isinstance(result.parts.drive, Laws)
     digits = _PRECISIONS[result.settings.precision] if laws else _SOLVED
@@ -195,24 +177,18 @@ def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Find
         stored, value = read_json(files.claims), json.loads(json.dumps(summary(result)))
         theirs, ours = [{k: x[k] for k in names if k in x} for x in (stored, value)]
         yield from compare_values("", theirs, ours, digits)
-        yield from _compare_origin(stored, data)
+        # What both files say of the program: nothing else says it.
+        versions = {k[8:]: x for k, x in data.attributes.items() if k.startswith("version_")}
+        value = {"engine": data.attributes.get("computed_by"), "versions": versions}
+        yield from compare_values("", {key: stored.get(key) for key in value}, value)
     written = files.data.parent / REPORT
     if written.is_file() and not stopped:
         yield _compare_report(written, report(result) + "\n")
 
 
-def _compare_origin(stored: JsonObject, data: Labelled) -> Iterator[Finding]:
-    """Compare what both files say of the program: nothing else says it."""
-    attributes = data.attributes
-    versions = {k[8:]: text for k, text in attributes.items() if k.startswith("version_")}
-    value = {"engine": attributes.get("computed_by"), "versions": versions}
-    yield from compare_values("", {key: stored.get(key) for key in value}, value)
-
-
 def _compare_dataset(
     name: str, data: Labelled, result: Result, digits: Digits
-) -> Iterator[Finding]:
-    """Compare arrays and attributes of a dataset, but those of the parts of the run."""
+) -> Iterator[CheckResult]:
     parts = labelled_parts(result.parts, result.settings)
     stored, again = data.arrays(), with_sums(result)
     for key, value in again.arrays().items():
@@ -229,7 +205,7 @@ def _compare_dataset(
             yield from compare_values(f"{name}: observed", theirs, ours, digits)
 
 
-def _compare_report(file: Path, text: str) -> Finding:
+def _compare_report(file: Path, text: str) -> CheckResult:
     """Compare a report; last digits may be rounded in another way, and are then left open."""
     try:
         stored = file.read_text("utf-8")
@@ -295,15 +271,11 @@ def check_files(
 ) -> tuple[Verification, str]:
     """Return what holds of files with claims, and what is against their scenario, if anything.
 
-    Args:
-        files: of a run, or a gain file.
-        trusted: the scenario whose code may be executed.
-        repeat: whether to simulate the scenario again.
-        begin: called with a text before each part that may take a minute or longer.
+    `begin` is called with a text before each part that may take a minute or longer.
     """
     source, obstacle = _source(files, trusted)
     findings, note = _independent(files, trusted)
-    computed = list[Finding]()
+    computed = list[CheckResult]()
     # A gain file by itself is no run.
     if source is not None and (files.claims is not None or files.data is not None):
         computed = [*_computed(files, source, repeat, begin)]
@@ -315,8 +287,7 @@ def check_files(
 
 def _computed(
     files: ClaimFiles, source: Scenario, repeat: bool, begin: Callable[[str], None]
-) -> Iterator[Finding]:
-    """Yield what is computed again from a scenario: the guarantee, and then the run."""
+) -> Iterator[CheckResult]:
     begin("computing the guarantee again, which takes up to a minute")
     experiment, findings = experiment_of(source, files.claims, files.gain)
     yield from findings
@@ -335,7 +306,6 @@ def _computed(
 
 
 def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | None, str]:
-    """Return the scenario from which claims are computed again; or None, and what is against it."""
     if files.scenario is None:
         return trusted, "" if trusted is not None else "no scenario is beside the file"
     own = load_scenario(files.scenario)
@@ -350,8 +320,7 @@ def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | Non
     return own, ""
 
 
-def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[Finding], str]:
-    """Return what independent code finds in each file, and its notes."""
+def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[CheckResult], str]:
     model = None if trusted is None else build(trusted).parts.model
     checked = [each for each in (files.gain, files.claims) if each is not None]
     results = [verifier.verify(each, model) for each in checked]
@@ -359,8 +328,8 @@ def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[Find
 
 
 def _still_open(
-    findings: list[Finding], computed: list[Finding], obstacle: str
-) -> Iterator[Finding]:
+    findings: list[CheckResult], computed: list[CheckResult], obstacle: str
+) -> Iterator[CheckResult]:
     """Yield what independent code found, without what it left open and the scenario has settled."""
     agree = {each.claim.partition(": ")[2] for each in computed if each.verdict == "recomputed"}
     for each in findings:

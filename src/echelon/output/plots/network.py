@@ -152,7 +152,6 @@ def _near_leaders(run: Recording) -> Recording:
 
 
 def _stretches(run: Recording) -> list[tuple[str, Array]]:
-    """Return the weights (E,) of each graph of a schedule, with its time span."""
     if run.schedule is None:
         return [("", run.weights)]
     spans = list(run.schedule.spans())[:_STRETCHES]
@@ -217,8 +216,8 @@ def curves_of(places: Array, edges: Array, least: float) -> list[Array]:
 
 def _bend(places: Array, edge: Array, least: float) -> Array:
     # Links of adjacent agents bend to different sides.
-    bends = [bend * (-1.0) ** int(edge.min()) for bend in _BENDS]
-    lines = [_arc(places[edge[0]], places[edge[1]], bend) for bend in bends]
+    kinks = [bend * (-1.0) ** int(edge.min()) for bend in _BENDS]
+    lines = [_arc(places[edge[0]], places[edge[1]], bend) for bend in kinks]
     gaps = [_gap(places, edge, line) for line in lines]
     clear = [line for line, gap in zip(lines, gaps, strict=True) if gap > least]
     return clear[0] if clear else lines[int(np.argmax(gaps))]
@@ -245,7 +244,6 @@ def _gap(places: Array, edge: Array, line: Array) -> float:
 def _links(
     ax: "Axes", run: Recording, places: Array, curves: list[Array], weights: Array, small: float
 ) -> None:
-    """Draw the edges, with widths by their weights."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     wide = np.clip(1.6 * np.sqrt(weights / run.weights.max()), 0.3, 1.6) * small

@@ -214,11 +214,9 @@ def formation(run: Recording) -> "Figure":
     Of a large swarm it shows quantiles, the median and the worst follower.
     """
     followers, many = list(run.followers), run.agents > draw.NAMED
-    errors, floor, bound = (
-        run.formation_errors[:, followers],
-        error_rounding(run),
-        run.error_bound(),
-    )
+    errors = run.formation_errors[:, followers]
+    floor = error_rounding(run)
+    bound = run.error_bound()
     marks = [SETTLED] if run.length_unit else []
     # The end of the bound may lie far below all errors, so only its start sets the axis.
     marks = np.array(marks if bound is None else [*marks, bound[0]])
@@ -248,10 +246,7 @@ def formation(run: Recording) -> "Figure":
 def _worst(
     ax: "Axes", run: Recording, times: Array, errors: Array, keep: Array, floor: float
 ) -> None:
-    """Draw the follower with the largest steady error, and the largest error at each time.
-
-    A run that ended before its steady window is evaluated as a whole.
-    """
+    """A run that ended before its steady window is evaluated as a whole."""
     window = float(run.attributes.get("steady_window", 0.2 * run.horizon))
     steady = run.times >= run.horizon - window
     with np.errstate(over="ignore", invalid="ignore"):
@@ -513,7 +508,6 @@ def _clip(ax: "Axes", values: Array, limited: bool) -> None:
 
 
 def _limits(ax: "Axes", values: Array) -> None:
-    """Draw the limits 0 and 100 %, and shade the area beyond."""
     for value in (0.0, 100.0):
         ax.axhline(value, label="limit" if value else None, **draw.LIMIT)
     low, high = min(-8.0, float(np.nanmin(values))), max(108.0, float(np.nanmax(values)))
@@ -523,7 +517,6 @@ def _limits(ax: "Axes", values: Array) -> None:
 
 
 def _agents_over(ax: "Axes", run: Recording, times: Array, values: Array) -> None:
-    """Draw a number of each agent (T, N) as lines, or as quantiles of a large swarm."""
     if run.agents > draw.NAMED:
         bands(ax, times, values[:, list(run.followers)])
         first = run.leaders[0]

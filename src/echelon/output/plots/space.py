@@ -118,7 +118,6 @@ def _corners(points: Array) -> tuple[Array, Array]:
 
 
 def _box(run: Recording, kind: str, axes: tuple[int, ...], places: Array) -> tuple[Array, Array]:
-    """Return the corners of the box around goals and starts, with a margin."""
     low, high = np.zeros(3), np.zeros(3)
     drawn = slice(1, 2) if kind == "time" else slice(0, len(axes))
     low[drawn], high[drawn] = _extent(run, axes, places)

@@ -25,7 +25,7 @@ from echelon.experiments.studies.basin import (
 from echelon.experiments.studies.compare import Comparison
 from echelon.experiments.sweeps.plan import SEED, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
-from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.promises.promise import guarantee
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import save
 from echelon.output.plots.network import poles
@@ -190,12 +190,10 @@ def save_sweep_figures(data: "xr.Dataset", folder: Path) -> None:
 
 
 def _is_line(data: "xr.Dataset", key: str) -> bool:
-    """Return whether the values of a key are several numbers."""
     return data.sizes[key] > 1 and np.issubdtype(data[key].dtype, np.number)
 
 
 def _distributions(data: "xr.Dataset") -> "Figure":
-    """Return the shares of runs below each value, as lines."""
     figure, (axes,) = draw.sheet(2.8, 1, len(SUMMARIZED))
     for ax, name in zip(axes, SUMMARIZED, strict=True):
         values = np.sort(data[name].values.ravel())
@@ -236,7 +234,6 @@ def _success(data: "xr.Dataset", keys: list[str]) -> "Figure":
 
 
 def _region(data: "xr.Dataset", first: str, second: str) -> "Figure":
-    """Return the share of settled runs as colours over two keys."""
     settled, runs = (part.sortby([first, second]) for part in _share(data, [first, second]))
     rate = (settled / runs.clip(min=1)).transpose(second, first)
     figure, ((ax,),) = draw.sheet(2.8)
@@ -256,7 +253,6 @@ def _region(data: "xr.Dataset", first: str, second: str) -> "Figure":
 
 
 def _count(ax: "Axes", settled: "xr.DataArray", runs: "xr.DataArray") -> None:
-    """Write into each cell how many of its runs settle."""
     second, first = map(str, settled.dims)
     for (row, column), count in np.ndenumerate(settled.values):
         total = int(runs.values[row, column])
@@ -268,7 +264,6 @@ def _count(ax: "Axes", settled: "xr.DataArray", runs: "xr.DataArray") -> None:
 
 
 def _label(data: "xr.Dataset", key: str) -> str:
-    """Return the label of a key: its meaning and unit, or itself."""
     attributes = data[key].attrs
     return draw.label(str(attributes.get("long_name", key)), str(attributes.get("units", "")))
 
@@ -284,13 +279,11 @@ def _is_geometric(values: Array) -> bool:
 
 
 def _scale(ax: "Axes", which: str, values: Array) -> None:
-    """Choose a logarithmic axis where values need one."""
     if _is_geometric(values):
         getattr(ax, f"set_{which}scale")("log")
 
 
 def _name_values(ax: "Axes", which: str, values: Array) -> None:
-    """Put ticks of an axis at values, or at some of many."""
     _scale(ax, which, values)
     ticks = values if len(values) <= _TICKS else values[:: -(-len(values) // _TICKS)]
     getattr(ax, f"set_{which}ticks")(ticks, [f"{value:g}" for value in ticks])
@@ -321,7 +314,7 @@ def save_design_figures(
         GainError: `axes` names no two states of the model.
         OSError: the folder or a file cannot be written.
     """
-    loop = promise(parts, settings).loop
+    loop = guarantee(parts, settings).loop
     figures, radii = {}, None
     sliced = axes is not None or len(parts.model.state_names) > 1
     states = chosen_slice(parts.model, axes) if sliced else None
@@ -335,12 +328,9 @@ def save_design_figures(
 def _certified_set(
     parts: Parts, settings: Settings, states: tuple[int, int]
 ) -> "tuple[Figure, Radii]":
-    """Return the starts in a slice that converge, with the certified ellipse over them.
-
-    A certified set much smaller than the observed one has a second panel.
-    """
+    """A certified set much smaller than the observed one has a second panel."""
     run, plane = trial(parts, settings), slice_of(parts, states)
-    region = promise(run.parts, settings).certified
+    region = guarantee(run.parts, settings).certified
     certified, observed = None if region is None else region.radius, observed_radius(run, plane)
     names = (parts.model.state_names[states[0]], parts.model.state_names[states[1]])
     radii = Radii(names, certified, observed, plane.largest, run.horizon)
@@ -363,7 +353,6 @@ def _certified_set(
 
 
 def _starts(ax: "Axes", run: Trial, plane: StateSlice, half: Array) -> None:
-    """Colour a grid of starts by whether they converge."""
     from matplotlib.colors import ListedColormap
 
     side = side_of(run.followers)
@@ -394,7 +383,6 @@ def _ellipses(ax: "Axes", plane: StateSlice, radii: Radii, half: Array) -> None:
 
 
 def _legend(figure: "Figure", ax: "Axes", radii: Radii, run: Trial) -> None:
-    """Draw the legend above the panels."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

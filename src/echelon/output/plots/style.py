@@ -116,10 +116,7 @@ def style(page: FigureSize = SCREEN, ax: "Axes | None" = None) -> Iterator[None]
 
 
 def _matplotlib() -> Any:
-    """Return matplotlib, whatever `MPLBACKEND` says: figures are files and need no backend.
-
-    Jupyter sets the variable for all its child processes, whose Python may lack that backend.
-    """
+    """Jupyter sets `MPLBACKEND` for its child processes, whose Python may lack that backend."""
     if "matplotlib" in sys.modules or not os.environ.get("MPLBACKEND"):
         return importlib.import_module("matplotlib")
     asked = os.environ.pop("MPLBACKEND")

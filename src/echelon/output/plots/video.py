@@ -316,10 +316,7 @@ def _name_closest(figure: Any, run: Recording) -> None:
     closest, sizes = run.closest_pair(run.scales), run.ellipsoid
     if closest is not None:
         text = "smallest {}distance in the frames {:.3g} m: {} and {} at {:.4g} s".format(
-            "scaled " * (run.avoidance is not None),
-            closest.distance,
-            *closest.agents,
-            closest.time,
+            "scaled " * (run.avoidance is not None), closest.distance, *closest.agents, closest.time
         )
         touch = closest.touch(None if sizes is None else sizes.radius)
         figure.text(0.012, 0.02, text, color=draw.COLOURS[1] if touch else "0.45", size=9)
@@ -343,7 +340,6 @@ def _curves(figure: Any, run: Recording, ends: Array) -> list[Any]:
 
 
 def _draw_errors(ax: "Axes", run: Recording, keep: Array) -> None:
-    """Draw the formation errors, or the worst and the median of a large swarm."""
     followers, floor = list(run.followers), error_rounding(run)
     errors = run.goal_distances(keep)[:, followers]
     if run.agents > draw.NAMED:

@@ -15,11 +15,9 @@ _PAPERS = {
     *(Topic.AUTONOMOUS, Topic.GRAPH, Topic.GROUNDED, Topic.POSITIVE, Topic.SCHUR, Topic.EDGES),
     *(Topic.MONOTONE, Topic.DRIFT_ALONG_Z, Topic.LMI_AS_PRINTED, Topic.FINITE),
 }
-_RESTS, _LOOP, _PRINTED = (
-    "what a guarantee rests on",
-    "leader, links and margins of this loop",
-    "the paper's printed claims; the guarantee does not need those that fail",
-)
+_RESTS = "what a guarantee rests on"
+_LOOP = "leader, links and margins of this loop"
+_PRINTED = "the paper's printed claims; the guarantee does not need those that fail"
 
 
 def grouped(lines: Sequence[Statement]) -> dict[str, list[Statement]]:
@@ -70,7 +68,6 @@ def _text(check: CheckResult, detail: _Detail) -> Iterator[str]:
 
 
 def _group(lines: list[Statement], width: int, detail: _Detail, brief: bool) -> Iterator[str]:
-    """Yield the rows of a group, and the names of its other lines."""
     rows = detail is _Detail.ROWS
     shown = [x for x in lines if x.fails or (rows and x.verdict is Verdict.HOLDS and x.number_text)]
     for line in shown:
@@ -82,7 +79,6 @@ def _group(lines: list[Statement], width: int, detail: _Detail, brief: bool) -> 
 
 
 def _listed(lines: list[Statement], detail: _Detail) -> Iterator[str]:
-    """Yield lines of one verdict by their names, or how many they are."""
     verdict = lines[0].verdict
     numbers = verdict is Verdict.HOLDS and detail is _Detail.NUMBERS
     names = [f"{x.name} ({x.number_text})" if numbers and x.number_text else x.name for x in lines]
@@ -91,10 +87,7 @@ def _listed(lines: list[Statement], detail: _Detail) -> Iterator[str]:
 
 
 def _row(line: Statement, width: int, short: bool, brief: bool) -> Iterator[str]:
-    """Yield a line with its verdict and number, and the remedy of what fails unless `brief`.
-
-    With `short` a text in place of the number has one row.
-    """
+    """With `short` a text in place of the number has one row."""
     head = f" {line.name:{width}}  {line.verdict!s:5}  "
     text = line.number_text or (line.text if line.fails else "")
     text = textwrap.shorten(text, WIDTH - len(head), placeholder=" ...") if short else text

@@ -13,14 +13,13 @@ from echelon.experiments.results.run_numbers import (
     AGENT_NUMBERS,
     ERROR,
     RUN_NUMBERS,
-    Shown,
+    Appearance,
     settling_bound,
     shown_in,
 )
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
-from echelon.guarantees.promises.promise import Promise
+from echelon.guarantees.promises.promise import Guarantee
 from echelon.output.reports.run_report import PRINTED, ROUNDING, is_papers_experiment, say
-from echelon.simulation.step.solver_stats import SolverStats
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -74,13 +73,10 @@ def _errors_table(comparison: Comparison, printed: bool) -> "Table":
     followers = graphs[0].followers if graphs and len(graphs[0].followers) <= _NAMED else ()
     whole, last = f"{comparison.horizon:.3g} s", f"last {comparison.steady_window:.3g} s"
     heads = ["leader", *(f"F{k}" for k in followers)] if followers else ["leader", "worst F"]
-    title = f"{comparison.scenario}, {whole}: RMSE" + "".join(
-        f", {text}" for text in comparison.conditions
-    )
+    title = ", ".join([comparison.scenario, f"{whole}: RMSE", *comparison.conditions])
     columns = [f"{head}\n{whole}" for head in heads] + [f"{head}\n{last}" for head in heads]
-    within = AGENT_NUMBERS["settling_time"].column.format(
-        settled=settling_bound(_unit(comparison.rows))
-    )
+    settled = settling_bound(_unit(comparison.rows))
+    within = AGENT_NUMBERS["settling_time"].column.format(settled=settled)
     table = _table(title, [*columns, within])
     for row in comparison.rows:
         table.add_row(row.label, *_errors(row, bool(followers)))
@@ -93,13 +89,11 @@ def _errors_table(comparison: Comparison, printed: bool) -> "Table":
 
 
 def _unit(rows: Sequence[ComparisonRow]) -> str:
-    """Return the unit of the errors, which all methods share."""
     units = (row.flight.result.length_unit for row in rows if row.flight is not None)
     return next(units, "")
 
 
 def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
-    """Yield the cells of one method: whole-run errors, steady errors, settling time."""
     if row.flight is None:
         return
     for name in ("rmse", "steady_rmse"):
@@ -112,12 +106,11 @@ def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
 
 
 def _costs_table(comparison: Comparison) -> "Table":
-    """Return the costs, one row per method: effort, computing, information."""
     runs = [row.flight for row in comparison.rows if row.flight is not None]
     # In the ideal network no run has ages of messages.
     costs = {
         name: quantity.column
-        for name, quantity in shown_in(RUN_NUMBERS, Shown.COMPARISON).items()
+        for name, quantity in shown_in(RUN_NUMBERS, Appearance.COMPARISON).items()
         if quantity.column
         and (quantity.absent != "-" or any(run.number(name) is not None for run in runs))
     }
@@ -155,8 +148,7 @@ def _table(title: str, columns: Sequence[str]) -> "Table":
     return table
 
 
-def _guaranteed(promise: Promise) -> str:
-    """Return the guaranteed rate, with its theorem if there is one."""
+def _guaranteed(promise: Guarantee) -> str:
     if promise.rate is None:
         return "none"
     if not promise.promised:
@@ -166,25 +158,20 @@ def _guaranteed(promise: Promise) -> str:
 
 
 def _remarks(row: ComparisonRow) -> Iterator[str]:
-    """Yield why a method did not run, how its run ended, its solver times, and warnings."""
     if row.flight is None:
         yield row.reason
         return
     result = row.flight.result
     if result.outcome is not Outcome.COMPLETED:
         yield result.message
-    if result.work is not None:
-        yield _solver_times(result.work)
+    if (work := result.work) is not None:
+        yield (
+            f"{work.solver} computed {amount(work.solves, 'plan')} with "
+            f"{amount(work.failures, 'failure')}, in {work.median_ms:.3g} ms (median; 99th "
+            f"percentile {work.p99_ms:.3g}, worst {work.worst_ms:.3g}) each; iterations: "
+            f"median {work.iterations_median:.3g}, worst {work.iterations_worst}."
+        )
     yield from result.warnings
-
-
-def _solver_times(figures: SolverStats) -> str:
-    return (
-        f"{figures.solver} computed {amount(figures.solves, 'plan')} with "
-        f"{amount(figures.failures, 'failure')}, in {figures.median_ms:.3g} ms (median; 99th "
-        f"percentile {figures.p99_ms:.3g}, worst {figures.worst_ms:.3g}) each; iterations: "
-        f"median {figures.iterations_median:.3g}, worst {figures.iterations_worst}."
-    )
 
 
 # ---- the paragraph ------------------------------------------------------------------------------
@@ -214,7 +201,6 @@ def verdict(comparison: Comparison) -> tuple[str, ...]:
 
 
 def _among_settled(some: bool, sentence: str) -> str:
-    """Return a sentence on methods that settle, which says so if others do not."""
     if not some or not sentence:
         return sentence
     return f"Of those that settle, {sentence.replace('All ', 'all ', 1)}"
@@ -240,13 +226,11 @@ def _closest(rows: Sequence[ComparisonRow]) -> str:
 
 
 def _numbers(rows: Sequence[ComparisonRow], name: str) -> dict[str, float]:
-    """Return a number of all rows that have it, by label."""
     values = {row.label: row.number(name) for row in rows}
     return {label: value for label, value in values.items() if value is not None}
 
 
 def _best(rows: Sequence[ComparisonRow], claim: str, name: str) -> str:
-    """Return which method has the smallest of a number, and the next one."""
     ranking = sorted((value, label) for label, value in _numbers(rows, name).items())
     if not ranking:
         return ""
@@ -317,7 +301,7 @@ def _row_mapping(row: ComparisonRow) -> JsonObject:
             f"follower_{name}": {str(f.agent): getattr(f, name) for f in followers}
             for name in ("rmse", "steady_rmse")
         },
-        **row.flight.json(Shown.COMPARISON),
+        **row.flight.json(Appearance.COMPARISON),
         "promise": row.flight.promise.as_mapping(),
         "told": list(result.parts.information.follower),
         "solver": None if result.work is None else result.work._asdict(),

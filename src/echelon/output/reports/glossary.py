@@ -66,7 +66,6 @@ def explain_term(term: str, more: Mapping[str, str]) -> dict[str, str]:
 
 
 def _plain(term: str) -> str:
-    """Return the words of a term, without the signs between them."""
     return " ".join(re.findall(r"[^\s_.,-]+", term.lower()))
 
 

@@ -31,7 +31,7 @@ from echelon.experiments.results.run_numbers import (
     settling_bound,
     steady_error,
 )
-from echelon.guarantees.promises.promise import Promise, coverage, promise
+from echelon.guarantees.promises.promise import Guarantee, coverage, guarantee
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED
 
@@ -97,12 +97,7 @@ def report(result: Result) -> str:
 
 
 def whole_report(run: Recording, numbers: str) -> str:
-    """Return the numbers of a run, its guarantee with all conditions, and where it is from.
-
-    Args:
-        run: as it is stored.
-        numbers: its `report`; empty where there is none.
-    """
+    """Return the numbers of a run, its guarantee with all conditions, and where it is from."""
     message, promise = str(run.attributes["message"]), run.promise
     facts = f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s"
     versions = {k[8:]: v for k, v in run.attributes.items() if k.startswith("version_")}
@@ -118,13 +113,11 @@ def whole_report(run: Recording, numbers: str) -> str:
 
 
 def _wrapped(*sentences: str) -> str:
-    """Return sentences as the items of a list."""
     fill = textwrap.TextWrapper(_WIDTH, initial_indent="- ", subsequent_indent="  ").fill
     return "\n".join(map(fill, filter(None, sentences)))
 
 
 def _condition(line: JsonObject) -> str:
-    """Return a condition with its verdict, number, reason, and remedy if it fails."""
     text = f"{line['statement']}: {line['verdict']}"
     text += f" ({line['shown']})" if line["shown"] else ""
     text += f"; {line['text']}" if line["text"] else ""
@@ -158,25 +151,18 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
         "settled": settling_bound(result.length_unit),
     }
     columns = ["agent", *(quantity.column.format(**texts) for quantity in _COLUMNS.values())]
-    if printed:
-        columns += ["printed,\nconsensus", "printed,\noptimiz."]
+    columns += ["printed,\nconsensus", "printed,\noptimiz."] * printed
     agents = f"{result.graph.agents} x {type(result.model).__name__}"
     name = result.provenance.get("scenario") or agents
-    title = f"{name}, {_length(result)}, seed {result.settings.seed}"
+    end = result.times[-1] if len(result.times) else 0.0
+    part = "" if result.outcome.reached else f"{end:g} s of "
+    title = f"{name}, {part}{result.settings.horizon:g} s, seed {result.settings.seed}"
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
     for column in columns:
         table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
     for row in _rows(result, numbers, printed):
         table.add_row(*row)
     return table
-
-
-def _length(result: Result) -> str:
-    """Return the duration of the run, and the horizon if the run did not reach it."""
-    horizon = f"{result.settings.horizon:g} s"
-    if result.outcome.reached:
-        return horizon
-    return f"{result.times[-1] if len(result.times) else 0.0:g} s of {horizon}"
 
 
 def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
@@ -207,7 +193,6 @@ def labelled(
 
 
 def _cell(agent: LeaderMetrics | FollowerMetrics, name: str) -> str:
-    """Return a cell of the table; empty if the agent's role has no such number."""
     if not hasattr(agent, name):
         return ""
     value: float | None = getattr(agent, name)
@@ -219,20 +204,20 @@ def _cell(agent: LeaderMetrics | FollowerMetrics, name: str) -> str:
 
 def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
     """Return the sentences of a report: outcome, what was observed, world, guarantee, V."""
-    guarantee = promise(result.parts, result.settings)
+    stated = guarantee(result.parts, result.settings)
     return (
-        *_outcome(result, numbers, guarantee),
+        *_outcome(result, numbers, stated),
         *_closest(result, numbers),
         *(outcome.sentence() for outcome in event_outcomes(result)),
         *_lag(result),
-        *observations(result, numbers, guarantee),
+        *observations(result, numbers, stated),
         *_world(result),
-        *_guarantee(result, guarantee),
-        *_lyapunov_trend(result, guarantee),
+        *_guarantee(result, stated),
+        *_lyapunov_trend(result, stated),
     )
 
 
-def _outcome(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[str]:
+def _outcome(result: Result, numbers: Metrics, guarantee: Guarantee) -> Iterator[str]:
     yield result.message
     if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
         return
@@ -262,7 +247,6 @@ def _outcome(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[s
 
 
 def _closest(result: Result, numbers: Metrics) -> Iterator[str]:
-    """Yield which agents came closest to each other, and whether vehicles would have touched."""
     if numbers.closest is not None and result.outcome is not Outcome.DIVERGED:
         yield numbers.closest.sentence(result.radius, result.length_unit)
     kept = avoidance(result)
@@ -270,7 +254,6 @@ def _closest(result: Result, numbers: Metrics) -> Iterator[str]:
 
 
 def _lag(result: Result) -> Iterator[str]:
-    """Yield by how much followers lag behind places that change with time, under laws that do."""
     late = np.flatnonzero(result.times >= result.settings.horizon - result.settings.window)
     if result.formation.motion is None or not result.drive.lags or not len(late):
         return
@@ -284,7 +267,6 @@ def _lag(result: Result) -> Iterator[str]:
 
 
 def _world(result: Result) -> Iterator[str]:
-    """Yield what the laws and gains do not know."""
     world = result.world.describe(result.model)
     if world["plant"]:
         yield f"Plant: {world['plant']}; laws and gains use the model's values."
@@ -300,7 +282,6 @@ def _world(result: Result) -> Iterator[str]:
 
 
 def _messages(result: Result) -> Iterator[str]:
-    """Yield what became of the messages, if there were any."""
     traffic = result.traffic
     if traffic is None or not traffic.sent:
         return
@@ -314,8 +295,7 @@ def _messages(result: Result) -> Iterator[str]:
     yield f"Messages: {traffic.sent} sent, {traffic.lost} lost{late}{ages}."
 
 
-def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
-    """Yield the guarantee, whether it covers this run, and the information that the law uses."""
+def _guarantee(result: Result, guarantee: Guarantee) -> Iterator[str]:
     yield guarantee.sentence()
     slowest, coupling = guarantee.slowest, guarantee.coupling
     if result.drive.gain is not None and guarantee.governed and slowest is not None:
@@ -334,8 +314,7 @@ def _guarantee(result: Result, guarantee: Promise) -> Iterator[str]:
     yield f"Information used by each follower: {information}."
 
 
-def _lyapunov_trend(result: Result, guarantee: Promise) -> Iterator[str]:
-    """Yield whether V decreased, with a warning where theory forbids its increase."""
+def _lyapunov_trend(result: Result, guarantee: Guarantee) -> Iterator[str]:
     v = lyapunov(result)
     if v is None or len(v.value) < 2 or not np.isfinite(v.value).all():
         return
@@ -360,7 +339,7 @@ def _lyapunov_trend(result: Result, guarantee: Promise) -> Iterator[str]:
 # ---- what was observed in a poor run -------------------------------------------------------------
 
 
-def observations(result: Result, numbers: Metrics, guarantee: Promise) -> Iterator[str]:
+def observations(result: Result, numbers: Metrics, guarantee: Guarantee) -> Iterator[str]:
     """Yield what was observed of large errors, in sentences; no cause, since none was tried."""
     alone, text = _alone(result)
     yield from (text,) if text else ()
@@ -395,10 +374,7 @@ def _alone(result: Result) -> tuple[tuple[int, ...], str]:
 
 
 def _silences(result: Result) -> Iterator[tuple[int, float, float]]:
-    """Yield each follower that was there without a link to receive from, from when until when (s).
-
-    Nothing of a graph that never switches, in which everybody has a path from a leader.
-    """
+    """Nothing of a graph that never switches, in which everybody has a path from a leader."""
     schedule, dt = result.schedule, result.settings.dt
     if schedule is None or not len(result.times):
         return
@@ -414,7 +390,6 @@ def _silences(result: Result) -> Iterator[tuple[int, float, float]]:
 
 
 def _silent(result: Result) -> Bool[np.ndarray, "S N"]:
-    """Return which followers have no link to receive from in each row of the schedule."""
     schedule, agents = result.schedule, result.graph.agents
     assert schedule is not None
     heard = np.zeros((len(schedule.weights), agents), bool)
@@ -429,7 +404,7 @@ def _silent(result: Result) -> Bool[np.ndarray, "S N"]:
     return ~heard & here & ~leads
 
 
-def beyond(saturated: float, guarantee: Promise) -> Iterator[str]:
+def beyond(saturated: float, guarantee: Guarantee) -> Iterator[str]:
     """Yield that a guarantee does not cover a run whose errors grow.
 
     `saturated` is the largest fraction of steps in which an agent's input was at a limit.
@@ -444,8 +419,7 @@ def beyond(saturated: float, guarantee: Promise) -> Iterator[str]:
     yield f"{text}{limited if saturated else ''}."
 
 
-def _slow(result: Result, guarantee: Promise) -> Iterator[str]:
-    """Yield that the horizon is too short for the slowest mode."""
+def _slow(result: Result, guarantee: Guarantee) -> Iterator[str]:
     by_mode = guarantee.slowest is not None
     rate = -guarantee.slowest if guarantee.slowest is not None else guarantee.rate
     if guarantee.promised and rate and result.settings.horizon * rate < _SETTLES:
@@ -458,7 +432,6 @@ def _slow(result: Result, guarantee: Promise) -> Iterator[str]:
 
 
 def _offset(result: Result, numbers: Metrics) -> Iterator[str]:
-    """Yield that a leader keeps an error from its reference."""
     steady = numbers.leader.steady_rmse
     if steady is None or steady <= SETTLED or _falls(result, steady):
         return
@@ -496,7 +469,7 @@ def sizes(result: Result) -> tuple[float, float]:
     return first, last
 
 
-def grows(result: Result, guarantee: Promise) -> bool:
+def grows(result: Result, guarantee: Guarantee) -> bool:
     """Return whether a run diverged, or its errors grew beyond what a guarantee allows for.
 
     Under one, errors that end below 1 cm are those of rounding and of inputs that are held.

@@ -61,13 +61,11 @@ def sweep_report(data: "xr.Dataset") -> str:
 
 
 def _warnings(data: "xr.Dataset") -> list[str]:
-    """Return a line for each of the most common warnings."""
     counts = Counter(line for text in data["warnings"].values.flat for line in text.splitlines())
     return [f"- Warning ({amount(n, 'run')}): {line}" for line, n in counts.most_common(_WARNINGS)]
 
 
 def _cases(data: "xr.Dataset") -> list[str]:
-    """Return a line per combination of values other than the seed, if there are few."""
     keys = [key for key in data["outcome"].dims if key != SEED]
     if SEED not in data.dims or not keys or np.prod([data.sizes[key] for key in keys]) > _LINES:
         return []
@@ -84,7 +82,6 @@ def _cases(data: "xr.Dataset") -> list[str]:
 
 
 def _share(count: int, total: int) -> str:
-    """Return a count with its 95 % confidence interval."""
     if not total:
         return "0 of 0"
     low, high = share_bounds(count, total)
@@ -92,6 +89,5 @@ def _share(count: int, total: int) -> str:
 
 
 def _quantiles(values: Array) -> list[float] | None:
-    """Return the 5, 50 and 95 % quantiles of the finite values."""
     finite = values[np.isfinite(values)]
     return [float(q) for q in np.quantile(finite, [0.05, 0.5, 0.95])] if finite.size else None

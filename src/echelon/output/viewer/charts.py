@@ -28,8 +28,6 @@ class Charts(NamedTuple):
 
 
 class _Sheet:
-    """Collects curves as columns."""
-
     def __init__(self, run: Recording) -> None:
         # Denser at the start, where inputs change quickly.
         last = len(run.times) - 1
@@ -39,12 +37,7 @@ class _Sheet:
         self.columns: list[Array] = []
 
     def line(
-        self,
-        name: str | None,
-        values: Array,
-        colour: int | str,
-        log: bool,
-        floor: float = FLOOR,
+        self, name: str | None, values: Array, colour: int | str, log: bool, floor: float = FLOOR
     ) -> JsonObject:
         return self.thinned(name, values[self.frames], colour, log, floor)
 
@@ -56,7 +49,6 @@ class _Sheet:
         log: bool = False,
         floor: float = FLOOR,
     ) -> JsonObject:
-        """Take the values in `frames`."""
         curve = np.asarray(values, np.float64)
         if log:
             # A logarithm has no 0, and values below the floor are rounding errors.
@@ -126,7 +118,6 @@ def _off_reference(run: Recording, reference: Float[Array, "T n"]) -> Float[Arra
 
 
 def _slope(run: Recording, begin: float, times: float) -> list[JsonObject]:
-    """Return the line of the guaranteed rate from the first value on, if there is one."""
     rate = run.rate
     if rate is None or begin <= 0.0 or not np.isfinite(begin):
         return []

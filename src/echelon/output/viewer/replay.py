@@ -259,10 +259,7 @@ def _rate_in_words(promise: Mapping[str, Any]) -> str:
 
 
 def _badge_of_run(run: Recording) -> dict[str, str] | None:
-    """Return the badge of a run, withdrawn if the guarantee does not cover the run.
-
-    None where no guarantee was computed.
-    """
+    """None where no guarantee was computed; withdrawn if it does not cover the run."""
     if not run.promise["sentence"]:
         return None
     badge, outcome = promise_badge(run.promise), run.attributes.get("outcome")
@@ -277,14 +274,9 @@ def _badge_of_run(run: Recording) -> dict[str, str] | None:
 
 @final
 class Growing:
-    """The parts of a run so far, for any number of pages.
-
-    Args:
-        run: its recording before the first frame.
-    """
+    """The parts of a run so far, for any number of pages."""
 
     def __init__(self, run: Recording) -> None:
-        """Create the page without frames."""
         more = {"growing": True, "horizon": run.horizon}
         self.html = page(run.name, pack(header(run, space_of(run)) | more, {})).encode()
         self.blocks, self.done = list[bytes](), False

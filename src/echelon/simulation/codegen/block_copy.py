@@ -39,7 +39,6 @@ def copy_text(bits: int, lanes: int) -> str:
 
 
 def _copy_all(w: Writer, slots: dict[str, str], kind: str, inward: bool) -> None:
-    """Write the loops over blocks, their lanes and the rows of each."""
     with loop(w, slots["first"], slots["last"]) as (block, _, _):
         begin, place = (w.put(f"mul i64 {block}, {n}") for n in (slots["size"], w.lanes))
         base = w.at(w.scalar, slots["blocks"], begin)
@@ -54,7 +53,6 @@ def _copy_all(w: Writer, slots: dict[str, str], kind: str, inward: bool) -> None
 
 
 def _copy(w: Writer, source: tuple[str, str], target: tuple[str, str]) -> None:
-    """Write the copy of a number, of a type at an address, to another one."""
     (kind, here), (other, there) = source, target
     value = w.load(kind, here)
     if kind != other:
@@ -64,7 +62,6 @@ def _copy(w: Writer, source: tuple[str, str], target: tuple[str, str]) -> None:
 
 @cache
 def _copier(bits: int, lanes: int) -> Code:
-    """Return the code of `copy_text`, compiled once."""
     return Code(copy_text(bits, lanes))
 
 

@@ -72,11 +72,7 @@ def find_branches(nodes: list[Node], results: Sequence[Node]) -> list[Branch]:
 
 
 def _without_cycles(nodes: list[Node], branches: list[Branch]) -> list[Branch]:
-    """Return the branches that can be written in one piece each.
-
-    One that needs the result of a choice which itself reads the branch cannot; its nodes are then
-    written among the others.
-    """
+    """Leave out those that need the result of a choice which itself reads the branch."""
     while branches:
         owner: dict[Node, Node | Branch] = {node: b for b in branches for node in b.nodes}
         needs: dict[Node | Branch, set[Node | Branch]] = {
@@ -166,10 +162,7 @@ class Emitter:
     def _early(
         self, first: Sequence[Node], rest: Sequence[Node], results: Sequence[Node]
     ) -> list[Node]:
-        """Write some nodes, and those that now free more registers than they take; return others.
-
-        A sum over the stages of an integrator is such: later, all stages would be live to the end.
-        """
+        """Write nodes and those that now free more registers than they take: sums over stages."""
         self._write(first)
         left = [n for n in rest if n not in self.values]
         users = dict[Node, int]()
@@ -192,7 +185,6 @@ class Emitter:
         return [n for n in others if n not in self.values]
 
     def _leave(self, level: Sequence[Node], otherwise: str) -> None:
-        """Write a branch that is taken if one of some truths holds in any lane."""
         w, kind = self.writer, self.writer.kind(True, False)
         truths, largest = list[str](), dict[float, str]()
         for node in level:
@@ -240,10 +232,7 @@ class Emitter:
             return w.put(f"select {which} {args[0]}, {kind} {args[1]}, {kind} {args[2]}")
         return w.operation(node.op, args, node.args[0].truth, uniform)
 
-    # ---- branches ----
-
     def _write_in_order(self, nodes: Iterable[Node], owner: Mapping[Node, Branch]) -> None:
-        """Write nodes outside of branches; each branch before the first node that reads it."""
         for node in nodes:
             if node in owner or node in self.values:
                 continue
@@ -256,7 +245,6 @@ class Emitter:
             self._write([node])
 
     def _branch(self, branch: Branch) -> None:
-        """Write nodes behind a branch, and those read outside as values that hold after it."""
         w, which = self.writer, self.value(branch.which)
         if not branch.side:
             which = w.put(f"xor {w.kind(True, False)} {which}, splat (i1 true)")
@@ -280,9 +268,6 @@ class Emitter:
             self.values[node] = w.put(f"phi {w.kind(node.truth, False)} {values}")
 
 
-# ---- the fast path -------------------------------------------------------------------------------
-
-
 class FastPath(NamedTuple):
     """A step without its unlikely cases.
 
@@ -302,12 +287,7 @@ def general_case(results: Sequence[Node]) -> Mapping[Node, Node]:
 
 
 def find_fast_path(results: Sequence[Node], choices: Iterable[tuple[Node, bool]]) -> FastPath:
-    """Return each node with every unlikely truth assumed not to hold.
-
-    Args:
-        results: of the step.
-        choices: further truths, and for each whether it is unlikely to hold, or not to hold.
-    """
+    """Return each node with every unlikely truth assumed not to hold, `choices` included."""
     sides, depths, excluded = dict(choices), dict[Node, int](), list[tuple[int, Node]]()
 
     def assume(node: Node, args: Sequence[Node]) -> Node | bool | None:

@@ -62,8 +62,6 @@ def factored(results: Sequence[Node]) -> Mapping[Node, Node]:
 
 @final
 class _Sums:
-    """The factored form of each node, its terms, and what these are multiples of."""
-
     def __init__(self, results: Sequence[Node]) -> None:
         nodes = needed(results)
         self.users = Counter(a for node in nodes for a in node.args)
@@ -141,7 +139,6 @@ class _Sums:
         return terms
 
     def _multiples(self, term: Term) -> set[Common]:
-        """Return what a term, or one of those inside, is a multiple of."""
         if term.inside is not None:
             return self.shared[term.inside]
         common = set(_multiples(term))
@@ -151,7 +148,6 @@ class _Sums:
 
 
 def _multiples(term: Term) -> list[Common]:
-    """Return what may be taken out of a term."""
     # r + r s by one product would round r itself.
     common: list[Common] = [*dict.fromkeys(term.factors)] if len(term.factors) > 1 else []
     return [*common, abs(term.number)] if term.factors and abs(term.number) != 1.0 else common
@@ -165,11 +161,7 @@ def _is_sound(term: Term) -> bool:
     return term.number == 0.0 or 1.0 / _LARGEST <= abs(term.number) <= _LARGEST
 
 
-# ---- fewer terms ---------------------------------------------------------------------------------
-
-
 def _fewer(terms: Sequence[Term]) -> list[Term]:
-    """Return fewer terms with the same sum, or as many if that is impossible."""
     fewer, bare = _merged(terms), list(map(_bare, terms))
     if all(map(_is_sound, bare)):
         fewer = min(fewer, _merged(bare), key=len)
@@ -194,10 +186,7 @@ def _bare(term: Term) -> Term:
 
 
 def _merged(terms: Sequence[Term]) -> list[Term]:
-    """Return terms of which no two have the same factors.
-
-    Plain numbers are not merged: one that is added and subtracted again is there for its rounding.
-    """
+    """Plain numbers stay: one that is added and subtracted again is there for its rounding."""
     merged, places = list[Term](), dict[tuple[Node, ...], int]()
     for term in terms:
         factors = term.factors
@@ -210,7 +199,6 @@ def _merged(terms: Sequence[Term]) -> list[Term]:
 
 
 def _most_common(terms: Sequence[Term]) -> Common | None:
-    """Return what most terms are multiples of, if there are several."""
     counts = Counter(common for term in terms for common in _multiples(term))
     # The first of them, by the order of nodes, so that the text is the same each time.
     order = {f: k for k, f in enumerate(f for t in terms for f in (*t.factors, abs(t.number)))}
@@ -237,7 +225,6 @@ def _take_out(terms: Sequence[Term], common: Common) -> list[Term]:
 
 
 def _without(term: Term, common: Common) -> Term | None:
-    """Return a term without a common factor; None if it is not a multiple of that."""
     number, factors = term.number, term.factors
     if not isinstance(common, Node):
         has = factors and abs(number) == common
@@ -248,11 +235,7 @@ def _without(term: Term, common: Common) -> Term | None:
     return Term(number, factors[:place] + factors[place + 1 :])
 
 
-# ---- terms as nodes ------------------------------------------------------------------------------
-
-
 def _sum_of(like: Node, terms: Sequence[Term]) -> Node:
-    """Return a sum, in the order of its terms, as a node of the same graph as another."""
     total, sign = like.graph.constant(0.0), 0.0
     for term in terms:
         own_sign, product = _size_of(like, term)
@@ -277,18 +260,13 @@ def _size_of(like: Node, term: Term) -> tuple[float, Node]:
     return math.copysign(1.0, term.number), product
 
 
-# ---- quotients -----------------------------------------------------------------------------------
-
 _CONTINUOUS = {"add", "sub", "mul", "neg"}
 """Operations that may read a quotient with another rounding; if it is truncated or compared, 49/49
 must be 1."""
 
 
 def _inverses_shared(results: Sequence[Node]) -> Mapping[Node, Node]:
-    """Return each node with quotients by one number replaced by products with its inverse.
-
-    A division is the slowest operation. The results may differ by one unit in the last place.
-    """
+    """A division is the slowest operation; results may differ by one unit in the last place."""
     nodes = needed(results)
     exact = {a for node in nodes if node.op not in _CONTINUOUS for a in node.args}
     quotients = [n for n in nodes if n.op == "div" and not n.uniform and n not in exact]

@@ -62,14 +62,13 @@ def program(plan: Plan) -> str:
     attributes = f"attributes #0 = {{ nounwind noinline {width} {_ATTRIBUTES} }}"
     # The weights of a branch that is hardly ever taken.
     unlikely = '!0 = !{!"branch_weights", i32 1, i32 1000}'
-    parts = [*sorted(w.declared), "", head, *w.lines, "}", "", _entry()]
+    parts = [*sorted(w.declared), "", head, *w.lines, "}", "", _RUN]
     return "\n".join([*parts, "", attributes, unlikely, ""])
 
 
 def _write_uniform(
     w: Writer, plan: Plan, slots: dict[str, str], numbers: Sequence[Node], last: str
 ) -> None:
-    """Write the loop over the steps that computes what is the same for all agents."""
     with loop(w, slots["first_step"], last) as (step, _, _):
         passed = w.put(f"sub i64 {step}, {slots['first_step']}")
         table = w.part(slots["table"], passed, plan.table)
@@ -87,7 +86,6 @@ def _write_uniform(
 
 
 def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str, str]:
-    """Write where the numbers of a group are."""
     blocks = w.put(f"mul i64 {group}, {slots['blocks']}")
     edges = w.put(f"mul i64 {group}, {slots['edge_blocks']}")
     parts = {
@@ -101,7 +99,6 @@ def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str
 
 
 def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
-    """Write all steps of a group, task by task."""
     with loop(w, "0", slots["count"]) as (number, _, _):
         first = w.put(f"mul i64 {number}, {len(TASK)}")
         task = {name: w.load("i64", slots["schedule"], first, k) for k, name in enumerate(TASK)}
@@ -125,7 +122,6 @@ def _tasks(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
 
 
 def _context(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers: int) -> Context:
-    """Write where the numbers are that change from step to step."""
     step = w.put(f"add i64 {slots['first_step']}, {passed}")
     odd = w.put(f"trunc i64 {passed} to i1")
     mirror, next_mirror = (
@@ -153,10 +149,7 @@ _AT_HAND = 12
 
 
 def _with_uniform(w: Writer, context: Context, body: Body) -> Context:
-    """Write the load of what is the same for all agents, before the loop over them.
-
-    In the loop, LLVM would load it again after every store, which might change it.
-    """
+    """In the loop, LLVM would load it again after every store, which might change it."""
     leaves = [n for n in needed(body.results()) if n.op == "leaf" and n.value[0] == "uniform"]
     values = {n.value[1]: _load_uniform(w, context, *n.value) for n in leaves[:_AT_HAND]}
     return context._replace(at_hand=values)
@@ -176,9 +169,6 @@ def _lead(w: Writer, context: Context, task: dict[str, str]) -> None:
             messages = w.part(context.leader_messages, block, plan.message_size * plan.lanes)
             for k in range(plan.message_size):
                 w.store_row(w.load_row(base, plan.message_start + k), messages, k)
-
-
-# ---- a body --------------------------------------------------------------------------------------
 
 
 def _act(w: Writer, context: Context, body: Body, block: str) -> None:
@@ -227,7 +217,6 @@ def _new_minima(body: Body) -> list[tuple[Node, bool]]:
 
 
 def _has_no_effect(op: str, node: Node) -> bool:
-    """Tell whether an operation with a number changes no sum or minimum."""
     neutral = {"add": 0.0, "min": NO_MINIMUM}.get(op)
     return neutral is not None and node is node.graph.constant(neutral)
 
@@ -235,7 +224,6 @@ def _has_no_effect(op: str, node: Node) -> bool:
 def _load(
     w: Writer, context: Context, block: str, base: str, kind: str, rest: Sequence[int]
 ) -> str:
-    """Write the load of a leaf of a body, except for sums over neighbours."""
     plan = context.plan
     if kind == "row":
         return w.load_row(base, rest[0])
@@ -252,7 +240,6 @@ def _load(
 def _write(
     w: Writer, context: Context, body: Body, emitter: Emitter, base: str, block: str
 ) -> None:
-    """Write the results of a body: in the rows of its block, and for its neighbours."""
     for row, node in body.stores.items():
         w.store_row(emitter.value(node), base, row)
     with only_if(w, context.slots["input_step"]):
@@ -274,7 +261,6 @@ def _write(
 
 
 def _note_exceptions(w: Writer, row: int, body: Body, emitter: Emitter, base: str) -> None:
-    """Write that a row becomes 1 where an exception holds."""
     kind, either = w.kind(True, False), ""
     for node in body.exceptions:
         if node.op != "constant" or node.value:
@@ -288,7 +274,6 @@ def _note_exceptions(w: Writer, row: int, body: Body, emitter: Emitter, base: st
 
 @contextlib.contextmanager
 def _if_effective(w: Writer, emitter: Emitter, op: str, node: Node) -> Iterator[str]:
-    """Write what is done with a number, only where a uniform truth says that it has an effect."""
     if node.op == "select" and node.args[0].uniform:
         which, *sides = node.args
         for k, side in enumerate(sides):
@@ -303,7 +288,6 @@ def _if_effective(w: Writer, emitter: Emitter, op: str, node: Node) -> Iterator[
 
 
 def _load_uniform(w: Writer, context: Context, kind: str, *rest: int) -> str:
-    """Write a number that is the same for all agents."""
     if kind == "steady":
         late = w.put(f"icmp sge i64 {context.step}, {context.slots['first_steady']}")
         return w.put(f"uitofp i1 {late} to {w.scalar}")
@@ -361,7 +345,6 @@ def wait(w: Writer, slots: dict[str, str], before: str, after: str) -> None:
 
 
 def _wait_for(w: Writer, slots: dict[str, str], other: str, count: str) -> None:
-    """Write that a thread waits for another."""
     at = w.part(slots["progress"], other, _APART, "i64")
     start, turn, here = (w.fresh(stem) for stem in ("start", "turn", "here"))
     w.do(f"br label %{start}")
@@ -396,8 +379,6 @@ def announce(w: Writer, slots: dict[str, str], task: str) -> None:
         w.do(f"store atomic i64 {count}, ptr {at} release, align 8")
 
 
-# ---- denormal numbers ----------------------------------------------------------------------------
-
 _X86 = """\
 declare void @llvm.x86.sse.stmxcsr(ptr)
 declare void @llvm.x86.sse.ldmxcsr(ptr)
@@ -429,20 +410,14 @@ define void @run(ptr noalias %slots) nounwind {
   call void @steps(ptr %slots)
   ret void
 }"""
-_ENTRIES = {"x86_64": _X86, "AMD64": _X86, "aarch64": _ARM, "arm64": _ARM}
+_RUNS = {"x86_64": _X86, "AMD64": _X86, "aarch64": _ARM, "arm64": _ARM}
+_RUN = _RUNS.get(platform.machine(), _OTHER)
+"""The function `run`, which calls `steps`, as LLVM moves arithmetic over neither end of a call.
+
+Denormal numbers are 0 in it, in operands and in results, as in JAX: an operation with one takes a
+hundred times as long. Each thread sets its processor's register so, and puts it back at the end."""
 
 _ATTRIBUTES = " ".join(
     f'"denormal-fp-math{suffix}"="preserve-sign,preserve-sign"' for suffix in ("", "-f32")
 )
 """What LLVM must know to fold constants as the processor would."""
-
-
-def _entry() -> str:
-    """Return the function `run` as text for LLVM, which calls `steps` and is all that is called.
-
-    It treats denormal numbers as 0, in operands and in results, as JAX does: an operation with one
-    takes a hundred times as long. Each thread sets the bits of its processor's register that say so
-    when it enters a kernel, and puts them back when it leaves.
-    """
-    # A function of its own, because LLVM moves arithmetic over neither end of a call.
-    return _ENTRIES.get(platform.machine(), _OTHER)

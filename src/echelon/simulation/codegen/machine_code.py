@@ -17,11 +17,7 @@ from echelon.simulation.scalars import Unsupported
 
 @cache
 def llvm() -> ModuleType:
-    """Return llvmlite's binding, ready for this machine.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """Return llvmlite's binding for this machine; `MissingExtraError` if it is not installed."""
     # Not at the top: it comes with an extra, and is slow to import.
     try:
         import llvmlite.binding as binding
@@ -72,7 +68,6 @@ class Code:
     """A kernel as machine code, which exists as long as this object."""
 
     def __init__(self, text: str) -> None:
-        """Compile a text, or load its code from the cache."""
         binding = llvm()
         import llvmlite
 

@@ -90,7 +90,6 @@ def _sums(
     mine: dict[Node | int, str],
     contiguous: bool,
 ) -> list[str]:
-    """Write the sums of some entries of the difference over the neighbours."""
     entries = _read_entries(differences)
     zero = [(w.vector, "zeroinitializer")] * len(differences)
     with loop(w, *ends, zero) as (slot, totals, following):
@@ -119,7 +118,6 @@ def _shifted_sums(
 
 
 def _read_entries(differences: Sequence[Node]) -> list[int]:
-    """Return the entries of a neighbour that some differences depend on."""
     leaves = [n for n in needed(differences) if n.op == "leaf"]
     return sorted({n.value[1] for n in leaves if n.value[0] == "neighbour"})
 
@@ -132,7 +130,6 @@ def _added(
     values: dict[Node | int, str],
     totals: Sequence[str],
 ) -> list[str]:
-    """Write sums with the differences to the neighbours of a slot; values are by leaf, or entry."""
     emitter = Emitter(w, lambda leaf: values[leaf if leaf.value[0] == "self" else leaf.value[1]])
     emitter.emit(differences)
     read = [emitter.value(node) for node in differences]
@@ -144,7 +141,6 @@ def _added(
 
 
 def _row_part(w: Writer, context: Context, row: int, place: str) -> str:
-    """Write the load of numbers that follow each other in a row of a row-major mirror."""
     # Aligned for a number only: the first one is in any lane.
     at = mirror_row(w, context, row, place)
     return w.put(f"load {w.vector}, ptr {at}, align {w.bits // 8}")
@@ -153,7 +149,6 @@ def _row_part(w: Writer, context: Context, row: int, place: str) -> str:
 def _own_entries(
     w: Writer, context: Context, shown: dict[Node, Node], block: str, load: Callable[[Node], str]
 ) -> dict[Node, str]:
-    """Write what neighbours read of the agents of a block: leaf -> a vector."""
     if context.plan.batched:
         start = w.part(context.mirror, block, context.plan.mirror)
         return {leaf: w.load_row(start, leaf.value[1]) for leaf in shown}
@@ -176,10 +171,7 @@ def _listed_entries(
     entries: Sequence[int],
     contiguous: bool,
 ) -> dict[int, str]:
-    """Write the load of what is read of agents whose places are in a list: entry -> a vector.
-
-    In a row-major mirror they follow each other if they are contiguous.
-    """
+    """In a row-major mirror the places follow each other if they are contiguous."""
     plan, slots = context.plan, context.slots
     if plan.batched:
         there = listed_block(w, slots[which], slot, context.mirror)
@@ -230,7 +222,6 @@ def _with_leaders(w: Writer, context: Context, row: int, places: str) -> str:
 
 
 def _joined(w: Writer, parts: Sequence[str]) -> str:
-    """Write short vectors as one."""
     size = w.lanes // len(parts)
     while len(parts) > 1:
         order = ", ".join(f"i32 {k}" for k in range(2 * size))
@@ -295,7 +286,6 @@ def _subtract_some(
 def _neighbour_at(
     w: Writer, context: Context, places: str, lane: int, leaders_ahead: bool = False
 ) -> str:
-    """Write the address of what is read of a lane's neighbour, which may be a leader ahead."""
     start = context.mirror
     if leaders_ahead:
         place = w.load_place(places, lane)
@@ -303,9 +293,6 @@ def _neighbour_at(
         leads = w.put(f"icmp slt i64 {place}, {end}")
         start = w.put(f"select i1 {leads}, ptr {context.leader_mirror}, ptr {start}")
     return listed_block(w, places, str(lane), start)
-
-
-# ---- what neighbours read ------------------------------------------------------------------------
 
 
 def write_mirror(w: Writer, context: Context, values: Sequence[str], block: str) -> None:
@@ -352,15 +339,8 @@ def _shuffle(w: Writer, a: str, b: str, order: Sequence[int]) -> str:
     return w.put(f"shufflevector {w.vector} {a}, {w.vector} {b}, <{w.lanes} x i32> <{places}>")
 
 
-# ---- edges ---------------------------------------------------------------------------------------
-
-
 def measure_edges(w: Writer, context: Context, start: str, end: str) -> None:
-    """Write the loop that adds up by how much distances along edges differ from the formation's.
-
-    A block of edges has the differences of their goals, row by row, the distances of these, and the
-    sums.
-    """
+    """Write the loop that adds up by how much distances along edges differ from their goals'."""
     plan, slots, axes = context.plan, context.slots, context.plan.edges
     with loop(w, start, end) as (block, _, _):
         base = w.part(slots["edges"], block, (len(axes) + 2) * plan.lanes)
@@ -427,7 +407,6 @@ def _limit(k: int, node: Node) -> float:
 
 
 def _is_plain(k: int, node: Node) -> bool:
-    """Tell whether an entry of the difference is that of two numbers."""
     leaves = [a.value for a in node.args if a.op == "leaf"]
     return node.op == "sub" and leaves == [("self", k), ("neighbour", k)]
 

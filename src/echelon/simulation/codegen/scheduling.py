@@ -6,8 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from echelon.simulation.codegen.kernel_plan import Body, Plan
 from echelon.simulation.scalars import Node, needed, rewritten
 
-# ---- values that all agents share ----------------------------------------------------------------
-
 
 def shared(plan: Plan) -> list[Node]:
     """Return the numbers of a plan's bodies that are the same for all agents at a step, in order.
@@ -40,9 +38,6 @@ def _border(body: Body) -> list[Node]:
     return [n for n in nodes if n.uniform and n.op != "constant" and n in border]
 
 
-# ---- fused operations ----------------------------------------------------------------------------
-
-
 def fuse(body: Body) -> Body:
     """Return a body with sums fused with a product that nothing else reads.
 
@@ -67,8 +62,6 @@ def fuse(body: Body) -> Body:
 
     return body.map_nodes(rewritten(results, join))
 
-
-# ---- order ---------------------------------------------------------------------------------------
 
 _LATENCY = {"div": 3, "sqrt": 4, "select": 0, "neg": 0}
 """Of operations that take longer than a product or less, in products."""

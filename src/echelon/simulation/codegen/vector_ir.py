@@ -249,7 +249,6 @@ def _root_guess(w: Writer, x: str, uniform: bool) -> str:
 
 
 def _bit(w: Writer, x: str, uniform: bool, place: int) -> str:
-    """Write whether a bit of a number is set."""
     real, whole = w.kind(False, uniform), w.integers(uniform)
     as_bits = w.put(f"bitcast {real} {x} to {whole}")
     masked = w.put(f"and {whole} {as_bits}, {w.integer(1 << place, uniform)}")
@@ -257,7 +256,6 @@ def _bit(w: Writer, x: str, uniform: bool, place: int) -> str:
 
 
 def _single(w: Writer, x: str, uniform: bool) -> str:
-    """Write a number rounded to single precision."""
     real, one = w.kind(False, uniform), "float" if uniform else f"<{w.lanes} x float>"
     return w.put(f"fpext {one} {w.put(f'fptrunc {real} {x} to {one}')} to {real}")
 

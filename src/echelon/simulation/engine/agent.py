@@ -15,9 +15,9 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.exchange import Exchange, Near
 from echelon.agents.network.inbox import (
     Inbox,
+    LeaderPacket,
     Message,
     NamedValues,
-    Packet,
     Received,
     Stamps,
     Surroundings,
@@ -34,7 +34,7 @@ from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.action import Action, act, feedforward_of
+from echelon.simulation.step.action import AgentOutput, act, feedforward_of
 from echelon.simulation.step.knowledge import (
     NOBODY,
     Ages,
@@ -120,7 +120,6 @@ def hull_of(loop: Loop, law: Law, own: OwnState) -> Float[jax.Array, "r d"] | No
 
 
 def _gaps(near: Near | None, hull: Float[jax.Array, "r d"] | None) -> Near | None:
-    """Return what an agent knows of others, from their hulls and its own."""
     return None if near is None or hull is None else near._replace(gaps=hull[None] - near.gaps)
 
 
@@ -161,7 +160,7 @@ class Step(NamedTuple):
     """
 
     signal: jax.Array
-    action: Action
+    action: AgentOutput
     finite: jax.Array
     letter: Letters | None = None
     hull: jax.Array | None = None
@@ -293,7 +292,6 @@ class Agent:
     """
 
     def __init__(self, parts: Parts, agent: int, dt: float = 0.005, limits: bool = True) -> None:
-        """Prepare its law."""
         check_kind("parts", parts, Parts)
         check_kind("drive", parts.drive, Laws)
         if not isinstance(agent, numbers.Integral) or not 0 <= agent < parts.graph.agents:
@@ -325,7 +323,7 @@ class Agent:
         self._schedule = graph.schedule
         with precision("float64"):
             self._names = _names(self._loop, self._law)
-        self._stamps = self._stamps_of(graph.leaders, graph.heirs)
+        self._stamps = self._stamps_of(graph.leaders, graph.backups)
         self._source = self._source_in(parts)
         self._inbox = Inbox(self.neighbours, self._source, *self._names, stamps=self._stamps)
         self._others = self._surroundings(graph.agents)
@@ -337,15 +335,14 @@ class Agent:
         self._late = False
         self._last: tuple[Array, Message | None] = np.array(self._loop.model.trim[1], float), None
 
-    def _stamps_of(self, leaders: Sequence[int], heirs: Sequence[int]) -> Stamps | None:
-        """Return where times and packets are stored; None in the ideal network."""
+    def _stamps_of(self, leaders: Sequence[int], backups: Sequence[int]) -> Stamps | None:
         channel = self._loop.channel
         if channel is None:
             return None
-        size = packet_size(channel, *self._sizes, bool(heirs))
+        size = packet_size(channel, *self._sizes, bool(backups))
         own = self.number if self.leads else None
         deviation = channel.messages is MessageContent.DEVIATION
-        return Stamps(len(self.neighbours), leaders, size, own, deviation, heirs)
+        return Stamps(len(self.neighbours), leaders, size, own, deviation, backups)
 
     def _succeed(self, stamps: Stamps) -> None:
         """Take the lead if nobody was heard to lead for long, or leave it to whoever has it."""
@@ -363,7 +360,6 @@ class Agent:
         self._law = self._loop.leader if self.leads else self._loop.follower
 
     def _surroundings(self, agents: int) -> Surroundings | None:
-        """Return where the hulls of others are stored; None where agents do not keep apart."""
         safety, model = self._loop.follower.safety, self._loop.model
         if safety is None:
             return None
@@ -480,7 +476,6 @@ class Agent:
         return self._last
 
     def _hulls(self) -> Near | None:
-        """Return the hulls of others for a follower, NaN for those that it did not receive."""
         if self._others is None or self.leads:
             return None
         others, d = len(self._others.time), len(self._loop.model.position)
@@ -502,7 +497,6 @@ class Agent:
         return Readers(jnp.array([self.number], jnp.int32), jnp.array([self.leads]))
 
     def _mail(self, stamps: Stamps) -> tuple[Mail, Ages]:
-        """Return what the agent keeps of what it received, and its ages (s)."""
         assert self._loop.channel is not None
         size = packet_size(self._loop.channel, *self._sizes, self._loop.succession is not None)
         packet = stamps.packet
@@ -522,13 +516,12 @@ class Agent:
         return mail, Ages(link, jnp.array([since]))
 
     def _written(self, step: "Step") -> Message | None:
-        """Return the message of a step; None of an agent that has heard of no leader."""
         if self._stamps is None or step.letter is None:
             return self._message(step.signal, step.action.message)
         packet, leader = self._stamps.packet, int(step.letter.packet.leader[0])
         if leader == self.number:
             content = tuple(step.letter.packet.content[0].tolist())
-            packet = Packet(leader, self._time, content, self._stamps.epoch)
+            packet = LeaderPacket(leader, self._time, content, self._stamps.term)
         if packet is None and self._stamps.needs_packet:
             return None
         message = self._message(step.letter.value[0])
@@ -550,7 +543,6 @@ class Agent:
         return jnp.asarray(state, float)
 
     def _measured(self, y: State) -> tuple[State, Estimate | None]:
-        """Return the state that the agent assumes at a measurement (n,), and its estimate."""
         if self._estimator is None:
             return y, None
         model, before = self._loop.model, self._estimate
@@ -568,7 +560,7 @@ class Agent:
         return expected_alone(self._loop, time, content, age, self._sizes[0])
 
     def _own(self, state: State, time: jax.Array) -> "OwnState":
-        # As in a run, where leaders may follow their heirs.
+        # As in a run, where leaders may follow their backup leaders.
         law = self._law if self._loop.succession is None else self._loop.follower
         memory = self._memory if self._begun else begin_alone(self._loop, law, state)
         self._late = self._late if self._begun else float(time) > 0.0

@@ -31,7 +31,7 @@ from echelon.simulation.native.threads import processors
 from echelon.simulation.native.varying import ProgramKeys
 from echelon.simulation.step.drive import Stepper
 from echelon.simulation.step.loop import Loop, assemble
-from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.settings import Settings
 
 Run: TypeAlias = tuple[Parts, Settings]
@@ -42,8 +42,6 @@ _SMALL = 64
 
 
 class _SharedRun(NamedTuple):
-    """What runs that differ in the seed alone have in common."""
-
     prepared: Prepared
     starts: Starts
     loop: Loop | None
@@ -51,8 +49,6 @@ class _SharedRun(NamedTuple):
 
 
 class _BatchJob(NamedTuple):
-    """A run of the batch, by its place, with all that its steps need."""
-
     place: int
     prepared: Prepared
     loop: Loop
@@ -67,7 +63,6 @@ class Batch:
     """
 
     def __init__(self, threads: int | None = None) -> None:
-        """Start the threads."""
         self.threads = threads or processors()
         self.pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
         self.kinds = ProgramKeys()
@@ -88,10 +83,7 @@ class Batch:
         for place, (parts, settings) in enumerate(runs):
             yield results.pop(place) if place in results else _run_alone(parts, settings, progress)
 
-    # ---- groups ----
-
     def _groups(self, runs: Sequence[Run]) -> list[list[_BatchJob]]:
-        """Return the runs that can be stepped together, group by group."""
         cases: dict[int, tuple[_SharedRun, list[int]]] = {}
         for place, (parts, settings) in enumerate(runs):
             try:
@@ -107,7 +99,6 @@ class Batch:
         return [jobs for jobs in groups.values() if jobs and _fit(jobs)]
 
     def _share(self, parts: Parts, settings: Settings) -> _SharedRun:
-        """Return what runs of these parts share, whatever their seeds."""
         # Runs that differ only in their seeds share everything but their starts.
         shared, unseeded = self._shared.setdefault(parts, {}), settings._replace(seed=0)
         if unseeded not in shared:
@@ -120,8 +111,6 @@ class Batch:
                     group = self.kinds.of(loop, unseeded)
                 shared[unseeded] = _SharedRun(prepared, Starts(prepared.parts), loop, group)
         return shared[unseeded]
-
-    # ---- runs ----
 
     def _together(
         self, jobs: list[_BatchJob], progress: StepCount | None
@@ -185,7 +174,6 @@ def _run_alone(
 
 
 def _jobs(case: _SharedRun, places: Sequence[int], chosen: Sequence[Settings]) -> list[_BatchJob]:
-    """Return the jobs of runs whose starts the laws accept."""
     parts = case.prepared.parts
     assert isinstance(parts.drive, Laws)
     try:
@@ -206,7 +194,7 @@ def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _Ba
     if not world.ideal:
         # Draws of a seed of its own.
         drawn = {
-            "motion": Motion.of(problem.model, world, settings, len(states)),
+            "motion": PlantStep.of(problem.model, world, settings, len(states)),
             "channel": channel_of(prepared.parts, settings),
             "sensors": sensors_of(prepared.parts, settings),
         }

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from echelon.core.types import Array
-from echelon.simulation.step.drive import Chunk, Moment, Stepper
+from echelon.simulation.step.drive import Chunk, LoopState, Stepper
 from echelon.simulation.step.settings import Settings
 
 _CHUNKS = 100
@@ -26,7 +26,6 @@ class ChunkGrid:
     """
 
     def __init__(self, settings: Settings, longest: int) -> None:
-        """Choose the points."""
         self.steps, self.every = settings.steps, settings.store_every
         longest = min(longest, self.every * -(-self.frames // _CHUNKS))
         # Frames farther apart than a chunk is long are cut between, and those cuts are not stored.
@@ -59,16 +58,10 @@ class ChunkGrid:
         return ((points % self.every == 0) | (points == self.steps)) & ~repeated
 
 
-# ---- the step at which a run diverges ------------------------------------------------------------
-
-
 def advance_until_lost(
-    stepper: Stepper, now: Moment, counts: Array, reference: Array | None, formations: int
+    stepper: Stepper, now: LoopState, counts: Array, reference: Array | None, formations: int
 ) -> tuple[Chunk, Array]:
-    """Return a chunk, and the steps after each of its points.
-
-    If formations diverge in it, there is a point at the first step at which each is not finite.
-    """
+    """Return a chunk and the steps after its points, one of them where a formation diverges."""
     chunk = stepper.advance(now, counts, reference)
     if not stepper.repeats or np.isfinite(np.asarray(chunk.now.states)).all():
         return chunk, counts
@@ -82,9 +75,8 @@ def advance_until_lost(
 
 
 def _first_lost(
-    stepper: Stepper, now: Moment, counts: Array, reference: Array | None, formations: int
+    stepper: Stepper, now: LoopState, counts: Array, reference: Array | None, formations: int
 ) -> dict[int, tuple[Array, Array]]:
-    """Return states and inputs at the steps at which formations first are not finite."""
     total, step, lost = int(counts.sum()), 0, np.zeros(formations, bool)
     frames = dict[int, tuple[Array, Array]]()
     while step < total and not lost.all():

@@ -100,10 +100,7 @@ class FrameNumbers(abc.ABC):
 
     @property
     def errors(self) -> Float[Array, "T N n"]:
-        """Deviation of each agent from its goal relative to its nearest leader.
-
-        The leaders' rows are zero.
-        """
+        """Deviation of each agent from its goal relative to its nearest leader; 0 of leaders."""
         return self.deviations()
 
     @property
@@ -198,7 +195,6 @@ class FrameNumbers(abc.ABC):
 def _approaches_of_some(
     places: Float[Array, "T N k"], presence: Bool[Array, "T N"], times: Float[Array, " T"]
 ) -> list[ClosestPair]:
-    """Return `approaches` of the agents that are present in each frame."""
     pairs = list[ClosestPair]()
     for place, here, time in zip(places, presence, times.tolist(), strict=True):
         who = np.flatnonzero(here)

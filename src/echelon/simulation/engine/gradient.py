@@ -19,8 +19,8 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.simulate import sample_reference
 from echelon.simulation.step.distances import distance_of
-from echelon.simulation.step.drive import Drive, Problem
-from echelon.simulation.step.loop import Loop, Moment, assemble
+from echelon.simulation.step.drive import Controller, Problem
+from echelon.simulation.step.loop import Loop, LoopState, assemble
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.sequence import begin, measured_step
 from echelon.simulation.step.settings import Settings
@@ -95,12 +95,7 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
     return Gradient(float(value), by_variable, jax.tree.map(np.asarray, sums))
 
 
-def _values_of(problem: Problem, drive: Drive, wrt: Sequence[str]) -> dict[str, Array]:
-    """Return the values of the variables by name.
-
-    Raises:
-        SimulationError: no laws drive the run, the law has no gain, or a variable is unknown.
-    """
+def _values_of(problem: Problem, drive: Controller, wrt: Sequence[str]) -> dict[str, Array]:
     gain = drive.gain
     if not isinstance(drive, Laws):
         raise SimulationError(
@@ -118,11 +113,6 @@ def _values_of(problem: Problem, drive: Drive, wrt: Sequence[str]) -> dict[str, 
 
 
 def _cost_number(cost: Cost, sums: Sums) -> jax.Array:
-    """Return the cost of sums.
-
-    Raises:
-        SimulationError: it fails, or is not one number.
-    """
     try:
         value = cost(sums)
     # The cost is the user's code, which may raise whatever it likes.
@@ -147,8 +137,6 @@ def _differentiate(
     steps: int,
     cost: Cost,
 ) -> tuple[tuple[jax.Array, Sums], dict[str, jax.Array]]:
-    """Return the cost, the sums of the run, and the slopes."""
-
     def whole(values: dict[str, jax.Array]) -> tuple[jax.Array, Sums]:
         start = jnp.asarray(values.get("initial", states))
         changed = _with_offsets(_with_gain(loop, values), values)
@@ -159,7 +147,6 @@ def _differentiate(
 
 
 def _with_gain(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
-    """Return the loop with other numbers in the followers' gain."""
     numbers = {name: values[name] for name in ("P", "R", "coupling") if name in values}
     if "R" in numbers:
         numbers["R_inverse"] = jnp.linalg.inv(numbers["R"])
@@ -172,7 +159,6 @@ def _with_gain(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
 
 
 def _with_offsets(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
-    """Return the loop with other offsets of the goals."""
     if "offsets" not in values:
         return loop
     offsets, meter = values["offsets"], loop.meter
@@ -186,14 +172,12 @@ def _with_offsets(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
 
 
 def _sums(loop: Loop, states: jax.Array, reference: Array | None, steps: int) -> Sums:
-    """Return the sums over the steps of a run."""
-
-    def one(carry: tuple[Moment, Sums], _: None) -> tuple[tuple[Moment, Sums], None]:
+    def one(carry: tuple[LoopState, Sums], _: None) -> tuple[tuple[LoopState, Sums], None]:
         now, sums = measured_step(loop, carry[0], reference, 0)
         return (now, carry[1].plus(sums)), None
 
     @jax.checkpoint
-    def several(carry: tuple[Moment, Sums], _: None) -> tuple[tuple[Moment, Sums], None]:
+    def several(carry: tuple[LoopState, Sums], _: None) -> tuple[tuple[LoopState, Sums], None]:
         return jax.lax.scan(one, carry, None, length=few)
 
     # Checkpoints and the steps after each are then equally many: the least memory.

@@ -20,7 +20,7 @@ from echelon.core.errors import SimulationError
 from echelon.core.types import Array, PyTree
 from echelon.simulation.native.varying import is_number
 from echelon.simulation.step.drive import Chunk, Stepper
-from echelon.simulation.step.loop import Loop, Moment, WorldState
+from echelon.simulation.step.loop import Loop, LoopState, WorldState
 from echelon.simulation.step.meter import Sums, on_host
 from echelon.simulation.step.sequence import Frames, advance, begin
 
@@ -55,7 +55,6 @@ class JaxStepper(Stepper):
     """
 
     def __init__(self, loop: Loop, states: Array, reason: str = "", devices: int = 1) -> None:
-        """Store what the steps need."""
         self.loop, self.states, self.reason = loop, states, reason
         self.mesh = mesh_of(devices, len(states)) if devices > 1 else None
 
@@ -78,11 +77,11 @@ class JaxStepper(Stepper):
         """Continue in a loop that is like the one before but for its numbers."""
         self.loop = loop
 
-    def start(self) -> Moment:
+    def start(self) -> LoopState:
         """Return the moment at which the run begins."""
         return begin(self.loop, self.states)
 
-    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+    def advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; a divergence is noticed afterwards."""
         step = advance if self.mesh is None else partial(advance_parted, self.mesh)
         now, frames, sums = step(self.loop, now, counts, reference, now.step)
@@ -90,21 +89,11 @@ class JaxStepper(Stepper):
         return Chunk(now, states, inputs, sums.split(1))
 
 
-# ---- many formations -----------------------------------------------------------------------------
-
-
 @final
 class JaxFormations(Stepper):
-    """Steps many formations whose loops differ in numbers alone, each as if it were alone.
-
-    Args:
-        loops: of each formation.
-        states: (N, n) at the beginning, formation by formation.
-        reason: as in `JaxStepper`.
-    """
+    """Steps many formations whose loops differ in numbers alone, each as if it were alone."""
 
     def __init__(self, loops: Sequence[Loop], states: Array, reason: str = "") -> None:
-        """Stack what differs."""
         self.count, self.states, self.reason = len(loops), states, reason
         self.loop, self.axes = _stack(loops)
 
@@ -118,31 +107,31 @@ class JaxFormations(Stepper):
         """Steps of a chunk, those of one formation alone."""
         return _longest(len(self.states) // self.count)
 
-    def start(self) -> Moment:
+    def start(self) -> LoopState:
         """Return the moment at which all runs begin, a formation a row."""
         states = jnp.asarray(self.states).reshape(self.count, -1, self.states.shape[1])
         return _begin_all(self.loop, self.axes, states)
 
-    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+    def advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; formations follow each other in what is returned."""
         now, frames, sums = _advance_all(self.loop, self.axes, now, counts, reference)
         states, inputs = (part.reshape(len(part), -1, part.shape[3]) for part in on_host(frames))
         return Chunk(now, states, inputs, on_host(sums))
 
 
-_ALL = Moment(None, 0, 0, 0, 0, WorldState(*(0,) * len(WorldState._fields)))  # type: ignore[arg-type]
+_ALL = LoopState(None, 0, 0, 0, 0, WorldState(*(0,) * len(WorldState._fields)))  # type: ignore[arg-type]
 """All are at the same step."""
 
 
 @cached_jit
-def _begin_all(loop: Loop, axes: PyTree, states: jax.Array) -> Moment:
+def _begin_all(loop: Loop, axes: PyTree, states: jax.Array) -> LoopState:
     return eqx.filter_vmap(begin, in_axes=(axes, 0), out_axes=_ALL)(loop, states)
 
 
 @cached_jit
 def _advance_all(
-    loop: Loop, axes: PyTree, now: Moment, counts: Array, reference: Array | None
-) -> tuple[Moment, Frames, Sums]:
+    loop: Loop, axes: PyTree, now: LoopState, counts: Array, reference: Array | None
+) -> tuple[LoopState, Frames, Sums]:
     in_axes = (axes, _ALL, None, None, None)
     return eqx.filter_vmap(advance, in_axes=in_axes, out_axes=(_ALL, 1, 0))(
         loop, now, counts, reference, now.step
@@ -170,15 +159,8 @@ def _differ(leaves: Sequence[object]) -> bool:
     return any(np.asarray(leaf).tobytes() != np.asarray(leaves[0]).tobytes() for leaf in leaves)
 
 
-# ---- several devices -----------------------------------------------------------------------------
-
-
 def mesh_of(devices: int, agents: int) -> Mesh:
-    """Return a row of devices, over which the agents are spread.
-
-    Raises:
-        SimulationError: JAX has fewer, or the number of agents is no multiple of them.
-    """
+    """Return a row of devices; `SimulationError` if JAX has fewer, or agents are no multiple."""
     available = jax.devices()
     if devices > len(available):
         raise SimulationError(
@@ -202,11 +184,11 @@ def mesh_of(devices: int, agents: int) -> Mesh:
 def advance_parted(
     mesh: Mesh,
     loop: Loop,
-    now: Moment,
+    now: LoopState,
     counts: jax.Array,
     reference: Array | None,
     first: jax.Array,
-) -> tuple[Moment, Frames, Sums]:
+) -> tuple[LoopState, Frames, Sums]:
     """Do what `advance` does, with the agents spread over the devices of a mesh."""
     agents = len(loop.offsets)
 

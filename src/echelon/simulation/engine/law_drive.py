@@ -31,7 +31,7 @@ from echelon.simulation.native import is_installed
 from echelon.simulation.native.agent_step import BlockRows
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.scalars import Unsupported
-from echelon.simulation.step.drive import Drive, Information, Problem, Stepper
+from echelon.simulation.step.drive import Controller, Information, Problem, Stepper
 from echelon.simulation.step.loop import assemble
 from echelon.simulation.step.settings import Settings
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:  # a gain is passed on to callers, and never read here
 
 
 @final
-class Laws(Drive):
+class Laws(Controller):
     """One law for the leaders, and one for all others.
 
     Args:
@@ -52,7 +52,6 @@ class Laws(Drive):
     follower: Law
 
     def __check_init__(self) -> None:
-        """Check the types of the laws."""
         for place in ("leader", "follower"):
             check_kind(place, getattr(self, place), Law)
 
@@ -166,7 +165,7 @@ class Laws(Drive):
         """
         motion = formation.motion
         assert motion is not None
-        if self.safety is not None and motion.moves([*graph.leaders, *graph.heirs]):
+        if self.safety is not None and motion.moves([*graph.leaders, *graph.backups]):
             raise LawError(
                 "`safety` keeps agents apart that move relative to the leader, whose own offset "
                 "must be constant; leave out its new offset."
@@ -179,34 +178,34 @@ class Laws(Drive):
             "offsets that change with time, and lags behind them; `stopping-point` does not.",
         )
 
-    def check_heirs(self, graph: Graph) -> None:
+    def check_backups(self, graph: Graph) -> None:
         """Check that followers can take the lead, and leaders can follow.
 
         Raises:
             SimulationError: they cannot.
         """
-        if not graph.heirs:
+        if not graph.backups:
             return
         name = f"`{type(self.leader).__name__}`"
         if not self.leader.plans:
             raise SimulationError(
-                f"got `heirs`, but a leader under the law {name} has no plan that they could carry "
-                "on; give it a `reference`."
+                f"got `backups`, but a leader under the law {name} has no plan that they could "
+                "carry on; give it a `reference`."
             )
         if self.follower.feedforward is Feedforward.PARENT:
             raise SimulationError(
-                "got `heirs`, but with `feedforward: parent` nobody knows who leads; use `relay`."
+                "got `backups`, but with `feedforward: parent` nobody knows who leads; use `relay`."
             )
         observers = {getattr(law, "observer", None) for law in (self.leader, self.follower)}
         first, then = self.leader.init(), self.follower.init()
-        # How many others hold it back an heir forgets when it leads.
+        # How many others hold it back a backup leader forgets when it leads.
         then = then._replace(active=None) if isinstance(then, FlatMemory) else then
         trees = {*map(jax.tree.structure, (first, then))}
         if len(trees) > 1 or len(observers) > 1:
             raise SimulationError(
-                f"got `heirs`, but followers under `{type(self.follower).__name__}` remember other "
-                f"things than a leader under {name}, and could not take over; give both the same "
-                "kind of law, with the same `observer`."
+                f"got `backups`, but followers under `{type(self.follower).__name__}` remember "
+                f"other things than a leader under {name}, and could not take over; give both "
+                "the same kind of law, with the same `observer`."
             )
 
     def accept(self, problem: Problem) -> None:
@@ -340,10 +339,7 @@ def choose_engine(
 
 
 def worth_native(settings: Settings, agents: int) -> bool:
-    """Tell whether native code steps the agents: if it is requested, or saves time.
-
-    It computes on processors alone.
-    """
+    """Tell whether native code is requested, or saves time; it computes on processors alone."""
     if settings.engine != "auto":
         return settings.engine == "native"
     if settings.devices > 1 or not is_long(settings, agents):
@@ -357,7 +353,6 @@ def is_long(settings: Settings, agents: int) -> bool:
 
 
 def _in_words(error: EchelonError) -> str:
-    """Return why there is no native code."""
     if isinstance(error, Unsupported):
         return f"there is no native code for {error}"
     return str(error).rstrip(".")

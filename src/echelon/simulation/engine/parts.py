@@ -22,7 +22,7 @@ from echelon.agents.world.world import World
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.types import Array
 from echelon.core.words import amount
-from echelon.simulation.step.drive import Drive, Information
+from echelon.simulation.step.drive import Controller, Information
 from echelon.simulation.step.leadership import Leadership
 
 Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.ndarray | None
@@ -32,11 +32,7 @@ Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.nd
 def read_states(
     values: object, shape: tuple[int, ...], what: str, meaning: str
 ) -> Float[Array, "..."]:
-    """Return a copy of given states, after checking them; `what` and `meaning` are for messages.
-
-    Raises:
-        SimulationError: they have another shape, or are not finite.
-    """
+    """Return a checked copy of states, else `SimulationError` with `what` and `meaning`."""
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -79,7 +75,7 @@ class Parts:
     model: ControlAffine
     graph: Graph
     formation: Formation
-    drive: Drive
+    drive: Controller
     initial: Initial = None
     start_error: Mapping[str, float] = dataclasses.field(default_factory=dict)
     world: World = dataclasses.field(default_factory=World)
@@ -87,9 +83,8 @@ class Parts:
     leadership: Leadership | None = None
 
     def __post_init__(self) -> None:
-        """Check that each part is of the kind of its place, and what can be checked of starts."""
         # The model is left out: `check_model` says more of what is wrong with one.
-        kinds = {"graph": Graph, "formation": Formation, "drive": Drive, "world": World}
+        kinds = {"graph": Graph, "formation": Formation, "drive": Controller, "world": World}
         for place, kind in kinds.items():
             check_kind(place, getattr(self, place), kind)
         if self.leadership is not None:
@@ -101,10 +96,9 @@ class Parts:
             )
         self._check_starts()
         object.__setattr__(self, "events", tuple(self.events))
-        object.__setattr__(self, "graph", self.graph.with_events(self.events, self.heirs))
+        object.__setattr__(self, "graph", self.graph.with_events(self.events, self.backups))
 
     def _check_starts(self) -> None:
-        """Check the shape of given states, and the names and signs of spreads."""
         for named in (self.initial, self.start_error):
             for name in named if isinstance(named, Mapping) else ():
                 if isinstance(name, str) and isinstance(self.model, ControlAffine):
@@ -125,9 +119,9 @@ class Parts:
             )
 
     @property
-    def heirs(self) -> tuple[int, ...]:
+    def backups(self) -> tuple[int, ...]:
         """Who takes the lead after the leader, in this order."""
-        return () if self.leadership is None else tuple(self.leadership.heirs)
+        return () if self.leadership is None else tuple(self.leadership.backups)
 
     @property
     def information(self) -> Information:
@@ -151,9 +145,6 @@ class Parts:
     def replace(self, **changes: object) -> "Parts":
         """Return a copy with some parts changed."""
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
-
-
-# ---- the states at the beginning -----------------------------------------------------------------
 
 
 def initial_states(parts: Parts, seed: int) -> Float[Array, "N n"]:
@@ -182,7 +173,6 @@ class Starts:
     """
 
     def __init__(self, parts: Parts) -> None:
-        """Compute what does not depend on the seed."""
         model, graph, initial = parts.model, parts.graph, parts.initial
         self.graph, self.shape = graph, (graph.agents, len(model.state_names))
         self.error = _per_state(model, parts.start_error, "start error")
@@ -223,7 +213,6 @@ class Starts:
 
 
 def _place(states: Float[Array, "K N n"], named: Mapping[int, ArrayLike], graph: Graph) -> None:
-    """Put agents into the states that are given for them, in all starts (K, N, n)."""
     for agent, state in named.items():
         _check_agent(agent, graph)
         states[:, agent] = read_states(
@@ -240,7 +229,6 @@ def _check_agent(agent: int, graph: Graph) -> None:
 
 
 def _per_state(model: ControlAffine, named: Mapping[str, Any], what: str) -> Float[Array, " n"]:
-    """Return one finite number for each state, (n,), from numbers by state or group."""
     for name, value in named.items():
         if not np.isfinite(value):
             raise SimulationError(f"the {what} of `{name}` is {value}, and must be finite.")

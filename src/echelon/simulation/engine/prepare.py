@@ -24,8 +24,8 @@ from echelon.core.words import amount
 from echelon.simulation.engine.frame_numbers import ClosestPair
 from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.step.drive import Problem
-from echelon.simulation.step.meter import Meter
-from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.meter import RunStatistics
+from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.settings import Settings
 
 
@@ -38,7 +38,6 @@ class Prepared(NamedTuple):
 
 
 def _size(prepared: Prepared) -> int:
-    """Return the bytes of what is held with prepared parts."""
     arrays = jax.tree.leaves((prepared.problem.meter, prepared.problem.states))
     return sum(np.asarray(array).nbytes for array in arrays)
 
@@ -75,7 +74,6 @@ def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepare
 
 
 def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
-    """Prepare parts that are not in the cache."""
     model, graph, formation = parts.model, parts.graph, parts.formation
     # Gains, plans and starts are the same in a float32 run, and so is what is guaranteed of them.
     with precision("float64"):
@@ -92,7 +90,7 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
         parts.world.check_agents(model, graph.agents)
         # Its own numbers first: whether they suit the laws is asked of a network that can be.
         channel = channel_of(parts, settings)
-        drive.check_heirs(graph)
+        drive.check_backups(graph)
         if parts.leadership is not None:
             parts.leadership.check_network(parts.world.network)
         drive.check_world(parts.world, graph, settings.dt)
@@ -100,8 +98,8 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
             model,
             graph,
             formation,
-            Motion.of(model, parts.world, settings, graph.agents),
-            Meter.of(
+            PlantStep.of(model, parts.world, settings, graph.agents),
+            RunStatistics.of(
                 model, graph, formation, settings, drive.safety and drive.safety.scales(model)
             ),
             settings,
@@ -132,11 +130,7 @@ def channel_of(parts: Parts, settings: Settings) -> Channel | None:
 
 
 def check_engine(parts: Parts, settings: Settings) -> None:
-    """Check, before anything is compiled, that the engine which is requested can step the agents.
-
-    Raises:
-        EchelonError: it cannot, or a part is malformed or does not fit the others.
-    """
+    """Raise `EchelonError`, before compiling, unless the requested engine can step the agents."""
     if settings.engine == "native":
         prepared = prepare(parts, settings)
         with precision("float64"):
@@ -144,11 +138,7 @@ def check_engine(parts: Parts, settings: Settings) -> None:
 
 
 def check_memory(model: ControlAffine, agents: int, settings: Settings) -> None:
-    """Check that memory suffices for what a run of so many agents stores.
-
-    Raises:
-        SimulationError: it does not; the text says how many frames would fit.
-    """
+    """Raise `SimulationError`, with how many frames would fit, unless memory suffices for a run."""
     n, m = len(model.state_names), len(model.input_names)
     every = settings.store_every
     # The last term is the reference.
@@ -159,9 +149,8 @@ def check_memory(model: ControlAffine, agents: int, settings: Settings) -> None:
 
 
 def _check_events(parts: Parts, settings: Settings) -> None:
-    """Check that all that happens does so during the run."""
     graph = parts.graph
-    for fault in event_faults(graph.before, graph.events, graph.heirs, settings.horizon):
+    for fault in event_faults(graph.before, graph.events, graph.backups, settings.horizon):
         raise SimulationError(f"{fault.text}.")
     if graph.presence is not None and settings.devices > 1:
         raise SimulationError(
@@ -177,8 +166,6 @@ def _check_offsets(model: ControlAffine, parts: Parts) -> None:
             f"with {amount(shape[1], 'state')} need {shape}."
         )
 
-
-# ---- what is allowed and probably not intended ---------------------------------------------------
 
 _HALF_TURN = 3.0
 """Below half a turn in rad: no smaller spread is looked at, since `difference` is compiled."""
@@ -229,7 +216,6 @@ def _coarse(model: ControlAffine, states: Array, settings: Settings) -> Iterator
 
 
 def _goals(model: ControlAffine, formation: Formation) -> Iterator[str]:
-    """Yield offsets that break a symmetry of the model, and goals that are equal or too close."""
     broken = formation.broken_symmetries(model)
     # One warning is enough: the other offsets mostly break the same symmetry.
     for agent, reason in list(broken.items())[:1]:
@@ -255,7 +241,6 @@ def _goals(model: ControlAffine, formation: Formation) -> Iterator[str]:
 
 
 def _meetings(model: ControlAffine, motion: FormationMotion) -> Iterator[str]:
-    """Yield the reshapes in which agents touch on their straight ways."""
     for begin, i, j, apart in motion.meetings():
         if apart <= 2.0 * (model.radius or 0.0) + _MET:
             yield (
@@ -265,7 +250,6 @@ def _meetings(model: ControlAffine, motion: FormationMotion) -> Iterator[str]:
 
 
 def _starts(model: ControlAffine, states: Array) -> Iterator[str]:
-    """Yield the first agent that starts where the equations do not hold, for each state."""
     for name, (low, high) in model.chart.items():
         values = states[:, model.state_names.index(name)]
         outside = np.flatnonzero(~((low < values) & (values < high)))

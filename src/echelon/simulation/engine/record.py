@@ -10,14 +10,14 @@ from echelon.core.errors import Outcome
 from echelon.core.types import Array
 from echelon.simulation.engine.chunk_grid import ChunkGrid, finite_formations
 from echelon.simulation.step.drive import Chunk, Problem, numbers
-from echelon.simulation.step.meter import ALWAYS, Meter, Sums, on_host, outside
+from echelon.simulation.step.meter import ALWAYS, RunStatistics, Sums, on_host, outside
 
 _BY_FRAME = ("times", "states", "inputs", "reference")
 """What a stretch has of each frame."""
 _VERBS = {Outcome.INTERRUPTED: "interrupted", Outcome.STOPPED: "ended from outside"}
 
 
-class Stretch(NamedTuple):
+class Segment(NamedTuple):
     """A part of a run in NumPy; a run can be continued from its last stretch alone.
 
     Attributes:
@@ -49,7 +49,7 @@ class Stretch(NamedTuple):
         """Whether every number of its frames is finite."""
         return bool(np.isfinite(self.states).all() and np.isfinite(self.inputs).all())
 
-    def rows(self, rows: Array | slice) -> "Stretch":
+    def rows(self, rows: Array | slice) -> "Segment":
         """Return some of its frames."""
         names = [name for name in _BY_FRAME if getattr(self, name) is not None]
         return self._replace(**{name: getattr(self, name)[rows] for name in names})
@@ -95,20 +95,20 @@ class Recorder:
     """
 
     def __init__(
-        self, problems: Sequence[Problem], grid: ChunkGrid, before: Sequence[Stretch] = ()
+        self, problems: Sequence[Problem], grid: ChunkGrid, before: Sequence[Segment] = ()
     ) -> None:
         """Begin after the stretches of an earlier session, if any."""
-        self.problems, self.grid, self.stretches = problems, grid, list(before)
+        self.problems, self.grid, self.segments = problems, grid, list(before)
         nothing = on_host(problems[0].meter.zero_sums(np))
-        sums = [stretch.sums for stretch in before[-1:]] or [nothing] * len(problems)
+        sums = [segment.sums for segment in before[-1:]] or [nothing] * len(problems)
         self.sums = Sums(*map(np.stack, zip(*sums, strict=True)))
-        self.frames = sum(len(stretch.times) for stretch in before)
-        self._finite = np.full(len(problems), all(stretch.finite for stretch in before))
+        self.frames = sum(len(segment.times) for segment in before)
+        self._finite = np.full(len(problems), all(segment.finite for segment in before))
 
     @property
     def done(self) -> int:
         """The number of steps so far."""
-        return self.stretches[-1].done if self.stretches else 0
+        return self.segments[-1].done if self.segments else 0
 
     @property
     def complete(self) -> bool:
@@ -118,14 +118,11 @@ class Recorder:
     @property
     def ended(self) -> bool:
         """Whether no further step is to be taken."""
-        stopped = bool(self.stretches) and self.stretches[-1].stopped is not None
+        stopped = bool(self.segments) and self.segments[-1].stopped is not None
         return self.complete or stopped or not self._finite.any()
 
     def keep(self, chunk: Chunk, counts: Array, reference: Array | None, seconds: float) -> None:
-        """Keep the stretch of a chunk with so many steps after each point.
-
-        It followed a reference (S, n) step by step.
-        """
+        """Keep the stretch of a chunk with steps after its points, along a reference (S, n)."""
         first = self.done
         # One that stopped has fewer points.
         points = (first + np.cumsum(counts) - counts)[: len(chunk.states)]
@@ -140,11 +137,11 @@ class Recorder:
         self.frames += int(frames.sum())
         alone = len(self.problems) == 1
         rows = None if reference is None else reference[points[stored] - first]
-        if self.stretches:
+        if self.segments:
             # Only the last one's are read, and those of all stretches would fill the memory.
-            self.stretches[-1] = self.stretches[-1]._replace(moment=(), sums=self.sums)
-        self.stretches.append(
-            Stretch(
+            self.segments[-1] = self.segments[-1]._replace(moment=(), sums=self.sums)
+        self.segments.append(
+            Segment(
                 first,
                 first + int(chunk.sums.steps[0, 0]),
                 self.problems[0].settings.dt * points[stored],
@@ -160,14 +157,14 @@ class Recorder:
 
     def stop(self, reason: str) -> None:
         """Store the reason why the run stops."""
-        self.stretches[-1] = self.stretches[-1]._replace(stopped=reason)
+        self.segments[-1] = self.segments[-1]._replace(stopped=reason)
 
     def close(self, unfinished: Outcome) -> Iterator[Record]:
         """Yield the record of each formation, cut at its first frame that is not finite.
 
         `unfinished` is the outcome of a run that neither reached its horizon nor diverged.
         """
-        whole = join(self.stretches) or self._nothing()
+        whole = join(self.segments) or self._nothing()
         states, inputs = (
             np.ascontiguousarray(self._by_formation(part).swapaxes(0, 1))
             for part in (whole.states, whole.inputs)
@@ -186,12 +183,11 @@ class Recorder:
                 yield self._closed(problem, mine, unfinished)
 
     def _by_formation(self, rows: Float[np.ndarray, "T FN k"]) -> Float[np.ndarray, "T F N k"]:
-        """Return rows of agents that follow each other, with an axis of formations."""
         count = len(self.problems)
         return rows.reshape(len(rows), count, rows.shape[1] // count, rows.shape[2])
 
     def _inside(
-        self, whole: Stretch, states: Float[np.ndarray, "F T N n"]
+        self, whole: Segment, states: Float[np.ndarray, "F T N n"]
     ) -> Bool[np.ndarray, " F"]:
         """Return which formations reached the horizon, finite and in their chart."""
         if not self.complete or whole.stopped is not None:
@@ -200,15 +196,13 @@ class Recorder:
         inside = inside_at_last(meter, self.sums.inside, states[:, -1], steps)
         return self._finite & (inside >= ALWAYS).all(axis=(1, 2))
 
-    def _nothing(self) -> Stretch:
-        """Return a stretch without frames, whose arrays have the right shapes."""
+    def _nothing(self) -> Segment:
         states = np.concatenate([problem.states for problem in self.problems])
         m = len(self.problems[0].model.input_names)
         empty = np.zeros((0, *states.shape)), np.zeros((0, len(states), m))
-        return Stretch(0, 0, np.zeros(0), *empty, None, self.sums, (), None, 0.0)
+        return Segment(0, 0, np.zeros(0), *empty, None, self.sums, (), None, 0.0)
 
-    def _closed(self, problem: Problem, whole: Stretch, unfinished: Outcome) -> Record:
-        """Return the record of a formation, cut at its first frame that is not finite."""
+    def _closed(self, problem: Problem, whole: Segment, unfinished: Outcome) -> Record:
         # In the order of frames, then agents: the first row is the first to be lost.
         lost = np.argwhere(~_finite(whole))
         outcome, message = self._verdict(problem, whole, lost, unfinished)
@@ -216,9 +210,8 @@ class Recorder:
         return whole.rows(rows).record(outcome, message)
 
     def _verdict(
-        self, problem: Problem, whole: Stretch, lost: Array, unfinished: Outcome
+        self, problem: Problem, whole: Segment, lost: Array, unfinished: Outcome
     ) -> tuple[Outcome, str]:
-        """Return how a run ended; `lost` are the frames and agents that are not finite."""
         if len(lost):
             frame, agent = lost[0]
             role, when = _role(problem, agent).lower(), f"by t = {whole.times[frame]:.6g} s"
@@ -232,8 +225,7 @@ class Recorder:
         what = whole.stopped or f"The run was {_VERBS[unfinished]}"
         return unfinished, f"{what} at t = {reached:.6g} s; what was computed is kept."
 
-    def _completed(self, problem: Problem, whole: Stretch) -> tuple[Outcome, str]:
-        """Return how a run ended that reached its horizon: whether all stayed in their chart."""
+    def _completed(self, problem: Problem, whole: Segment) -> tuple[Outcome, str]:
         last, meter, model = whole.states[-1], problem.meter, problem.model
         inside = inside_at_last(meter, whole.sums.inside, last, self.grid.steps)
         if not inside.size or inside.min() >= ALWAYS:
@@ -254,31 +246,23 @@ def _role(problem: Problem, agent: int) -> str:
     return "Leader" if agent in problem.graph.leaders else "Follower"
 
 
-def inside_at_last(meter: Meter, inside: Array, last: Array, steps: int) -> Array:
-    """Return `Sums.inside` (..., N, k) with the moment of the last step's end, which begins none.
-
-    Args:
-        meter: of the run.
-        inside: as it was counted at the beginning of each step.
-        last: the states (..., N, n) at the end.
-        steps: of the run.
-    """
+def inside_at_last(meter: RunStatistics, inside: Array, last: Array, steps: int) -> Array:
+    """Return `Sums.inside` (..., N, k) with the last moment, which begins no step."""
     beyond = outside(last[..., meter.charted], *meter.chart.T)
     return np.minimum(inside, np.where(beyond, steps, ALWAYS))
 
 
-def join(stretches: Sequence[Stretch]) -> Stretch | None:
+def join(segments: Sequence[Segment]) -> Segment | None:
     """Return stretches that follow each other as one; None where there is none."""
-    if len(stretches) < 2:
-        return stretches[0] if stretches else None
+    if len(segments) < 2:
+        return segments[0] if segments else None
     rows = dict[str, Array | None]()
     for name in _BY_FRAME:
-        parts = [getattr(stretch, name) for stretch in stretches]
+        parts = [getattr(segment, name) for segment in segments]
         rows[name] = None if any(part is None for part in parts) else np.concatenate(parts)
-    return stretches[-1]._replace(first=stretches[0].first, **rows)
+    return segments[-1]._replace(first=segments[0].first, **rows)
 
 
-def _finite(stretch: Stretch) -> Bool[np.ndarray, "T N"]:
-    """Return which agents are finite in which frames."""
-    states, inputs = (np.isfinite(part).all(axis=2) for part in (stretch.states, stretch.inputs))
+def _finite(segment: Segment) -> Bool[np.ndarray, "T N"]:
+    states, inputs = (np.isfinite(part).all(axis=2) for part in (segment.states, segment.inputs))
     return np.logical_and(states, inputs)

@@ -20,7 +20,7 @@ from echelon.core.words import amount
 from echelon.simulation.engine.frame_numbers import ClosestPair, FrameChoice, FrameNumbers
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.traffic import Traffic, traffic
-from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats
@@ -113,7 +113,7 @@ class Result(FrameNumbers):
         return self.parts.formation
 
     @property
-    def drive(self) -> Drive:
+    def drive(self) -> Controller:
         """What drove the agents."""
         return self.parts.drive
 
@@ -209,7 +209,6 @@ class Result(FrameNumbers):
         return self.length_unit or "state"
 
     def __repr__(self) -> str:
-        """Return the scenario, the numbers of agents and frames, and how the run ended."""
         # Neither arrays, which would fill the screen, nor parts, which may still have to be built.
         frames, agents = self.states.shape[:2]
         name = self.provenance.get("scenario", "")
@@ -217,7 +216,6 @@ class Result(FrameNumbers):
         return f"Result({who}, {amount(frames, 'frame')}, {self.message!r})"
 
     def _repr_html_(self) -> str:
-        """Return the run as a notebook displays it: a table with its picture."""
         return notebook_page("result", self)
 
     def view(self, height: int = 560) -> CellPage:
@@ -233,10 +231,6 @@ class Result(FrameNumbers):
             MissingExtraError: the page's three.js is not built.
         """
         return CellPage(notebook_page("replay", self), height)
-
-    def with_provenance(self, **texts: str) -> "Result":
-        """Return a copy with more provenance."""
-        return dataclasses.replace(self, provenance={**self.provenance, **texts})
 
 
 def finite_or_none(value: float | np.floating | None) -> float | None:

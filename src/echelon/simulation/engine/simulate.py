@@ -16,7 +16,7 @@ from echelon.core.types import Array
 from echelon.simulation.engine.chunk_grid import ChunkGrid, advance_until_lost
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared, prepare
-from echelon.simulation.engine.record import Record, Recorder, Stretch, join
+from echelon.simulation.engine.record import Record, Recorder, Segment, join
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.drive import Stepper, Stopped
 from echelon.simulation.step.settings import Settings
@@ -25,15 +25,9 @@ from echelon.simulation.step.solver_stats import SolverStats
 
 @final
 class RunSoFar:
-    """A run in progress, as passed to callbacks.
-
-    Attributes:
-        done: how many steps were taken.
-        steps: of the whole run.
-    """
+    """A run in progress, as passed to callbacks: `done` of so many `steps` were taken."""
 
     def __init__(self, prepared: Prepared, recorder: Recorder, stepper: Stepper) -> None:
-        """Note how many steps were taken."""
         self._prepared, self._recorder, self._stepper = prepared, recorder, stepper
         self.done, self.steps = recorder.done, recorder.grid.steps
 
@@ -45,7 +39,7 @@ class RunSoFar:
     @property
     def states(self) -> Array:
         """The states (N, n) of the newest stored frame."""
-        return next(x.states[-1] for x in reversed(self._recorder.stretches) if len(x.states))
+        return next(x.states[-1] for x in reversed(self._recorder.segments) if len(x.states))
 
     def result(self) -> Result:
         """Return the run so far as a result, such as for `metrics`."""
@@ -58,7 +52,7 @@ class RunSoFar:
 
 Progress: TypeAlias = Callable[[RunSoFar], None]
 """Called between chunks with the run so far."""
-Keep: TypeAlias = Callable[[Stretch], None]
+Keep: TypeAlias = Callable[[Segment], None]
 """Called with every stretch of a run in order, as soon as it is computed.
 
 Raising `Stopped`, with the reason in words, ends the run there.
@@ -76,7 +70,7 @@ def simulate(
     settings: Settings,
     progress: Progress | None = None,
     keep: Keep | None = None,
-    before: Sequence[Stretch] = (),
+    before: Sequence[Segment] = (),
 ) -> Result:
     """Simulate the closed loop and return its result.
 
@@ -112,10 +106,7 @@ def simulate(
 
 @contextlib.contextmanager
 def _mixed_tables() -> Iterator[None]:
-    """Say which table of a user JAX cannot use in two precisions.
-
-    It keeps one converted copy of an array of NumPy, by its identity and not by the precision.
-    """
+    """JAX keeps one converted copy of an array of NumPy, by its identity and not the precision."""
     try:
         yield
     except ValueError as error:
@@ -127,24 +118,15 @@ def _mixed_tables() -> Iterator[None]:
         ) from error
 
 
-def reassemble(parts: Parts, settings: Settings, stretches: Sequence[Stretch]) -> Result:
-    """Return the result of a run that was ended from outside.
-
-    Args:
-        parts: those of the run.
-        settings: those of the run.
-        stretches: all that it gave to `keep`.
-
-    Raises:
-        EchelonError: as in `simulate`.
-    """
+def reassemble(parts: Parts, settings: Settings, segments: Sequence[Segment]) -> Result:
+    """Return the result of a run, ended from outside, from all stretches that it gave to `keep`."""
     prepared = prepare(parts, settings)
     with precision("float64"):
         stepper = prepared.parts.drive.stepper(prepared.problem)
-    return _result(prepared, _recorder(prepared, stepper, stretches), stepper, Outcome.STOPPED)
+    return _result(prepared, _recorder(prepared, stepper, segments), stepper, Outcome.STOPPED)
 
 
-def _recorder(prepared: Prepared, stepper: Stepper, before: Sequence[Stretch]) -> Recorder:
+def _recorder(prepared: Prepared, stepper: Stepper, before: Sequence[Segment]) -> Recorder:
     problem = prepared.problem
     return Recorder([problem], ChunkGrid(problem.settings, stepper.longest), before)
 
@@ -185,11 +167,11 @@ class _ChunkLoop:
     ) -> None:
         self.stepper, self.prepared, self.recorder = stepper, prepared, recorder
         self.reference = _ReferenceRows(prepared)
-        last = recorder.stretches[-1] if recorder.stretches else None
+        last = recorder.segments[-1] if recorder.segments else None
         self.now = stepper.start() if last is None else stepper.recall(last.moment)
         # Shifted into the past by the time of earlier sessions, which counts too.
         self.began = began - (0.0 if last is None else last.seconds)
-        self.handed_over, self.last_time = len(recorder.stretches), time.perf_counter()
+        self.handed_over, self.last_time = len(recorder.segments), time.perf_counter()
 
     def run(self, progress: Progress | None, keep: Keep | None) -> None:
         """Take all remaining steps, until the run ends or is stopped."""
@@ -217,11 +199,10 @@ class _ChunkLoop:
         self.now = chunk.now
 
     def _hand_over(self, keep: Keep | None) -> None:
-        """Pass the new stretch to the callback."""
-        new = join(self.recorder.stretches[self.handed_over :])
+        new = join(self.recorder.segments[self.handed_over :])
         if keep is not None and new is not None:
             keep(new)
-        self.handed_over, self.last_time = len(self.recorder.stretches), time.perf_counter()
+        self.handed_over, self.last_time = len(self.recorder.segments), time.perf_counter()
 
 
 @final

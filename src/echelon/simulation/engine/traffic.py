@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from echelon.agents.network.channel import NEVER, Channel, Posts
+from echelon.agents.network.channel import NEVER, Channel, InFlight
 from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.hearing import edges_of
 from echelon.core.compiled import cached_jit
@@ -32,12 +32,12 @@ from echelon.simulation.step.knowledge import (
     usable_age,
     write,
 )
-from echelon.simulation.step.leadership import Succession
-from echelon.simulation.step.loop import Presence, Switches, exchange_at
+from echelon.simulation.step.leadership import Failover
+from echelon.simulation.step.loop import ActiveAgents, Switches, exchange_at
 from echelon.simulation.step.messages import (
     age_of,
     all_readers,
-    led_by_heirs,
+    led_by_backups,
     links_with,
     take,
 )
@@ -67,10 +67,7 @@ class Traffic(NamedTuple):
     def of_agents(
         self, edges: Int[Array, "E 2"], agents: int, presence: Bool[Array, "T N"] | None = None
     ) -> Float[Array, "T N"]:
-        """Return the age of the oldest message that each agent has of its neighbours, s.
-
-        Neighbours that are absent do not count, and an agent that is absent has none.
-        """
+        """Return the age (s) of each agent's oldest message; absent agents do not count."""
         ages = np.full((agents, len(self.ages)), -np.inf)
         both = True if presence is None else presence[:, edges].all(axis=2)
         for end in (0, 1):
@@ -101,7 +98,7 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
         readers = all_readers(graph.agents, np.array(graph.leaders))
         switches = Switches.of(graph, settings)
         numbers = np.asarray(steps), np.asarray(settings.dt)
-        cast = Presence.of(graph), Succession.of(graph, parts.leadership)
+        cast = ActiveAgents.of(graph), Failover.of(graph, parts.leadership)
         radio = _Radio(channel, exchange, switches, readers, receives, *numbers, *cast)
         followed = _follow(radio, ends.astype(np.int32))
         stamps, losses, counted = jax.tree.map(np.asarray, followed)
@@ -122,10 +119,7 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
 
 
 class _Radio(NamedTuple):
-    """The network of a run: who `receives` (K,) what, in a run of so many steps of dt (s).
-
-    Also who is there, and who takes the lead.
-    """
+    """The network of a run: who `receives` (K,) what, in a run of so many steps of dt (s)."""
 
     channel: Channel
     exchange: Exchange
@@ -134,8 +128,8 @@ class _Radio(NamedTuple):
     receives: Bool[Array, " K"]
     steps: Array
     dt: Array
-    presence: Presence | None
-    succession: Succession | None
+    presence: ActiveAgents | None
+    succession: Failover | None
 
 
 class _Counts(NamedTuple):
@@ -158,7 +152,7 @@ class _Carry(NamedTuple):
     """What a network remembers; stamps at the last frame, losses since then, and the counts."""
 
     step: jax.Array
-    posts: Posts
+    posts: InFlight
     mail: Mail
     stamps: Int[jax.Array, " K"]
     losses: Int[jax.Array, " K"]
@@ -169,10 +163,7 @@ class _Carry(NamedTuple):
 def _follow(
     radio: _Radio, ends: Int[Array, " T"]
 ) -> tuple[Int[jax.Array, "T K"], Int[jax.Array, "T K"], _Counts]:
-    """Return the newest stamps at each frame, the losses after it, and the counts of all steps.
-
-    What is between two frames ends before the steps ends (T,).
-    """
+    """Return the newest stamps at each frame, the losses after it, and the counts of all steps."""
 
     def frame(now: _Carry, end: jax.Array) -> tuple[_Carry, tuple[jax.Array, jax.Array]]:
         now, first = now._replace(losses=jnp.zeros_like(now.losses)), now.step
@@ -191,15 +182,12 @@ def _follow(
 
 
 def _step(radio: _Radio, first: jax.Array, now: _Carry) -> _Carry:
-    """Return what the network remembers a step later, of messages that say nothing.
-
-    Frames are stored at the step `first`.
-    """
+    """Take a step of messages that say nothing; frames are stored at the step `first`."""
     channel, readers = radio.channel, radio.readers
     exchange = exchange_at(radio.exchange, radio.switches, now.step)
     mail = take(channel, exchange, now.step, now.posts, now.mail)
     if radio.succession is not None:
-        packet = led_by_heirs(radio, now.step, mail.packet, radio.dt)
+        packet = led_by_backups(radio, now.step, mail.packet, radio.dt)
         mail = mail._replace(packet=packet)
         readers = readers._replace(leads=packet.leader == readers.number)
     ages = age_of(now.step, mail.stamp, radio.dt)

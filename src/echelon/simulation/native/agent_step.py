@@ -69,11 +69,7 @@ class BlockRows(NamedTuple):
 
     @classmethod
     def of(cls, loop: Loop, varying: int = 0) -> "BlockRows":
-        """Return the rows of a loop of which so many numbers differ between formations.
-
-        Raises:
-            Unsupported: the memory of a law is not made of numbers, or messages take time.
-        """
+        """Return a loop's rows; `Unsupported` if memory is not numbers, or messages take time."""
         check_information(loop)
         if not loop.motion.ideal:
             raise Unsupported(
@@ -91,11 +87,7 @@ class BlockRows(NamedTuple):
 
 
 def check_information(loop: Loop) -> None:
-    """Check that agents know exact states, current messages, and nothing else.
-
-    Raises:
-        Unsupported: they do not.
-    """
+    """Raise `Unsupported` unless agents know exact states, current messages, and nothing else."""
     if loop.moving is not None:
         raise Unsupported("formations that change with time")
     if loop.channel is not None:
@@ -106,11 +98,7 @@ def check_information(loop: Loop) -> None:
 
 
 def check_distances(loop: Loop) -> None:
-    """Check that agents keep no distances from each other, are always there and have no heirs.
-
-    Raises:
-        Unsupported: they are not so.
-    """
+    """Raise `Unsupported` if agents keep distances, come or go, or have backup leaders."""
     for part, text in (
         (loop.follower.safety, "agents that keep away from each other"),
         (loop.presence or loop.succession, "agents that are lost, join or take the lead"),
@@ -120,11 +108,7 @@ def check_distances(loop: Loop) -> None:
 
 
 def memory_size(law: Law) -> int:
-    """Return how many numbers the memory of one agent under a law has.
-
-    Raises:
-        Unsupported: it is not made of numbers, such as a random key.
-    """
+    """Return how many numbers a law's memory has; `Unsupported` of others, as a random key."""
     leaves = jax.tree.leaves(jax.eval_shape(law.init))
     for leaf in leaves:
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -162,7 +146,6 @@ def signal_size(loop: Loop) -> int:
 
 
 def _signal_of(loop: Loop, law: Law, x: jax.Array, offset: jax.Array, memory: Memory) -> jax.Array:
-    """Return the signal of an agent, of length 0 if it has none."""
     signal = law.signal(loop.model, x, offset, memory)
     return jnp.zeros(0, x.dtype) if signal is None else signal
 
@@ -305,10 +288,7 @@ def body_of(
 
 
 def _before_and_in_window(inputs: StepInputs, sums: list[Node]) -> list[Node]:
-    """Return a number for all steps and for the steady window as one before and one in the window.
-
-    Each step then adds to one of the two only.
-    """
+    """Split sums into before and in the steady window: each step adds to one of the two only."""
     all_, steady = sums
     return [all_.graph.make("select", inputs.steady[()], 0.0, all_), steady]
 
@@ -326,7 +306,6 @@ def _difference(loop: Loop, graph: ScalarGraph, states: int, signals: int) -> li
 def _step_inputs(
     loop: Loop, graph: ScalarGraph, rows: BlockRows, law: Law, leads: bool, follows: bool
 ) -> StepInputs:
-    """Return what a step depends on as leaves of a graph."""
     n, signals = len(rows.state), signal_size(loop)
 
     def row(places: range) -> np.ndarray:
@@ -373,7 +352,6 @@ def single(node: Node) -> np.ndarray:
 
 
 def _placed(rows: BlockRows, named: dict[str, list[Node]]) -> dict[int, Node]:
-    """Return row -> node for the entries of each name."""
     return {
         row: node
         for name, entries in named.items()
@@ -381,19 +359,12 @@ def _placed(rows: BlockRows, named: dict[str, list[Node]]) -> dict[int, Node]:
     }
 
 
-# ---- where the numbers of an agent are not what JAX computes -------------------------------------
-
-
 _SIZES = (1e9, 1e6, 1e3)
 """Sizes of what neighbours read, of which the first is taken for which a difference is right."""
 
 
 def exceptions_of(graph: ScalarGraph, body: Body) -> list[Node]:
-    """Return where the numbers of an agent are not what JAX computes.
-
-    Raises:
-        Unsupported: nothing is known of the angles in a difference.
-    """
+    """Return where an agent's numbers are not what JAX computes; `Unsupported` if not known."""
     truths, false = graph.exceptions_of(body.results()), graph.constant(False)
     truths += _between(graph, body)
     uniform = [truth for truth in truths if truth.uniform]

@@ -52,13 +52,7 @@ def plan_of(
     apart: bool = True,
     shifts: Shifts = ((), ()),
 ) -> Plan:
-    """Return the plan of some loops.
-
-    `apart` is false if all agents of each loop have one goal; `shifts` are those of their places.
-
-    Raises:
-        Unsupported: a law or the model has no scalar operations.
-    """
+    """Return the plan of loops; `apart` is false if all goals are one; or raise `Unsupported`."""
     loop, tracks = varying.loop, follows(varying.loop)
     n, one_leader = len(rows.state), len(loop.leaders) == 1
     plan = Plan(
@@ -90,10 +84,7 @@ def plan_of(
 
 
 def compiled(rows: BlockRows, plan: Plan, codes: BoundedCache[Code]) -> Kernel:
-    """Return the kernel of a plan.
-
-    `codes` are those compiled before, by their texts: other graphs are other numbers in the same.
-    """
+    """Return the kernel of a plan; `codes` by text, since another graph has the same code."""
     text = program(plan)
     code = codes.get_or_make(text, lambda: Code(text))
     return Kernel(code, rows, plan, len(shared(plan)))
@@ -111,7 +102,6 @@ class Kernels:
     """
 
     def __init__(self) -> None:
-        """Begin with an empty cache."""
         # A sweep over models has one after the other.
         self.codes, self._kernels = BoundedCache[Code](_MOST), BoundedCache[Kernel](_MOST)
 
@@ -125,13 +115,7 @@ class Kernels:
         apart: bool = True,
         shifts: Shifts = ((), ()),
     ) -> Kernel:
-        """Return the kernel of some loops, `weighted` if the weights of their edges may change.
-
-        `apart` and `shifts` as in `plan_of`.
-
-        Raises:
-            Unsupported: a law or the model has no scalar operations.
-        """
+        """Return the kernel of loops, `weighted` if weights may change; as `plan_of`."""
         # Also by wind and noise, which have rows only if they exist.
         wind, signature = jax.tree.structure(varying.loop.motion.wind), varying.signature
         key = (signature, wind, bits, LANES[bits], batched, row_major, weighted, apart, shifts)

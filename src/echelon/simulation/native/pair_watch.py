@@ -30,7 +30,6 @@ class PairWatch:
     def __init__(
         self, places: Places, axes: int, formations: int, dtype: np.dtype, steps: int
     ) -> None:
-        """Allocate memory for some steps."""
         numbers = places.blocks * axes * places.lanes
         self.steps = max(1, min(steps, _NUMBERS // max(1, numbers)))
         self.tape = aligned((self.steps, places.blocks, axes, places.lanes), dtype)
@@ -85,7 +84,6 @@ class PairWatch:
         self.used = 0
 
     def _search_all(self) -> None:
-        """Compare all pairs at all steps."""
         (i, j), count = self.pairs, self.formations
         axes = self.tape[: self.used].transpose(2, 0, 1, 3).reshape(self.tape.shape[2], -1)
         places = axes.reshape(len(axes), self.used, -1)[..., self.position].astype(float)
@@ -98,7 +96,6 @@ class PairWatch:
         self._keep(np.arange(count), np.sqrt(squares[np.arange(count), best]), step, pair)
 
     def _keep(self, f: Array, least: Array, step: Array, pair: Array) -> None:
-        """Keep the distances of some formations that are smaller than those before."""
         new, (i, j) = least < self.closest[f], self.pairs
         self.closest[f[new]] = least[new]
         rows = self.first + step[new], i[pair[new]], j[pair[new]]

@@ -23,7 +23,7 @@ from echelon.simulation.native.threads import ThreadPool
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import needed
 from echelon.simulation.step.drive import Chunk, Stepper
-from echelon.simulation.step.loop import Loop, Moment, begin_forgetful, stretch_at
+from echelon.simulation.step.loop import Loop, LoopState, begin_forgetful, stretch_at
 from echelon.simulation.step.meter import ALWAYS, Sums
 from echelon.simulation.step.sequence import begin, signals
 
@@ -64,7 +64,6 @@ class NativeStepper(Stepper):
         variant: Loop | None = None,
         threads: int | None = None,
     ) -> None:
-        """Generate and compile the step."""
         self.varying = VaryingNumbers(loops, variant)
         self.loop, self.loops, self.states, self.fallback = loops[0], loops, states, fallback
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
@@ -88,7 +87,7 @@ class NativeStepper(Stepper):
         self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
         # The moment in the blocks: a chunk that continues from it need not be written there.
-        self._moment: Moment | None = None
+        self._moment: LoopState | None = None
         self._hold, self._fallback_step = -1, -1
         axes, count = len(self.loop.meter.paired), len(loops)
         self._pairs = PairWatch(self.places, axes, count, self.dtype, _STEPS)
@@ -98,7 +97,6 @@ class NativeStepper(Stepper):
 
     @cached_property
     def _no_sums(self) -> Array:
-        """The sums of no step, (rows, lanes)."""
         rows = self.rows
         # Whole vectors, because to repeat single numbers takes as long as many steps.
         initial = np.zeros((rows.total, self.plan.lanes), self.dtype)
@@ -106,7 +104,6 @@ class NativeStepper(Stepper):
         return initial[rows.errors.start :]
 
     def _reserve(self) -> None:
-        """Allocate blocks and mirrors, and compute what does not change during a run."""
         places, plan = self.places, self.plan
         self.blocks = aligned((places.blocks, plan.rows, plan.lanes), self.dtype)
         self.mirrors = places.mirrors(plan, self.dtype)
@@ -123,12 +120,10 @@ class NativeStepper(Stepper):
         self.edges, self.edge_weights = self.neighbourhood.edges, self.neighbourhood.weights
 
     def _read(self, rows: range, out: Array) -> Array:
-        """Read rows of all agents into an array (N, rows), and return it."""
         self.threads.copy(self.blocks, rows, out)
         return out
 
     def _write(self, rows: range, values: Array) -> None:
-        """Write values of all agents, (N, rows)."""
         self.threads.copy(self.blocks, rows, np.ascontiguousarray(values, self.dtype), inward=True)
 
     # ---- steps ----
@@ -156,7 +151,7 @@ class NativeStepper(Stepper):
         more = int(_OPERATIONS[self.bits] / (self._work * agents))
         return max(_FEWEST, _AGENT_STEPS // agents, min(_ENOUGH, more))
 
-    def start(self) -> Moment:
+    def start(self) -> LoopState:
         """Return the moment at which the run begins."""
         states = np.asarray(self.states, self.dtype)
         if not len(self.rows.memory):
@@ -164,9 +159,9 @@ class NativeStepper(Stepper):
         pairs = zip(self.loops, np.split(np.asarray(self.states), len(self.loops)), strict=True)
         moments = [jax.tree.map(np.asarray, begin(loop, jnp.asarray(x))) for loop, x in pairs]
         many = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(m[1:] for m in moments))
-        return Moment(moments[0].step, *many)._replace(states=states)
+        return LoopState(moments[0].step, *many)._replace(states=states)
 
-    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+    def advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; divergence is detected afterwards."""
         if now is not self._moment:
             self._load(now)
@@ -185,7 +180,7 @@ class NativeStepper(Stepper):
         # Offsets, numbers and the wind are written with a moment.
         self._moment = None
 
-    def _advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+    def _advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
         self._clear_sums()
         first = int(now.step)
         table = None if reference is None else np.ascontiguousarray(reference, self.dtype)
@@ -227,10 +222,7 @@ class NativeStepper(Stepper):
         self._hold = hold
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
-        """Take steps, one draw of the wind and one stretch of the graph after the other.
-
-        The inputs of the first step are then in the rows.
-        """
+        """Take steps, one draw and one stretch at a time; the rows then have the first inputs."""
         wind, input_step = self.loop.motion.wind, step
         most = _TASKS // len(self.places.segments)
         if self.plan.leaders_ahead:
@@ -248,7 +240,6 @@ class NativeStepper(Stepper):
             step, steps = step + count, steps - count
 
     def _draw(self, number: int, hold: int) -> None:
-        """Write wind and noise of a holding interval."""
         if number == self._hold:
             return
         count = self._draws_ahead
@@ -292,15 +283,13 @@ class NativeStepper(Stepper):
 
     @property
     def _leader_mirror(self) -> Array:
-        """What is read of leaders."""
         if self.plan.row_major:
             return self.mirrors[0][:, : self.leader_blocks * self.plan.lanes]
         return self.mirrors[0][: self.leader_blocks]
 
     # ---- moments and sums ----
 
-    def _load(self, now: Moment) -> None:
-        """Write a moment into the blocks."""
+    def _load(self, now: LoopState) -> None:
         rows, x = self.rows, np.asarray(now.states, self.dtype)
         offsets = offsets_of(self.loops, self.dtype)
         self._write(rows.state, x)
@@ -318,7 +307,6 @@ class NativeStepper(Stepper):
         self._hold = -1
 
     def _write_mirror(self, values: Array) -> None:
-        """Write what neighbours read of all agents, (N, s)."""
         if self.plan.row_major:
             self.mirrors[0][:, : len(self.places.agents)] = values[self.places.agents].T
             return
@@ -332,8 +320,7 @@ class NativeStepper(Stepper):
         wide[:, :, : self.plan.width] = np.nan
         wide[:, :, : values.shape[1]] = lanes
 
-    def _moment_and_sums(self, first: int, step: int) -> tuple[Moment, Sums]:
-        """Return the moment in the blocks, and the sums from one step to another."""
+    def _moment_and_sums(self, first: int, step: int) -> tuple[LoopState, Sums]:
         rows = self.rows
         sums = range(rows.errors.start, rows.tracking.start)
         parts = ((part, self.dtype) for part in (rows.state, rows.memory, rows.cut))
@@ -344,7 +331,7 @@ class NativeStepper(Stepper):
         pairs = zip(self.memories, (self.leaders, self.followers), strict=True)
         memories = [unflatten(like, memory[agents]) for like, agents in pairs]
         fields: Any = [np.asarray(step, np.int32), x, *memories, cut.astype(np.int8)]
-        return Moment(*fields), self._sums(first, step, agent_sums)
+        return LoopState(*fields), self._sums(first, step, agent_sums)
 
     def _find_inexact(self) -> None:
         """Note the formations whose numbers are not what JAX computes."""
@@ -360,7 +347,6 @@ class NativeStepper(Stepper):
         self.edges[..., -1, :] = 0.0
 
     def _sums(self, first: int, end: int, agent_sums: Array) -> Sums:
-        """Return the sums over the steps from one to another; those of agents are given."""
         rows, leaders, meter = self.rows, self.leaders, self.loop.meter
         steady = max(0, end - max(first, int(meter.first_steady)))
         begin = rows.errors.start
@@ -394,9 +380,6 @@ def _total_and_window(sums: Array) -> Array:
     return np.stack([sums[:, 0] + sums[:, 1], sums[:, 1]])
 
 
-# ---- what neighbours read of agents at a moment --------------------------------------------------
-
-
 def offsets_of(loops: Sequence[Loop], dtype: np.dtype) -> Float[Array, "N n"]:
     """Return the goals' offsets of all agents, loop by loop."""
     # Runs that differ only in their initial states share one loop, and are often thousands.
@@ -409,7 +392,7 @@ def offsets_of(loops: Sequence[Loop], dtype: np.dtype) -> Float[Array, "N n"]:
 
 def mirror_values(
     loops: Sequence[Loop],
-    now: Moment,
+    now: LoopState,
     x: Float[Array, "N n"],
     offsets: Float[Array, "N n"],
     with_signals: bool,
@@ -439,9 +422,6 @@ def mirror_values(
     return np.concatenate([relative, np.concatenate(sent)], axis=1)
 
 
-# ---- wind and noise ------------------------------------------------------------------------------
-
-
 _AHEAD, _AT_ONCE = 64, 50_000
 """Holding intervals that are drawn in a call, and the most draws; a call takes 0.5 ms."""
 
@@ -454,9 +434,6 @@ def _drawn(
     many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
     one = jax.vmap(draw, (None, None, 0))
     return jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, None))(many, steps, agents)
-
-
-# ---- reused memory -------------------------------------------------------------------------------
 
 
 _MOST, _LARGE = 16, 2**20
@@ -480,7 +457,6 @@ class BufferPool:
     """
 
     def __init__(self) -> None:
-        """Begin with no memory."""
         self._owners = list[Array]()
 
     def empty(self, shape: tuple[int, ...], dtype: np.dtype | type) -> Array:

@@ -32,7 +32,6 @@ _Part = TypeVar("_Part")
 
 @cache
 def _yield_processor() -> Any:
-    """Return the function of the system by which a thread yields its processor."""
     if sys.platform == "win32":
         return ctypes.WinDLL("kernel32").SwitchToThread
     return ctypes.CDLL(None).sched_yield
@@ -56,7 +55,6 @@ class ThreadPool:
     """
 
     def __init__(self, places: Places, pool: Executor | None, threads: int | None) -> None:
-        """Begin with no thread running."""
         self.places, self.pool = places, pool
         large = len(places.agents) >= _SHARED
         self.threads = 1 if places.batched else threads or (processors() if large else 1)
@@ -96,10 +94,7 @@ class ThreadPool:
         share(self.pool, run_groups, np.array_split(groups, min(len(groups), 8)))
 
     def copy(self, blocks: Array, rows: range, values: Array, inward: bool = False) -> None:
-        """Read rows of blocks into values of the agents (N, rows), or write them there (`inward`).
-
-        The values are contiguous and of the precision of the blocks, or float64 to read into.
-        """
+        """Read rows of blocks into (N, rows), of their precision or float64; `inward` writes."""
         count, part = len(blocks), blocks[:, rows.start : rows.stop]
         pool = self._workers or self.pool
 
@@ -116,7 +111,6 @@ class ThreadPool:
     def _run_swarm(
         self, code: Code, values: dict[str, int], firsts: dict[str, Array], uniform_values: Array
     ) -> None:
-        """Let each thread do its tasks."""
         assert self._workers is not None
         # Each count has its own cache line.
         progress = aligned((self.threads, 8), np.int64)
@@ -136,7 +130,6 @@ class ThreadPool:
         share(self._workers, run_thread, range(self.threads))
 
     def _schedule(self, steps: int, thread: int) -> Array:
-        """Return the tasks of a thread."""
         if (steps, thread) not in self._schedules:
             if len(self._schedules) > 8 * self.threads:
                 self._schedules.clear()
@@ -151,10 +144,7 @@ class ThreadPool:
 
 
 def share(pool: Executor, act: Callable[[_Part], None], parts: Iterable[_Part]) -> None:
-    """Let threads act on a part each: all of them or, if Ctrl-C comes before, none.
-
-    Otherwise those that began would wait forever for those that did not.
-    """
+    """Let all threads act, or none if Ctrl-C comes before: some would wait for the others."""
     gate, all_submitted, futures = Event(), list[bool](), list[Future[None]]()
 
     def begin(part: _Part) -> None:

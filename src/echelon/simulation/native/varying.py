@@ -55,7 +55,6 @@ class VaryingNumbers:
     """
 
     def __init__(self, loops: Sequence[Loop], variant: Loop | None = None) -> None:
-        """Find the numbers that differ."""
         self._take(loops[0])
         # By identity: runs that differ only in their initial states share one loop.
         distinct = list({id(loop): loop for loop in loops}.values())
@@ -126,15 +125,12 @@ class VaryingNumbers:
 
 
 def _differing(leaves: Sequence[Any]) -> Array:
-    """Return which entries of a leaf are not equal in all loops."""
     # All other leaves are equal already: they are in the key of the program.
     if not is_number(leaves[0]) or len(leaves) == 1:
         return np.zeros(np.shape(leaves[0]), bool)
     stacked = np.stack([np.asarray(leaf, float) for leaf in leaves])
     return (stacked != stacked[0]).any(axis=0)
 
-
-# ---- loops that one program steps ----------------------------------------------------------------
 
 _MOST = 256
 """Kinds of loops for which it is cached which numbers they read."""
@@ -145,7 +141,6 @@ class ProgramKeys:
     """Returns the keys of loops; which numbers a kind of loop reads is traced once."""
 
     def __init__(self) -> None:
-        """Begin with an empty cache."""
         self._fixed = BoundedCache[list[bool]](_MOST)
 
     def of(self, loop: Loop, settings: Settings) -> Hashable:
@@ -168,7 +163,6 @@ class ProgramKeys:
 
 
 def _fixed(leaves: Sequence[object], tree: Any) -> list[bool]:
-    """Return which leaves must be equal in all loops."""
     numbers = [k for k, leaf in enumerate(leaves) if is_number(leaf)]
 
     def outside(values: list[jax.Array]) -> PyTree:

@@ -46,7 +46,7 @@ from echelon.simulation.step.knowledge import (
     packet_size,
     parts_of,
 )
-from echelon.simulation.step.motion import Motion, MotionState
+from echelon.simulation.step.motion import MotionState, PlantStep
 
 
 class LawFunction(NamedTuple):
@@ -79,20 +79,13 @@ class LawFunction(NamedTuple):
 
 
 def law_functions(own: OwnLaw, bits: int = 64) -> dict[str, LawFunction]:
-    """Return what an agent computes, by name, in double or single precision (64 or 32 bits).
-
-    Raises:
-        Unsupported: the agent needs more than them, or its law has no scalar operations; with the
-            file and line of a user's code.
-    """
+    """Return what an agent computes, in 64 or 32 bits; else `Unsupported`, with the user's line."""
     check_distances(own.loop)
     return {function.name: function for function in _Traces(own, bits).all()}
 
 
 @final
 class _Traces:
-    """Traces the functions of one agent in a precision (bits)."""
-
     def __init__(self, own: OwnLaw, bits: int) -> None:
         self.own, self.bits = own, bits
         self.loop, self.law = own.loop, own.law
@@ -212,7 +205,6 @@ class _Traces:
     # ---- where messages are late ----
 
     def _expectation(self, prediction: Prediction) -> Iterator[LawFunction]:
-        """Yield where a leader is expected, and how it is carried on."""
         loop, follower, s = self.loop, self.loop.follower, self.s
         assert loop.channel is not None
         size = packet_size(loop.channel, s, self.k, self.m)
@@ -289,10 +281,7 @@ class _Traces:
         outputs: tuple[str, ...],
         sizes: Mapping[str, int | None],
     ) -> LawFunction:
-        """Return a function whose leaves have the names of its inputs.
-
-        What `compute` returns after its outputs must be finite where it is valid.
-        """
+        """What `compute` returns after its outputs must be finite where the function is valid."""
         graph = ScalarGraph(self.bits)
         leaves = [
             single(graph.leaf(key)) if size is None else leaves_of(graph, key, range(size))
@@ -344,7 +333,6 @@ def _fewer(truths: Sequence[Node]) -> list[Node]:
 
 
 def _flat(tree: PyTree) -> jax.Array:
-    """Return the numbers of a tree, one after the other."""
     return jnp.concatenate([jnp.zeros(0), *map(jnp.ravel, jax.tree.leaves(tree))])
 
 
@@ -403,15 +391,8 @@ def message_words(own: OwnLaw) -> list[str]:
     return [*names, *heading]
 
 
-# ---- the motion of a simulated vehicle -----------------------------------------------------------
-
-
-def move_function(motion: Motion) -> LawFunction:
-    """Return `move`: how one agent moves in a step of its own motion, under its actuators.
-
-    Raises:
-        Unsupported: the plant has no scalar operations; with the file and line of a user's code.
-    """
+def move_function(motion: PlantStep) -> LawFunction:
+    """Return `move`, a step of an agent's own motion; else `Unsupported`, with the user's line."""
     plant, lags = motion.plant, motion.motors is not None and motion.motors.lag is not None
     n, m = len(plant.state_names), len(plant.input_names)
 
@@ -432,7 +413,7 @@ def move_function(motion: Motion) -> LawFunction:
     return LawFunction("move", about, sizes, {"x": x, "memory": memory})
 
 
-def motions_of(motion: Motion, agents: int, substeps: int) -> list[Motion]:
+def motions_of(motion: PlantStep, agents: int, substeps: int) -> list[PlantStep]:
     """Return the motion of each agent in a part of a step."""
     rows = [motion] * agents
     if motion.rows is not None:

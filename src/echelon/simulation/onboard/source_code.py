@@ -261,10 +261,7 @@ def _c_syntax(bits: int) -> Syntax:
 
 
 def c_text(double: Collection[LawFunction], single: Collection[LawFunction], about: str) -> str:
-    """Return functions as a file of C, in single precision where `LAW_SINGLE` is defined.
-
-    `about` is a comment at its head.
-    """
+    """Return functions as a file of C, single if `LAW_SINGLE` is defined; `about` is its head."""
     parts = [
         f"/* {about} */",
         "",
@@ -430,7 +427,6 @@ def law_single(a):
 
 
 def _python_literal(value: float | bool) -> str:
-    """Return a plain number, to the bit."""
     if isinstance(value, bool) or math.isfinite(value):
         return repr(value)
     return "math.nan" if math.isnan(value) else f"{'-' * (value < 0.0)}math.inf"

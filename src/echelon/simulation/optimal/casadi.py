@@ -25,11 +25,7 @@ Expression: TypeAlias = "SX | float"
 
 
 def casadi() -> ModuleType:
-    """Return the library.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """Return the library; raise `MissingExtraError` if it is not installed."""
     # Here, since it comes with an extra, and takes long to load.
     try:
         import casadi
@@ -97,11 +93,7 @@ def symbols(owner: str) -> Algebra:
     return Algebra(_rules(casadi()), float, lambda numbers: numbers, lambda: float("nan"), unknown)
 
 
-# ---- the rules -----------------------------------------------------------------------------------
-
-
 def _rules(ca: ModuleType) -> dict[str, Rule]:
-    """Return the rules of JAX's primitives for symbols, in addition to those of the walk."""
     written: dict[str, Rule] = {
         "integer_pow": lambda params, x: map_entries(lambda value: value ** params["y"], x),
         # A symbol counts as finite, since its value is unknown; solvers report what is not.
@@ -120,7 +112,6 @@ def _rules(ca: ModuleType) -> dict[str, Rule]:
 
 
 def _functions(ca: ModuleType) -> dict[str, Callable[..., object]]:
-    """Return the primitives that are functions of entries."""
     return {
         **{name: getattr(ca, name) for name in _SAME_NAME},
         **{name: getattr(operator, name) for name in ("lt", "le", "gt", "ge", "eq", "ne", "pow")},

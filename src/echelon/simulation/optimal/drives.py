@@ -18,15 +18,15 @@ from echelon.agents.references.flatness import (
     reference_targets,
     reference_warnings,
 )
-from echelon.agents.references.reference import Guide, check_kind_of
+from echelon.agents.references.reference import LeaderPath, check_kind_of
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, Input, State
 from echelon.laws.law import Law, LocalView
 from echelon.simulation.optimal.formation_plan import plan_formation
 from echelon.simulation.optimal.horizon import MPC, Answer, Course, Horizon
 from echelon.simulation.optimal.objectives import TrackingOptions, grid
-from echelon.simulation.step.drive import Chunk, Drive, Information, Problem, Stepper, Stopped
-from echelon.simulation.step.loop import Moment, assemble
+from echelon.simulation.step.drive import Chunk, Controller, Information, Problem, Stepper, Stopped
+from echelon.simulation.step.loop import LoopState, assemble
 from echelon.simulation.step.meter import Sums, on_host
 from echelon.simulation.step.sequence import advance, begin
 from echelon.simulation.step.settings import Settings
@@ -36,13 +36,10 @@ _SETTLING = 20
 """Most quadratic programs of an agent's first plan, which has no earlier plan as its guess."""
 
 
-class _Optimized(Drive):
-    """A drive whose leaders follow a reference, or keep their trim."""
-
-    reference: eqx.AbstractVar[Guide | None]
+class _Optimized(Controller):
+    reference: eqx.AbstractVar[LeaderPath | None]
 
     def __check_init__(self) -> None:
-        """Check the type of the reference."""
         if self.reference is not None:
             check_kind_of(self.reference)
 
@@ -86,7 +83,7 @@ class Plans(_Optimized):
         options: of the planning problems.
     """
 
-    reference: Guide | None = None
+    reference: LeaderPath | None = None
     options: TrackingOptions = eqx.field(default_factory=TrackingOptions, static=True)
 
     @property
@@ -103,7 +100,7 @@ class Plans(_Optimized):
         """
         settings = problem.settings
         times = grid(settings.horizon, settings.dt, self.options.interval)
-        formation_plan = plan_formation(
+        plan = plan_formation(
             problem.model,
             problem.graph,
             problem.formation,
@@ -114,8 +111,7 @@ class Plans(_Optimized):
             limits=settings.limits,
         )
         # One input per interval; the last interval may extend beyond the run's end.
-        inputs = np.stack([plan.inputs for plan in formation_plan.plans], axis=1)
-        plan = formation_plan
+        inputs = np.stack([each.inputs for each in plan.plans], axis=1)
         work = plan.seconds, plan.iterations, plan.failures, plan.setup_seconds
         stats = solver_stats("optimization", self.options.solver, *work)
         return HostStepper(
@@ -136,7 +132,7 @@ class RecedingHorizon(_Optimized):
         mpc: the receding horizon.
     """
 
-    reference: Guide | None = None
+    reference: LeaderPath | None = None
     mpc: MPC = eqx.field(default_factory=MPC, static=True)
 
     @property
@@ -158,9 +154,7 @@ class RecedingHorizon(_Optimized):
 
 @final
 class _Planners:
-    """The planners of all agents; called with the measured states, they return the inputs."""
-
-    def __init__(self, problem: Problem, reference: Guide | None, mpc: MPC, hold: int) -> None:
+    def __init__(self, problem: Problem, reference: LeaderPath | None, mpc: MPC, hold: int) -> None:
         began = time.perf_counter()
         settings, graph = problem.settings, problem.graph
         dt = hold * settings.dt
@@ -187,11 +181,7 @@ class _Planners:
         return solver_stats("mpc", self.mpc.solver, *work)
 
     def __call__(self, step: int, states: Array) -> Array:
-        """Return the desired inputs (N, m) of all agents, planned in the order of the graph.
-
-        Raises:
-            Stopped: a solver failed, and `on_failure` is `stop`.
-        """
+        """Return the inputs (N, m); raise `Stopped` if a solver fails and `on_failure` says so."""
         inputs = np.zeros((len(states), self.horizon.m))
         for agent, earlier, share in self.turns:
             targets = self._targets(agent, earlier, share, step // self.hold)
@@ -259,11 +249,7 @@ _PLANS = 64
 
 @final
 class HeldInput(Law):
-    """u = the input (m,) in the agent's memory, which the pilot writes.
-
-    Args:
-        size: m.
-    """
+    """u = the input (m,) in the agent's memory, which the pilot writes."""
 
     size: int = eqx.field(static=True)
 
@@ -294,7 +280,6 @@ class HostStepper(Stepper):
         hold: int,
         work: Callable[[], SolverStats],
     ) -> None:
-        """Assemble the loop."""
         law = HeldInput(len(problem.model.input_names))
         self.loop, self.states = assemble(problem, law, law), problem.states
         self.pilot, self.hold, self._work = pilot, hold, work
@@ -315,22 +300,18 @@ class HostStepper(Stepper):
         """Steps in which a few dozen plans are made."""
         return self.hold * max(1, _PLANS // len(self.states))
 
-    def recall(self, leaves: Sequence[Array]) -> Moment:
-        """Raise an error, since the plans of a pilot are not part of a moment.
-
-        Raises:
-            SimulationError: always.
-        """
+    def recall(self, leaves: Sequence[Array]) -> LoopState:
+        """Raise `SimulationError`: the plans of a pilot are not part of a moment."""
         raise SimulationError(
             "a run with planned inputs cannot be continued from stored data; start it again."
         )
 
-    def start(self) -> Moment:
+    def start(self) -> LoopState:
         """Return the moment at which the run begins, before the pilot gives any input."""
         self._queried = -1
         return begin(self.loop, self.states)
 
-    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+    def advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps, until a pilot stops or a state is not finite."""
         chunk = _HeldChunk(now, self.loop.meter.zero_sums(), reference)
         try:
@@ -363,7 +344,6 @@ class HostStepper(Stepper):
                 return
 
     def _query_pilot(self, chunk: "_HeldChunk") -> None:
-        """Put the pilot's inputs into the agents' memories where a hold begins, once."""
         if chunk.step % self.hold or chunk.step == self._queried:
             return
         # Solvers work in float64, and so are the states that they start from.
@@ -380,7 +360,6 @@ class HostStepper(Stepper):
         )
 
     def _take(self, chunk: "_HeldChunk", count: int, store: bool = False) -> None:
-        """Take steps, or store a frame."""
         # As an array, so that another count does not compile again.
         counts = np.array([count], np.int32)
         chunk.now, frames, sums = advance(
@@ -395,9 +374,7 @@ class HostStepper(Stepper):
 
 @final
 class _HeldChunk:
-    """The frames and sums of a chunk while it is computed."""
-
-    def __init__(self, now: Moment, sums: Sums, reference: Array | None) -> None:
+    def __init__(self, now: LoopState, sums: Sums, reference: Array | None) -> None:
         self.now, self.step, self.first = now, int(now.step), now.step
         self.sums, self.reference = sums, reference
         self.states: list[Array] = []

@@ -16,7 +16,7 @@ from echelon.agents.references.flatness import (
     reference_targets,
     shifted_targets,
 )
-from echelon.agents.references.reference import Guide
+from echelon.agents.references.reference import LeaderPath
 from echelon.core.errors import PlanError
 from echelon.core.types import Array
 from echelon.simulation.optimal.objectives import (
@@ -74,7 +74,7 @@ def plan_formation(
     states: Array,
     grid: PlanTimes,
     *,
-    reference: Guide | None,
+    reference: LeaderPath | None,
     planning: TrackingOptions,
     limits: bool,
 ) -> FormationPlan:
@@ -123,12 +123,7 @@ def plan_tracking(
     planning: TrackingOptions,
     limits: bool,
 ) -> Trajectory:
-    """Return the plan of one agent that follows targets.
-
-    Raises:
-        PlanError: the plan violates a constraint; the message names it and the amount.
-        MissingExtraError: casadi is not installed.
-    """
+    """Return an agent's plan to its targets; `PlanError` names a violated constraint."""
     return _Planner(model, planning, grid, limits).follow(0, start, targets)
 
 
@@ -176,15 +171,7 @@ class _Planner:
         neighbours: list[Array],
         displacements: list[Array],
     ) -> Trajectory:
-        """Return the plan of an agent that keeps its distances from neighbours.
-
-        Args:
-            agent: its number.
-            start: its state, (n,).
-            targets: the initial guess of the solver.
-            neighbours: the neighbours' states, (T, n) each.
-            displacements: displacements (n,) whose lengths are the distances.
-        """
+        """Return a plan that keeps the lengths of displacements (n,) to neighbours (T, n) each."""
         axes = list(self.model.position_indices())
         distances = np.array([np.linalg.norm(d[axes]) for d in displacements])
         # In the key, since the distances are constants of the problem; all else is its data.

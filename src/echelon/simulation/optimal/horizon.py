@@ -17,7 +17,7 @@ import scipy.sparse
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import PlanError
-from echelon.core.linear import without_warnings
+from echelon.core.linear import discretize, without_warnings
 from echelon.core.numerics import precision, rk4
 from echelon.core.types import Array
 from echelon.simulation.optimal.casadi import casadi, casadi_function
@@ -78,7 +78,6 @@ class MPC:
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what is out of range."""
         for name in ("period", "horizon"):
             check_seconds(name, getattr(self, name))
         if self.horizon < self.period:
@@ -138,15 +137,7 @@ class Horizon:
     """
 
     def __init__(self, model: ControlAffine, mpc: MPC, steps: int, dt: float, limits: bool) -> None:
-        """Build the quadratic program.
-
-        Args:
-            model: of the agent.
-            mpc: the horizon.
-            steps: of the horizon's grid.
-            dt: of that grid, s.
-            limits: whether the actuators' limits are constraints.
-        """
+        """Build the quadratic program for a grid of `steps` of dt (s)."""
         self.steps, self.dt = steps, dt
         self.n, self.m = len(model.state_names), len(model.input_names)
         Q, R = mpc.weights(model)
@@ -206,17 +197,10 @@ def _interleave(inputs: Array, states: Array) -> Array:
 
 def _cost_to_go(model: ControlAffine, Q: Array, R: Array, dt: float) -> Array:
     """Return the cost matrix of the LQR about the trim in discrete time."""
-    A, B = linearize(model)
-    n, m = B.shape
-    block = np.zeros((n + m, n + m))
-    block[:n, :n], block[:n, n:] = A, B
-    # expm([[A, B], [0, 0]] dt) holds both matrices of a step with the input held, exactly.
-    flow = scipy.linalg.expm(block * dt)
+    step = discretize(*linearize(model), dt)
     try:
         with without_warnings():
-            return scipy.linalg.solve_discrete_are(
-                flow[:n, :n], flow[:n, n:], np.diag(dt * Q), np.diag(dt * R)
-            )
+            return scipy.linalg.solve_discrete_are(*step, np.diag(dt * Q), np.diag(dt * R))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise PlanError(
             f"the cost from the horizon's end on does not exist for `{type(model).__name__}`: "
@@ -239,11 +223,7 @@ def _limit_rows(model: ControlAffine, limits: bool) -> tuple[Array, Array, Array
 def _assembly(
     model: ControlAffine, steps: int, dt: float, rows: Array
 ) -> "tuple[Function, Function]":
-    """Return the flow (x, v) -> x after dt, and the function of the equations along a course.
-
-    The latter takes states (n, N) and inputs (m, N), and returns the matrix of the program and the
-    right-hand side (n, N) of its equations.
-    """
+    """Return the flow (x, v) -> x, and (states (n, N), inputs (m, N)) -> matrix and rhs (n, N)."""
     ca, n, m = casadi(), len(model.state_names), len(model.input_names)
     x, v = ca.SX.sym("x", n), ca.SX.sym("v", m)
     owner = type(model).__name__

@@ -18,7 +18,7 @@ from echelon.agents.references.flatness import (
     reference_targets,
     reference_warnings,
 )
-from echelon.agents.references.reference import Guide
+from echelon.agents.references.reference import LeaderPath
 from echelon.core.cache import BoundedCache
 from echelon.core.errors import LawError
 from echelon.core.identity import process_key
@@ -55,7 +55,7 @@ class OptimalTracking(Law):
         regulator, states, inputs: the gain in use and the plan; set by `prepared`.
     """
 
-    reference: Guide
+    reference: LeaderPath
     gain: Gain | None
     regulator: Gain | None
     states: Array | None
@@ -67,14 +67,13 @@ class OptimalTracking(Law):
 
     def __init__(
         self,
-        reference: Guide,
+        reference: LeaderPath,
         horizon: float = 10.0,
         start_error: Mapping[str, float] | None = None,
         limits: bool = True,
         planning: TrackingOptions | None = None,
         gain: Gain | None = None,
     ) -> None:
-        """Store the problem, which `prepared` solves."""
         self.reference, self.gain = reference, gain
         self.regulator, self.states, self.inputs = None, None, None
         self.horizon, self.limits = horizon, limits

@@ -50,7 +50,6 @@ class TrackingOptions:
     solver: str = "ipopt"
 
     def __post_init__(self) -> None:
-        """Refuse what is out of range."""
         check_seconds("interval", self.interval)
         if not 0.0 <= self.input_weight < math.inf:
             raise PlanError(
@@ -91,11 +90,7 @@ class PlanTimes(NamedTuple):
 
 
 def grid(horizon: float, dt: float, interval: float) -> PlanTimes:
-    """Return the grid of a horizon: intervals of whole steps, the last of which covers its end.
-
-    Raises:
-        PlanError: the horizon is shorter than a step.
-    """
+    """Return intervals of whole steps that cover a horizon; `PlanError` if it is below a step."""
     if not dt <= horizon < math.inf:
         raise PlanError(
             f"`horizon` is {horizon} s, and must be finite and at least one step of {dt} s."
@@ -106,17 +101,10 @@ def grid(horizon: float, dt: float, interval: float) -> PlanTimes:
     return PlanTimes(-(-count // hold), hold, dt)
 
 
-# ---- problems ------------------------------------------------------------------------------------
-
-
 def tracking(
     model: ControlAffine, planning: TrackingOptions, times: PlanTimes, limits: bool, fine: bool
 ) -> OptimalControl:
-    """Return the problem of an agent with targets.
-
-    Its parameters at a time are the target's outputs (q,), its normalized input (m,), and the
-    factor on the input weights.
-    """
+    """Return an agent's problem; parameters: outputs (q,), normalized input (m,), a factor."""
     W, q = planning.weights(model), len(model.output_names)
     input_cost = _input_cost(model)
 

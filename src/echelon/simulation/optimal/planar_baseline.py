@@ -63,7 +63,6 @@ class PlanarBaseline:
     noise: float = 0.2
 
     def __post_init__(self) -> None:
-        """Check the options."""
         check_choice("terminal", self.terminal, TERMINALS)
         check_choice("separation", self.separation, SEPARATIONS)
 

@@ -81,7 +81,6 @@ class OptimalControl:
     substeps: int = 1
 
     def __post_init__(self) -> None:
-        """Check the range of each argument."""
         if not isinstance(self.model, ControlAffine):
             raise PlanError(
                 f"the model is {self.model!r}, and must be an instance of a `ControlAffine` class."

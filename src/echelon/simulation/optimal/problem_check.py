@@ -11,43 +11,27 @@ from echelon.core.types import Array
 
 
 def check_seconds(name: str, value: float) -> None:
-    """Check that a time is positive and finite.
-
-    Raises:
-        PlanError: it is not.
-    """
+    """Raise `PlanError` unless a time is positive and finite."""
     # By its type first: a comparison with a word would raise an error of Python's own.
     if not (is_number(value) and 0.0 < value < math.inf):
         raise PlanError(f"`{name}` is {value}, and must be a positive finite number of seconds.")
 
 
 def check_whole(name: str, value: object, least: int, hint: str = "") -> None:
-    """Check that a count is a whole number from `least` on.
-
-    Raises:
-        PlanError: it is not; `hint` ends the message.
-    """
+    """Raise `PlanError`, which `hint` ends, unless a count is a whole number from `least` on."""
     # `True` is an integer to Python, and never meant as a count.
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < least:
         raise PlanError(f"`{name}` is {value}, and must be a whole number from {least} on{hint}.")
 
 
 def check_choice(name: str, value: object, allowed: Sequence[str]) -> None:
-    """Check that an option is one of those allowed.
-
-    Raises:
-        PlanError: it is not.
-    """
+    """Raise `PlanError` unless an option is one of those allowed."""
     if value not in allowed:
         raise PlanError(f"`{name}` is `{value}`, allowed are {listing(allowed)}.")
 
 
 def read_weights(name: str, values: object, owners: Sequence[str]) -> Array:
-    """Return a weight for each of the owners, float64.
-
-    Raises:
-        PlanError: they are not as many finite numbers, or one is negative.
-    """
+    """Return a float64 weight for each owner; `PlanError` unless all are finite, none negative."""
     try:
         weights = np.asarray(values, np.float64)  # pyright: ignore
     except (TypeError, ValueError):

@@ -200,7 +200,6 @@ class Solver:
         return self._plan(solution, data["p"], self._solve.stats(), seconds)
 
     def _begin(self, x: Array, guess: Trajectory | tuple[Array, Array] | None) -> dict[str, Array]:
-        """Return the solver's initial guess."""
         problem = self.problem
         shapes = (problem.steps + 1, len(x)), (problem.nodes, len(problem.model.input_names))
         # Only a plan of the same problem has multipliers.
@@ -278,7 +277,6 @@ def solve(
 
 
 def _numbers(name: str, value: object, shape: tuple[int, ...], repeat: bool = False) -> Array:
-    """Return finite numbers of a shape; a single row of it is repeated if that is allowed."""
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError):

@@ -142,7 +142,6 @@ def _parts(problem: OptimalControl) -> _Parts:
 
 
 def _constraints(problem: OptimalControl) -> list[tuple[Constraint, "Function"]]:
-    """Return each constraint with its `casadi.Function` of x and p."""
     n, k = len(problem.model.state_names), problem.parameters
     return [
         (one, casadi_function(f"c{i}", one.function, n, k, owner=one.name))
@@ -170,7 +169,6 @@ def _scalar(name: str, function: "Function") -> "Function":
 
 
 def _rows(problem: OptimalControl) -> tuple[Array, Array, tuple[ConstraintRow, ...]]:
-    """Return the bounds of g and what each row says, in the order of `transcribe`."""
     motion = [(0.0, 0.0, ConstraintRow(f"motion of {name}")) for name in problem.model.state_names]
     begin = [(0.0, 0.0, ConstraintRow(f"start of {name}")) for name in problem.model.state_names]
     limits = [
@@ -211,7 +209,6 @@ def _limits(problem: OptimalControl) -> list[tuple[float, float, float]]:
 
 
 def _bounds(constraint: Constraint, count: int) -> list[tuple[float, float]]:
-    """Return a constraint's bounds row by row."""
     try:
         low = np.broadcast_to(np.asarray(constraint.low, float), (count,))
         high = np.broadcast_to(np.asarray(constraint.high, float), (count,))

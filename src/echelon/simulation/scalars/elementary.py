@@ -50,7 +50,6 @@ def signed(x: Node, like: Node) -> Node:
 
 
 def _sine_and_cosine(x: Node) -> tuple[Node, Node]:
-    """Return both; the graph shares their common operations."""
     g, eps, width = x.graph, EPS[x.graph.bits], 0.62  # (pi / 4)^2 is 0.617
     # Below, nothing is subtracted, and the quarter is 0.
     far = g.make("unlikely", less(g.constant(0.61), x * x))
@@ -254,7 +253,6 @@ def _small_angle(t: Node) -> Node:
 
 
 def _angle(y: Node, x: Node) -> Node:
-    """Return the angle of any point (x, y)."""
     g, a, b = y.graph, size(y), size(x)
     low, high = g.make("min", a, b), g.make("max", a, b)
     # Two infinite sides are equal, and two zero sides have the angle 0.
@@ -408,10 +406,7 @@ def _positive_power(x: Node, y: Node) -> Node:
 
 
 def _logarithm(x: Node) -> tuple[Node, Node]:
-    """Return ln x for x >= 0 as the sum of two numbers, the second a rounding error of the first.
-
-    The logarithm of a large number is large, and a power needs as many digits behind its point.
-    """
+    """Return ln x for x >= 0 as a number and its rounding error: a power needs these digits."""
     g, bits = x.graph, x.graph.bits
     e, f = g.make("exponent", x), g.make("mantissa", x) - 1.0
     below = f + 2.0
@@ -452,10 +447,7 @@ def _shifted_chebyshev(degree: int, width: Fraction) -> list[Fraction]:
 
 @functools.cache
 def economized(series: Callable[[int], Fraction], width: float, tolerance: float) -> list[float]:
-    """Return coefficients, lowest first, with an error below a tolerance for s in [0, width].
-
-    `series(k)` is the Taylor coefficient of s^k.
-    """
+    """Return coefficients of sum series(k) s^k, lowest first, within a tolerance on [0, width]."""
     end, rest, count = Fraction(width), Fraction(tolerance), 1
     while abs(series(count)) * end**count > rest / 8:
         count += 1

@@ -56,16 +56,7 @@ from echelon.simulation.scalars.whole_numbers import WHOLE_NUMBERS, TypeRules
 def lower(
     function: Callable[..., PyTree], graph: ScalarGraph, arguments: Sequence[PyTree]
 ) -> Arrays:
-    """Return the results of a function for JAX, flattened, as arrays of nodes and numbers.
-
-    Args:
-        function: takes arrays and returns a tree of arrays.
-        graph: that the nodes belong to.
-        arguments: trees of arrays of nodes (of dtype object), or of plain numbers.
-
-    Raises:
-        Unsupported: a primitive has no scalar operations.
-    """
+    """Return results of a JAX function, flattened, as nodes and numbers; or raise `Unsupported`."""
     leaves, tree = jax.tree.flatten(list(arguments), is_leaf=lambda a: isinstance(a, np.ndarray))
     # In the precision of the run: a user's function may ask for it (`x.dtype`).
     name: Precision = "float64" if graph.bits == 64 else "float32"
@@ -183,7 +174,6 @@ def _round(graph: ScalarGraph, params: Params, x: np.ndarray) -> np.ndarray:
 
 
 def _scan(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
-    """Return the results of a loop of fixed length, unrolled."""
     params, body = equation.params, equation.params["jaxpr"]
     length, constant, carried = params["length"], params["num_consts"], params["num_carry"]
     if length > LONGEST:
@@ -255,7 +245,6 @@ def _parts(rows: np.ndarray) -> list[list[int]]:
 
 
 def _eliminate(graph: ScalarGraph, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solution by Gauss's method."""
     both, n = np.column_stack([matrix, right]), len(matrix)
     for k in range(n):
         _pivot(graph, both, k, n)
@@ -281,7 +270,6 @@ def _pivot(graph: ScalarGraph, rows: np.ndarray, k: int, n: int) -> Node:
 
 
 def _by_triangle(A: np.ndarray, right: np.ndarray, lower: bool, unit: bool) -> np.ndarray:
-    """Return the solution of equations whose matrix is triangular."""
     b, n = right.copy(), len(A)
     for k in range(n) if lower else reversed(range(n)):
         for j in range(k) if lower else range(k + 1, n):
@@ -353,7 +341,7 @@ def at_index(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands:
     if has_function(equation):
         raise Unsupported(f"`scatter` of a function{where(equation)}")
     rows, ends = _rows(equation, operands), _ends(equation, operands)
-    drops = _drops(equation)
+    drops = equation.params.get("mode") == jax.lax.GatherScatterMode.FILL_OR_DROP
     if not drops:
         rows = np.stack([_clipped(graph, rows[..., k], n) for k, n in enumerate(ends)], axis=-1)
     unknown = [k for k in range(len(ends)) if any(isinstance(e, Node) for e in rows[..., k].flat)]
@@ -386,7 +374,6 @@ def _rows(equation: JaxprEqn, operands: Arrays) -> np.ndarray:
 
 
 def _at(algebra: Algebra, equation: JaxprEqn, operands: Arrays, rows: np.ndarray) -> np.ndarray:
-    """Return the result of an equation at constant indices."""
     first = _FIRST.get(equation.primitive.name)
     if first is None:
         constant = [operands[0], rows, *operands[2:]]
@@ -399,13 +386,6 @@ def _is(graph: ScalarGraph, entries: tuple[Entry, ...], place: tuple[int, ...]) 
     """Return whether numbers are those of a place."""
     same = [graph.make("eq", entry(e), float(p)) for e, p in zip(entries, place, strict=True)]
     return functools.reduce(functools.partial(graph.make, "and"), same, True)
-
-
-def _drops(equation: JaxprEqn) -> bool:
-    """Tell whether indices outside of a table are ignored; otherwise they are clipped."""
-    from jax.lax import GatherScatterMode
-
-    return equation.params.get("mode") == GatherScatterMode.FILL_OR_DROP
 
 
 def _elsewhere(equation: JaxprEqn, operands: Arrays) -> np.ndarray:

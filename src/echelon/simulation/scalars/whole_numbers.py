@@ -97,22 +97,13 @@ def may_be_exception(graph: ScalarGraph, node: Node, size: float) -> bool:
 
 
 class TypeRules:
-    """Checks the results of each equation of a trace, and gives them the range of their type.
-
-    Args:
-        graph: of the results.
-    """
+    """Checks the results of each equation of a trace, and gives them the range of their type."""
 
     def __init__(self, graph: ScalarGraph) -> None:
-        """Begin with the nodes that come next."""
         self.graph, self._checked = graph, len(graph.nodes)
 
     def __call__(self, equation: JaxprEqn, results: Arrays) -> Arrays:
-        """Return the results of an equation with the rounding, or wrapping, of their type.
-
-        Raises:
-            Unsupported: there is no native code for one.
-        """
+        """Return results with the rounding, or wrapping, of their type; or raise `Unsupported`."""
         new, name = self.graph.nodes[self._checked :], equation.primitive.name
         if not all(map(_is_well_typed, new)):
             raise Unsupported(f"`{name}` of truths{where(equation)}")
@@ -144,7 +135,6 @@ class TypeRules:
         return map_entries(lambda e: self._bounded(e, kind) if isinstance(e, Node) else e, result)
 
     def _bounded(self, x: Node, kind: np.dtype) -> Node:
-        """Return a whole number of a type: as it is, wrapped, or with an exception."""
         g, limits, exact = self.graph, np.iinfo(kind), _EXACT[self.graph.bits]
         least, most, (low, high) = float(limits.min), float(limits.max), range_of(x)
         if max(least, -exact) <= low and high <= min(most, exact):
@@ -164,7 +154,6 @@ _PARTIAL = {"reduce_sum", "cumsum", "reduce_prod", "cumprod", "dot_general", "in
 
 
 def _is_well_typed(node: Node) -> bool:
-    """Tell whether an operation has truths, or numbers, where it needs them."""
     truths = [a.truth for a in node.args]
     if node.op == "select":
         return truths[0] and truths[1] == truths[2]

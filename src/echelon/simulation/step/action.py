@@ -14,7 +14,7 @@ from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.loop import Loop
 
 
-class Action(NamedTuple):
+class AgentOutput(NamedTuple):
     """What an agent does in a step.
 
     Attributes:
@@ -30,7 +30,7 @@ class Action(NamedTuple):
     message: Float[jax.Array, " k"]
 
 
-def act(loop: Loop, law: Law, view: LocalView, memory: Memory, leads: bool) -> Action:
+def act(loop: Loop, law: Law, view: LocalView, memory: Memory, leads: bool) -> AgentOutput:
     """Return what one agent does with what it knows.
 
     The heading that a follower is sent comes last in the feed-forward, and is passed on.
@@ -47,7 +47,7 @@ def act(loop: Loop, law: Law, view: LocalView, memory: Memory, leads: bool) -> A
     delivered = loop.motion.deliver(desired)
     memory = law.settle(loop.model, view, desired, delivered, memory)
     forward = feedforward_of(follower, loop.model, view.x, loop.model.normalized(delivered), memory)
-    return Action(desired, delivered, memory, jnp.concatenate([forward, heading]))
+    return AgentOutput(desired, delivered, memory, jnp.concatenate([forward, heading]))
 
 
 def _split_heading(loop: Loop, law: Law, view: LocalView, leads: bool) -> tuple[LocalView, Scalar]:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from echelon.core.types import Array
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law, Memory
-from echelon.simulation.step.loop import Loop, Moment
+from echelon.simulation.step.loop import Loop, LoopState
 
 
 def has_angles(law: Law) -> bool:
@@ -17,11 +17,11 @@ def has_angles(law: Law) -> bool:
 
 def beside_others(
     loop: Loop,
-    now: Moment,
+    now: LoopState,
     new: Bool[jax.Array, " N"],
     there: Bool[jax.Array, " N"],
     sent: Float[jax.Array, "N s"],
-) -> Moment:
+) -> LoopState:
     """Return the moment with the headings of new agents next to those of others.
 
     An angle is a number that grows with every turn, and who begins late knows none of them.

@@ -23,16 +23,16 @@ from echelon.core.words import Feedforward, Frame
 from echelon.laws.law import Law
 from echelon.laws.safety import Safety
 from echelon.simulation.step.leadership import Leadership
-from echelon.simulation.step.meter import Meter, Sums
-from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.meter import RunStatistics, Sums
+from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats
 
 if TYPE_CHECKING:  # a gain is passed on to callers, and never read here
     from echelon.synthesis.gains.gain import Gain
 
-Moment: TypeAlias = PyTree
-"""All that changes during a run, as `loop.Moment`."""
+LoopState: TypeAlias = PyTree
+"""All that changes during a run, as `loop.LoopState`."""
 
 
 class Problem(NamedTuple):
@@ -54,8 +54,8 @@ class Problem(NamedTuple):
     model: ControlAffine
     graph: Graph
     formation: Formation
-    motion: Motion
-    meter: Meter
+    motion: PlantStep
+    meter: RunStatistics
     settings: Settings
     states: Array
     channel: Channel | None = None
@@ -75,7 +75,7 @@ class Chunk(NamedTuple):
         inexact: (F,) the formations whose numbers are not those that JAX would compute.
     """
 
-    now: Moment
+    now: LoopState
     states: Array
     inputs: Array
     sums: Sums
@@ -83,14 +83,13 @@ class Chunk(NamedTuple):
     inexact: Array | bool = False
 
 
-def numbers(now: Moment) -> tuple[Array, ...]:
+def numbers(now: LoopState) -> tuple[Array, ...]:
     """Return the numbers of a moment, in the order of its tree."""
     leaves = jax.tree.leaves(now)
     return tuple(np.asarray(jax.random.key_data(x) if _is_key(x) else x) for x in leaves)
 
 
 def _leaf(stored: Array, like: jax.Array) -> jax.Array:
-    """Return one of the numbers as the leaf that it was in the moment."""
     if _is_key(like):
         return jax.random.wrap_key_data(jnp.asarray(stored), impl=jax.random.key_impl(like))
     return jnp.asarray(stored, like.dtype)
@@ -114,11 +113,11 @@ class Stepper(abc.ABC):
         """The most steps of a chunk, so that one takes well under two seconds."""
 
     @abc.abstractmethod
-    def start(self) -> Moment:
+    def start(self) -> LoopState:
         """Return the moment at which the run begins."""
 
     @abc.abstractmethod
-    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+    def advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
         """Store a frame and take counts[k] steps, for each k.
 
         `reference` (S, n) is what the leaders follow at this step and the next ones, which the
@@ -126,12 +125,8 @@ class Stepper(abc.ABC):
         that is not finite may end early, with that state in its last frame.
         """
 
-    def recall(self, leaves: Sequence[Array]) -> Moment:
-        """Return the moment of which these are the numbers, in the order of its tree.
-
-        Raises:
-            SimulationError: the moment is of another run, or not all that decides what comes next.
-        """
+    def recall(self, leaves: Sequence[Array]) -> LoopState:
+        """Return the moment of its numbers in tree order; `SimulationError` if of another run."""
         # The moment at the start says of what kind and shape each of the numbers is.
         like, tree = jax.tree.flatten(self.start())
         if [np.shape(leaf) for leaf in numbers(like)] != [np.shape(leaf) for leaf in leaves]:
@@ -171,7 +166,7 @@ class Information(NamedTuple):
     follower: tuple[str, ...]
 
 
-class Drive(Declared):
+class Controller(Declared):
     """What gives the agents their inputs: laws, plans made before, or a receding horizon."""
 
     @property
@@ -190,18 +185,10 @@ class Drive(Declared):
 
     @abc.abstractmethod
     def stepper(self, problem: Problem) -> Stepper:
-        """Return the stepper of agents under a prepared drive.
-
-        Raises:
-            EchelonError: there is none, such as for a plan that violates a constraint.
-        """
+        """Return the stepper of agents under a prepared drive, else raise `EchelonError`."""
 
     def check_motion(self, formation: Formation, graph: Graph) -> tuple[str, ...]:
-        """Return warnings of a formation that changes with time.
-
-        Raises:
-            EchelonError: the drive cannot follow it.
-        """
+        """Return warnings of a moving formation; `EchelonError` if the drive cannot follow it."""
         raise SimulationError(
             "a formation that changes with time needs control laws, and plans and receding "
             "horizons have constant offsets; leave out `motion`."
@@ -242,12 +229,8 @@ class Drive(Declared):
         """Whether the trim input is applied."""
         return True
 
-    def prepare(self, model: ControlAffine, graph: Graph) -> "Drive":
-        """Return the drive completed with what depends on the model and the graph.
-
-        Raises:
-            LawError: a law does not fit the model or the graph.
-        """
+    def prepare(self, model: ControlAffine, graph: Graph) -> "Controller":
+        """Return the drive completed for model and graph; `LawError` if a law does not fit."""
         return self
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
@@ -255,11 +238,7 @@ class Drive(Declared):
         return ()
 
     def check_world(self, world: World, graph: Graph, dt: float) -> None:
-        """Check that a world suits the drive, at a step dt (s).
-
-        Raises:
-            EchelonError: it does not.
-        """
+        """Raise `EchelonError` unless a world suits the drive at a step dt (s)."""
         for name in ("network", "sensing"):
             if getattr(world, name) is not None:
                 raise SimulationError(
@@ -267,31 +246,19 @@ class Drive(Declared):
                     f"that arrive at once; use control laws, or remove `{name}`."
                 )
 
-    def check_heirs(self, graph: Graph) -> None:
-        """Check that agents may be lost or join, and that heirs may take the lead.
-
-        Raises:
-            EchelonError: they may not.
-        """
-        if graph.presence is not None or graph.heirs:
+    def check_backups(self, graph: Graph) -> None:
+        """Raise `EchelonError` unless agents may be lost or join, and backups take the lead."""
+        if graph.presence is not None or graph.backups:
             raise SimulationError(
-                f"agents are lost or join, or have heirs, but `{type(self).__name__}` optimizes "
-                "inputs of agents that are all there; use control laws."
+                f"agents are lost or join, or have backup leaders, but `{type(self).__name__}` "
+                "optimizes inputs of agents that are all there; use control laws."
             )
 
     def accept(self, problem: Problem) -> None:
-        """Check the starts of a run under a drive that is prepared.
-
-        Raises:
-            LawError: an agent starts where its law has no meaning.
-        """
+        """Raise `LawError` if an agent starts where its prepared law has no meaning."""
 
     def check_engine(self, problem: Problem) -> None:
-        """Check, before anything is compiled, that the engine which is requested can step this.
-
-        Raises:
-            SimulationError: it cannot.
-        """
+        """Raise `SimulationError`, before compiling, if the requested engine cannot step this."""
         if problem.settings.engine == "native":
             raise SimulationError(
                 "`engine` is `native`, and must be `auto` or `jax` where a solver drives agents."
@@ -306,12 +273,8 @@ class Drive(Declared):
         """Return the states (T, n) that the leaders follow; None where they follow nothing."""
         return None
 
-    def with_follower(self, law: Law) -> "Drive":
-        """Return a drive with the same leaders, and followers under another law.
-
-        Raises:
-            SimulationError: the leaders have no law of their own.
-        """
+    def with_follower(self, law: Law) -> "Controller":
+        """Return the drive with another follower law; `SimulationError` if leaders have none."""
         raise SimulationError(
             f"the leaders under `{type(self).__name__}` have no law of their own."
         )

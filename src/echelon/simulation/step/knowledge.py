@@ -38,13 +38,13 @@ class Packets(NamedTuple):
         leader: its number.
         stamp: the step at which it said so; `NEVER` for no packet.
         content: a row of numbers, which depends on the prediction.
-        epoch: how often the lead was taken over; None without heirs.
+        term: how often the lead was taken over; None without backup leaders.
     """
 
     leader: Int[jax.Array, " N"]
     stamp: Int[jax.Array, " N"]
     content: Float[jax.Array, "N p"]
-    epoch: Int[jax.Array, " N"] | None = None
+    term: Int[jax.Array, " N"] | None = None
 
 
 class Letters(NamedTuple):
@@ -105,44 +105,44 @@ class Knowledge(NamedTuple):
 
 
 def no_mail(
-    readers: Readers, links: int, sent: Float[jax.Array, "N s"], packet: int, heirs: bool = False
+    readers: Readers, links: int, sent: Float[jax.Array, "N s"], packet: int, backups: bool = False
 ) -> Mail:
     """Return the mail before the first message, for signals as sent and packets (packet,)."""
     return Mail(
         jnp.full(links, NEVER, jnp.int32),
         jnp.zeros((links, sent.shape[1]), sent.dtype),
         jnp.full(links, NOBODY, jnp.int32),
-        no_packets(readers, jnp.zeros((len(readers.number), packet), sent.dtype), heirs),
+        no_packets(readers, jnp.zeros((len(readers.number), packet), sent.dtype), backups),
     )
 
 
-def no_packets(readers: Readers, content: Float[jax.Array, "N p"], heirs: bool) -> Packets:
-    """Return the packets before the first one, with epochs where there are heirs."""
+def no_packets(readers: Readers, content: Float[jax.Array, "N p"], backups: bool) -> Packets:
+    """Return the packets before the first one, with terms where there are backup leaders."""
     leader = jnp.where(readers.leads, readers.number, NOBODY).astype(jnp.int32)
     never = jnp.full(len(leader), NEVER, jnp.int32)
-    return Packets(leader, never, content, jnp.zeros_like(never) if heirs else None)
+    return Packets(leader, never, content, jnp.zeros_like(never) if backups else None)
 
 
 def taken_over(
     packet: Packets, chosen: Bool[jax.Array, " N"], number: jax.Array, step: jax.Array
 ) -> Packets:
     """Return the packets of agents of which the chosen ones have just taken the lead."""
-    assert packet.epoch is not None
+    assert packet.term is not None
     leader = jnp.where(chosen, number, packet.leader)
     stamp = jnp.where(chosen, step, packet.stamp)
-    return packet._replace(leader=leader, stamp=stamp, epoch=packet.epoch + chosen)
+    return packet._replace(leader=leader, stamp=stamp, term=packet.term + chosen)
 
 
-def packet_size(channel: Channel, s: int, forward: int, m: int, heirs: bool = False) -> int:
+def packet_size(channel: Channel, s: int, forward: int, m: int, backups: bool = False) -> int:
     """Return how many numbers a packet has, for signals (s,), a feed-forward and inputs (m,).
 
-    Where the leader has `heirs` it also says how its feed-forward changes, since it is carried on
+    Where the leader has `backups` it also says how its feed-forward changes, since it is carried on
     for longer.
     """
     if channel.messages is MessageContent.STATE:
         return forward
     carried = channel.prediction is Prediction.PACKET
-    return s + carried * (forward + m + heirs * forward)
+    return s + carried * (forward + m + backups * forward)
 
 
 def understand(
@@ -264,7 +264,7 @@ def _slope(
 ) -> Float[jax.Array, " k"]:
     """Return the rate at which the feed-forward of a leader with a plan changes, from a step on."""
     deviation, dt = loop.leader.deviation(loop.model, t, x, offset, memory), loop.motion.dt
-    assert deviation is not None, "a leader with heirs has a plan"
+    assert deviation is not None, "a leader with backup leaders has a plan"
     expected = loop.leader.expected(loop.model, t + dt, deviation, jnp.asarray(dt, t.dtype), dt)
     if expected is None or expected.feedforward is None:
         return jnp.zeros_like(forward)

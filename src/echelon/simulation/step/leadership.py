@@ -1,8 +1,8 @@
 """Who takes the lead when nobody hears of the leader any more.
 
-Each packet of a leader has an epoch. An heir that hears of no leader for long raises the epoch by
-one and leads along the plan, at its own offset; everybody, an old leader too, follows the packet of
-the highest epoch. The next heirs wait longer by a timeout each, so that no agent has to know who is
+Each packet of a leader has a term. A backup leader that hears of no leader for long raises the term
+by one and leads along the plan, at its own offset; everybody, an old leader too, follows the packet
+of the highest term. The next ones wait longer by a timeout each, so that no agent must know who is
 left.
 """
 
@@ -32,27 +32,26 @@ class Leadership:
     """Who takes the lead when nobody hears of the leader any more.
 
     Args:
-        heirs: the numbers of followers, in the order in which they take over.
+        backups: the numbers of followers, in the order in which they take over.
         timeout: s without news of a leader after which the first of them does, the second after
             twice that, and so on.
 
     Raises:
-        SimulationError: there is no heir, or the timeout is not positive and finite.
+        SimulationError: there is no backup leader, or the timeout is not positive and finite.
     """
 
-    heirs: Sequence[int]
+    backups: Sequence[int]
     timeout: float = 0.3
 
     def __post_init__(self) -> None:
-        """Check all."""
-        object.__setattr__(self, "heirs", tuple(self.heirs))
-        if not self.heirs:
-            raise SimulationError("`heirs` is empty, and must name at least one follower.")
+        object.__setattr__(self, "backups", tuple(self.backups))
+        if not self.backups:
+            raise SimulationError("`backups` is empty, and must name at least one follower.")
         if not (is_number(self.timeout) and 0.0 < float(self.timeout) < math.inf):
             raise SimulationError(f"`timeout` is {self.timeout}, and must be positive and finite.")
 
     def check_network(self, network: Network | None) -> None:
-        """Check that heirs wait longer than messages of a network that is not disturbed take.
+        """Check that backup leaders wait longer than messages of an undisturbed network take.
 
         Raises:
             SimulationError: they do not.
@@ -65,11 +64,11 @@ class Leadership:
             )
 
 
-class Succession(NamedTuple):
-    """The heirs of a run.
+class Failover(NamedTuple):
+    """The backup leaders of a run.
 
     Attributes:
-        rank: (N,) the place of each agent among the heirs; -1 of no heir.
+        rank: (N,) the place of each agent among the backup leaders; -1 of no backup leader.
         first: (N,) who leads at the start.
         timeout: s.
     """
@@ -79,12 +78,12 @@ class Succession(NamedTuple):
     timeout: Array
 
     @classmethod
-    def of(cls, graph: Graph, leadership: Leadership | None) -> "Succession | None":
-        """Return the heirs of a run; None without any."""
+    def of(cls, graph: Graph, leadership: Leadership | None) -> "Failover | None":
+        """Return the backup leaders of a run; None without any."""
         if leadership is None:
             return None
         rank = np.full(graph.agents, _NO_HEIR, np.int32)
-        rank[list(leadership.heirs)] = np.arange(len(leadership.heirs))
+        rank[list(leadership.backups)] = np.arange(len(leadership.backups))
         first = np.isin(np.arange(graph.agents), graph.leaders)
         return cls(rank, first, np.asarray(float(leadership.timeout)))
 
@@ -94,13 +93,7 @@ class Succession(NamedTuple):
         leader: Int[jax.Array, " K"] | Array,
         waited: Float[jax.Array, " K"] | Array,
     ) -> Bool[jax.Array, " K"]:
-        """Return which of some agents take the lead.
-
-        Args:
-            number: of the agents.
-            leader: whom each follows.
-            waited: since each last heard of it, or began to listen, s.
-        """
+        """Return which of `number` take the lead, having `waited` (s) for whom they follow."""
         rank = jnp.asarray(self.rank)[number]
         # Beyond rounding, so that all see the same step.
         late = jnp.asarray(waited) > jnp.asarray(self.timeout) * (rank + 1) + _ROUNDED

@@ -22,9 +22,9 @@ from echelon.core.types import Array, PyTree, Scalar, States
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law, Memory, without_certificates
 from echelon.simulation.step.drive import Problem
-from echelon.simulation.step.leadership import Succession
-from echelon.simulation.step.meter import Meter
-from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.leadership import Failover
+from echelon.simulation.step.meter import RunStatistics
+from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.settings import Settings
 
 
@@ -48,7 +48,7 @@ class Loop(eqx.Module):
         order: (N,) from leaders and followers to the agents' own order.
         switches: when the graph switches; None where it does not.
         presence: who is there; None where all always are.
-        succession: the heirs, which act with the leaders; None without any.
+        succession: the backup leaders, which act with the leaders; None without any.
         channel: what the network does to messages; None for the ideal network.
         sensors: of the agents' own states; None for exact ones.
         share: of the feed-forward that followers use; None for all of it.
@@ -56,8 +56,8 @@ class Loop(eqx.Module):
     """
 
     model: ControlAffine
-    motion: Motion
-    meter: Meter
+    motion: PlantStep
+    meter: RunStatistics
     leader: Law
     follower: Law
     exchange: Exchange
@@ -69,8 +69,8 @@ class Loop(eqx.Module):
     levels: Array | None
     order: Array
     switches: "Switches | None"
-    presence: "Presence | None" = None
-    succession: Succession | None = None
+    presence: "ActiveAgents | None" = None
+    succession: Failover | None = None
     channel: Channel | None = None
     sensors: Sensors | None = None
     share: Array | None = None
@@ -86,10 +86,7 @@ class Loop(eqx.Module):
 def offsets_at(
     loop: Loop, law: Law, t: Scalar, agents: Array | jax.Array
 ) -> tuple[Float[jax.Array, "K n"], Float[jax.Array, "K n"] | None]:
-    """Return what agents (K,) under a law take for their offsets at a time (s), and the rates.
-
-    There are no rates of constant offsets, or where the law does not use them.
-    """
+    """Return offsets of agents (K,) at a time (s), and their rates if a law uses moving ones."""
     offsets, motion = jnp.asarray(loop.offsets, t.dtype)[agents], loop.moving
     if motion is None:
         return offsets, None
@@ -107,7 +104,7 @@ def all_offsets(loop: Loop, t: jax.Array) -> Float[jax.Array, "N n"]:
     ]
 
 
-def goals_at(loop: Loop, now: "Moment") -> Float[jax.Array, "N n"] | None:
+def goals_at(loop: Loop, now: "LoopState") -> Float[jax.Array, "N n"] | None:
     """Return the offsets of all agents, as errors are measured; None of constant ones."""
     motion, t = loop.moving, time_of(loop, now)
     if motion is None:
@@ -129,7 +126,7 @@ class Switches(NamedTuple):
         return None if schedule is None else cls(*schedule.switches(settings.dt, settings.horizon))
 
 
-class Presence(eqx.Module):
+class ActiveAgents(eqx.Module):
     """Who is there in each of S stretches of the graph.
 
     Attributes:
@@ -146,7 +143,7 @@ class Presence(eqx.Module):
     returns: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, graph: Graph) -> "Presence | None":
+    def of(cls, graph: Graph) -> "ActiveAgents | None":
         """Return who is there when; None where all always are."""
         schedule = graph.schedule
         if schedule is None or schedule.present is None or schedule.nearest is None:
@@ -166,25 +163,25 @@ def row_at(switches: Switches, step: jax.Array) -> jax.Array:
     return rows[jnp.searchsorted(steps, step, side="right") - 1]
 
 
-class Cast(Protocol):
+class Roster(Protocol):
     """Who is there when, and who may lead: a loop, or a network by itself."""
 
     @property
     def switches(self) -> "Switches | None": ...  # noqa: D102
     @property
-    def presence(self) -> "Presence | None": ...  # noqa: D102
+    def presence(self) -> "ActiveAgents | None": ...  # noqa: D102
     @property
-    def succession(self) -> Succession | None: ...  # noqa: D102
+    def succession(self) -> Failover | None: ...  # noqa: D102
 
 
-def present_at(loop: Cast, step: jax.Array) -> Bool[jax.Array, " N"] | None:
+def present_at(loop: Roster, step: jax.Array) -> Bool[jax.Array, " N"] | None:
     """Return who is present at a step; None where all always are."""
     if loop.presence is None or loop.switches is None:
         return None
     return jnp.asarray(loop.presence.rows)[row_at(loop.switches, step)]
 
 
-def since_at(loop: Cast, step: jax.Array) -> jax.Array:
+def since_at(loop: Roster, step: jax.Array) -> jax.Array:
     """Return since when each agent has been there, s, (N,)."""
     if loop.presence is None or loop.switches is None:
         return jnp.zeros(())
@@ -216,15 +213,15 @@ class WorldState(NamedTuple):
     """What the world remembers between two steps; empty in the ideal world.
 
     Attributes:
-        in_flight: the last messages that were sent, as `Posts` of the channel.
+        in_flight: the last messages that were sent, as `InFlight` of the channel.
         mail: what agents keep of those that they received, as `Mail`.
         motion: what the plants remember besides their states, as `MotionState`.
         measured: (d, N, n) the states of the last d steps, where agents measure theirs late.
-        seen: messages about places, as `Sightings`, where agents keep away from each other.
+        seen: messages about places, as `NeighbourHulls`, where agents keep away from each other.
         estimates: of agents that estimate their states, as `Estimate`.
         starts: (N, n) the initial states, where agents are lost and join again.
         led: what each agent last received of its leader, as `Packets`, in the ideal network with
-            heirs.
+            backup leaders.
     """
 
     in_flight: PyTree = None
@@ -237,7 +234,7 @@ class WorldState(NamedTuple):
     led: PyTree = None
 
 
-class Moment(NamedTuple):
+class LoopState(NamedTuple):
     """All that changes during a run.
 
     Attributes:
@@ -260,8 +257,8 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
     """Return the loop of prepared laws."""
     graph = problem.graph
     leader = leader if problem.channel is None else leader.predictable(problem.model)
-    leaders = np.array([*graph.leaders, *graph.heirs])
-    followers = np.array([k for k in graph.followers if k not in graph.heirs], int)
+    leaders = np.array([*graph.leaders, *graph.backups])
+    followers = np.array([k for k in graph.followers if k not in graph.backups], int)
     by_depth = follower.feedforward is Feedforward.PARENT
     nearest = np.array(graph.nearest_leader())
     return Loop(
@@ -281,8 +278,8 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         # Leaders act first, and this puts what all did back into the agents' own order.
         order=np.argsort(np.concatenate([leaders, followers])),
         switches=Switches.of(graph, problem.settings),
-        presence=Presence.of(graph),
-        succession=Succession.of(graph, problem.leadership),
+        presence=ActiveAgents.of(graph),
+        succession=Failover.of(graph, problem.leadership),
         channel=problem.channel,
         sensors=problem.sensors,
         moving=problem.formation.motion,
@@ -290,10 +287,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
 
 
 def _levels(graph: Graph) -> Array:
-    """Return the places of followers among the followers, (D, W), a row for each depth.
-
-    A row that is too short repeats its first entry.
-    """
+    """Return followers' places among followers by depth, (D, W); short rows repeat a place."""
     depth = graph.depths()[list(graph.followers)]
     rows = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
     # One shape for all levels, as a scan needs; a copy of an agent does what the agent does.
@@ -301,21 +295,21 @@ def _levels(graph: Graph) -> Array:
     return np.stack([np.append(row, np.repeat(row[0], width - len(row))) for row in rows])
 
 
-def begin_forgetful(loop: Loop, states: Any) -> Moment:
+def begin_forgetful(loop: Loop, states: Any) -> LoopState:
     """Return it for laws without memory, without JAX: one of its calls costs many steps."""
     # `Any`, since NumPy's arrays are where a moment has JAX's until the first step.
     cut: Any = np.zeros((len(states), len(loop.model.input_names)), np.int8)
     step: Any = np.zeros((), np.int32)
-    return Moment(step, states, loop.leader.init(), loop.follower.init(), cut)
+    return LoopState(step, states, loop.leader.init(), loop.follower.init(), cut)
 
 
-def time_of(loop: Loop, now: Moment) -> jax.Array:
+def time_of(loop: Loop, now: LoopState) -> jax.Array:
     """Return the time (s) of a moment."""
     # From the step number, since a sum of many dt would gather rounding.
     return now.step.astype(now.states.dtype) * loop.motion.dt
 
 
-def measured(loop: Loop, now: Moment) -> Moment:
+def measured(loop: Loop, now: LoopState) -> LoopState:
     """Return the moment as the agents measure it: they know nothing of their true states."""
     if loop.sensors is None:
         return now

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from echelon.agents.network.channel import NEVER, Channel, Posts
+from echelon.agents.network.channel import NEVER, Channel, InFlight
 from echelon.agents.network.exchange import Difference, Exchange
 from echelon.core.types import Array
 from echelon.simulation.step.knowledge import (
@@ -23,9 +23,9 @@ from echelon.simulation.step.knowledge import (
     write,
 )
 from echelon.simulation.step.loop import (
-    Cast,
     Loop,
-    Moment,
+    LoopState,
+    Roster,
     WorldState,
     offsets_at,
     present_at,
@@ -53,9 +53,9 @@ def begin_network(
     channel, readers = loop.channel, first_readers(loop)
     assert channel is not None
     links, s = len(loop.exchange.receivers), sent.shape[1]
-    heirs = loop.succession is not None
-    size = packet_size(channel, s, forward, len(loop.model.input_names), heirs)
-    mail = no_mail(readers, links, sent, size, heirs)
+    backups = loop.succession is not None
+    size = packet_size(channel, s, forward, len(loop.model.input_names), backups)
+    mail = no_mail(readers, links, sent, size, backups)
     posts = channel.begin(Letters(sent, readers.number, mail.packet), links)
     return world._replace(in_flight=posts, mail=mail)
 
@@ -63,7 +63,7 @@ def begin_network(
 def read_messages(
     loop: Loop,
     exchange: Exchange,
-    now: Moment,
+    now: LoopState,
     sent: Float[jax.Array, "N s"],
     difference: Difference,
 ) -> tuple[Knowledge, Mail]:
@@ -71,14 +71,14 @@ def read_messages(
     channel = loop.channel
     assert channel is not None
     mail = take(channel, exchange, now.step, now.world.in_flight, now.world.mail)
-    mail = mail._replace(packet=led_by_heirs(loop, now.step, mail.packet, loop.motion.dt))
+    mail = mail._replace(packet=led_by_backups(loop, now.step, mail.packet, loop.motion.dt))
     ages = Ages(*(age_of(now.step, x, loop.motion.dt) for x in (mail.stamp, mail.packet.stamp)))
     t, readers = now.step.astype(sent.dtype) * loop.motion.dt, readers_of(loop, mail.packet)
     return understand(loop, exchange, readers, t, mail, ages, sent, difference), mail
 
 
-def led_by_heirs(loop: Cast, step: jax.Array, packet: Packets, dt: Array | float) -> Packets:
-    """Return the packets after those heirs took the lead that hear of no leader; dt in s."""
+def led_by_backups(loop: Roster, step: jax.Array, packet: Packets, dt: Array | float) -> Packets:
+    """Return the packets after backup leaders that hear of no leader took the lead; dt in s."""
     if loop.succession is None:
         return packet
     number = jnp.arange(len(packet.leader), dtype=jnp.int32)
@@ -98,23 +98,16 @@ def readers_of(loop: Loop, packet: Packets) -> Readers:
 
 
 def heard_at_once(
-    loop: Loop, now: Moment, packet: Packets, said: Float[jax.Array, "L k"]
+    loop: Loop, now: LoopState, packet: Packets, said: Float[jax.Array, "L k"]
 ) -> Packets:
-    """Return the packets of an ideal network, in which all hear leaders in the same step.
-
-    Args:
-        loop: with heirs.
-        now: the moment.
-        packet: of all agents.
-        said: what leaders and heirs would say if they led.
-    """
+    """Return the packets of an ideal network, in which all hear leaders in the same step."""
     agents, number = len(loop.order), jnp.asarray(loop.leaders)
     here = present_at(loop, now.step)
     here = jnp.ones(agents, bool) if here is None else here
     leads = readers_of(loop, packet).leads & here
     stamp = jnp.full(len(number), now.step, jnp.int32)
-    assert packet.epoch is not None
-    own = Packets(packet.leader[number], stamp, said, packet.epoch[number])
+    assert packet.term is not None
+    own = Packets(packet.leader[number], stamp, said, packet.term[number])
     each = jax.tree.map(lambda part: jnp.repeat(part, agents, axis=0), own)
     receivers = jnp.tile(jnp.arange(agents), len(number))
     new = jnp.repeat(leads[number], agents) & here[receivers]
@@ -128,7 +121,9 @@ def age_of(
     return jnp.where(stamp == NEVER, jnp.inf, (step - stamp) * jnp.asarray(dt))
 
 
-def take(channel: Channel, exchange: Exchange, step: jax.Array, posts: Posts, mail: Mail) -> Mail:
+def take(
+    channel: Channel, exchange: Exchange, step: jax.Array, posts: InFlight, mail: Mail
+) -> Mail:
     """Return the mail with what arrives at a step."""
     arrival = channel.arrivals(posts, step, mail.stamp)
     places = arrival.slot, jnp.asarray(exchange.senders)
@@ -143,7 +138,7 @@ def take(channel: Channel, exchange: Exchange, step: jax.Array, posts: Posts, ma
 def newest(own: Packets, others: Packets, new: jax.Array, receivers: jax.Array) -> Packets:
     """Return the packet of each agent: of the leader with the lowest number, the newest one.
 
-    Of several epochs the highest counts.
+    Of several terms the highest counts.
 
     Args:
         own: of the agents.
@@ -152,13 +147,13 @@ def newest(own: Packets, others: Packets, new: jax.Array, receivers: jax.Array) 
         receivers: (K,) of the messages.
     """
     count = len(own.stamp)
-    valid, epoch, current = new & (others.stamp != NEVER), own.epoch, own.leader
-    if others.epoch is not None and epoch is not None:
-        epochs = jnp.where(valid, others.epoch, 0)
-        epoch = jnp.maximum(epoch, jax.ops.segment_max(epochs, receivers, count))
-        valid &= others.epoch == epoch[receivers]
-        # Whoever led in an earlier epoch does so no more.
-        current = jnp.where(own.epoch == epoch, current, NOBODY)
+    valid, term, current = new & (others.stamp != NEVER), own.term, own.leader
+    if others.term is not None and term is not None:
+        terms = jnp.where(valid, others.term, 0)
+        term = jnp.maximum(term, jax.ops.segment_max(terms, receivers, count))
+        valid &= others.term == term[receivers]
+        # Whoever led in an earlier term does so no more.
+        current = jnp.where(own.term == term, current, NOBODY)
     leaders = jnp.where(valid, others.leader, NOBODY)
     leader = jnp.minimum(current, jax.ops.segment_min(leaders, receivers, count))
     of_it = valid & (leaders == leader[receivers])
@@ -170,13 +165,13 @@ def newest(own: Packets, others: Packets, new: jax.Array, receivers: jax.Array) 
     place = jax.ops.segment_max(places, receivers, count)
     better = (place >= 0) & (stamp > last)
     content = jnp.where(better[:, None], others.content[place], own.content)
-    return Packets(leader, stamp, content, epoch)
+    return Packets(leader, stamp, content, term)
 
 
 def send_messages(
     loop: Loop,
     exchange: Exchange,
-    now: Moment,
+    now: LoopState,
     mail: Mail,
     knowledge: Knowledge,
     sent: Float[jax.Array, "N s"],

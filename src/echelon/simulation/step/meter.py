@@ -57,7 +57,7 @@ class Sums(NamedTuple):
             in each of B slices of the run; infinite before.
         avoidance: (N, B) how many others changed the agent's rate, summed over the steps of each.
         closest: (1,) the smallest distance between two agents at the beginning of a step, and `met`
-            (1, 3) that step and the two; (0,) and (0, 3) where `Meter.paired` is empty.
+            (1, 3) that step and the two; (0,) and (0, 3) where `RunStatistics.paired` is empty.
     """
 
     steps: Total
@@ -101,10 +101,7 @@ class Sums(NamedTuple):
         return Sums(*(np.where(w, a, b) for w, a, b in zip(shapes, self, others, strict=True)))
 
     def split(self, count: int) -> "Sums":
-        """Return the sums of `count` formations whose agents, leaders and edges follow each other.
-
-        Of one swarm of them all; its steps are those of each.
-        """
+        """Return sums of `count` formations in a row, from those of one swarm of them all."""
         # These have their axis of two in front of that of the agents.
         pairs = ("errors", "tracking")
         parts = {
@@ -136,12 +133,11 @@ class OfAgent(NamedTuple):
 
 
 def _twice(steady: jax.Array, square: jax.Array) -> Float[jax.Array, "2"]:
-    """Return a square for all steps and for those of the steady window."""
     return jnp.where(jnp.stack([jnp.asarray(True), steady]), square, 0.0)
 
 
 @final
-class Meter(eqx.Module):
+class RunStatistics(eqx.Module):
     """Measures the agents at the beginning of each step, by the model and never by the plant."""
 
     model: ControlAffine
@@ -169,7 +165,7 @@ class Meter(eqx.Module):
         formation: Formation,
         settings: Settings,
         scales: Array | None = None,
-    ) -> "Meter":
+    ) -> "RunStatistics":
         """Return the meter of a run, in which agents that keep apart have `scales` (d,)."""
         per_slice = steps_per_slice(settings)
         measured = measured_states(model)
@@ -263,7 +259,7 @@ class Meter(eqx.Module):
             met=jnp.zeros((min(1, len(self.paired)), 3), jnp.int32),
         )
 
-    def following(self, nearest: jax.Array) -> "Meter":
+    def following(self, nearest: jax.Array) -> "RunStatistics":
         """Return a meter of errors relative to these leaders (N,)."""
         return dataclasses.replace(self, nearest=nearest)
 
@@ -344,7 +340,6 @@ class Meter(eqx.Module):
         return _twice(steady, self._length(x - offset - reference)), deviation * deviation
 
     def _length(self, deviation: jax.Array) -> jax.Array:
-        """Return the squared length of the measured part of a deviation (n,)."""
         part = deviation[np.array(self.measured)]
         return jnp.sum(part * part)
 
@@ -388,8 +383,5 @@ def measured_states(model: ControlAffine) -> tuple[int, ...]:
 
 
 def output_error(model: ControlAffine, x: State, reference: State) -> Output:
-    """Return h(x) - h(reference), (q,), of two states (n,).
-
-    The states differ by the model's difference, which may wind angles.
-    """
+    """Return h(x) - h(reference) (q,); states differ by the model's difference, which may wind."""
     return model.output(reference + model.difference(x, reference)) - model.output(reference)

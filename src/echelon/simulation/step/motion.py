@@ -34,7 +34,7 @@ class MotionState(NamedTuple):
 
 
 @final
-class Motion(eqx.Module):
+class PlantStep(eqx.Module):
     """The plant in its world, advanced a step at a time.
 
     Attributes:
@@ -60,11 +60,7 @@ class Motion(eqx.Module):
 
     @classmethod
     def of(cls, model: ControlAffine, world: World, settings: Settings, agents: int = 0) -> Self:
-        """Return the motion of so many agents in a world.
-
-        Raises:
-            SimulationError: the integrator has no time in which an actuator could lag.
-        """
+        """Return the motion in a world; `SimulationError` if the integrator allows no lag."""
         # Limits and disturbance are the plant's: its motors may differ from those that laws know.
         plant, disturbance = world.plant_for(model), world.disturbance
         wind = disturbance and disturbance.prepared(plant, settings.dt, settings.seed)
@@ -96,7 +92,7 @@ class Motion(eqx.Module):
         windy = self.wind is not None and (self.wind.fade is not None or self.wind.air is not None)
         return self.motors is None and self.rows is None and self.substeps == 1 and not windy
 
-    def of_row(self, row: Row | None) -> "Motion":
+    def of_row(self, row: Row | None) -> "PlantStep":
         """Return the motion of one agent, of which `row` has the parameters of its own."""
         if row is None:
             return self
@@ -121,10 +117,7 @@ class Motion(eqx.Module):
     def advance(
         self, states: States, inputs: Inputs, step: jax.Array, memory: MotionState = MotionState()
     ) -> tuple[States, MotionState]:
-        """Return the states (N, n) one dt later, and what the plants then remember.
-
-        The delivered inputs (N, m) are held over it, and so is the disturbance of this step.
-        """
+        """Return states (N, n) one dt later, and memory; inputs (N, m) and disturbance are held."""
 
         # Integrated with the input held, as a digital controller holds it: the order of the method
         # stays, since u and the wind are constant within a step.

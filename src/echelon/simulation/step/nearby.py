@@ -11,15 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from echelon.agents.network.channel import NEVER, Posts
+from echelon.agents.network.channel import NEVER, InFlight
 from echelon.agents.network.exchange import Near
 from echelon.core.types import Array, States
 from echelon.laws.law import Law, Memory
 from echelon.simulation.step.knowledge import Knowledge, Mail
-from echelon.simulation.step.loop import Loop, Moment, present_at
+from echelon.simulation.step.loop import Loop, LoopState, present_at
 
 
-class Sightings(NamedTuple):
+class NeighbourHulls(NamedTuple):
     """Messages about the places of all agents, along K = N (N - 1) links.
 
     Attributes:
@@ -28,12 +28,12 @@ class Sightings(NamedTuple):
         points: (K, r, d) that it contains.
     """
 
-    posts: Posts
+    posts: InFlight
     stamp: Int[jax.Array, " K"]
     points: Float[jax.Array, "K r d"]
 
 
-def begin_sightings(loop: Loop, now: Moment) -> Sightings | None:
+def begin_sightings(loop: Loop, now: LoopState) -> NeighbourHulls | None:
     """Return the messages before the first one; None in the ideal network or without `safety`."""
     if loop.channel is None or loop.follower.safety is None:
         return None
@@ -41,25 +41,17 @@ def begin_sightings(loop: Loop, now: Moment) -> Sightings | None:
     links = len(_links(len(hulls))[0])
     points = jnp.zeros((links, *hulls.shape[1:]), hulls.dtype)
     stamp = jnp.full(links, NEVER, jnp.int32)
-    return Sightings(loop.channel.begin(hulls, links), stamp, points)
+    return NeighbourHulls(loop.channel.begin(hulls, links), stamp, points)
 
 
 def look_around(
     loop: Loop,
-    now: Moment,
+    now: LoopState,
     leads: Bool[jax.Array, " N"],
     knowledge: Knowledge | None,
     mail: Mail | None,
-) -> tuple[Near | None, Sightings | None]:
-    """Return what each agent knows of all others, rows (N, N - 1, ..), and the messages after it.
-
-    Args:
-        loop: of the run.
-        now: the moment, as agents measure it.
-        leads: who leads.
-        knowledge: of the agents; None in the ideal network.
-        mail: likewise.
-    """
+) -> tuple[Near | None, NeighbourHulls | None]:
+    """Return what each agent knows of all others (N, N - 1, ..), and the messages after it."""
     if loop.follower.safety is None:
         return None, None
     hulls, agents = all_hulls(loop, now), len(loop.order)
@@ -89,22 +81,21 @@ def less_expected(
 
 def _exchanged(
     loop: Loop,
-    now: Moment,
+    now: LoopState,
     hulls: Float[jax.Array, "N r d"],
     sends: Bool[jax.Array, " K"],
     links: tuple[Array, Array],
-) -> Sightings:
-    """Return the messages with those that arrive at a step, and those that are sent at it."""
+) -> NeighbourHulls:
     channel, seen = loop.channel, now.world.seen
     assert channel is not None
     arrival = channel.arrivals(seen.posts, now.step, seen.stamp)
     new = arrival.new[:, None, None]
     points = jnp.where(new, seen.posts.content[arrival.slot, links[1]], seen.points)
     posts = channel.post(seen.posts, now.step, hulls, sends, *links)
-    return Sightings(posts, arrival.stamp, points)
+    return NeighbourHulls(posts, arrival.stamp, points)
 
 
-def all_hulls(loop: Loop, now: Moment) -> Float[jax.Array, "N r d"]:
+def all_hulls(loop: Loop, now: LoopState) -> Float[jax.Array, "N r d"]:
     """Return the points in whose hulls the positions of all agents stay."""
 
     def of(law: Law, states: States, memory: Memory) -> jax.Array | None:

@@ -12,13 +12,13 @@ from echelon.agents.network.exchange import Difference, Near
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.laws.law import Law, LocalView, Memory
-from echelon.simulation.step.action import Action, act, limit_sides
+from echelon.simulation.step.action import AgentOutput, act, limit_sides
 from echelon.simulation.step.arrivals import beside_others, has_angles
 from echelon.simulation.step.distances import closest_two
 from echelon.simulation.step.knowledge import no_packets
 from echelon.simulation.step.loop import (
     Loop,
-    Moment,
+    LoopState,
     WorldState,
     all_offsets,
     exchange_at,
@@ -33,7 +33,7 @@ from echelon.simulation.step.messages import (
     begin_network,
     first_readers,
     heard_at_once,
-    led_by_heirs,
+    led_by_backups,
     read_messages,
     readers_of,
     send_messages,
@@ -44,15 +44,15 @@ from echelon.simulation.step.nearby import begin_sightings, look_around
 
 
 @cached_jit
-def begin(loop: Loop, states: States) -> Moment:
+def begin(loop: Loop, states: States) -> LoopState:
     """Return the moment at which a run begins from states (N, n)."""
 
     def remember(law: Law, agents: Array) -> Memory:
         return jax.vmap(lambda x: law.begin(loop.model, x))(jnp.asarray(states)[agents])
 
-    # Heirs, and a leader that may follow one of them, have the memory of followers.
+    # Backup leaders, and a leader that may follow one of them, have the memory of followers.
     lead = loop.leader if loop.succession is None else loop.follower
-    moment = Moment(
+    moment = LoopState(
         step=jnp.zeros((), jnp.int32),
         states=jnp.asarray(states),
         leader_memory=remember(lead, loop.leaders),
@@ -81,8 +81,7 @@ def begin(loop: Loop, states: States) -> Moment:
     return moment._replace(world=world)
 
 
-def _feedforward_size(loop: Loop, moment: Moment) -> int:
-    """Return how many numbers leaders send to their followers."""
+def _feedforward_size(loop: Loop, moment: LoopState) -> int:
     return jax.eval_shape(lambda: _lead(loop, moment, _sent(loop, moment)[0])).message.shape[1]
 
 
@@ -97,7 +96,7 @@ class Control(NamedTuple):
     world: WorldState
 
 
-def control(loop: Loop, now: Moment) -> Control:
+def control(loop: Loop, now: LoopState) -> Control:
     """Return what all agents do from a moment on."""
     now = measured(loop, now)
     here = present_at(loop, now.step)
@@ -111,7 +110,7 @@ def control(loop: Loop, now: Moment) -> Control:
         knowledge, mail = read_messages(loop, exchange, now, sent, difference)
         z = knowledge.disagreement
     dt, led = loop.motion.dt, now.world.led
-    packet = mail.packet if mail is not None else led_by_heirs(loop, now.step, led, dt)
+    packet = mail.packet if mail is not None else led_by_backups(loop, now.step, led, dt)
     leads = readers_of(loop, packet).leads
     near, seen = look_around(loop, now, leads, knowledge, mail)
     said, led = (_lead(loop, now, z),) * 2
@@ -149,17 +148,14 @@ def control(loop: Loop, now: Moment) -> Control:
     return Control(u, limited.any(axis=1), cut.astype(jnp.int8), led.memory, followed.memory, world)
 
 
-def _chosen(first: Bool[jax.Array, " L"], one: Action, other: Action) -> Action:
-    """Return what some agents do as in one of two actions, and all others as in the other one."""
-
+def _chosen(first: Bool[jax.Array, " L"], one: AgentOutput, other: AgentOutput) -> AgentOutput:
     def pick(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(first.reshape(-1, *[1] * (jnp.ndim(a) - 1)), a, b)
 
     return jax.tree.map(pick, one, other)
 
 
-def _lead(loop: Loop, now: Moment, z: Float[jax.Array, "N s"]) -> Action:
-    """Return what the leaders do."""
+def _lead(loop: Loop, now: LoopState, z: Float[jax.Array, "N s"]) -> AgentOutput:
     # Nobody is before a leader whose input it could be sent.
     silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), z.dtype)
     rows = loop.leaders, silence, now.leader_memory
@@ -168,7 +164,7 @@ def _lead(loop: Loop, now: Moment, z: Float[jax.Array, "N s"]) -> Action:
 
 def _act_all(
     loop: Loop,
-    now: Moment,
+    now: LoopState,
     z: Float[jax.Array, "N s"],
     law: Law,
     agents: Array | jax.Array,
@@ -176,8 +172,7 @@ def _act_all(
     memory: Memory,
     leads: bool = False,
     near: Near | None = None,
-) -> Action:
-    """Return what some agents do, with what they are sent (K, k), remember and know of others."""
+) -> AgentOutput:
     x, t = now.states, time_of(loop, now)
     offsets, rates = offsets_at(loop, law, t, agents)
 
@@ -191,7 +186,7 @@ def _act_all(
         row: PyTree,
         near: Near | None,
         rate: State | None,
-    ) -> Action:
+    ) -> AgentOutput:
         view = LocalView(t, x, offset, z, forward, loop.motion.dt, near, rate)
         return act(loop.with_motion(row), law, view, memory, leads)
 
@@ -199,7 +194,9 @@ def _act_all(
     return jax.vmap(one)(x[agents], offsets, z[agents], forward, memory, rows, near, rates)
 
 
-def _by_depth(loop: Loop, now: Moment, led: Action, z: Float[jax.Array, "N s"]) -> Action:
+def _by_depth(
+    loop: Loop, now: LoopState, led: AgentOutput, z: Float[jax.Array, "N s"]
+) -> AgentOutput:
     """Let the followers act level by level, each sent what its parent has just done."""
     followers, parents = jnp.asarray(loop.followers), jnp.asarray(loop.parents)
     messages = jnp.zeros((len(now.states), led.message.shape[1]), led.message.dtype)
@@ -207,8 +204,8 @@ def _by_depth(loop: Loop, now: Moment, led: Action, z: Float[jax.Array, "N s"]) 
     nothing = jnp.zeros((len(followers), led.input.shape[1]), led.input.dtype)
 
     def level(
-        carry: tuple[jax.Array, Action], places: jax.Array
-    ) -> tuple[tuple[jax.Array, Action], None]:
+        carry: tuple[jax.Array, AgentOutput], places: jax.Array
+    ) -> tuple[tuple[jax.Array, AgentOutput], None]:
         messages, actions = carry
         agents = followers[places]
         memory = jax.tree.map(lambda leaf: leaf[places], now.follower_memory)
@@ -219,7 +216,7 @@ def _by_depth(loop: Loop, now: Moment, led: Action, z: Float[jax.Array, "N s"]) 
         return (messages.at[agents].set(acted.message), actions), None
 
     # Every follower is in one level, so that no zero of these is left.
-    start = Action(nothing, nothing, now.follower_memory, messages[followers])
+    start = AgentOutput(nothing, nothing, now.follower_memory, messages[followers])
     return jax.lax.scan(level, (messages, start), jnp.asarray(loop.levels))[0][1]
 
 
@@ -228,7 +225,7 @@ def _by_depth(loop: Loop, now: Moment, led: Action, z: Float[jax.Array, "N s"]) 
 
 @cached_jit
 def signals(
-    loop: Loop, now: Moment, offsets: Float[jax.Array, "N n"]
+    loop: Loop, now: LoopState, offsets: Float[jax.Array, "N n"]
 ) -> Float[jax.Array, "N s"] | None:
     """Return the signals of all agents (N, s); None where they send their states less offsets."""
     x = jnp.asarray(now.states)
@@ -245,7 +242,7 @@ def signals(
     return jnp.concatenate([leaders, followers])[loop.order]
 
 
-def _sent(loop: Loop, now: Moment) -> tuple[Float[jax.Array, "N s"], Difference]:
+def _sent(loop: Loop, now: LoopState) -> tuple[Float[jax.Array, "N s"], Difference]:
     """Return what all agents send to their neighbours, and how far two such values are apart."""
     offsets = all_offsets(loop, time_of(loop, now))
     sent = signals(loop, now, offsets)
@@ -257,13 +254,13 @@ def _sent(loop: Loop, now: Moment) -> tuple[Float[jax.Array, "N s"], Difference]
 # ---- steps ---------------------------------------------------------------------------------------
 
 
-def step(loop: Loop, now: Moment) -> Moment:
+def step(loop: Loop, now: LoopState) -> LoopState:
     """Return the moment one dt later."""
     now = _with_arrivals(loop, now)
     return _move(loop, now, control(loop, now))
 
 
-def _with_arrivals(loop: Loop, now: Moment) -> Moment:
+def _with_arrivals(loop: Loop, now: LoopState) -> LoopState:
     """Return the moment with who returns where it began, who joins beside others' headings."""
     here, before = present_at(loop, now.step), present_at(loop, now.step - 1)
     returns = now.world.starts is not None
@@ -271,16 +268,16 @@ def _with_arrivals(loop: Loop, now: Moment) -> Moment:
         return now
     new = here & ~before & (now.step > 0)
 
-    def begun(now: Moment) -> Moment:
+    def begun(now: LoopState) -> LoopState:
         moment = _where(loop, new, begin(loop, now.world.starts), now) if returns else now
         return beside_others(loop, moment, new, here & before, _sent(loop, now)[0])
 
     return jax.lax.cond(new.any(), begun, lambda now: now, now)
 
 
-def _where(loop: Loop, chosen: Bool[jax.Array, " N"], one: Moment, other: Moment) -> Moment:
-    """Return a moment in which some agents are as in one moment, and all others as in another."""
-
+def _where(
+    loop: Loop, chosen: Bool[jax.Array, " N"], one: LoopState, other: LoopState
+) -> LoopState:
     def some(agents: Array | slice) -> Callable[[jax.Array, jax.Array], jax.Array]:
         def pick(a: jax.Array, b: jax.Array) -> jax.Array:
             mask = chosen[agents]
@@ -288,7 +285,7 @@ def _where(loop: Loop, chosen: Bool[jax.Array, " N"], one: Moment, other: Moment
 
         return pick
 
-    def of_all(part: Callable[[Moment], PyTree]) -> PyTree:
+    def of_all(part: Callable[[LoopState], PyTree]) -> PyTree:
         return jax.tree.map(some(slice(None)), part(one), part(other))
 
     return other._replace(
@@ -305,14 +302,13 @@ def _where(loop: Loop, chosen: Bool[jax.Array, " N"], one: Moment, other: Moment
     )
 
 
-def _move(loop: Loop, now: Moment, acted: Control) -> Moment:
-    """Return the moment one dt later under what all agents do."""
+def _move(loop: Loop, now: LoopState, acted: Control) -> LoopState:
     world = acted.world
     own = MotionState() if world.motion is None else world.motion
     states, own = loop.motion.advance(now.states, acted.inputs, now.step, own)
     world = world if world.motion is None else world._replace(motion=own)
     memories = acted.leader_memory, acted.follower_memory
-    after = Moment(now.step + 1, states, *memories, acted.cut, world)
+    after = LoopState(now.step + 1, states, *memories, acted.cut, world)
     here = present_at(loop, now.step)
     # Who is absent stays as it is.
     return (
@@ -323,12 +319,9 @@ def _move(loop: Loop, now: Moment, acted: Control) -> Moment:
 
 
 def measured_step(
-    loop: Loop, now: Moment, reference: Array | None, first: jax.Array | int
-) -> tuple[Moment, Sums]:
-    """Return the moment one dt later, and the sums of this step.
-
-    `reference` (S, n) is what the leaders follow from the step `first` on.
-    """
+    loop: Loop, now: LoopState, reference: Array | None, first: jax.Array | int
+) -> tuple[LoopState, Sums]:
+    """Return the moment one dt later and its sums; `reference` (S, n) starts at step `first`."""
     now = _with_arrivals(loop, now)
     acted = control(loop, now)
     followed = reference_at(reference, now.step - first, now.states)
@@ -355,21 +348,21 @@ Frames: TypeAlias = tuple[Float[jax.Array, "T N n"], Float[jax.Array, "T N m"]]
 
 @cached_jit
 def advance(
-    loop: Loop, now: Moment, counts: jax.Array, reference: Array | None, first: jax.Array | int
-) -> tuple[Moment, Frames, Sums]:
+    loop: Loop, now: LoopState, counts: jax.Array, reference: Array | None, first: jax.Array | int
+) -> tuple[LoopState, Frames, Sums]:
     """Store a frame and take counts[k] steps, for each k.
 
     Return the last moment, the stored states and inputs, and the sums over the steps. `reference`
     (S, n) is what the leaders follow from the step `first` on.
     """
 
-    def one(_: jax.Array, carry: tuple[Moment, Sums]) -> tuple[Moment, Sums]:
+    def one(_: jax.Array, carry: tuple[LoopState, Sums]) -> tuple[LoopState, Sums]:
         now, sums = measured_step(loop, carry[0], reference, first)
         return now, carry[1].plus(sums)
 
     def frame(
-        carry: tuple[Moment, Sums], count: jax.Array
-    ) -> tuple[tuple[Moment, Sums], tuple[States, Inputs]]:
+        carry: tuple[LoopState, Sums], count: jax.Array
+    ) -> tuple[tuple[LoopState, Sums], tuple[States, Inputs]]:
         # The first step computes these inputs again, but after the last frame there is none.
         now = _with_arrivals(loop, carry[0])
         stored = (now.states, control(loop, now).inputs)

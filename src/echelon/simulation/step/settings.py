@@ -16,10 +16,7 @@ _T = TypeVar("_T", bound="Settings")
 
 
 def _checked(cls: type[_T]) -> type[_T]:
-    """Return a class of tuples whose constructor checks the numbers; `_replace` does not.
-
-    It makes plain numbers of integers and of NumPy's: JAX has no derivative by an integer.
-    """
+    """Check numbers and make them plain: JAX has no derivative by an integer."""
     create = cls.__new__
 
     @functools.wraps(create)
@@ -143,7 +140,6 @@ class Settings(NamedTuple):
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Return a number as a plain float or int of Python, and any other value as it is."""
     if name in ("horizon", "dt", "steady_window") and is_number(value):
         try:
             return float(value)

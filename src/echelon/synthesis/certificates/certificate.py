@@ -57,7 +57,6 @@ class Certificate(eqx.Module):
             is known.
         observable: rank of the observability matrix of (A, g'P), out of n; below n, disagreements
             exist that never enter the input.
-        region: the guarantee on a domain; None without one.
     """
 
     kind: Kind = eqx.field(static=True)

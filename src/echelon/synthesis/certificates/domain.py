@@ -26,7 +26,6 @@ class Domain:
     """
 
     def __init__(self, lower: Array, upper: Array, input_lower: Array, input_upper: Array) -> None:
-        """Store the bounds, read-only."""
         self.lower, self.upper = np.array(lower, float), np.array(upper, float)
         self.input_lower, self.input_upper = (
             np.array(input_lower, float),
@@ -101,11 +100,9 @@ class Domain:
         return ", ".join(named) or "all states"
 
     def __eq__(self, other: object) -> bool:
-        """Tell whether two domains have the same bounds."""
         return isinstance(other, Domain) and self._bounds() == other._bounds()
 
     def __hash__(self) -> int:
-        """Hash what `__eq__` compares."""
         return hash(self._bounds())
 
     def _bounds(self) -> tuple[tuple[float, ...], ...]:
@@ -165,7 +162,6 @@ def _check_turns(model: ControlAffine, state: Array) -> None:
 
 
 def _check_chart(model: ControlAffine, state: Array) -> None:
-    """Check that a bounded state stays where the model's equations hold."""
     trim = np.asarray(model.trim[0], float)
     for name, (low, high) in model.chart.items():
         k = model.state_names.index(name)

@@ -30,7 +30,6 @@ class DomainPairs(NamedTuple):
     """The matrices that a gain must contract on a domain.
 
     Attributes:
-        domain: of the states and inputs.
         jacobians: the Jacobians there, with their W to the right where g varies.
         A: (K, n, n), the Jacobians alone.
         W: (K, n, n), W_k = g S R^-1 (g S)' enclosed with A_k; None where g is constant.
@@ -87,15 +86,7 @@ def contracting_region(
 ) -> RegionCertificate | None:
     """Return the guarantee of a metric on a domain; None where it contracts at no rate there.
 
-    Args:
-        pairs: the matrices that it contracts.
-        P: metric (n, n).
-        B: input matrix at the trim (n, m).
-        R: weight of the normalized input (m, m).
-        exact: whether to prove it in rational arithmetic (seconds), where a hull is at hand and g
-            is constant.
-        coupling: c.
-        spectrum: its smallest eigenvalue enters the strength 2 c lambda_min.
+    `exact` proves it in rationals (seconds), where a hull is at hand and g is constant.
     """
     domain, hull, A, W = pairs
     strength, constant = 2.0 * coupling * spectrum.proved, W is None

@@ -52,40 +52,30 @@ class _Scaled(NamedTuple):
     bits: int
 
     def times(self, other: "_Scaled") -> "_Scaled":
-        """Return the matrix product (or that with a number)."""
         if other.integers.ndim == 0:
             return _Scaled(self.integers * other.integers[()], self.bits + other.bits)
         return _Scaled(self.integers @ other.integers, self.bits + other.bits)
 
     def plus(self, other: "_Scaled") -> "_Scaled":
-        """Return the sum."""
         bits = max(self.bits, other.bits)
         left, right = 1 << (bits - self.bits), 1 << (bits - other.bits)
         return _Scaled(self.integers * left + other.integers * right, bits)
 
     def minus(self, other: "_Scaled") -> "_Scaled":
-        """Return the difference."""
         return self.plus(_Scaled(-other.integers, other.bits))
 
     def transpose(self) -> "_Scaled":
-        """Return the transpose."""
         return _Scaled(self.integers.T, self.bits)
 
     def absolute(self) -> "_Scaled":
-        """Return the absolute values."""
         return _Scaled(abs(self.integers), self.bits)
 
     def row_sums(self) -> "_Scaled":
-        """Return the diagonal matrix of the sums of rows."""
         return _Scaled(np.diag(self.integers.sum(axis=1)), self.bits)
 
 
 def _scale(values: object, name: str) -> _Scaled:
-    """Return floats (or dyadic fractions) as integers over one power of two.
-
-    Raises:
-        GainError: a value is not finite or is no dyadic fraction.
-    """
+    """Return floats (or dyadic fractions) as integers over one power of two."""
     # As objects they stay Python's numbers: float64 would round an integer above 2^53.
     array = np.asarray(values, object)
     try:
@@ -102,11 +92,7 @@ def _scale(values: object, name: str) -> _Scaled:
 
 
 def _symmetrize(values: object, name: str) -> _Scaled:
-    """Return the symmetric part of a square matrix, exactly.
-
-    Raises:
-        GainError: the matrix is asymmetric by more than rounding.
-    """
+    """Return the symmetric part of a square matrix, exactly; more than rounding is refused."""
     matrix = _scale(values, name)
     skew = matrix.minus(matrix.transpose()).absolute().integers
     if skew.size and skew.max() > _ASYMMETRY * Fraction(matrix.absolute().integers.max()):
@@ -117,7 +103,6 @@ def _symmetrize(values: object, name: str) -> _Scaled:
 
 
 def _definiteness(matrix: _Scaled) -> Definiteness:
-    """Say whether a symmetric matrix is positive definite."""
     rest, previous, smallest = matrix.integers, 1, None
     while len(rest):
         pivot, row, rest = rest[0, 0], rest[0, 1:], rest[1:, 1:]
@@ -193,7 +178,6 @@ def _constant_part(
 
 
 def _check_shapes(vertices: Array, error: Array, B: Array, P: Array) -> None:
-    """Raise unless all matrices belong to n states and there is a vertex."""
     n = len(P)
     shapes = {
         "vertices": (np.shape(vertices), (len(vertices), n, n)),

@@ -83,7 +83,6 @@ def _units(domain: Domain) -> Array:
 
 
 def _check_finite(model: ControlAffine, points: Array, matrices: Array) -> None:
-    """Refuse matrices (K, n, n) that are not numbers, at points (K, n + m)."""
     bad = np.flatnonzero(~np.isfinite(matrices).all(axis=(1, 2)))
     if len(bad):
         names = (*model.state_names, *model.input_names)
@@ -228,7 +227,6 @@ def model_jacobian(model: ControlAffine) -> _OfState:
 def _enclose(
     model: ControlAffine, domain: Domain, velocity: _OfState, weight: _OfState | None = None
 ) -> Jacobians:
-    """Return the slopes of a model over a domain, with a weight to their right."""
     names = [*model.state_names, *model.input_names]
     with precision("float64"):
         try:

@@ -28,7 +28,6 @@ class Obstacle(NamedTuple):
     """A mode that no constant metric can keep from growing.
 
     Attributes:
-        vertex: which matrix has it.
         eigenvalue: 1/s; on the imaginary axis where the mode is `defective`.
         defective: whether it is a Jordan block on the axis rather than an unstable mode.
         states: indices of the states that take part, those that feed a Jordan block included.
@@ -137,11 +136,7 @@ class Metric(NamedTuple):
 
 
 def rate_of(
-    P: Array,
-    As: Array,
-    B: Array | None = None,
-    R: Array | None = None,
-    strength: float = 0.0,
+    P: Array, As: Array, B: Array | None = None, R: Array | None = None, strength: float = 0.0
 ) -> float:
     """Return the largest alpha with P A_k + A_k'P - strength P B R^-1 B'P <= -2 alpha P for all k.
 
@@ -248,11 +243,7 @@ def robust_lqr(As: Array, B: Array, Q: Array, R: Array, W: Array | None = None) 
 
 
 def contraction(
-    As: Array,
-    B: Array,
-    rate: float,
-    condition_max: float = 1e4,
-    W: Array | None = None,
+    As: Array, B: Array, rate: float, condition_max: float = 1e4, W: Array | None = None
 ) -> Metric:
     """Return the metric of least strength rho that contracts every vertex at `rate`, with R = I.
 
@@ -318,7 +309,6 @@ def _rate(P: Array, As: Array, S: Array | None, strength: float) -> float:
 
 
 def _condition(P: Array) -> float:
-    """Return the condition number of P, infinite where it is not positive definite."""
     low, high = np.linalg.eigvalsh(P)[[0, -1]]
     return float(high / low) if low > 0.0 else np.inf
 
@@ -353,11 +343,7 @@ def _cvxpy() -> Any:
 
 
 def _least(cp: Any, goal: Any, cones: list[Any], gaps: list[Any]) -> bool:
-    """Minimize with every gap X_k < 0; False where the solver has no point.
-
-    Few vertices bind, so those that a solution violates are added until there are none. The
-    variables hold the solution, however the solver ended.
-    """
+    """Few vertices bind, so those that a solution violates are added until there are none."""
     new = np.unique(np.linspace(0, len(gaps) - 1, min(len(gaps), _FIRST)).astype(int)).tolist()
     active = list[int]()
     while True:
@@ -390,11 +376,7 @@ def _pull(As: Array, basis: Array) -> Array:
 
 
 def _gaps(cp: Any, slopes: list[Array], x: Any) -> list[Any]:
-    """Return sum_i x_i slopes_k[i] for each k, turned by a dense orthogonal matrix.
-
-    An unknown that enters few rows of many cones is eliminated first by the solver, which fills its
-    matrix: unturned, 60 vertices of 12 states take ten times as long.
-    """
+    """Turned by a dense orthogonal matrix: unturned, 60 x 12 states take ten times as long."""
     # Here, since it takes long to load.
     import scipy.fft
 

@@ -308,10 +308,7 @@ def _edge(decays: Callable[[float], bool], k: float, edges: Array, end: float) -
 
 
 def _crossings(A: Array, G: Array, top: float) -> Array:
-    """Return the k in (0, top) at which two eigenvalues of A - k G may add to zero, ascending.
-
-    Of a complex G, at which one of them and the conjugate of another do.
-    """
+    """Return the k in (0, top) at which two modes of A - k G (one conjugated) add to 0."""
     if np.iscomplexobj(G):
         one = np.eye(len(A))
         fixed, moved = (np.kron(M, one) + np.kron(one, M.conj()) for M in (A, G))
@@ -348,7 +345,6 @@ def _unobservable(A: Array, C: Array) -> Array:
 
 
 def _null_space(M: Array, tolerance: float) -> Array:
-    """Return an orthonormal basis of the vectors that M sends to less than the tolerance."""
     _, singular, right = np.linalg.svd(M)
     return right[int((singular > tolerance).sum()) :].conj().T
 
@@ -548,11 +544,7 @@ def peak_gain(loop: ClosedLoop, E: Array, bound: float = 1.0) -> Array:
 
 
 def _impulse_norms(A: Array, E: Array) -> Array:
-    """Return the integrals over t >= 0 of the norms of the rows of exp(A t) E, (n,).
-
-    Gauss's rule of 8 nodes on panels that are halved until the halves agree with the whole, all
-    open panels of one length at a time; the first is halved until it resolves the fastest mode.
-    """
+    """Return the integrals over t >= 0 of the norms of the rows of exp(A t) E, (n,)."""
     A, (d, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
     h, fast = -1.0 / float(np.linalg.eigvals(A).real.max()), 0.1 / float(np.linalg.norm(A, 2))
     flow = matrix_exponential(A * h)

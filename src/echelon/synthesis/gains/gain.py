@@ -66,7 +66,6 @@ class Gain(eqx.Module):
         certificate: Certificate,
         inner: Array | None = None,
     ) -> None:
-        """Reject P or R not symmetric positive definite, and a coupling that is not positive."""
         check_definite("P", P)
         check_definite("R", R)
         check_coupling(coupling)
@@ -139,7 +138,6 @@ class Feedback(NamedTuple):
         rho: the strength 2 c lambda_min from which on P A + A'P - rho P B R^-1 B'P <= 0 at the trim
             is guaranteed, so that the smallest coupling is rho / (2 lambda_min); 0 where any
             coupling suffices, None where no bound is known.
-        region: the guarantee on a domain; None without one.
         inner: (m, n) feedback K of an inner loop, closed in A; None without.
     """
 
@@ -213,7 +211,6 @@ class Method(Declared):
         return Gain(P, R, coupling, self.name, certificate, inner)
 
     def _checked_feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
-        """Return the result of `feedback`, after checking its type and shapes."""
         result, name = self.feedback(model, linear), type(self).__name__
         if not isinstance(result, Feedback):
             raise GainError(

@@ -271,7 +271,6 @@ def _region(stored: JsonObject) -> RegionCertificate:
 
 
 def _check_model(path: PathLike, stored: JsonObject, model: ControlAffine) -> None:
-    """Check that the model is the one that the gain was made for, near its trim."""
     linear = linearize(model)
     name, made_for = f"`{type(model).__name__}`", str(stored["class"]).rpartition(":")[2]
     for what, ours in (("state_names", model.state_names), ("input_names", model.input_names)):
@@ -299,7 +298,6 @@ def _check_model(path: PathLike, stored: JsonObject, model: ControlAffine) -> No
 
 
 def _check_graph(path: PathLike, stored: JsonObject, graph: Graph) -> None:
-    """Check that the spectrum is the one that the coupling was chosen for."""
     values, spectrum = stored["spectrum"], graph.spectrum()
     sizes = [abs(complex(*x)) if isinstance(x, list) else float(x) for x in values]
     low = values[0][0] if isinstance(values[0], list) else float(values[0])

@@ -181,7 +181,6 @@ class InnerLoop(Method):
         return K
 
     def _weights(self, model: ControlAffine, count: int) -> Array:
-        """Return the weights of the symmetric states, (count,)."""
         chosen = model.symmetry_weights if self.symmetry_weight is None else self.symmetry_weight
         try:
             weights = np.asarray(1.0 if chosen is None else chosen, float)
@@ -221,10 +220,7 @@ def _others(model: ControlAffine, fixed: list[int]) -> list[int]:
 
 
 def _monotone(model: ControlAffine, A: Array, fixed: list[int], weights: Array) -> Array:
-    """Return P = T^-T diag(weights, P_s) T^-1, with P_s from a Lyapunov equation.
-
-    T^-1 maps the symmetric states to coordinates that stay constant while the rest decays.
-    """
+    """Return P = T^-T diag(weights, P_s) T^-1, with P_s from a Lyapunov equation."""
     free = _others(model, fixed)
     inner = A[np.ix_(free, free)]
     # Without other states nothing needs to decay; -1 stands for a mode that does.
