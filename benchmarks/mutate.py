@@ -55,7 +55,7 @@ TESTS = {
     "simulation/engine/traffic.py": ["traffic"],
     "simulation/native": ["native"],
     "simulation/codegen": ["codegen", "native"],
-    "simulation/optimal/drives.py": ["host_stepper", "mpc"],
+    "simulation/optimal/drives.py": ["mpc"],
     "guarantees/messages": ["late_messages", "late_promises"],
     "guarantees/promises": ["promises", "check", "frozen_laws", "heading"],
     "guarantees/stopping": ["stopping_point", "borders", "motors", "separation"],

@@ -11,7 +11,7 @@ from echelon.output.archive.flight_folder import network_facts
 from echelon.simulation.onboard.law_functions import law_functions
 from echelon.simulation.onboard.source_code import python_text
 from echelon_flight.pilot import NOBODY, Letterbox, Pilot, TickResult
-from echelon_flight.wire import LeaderPacket, Letter
+from echelon_flight.wire import LeaderPacket, Message
 
 
 def as_python(functions, folder=None):
@@ -117,7 +117,7 @@ class StatePilot:
         forward = [0.0] * len(facts["message"]) if packet is None else list(packet.content)
         u, after, signal, _, valid = law.tick(t, x, z.tolist(), forward, memory)
         self.memory = after
-        return TickResult(u, Letter(facts["agent"], t, hops, tuple(signal), packet), valid)
+        return TickResult(u, Message(facts["agent"], t, hops, tuple(signal), packet), valid)
 
 
 def compare_late(agent, dt, steps, size=0.1):
@@ -163,7 +163,7 @@ def draw_letter(own, facts, sender, time, draws):
         said[-len(units) :] *= units
     said = tuple(said.tolist())
     packet = LeaderPacket(network["leaders"][0], max(0.0, time - draws.uniform(0.0, 0.9)), said)
-    return Letter(sender, time, hops, tuple(values.tolist()), packet)
+    return Message(sender, time, hops, tuple(values.tolist()), packet)
 
 
 def as_message(letter, names):

@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 
 import echelon as ech
-from echelon import Agent, EchelonError, check
+from echelon import Agent, EchelonError, check, guarantee
 from echelon.agents.models.linearization import linearize
 from echelon.agents.network.hearing import heard_along
 from echelon.core.digits import at_most

@@ -15,7 +15,7 @@ from echelon.apps.cli.terminal import STATUS
 
 if TYPE_CHECKING:
     from echelon.core.types import JsonObject
-    from echelon.guarantees.verifier.findings import CheckResult
+    from echelon.guarantees.verifier.findings import ClaimCheck
     from echelon.guarantees.verifier.verify import Verification
     from echelon.output.archive.verify_folder import ClaimFiles
 
@@ -116,7 +116,7 @@ def _as_mapping(verification: "Verification") -> "JsonObject":
 
 def _print_verification(verification: "Verification", run: Path | None) -> None:
     """`run` is the folder if the claims are of a whole run."""
-    by = {"recomputed": list["CheckResult"](), "independent": list["CheckResult"]()}
+    by = {"recomputed": list["ClaimCheck"](), "independent": list["ClaimCheck"]()}
     for finding in verification.findings:
         by["recomputed" if finding.by_scenario else "independent"].append(finding)
     _print_rows("By independent code", [x[:4] for x in by["independent"] if not x.open])
@@ -143,7 +143,7 @@ def _print_rows(title: str, rows: Iterable[Iterable[str]]) -> None:
         tables.console(_WIDTH).print(table)
 
 
-def _reasons(findings: Iterable["CheckResult"]) -> Iterator[str]:
+def _reasons(findings: Iterable["ClaimCheck"]) -> Iterator[str]:
     """Yield why claims are refused, each by itself, and then why others are open."""
     findings = list(findings)
     for each in findings:
@@ -153,7 +153,7 @@ def _reasons(findings: Iterable["CheckResult"]) -> Iterator[str]:
         yield f"not checked: {', '.join(x.claim for x in some)}; {reason}."
 
 
-def _summed(findings: Iterable["CheckResult"]) -> Iterator[tuple[str, ...]]:
+def _summed(findings: Iterable["ClaimCheck"]) -> Iterator[tuple[str, ...]]:
     """Yield rows, one for all values below a key that agree."""
     for key, some in groupby(findings, lambda x: _key(x.claim)):
         some = list(some)

@@ -23,7 +23,7 @@ from echelon.experiments.scenario.yaml import read_yaml
 from echelon.experiments.studies.check import check
 from echelon.experiments.studies.design import with_gain
 from echelon.guarantees.promises.promise import guarantee
-from echelon.guarantees.verifier.findings import CheckResult, decide
+from echelon.guarantees.verifier.findings import ClaimCheck, decide
 from echelon.guarantees.verifier.saved_gain import parse_json, read_json
 from echelon.guarantees.verifier.stored_values import Digits, compare_values
 from echelon.laws.consensus import Consensus
@@ -44,7 +44,7 @@ _WRITTEN = {"units": ("s", "m"), "_FillValue": ("nan",)}
 """Attributes of variables and their values in every format, beside the names of coordinates."""
 
 
-def compare_attributes(file: Path) -> Iterator[CheckResult]:
+def compare_attributes(file: Path) -> Iterator[ClaimCheck]:
     """Yield a refused finding for each attribute of a group or variable that echelon never writes.
 
     Those of the root are compared with the run, one by one.
@@ -57,7 +57,7 @@ def compare_attributes(file: Path) -> Iterator[CheckResult]:
                 yield decide(ascii(claim)[1:-1], False, value, text=text)._replace(by_scenario=True)
 
 
-def compare_structure(file: Path, again: bytes) -> Iterator[CheckResult]:
+def compare_structure(file: Path, again: bytes) -> Iterator[ClaimCheck]:
     """Compare groups, dimensions, variables, types and attributes with those of a file in memory.
 
     Sizes and numbers are compared with the arrays.
@@ -65,7 +65,7 @@ def compare_structure(file: Path, again: bytes) -> Iterator[CheckResult]:
     claim, stored, value = f"{file.name}: structure", _structure(file), _structure(again)
     findings = [*compare_values(claim, stored, value)]
     refused = [each for each in findings if each.verdict == "refused"]
-    same = CheckResult(claim, f"{len(stored)} parts", f"{len(value)} parts", "recomputed", "", True)
+    same = ClaimCheck(claim, f"{len(stored)} parts", f"{len(value)} parts", "recomputed", "", True)
     yield from refused or [same]
 
 
@@ -104,7 +104,7 @@ SOLVED = Digits(1e-3)
 
 def experiment_of(
     scenario: Scenario, claims: Path | None, gain: Path | None
-) -> tuple[Experiment, list[CheckResult]]:
+) -> tuple[Experiment, list[ClaimCheck]]:
     """Return the parts of a run with the gains that its files state, and what is compared of them.
 
     Args:
@@ -116,7 +116,7 @@ def experiment_of(
         EchelonError: the scenario cannot be built, or a file cannot be read.
     """
     # As for a run: what is too large to have been run is refused.
-    experiment, findings = build(scenario, to_run=True), list[CheckResult]()
+    experiment, findings = build(scenario, to_run=True), list[ClaimCheck]()
     if gain is not None:
         findings += compare_gain(gain, experiment)
         with contextlib.suppress(GainError):
@@ -130,7 +130,7 @@ def experiment_of(
 
 def recompute(
     experiment: Experiment, scenario: Scenario, claims: Path | None, data: Path | None = None
-) -> Iterator[CheckResult]:
+) -> Iterator[ClaimCheck]:
     """Yield a finding for each value that a run's files state and its scenario gives.
 
     `claims` are as in `experiment_of`; of `run.nc` parts, guarantee and starts are compared.
@@ -161,7 +161,7 @@ def with_gain_of(experiment: Experiment, file: Path) -> Experiment:
     return experiment._replace(parts=with_gain(parts, gain))
 
 
-def compare_gain(file: Path, experiment: Experiment) -> Iterator[CheckResult]:
+def compare_gain(file: Path, experiment: Experiment) -> Iterator[ClaimCheck]:
     """Compare a gain file with the gain of a scenario; its certificate the verifier checks."""
     try:
         with_gain_of(experiment, file)
@@ -179,7 +179,7 @@ def compare_gain(file: Path, experiment: Experiment) -> Iterator[CheckResult]:
     yield from compare_values(f"{file.name}: model", stored, value)
 
 
-def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Iterator[CheckResult]:
+def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Iterator[ClaimCheck]:
     """Compare a summary, or the output of a check, with what a scenario of a name gives."""
     if "lines" in stored:
         value = check(*experiment).as_mapping()
@@ -189,9 +189,7 @@ def compare_claims(stored: JsonObject, experiment: Experiment, name: str) -> Ite
     yield from compare_values("", stored, _as_json(value))
 
 
-def with_leader_gain(
-    experiment: Experiment, stored: object
-) -> tuple[Experiment, list[CheckResult]]:
+def with_leader_gain(experiment: Experiment, stored: object) -> tuple[Experiment, list[ClaimCheck]]:
     """Return the parts with the gain that a summary states of the leaders, and what is compared.
 
     It must be that of the scenario up to what differs between solvers.
@@ -219,7 +217,7 @@ def _led_by(parts: Parts, gain: Gain) -> Parts:
     return parts.replace(drive=Laws(leader, drive.follower).prepare(parts.model, parts.graph))
 
 
-def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[CheckResult]:
+def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Iterator[ClaimCheck]:
     (run, data), (parts, settings), name = read_recording(file), experiment, file.name
     stored = parse_json(str(run.attributes["promise"]), f"{file}, promise")
     value = _as_json(guarantee(parts, settings).as_mapping())
@@ -242,7 +240,7 @@ def _compare_data(file: Path, scenario: Scenario, experiment: Experiment) -> Ite
 
 def _compare_frames(
     run: Recording, data: Labelled, experiment: Experiment, name: str
-) -> Iterator[CheckResult]:
+) -> Iterator[ClaimCheck]:
     (parts, settings), stored = experiment, data.arrays()
     steps = np.minimum(np.arange(len(run.states)) * settings.store_every, settings.steps)
     times, schedule = steps * settings.dt, parts.graph.schedule

@@ -19,7 +19,7 @@ from echelon.core.types import Array
 from echelon.guarantees.verifier.findings import (
     ROUNDING,
     TIGHT,
-    CheckResult,
+    ClaimCheck,
     Recomputed,
     decide,
     unchecked,
@@ -339,7 +339,7 @@ _ROUNDING = 256.0 * float(np.finfo(float).eps)
 """Rounding of a model's own arithmetic relative to its terms."""
 
 
-def check_equations(facts: Recomputed, user_model: ControlAffine | None) -> Iterator[CheckResult]:
+def check_equations(facts: Recomputed, user_model: ControlAffine | None) -> Iterator[ClaimCheck]:
     """Check the claims about the model; without `user_model` it is rebuilt from the file."""
     saved, claim = facts.saved.model, MODEL
     model = model_of(saved) if user_model is None else user_model
@@ -355,7 +355,7 @@ def check_equations(facts: Recomputed, user_model: ControlAffine | None) -> Iter
         yield decide(claim, False, saved.path, "", text)
 
 
-def _check_model(facts: Recomputed, model: ControlAffine) -> Iterator[CheckResult]:
+def _check_model(facts: Recomputed, model: ControlAffine) -> Iterator[ClaimCheck]:
     saved, name = facts.saved.model, type(model).__name__
     if (tuple(model.state_names), tuple(model.input_names)) != (
         saved.state_names,
@@ -378,7 +378,7 @@ def _is_close(stored: Array, expected: Array) -> bool:
     return fits and bool((np.abs(stored - expected) <= TIGHT * np.abs(expected)).all())
 
 
-def _check_trim(facts: Recomputed, model: ControlAffine) -> Iterator[CheckResult]:
+def _check_trim(facts: Recomputed, model: ControlAffine) -> Iterator[ClaimCheck]:
     saved, n = facts.saved.model, len(facts.saved.P)
     sizes = np.multiply.outer(_STEPS, np.maximum(1.0, np.abs(saved.state)))
     displaced = saved.state + np.stack([sizes, -sizes])[..., None] * np.eye(n)
@@ -412,7 +412,7 @@ def _quotients_off(saved: SavedModel, at: Evaluated, steps: Array) -> float:
 
 def _check_domain(
     facts: Recomputed, region: SavedRegion, model: ControlAffine
-) -> Iterator[CheckResult]:
+) -> Iterator[ClaimCheck]:
     saved = facts.saved
     yield decide("the domain lies inside the chart", _is_inside_chart(saved.model, region, model))
     some = points(saved, region)
@@ -453,7 +453,7 @@ def _is_inside_chart(saved: SavedModel, region: SavedRegion, model: ControlAffin
 
 def _check_secants(
     facts: Recomputed, region: SavedRegion, model: ControlAffine, some: Points
-) -> CheckResult:
+) -> ClaimCheck:
     """Differences of velocities reveal a discontinuous velocity and wrong derivatives."""
     saved, at = facts.saved, pairs(facts.saved, region, some)
     x, y = saved.model.state + at.ones, saved.model.state + at.others

@@ -20,7 +20,7 @@ VERDICTS = ("holds", "recomputed", "refused", "not checked")
 """Verified by code of its own; equal to what the code gives again that made it; false; open."""
 
 
-class CheckResult(NamedTuple):
+class ClaimCheck(NamedTuple):
     """A claim of the file with its stored and recomputed value, and one of the `VERDICTS`.
 
     `by_scenario` is true of what was computed from a scenario, and not by independent code.
@@ -53,14 +53,14 @@ class CheckResult(NamedTuple):
 
 def decide(
     claim: str, fine: bool, stored: object = "", value: object = "", text: str = ""
-) -> CheckResult:
+) -> ClaimCheck:
     """Return a finding with the verdict `holds` or `refused`."""
-    return CheckResult(claim, _text(stored), _text(value), "holds" if fine else "refused", text)
+    return ClaimCheck(claim, _text(stored), _text(value), "holds" if fine else "refused", text)
 
 
-def unchecked(claim: str, stored: object, text: str) -> CheckResult:
+def unchecked(claim: str, stored: object, text: str) -> ClaimCheck:
     """Return a finding for a claim that could not be checked."""
-    return CheckResult(claim, _text(stored), "", "not checked", text)
+    return ClaimCheck(claim, _text(stored), "", "not checked", text)
 
 
 def _text(value: object) -> str:
@@ -69,7 +69,7 @@ def _text(value: object) -> str:
 
 def compare(
     claim: str, stored: float, value: float, slack: float = 0.0, text: str = ""
-) -> CheckResult:
+) -> ClaimCheck:
     """Compare two numbers with the relative tolerance `TIGHT` plus their rounding `slack`."""
     fine = abs(stored - value) <= TIGHT * max(abs(stored), abs(value)) + slack
     return decide(claim, fine, stored, value, text)

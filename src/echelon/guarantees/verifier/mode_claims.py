@@ -11,7 +11,7 @@ from echelon.guarantees.verifier.findings import (
     DECIDED,
     ROUNDING,
     TIGHT,
-    CheckResult,
+    ClaimCheck,
     Recomputed,
     compare,
     decide,
@@ -25,7 +25,7 @@ _LOOSE = 1e-6
 """Relative to the largest eigenvalue; those of a nonnormal L keep only half of their digits."""
 
 
-def check_graph(saved: SavedGain) -> Iterator[CheckResult]:
+def check_graph(saved: SavedGain) -> Iterator[ClaimCheck]:
     """Check the edges before the spectrum is computed."""
     graph = saved.graph
     followers = graph.agents - len(graph.leaders)
@@ -43,7 +43,7 @@ def check_graph(saved: SavedGain) -> Iterator[CheckResult]:
         yield decide("graph", False, text=text + " missing")
 
 
-def check_spectrum(facts: Recomputed) -> Iterator[CheckResult]:
+def check_spectrum(facts: Recomputed) -> Iterator[ClaimCheck]:
     """Check the stored spectrum."""
     saved, stored = facts.saved, facts.saved.graph.spectrum
     result, claim = facts.eigenvalues, "graph spectrum"
@@ -68,7 +68,7 @@ def check_spectrum(facts: Recomputed) -> Iterator[CheckResult]:
     yield compare("lambda_max", saved.lambda_max, high, ROUNDING * high)
 
 
-def _compare_complex(recomputed: Array, stored: Array, high: float) -> CheckResult:
+def _compare_complex(recomputed: Array, stored: Array, high: float) -> ClaimCheck:
     """Compare complex eigenvalues; each is paired with the nearest remaining one."""
     gap, left = 0.0, list(stored.astype(complex))
     for value in recomputed:
@@ -96,7 +96,7 @@ _MOST_MODES = 16
 _MODE_DECIDED = 1e-3
 
 
-def check_linearization(facts: Recomputed) -> Iterator[CheckResult]:
+def check_linearization(facts: Recomputed) -> Iterator[ClaimCheck]:
     """Check the claims about the linearization at the trim."""
     saved = facts.saved
     yield decide("kind of the slowest mode", saved.kind == "linearization", saved.kind)
@@ -116,7 +116,7 @@ def check_linearization(facts: Recomputed) -> Iterator[CheckResult]:
     yield decide("observability rank", saved.observable == rank, saved.observable, rank)
 
 
-def _check_between(facts: Recomputed) -> Iterator[CheckResult]:
+def _check_between(facts: Recomputed) -> Iterator[ClaimCheck]:
     values, followers = facts.eigenvalues, facts.saved.graph.agents - len(facts.saved.graph.leaders)
     every = followers <= algebra.ALL_MODES or facts.saved.graph.directed
     if every or facts.saved.graph.switches or facts.saved.abscissa >= 0.0:
@@ -154,7 +154,7 @@ def _doubt(facts: Recomputed, K: Array, value: float) -> algebra.Doubt:
     return bound
 
 
-def _check_edge(facts: Recomputed) -> Iterator[CheckResult]:
+def _check_edge(facts: Recomputed) -> Iterator[ClaimCheck]:
     """Check the smallest coupling with a guaranteed stable linearization."""
     saved, claim = facts.saved, "edge of the coupling"
     threshold = _EDGES.get(saved.method)

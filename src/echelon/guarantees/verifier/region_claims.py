@@ -14,7 +14,7 @@ from echelon.guarantees.verifier.findings import (
     DECIDED,
     ROUNDING,
     TIGHT,
-    CheckResult,
+    ClaimCheck,
     Recomputed,
     compare,
     decide,
@@ -25,7 +25,7 @@ from echelon.guarantees.verifier.saved_gain import SavedRegion
 _EXACT_FOLLOWERS = 60
 
 
-def check_region(facts: Recomputed) -> Iterator[CheckResult]:
+def check_region(facts: Recomputed) -> Iterator[ClaimCheck]:
     """Check the guarantee on a domain at the stored vertices."""
     saved, region = facts.saved, facts.saved.region
     if region is None:
@@ -52,7 +52,7 @@ def check_region(facts: Recomputed) -> Iterator[CheckResult]:
     yield from _check_rate(facts, region)
 
 
-def _check_strength(facts: Recomputed, region: SavedRegion) -> CheckResult:
+def _check_strength(facts: Recomputed, region: SavedRegion) -> ClaimCheck:
     """Compare with 2 c lambda_min; for a directed graph with the bound of its weighted sum."""
     saved = facts.saved
     if not saved.graph.directed:
@@ -90,7 +90,7 @@ def _spread(facts: Recomputed) -> float:
     return float(np.sqrt(facts.low / facts.high))
 
 
-def _check_radius(facts: Recomputed, region: SavedRegion) -> CheckResult:
+def _check_radius(facts: Recomputed, region: SavedRegion) -> ClaimCheck:
     """Compare with the largest r for which {x'P x <= r^2} lies inside the bounds."""
     widest, sums = _widest(facts.saved.P, region), facts.saved.graph.sums
     widest = widest if sums is None else widest / float(np.sqrt(sums.max() / sums.min()))
@@ -113,7 +113,7 @@ def _widest(P: Array, region: SavedRegion) -> float:
     return float((margins / reach).min())
 
 
-def _check_rate(facts: Recomputed, region: SavedRegion) -> Iterator[CheckResult]:
+def _check_rate(facts: Recomputed, region: SavedRegion) -> Iterator[ClaimCheck]:
     """Check the rate at every vertex: by exact minors for a proof, otherwise by eigenvalues."""
     result, slack, decided = slowest(facts, region, *_split_hull(facts, region.hull))
     claim = f"rate at {amount(len(region.hull), 'vertex', 'vertices')}, 1/s"
@@ -144,7 +144,7 @@ def _split_hull(facts: Recomputed, hull: Array) -> tuple[Array, Array]:
     return hull[:, :, :n], hull[:, :, n:]
 
 
-def _proof(facts: Recomputed, region: SavedRegion) -> Iterator[CheckResult]:
+def _proof(facts: Recomputed, region: SavedRegion) -> Iterator[ClaimCheck]:
     saved, claim = facts.saved, "rate at the vertices, proved"
     if region.theorem == "T2" or not np.array_equal(saved.P, saved.P.T):
         text = "a proof requires a constant g and an exactly symmetric P"

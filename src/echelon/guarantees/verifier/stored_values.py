@@ -12,7 +12,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.core.words import amount
-from echelon.guarantees.verifier.findings import CheckResult
+from echelon.guarantees.verifier.findings import ClaimCheck
 
 
 class Digits(NamedTuple):
@@ -35,7 +35,7 @@ _SHOWN = 60
 
 def compare_values(
     claim: str, stored: object, value: object, digits: Digits = _USUAL
-) -> Iterator[CheckResult]:
+) -> Iterator[ClaimCheck]:
     """Yield a finding for each number, matrix or text of a stored value."""
     arrays = _array(stored), _array(value)
     if isinstance(stored, dict) and isinstance(value, dict):
@@ -59,7 +59,7 @@ def compare_values(
 
 def compare_arrays(
     claim: str, stored: Array | None, value: Array, digits: Digits = _USUAL
-) -> CheckResult:
+) -> ClaimCheck:
     """Return the finding for an array of numbers or words; NaN agrees with NaN."""
     if stored is None:
         return _differs(claim, "", _described(value), "it is missing")
@@ -73,14 +73,14 @@ def compare_arrays(
         fine = fine and (not value.size or _agree(theirs, ours, digits))
     if not fine:
         return _differs(*shown, "")
-    return CheckResult(*shown, "recomputed", "", True)
+    return ClaimCheck(*shown, "recomputed", "", True)
 
 
 def _described(array: Array) -> str:
     return f"{' x '.join(map(str, array.shape)) or 1} {'number' if array.size == 1 else 'numbers'}"
 
 
-def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> CheckResult:
+def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> ClaimCheck:
     if isinstance(stored, str) and isinstance(value, str):
         fine, pairs = _same_text(stored, value), enumerate(zip(stored, value))
         at = next((k for k, (x, y) in pairs if x != y), min(len(stored), len(value)))
@@ -94,16 +94,14 @@ def _compare_leaf(claim: str, stored: object, value: object, digits: Digits) -> 
     return _finding(claim, stored, value, type(stored) is type(value) and stored == value)
 
 
-def _finding(
-    claim: str, stored: object, value: object, fine: bool, reason: str = ""
-) -> CheckResult:
+def _finding(claim: str, stored: object, value: object, fine: bool, reason: str = "") -> ClaimCheck:
     if not fine:
         return _differs(claim, _shown(stored), _shown(value), reason)
-    return CheckResult(claim, _shown(stored), _shown(value), "recomputed", "", True)
+    return ClaimCheck(claim, _shown(stored), _shown(value), "recomputed", "", True)
 
 
-def _differs(claim: str, stored: str, value: str, reason: str) -> CheckResult:
-    return CheckResult(
+def _differs(claim: str, stored: str, value: str, reason: str) -> ClaimCheck:
+    return ClaimCheck(
         claim, stored, value, "refused", reason or "the scenario gives another value", True
     )
 

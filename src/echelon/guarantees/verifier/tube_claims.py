@@ -15,7 +15,7 @@ from echelon.agents.models.quadrotor import Quadrotor
 from echelon.core.digits import at_most
 from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
-from echelon.guarantees.verifier.findings import CheckResult, compare, decide
+from echelon.guarantees.verifier.findings import ClaimCheck, compare, decide
 
 # ---- thrusts of the motors -----------------------------------------------------------------------
 # The certificate encloses time slices in rational arithmetic. Here responses are evaluated at
@@ -29,7 +29,7 @@ _TIMES, _MOTIONS = 24, 4000
 """Times of random motions (the least thrust of each interval), and motions per time."""
 
 
-def motor_findings(claims: JsonObject) -> Iterator[CheckResult]:
+def motor_findings(claims: JsonObject) -> Iterator[ClaimCheck]:
     """Yield a finding for each claim about the motors."""
     motion = _Motion.of(claims)
     demands = [_demands(motion, _start_bounds(start)) for start in claims["starts"]]
@@ -188,7 +188,7 @@ def _random_motions(
     return float(thrusts.min()), float(thrusts.max())
 
 
-def _check_single_starts(claims: JsonObject, motion: _Motion) -> Iterator[CheckResult]:
+def _check_single_starts(claims: JsonObject, motion: _Motion) -> Iterator[ClaimCheck]:
     alone, ahead, most = claims["alone"], claims["ahead"], float(claims["most"])
     if alone is None:
         return
@@ -217,7 +217,7 @@ _CLOSE = 1e-6
 _BLEND = np.polynomial.Polynomial([0, 0, 0, 0, 0, 0, 462, -1980, 3465, -3080, 1386, -252])
 
 
-def offset_findings(claim: JsonObject) -> Iterator[CheckResult]:
+def offset_findings(claim: JsonObject) -> Iterator[ClaimCheck]:
     """Yield whether the bounds of offsets and their derivatives are those of their motion."""
     if claim["sizes"] is None:
         return
@@ -255,7 +255,7 @@ def _sizes(claim: JsonObject) -> Array:
 _SLACK = 1e-9
 
 
-def separation_findings(claim: JsonObject) -> Iterator[CheckResult]:
+def separation_findings(claim: JsonObject) -> Iterator[ClaimCheck]:
     """Yield a finding for each condition of the theorem."""
     width, _, height = claim["radii"]
     scales = np.array([width / height if axis == "z" else 1.0 for axis in claim["axes"]])
@@ -301,7 +301,7 @@ def tube_of(promise: JsonObject) -> JsonObject | None:
     return tube if isinstance(tube, dict) and tube.get("format") == FORMAT else None
 
 
-def tube_findings(tube: JsonObject) -> Iterator[CheckResult]:
+def tube_findings(tube: JsonObject) -> Iterator[ClaimCheck]:
     """Yield a finding for each claim of a tube."""
     for border in tube["borders"]:
         roots = [Fraction(str(root)) for root in border["roots"]]
@@ -320,9 +320,7 @@ def tube_findings(tube: JsonObject) -> Iterator[CheckResult]:
         yield from separation_findings(tube["separation"])
 
 
-def _check_margin(
-    border: JsonObject, roots: Sequence[Fraction], name: str
-) -> Iterator[CheckResult]:
+def _check_margin(border: JsonObject, roots: Sequence[Fraction], name: str) -> Iterator[ClaimCheck]:
     order = int(border["derivative"]) - 1
     allowed = float(border["path"]) - float(border["above"])
     total = float(border["speed"]) + float(border["leader_speed"])

@@ -16,7 +16,7 @@ from echelon.core.types import JsonObject, PathLike
 from echelon.guarantees.verifier import algebra
 from echelon.guarantees.verifier.agent_claims import MODEL as MODEL
 from echelon.guarantees.verifier.agent_claims import check_equations
-from echelon.guarantees.verifier.findings import VERDICTS, CheckResult, decide, facts, unchecked
+from echelon.guarantees.verifier.findings import VERDICTS, ClaimCheck, decide, facts, unchecked
 from echelon.guarantees.verifier.mode_claims import check_graph, check_linearization, check_spectrum
 from echelon.guarantees.verifier.region_claims import check_region
 from echelon.guarantees.verifier.saved_gain import FORMAT, SavedGain, read, read_json
@@ -37,7 +37,7 @@ class Verification(NamedTuple):
         note: the end of the sentence, on a correct gain that is not stabilizing.
     """
 
-    findings: tuple[CheckResult, ...]
+    findings: tuple[ClaimCheck, ...]
     verdict: Literal["verified", "incomplete", "refused"]
     sentence: str
     note: str = ""
@@ -75,7 +75,7 @@ def states_gain(document: JsonObject) -> bool:
     return document.get("format") == FORMAT or "promise" not in document
 
 
-def _promise_findings(promise: object) -> Iterator[CheckResult]:
+def _promise_findings(promise: object) -> Iterator[ClaimCheck]:
     if not isinstance(promise, dict):
         yield decide("promise", False, text="it must be a mapping")
         return
@@ -86,8 +86,8 @@ def _promise_findings(promise: object) -> Iterator[CheckResult]:
         yield unchecked(f"{PROMISE}{key}", "", "it follows from the run's scenario alone")
 
 
-def _collect(checks: Iterator[CheckResult]) -> tuple[CheckResult, ...]:
-    findings = list[CheckResult]()
+def _collect(checks: Iterator[ClaimCheck]) -> tuple[ClaimCheck, ...]:
+    findings = list[ClaimCheck]()
     # Numbers of a false file may overflow; comparisons with non-finite numbers then fail.
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -100,7 +100,7 @@ def _collect(checks: Iterator[CheckResult]) -> tuple[CheckResult, ...]:
     return tuple(findings)
 
 
-def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[CheckResult]:
+def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[ClaimCheck]:
     first = [*_check_definite(saved), *check_graph(saved)]
     yield from first
     # All later claims assume a valid graph and positive definite matrices.
@@ -115,7 +115,7 @@ def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[CheckRe
         yield from check_equations(recomputed, model)
 
 
-def judge(findings: Sequence[CheckResult], note: str = "") -> Verification:
+def judge(findings: Sequence[ClaimCheck], note: str = "") -> Verification:
     """Return the verdict on findings, with a note; of nothing at all it is `incomplete`."""
     claims = {name: [x.claim for x in findings if x.verdict == name] for name in VERDICTS}
     held = [f"{len(claims['holds'])} claims hold as stored"] if claims["holds"] else []
@@ -134,7 +134,7 @@ def judge(findings: Sequence[CheckResult], note: str = "") -> Verification:
     return Verification(tuple(findings), "verified", f"Verified: {text}.{note}", note)
 
 
-def _check_definite(saved: SavedGain) -> Iterator[CheckResult]:
+def _check_definite(saved: SavedGain) -> Iterator[ClaimCheck]:
     for name, matrix in (("P", saved.P), ("R", saved.R)):
         units = np.sqrt(np.abs(np.diag(matrix)))
         even = (np.abs(matrix - matrix.T) <= _SKEW * np.outer(units, units)).all()

@@ -30,7 +30,7 @@ from echelon.experiments.scenario.self_contained import files_of, names_code, wi
 from echelon.experiments.studies.recomputation import compare_structure, experiment_of, recompute
 from echelon.guarantees.promises.promise import guarantee
 from echelon.guarantees.verifier import verify as verifier
-from echelon.guarantees.verifier.findings import CheckResult, unchecked
+from echelon.guarantees.verifier.findings import ClaimCheck, unchecked
 from echelon.guarantees.verifier.saved_gain import read_json
 from echelon.guarantees.verifier.stored_values import Digits, compare_arrays, compare_values
 from echelon.guarantees.verifier.verify import PROMISE, Verification, judge, states_gain
@@ -117,7 +117,7 @@ def _place(path: Path) -> Path:
 
 def compare_run(
     files: ClaimFiles, scenario: Scenario, experiment: Experiment
-) -> Iterator[CheckResult]:
+) -> Iterator[ClaimCheck]:
     """Yield a finding for each array, number and text that only the run itself gives.
 
     Raises:
@@ -166,7 +166,7 @@ def _repeated(experiment: Experiment, data: Labelled, steps: int) -> Result | No
     return dataclasses.replace(result, outcome=stored) if same else None
 
 
-def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[CheckResult]:
+def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[ClaimCheck]:
     assert files.data is not None
     laws = isinstance(result.parts.drive, Laws)
     digits = _PRECISIONS[result.settings.precision] if laws else _SOLVED
@@ -188,7 +188,7 @@ def _compare(files: ClaimFiles, data: Labelled, result: Result) -> Iterator[Chec
 
 def _compare_dataset(
     name: str, data: Labelled, result: Result, digits: Digits
-) -> Iterator[CheckResult]:
+) -> Iterator[ClaimCheck]:
     parts = labelled_parts(result.parts, result.settings)
     stored, again = data.arrays(), with_sums(result)
     for key, value in again.arrays().items():
@@ -205,7 +205,7 @@ def _compare_dataset(
             yield from compare_values(f"{name}: observed", theirs, ours, digits)
 
 
-def _compare_report(file: Path, text: str) -> CheckResult:
+def _compare_report(file: Path, text: str) -> ClaimCheck:
     """Compare a report; last digits may be rounded in another way, and are then left open."""
     try:
         stored = file.read_text("utf-8")
@@ -275,7 +275,7 @@ def check_files(
     """
     source, obstacle = _source(files, trusted)
     findings, note = _independent(files, trusted)
-    computed = list[CheckResult]()
+    computed = list[ClaimCheck]()
     # A gain file by itself is no run.
     if source is not None and (files.claims is not None or files.data is not None):
         computed = [*_computed(files, source, repeat, begin)]
@@ -287,7 +287,7 @@ def check_files(
 
 def _computed(
     files: ClaimFiles, source: Scenario, repeat: bool, begin: Callable[[str], None]
-) -> Iterator[CheckResult]:
+) -> Iterator[ClaimCheck]:
     begin("computing the guarantee again, which takes up to a minute")
     experiment, findings = experiment_of(source, files.claims, files.gain)
     yield from findings
@@ -320,7 +320,7 @@ def _source(files: ClaimFiles, trusted: Scenario | None) -> tuple[Scenario | Non
     return own, ""
 
 
-def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[CheckResult], str]:
+def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[ClaimCheck], str]:
     model = None if trusted is None else build(trusted).parts.model
     checked = [each for each in (files.gain, files.claims) if each is not None]
     results = [verifier.verify(each, model) for each in checked]
@@ -328,8 +328,8 @@ def _independent(files: ClaimFiles, trusted: Scenario | None) -> tuple[list[Chec
 
 
 def _still_open(
-    findings: list[CheckResult], computed: list[CheckResult], obstacle: str
-) -> Iterator[CheckResult]:
+    findings: list[ClaimCheck], computed: list[ClaimCheck], obstacle: str
+) -> Iterator[ClaimCheck]:
     """Yield what independent code found, without what it left open and the scenario has settled."""
     agree = {each.claim.partition(": ")[2] for each in computed if each.verdict == "recomputed"}
     for each in findings:
