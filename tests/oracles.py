@@ -137,3 +137,15 @@ def prioritized_thrusts(collective, tilt, yaw, maximum):
     fixed = (kept, max(0.0, yaw_share - 1e-9))
     shares = best([0.0, 0.0, 0.0, 1.0], fixed, fixed)
     return thrust @ shares
+
+
+def delayed_abscissa(A, F, delay, nodes=24):
+    """The rightmost root of x' = A x - F x(t - delay), by collocation at Chebyshev's points."""
+    n, k = len(A), np.arange(nodes + 1)
+    points = np.cos(np.pi * k / nodes)
+    weights = np.where((k == 0) | (k == nodes), 2.0, 1.0) * (-1.0) ** k
+    D = np.outer(weights, 1.0 / weights) / (points[:, None] - points + np.eye(nodes + 1))
+    D -= np.diag(D.sum(axis=1))
+    whole = np.kron(2.0 / delay * D, np.eye(n))
+    whole[:n], whole[:n, :n], whole[:n, -n:] = 0.0, A, -F
+    return np.linalg.eigvals(whole).real.max()

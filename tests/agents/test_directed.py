@@ -7,6 +7,7 @@ import networkx as nx
 import numpy as np
 import pytest
 import scipy.linalg
+from oracles import delayed_abscissa
 
 import echelon as ech
 from echelon import Agent, EchelonError, check, guarantee
@@ -46,9 +47,6 @@ def grounded(edges, agents):
         L[j, j] += w
         L[j, i] -= w
     return L[1:, 1:]
-
-
-# ---- spectra -------------------------------------------------------------------------------------
 
 
 def test_spectra_of_arrows_are_those_of_their_matrix_and_a_sum_falls_on_them():
@@ -158,9 +156,6 @@ def test_graphs_that_leave_agents_behind_are_told_with_what_would_do(make, text)
         make()
 
 
-# ---- what is proved ------------------------------------------------------------------------------
-
-
 def test_riccati_gains_hold_every_arrow_from_their_edge_on_and_a_weighted_sum_falls():
     draw = np.random.default_rng(2)
     for _ in range(40):
@@ -227,9 +222,6 @@ def test_graphs_take_turns_at_their_times(period):
     assert [schedule.row(0.1 * k) for k in range(30)] == held.tolist()
 
 
-# ---- flights -------------------------------------------------------------------------------------
-
-
 def by_hand(parts, gain, horizon, dt):
     """Followers' deviations behind a leader at rest, by the exact flow of a held input."""
     A, B = linearize(CARTS)
@@ -282,27 +274,12 @@ def test_agents_by_themselves_are_those_of_the_simulation(directed):
             np.testing.assert_allclose(u, result.inputs[k, agent.number], atol=1e-9)
 
 
-# ---- delays --------------------------------------------------------------------------------------
-
-
-def abscissa(A, F, delay, nodes=24):
-    """The rightmost root of x' = A x - F x(t - delay), by collocation at Chebyshev's points."""
-    n, k = len(A), np.arange(nodes + 1)
-    points = np.cos(np.pi * k / nodes)
-    weights = np.where((k == 0) | (k == nodes), 2.0, 1.0) * (-1.0) ** k
-    D = np.outer(weights, 1.0 / weights) / (points[:, None] - points + np.eye(nodes + 1))
-    D -= np.diag(D.sum(axis=1))
-    whole = np.kron(2.0 / delay * D, np.eye(n))
-    whole[:n], whole[:n, :n], whole[:n, -n:] = 0.0, A, -F
-    return np.linalg.eigvals(whole).real.max()
-
-
 @pytest.mark.parametrize("graph", [RING, ech.Graph([(0, 1), (1, 2), (1, 3)])])
 def test_the_delay_that_is_left_is_that_of_the_delayed_network(graph):
     gain = ech.synthesize(CARTS, graph, ech.gains.Riccati())
     lines, whole = lines_of(flown(graph, gain)), network(graph, gain)
     delay, spread = lines[Topic.DELAY].number, lines[Topic.EIGENVALUE_RATIO]
-    assert abscissa(*whole, 0.98 * delay) < 0.0 < abscissa(*whole, 1.02 * delay)
+    assert delayed_abscissa(*whole, 0.98 * delay) < 0.0 < delayed_abscissa(*whole, 1.02 * delay)
     values = np.linalg.eigvals(graph.grounded_laplacian().toarray())
     ratio = np.abs(values).max() / values.real.min()
     assert spread.number == pytest.approx(ratio) and spread.fails and ratio > 4.0
@@ -313,15 +290,16 @@ def test_agreement_bears_the_delay_that_is_told():
     parts, settings = stopping(RING), ech.Settings(4.0, 0.01)
     c = float(prepare(parts, settings).parts.drive.follower.strength(0.01))
     L, delay = c * RING.grounded_laplacian().toarray(), lines_of(parts)[Topic.DELAY].number
-    assert abscissa(0.0 * L, L, 0.98 * delay) < 0.0 < abscissa(0.0 * L, L, 1.02 * delay)
+    assert (
+        delayed_abscissa(0.0 * L, L, 0.98 * delay)
+        < 0.0
+        < delayed_abscissa(0.0 * L, L, 1.02 * delay)
+    )
 
 
 def stopping(graph, position=3.0, observer=True, **law):
     leader = StoppingLeader(rate=3.0, observer=observer)
     return parts_of(graph, leader, StoppingPoint(rate=3.0, observer=observer, **law), position)
-
-
-# ---- promises ------------------------------------------------------------------------------------
 
 
 def test_what_is_promised_of_a_linear_law_on_arrows_is_its_modes():

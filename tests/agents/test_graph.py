@@ -96,9 +96,6 @@ def test_renaming_agents_renames_everything(graph, random, seed):
     assert relabelled(renamed, np.argsort(order)) == graph
 
 
-# ---- spectra in closed form ----
-
-
 def path_spectrum(followers):
     """Eigenvalues of a path whose one end is a leader."""
     k = np.arange(1, followers + 1)
@@ -136,9 +133,6 @@ def test_parents_make_a_spectrum_of_the_weights_that_followers_feel():
     assert Graph(edges).parent_spectrum().eigenvalues.tolist() == [0.5, 2.0, 3.0]
     led = Graph(edges, leaders=[3, 4]).parent_spectrum()
     assert (led.eigenvalues.tolist(), led.total) == ([0.5, 2.0], 2)
-
-
-# ---- making graphs ----
 
 
 def same_edges(graph, other):
@@ -209,9 +203,6 @@ def test_outward_goes_by_distance_and_lists_the_neighbours_passed_on_the_way(gra
         passed = {j for j in graph.neighbours(agent) if j in order[:place]}
         assert set(earlier) == (set() if agent in graph.leaders else passed)
         assert bool(earlier) == (agent not in graph.leaders)
-
-
-# ---- the smallest eigenvalue, proved --------------------------------------------------------
 
 
 def exact_laplacian(graph):

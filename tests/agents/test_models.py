@@ -136,9 +136,6 @@ def test_quadrotor_is_newton_euler_for_any_parameters(x, u, mass, sides, gravity
     assert numpy(model.input_map, x) == pytest.approx(columns, rel=1e-9, abs=1e-9)
 
 
-# ---- what every agent promises ----
-
-
 @every_model
 def test_the_trim_is_an_equilibrium_within_the_limits(model):
     x, u = map(np.array, model.trim)
@@ -270,9 +267,6 @@ def test_headings_differ_by_the_shorter_way_round(model, a, b):
     assert gap[:2] == pytest.approx([0.5, 3.0])
     assert abs(gap[2]) <= np.pi + 1e-12
     assert np.exp(1j * gap[2]) == pytest.approx(np.exp(1j * (a - b)), abs=1e-12)
-
-
-# ---- flatness ----
 
 
 class Smooth:

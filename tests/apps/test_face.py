@@ -61,9 +61,6 @@ def backup():
     return ech.simulate(parts, ech.Settings(horizon=2.0, dt=0.02))
 
 
-# ---- numbers ----------------------------------------------------------------------------------
-
-
 def test_only_what_a_file_holds_as_it_is_is_written_without_xarray():
     for variables, attributes in (
         ({"a": ("x", [True, False])}, {}),
@@ -163,9 +160,6 @@ def test_parquet_names_the_extra_that_it_needs(echelon, file, monkeypatch):
         "echelon: Parquet needs pyarrow, which is not installed; `pip install '.[parquet]'` in "
         "echelon's clone, or use `csv`.\n",
     )
-
-
-# ---- pages and videos -------------------------------------------------------------------------
 
 
 def test_the_report_has_numbers_conditions_scenario_versions_and_how_to_cite(echelon, here):
@@ -348,9 +342,6 @@ def test_a_video_that_cannot_be_is_refused(echelon, file):
         assert echelon("video", file, *words.split())[::2] == (2, f"echelon: {sentence}\n")
 
 
-# ---- a folder to begin with -------------------------------------------------------------------
-
-
 def test_a_starter_names_the_extra_that_its_notebook_needs(echelon, monkeypatch):
     monkeypatch.setattr(list_command, "find_spec", lambda name: None)
     told = echelon("init", "my-swarm")[1]
@@ -381,9 +372,6 @@ def test_init_takes_a_new_folder_and_no_other(echelon, here):
     code, _, fault = echelon("init", "my swarm")
     assert code == 2 and "`my swarm` cannot name a scenario" in fault
     assert not (here / "my swarm").exists()
-
-
-# ---- words ------------------------------------------------------------------------------------
 
 
 def test_explain_says_what_a_word_means(echelon):

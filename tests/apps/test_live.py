@@ -82,9 +82,6 @@ def flown(swarm, pictures=10):
     return np.stack([swarm.advance().states for _ in range(pictures)])
 
 
-# ---- the loop ---------------------------------------------------------------------------------
-
-
 def test_a_live_loop_is_the_loop_of_a_run_and_tells_its_v(panel, swarm, native):
     whole = ech.run(panel.scenario)
     for each in (swarm, native):
@@ -455,9 +452,6 @@ def test_reset_begins_again_with_the_knobs_as_they_are(session, swarm):
     assert session.events == [{"at": 0.0, "coupling": 3.0}]
 
 
-# ---- the promise ------------------------------------------------------------------------------
-
-
 def test_the_promise_holds_stands_on_its_edge_or_is_lost_with_its_number(panel):
     strong = badge_of(panel, panel.start)
     assert strong["state"] == "holds" and strong["short"].startswith("guaranteed: ")
@@ -611,9 +605,6 @@ def test_the_badge_of_distances_is_green_while_hulls_are_apart_whatever_the_erro
         "The hulls of two agents are 0.28 m apart, scaled, as after a kick; from 0.3 m on it is "
         "guaranteed again that agents stay apart."
     ]
-
-
-# ---- the server and the page ------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -75,9 +75,6 @@ def assert_same(one, other):
     assert (one / "run.nc").read_bytes() == (other / "run.nc").read_bytes()
 
 
-# ---- the engine hands over what it computed, and goes on from it ----
-
-
 class Wandering(Law):
     def init(self):
         return jnp.zeros(()), jnp.zeros((), jnp.int32), jax.random.key(3)
@@ -149,9 +146,6 @@ def test_the_grid_visits_each_step_once_and_stores_each_frame_once():
         assert first == steps and frames == sorted({*range(0, steps, every), steps})
 
 
-# ---- a real process is killed, and its run goes on ----
-
-
 @pytest.mark.slow
 def test_a_killed_run_opens_as_stopped_and_goes_on_to_the_same_bits(here, echelon):
     with started(EAGER, "run", "mine.yaml", *LONG, "--no-figures", "--out", "o") as process:
@@ -192,9 +186,6 @@ def test_interrupting_keeps_what_was_computed(here, echelon):
     assert len(stored(here / "o")["states"]) > 1
     code, out, _ = echelon("run", "--resume", "o", "--no-figures", "--json")
     assert code == 0 and json.loads(out)["outcome"]["name"] == "completed"
-
-
-# ---- a disk that takes no more ----
 
 
 def under(most, call, *arguments):
@@ -256,9 +247,6 @@ def test_a_link_and_a_device_are_written_through(here):
     assert (here / "link").is_symlink() and (here / "target").read_text() == "new"
     with pytest.raises(OSError):
         write_atomic(Path("/dev/full"), "anything")
-
-
-# ---- folders and files of the user's ----
 
 
 def test_of_two_runs_into_one_folder_one_is_refused(here, echelon):

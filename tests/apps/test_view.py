@@ -72,9 +72,6 @@ def text_of(page, place, number=0):
     return page.locator(place).nth(number).inner_text().replace("\n", " ")
 
 
-# ---- what is shown ----------------------------------------------------------------------------
-
-
 def test_scrubbing_shows_places_attitudes_and_goals_beside_the_leader(browser, run, file):
     with opened(browser, file) as page:
         for frame in (0, 37, 150, 300):
@@ -197,9 +194,6 @@ def test_a_click_on_an_agent_tells_its_place_its_error_and_whom_it_hears(browser
         assert card.startswith("follower 2\n") and "receives from 0" in card
         error = run.formation_errors[60, 2]
         assert f"{error:.3g}"[:4] in card
-
-
-# ---- how it is used ---------------------------------------------------------------------------
 
 
 def test_keys_the_slider_and_a_chart_move_the_time_and_play_lets_it_run(browser, file):
@@ -457,9 +451,6 @@ def test_nothing_is_cut_off_on_narrow_and_wide_screens(browser, file):
                 assert box["width"] > 10 and box["height"] > 10
 
 
-# ---- a run that is being computed ----
-
-
 def parts_of(run, cuts):
     names = ("times", "states", "inputs", "lyapunov", "reference")
     for a, b in itertools.pairwise(cuts):
@@ -508,9 +499,6 @@ def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_en
         assert page.locator("dialog pre").inner_text() == "all of it"
 
 
-# ---- other models -----------------------------------------------------------------------------
-
-
 OTHERS = {
     "plane": (swinging(("x", "y", "heading"), (0, 1), n=3), "plane", "car"),
     "side": (swinging(("y", "z", "roll"), (0, 1), n=3), "plane", "birotor"),
@@ -542,9 +530,6 @@ def test_other_models_are_drawn_in_their_own_space(drawn, name):
             # A turn in the plane goes from the first axis to the second.
             turn = Rotation.from_quat(page.evaluate("echelon.turn(1)")).as_matrix()
             np.testing.assert_allclose(turn, rotation([0, 0, run.states[40, 1, 2]]), atol=1e-3)
-
-
-# ---- data -------------------------------------------------------------------------------------
 
 
 def unpacked(block):
@@ -611,9 +596,6 @@ def test_a_run_without_frames_is_refused(run):
     empty = {name: getattr(run, name)[:0] for name in ("times", "states", "inputs")}
     with pytest.raises(OutputError, match="no stored frame"):
         replay_data(dataclasses.replace(run, **empty))
-
-
-# ---- the command and the server ---------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

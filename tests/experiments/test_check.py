@@ -100,9 +100,6 @@ def with_claim(built, **changes):
     )
 
 
-# ---- the finite condition ----
-
-
 def goals(*offsets):
     return ech.Formation([[offset] for offset in offsets])
 
@@ -157,9 +154,6 @@ def test_the_largest_pair_is_the_largest(seed):
     assert found.largest == pytest.approx(max(pairs.values()), rel=1e-9)
     at = max(found.pair), min(found.pair)
     assert pairs[at] == pytest.approx(max(pairs.values()), rel=1e-9)
-
-
-# ---- the region and the set ----
 
 
 def test_the_region_is_told_and_the_promise_says_it(robust):

@@ -53,9 +53,6 @@ def check_same(one, other, tolerance=0.0):
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * size, err_msg=name)
 
 
-# ---- formations that are stepped together ----
-
-
 @pytest.mark.parametrize("name", ["van-der-pol", "unicycle"])
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_a_run_among_many_has_the_bits_that_it_has_alone(name, precision):
@@ -146,9 +143,6 @@ def test_states_beyond_the_range_of_the_sines_go_on_by_jax():
     runs = [(ech.Parts(model, graph, goals, drive, initial=start), chosen) for start in starts]
     for one, run in zip(Batch(1).fly(runs), runs, strict=True):
         check_same(one, ech.simulate(*run))
-
-
-# ---- what has no native code ----
 
 
 @pytest.mark.parametrize("command", ["sweep", "compare", "run"])
@@ -295,9 +289,6 @@ def test_agents_may_differ_in_number_and_what_cannot_be_made_is_refused():
     assert np.isfinite(found["rmse"].values[1, 0, 1:]).all()
 
 
-# ---- which runs there are ----
-
-
 @given(st.integers(1, 5), st.integers(1, 4), st.integers(1, 3), st.sampled_from([0, 1, 2]))
 @settings(max_examples=20)
 def test_every_combination_is_a_run_once_with_the_seeds_fastest(seeds, a, b, where):
@@ -413,8 +404,6 @@ def test_figures_show_the_shares_that_the_batches_hold():
     assert found["success"].axes[0].get_lines()[0].get_ydata().tolist() == [0.0, 1.0, 1.0]
 
 
-# ---- nothing is lost ----
-
 # Whoever started the tests may have switched Ctrl-C off, and a child inherits that. Batches are
 # small, so that there are some before the end.
 SMALL = """
@@ -498,8 +487,6 @@ def test_a_sweep_writes_its_folder_and_is_complete(echelon, here):
     assert code == 0 and "nothing to do" in out + err
     assert "is not empty" in echelon(*call)[2]
 
-
-# ---- the states of runs ----
 
 OVER = {"seed": range(3), "follower.gain.coupling": [0.5, 1.0]}
 
@@ -607,9 +594,6 @@ def test_a_plan_with_states_travels_without_its_parts():
     assert plan.frames is not None
     again = pickle.loads(pickle.dumps(plan))
     assert "first_built" not in vars(again) and again.frames == plan.frames
-
-
-# ---- on a cluster ----
 
 
 @pytest.mark.slow

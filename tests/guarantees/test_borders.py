@@ -80,9 +80,6 @@ def test_of_one_root_the_longest_vector_is_the_longer_of_start_and_speed():
         assert 1.98 <= float(alone.steepest) <= 2.0
 
 
-# ---- unicycles -----------------------------------------------------------------------------------
-
-
 def test_a_unicycle_is_promised_while_it_drives(tmp_path):
     found = promised(driven((0.9, -0.9, 0.2), away=8.0))
     assert found.promised and found.theorem is Theorem.T5 and found.kind is Kind.PROOF
@@ -158,9 +155,6 @@ def test_unicycles_come_together_from_afar_and_never_stop():
     assert outside <= found.tube.arrival <= 2.0 * outside
 
 
-# ---- models that do not say ----------------------------------------------------------------------
-
-
 def name_of(value):
     return type(value).__name__
 
@@ -230,9 +224,6 @@ def test_what_is_proved_of_a_model_of_ones_own_is_promised_and_flown():
     found = promised(swings(Tilted()))
     assert not found.promised
     assert "does not state where its flat coordinates end" in found.sentence()
-
-
-# ---- bounds that models state --------------------------------------------------------------------
 
 
 STATED = {"flat_chains": FlatChains((2,), (0,)), "flat_bounds": ()}
@@ -332,9 +323,6 @@ BUNDLED += ("PlanarQuadrotor", "QuadrotorEuler", "QuadrotorThrust")
 )
 def test_a_word_on_borders_is_of_the_motion_that_it_was_given_with(model):
     assert knows_borders(model) != isinstance(model, Lost | Quickened)
-
-
-# ---- what a model declares, against its equations ------------------------------------------------
 
 
 class Sailing(ech.ControlAffine):

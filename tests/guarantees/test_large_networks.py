@@ -125,8 +125,6 @@ def test_the_slowest_mode_between_two_eigenvalues_is_none_too_fast(shift):
     assert loop.slowest > 0.0 if shift == 0.0 else worst <= loop.slowest <= worst + 1e-3
 
 
-# ---- the step with a held input: the integrator with its substeps beside the exact flow ----
-
 PATH = ech.Graph.path(4)
 
 

@@ -79,9 +79,6 @@ def worst(ratio, count, seed, one_way=False):
     return max(ratios)
 
 
-# ---- 1: errors never grow ------------------------------------------------------------------------
-
-
 def growth(draw, heard, led, c, s, dt, oldest, how):
     flown = agreeing(draw, heard, led, c, s, dt, 300, oldest, how)
     return flown.max() / flown[0].max()
@@ -132,9 +129,6 @@ def off_plan_ratio(seed):
 def test_a_leader_off_its_plan_costs_no_more_than_stated():
     worst = max(map(off_plan_ratio, range(4)))
     assert 0.2 < worst <= 1.0
-
-
-# ---- 2: the rate for messages of any age ---------------------------------------------------------
 
 
 def rate_ratio(draw, heard, led, c, s, dt, oldest, how):
@@ -189,9 +183,6 @@ def test_a_faster_rate_is_neither_proved_nor_true():
     assert not t9.is_proved(best._replace(weights=np.ones(3)), L, c, age)
     assert not t9.is_proved(best._replace(weights=-best.weights), L, c, age)
     assert not t9.is_proved(best, L, c, 2 * age)
-
-
-# ---- 3: the arrival where all hear one way -------------------------------------------------------
 
 
 def arrival_ratio(draw, heard, led, c, s, dt, oldest, how, ways=None):
@@ -273,9 +264,6 @@ def test_while_hops_change_the_bound_is_false():
 
     flown = leaderward(draw, hops, np.ones((3, 3)), c, 1e9, dt, 600, oldest, heard_by)
     assert leaderward_ratio(flown, hops, c, 1e9, dt, oldest) > 1.5
-
-
-# ---- how old messages become ---------------------------------------------------------------------
 
 
 def channel(**numbers):

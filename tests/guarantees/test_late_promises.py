@@ -57,9 +57,6 @@ def stops(result, guarantee):
     return zeta[:, 1:] - zeta[:, :1]
 
 
-# ---- what runs do --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("hears", "options"),
     [("all", {}), ("all", UNDIRECTED), ("leaderward", UNDIRECTED)],
@@ -117,9 +114,6 @@ def test_drawn_networks_keep_what_is_guaranteed(seed):
     if arrival is not None and arrival < 20.0:
         errors = np.linalg.norm((result.errors)[result.times >= arrival][:, :, :2], axis=-1)
         assert errors.max() <= 0.0101
-
-
-# ---- what is covered -----------------------------------------------------------------------------
 
 
 def test_the_network_is_no_longer_ignored_but_what_else_is_there_is():
@@ -186,9 +180,6 @@ def test_the_ideal_network_has_no_line_of_it_and_a_leader_that_stays_needs_no_pl
     assert said(parts_of(network, leader={"reference": None})).theorem is Theorem.T9
 
 
-# ---- 4: the tube ---------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_no_network_leaves_the_tube():
     # The path is at 1.4 m/s, and agreement may ask .5 + .3: before a packet the path counts.
@@ -217,9 +208,6 @@ def test_a_border_is_not_passed_before_the_first_packet():
     radio = said(parts.replace(world=ech.World(network=RADIO)))
     # Without a packet a unicycle stops, where its heading is not known.
     assert not radio.promised and "before their first packet" in radio.sentence()
-
-
-# ---- 5: own states -------------------------------------------------------------------------------
 
 
 def delayed_radius(c, root, dt, delay):

@@ -26,8 +26,6 @@ from echelon.guarantees.promises.leaders import leaders_of
 from echelon.guarantees.promises.promise import REQUIRED, Guarantee, promises
 from echelon.laws.law import TrimInput
 
-# ---- all tellers say the same ----
-
 DOMAINS = {
     "integrators": "{}",
     "van-der-pol": "{position: 0.5, velocity: 0.5}",
@@ -132,8 +130,6 @@ def combinations():
 def test_all_who_tell_of_a_promise_say_the_same(scenario, method, feedforward, tmp_path):
     agree(scenario, method, feedforward, tmp_path)
 
-
-# ---- what is promised is of what runs ----
 
 PATH = ech.Graph.path(4)
 
@@ -374,9 +370,6 @@ def test_the_report_says_whether_the_proof_covers_the_run(swinging, factor, worl
     assert "guaranteed for linear agents" not in report
 
 
-# ---- before a run, and in its data ----
-
-
 def test_a_run_that_will_grow_says_what_would_not(echelon):
     quick = ["--set", "simulation.horizon=0.5", "--set", "simulation.dt=0.05", "--no-figures"]
     code, _, err = echelon("run", "planar-quadrotor", *quick, "--out", "o")
@@ -615,9 +608,6 @@ def test_a_step_too_long_for_one_side_of_a_bend_is_not_promised():
         promise = ech.guarantee(parts, settings(dt=dt))
         assert promise.promised is holds
         assert promise.hypotheses[Hypothesis.SAMPLING].fails is not holds
-
-
-# ---- a law with a theorem of its own ----
 
 
 @final

@@ -35,9 +35,6 @@ PAPER_TREE = ech.Graph([(0, 1), (1, 2), (1, 3)])
 LAWS = StoppingLeader, StoppingPoint
 
 
-# ---- the certificate -----------------------------------------------------------------------------
-
-
 def companion(roots):
     """xdot = A x + b w for x = (v, v', ..) of q(D) v = -k0 w."""
     A = np.eye(len(roots), k=1)
@@ -174,9 +171,6 @@ def test_agreement_does_on_random_graphs_what_the_theorem_says():
             x = x - 0.2 / (c * d_max) * pull
 
 
-# ---- flat coordinates ----------------------------------------------------------------------------
-
-
 MODELS = ("SingleIntegrator", "DoubleIntegrator", "Pendulum", "VanDerPol", "Unicycle")
 VEHICLES = ("PlanarQuadrotor", "Quadrotor", "QuadrotorEuler", "QuadrotorThrust")
 
@@ -257,9 +251,6 @@ def test_flat_coordinates_are_those_of_automatic_differentiation(name):
             ours, theirs = (f(model, chains, x, e) for f in (to_flat, differentiate))
             np.testing.assert_allclose(ours.values, theirs.values, atol=1e-12)
             np.testing.assert_allclose(ours.invert(tops), theirs.invert(tops), atol=1e-10)
-
-
-# ---- flights of small agents ---------------------------------------------------------------------
 
 
 CARTS = ech.models.DoubleIntegrator()
@@ -346,9 +337,6 @@ def test_native_steps_are_those_of_jax(graph, law):
     assert [run.engine for run in runs] == ["native", "jax"]
     np.testing.assert_allclose(runs[0].states, runs[1].states, atol=1e-11)
     np.testing.assert_allclose(runs[0].inputs, runs[1].inputs, atol=1e-9)
-
-
-# ---- what is promised ----------------------------------------------------------------------------
 
 
 def promised(parts, **settings):
@@ -600,9 +588,6 @@ def test_speeds_that_are_left_out_are_what_the_thrust_bears(roots):
     assert 0.9 * most < 29 * long.prepared(QUADROTOR, ech.Graph.path(30)).speed_of(z) < most
 
 
-# ---- bad input -----------------------------------------------------------------------------------
-
-
 def test_a_law_that_makes_no_loop_is_refused():
     for law, text in (
         ({"roots": (4.0, 4.0, 5.0)}, "different from each other"),
@@ -630,9 +615,6 @@ def test_parts_that_do_not_fit_each_other_are_refused():
     }.items():
         with pytest.raises(EchelonError, match=text):
             prepare(*ech.build(override(change)))
-
-
-# ---- attacks -------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -51,9 +51,6 @@ def test_the_checker_loads_nothing_of_the_synthesis():
     assert {name for name in ours if not name.startswith(packages)} <= shared
 
 
-# ---- files as they are written, and with faults ----
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     """The file of each fast case, as JSON reads it."""
@@ -179,9 +176,6 @@ def test_a_method_of_ones_own_is_open(files, tmp_path):
     assert found.verdict == "incomplete" and open_ == ["method"]
 
 
-# ---- bad input ----
-
-
 def changed(told, **parts):
     """A file with another region."""
     certificate = told["certificate"]
@@ -272,9 +266,6 @@ def test_the_command_prints_a_table_and_exits_by_what_holds(files, echelon, tmp_
     file.write_text("no JSON")
     code, out, err = echelon("verify", file)
     assert (code, out) == (2, "") and "is not valid JSON" in err and err.count("\n") == 1
-
-
-# ---- its algebra ----
 
 
 @given(

@@ -69,9 +69,6 @@ MODELS = [models.UnicyclePoint(ahead=0.4), models.PlanarQuadrotor(), QUAD]
 every_model = pytest.mark.parametrize("model", MODELS, ids=lambda m: type(m).__name__)
 
 
-# ---- the paper's law ----
-
-
 @every_model
 @given(connected(most=6), st.integers(0, 10**6))
 @settings(max_examples=8)
@@ -137,9 +134,6 @@ def test_laws_carry_the_metric_of_their_lyapunov_function():
     assert np.array_equal(Consensus(gain, "none").metric(QUAD), gain.P)
     assert np.array_equal(Agreement().metric(models.SingleIntegrator(2)), np.eye(2))
     assert TrimInput().metric(QUAD) is None and Tracking(Hover()).metric(QUAD) is None
-
-
-# ---- the leader's law ----
 
 
 @pytest.mark.parametrize("reacts", [False, True])
@@ -255,9 +249,6 @@ def test_a_domain_of_half_a_turn_is_refused_where_differences_wind():
         "round; allowed is less than 3.142 in all."
     )
     Domain.about(QUAD, {"yaw": 1.5, "attitude": 0.5})
-
-
-# ---- a law of one's own ----
 
 
 class Sound(Law):

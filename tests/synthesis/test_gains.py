@@ -42,9 +42,6 @@ def modes(gain, A, B, eigenvalue, coupling=None):
     return np.linalg.eigvals(A - c * eigenvalue * B @ np.linalg.solve(gain.R, B.T @ gain.P))
 
 
-# ---- Riccati ----
-
-
 @pytest.mark.parametrize("model", STABILIZABLE, ids=lambda m: type(m).__name__)
 def test_riccati_solves_its_equation_and_stabilizes_every_mode(model):
     gain = synthesize(model, TREE, Riccati())
@@ -145,9 +142,6 @@ def test_on_a_large_graph_the_extreme_modes_are_looked_at():
     ends = certificate.lambda_min, certificate.lambda_max
     assert ends == pytest.approx((2.0 - np.sqrt(3.0), 2.0 + np.sqrt(3.0)))
     assert certificate.modes == 3
-
-
-# ---- what cannot be had ----
 
 
 def test_the_mode_of_a_unicycle_that_no_input_moves_is_named():
@@ -308,9 +302,6 @@ def test_the_coupling_is_the_edge_of_the_strength_times_the_headroom():
     ):
         with pytest.raises(GainError, match=said):
             synthesize(growing, LINE, method)
-
-
-# ---- gains of one's own ----
 
 
 def test_the_paper_s_gain_sees_four_of_twelve_states():

@@ -72,9 +72,6 @@ def well_conditioned(rng, n):
     return np.linalg.qr(rng.normal(size=(n, n)))[0] @ np.diag(rng.uniform(0.5, 2.0, n))
 
 
-# ---- modes that forbid ----
-
-
 def test_a_double_integrator_has_no_metric_and_the_mode_is_named():
     with pytest.raises(GainError) as caught:
         monotone(DOUBLE_INTEGRATOR[None], names=["position", "velocity"])
@@ -150,9 +147,6 @@ def test_units_do_not_hide_a_jordan_block():
     assert obstacle((DOUBLE_INTEGRATOR * units / units[:, None])[None]).defective
 
 
-# ---- monotone ----
-
-
 def test_a_pendulum_under_gravity_loses_its_metric_at_the_closed_form():
     # k1 <= stiffness <= k2 with damping d has a common metric where sqrt(k2) - sqrt(k1) < d.
     edge = np.arccos((1.0 - 0.5 / np.sqrt(GRAVITY)) ** 2)
@@ -220,9 +214,6 @@ def test_a_metric_that_needs_the_whole_allowed_condition_is_none():
     assert monotone(fast, condition_max=401.0).condition == pytest.approx(400.0, rel=1e-6)
     with pytest.raises(GainError, match="condition number below 400 was found"):
         monotone(fast, condition_max=400.0)
-
-
-# ---- gains ----
 
 
 def test_one_vertex_gives_the_riccati_gain():

@@ -8,6 +8,7 @@ import scipy.linalg
 import scipy.optimize
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from oracles import delayed_abscissa
 
 from echelon.agents.models import Quadrotor
 from echelon.core.errors import GainError
@@ -95,9 +96,6 @@ def test_stiffness_is_the_ratio_of_rates(seed, decades):
     assert stiffness(scalar(1.0, 1.0, 1.0, [1.0, 3.0])) == np.inf
 
 
-# ---- gain ----
-
-
 @pytest.mark.parametrize(
     ("loop", "low", "high"),
     [
@@ -152,23 +150,6 @@ def test_a_loop_that_only_its_extremes_bear_is_not_called_stable_between_them(ex
     # s^3 + (1 + k) s^2 + (1 + k) s + 0.5 + 4 k: Routh asks (1 + k)^2 > 0.5 + 4 k, |k - 1| > 0.71.
     assert decays_between(chain([4.0, 1.0, 1.0], [-0.5, -1.0, -1.0], 1.0, extremes)) is holds
     assert decays_between(QUAD_ON_LINE)
-
-
-# ---- delay ----
-
-
-def delayed_abscissa(A, G, delay, nodes=24):
-    """Rightmost root of x' = A x - G x(t - delay), by collocation on Chebyshev points."""
-    n = len(A)
-    x = np.cos(np.pi * np.arange(nodes + 1) / nodes)
-    weight = np.concatenate([[2.0], np.ones(nodes - 1), [2.0]]) * (-1.0) ** np.arange(nodes + 1)
-    apart = x[:, None] - x + np.eye(nodes + 1)
-    D = np.outer(weight, 1.0 / weight) / apart
-    D -= np.diag(D.sum(1))
-    generator = np.kron(2.0 / delay * D, np.eye(n))
-    generator[:n] = 0.0
-    generator[:n, :n], generator[:n, -n:] = A, -G
-    return abscissa(generator)
 
 
 def test_a_delayed_integrator_bears_a_quarter_turn():
@@ -264,9 +245,6 @@ def test_a_quadrotor_with_thrust_and_torques_off_by_30_percent_still_decays():
     assert min(worst.scales[1:3]) == pytest.approx(0.7)
     # With the thrust of the trim known exactly there is more room.
     assert input_scaling(QUAD_ON_LINE).abscissa < -0.4
-
-
-# ---- disturbances ----
 
 
 @given(st.integers(0, 10**6), st.integers(1, 6), st.floats(-6.0, 4.0))
@@ -412,9 +390,6 @@ def test_string_gain_agrees_with_the_hamiltonian(seed, m):
 
 def test_a_chain_of_integrators_passes_on_what_it_gets():
     assert string_gain(scalar(0.0, 1.0, 2.0)) == pytest.approx((1.0, 0.0))
-
-
-# ---- detectability ----
 
 
 def test_the_paper_s_gain_never_sees_positions_and_yaw():

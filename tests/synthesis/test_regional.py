@@ -189,9 +189,6 @@ def test_a_domain_needs_known_names_and_all_bounds_that_matter():
         assert sentence(lambda: ech.synthesize(euler, LINE, method)).startswith(told)
 
 
-# ---- gain files ----
-
-
 @pytest.fixture
 def saved(tmp_path):
     model = ech.models.Quadrotor.crazyflie()
@@ -272,9 +269,6 @@ def test_a_gain_for_another_model_or_graph_is_refused_with_the_reason(saved, tmp
     assert "cannot be read" in refused(file=tmp_path / "no.json")
 
 
-# ---- check and design ----
-
-
 def verdicts(scenario, *changes):
     found = ech.check(*ech.build(ech.load_scenario(scenario, list(changes))))
     return {line.name: line for line in found.lines}, found
@@ -329,9 +323,6 @@ def test_check_exits_by_what_is_promised_and_by_a_missing_solver(echelon, monkey
     robust = "follower.gain={method: robust-lqr, domain: {position: 0.5, velocity: 0.5}}"
     code, _, err = echelon("run", "van-der-pol", "--set", robust)
     assert code == 4 and "pip install" in err and "certify" in err
-
-
-# ---- offsets, and jumps ----
 
 
 class Fenced(ech.ControlAffine):
