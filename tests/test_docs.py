@@ -338,3 +338,11 @@ def test_the_theory_page_has_every_numbered_statement_of_the_paper():
     statements = [(kind, str(k + 1)) for kind, count in last.items() for k in range(count)]
     for kind, number in [*statements, ("Table", "I"), ("Table", "II")]:
         assert re.search(rf"\b{kind}s? (\d, )?{number}\b", table), f"{kind} {number}"
+
+
+def test_tests_that_pages_name_exist():
+    tests = [*(ROOT / "tests").rglob("*.py"), *(ROOT / "packages").rglob("tests/*.py")]
+    for page in (ROOT / "docs").glob("*.md"):
+        for file, name in re.findall(r"`(test_\w+\.py)::(test_\w+)", page.read_text("utf-8")):
+            [path] = [path for path in tests if path.name == file]
+            assert f"def {name}(" in path.read_text("utf-8"), (page.name, name)

@@ -77,6 +77,7 @@ def test_disagreement_is_the_block_laplacian_times_the_states(graph, n, seed):
     y = np.random.default_rng(seed).normal(size=(graph.agents, n))
     block = np.kron(dense(graph), np.eye(n)) @ y.ravel()
     assert disagreement(graph, y).ravel() == pytest.approx(block, abs=1e-11)
+    assert not disagreement(graph, np.full((graph.agents, n), y[0, 0])).any()
     # Agents that agree have none at all.
     assert not disagreement(graph, np.tile(1e6 * y[0], (graph.agents, 1))).any()
 

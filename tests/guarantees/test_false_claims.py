@@ -87,8 +87,6 @@ def edited(told, changes, value=None):
     return told
 
 
-# ---- each false number is refused by its own claim ----
-
 CLAIM_OF = {
     "number of modes": ("certificate.modes", lambda x: x + 1),
     "graph": ("graph.edges.0", [1, 1, 1.0]),
@@ -174,9 +172,6 @@ def test_a_rate_that_is_a_little_too_fast_is_refused_at_the_corners(files, said)
         assert UNPROVED in said(edited(files["proof"], f"{REGION}.error.{place}", -1e-9))
 
 
-# ---- what could not be checked is not verified ----
-
-
 def rate_at_the_trim(told):
     A, B = np.array(told["model"]["A"]), np.array(told["model"]["B"])
     P, R = np.array(told["P"]), np.array(told["R"])
@@ -245,9 +240,6 @@ def test_of_two_equal_keys_none_is_read(files, said):
     assert said(inner).endswith("`lambda_min` occurs twice.")
 
 
-# ---- rounding is no credit ----
-
-
 def test_a_rate_that_rounding_leaves_open_is_refused(files, said):
     # Every state grows as e^t, and in a metric this close to singular rounding is of that size.
     told, narrow = copy.deepcopy(files["growing"]), 2.0**-50
@@ -289,9 +281,6 @@ def test_honest_gains_with_a_badly_conditioned_input_weight_are_accepted(said, t
     assert said(told) == []
     faster = edited(told, "certificate.abscissa", lambda x: x * (1.0 + 1e-5))
     assert said(faster) == ["slowest mode, 1/s"]
-
-
-# ---- graphs whose weights are of all sizes, and modes between those that were looked at ----
 
 
 def exact_bounds(edges, agents, leaders):
@@ -368,9 +357,6 @@ def test_modes_between_those_that_were_looked_at_must_decay(said, tmp_path):
     assert told["certificate"]["abscissa"] < -0.1
     assert said(told) == ["all modes between decay"]
     assert "all modes between decay" in said(edited(told, "graph.edges", None))
-
-
-# ---- models that are not what their derivatives say ----
 
 
 @jax.custom_jvp
@@ -510,9 +496,6 @@ def test_a_domain_stays_where_the_equations_hold(files, said):
         assert said(files["plain"], model) == ["the domain lies inside the chart"] * refused
 
 
-# ---- where promises are doubted ----
-
-
 def domain(bounded, lower=-1.0):
     """A gain, as far as points ask for it, and a domain of six states and of four inputs.
 
@@ -550,9 +533,6 @@ def test_a_quarter_of_the_pairs_is_about_the_trim_and_a_quarter_about_other_poin
     assert at_rest.sum() >= 0.15 * len(ones) and (near & ~at_rest).sum() >= 0.15 * len(ones)
     assert (apart > 0.5).sum() >= 0.4 * len(ones)
     assert apart[apart > 0.0].min() < 1e-4
-
-
-# ---- the algebra of it ----
 
 
 @given(st.integers(0, 10**6))

@@ -10,7 +10,7 @@ from runs import simulate
 
 from echelon import Formation, Graph, build, load_scenario, report, synthesize
 from echelon.agents import models
-from echelon.agents.references import Circle, Lemniscate
+from echelon.agents.references import Circle, Hover, Lemniscate
 from echelon.core.errors import EchelonError, ScenarioError
 from echelon.core.words import Feedforward
 from echelon.laws import Consensus, Law, Tracking, TrimInput
@@ -272,3 +272,14 @@ def test_where_the_input_map_is_constant_the_velocity_says_what_the_input_does()
     ]
     assert np.abs(runs[0].states - runs[1].states).max() <= 1e-11
     assert told.information[1] == "the velocity that the leader's input of the same step makes"
+
+
+def test_the_coupling_that_suffices_for_any_line_loses_quadrotors_on_a_long_one():
+    model, more = models.Quadrotor(), {"horizon": 20.0, "dt": 0.005, "store_every": 100}
+    # ||T|| = 1.49: a push grows by 3.3 along three agents, by 3000 along twenty.
+    for followers, low, high in ((3, 0.0, 0.01), (20, 10.0, np.inf)):
+        graph = Graph.path(followers + 1)
+        law = Consensus(synthesize(model, graph, Riccati(coupling=1.0)), "parent")
+        start, line = {"position": 1.0, "attitude": 0.3}, Formation.line(model, graph)
+        run = fly(model, graph, law, Tracking(Hover((0, 0, 0))), line, initial=start, **more)
+        assert low <= np.linalg.norm(run.errors[-1, :, :3], axis=1).max() < high

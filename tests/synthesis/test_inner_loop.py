@@ -145,3 +145,13 @@ def test_a_weight_of_one_input_may_be_a_plain_number():
 
     gain = ech.synthesize(Cart(dimension=1), ech.Graph.path(3), ech.gains.InnerLoop())
     np.testing.assert_array_equal(gain.R, [[3.0]])
+
+
+def test_its_time_constant_grows_as_the_square_of_a_line():
+    graphs = [ech.Graph.path(size + 1) for size in (10, 30, 90)]
+    gains = [ech.synthesize(AGENTS["double integrator"], g, ech.gains.InnerLoop()) for g in graphs]
+    times = np.array([-1.0 / gain.certificate.abscissa for gain in gains])
+    # First order: a position's zero eigenvalue moves by -c lambda times a constant of the loop.
+    shares = times * [graph.spectrum().low for graph in graphs]
+    assert shares == pytest.approx(shares[-1], rel=0.05)
+    assert np.log(times[2] / times[1]) / np.log(3.0) == pytest.approx(2.0, abs=0.05)
