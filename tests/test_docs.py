@@ -323,14 +323,6 @@ def test_what_pages_quote_of_the_readme_has_no_relative_link():
     assert quoted >= 4
 
 
-def test_the_theory_page_names_tests_that_exist():
-    named = re.findall(r"`(test_\w+)\.py::(test_\w+)`", page("theory.md").read_text("utf-8"))
-    assert len(named) >= 20
-    files = {path.stem: path.read_text("utf-8") for path in (ROOT / "tests").rglob("test_*.py")}
-    missing = [f"{f}.py::{test}" for f, test in named if f"def {test}(" not in files.get(f, "")]
-    assert missing == []
-
-
 def test_the_theory_page_has_every_numbered_statement_of_the_paper():
     text = page("theory.md").read_text("utf-8")
     table = text.partition("## The paper, statement by statement")[2].partition("\n### ")[0]
@@ -342,7 +334,9 @@ def test_the_theory_page_has_every_numbered_statement_of_the_paper():
 
 def test_tests_that_pages_name_exist():
     tests = [*(ROOT / "tests").rglob("*.py"), *(ROOT / "packages").rglob("tests/*.py")]
-    for page in (ROOT / "docs").glob("*.md"):
-        for file, name in re.findall(r"`(test_\w+\.py)::(test_\w+)", page.read_text("utf-8")):
+    for one in (ROOT / "docs").glob("*.md"):
+        named = re.findall(r"`(test_\w+\.py)::(test_\w+)", one.read_text("utf-8"))
+        assert one.name != "theory.md" or len(named) >= 20
+        for file, name in named:
             [path] = [path for path in tests if path.name == file]
-            assert f"def {name}(" in path.read_text("utf-8"), (page.name, name)
+            assert f"def {name}(" in path.read_text("utf-8"), (one.name, name)

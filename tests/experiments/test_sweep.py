@@ -229,7 +229,7 @@ def test_of_starts_that_no_tube_covers_none_is_promised_among_many():
     asked = [chosen._replace(seed=k) for k in (0, 1)]
     first, second = promises(parts, asked)
     for one, each in zip((first, second), asked, strict=True):
-        assert one.as_mapping() == guarantee(parts, each).as_mapping()
+        assert one.sentence() == guarantee(parts, each).sentence()
     assert first.tube is not second.tube
 
 

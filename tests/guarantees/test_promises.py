@@ -19,7 +19,7 @@ from echelon.core.words import Feedforward, Kind, Theorem, Verdict
 from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.registry import METHODS
 from echelon.guarantees.promises import promise as module
-from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import agent_lines
 from echelon.guarantees.promises.leaders import leaders_of
@@ -621,7 +621,7 @@ class RestPromise(Guarantee):
     @classmethod
     def of(cls, prepared, settings, brief=False):
         leaders = leaders_of(prepared.parts, prepared.problem.states)
-        case = Case(prepared.parts, settings, loop_of(prepared.parts), leaders)
+        case = GuaranteeInputs(prepared.parts, settings, loop_of(prepared.parts), leaders)
         own = (statement.holds(name, Kind.PROOF, "it rests") for name in REQUIRED)
         lines = {line.statement: line for line in (*agent_lines(case), *own)}
         return cls(loop=case.loop, hypotheses=lines, without="", leader_mode=None)
