@@ -24,7 +24,7 @@ from echelon_flight.ground import Ground
 from echelon_flight.mission import Mission, make_key
 from echelon_flight.wire import GROUND
 
-pytestmark = pytest.mark.study
+pytestmark = [pytest.mark.study, pytest.mark.outside]
 
 HERE = Path(__file__).parent
 STAND_INS = Path(__file__).parents[2] / "packages" / "flight" / "tests"

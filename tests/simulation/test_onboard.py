@@ -123,7 +123,7 @@ def with_outputs(function, call, array):
 
 
 WAYS = [as_python, as_read_c]
-COMPILED = pytest.mark.study  # which has a C compiler, and fails without
+COMPILED = pytest.mark.study, pytest.mark.outside  # with a C compiler, and fails without
 each_way = pytest.mark.parametrize("way", [*WAYS, pytest.param(as_compiled_c, marks=COMPILED)])
 all_ways = pytest.mark.parametrize(
     "ways",
@@ -284,7 +284,8 @@ def fly(agents, bits, moves, starts, steps, folder):
     return np.array(places)
 
 
-@COMPILED
+@pytest.mark.study
+@pytest.mark.outside
 def test_a_flight_in_single_precision_is_that_in_double_to_ten_micrometres(tmp_path):
     parts, settings = ech.build(ech.load_scenario("paper-global", OBSERVED))
     agents = [ech.Agent(parts, k, settings.dt) for k in range(4)]
