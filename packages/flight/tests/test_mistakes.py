@@ -177,5 +177,9 @@ def test_a_folder_that_was_changed_is_refused(tmp_path):
     (tmp_path / "flight.json").write_text(json.dumps(facts | {"formation": "cd"}), "utf-8")
     with pytest.raises(process.FlightError, match="is of another formation than"):
         Mission(tmp_path).law(1)
+    earlier = json.dumps(facts | {"leadership": {"heirs": [1]}})
+    (tmp_path / "flight.json").write_text(earlier, "utf-8")
+    with pytest.raises(process.FlightError, match="was prepared by an earlier version; prepare"):
+        Mission(tmp_path).law(1)
     with pytest.raises(process.FlightError, match=r"cannot be read; `echelon fly SCENARIO --out"):
         Mission(tmp_path / "nowhere")

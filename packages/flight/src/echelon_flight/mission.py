@@ -82,6 +82,11 @@ class Mission:
                 f"the law in `{file.parent}` is of another formation than `{self.folder}`; write "
                 "both again from one scenario."
             )
+        if "backups" not in (self.facts["leadership"] or {"backups": ()}):
+            raise FlightError(
+                f"`{self.folder}` was prepared by an earlier version; prepare it again with "
+                "`echelon fly`."
+            )
         return load_module(file), facts
 
     def wire(self, number: int, key: Path | None) -> Wire:
