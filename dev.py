@@ -27,9 +27,9 @@ HELP = """usage: python3 dev.py COMMAND [ARGUMENT ...]
 
   demo       run the paper's experiment: echelon run paper [ARGUMENT ...]; installs what
              `echelon run` needs (1.1 GB)
-  test       run the tests on all cores, and a minute of the studies: pytest [ARGUMENT ...];
-             --quick leaves the slow tests out; installs Chromium for the tests of the web page
-             where it is missing
+  test       run the quick tests on all cores, and those long ones that the commit chooses, for
+             two minutes: pytest [ARGUMENT ...]; `-m slow` and `-m study` run all long tests,
+             --quick runs none; installs Chromium for the tests of the web page where it is missing
   setup      create .venv with all extras (2.2 GB) and build three.js for the web page; does nothing
              where it is up to date; --minimal installs what `demo` needs (1.1 GB)
   browser    find or install Chromium
@@ -93,18 +93,18 @@ def tests(rest: list[str]) -> list[list[str]]:
         install_browser()
     parallel = ["-n", str(cores()), "--dist", "loadgroup"] if cores() > 1 else []
     if not rest:
-        # One after the other: processes that compiled the programs of both crashed in XLA.
-        marks = ["not slow and not study", "slow and not study"]
-        chosen = tool("pytest", "-m", "study and not outside", "--until", STUDIES)
-        return [*(tool("pytest", *parallel, "-m", mark) for mark in marks), chosen]
+        # One after the other: processes that compiled the programs of all crashed in XLA.
+        chosen = [["-m", mark, "--until", str(seconds)] for mark, seconds in ROTATING.items()]
+        quick = ["-m", "not slow and not study"]
+        return [tool("pytest", *parallel, *selection) for selection in (quick, *chosen)]
     chosen = [word for word in rest if word != "--quick"]
     if not any(word.startswith("-m") for word in chosen):
         chosen += ["-m", "not slow and not study" if "--quick" in rest else "not study"]
     return [tool("pytest", *parallel, *chosen)]
 
 
-STUDIES = "60"
-"""Seconds of a processor for those of the studies that the commit chooses, so that none rots."""
+ROTATING = {"slow and not study": 90, "study and not outside": 30}
+"""Seconds that each process spends on long tests that the commit chooses, so that none rots."""
 
 
 def cores() -> int:

@@ -44,8 +44,8 @@ MAPPINGS = 30_000
 DURATIONS = Path(__file__).resolve().parents[1] / "build" / "durations.csv"
 """What each test took when it last ran: an artefact of a whole run, to cut from its top."""
 
-LIMIT = 5.0
-"""Seconds of a processor from which on a test is `slow` or `study`; it fails from twice as many."""
+LIMIT = 10.0
+"""Seconds of a processor from which on a test that is not `slow` or `study` is named at the end."""
 
 
 def pytest_addoption(parser):
@@ -131,7 +131,7 @@ def pytest_terminal_summary(terminalreporter):
     facts = [(report.nodeid, dict(report.user_properties)) for report in reports]
     keep_durations({name: x["processor_time"] for name, x in facts if x})
     slow = [(x["processor_time"], name) for name, x in facts if x and not x["long"]]
-    slow = sorted(pair for pair in slow if pair[0] > 2.0 * LIMIT)
+    slow = sorted(pair for pair in slow if pair[0] > LIMIT)
     for spent, name in slow[::-1]:
         terminalreporter.write_line(f"{spent:.0f} s of a processor, and not marked `slow`: {name}")
 

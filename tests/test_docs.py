@@ -188,6 +188,7 @@ json.dump(said, sys.stdout)
 """
 
 
+@pytest.mark.slow
 def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
     """Its class becomes a file, and what its section adds to two others is added."""
     package = tmp_path / "echelon"

@@ -125,6 +125,7 @@ def test_every_bundled_model_declares_at_the_class_that_moves(name):
     assert stated == {*declared_of(kind())} and stated
 
 
+@pytest.mark.slow
 def test_an_inherited_map_to_flat_coordinates_is_not_that_of_another_motion():
     model = Dragged()
     with precision("float64"):

@@ -259,6 +259,7 @@ def test_native_steps_are_those_of_jax_however_the_run_is_cut():
     assert np.array_equal(found[0].states, found[1].states[::50])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("directed", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_agents_by_themselves_are_those_of_the_simulation(directed):
     turns = [(0.0, [(0, 1), (1, 2)]), (0.05, [(0, 2)]), (0.1, [(0, 1), (2, 1, 0.5), (0, 2)])]
@@ -355,6 +356,7 @@ def test_graphs_that_take_turns_need_one_p_or_stopping_points():
         ech.synthesize(CARTS, lost, ech.gains.Riccati())
 
 
+@pytest.mark.slow
 def test_stopping_points_wait_for_links_and_agree_at_the_rate_of_a_period():
     graph = ech.Graph.switching([(0.0, [(0, 1)]), (0.5, [(1, 2)])], period=1.0)
     parts, settings = stopping(graph, observer=False), ech.Settings(16.0, 0.01)

@@ -38,6 +38,7 @@ def flown(**sensing):
     return result.formation_errors[result.times > 4.0, 1].max()
 
 
+@pytest.mark.slow
 def test_the_model_carries_exact_states_that_are_late_to_the_present():
     assert flown(delay=0.1, estimator="constant-gain") < 1e-4
 

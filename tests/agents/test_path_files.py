@@ -37,6 +37,7 @@ def write_points(folder, order=("yaw", "t", "z", "x", "y")):
     return folder / "path.csv"
 
 
+@pytest.mark.slow
 def test_each_yaw_is_passed_on_time_and_is_as_smooth_as_the_place(tmp_path):
     path = Waypoints.read(write_points(tmp_path), degrees=True)
     assert at(path, TIMES)[:, 0] == pytest.approx(np.column_stack([POINTS, np.radians(YAWS)]))

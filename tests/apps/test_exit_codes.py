@@ -122,6 +122,7 @@ def test_a_reader_that_has_left_is_no_fault(tmp_path):
     assert left_by_reader(tmp_path, "check", "integrators", "--set", "follower.law=passive")[0] == 1
 
 
+@pytest.mark.slow
 def test_a_run_is_written_whole_whoever_reads(tmp_path):
     """Both streams go to one pipe, as with `2>&1 | head -0`."""
     words = "run integrators --set simulation.horizon=0.1 --no-figures --out kept".split()

@@ -53,6 +53,7 @@ def test_the_files_state_whom_an_agent_hears_and_run_without_echelon(tmp_path, e
     assert marks[0] == marks[1] != marks[2]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_exported_is_refused_in_one_sentence(tmp_path, echelon):
     code, _, errors = echelon("export", "integrators", "--agent", 99, "--out", tmp_path / "law")
     assert code == 2 and "agent 99 is not in this graph" in errors and errors.count("\n") == 1

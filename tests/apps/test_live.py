@@ -110,6 +110,7 @@ IMPERFECT = {
 }
 
 
+@pytest.mark.slow
 def test_radio_and_noise_are_knobs_in_gusts_and_with_motors_that_lag():
     own = scenario(**IMPERFECT)
     panel = Panel(own, build(own))
@@ -134,6 +135,7 @@ def shown(session, pictures=10):
     )
 
 
+@pytest.mark.slow
 def test_who_is_lost_or_joins_live_does_so_as_in_a_run(session):
     before = shown(session, 3)
     session.ask({"name": "lose", "value": 3})
@@ -156,6 +158,7 @@ def test_who_is_lost_or_joins_live_does_so_as_in_a_run(session):
     assert session.swarm.here.all() and not session.knobs.events
 
 
+@pytest.mark.slow
 def test_a_reshape_live_is_that_of_a_run(session):
     """And a formation that moves in the scenario does so live."""
     before = shown(session, 2)
@@ -303,6 +306,7 @@ SWITCHING = {
 }
 
 
+@pytest.mark.slow
 def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
     own = scenario(graph=SWITCHING)
     panel = Panel(own, build(own))

@@ -99,6 +99,7 @@ def wandering(**settings):
     return parts, ech.Settings(**{"horizon": 50.0, "dt": 0.01} | settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [
@@ -249,6 +250,7 @@ def test_a_link_and_a_device_are_written_through(here):
         write_atomic(Path("/dev/full"), "anything")
 
 
+@pytest.mark.slow
 def test_of_two_runs_into_one_folder_one_is_refused(here, echelon):
     with started(EAGER, "run", "mine.yaml", *LONG, "--no-figures", "--out", "o") as process:
         wait_for(process, lambda: list(here.glob("o/chunks/*.npz")))
@@ -260,6 +262,7 @@ def test_of_two_runs_into_one_folder_one_is_refused(here, echelon):
         assert process.poll() is None
 
 
+@pytest.mark.slow
 def test_force_takes_nothing_that_echelon_did_not_write(here, echelon):
     (here / "figures").mkdir()
     (here / "figures" / "thesis.pdf").write_text("years of work")
@@ -306,6 +309,7 @@ def test_a_refused_start_leaves_no_folder_and_says_where(here, echelon):
     assert code == 2 and not (here / "runs").exists()
 
 
+@pytest.mark.slow
 def test_design_overwrites_nothing(here, echelon):
     before = (here / "mine.yaml").read_text()
     design = ["design", "mine.yaml", "--method", "riccati"]

@@ -348,6 +348,7 @@ def test_a_run_of_every_bundled_scenario_is_verified(echelon, here, name):
     assert max(map(len, out.splitlines())) <= 80
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_is_repeated_until_then(echelon, here):
     (here / "small.yaml").write_text(SMALL.replace("horizon: 0.2", "horizon: 4.0"))
     count = 0

@@ -792,6 +792,7 @@ def bent(draw):
     return (lambda x, v: jnp.stack([row(x) for row in rows])), draw(st.integers(0, 99))
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(system=bent())
 def test_secants_of_what_bends_lie_in_the_hull(system):

@@ -139,6 +139,7 @@ BY_JAX = {
 }
 
 
+@pytest.mark.slow
 def test_numbers_are_those_of_jax_to_the_bit_and_mostly_without_jax(monkeypatch):
     faults = []
     for name, function in (BY_NUMPY | BY_JAX).items():

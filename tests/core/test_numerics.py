@@ -32,6 +32,7 @@ def process(code, *arguments, **environment):
     return done.returncode, done.stdout, without_status(done.stderr)
 
 
+@pytest.mark.slow
 def test_a_device_that_is_missing_is_named_with_its_variable_or_setting():
     for variable in ("JAX_PLATFORMS", "JAX_DEFAULT_DEVICE"):
         code, out, err = process("", "check", "paper", **{variable: "gpu"})
@@ -59,6 +60,7 @@ def test_jax_without_compiling_is_named_and_not_the_model():
     assert "derivative" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_fork_of_a_process_that_used_jax_is_told_and_does_not_hang():
     code = f"""
 import multiprocessing, jax

@@ -150,6 +150,7 @@ class Halved(ech.Law):
         return model.physical(u), memory
 
 
+@pytest.mark.slow
 def test_the_row_of_a_law_of_ones_own_has_the_name_of_its_class():
     given = {
         "name": "own",
@@ -165,6 +166,7 @@ def test_the_row_of_a_law_of_ones_own_has_the_name_of_its_class():
     assert "Halved" in text and "riccati" not in text
 
 
+@pytest.mark.slow
 def test_the_command_writes_numbers_text_runs_and_figures(echelon, here):
     call = ["compare", "planar-quadrotor", "--horizon", "0.5", "--out", "here", "--json"]
     code, out, _ = echelon(*call, "--method", "riccati", "--method", "riccati-relay")

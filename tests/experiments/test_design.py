@@ -115,6 +115,7 @@ def test_the_table_and_its_sentence_are_whole(echelon):
     assert sentence.startswith("Recommended: ") and sentence.endswith("is short enough.")
 
 
+@pytest.mark.slow
 def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to():
     tried = ech.design(ech.load_scenario("paper")).designs
     steps = {d.method: d.step for d in tried if d.gain is not None}
@@ -219,6 +220,7 @@ def test_both_pictures_are_written_and_both_radii_are_said(echelon, tmp_path):
     assert code == 2 and "is a file; give a folder" in err and err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_where_nothing_is_certified_the_picture_says_so(tmp_path):
     parts = resting(Cubic(), ech.gains.FixedGain(P=[1.0, 1.0]))
     _, radii = save_design_figures(parts, ech.Settings(horizon=1.0, dt=0.01), tmp_path)

@@ -59,6 +59,7 @@ def test_the_rate_is_the_derivative_of_v(leaders):
     assert fine < 0.6 * coarse
 
 
+@pytest.mark.slow
 def test_v_falls_wherever_theory_says_so_and_the_step_is_short():
     v = lyapunov(double_integrators())
     assert not v.forbidden().any()

@@ -11,6 +11,7 @@ from echelon.experiments.scenario.scenario import as_scenario
 SHORT = ["simulation.horizon=0.1"]
 
 
+@pytest.mark.slow
 def test_a_run_takes_a_name_a_file_a_folder_and_a_mapping(here):
     scenario = ech.load_scenario("integrators", SHORT)
     whole = ech.run(scenario)

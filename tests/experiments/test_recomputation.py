@@ -50,6 +50,7 @@ def stated(experiment, name):
     return dict.fromkeys(OBSERVED) | json.loads(json.dumps(statement(*experiment, name)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{}, AGREEMENT])
 def test_no_forged_field_of_a_summary_agrees_with_its_scenario(change):
     scenario = ech.scenario_from_mapping(SMALL | change)

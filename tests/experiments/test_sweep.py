@@ -120,6 +120,7 @@ class Cubic(ech.ControlAffine):
         return jnp.ones((1, 1), x.dtype)
 
 
+@pytest.mark.slow
 def test_one_that_is_lost_is_told_as_alone_and_loses_no_other():
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
     goals = ech.Formation(np.zeros((2, 1)))
@@ -223,6 +224,7 @@ def test_runs_with_noise_and_runs_without_fly_in_one_sweep():
     assert np.isfinite(shaken).any() and not np.array_equal(still, shaken, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_of_starts_that_no_tube_covers_none_is_promised_among_many():
     far = ["initial.spread={velocity: 18.0}", "simulation.horizon=1", "report.steady_window=0.5"]
     parts, chosen = built("paper-global", *far)
@@ -254,6 +256,7 @@ def test_a_sweep_is_each_of_its_runs():
         assert int(here["promised"]) == int(guarantee(run.parts, run.settings).promised)
 
 
+@pytest.mark.slow
 def test_formations_and_schedules_in_a_sweep_are_those_of_single_runs_by_jax():
     turns = [{"at": 0.3, "edges": [[0, 2], [2, 3], [3, 1]]}]
     ring = {"edges": [[0, 1], [1, 2], [2, 3]], "schedule": turns, "period": 0.7}

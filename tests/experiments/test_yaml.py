@@ -222,6 +222,7 @@ def test_the_place_of_an_overridden_value_is_the_override():
     assert found == places and done.place(("a", "d")) == first
 
 
+@pytest.mark.slow
 @given(st.dictionaries(KEYS, DATA, max_size=3), DATA)
 def test_an_override_of_a_new_key_changes_nothing_else(data, value):
     document = read_yaml(dump_yaml(data), "f.yaml")

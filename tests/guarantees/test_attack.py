@@ -65,6 +65,7 @@ def test_a_drift_that_contracts_by_itself_takes_any_coupling():
     assert gain.coupling > 0.0 and gain.certificate.region.rate >= 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "least"), [(8, 0), pytest.param(100, 10, marks=pytest.mark.study)]
 )

@@ -103,6 +103,7 @@ def test_a_unicycle_is_promised_while_it_drives(tmp_path):
         border[key] = was
 
 
+@pytest.mark.slow
 def test_a_unicycle_that_might_stop_is_told_what_would_help():
     lower = "lower the `speed` of `x`, `y` below 0.9"
     for change, text in (
@@ -124,6 +125,7 @@ def led(place=(0.0, 0.0), turned=0.0, **leader):
     return promised(parts.replace(initial=states))
 
 
+@pytest.mark.slow
 def test_of_a_leader_off_its_path_no_other_place_is_meant():
     # At most c |zeta - path| of its speed is used here, which grows from another place.
     found = led(place=(0.0, 0.02), speed=5.0)
@@ -214,6 +216,7 @@ def swings(model):
     return ech.Parts(model, TREE, ech.Formation(np.zeros((4, 2))), drive, initial={"angle": 3.0})
 
 
+@pytest.mark.slow
 def test_what_is_proved_of_a_model_of_ones_own_is_promised_and_flown():
     found = promised(swings(Swing()))
     assert found.promised and found.kind is Kind.PROOF
@@ -358,6 +361,7 @@ def afloat(model, x=0.0):
     return ech.Parts(model, TREE, ech.Formation(goals), drive, initial=initial)
 
 
+@pytest.mark.slow
 def test_offsets_of_outputs_that_other_states_answer_to_are_not_kept():
     # At rest v = sin x, so that boats at other places have other v for ever.
     parts = afloat(Sailing(), x=1.0)
@@ -369,6 +373,7 @@ def test_offsets_of_outputs_that_other_states_answer_to_are_not_kept():
     assert promised(afloat(Located(), x=1.0)).promised
 
 
+@pytest.mark.slow
 def test_a_time_within_1_cm_is_of_positions_that_are_outputs_in_metres():
     assert promised(afloat(Located())).tube.arrival is not None
     found = promised(afloat(Hundredth(2)))

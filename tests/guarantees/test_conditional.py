@@ -62,6 +62,7 @@ def test_a_limit_leaves_a_claim_to_the_run(kind):
         assert f"The conditional claim {says}" in " ".join(str(ech.report(result)).split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["T1", "T5"])
 def test_a_claim_is_guaranteed_without_limits_of_the_model_and_of_every_plant(kind):
     free, (wide, weak) = DOUBLE, (Cart(dimension=2, most=most) for most in (np.inf, 0.05))
@@ -87,6 +88,7 @@ def test_only_the_leader_at_its_limit_leaves_a_run_uncovered():
     assert ech.summary(result)["covered"] is False
 
 
+@pytest.mark.slow
 def test_the_badge_says_what_is_conditional_and_what_is_none():
     found = ech.guarantee(*ech.build(ech.load_scenario("crossing")))
     assert found.verdict is GuaranteeVerdict.CONDITIONAL and str(found.theorem) == "T10"

@@ -19,6 +19,7 @@ def line_of(found, name=Hypothesis.ALONG_PATH):
     return found.hypotheses[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("yaw", [1.05, -1.2])
 def test_a_yaw_that_loses_the_formation_is_not_promised_unless_the_law_turns(yaw):
     turning = ech.guarantee(*built("paper", f"reference.yaw={yaw}"))
@@ -50,6 +51,7 @@ def poles_at_the_steepest(parts, settings):
     return np.linalg.eigvals(A - B @ (gain.inner + parts.graph.spectrum().high * felt))
 
 
+@pytest.mark.slow
 def test_the_longest_step_is_that_of_the_steepest_tilt():
     parts, settings = built("paper", "follower.gain={method: inner-loop}")
     steep = 2.0 / np.abs(poles_at_the_steepest(parts, settings)).max()

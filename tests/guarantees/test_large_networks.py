@@ -166,6 +166,7 @@ def test_an_integrator_that_damps_what_a_held_input_drives_guarantees_nothing():
     assert exact_radius(parts, 0.02) < 1.0 and found.promised
 
 
+@pytest.mark.slow
 def test_a_stiff_model_asks_for_substeps_and_not_for_a_weaker_gain():
     A = [[0.0, 1.0, 0.0], [0.0, -20.0, 400.0], [0.0, -50.0, -50000.0]]
     parts, settings = held_parts(A, [[0.0], [0.0], [1000.0]]), ech.Settings(horizon=3.0, dt=0.01)

@@ -116,6 +116,7 @@ def test_drawn_networks_keep_what_is_guaranteed(seed):
         assert errors.max() <= 0.0101
 
 
+@pytest.mark.slow
 def test_the_network_is_no_longer_ignored_but_what_else_is_there_is():
     assert "ignores" not in said(parts_of()).sentence()
     wind = {"disturbance": ech.Disturbance(constant={"velocity": 0.1})}
@@ -151,6 +152,7 @@ def test_in_a_run_too_short_for_a_first_packet_nobody_is_said_to_arrive():
     assert over(said(parts_of(), single)) == over(said(parts_of(), double))
 
 
+@pytest.mark.slow
 def test_the_lag_behind_messages_of_states_is_that_of_a_run():
     network = ech.Network(rate=50.0, delay=0.02, loss=0.2, messages="state")
     parts = parts_of(network, [(0, 1), (1, 2)])
@@ -198,6 +200,7 @@ def test_no_network_leaves_the_tube():
     assert (off.max(axis=(0, 1)) > 0.7 * most).any()
 
 
+@pytest.mark.slow
 def test_a_border_is_not_passed_before_the_first_packet():
     unicycle = ech.models.Unicycle()
     graph = ech.Graph([(0, 1)], directed=True)
@@ -247,6 +250,7 @@ def test_margins_of_own_states_are_those_of_the_delayed_loop(network, edges):
     assert radii[0] < 1.0 < radii[1]
 
 
+@pytest.mark.slow
 def test_turns_along_the_circle_count_as_eigenvalues_do():
     ready = prepare(parts_of(None, world=MEASURED_LATE, coupling=1.5), SETTINGS)
     with jax.enable_x64(True):

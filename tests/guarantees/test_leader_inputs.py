@@ -45,6 +45,7 @@ def pushed(gain, push):
     return ech.laws.Tracking(ech.references.StatePath(times, states, inputs), gain)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("push", [0.9, 0.3])
 def test_small_errors_are_guaranteed_only_with_inputs_that_the_hull_covers(push):
     bare = promised(lambda gain: pushed(gain, push))

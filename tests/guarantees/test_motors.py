@@ -199,6 +199,7 @@ def test_motors_that_suffice_are_promised_and_verified(hovering, tmp_path):
         place[key] = was
 
 
+@pytest.mark.slow
 def test_motors_that_may_not_suffice_leave_the_tube_to_the_run(hovering):
     parts, settings, _ = hovering
     law = eqx.tree_at(lambda law: law.speed, parts.drive.follower, (4.0, 4.0, 0.7, 0.3))

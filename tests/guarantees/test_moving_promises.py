@@ -47,6 +47,7 @@ def parts(changes, model=AGENT, follower=None, **initial):
     return ech.Parts(model, GRAPH, formation, drive, initial=initial)
 
 
+@pytest.mark.slow
 def test_bounds_of_offsets_hold_at_all_times_and_are_not_far_above():
     motion = parts(CHANGES).formation.motion
     bounds = np.array(offset_sizes(motion), float)
@@ -62,6 +63,7 @@ def test_bounds_of_offsets_hold_at_all_times_and_are_not_far_above():
         offset_sizes(parts([Rotate(1e200)]).formation.motion)
 
 
+@pytest.mark.slow
 def test_a_motion_is_guaranteed_with_what_it_asks_of_the_chart():
     still, moving = (guarantee(parts(x), SETTINGS) for x in ([], CHANGES))
     assert moving.claimed and moving.rate == still.rate
@@ -73,6 +75,7 @@ def test_a_motion_is_guaranteed_with_what_it_asks_of_the_chart():
     assert "that of the own offset and the leader's" in moving.sentence()
 
 
+@pytest.mark.slow
 def test_agents_stay_within_the_tube_of_a_moving_formation():
     roots = (2.0, 2.5, 3.0)
     gentle = ech.laws.StoppingPoint(roots=roots, speed=(0.7, 0.7, 0.5, 1.0))
@@ -89,6 +92,7 @@ def test_agents_stay_within_the_tube_of_a_moving_formation():
     assert len(errors) and errors.max() < 0.01
 
 
+@pytest.mark.slow
 def test_no_bound_of_a_user_s_motion_leaves_agents_with_borders_unguaranteed():
     value = guarantee(parts([Wave()]), SETTINGS)
     assert not value.promised
@@ -108,6 +112,7 @@ def test_a_law_of_states_is_not_guaranteed():
     assert "offsets change with time" in value.sentence()
 
 
+@pytest.mark.slow
 def test_safety_keeps_the_tube_of_the_speed_and_promises_no_convergence():
     apart = ech.laws.StoppingPoint(safety=ech.Safety(radii=(0.1, 0.1, 0.3)))
     still, moving = (guarantee(parts(x, follower=apart), SETTINGS) for x in ([], [Rotate(0.5)]))
@@ -137,6 +142,7 @@ def test_claims_of_offsets_are_checked_by_code_of_its_own(tmp_path):
         assert verify(file).verdict == "refused", name
 
 
+@pytest.mark.slow
 def test_a_moving_run_is_not_accepted_under_the_promise_of_constant_offsets():
     stored = json.loads(json.dumps([check(parts(x), SETTINGS).as_mapping() for x in ([], TURN)]))
     moving = Experiment(parts(TURN), SETTINGS)

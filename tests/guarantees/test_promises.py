@@ -209,6 +209,7 @@ def test_one_step_of_the_integrator_that_runs_decides():
     assert step.fails and "ignores the goals" in step.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change", ["model.parameters={motor_thrust: 0.1}", "plant.parameters.motor_thrust=0.1"]
 )
@@ -283,6 +284,7 @@ def test_a_v_of_rounding_blames_nobody():
     assert v.value.max() < 1e-28 and not v.rises().any() and not v.forbidden().any()
 
 
+@pytest.mark.slow
 def test_only_a_law_that_keeps_the_theorem_is_promised_it():
     model, circle = ech.models.DoubleIntegrator(2), ech.laws.Tracking(ech.references.Circle())
     gain = ech.synthesize(model, PATH, ech.gains.Contraction({}, rate=0.3))
@@ -312,6 +314,7 @@ def test_a_parent_that_is_the_leader_relays():
         assert not kept or passed_on.rate == relayed.rate
 
 
+@pytest.mark.slow
 def test_the_relayed_velocity_has_no_local_theorem_where_g_varies():
     model, bounds = ech.models.PlanarQuadrotor(), {"roll": 0.2, "thrust": 1.0}
     gain = ech.synthesize(model, PATH, ech.gains.RobustLQR(bounds))
@@ -370,6 +373,7 @@ def test_the_report_says_whether_the_proof_covers_the_run(swinging, factor, worl
     assert "guaranteed for linear agents" not in report
 
 
+@pytest.mark.slow
 def test_a_run_that_will_grow_says_what_would_not(echelon):
     quick = ["--set", "simulation.horizon=0.5", "--set", "simulation.dt=0.05", "--no-figures"]
     code, _, err = echelon("run", "planar-quadrotor", *quick, "--out", "o")

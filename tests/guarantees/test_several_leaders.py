@@ -45,6 +45,7 @@ def shrinking(parts, begin, end):
     return measured, guarantee(parts, settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", [0.05, 0.3])
 def test_leaders_apart_come_together_no_faster_than_their_own_coupling(coupling):
     measured, found = shrinking(formation(1.0, coupling), 20.0, 40.0)
@@ -56,6 +57,7 @@ def test_leaders_apart_come_together_no_faster_than_their_own_coupling(coupling)
     assert alike.rate == pytest.approx(4.0) and alike.tube.arrival is not None
 
 
+@pytest.mark.slow
 def test_passive_leaders_apart_come_together_by_their_own_drift():
     model, goals = Sinking(), ech.Formation(np.zeros((4, 1)))
     laws = ech.Laws(TrimInput(), Consensus(ech.synthesize(model, LINE, ech.gains.Riccati())))
@@ -66,6 +68,7 @@ def test_passive_leaders_apart_come_together_by_their_own_drift():
         assert measured == pytest.approx(found.rate, rel=0.05) and found.slowest == -found.rate
 
 
+@pytest.mark.slow
 def test_agents_without_chains_are_promised_at_the_coupling_that_their_step_holds():
     # Twice the root over lambda_min is more than the step holds, so that c d_max dt is 1.
     states = np.zeros((10, 2))

@@ -285,6 +285,7 @@ def test_without_any_chain_a_step_is_that_of_the_linear_law():
     np.testing.assert_allclose(result.errors[-1, 1:], wanted, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hears", ["leaderward", pytest.param("all", marks=pytest.mark.slow)])
 def test_the_farthest_stopping_point_never_moves_away(hears):
     graph = ech.Graph([(0, 1, 0.4), (1, 2, 2.5), (2, 3), (1, 3, 0.7), (3, 4, 1.9)])
@@ -329,6 +330,7 @@ def test_the_step_alone_limits_a_coupling_that_is_left_open():
     assert c == pytest.approx(1.0 / (2.0 * 0.02 * 1.08))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("graph", "law"), [(PAPER_TREE, {"rate": 3.0}), (ech.Graph.path(5), {"feedforward": "parent"})]
 )

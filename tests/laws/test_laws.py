@@ -158,6 +158,7 @@ def test_the_leader_tracks_with_unit_coupling_and_reacts_with_the_followers_gain
     assert input_of(law, model, x=x, z=z, offset=offset, t=t) == pytest.approx(wanted)
 
 
+@pytest.mark.slow
 def test_under_computed_torque_a_leader_stays_on_its_circle_but_for_held_inputs():
     model, law = models.QuadrotorThrust(), Tracking(Circle(radius=1.5, rate=0.8))
 

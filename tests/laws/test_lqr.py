@@ -156,6 +156,7 @@ def test_how_far_a_path_is_from_a_motion_is_said_with_its_number():
     assert f"the rate of `rate` is {found.off[1]:.3g} off f + g u" in told
 
 
+@pytest.mark.slow
 def test_a_check_says_what_the_reference_asks(tmp_path, echelon):
     file = write_swing(tmp_path)
     assert "reference, what it asks" in echelon("check", file)[1]

@@ -38,6 +38,7 @@ class Wave(OffsetMotion):
         return place.at[-1].add(0.2 * jnp.sin(t))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "feedforward", "network", "most"),
     [
@@ -59,6 +60,7 @@ def test_what_held_inputs_leave_shrinks_with_the_step():
     assert errors[0] > 1.8 * errors[1] > 0.0
 
 
+@pytest.mark.slow
 def test_a_reshape_is_followed_to_the_end_the_leader_s_too():
     goals = ech.Formation.from_offsets(AGENT, GRAPH, {0: (0.5, 0), 1: (-1, 0), 2: (0, -1)})
     change = Reshape(goals.offsets, 2.5, 3.0)
@@ -100,6 +102,7 @@ def test_agents_alone_do_what_simulate_does():
             assert u == pytest.approx(result.inputs[k, agent.number], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_no_offset_of_a_moving_formation_is_faster_than_safety_allows():
     safe = ech.laws.StoppingPoint(safety=APART, speed=1.0)
     fast = {1: (2.0, 0), 2: (0, 1.0)}

@@ -220,6 +220,7 @@ def test_agents_cross_without_touching_and_arrive():
     assert least_distance(ech.simulate(crossing(None), settings)) < 0.05
 
 
+@pytest.mark.slow
 def test_agents_that_nobody_holds_back_fly_as_without():
     settings = ech.Settings(horizon=1.0, dt=0.02, engine="jax")
     parts = (crossing(safety, size=20.0) for safety in (ROUND, None))
@@ -228,6 +229,7 @@ def test_agents_that_nobody_holds_back_fly_as_without():
     np.testing.assert_allclose(wide.inputs, free.inputs, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_run_says_the_ellipsoids_of_its_model():
     class Round(ech.models.DoubleIntegrator):
         radius: float = 0.1
@@ -277,6 +279,7 @@ def test_what_cannot_be_kept_apart_is_refused_with_one_sentence(change, sentence
     assert str(refusal.value).count(". ") == 0
 
 
+@pytest.mark.slow
 def test_agents_that_hear_one_way_keep_apart_and_native_code_does_not():
     parts = crossing(ROUND)
     one_way = ech.simulate(parts.replace(graph=STAR.one_way()), BRIEF)

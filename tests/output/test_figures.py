@@ -348,6 +348,7 @@ def long():
 OVER_TIME = ("tracking", "formation", "inputs", "states", "distances", "lyapunov")
 
 
+@pytest.mark.slow
 def test_figures_over_time_have_their_start_enlarged_unless_they_settle_late(run, long):
     for name, figure in figures(long, OVER_TIME).items():
         times = [ax.get_xlim() for ax in figure.axes]

@@ -111,6 +111,7 @@ def test_every_function_gives_the_same_for_a_run_from_disk(run):
     assert next(charts).descriptions == next(charts).descriptions
 
 
+@pytest.mark.slow
 def test_the_lyapunov_function_of_a_run_from_disk_is_computed_to_the_same_bits(tmp_path):
     result = ech.run(ech.load_scenario("planar-quadrotor", ["simulation.horizon=0.1"]))
     folder = ech.save_run(result, tmp_path / "p", figures=False)
@@ -169,6 +170,7 @@ def test_a_run_from_python_is_read_and_its_parts_are_to_be_given(run, tmp_path):
     assert ech.report(ech.load(folder, parts)) == ech.report(result)
 
 
+@pytest.mark.slow
 def test_a_run_of_an_own_class_is_saved_with_its_file_and_read_from_anywhere(own, here):
     result = ech.run(own)
     folder = ech.save_run(result, "o", figures=False)
@@ -192,6 +194,7 @@ def test_no_code_is_executed_for_the_frames(own, here):
         other.parts
 
 
+@pytest.mark.slow
 def test_a_run_from_disk_is_verified_as_its_folder_is(own):
     folder = ech.save_run(ech.run(own), "o", figures=False)
     assert ech.verify(folder).verdict == "incomplete"

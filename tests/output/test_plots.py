@@ -335,6 +335,7 @@ def test_long_runs_are_thinned_and_keep_their_ends():
     assert thin(1).tolist() == [0]
 
 
+@pytest.mark.slow
 def test_each_figure_is_written_as_the_same_png_and_pdf_and_settings_are_left_alone(runs, tmp_path):
     # To look the back end up would itself choose one; a copy does not.
     before, errors = dict(matplotlib.rcParams.copy()), np.geterr()
@@ -370,6 +371,7 @@ def multitude():
     return ech.simulate(parts, ech.Settings(horizon=0.02, dt=0.01, steady_window=0.01))
 
 
+@pytest.mark.slow
 def test_a_multitude_is_drawn_by_some_and_the_graph_about_its_leader(multitude):
     made = figures(multitude, ("trajectories", "network", "states"))
     [ax] = made["trajectories"].axes

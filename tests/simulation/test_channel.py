@@ -196,6 +196,7 @@ def test_a_batch_draws_for_each_seed_what_a_run_alone_draws():
     assert not np.allclose(alone[0], alone[1])
 
 
+@pytest.mark.slow
 def test_a_link_that_is_cut_carries_nothing_and_hops_heal():
     """A follower that has lost its way to the leader is reached by another one."""
     turns = [(0.0, [(0, 1), (1, 2)]), (0.5, [(0, 1), (0, 2)]), (1.0, [(0, 2), (2, 1)])]
@@ -273,6 +274,7 @@ def test_a_leader_without_a_plan_is_carried_on_by_the_model():
         ech.simulate(in_a_row(ech.laws.TrimInput(), ech.Network()), settings)
 
 
+@pytest.mark.slow
 def test_states_are_not_predicted_by_a_plan_of_stopping_points():
     leader, short = ech.laws.StoppingLeader(), ech.Settings(horizon=0.05, dt=DT)
     with pytest.raises(SimulationError, match="`Consensus` do not send what the plan .* `packet`"):

@@ -34,6 +34,7 @@ def all_pairs(result):
     return apart.min(), result.times[frame], (i[pair], j[pair])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("engine", ["jax", "native"])
 def test_the_smallest_distance_does_not_depend_on_the_stored_frames(engine, precision):
@@ -80,6 +81,7 @@ def test_of_up_to_32_agents_all_steps_count_and_of_more_the_report_says_frames(e
     assert ech.summary(run)["minimum_distance_frames"] == 11
 
 
+@pytest.mark.slow
 def test_runs_of_a_batch_have_the_distances_of_each_alone_and_absent_agents_are_near_to_nobody():
     runs = [built(many(5), seed=seed) for seed in range(9)]
     found = [result.closest for result in Batch(1).fly(runs)]

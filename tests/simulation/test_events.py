@@ -33,6 +33,7 @@ def lost():
     return ech.simulate(_parts(events=[Lose(3, 2.0), Join(2, 3.0)]), SETTINGS)
 
 
+@pytest.mark.slow
 def test_a_cut_link_is_a_graph_that_switches():
     """To the bit, in both ways of stating it; native code steps it too."""
     edges = RING.edges.tolist()
@@ -75,6 +76,7 @@ def test_those_who_remain_fly_as_in_a_graph_without_the_others(lost):
     assert gap.max() < 1e-12
 
 
+@pytest.mark.slow
 def test_the_summary_states_each_event_and_what_followed(lost):
     summary = ech.summary(lost)
     assert [event["text"] for event in summary["events"]] == ["agent 3 is lost", "agent 2 joins"]
@@ -105,6 +107,7 @@ def of_states(graph, leader=None):
     return ech.Laws(leader or ech.laws.Tracking(CIRCLE), ech.laws.Consensus(gain, "relay"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "network", [None, pytest.param(RADIO, marks=pytest.mark.slow)], ids=["ideal", "radio"]
 )
@@ -123,6 +126,7 @@ def test_a_backup_leader_leads_along_the_path(network):
         assert run.formation_errors[-1].max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_backup_leader_leads_at_its_place_in_a_formation_that_turns():
     """Its place, and those of all others, are those of each time and not of the start."""
     parts = _parts(events=[Lose(0, 3.0)], leadership=ech.Leadership((1, 2), timeout=0.3))
@@ -217,6 +221,7 @@ def test_what_is_not_covered_is_not_guaranteed(network, events):
     assert not ech.guarantee(parts, SETTINGS).promised
 
 
+@pytest.mark.slow
 def test_who_hears_nearer_neighbours_alone_may_be_left_behind_by_an_event():
     """Agent 2 of a ring of five hears agent 1 alone, which is lost, or hears the leader no more."""
     ring, ward = ech.Graph.ring(5), ech.laws.StoppingPoint(hears="leaderward")
@@ -231,6 +236,7 @@ def test_who_hears_nearer_neighbours_alone_may_be_left_behind_by_an_event():
         assert ech.guarantee(_parts(ring, events=[event]), SETTINGS).promised
 
 
+@pytest.mark.slow
 def test_a_link_that_no_step_has_makes_nobody_nearer():
     """For 3 ms agent 3 is the leader's neighbour, and so hears nobody who is not."""
     line = [(0, 1), (1, 2), (2, 3)]

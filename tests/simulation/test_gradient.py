@@ -77,6 +77,7 @@ def with_distances(sums):
     return errors + led + 0.01 * sums.effort.sum() + 0.5 * sums.spacing.sum()
 
 
+@pytest.mark.slow
 def test_slopes_by_starts_and_offsets_are_those_of_differences_on_any_graph_in_wind():
     first = [(0, 1, 2.0), (1, 2, 1.0), (3, 2, 0.5), (2, 1, 1.5), (0, 4, 1.0)]
     then = [(3, 1, 1.0), (1, 2, 0.7), (1, 4, 1.0), (4, 2, 3.0)]

@@ -178,6 +178,7 @@ def test_a_run_that_diverges_says_so_and_makes_no_plan_from_a_state_that_is_not_
     assert "stopped being finite" in result.message and np.isfinite(starts).all()
 
 
+@pytest.mark.slow
 def test_the_figures_are_kept_with_the_result_which_says_what_agents_were_sent():
     result = swarm(horizon=0.1)
     figures, information = result.work, result.drive.information

@@ -158,6 +158,7 @@ def test_all_networks_and_feedforwards_step_as_by_jax(name):
     check_alike(flock(graph, **more), run_settings())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("common", [True, False])
 def test_wind_and_noise_are_those_that_jax_draws(common):
     rms = {"rms": {"velocity": 0.3}, "input_rms": {"thrust": 0.1}}

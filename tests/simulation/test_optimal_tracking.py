@@ -65,6 +65,7 @@ def test_after_the_plan_it_follows_the_reference():
         assert np.asarray(one) == pytest.approx(np.asarray(other), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_feedback_holds_the_plan_in_wind():
     wind = ech.Disturbance(constant={"vx": 1.0})
     held = led(LAW, disturbance=wind)

@@ -106,6 +106,7 @@ def by_hand(start, wanted, inputs, steps, step, limited, weight):
     return np.array(found.value(X)).T, np.array(found.value(V)).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limited", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_leader_s_plan_is_that_of_a_problem_written_by_hand(limited):
     states = starts()

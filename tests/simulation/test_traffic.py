@@ -123,6 +123,7 @@ def test_all_messages_lost_and_those_of_an_absent_sender_have_no_age():
     np.testing.assert_array_equal(found.of_agents(edges, 3, here), expected)
 
 
+@pytest.mark.slow
 def test_a_run_reports_its_messages():
     network = ech.Network(loss=0.3, seed=1)
     result = ech.simulate(parts_of(network), ech.Settings(horizon=1.0, dt=DT))

@@ -231,6 +231,7 @@ def test_scalar_vertices_give_the_riccati_gain_of_the_worst():
     assert rate_of(metric.P, As, one, one, 2.0) == pytest.approx(metric.P[0, 0] - 2.0, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_quadrotor_in_euler_rates_contracts_on_its_whole_hull():
     Q, R = (np.diag(weights) for weights in Quadrotor().weights)
     As = hull(20.0, 10.0, 2.0)

@@ -274,6 +274,7 @@ def verdicts(scenario, *changes):
     return {line.name: line for line in found.lines}, found
 
 
+@pytest.mark.slow
 def test_the_papers_own_experiment_is_checked_line_by_line():
     lines, found = verdicts("paper-literal")
     assert not found.promised
@@ -297,6 +298,7 @@ def test_an_inner_loop_makes_assumption_5_hold():
     assert lines["Lemma 4, drift along z"].verdict is Verdict.HOLDS and found.promised
 
 
+@pytest.mark.slow
 def test_a_broken_offset_and_a_missing_relay_are_named():
     lines, found = verdicts("paper", "formation.offsets.1=[1,0,0,0,0,0,0.2,0,0,0,0,0]")
     line = lines["offsets are symmetries"]
