@@ -30,7 +30,7 @@ from echelon.guarantees.stopping.stopping_run import stopping_run_of
 from echelon.guarantees.stopping.tube import tube_of
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.sequence import begin, step
 
 AGENTS, DT, SPAN, BATCH, AGAIN = 5, 0.0005, 0.7, 50, 6
@@ -62,17 +62,17 @@ def far(draw: np.random.Generator, states: Array) -> Array:
 
 def fly(loop: Any, weights: jax.Array, starts: jax.Array, dt: float) -> tuple[jax.Array, jax.Array]:
     """The least z'' and the most that the farthest stopping point moves away (S,), of flights."""
-    model, chains, ready = loop.model, chains_of(loop.model), loop.follower.ready
+    model, chains, ready = loop.model, chains_of(loop.model), loop.laws.follower.ready
 
     def flat(now: Any) -> tuple[jax.Array, jax.Array]:
-        x, e = now.states[loop.followers], now.follower_memory.chain
+        x, e = now.states[loop.laws.followers], now.memory.laws.follower.chain
         values = jax.vmap(lambda x, e: to_flat(model, chains, x, e).values)(x, e)
-        led = to_flat(model, chains, now.states[0], now.leader_memory.chain[0]).values
+        led = to_flat(model, chains, now.states[0], now.memory.laws.leader.chain[0]).values
         stops = jax.vmap(ready.stop)(values[:, : len(ready.weights)])
         return values[:, 2, 2], jnp.abs(stops - ready.stop(led[: len(ready.weights)])).max(axis=0)
 
     def one(rows: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        mine = eqx.tree_at(lambda each: each.exchange.weights, loop, rows)
+        mine = eqx.tree_at(lambda each: each.graph.exchange.weights, loop, rows)
 
         def on(_: jax.Array, done: Any) -> Any:
             now, least, size, rose = done

@@ -5,7 +5,6 @@ flights of a kind are one compiled program. The figures stand on the theory page
 """
 
 import argparse
-import dataclasses
 import itertools
 import time
 from collections.abc import Callable, Iterable
@@ -22,7 +21,10 @@ from echelon.agents.world.sensing import Sensing
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import Loop, LoopState, assemble
+from echelon.simulation.step.assembly import assemble
+from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.places import ConstantPlaces
+from echelon.simulation.step.records import LoopState
 from echelon.simulation.step.sequence import begin, step
 
 MODEL = ech.models.Quadrotor.crazyflie()
@@ -123,7 +125,7 @@ def _fly(loop: Loop, states: Array, offsets: Array, frames: int) -> tuple[jax.Ar
     scales = jnp.asarray(SCALES)
 
     def one(states: jax.Array, offsets: jax.Array) -> tuple[jax.Array, jax.Array]:
-        own = dataclasses.replace(loop, offsets=offsets)
+        own = loop.replace(places=ConstantPlaces(offsets))
 
         def each(_: jax.Array, carry: tuple[LoopState, jax.Array]) -> tuple[LoopState, jax.Array]:
             now = step(own, carry[0])

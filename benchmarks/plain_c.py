@@ -165,7 +165,7 @@ class PlainC:
 
 def beside(name: str, native: Any, bits: int) -> Callable[[], float]:
     """Return the rate of one turn in C, after it is seen to step as native code does."""
-    gain, states = native.loop.follower.gain, np.asarray(native.states)
+    gain, states = native.loop.laws.follower.gain, np.asarray(native.states)
     with precision("float64"):
         g = np.asarray(native.loop.model.input_map(jnp.zeros(states.shape[1])))
     plain = PlainC(name, bits, gain.coupling * gain.R_inverse @ g.T @ gain.P)

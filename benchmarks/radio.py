@@ -16,7 +16,7 @@ import echelon as ech
 from echelon.core.numerics import precision
 from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.assembly import assemble
 
 AGENTS, STEPS, TRIALS = 1000, 40, 5
 

@@ -18,8 +18,9 @@ from echelon.core.numerics import precision
 from echelon.simulation.engine.jax_stepper import JaxStepper
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.native.stepper import NativeStepper
+from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.drive import Stepper
-from echelon.simulation.step.loop import Loop, assemble
+from echelon.simulation.step.loop import Loop
 
 DT = 0.005
 FORMATIONS, STEPS = 2_560, 300
@@ -161,7 +162,7 @@ def _regained(loop: Loop, draws: np.random.Generator) -> Loop:
     """Return a loop with a gain a little other."""
 
     def numbers(loop: Loop) -> tuple[Any, ...]:
-        gain: Any = loop.follower
+        gain: Any = loop.laws.follower
         return gain.gain.P, gain.gain.R_inverse, gain.gain.coupling
 
     P, R_inverse, coupling = numbers(loop)

@@ -22,7 +22,8 @@ from echelon.guarantees.stopping.tube import tube_of
 from echelon.guarantees.verifier.verify import verify
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.assembly import assemble
+from echelon.simulation.step.records import Steps
 from echelon.simulation.step.sequence import begin, control, step
 
 CARTS = ech.models.DoubleIntegrator(2)
@@ -412,11 +413,11 @@ def flights(loop, weights, starts, steps):
     """The least upward acceleration of any follower in each flight (count,)."""
 
     def one(weights, x):
-        mine = eqx.tree_at(lambda each: each.exchange.weights, loop, weights)
+        mine = eqx.tree_at(lambda each: each.graph.exchange.weights, loop, weights)
 
         def on(_, done):
             now, least = done
-            acted = control(mine, now)
+            acted = control(mine, now, Steps(now.step, loop.motion.dt))
             tilt = jnp.cos(now.states[1:, 6]) * jnp.cos(now.states[1:, 7])
             lift = acted.inputs[1:, 0] / loop.model.mass * tilt - loop.model.gravity
             return step(mine, now), jnp.minimum(least, lift.min())

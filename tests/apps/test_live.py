@@ -379,7 +379,7 @@ def test_another_method_brings_its_gain_and_its_coupling(session):
     session.ask({"name": "method", "value": "inner-loop"})
     session.settle()
     found = build(scenario(follower={"gain": {"method": "inner-loop"}})).parts.drive.gain
-    own = session.swarm.loop.follower.gain
+    own = session.swarm.loop.laws.follower.gain
     np.testing.assert_array_equal(own.P, found.P)
     np.testing.assert_array_equal(own.inner, found.inner)
     assert session.knobs.coupling == pytest.approx(found.coupling, abs=1e-9)

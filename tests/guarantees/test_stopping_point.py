@@ -26,7 +26,7 @@ from echelon.guarantees.stopping.tube import _falling, _in_turns, tube_of
 from echelon.guarantees.verifier.verify import verify
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.sequence import begin, step
 
 SLOW_ROOTS, FAST_ROOTS = (2.0, 2.5, 3.0), (4.0, 4.5, 5.0)
@@ -671,11 +671,11 @@ def least_lift(loop, starts, steps):
     def one(x):
         def on(_, done):
             now, least = done
-            x, e = now.states[loop.followers], now.follower_memory.chain
+            x, e = now.states[loop.laws.followers], now.memory.laws.follower.chain
             lift = jax.vmap(lambda x, e: to_flat(QUADROTOR, chains, x, e).values[2, 2])(x, e)
             return step(loop, now), jnp.minimum(least, lift)
 
-        start = begin(loop, x), jnp.full(len(loop.followers), jnp.inf)
+        start = begin(loop, x), jnp.full(len(loop.laws.followers), jnp.inf)
         return jax.lax.fori_loop(0, steps, on, start)[1]
 
     return jax.jit(jax.vmap(one))(starts)

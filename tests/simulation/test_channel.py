@@ -12,8 +12,9 @@ from echelon.agents.network.channel import NEVER
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.simulation.engine.batch import Batch
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.knowledge import hop_life
-from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.assembly import assemble
+from echelon.simulation.step.leadership import FixedLeaders
+from echelon.simulation.step.network import MessageRules
 from echelon.simulation.step.sequence import begin, step
 
 DT = 0.01
@@ -54,7 +55,8 @@ def test_hop_counts_are_never_forgotten_where_forgetting_takes_ages(forget):
     channel = ech.Network(forget=forget).prepared(DT, 10.0, 0)
     for bits in (False, True):
         with jax.enable_x64(bits):
-            ages = jax.jit(hop_life)(channel, DT)
+            rules = MessageRules.of(channel, FixedLeaders(np.ones(1, bool)), 1)
+            ages = jax.jit(rules.hop_life)(DT)
             assert float(ages) >= 10.0 * min(forget, 1e6)
             assert ages.dtype == (np.float64 if bits else np.float32)
 
@@ -218,8 +220,8 @@ def test_a_link_that_is_cut_carries_nothing_and_hops_heal():
         loop = assemble(prepared.problem, drive.leader, drive.follower)
 
         def hops_of(now):
-            last = (now.step - 1) // loop.channel.every
-            return now.world.in_flight.content.hops[last % loop.channel.slots]
+            last = (now.step - 1) // loop.network.medium.every
+            return now.memory.network[0].content.hops[last % loop.network.medium.slots]
 
         def one(now, _):
             now = step(loop, now)

@@ -21,8 +21,8 @@ from echelon.simulation.native import blocks, threads
 from echelon.simulation.native import kernel_cache as kernel_code
 from echelon.simulation.native import stepper as native_stepper
 from echelon.simulation.native.varying import VaryingNumbers
+from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.drive import numbers
-from echelon.simulation.step.loop import assemble
 
 QUADROTOR = ech.models.Quadrotor()
 CART = ech.models.DoubleIntegrator(1)

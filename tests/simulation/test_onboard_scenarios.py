@@ -7,6 +7,7 @@ import echelon as ech
 from echelon.experiments.scenario.scenario import bundled_scenarios
 from echelon.simulation.onboard.law_functions import law_functions
 from echelon.simulation.scalars import Unsupported
+from echelon.simulation.step.network import LateNetwork
 
 REFUSED = {
     "crossing": "agents that keep away from each other",
@@ -42,7 +43,7 @@ def test_the_law_of_an_agent_is_the_agents(name, leads):
     parts, settings = flown(name)
     number = 0 if leads else parts.graph.followers[-1]
     agent = ech.Agent(parts, number, settings.dt, settings.limits)
-    if agent.own_law.loop.channel is not None:
+    if isinstance(agent.own_law.loop.network, LateNetwork):
         compare_late(agent, settings.dt, LATE_STEPS)
         return
     law = as_python(law_functions(agent.own_law).values())

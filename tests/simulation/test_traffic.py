@@ -10,7 +10,7 @@ from echelon.agents.network.hearing import edges_of
 from echelon.core.numerics import precision
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.traffic import Traffic, traffic
-from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.sequence import begin, step
 
 DT, STEPS = 0.02, 150
@@ -51,12 +51,12 @@ def test_ages_are_those_of_the_messages_that_the_run_itself_used(name, directed)
 
         def one(now, _):
             after = step(loop, now)
-            return after, after.world.mail.stamp
+            return after, after.memory.network[1].stamp
 
         run = jax.jit(lambda now: jax.lax.scan(one, now, None, STEPS)[1])
         stamps = np.asarray(run(begin(loop, prepared.problem.states)))
     # Mail is taken at the beginning of a step, and so is a frame.
-    place = edges_of(prepared.parts.graph, loop.exchange)
+    place = edges_of(prepared.parts.graph, loop.graph.exchange)
     times = np.arange(STEPS)[:, None]
     expected = np.where(stamps == NEVER, np.nan, DT * (times - stamps))
     expected = np.where(prepared.parts.receives[place], expected, np.nan)

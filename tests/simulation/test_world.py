@@ -11,7 +11,8 @@ import echelon as ech
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.sensing import Sensing
 from echelon.core.errors import EchelonError, SimulationError
-from echelon.simulation.step.motion import MotionState, PlantStep
+from echelon.simulation.step.motion import PlantStep
+from echelon.simulation.step.records import Steps
 
 POINT = ech.models.DoubleIntegrator()
 N = len(POINT.input_names)
@@ -28,11 +29,12 @@ def pushed(world, dt, steps, command, **more):
         moves, rest = motion(world, dt, **more), jnp.zeros((1, 2 * N))
 
         def step(now, k):
-            return moves.advance(now[0], jnp.asarray([command]), k, now[1]), None
+            x, own = now
+            return moves.advance(own, x, jnp.asarray([command]), k, jnp.arange(1)), None
 
         run = jax.jit(lambda now: jax.lax.scan(step, now, jnp.arange(steps))[0])
-        x, own = run((rest, moves.begin(rest)))
-    return np.asarray(x[0]), own
+        x, own = run((rest, jax.vmap(moves.begin)(rest)))
+    return np.asarray(x[0]), own[1]
 
 
 COMMAND = np.arange(1.0, N + 1.0)
@@ -46,7 +48,7 @@ def test_an_actuator_that_lags_follows_its_closed_form_to_the_order_of_runge_kut
     world = ech.World(actuator=Actuator(lag=lag))
     x, own = pushed(world, 0.005, 100, COMMAND)
     np.testing.assert_allclose(x, [*(place * COMMAND), *(speed * COMMAND)], rtol=2e-8)
-    np.testing.assert_allclose(own.actuators[0], COMMAND * (1.0 - np.exp(-t / lag)), rtol=1e-13)
+    np.testing.assert_allclose(own[0], COMMAND * (1.0 - np.exp(-t / lag)), rtol=1e-13)
     errors = [abs(pushed(world, t / n, n, COMMAND)[0][0] - place) for n in (5, 10, 20)]
     assert (np.log2(np.divide(errors[:-1], errors[1:])) > 3.8).all()
 
@@ -67,11 +69,19 @@ def test_late_states_are_those_of_some_steps_ago_and_noise_has_its_size():
     with jax.enable_x64(True):
         sensors = Sensing(delay=0.02, noise={"x": 0.5}, seed=3).prepared(POINT, 0.01, 9.0, 0)
         states = jnp.asarray(np.random.default_rng(0).normal(size=(9, 400, 2 * N)))
-        last, seen = sensors.begin(states[0]), []
+
+        def read(last, x, k):
+            numbers, clock = jnp.arange(len(x)), Steps(jnp.asarray(k), 0.01)
+            return jax.vmap(lambda *row: sensors.read(POINT, *row[:2], clock, row[2]))(
+                last, x, numbers
+            )
+
+        begun = jax.vmap(lambda x: sensors.begin(POINT, x))(states[0])
+        last, seen = begun, []
         for k in range(9):
-            measured, last = sensors.read(last, states[k], jnp.asarray(k))
+            measured, last = read(last, states[k], k)
             seen.append(np.asarray(measured))
-        again, _ = sensors.read(sensors.begin(states[0]), states[0], jnp.asarray(0))
+        again, _ = read(begun, states[0], 0)
     late = np.asarray(states)[[0, 0, *range(7)]]
     noise = np.array(seen) - late
     np.testing.assert_allclose(noise[:, :, 1:], 0.0, atol=1e-15)
@@ -87,11 +97,13 @@ def test_agents_that_differ_move_each_as_its_own_plant():
     x, u = rng.normal(size=(3, 6)), rng.uniform(0.1, 0.3, size=(3, 2)) * [1.0, 1e-3]
     with jax.enable_x64(True):
         mixed = PlantStep.of(base, ech.World(plants={1: heavy}), settings, agents=3)
-        got, _ = mixed.advance(jnp.asarray(x), jnp.asarray(u), jnp.asarray(0), MotionState())
+        numbers, first = jnp.arange(3), jnp.asarray(0)
+        own = ((), ())
+        got, _ = mixed.advance(own, jnp.asarray(x), jnp.asarray(u), first, numbers)
         for k, plant in enumerate((base, heavy, base)):
             alone = PlantStep.of(base, ech.World(plant), settings)
-            own = alone.move(jnp.asarray(x[k]), jnp.asarray(u[k]), None, None)
-            np.testing.assert_allclose(got[k], own, rtol=1e-14)
+            moved, _ = alone.move(own, jnp.asarray(x[k]), jnp.asarray(u[k]), first, numbers[k])
+            np.testing.assert_allclose(got[k], moved, rtol=1e-14)
 
 
 def test_gusts_have_their_size_and_their_time_constant():

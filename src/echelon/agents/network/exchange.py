@@ -25,8 +25,8 @@ class Exchange(eqx.Module):
         weights: (K,); of a graph that switches (S, K), a row for each stretch of time.
     """
 
-    receivers: Array
-    senders: Array
+    receivers: Array | jax.Array
+    senders: Array | jax.Array
     weights: Array | jax.Array
 
     def during(self, row: jax.Array | int) -> "Exchange":
@@ -55,6 +55,14 @@ class Exchange(eqx.Module):
         # leave rounding.
         differences = weights * difference(values[self.receivers], received)
         return jax.ops.segment_sum(differences, self.receivers, num_segments=len(values))
+
+    def least(self, values: jax.Array, agents: int) -> jax.Array:
+        """Return the least of the values (K,) that each of the agents receives."""
+        return jax.ops.segment_min(values, jnp.asarray(self.receivers), agents)
+
+    def most(self, values: jax.Array, agents: int) -> jax.Array:
+        """Return the largest of the values (K,) that each of the agents receives."""
+        return jax.ops.segment_max(values, jnp.asarray(self.receivers), agents)
 
     def mean(
         self,

@@ -17,7 +17,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import ModelError, SimulationError, did_you_mean, is_number, listing
 from echelon.core.numerics import Draw, Field, key_of, normals
-from echelon.core.types import Array, Input, State
+from echelon.core.types import Array, Input, PyTree, State
 from echelon.core.words import amount
 
 
@@ -184,6 +184,47 @@ class Wind(eqx.Module):
     fade: np.ndarray | None = None
     air: Array | None = None
 
+    @property
+    def remembers(self) -> bool:
+        """Whether a draw depends on the last one."""
+        return self.fade is not None
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is air that moves, which acts by the state."""
+        return self.air is not None
+
+    @property
+    def memoryless(self) -> "Wind":
+        """The wind without what is correlated."""
+        return self if self.fade is None else dataclasses.replace(self, rms=None, fade=None)
+
+    def begin(self, x: State) -> PyTree:
+        """Return the gust of the step before the first, (n,); () of independent draws."""
+        return () if self.fade is None else jnp.zeros_like(x)
+
+    def on(
+        self, field: Field, gust: PyTree, step: jax.Array, agent: jax.Array
+    ) -> tuple[Field, PyTree]:
+        """Return the field (x, u) -> xdot of an agent during a step, and the gust of the step."""
+        push, noise = self.on_state(step, agent), self.on_input(step, agent)
+        if self.fade is not None:
+            gust = self.gusts(gust, step, agent)
+            push = push + gust
+        return self.under(field, push, noise), gust
+
+    def under(self, field: Field, push: State, noise: Input | None) -> Field:
+        """Return the field under wind on the rate, noise on the input and the air, all held."""
+
+        def velocity(x: State, u: Input) -> State:
+            xdot = field(x, u if noise is None else u + noise) + push
+            if self.air is None:
+                return xdot
+            drag, wind = jnp.asarray(self.air, x.dtype)
+            return xdot + drag * (wind - x)
+
+        return velocity
+
     def gusts(self, last: State, step: jax.Array, agent: jax.Array) -> State:
         """Return the correlated part of the wind of an agent at a step, from that of the last."""
         fade = jnp.asarray(self.fade, last.dtype)
@@ -194,7 +235,7 @@ class Wind(eqx.Module):
         return fade * last + size * jnp.asarray(self.rms, last.dtype) * draw
 
     def on_state(self, step: jax.Array, agent: jax.Array) -> State:
-        """Return the wind on xdot of an agent during a step."""
+        """Return the wind on xdot of an agent during a step, without what is correlated."""
         constant = jnp.asarray(self.constant)
         if self.rms is None or self.fade is not None:
             return constant
@@ -210,31 +251,6 @@ class Wind(eqx.Module):
 
     def _draw(self, kind: Draw, step: jax.Array, agent: jax.Array, size: int) -> jax.Array:
         return normals(self.key, kind, step // jnp.asarray(self.window), agent, size=size)
-
-
-def draw(wind: Wind | None, step: jax.Array, agent: jax.Array) -> tuple[State | None, Input | None]:
-    """Return the wind on an agent's rate and the noise on its input during a step, or None."""
-    return (
-        (None, None) if wind is None else (wind.on_state(step, agent), wind.on_input(step, agent))
-    )
-
-
-def disturbed(
-    plant: ControlAffine, push: State | None, noise: Input | None, air: Array | None = None
-) -> Field:
-    """Return (x, u) -> xdot of an agent under wind, noise and air (2, n), constant over a step."""
-    if push is None and noise is None and air is None:
-        return plant.velocity
-
-    def velocity(x: State, u: Input) -> State:
-        xdot = plant.velocity(x, u if noise is None else u + noise)
-        xdot = xdot if push is None else xdot + push
-        if air is None:
-            return xdot
-        drag, wind = jnp.asarray(air, x.dtype)
-        return xdot + drag * (wind - x)
-
-    return velocity
 
 
 def _by_input(model: ControlAffine, named: Mapping[str, float]) -> Array:

@@ -1,9 +1,10 @@
 """What an agent measures of its own state, late and with noise, and how it estimates it."""
 
+import abc
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import NamedTuple, final
+from typing import ClassVar, NamedTuple, Protocol, final
 
 import equinox as eqx
 import jax
@@ -17,8 +18,18 @@ from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import SimulationError, is_number
 from echelon.core.linear import discretize
 from echelon.core.numerics import Draw, key_of, normals, rk4
-from echelon.core.types import Array, Input, State, States
+from echelon.core.types import Array, Input, PyTree, State
 from echelon.core.words import Estimation
+
+
+class SensorClock(Protocol):
+    """The step, and whether it is the first one."""
+
+    @property
+    def step(self) -> jax.Array: ...  # noqa: D102
+    @property
+    def first(self) -> jax.Array: ...  # noqa: D102
+
 
 _INPUT, _PUSH, _DRIFT = 0.1, 1.0, 0.01
 """Densities, by the root of a second: of what acts beside the inputs, in normalized ones; of how
@@ -153,12 +164,8 @@ class Sensing:
                 "a `noise` or a `delay`, or leave it out."
             )
 
-    def prepared(
-        self, model: ControlAffine, dt: float, horizon: float, seed: int
-    ) -> "Sensors | None":
+    def prepared(self, model: ControlAffine, dt: float, horizon: float, seed: int) -> "Sensors":
         """Return the sensing as arrays for a control step and a horizon (s) and a run's seed.
-
-        None if it is exact.
 
         Raises:
             ModelError: a name is no state or group of the model.
@@ -170,13 +177,14 @@ class Sensing:
                 f"{horizon:g} s, within which otherwise agents know only their starts."
             )
         std, late = model.per_state(self.noise), round(self.delay / dt)
-        if not late and not std.any():
-            return None
-        key = key_of(seed if self.seed is None else self.seed)
-        estimator = None
-        if self.estimator is Estimation.CONSTANT_GAIN:
-            estimator = Estimator.of(model, std, late, dt)
-        return Sensors(std if std.any() else None, key, late, estimator)
+        stages = list[SensorStage]()
+        if late:
+            stages.append(DelayedSensor(late))
+        if std.any():
+            stages.append(NoisySensor(std, key_of(seed if self.seed is None else self.seed)))
+        if stages and self.estimator is Estimation.CONSTANT_GAIN:
+            stages.append(EstimatingSensor(Estimator.of(model, std, late, dt)))
+        return Sensors(tuple(stages))
 
     def __str__(self) -> str:
         parts = [f"{1e3 * self.delay:g} ms late"] if self.delay else []
@@ -188,35 +196,111 @@ class Sensing:
         return "; ".join(parts) or "exact"
 
 
+# ---- what sensors do, stage after stage ---------------------------------------------------------
+
+
+class SensorStage(eqx.Module):
+    """A stage of the sensing of one agent, which reads what the stage before returns."""
+
+    on_board: ClassVar[bool] = False
+    """Whether it is part of the agent; what a real sensor does is left to it."""
+
+    def begin(self, model: ControlAffine, x: State) -> PyTree:
+        """Return what it remembers of an agent that begins at x; () of nothing."""
+        return ()
+
+    @abc.abstractmethod
+    def read(
+        self, model: ControlAffine, memory: PyTree, x: State, clock: SensorClock, number: jax.Array
+    ) -> tuple[State, PyTree]:
+        """Return what the agent of a number senses of x (n,) now, and the memory after it."""
+
+    def acted(self, memory: PyTree, u: Input) -> PyTree:
+        """Return the memory after the input (m,) that is delivered until the next step."""
+        return memory
+
+
+@final
+class DelayedSensor(SensorStage):
+    """The state `steps` steps ago; it remembers those since then, (steps, n)."""
+
+    steps: int = eqx.field(static=True)
+
+    def begin(self, model: ControlAffine, x: State) -> PyTree:
+        """Return the start, as if it had lasted."""
+        return jnp.repeat(x[None], self.steps, axis=0)
+
+    def read(
+        self, model: ControlAffine, memory: PyTree, x: State, clock: SensorClock, number: jax.Array
+    ) -> tuple[State, PyTree]:
+        """Return the oldest state, and the others."""
+        rows = jnp.concatenate([memory, x[None]])
+        return rows[0], rows[1:]
+
+
+@final
+class NoisySensor(SensorStage):
+    """Normal noise of deviations `std` (n,), independent from step to step."""
+
+    std: Array
+    key: Array
+
+    def read(
+        self, model: ControlAffine, memory: PyTree, x: State, clock: SensorClock, number: jax.Array
+    ) -> tuple[State, PyTree]:
+        """Return the state with the noise of this step."""
+        draw = normals(self.key, Draw.SENSING, clock.step, number, size=len(x))
+        return x + jnp.asarray(self.std, x.dtype) * draw.astype(x.dtype), memory
+
+
+@final
+class EstimatingSensor(SensorStage):
+    """What the agent makes of its measurements; it remembers its `Estimate`."""
+
+    estimator: Estimator
+    on_board = True
+
+    def begin(self, model: ControlAffine, x: State) -> PyTree:
+        """Return the estimate at the start."""
+        return self.estimator.begin(model, x)
+
+    def read(
+        self, model: ControlAffine, memory: PyTree, x: State, clock: SensorClock, number: jax.Array
+    ) -> tuple[State, PyTree]:
+        """Return the state that the agent assumes, and its estimate."""
+        return self.estimator.measure(model, memory, x, clock.first)
+
+    def acted(self, memory: PyTree, u: Input) -> PyTree:
+        """Return the estimate with what is delivered."""
+        return self.estimator.act(memory, u)
+
+
 @final
 class Sensors(eqx.Module):
-    """Sensing as arrays.
+    """The stages of an agent's sensing, one after the other; () senses the state exactly."""
 
-    Attributes:
-        std: (n,); None without noise.
-        key: of the draws.
-        delay: steps.
-        estimator: None where measurements are used as they are.
-    """
+    stages: tuple[SensorStage, ...] = ()
 
-    std: Array | None
-    key: Array
-    delay: int = eqx.field(static=True)
-    estimator: Estimator | None = None
+    @property
+    def on_board(self) -> "Sensors":
+        """The stages that are part of the agent."""
+        return Sensors(tuple(stage for stage in self.stages if stage.on_board))
 
-    def begin(self, states: States) -> jax.Array:
-        """Return the last states (delay, N, n), all as at the start."""
-        return jnp.repeat(states[None], self.delay, axis=0)
+    def begin(self, model: ControlAffine, x: State) -> PyTree:
+        """Return what the stages remember of an agent that begins at x."""
+        return tuple(stage.begin(model, x) for stage in self.stages)
 
-    def read(self, last: jax.Array, states: States, step: jax.Array) -> tuple[States, jax.Array]:
-        """Return what agents measure at a step, and the last states afterwards."""
-        rows = jnp.concatenate([last, states[None]])
-        late = rows[0]
-        if self.std is None:
-            return late, rows[1:]
+    def read(
+        self, model: ControlAffine, memory: PyTree, x: State, clock: SensorClock, number: jax.Array
+    ) -> tuple[State, PyTree]:
+        """Return what an agent at x knows of its state (n,), and what the stages then remember."""
+        after = list[PyTree]()
+        for stage, own in zip(self.stages, memory, strict=True):
+            x, own = stage.read(model, own, x, clock, number)
+            after.append(own)
+        return x, tuple(after)
 
-        def one(x: State, agent: jax.Array) -> State:
-            draw = normals(self.key, Draw.SENSING, step, agent, size=len(x))
-            return x + jnp.asarray(self.std, x.dtype) * draw.astype(x.dtype)
-
-        return jax.vmap(one)(late, jnp.arange(len(late))), rows[1:]
+    def acted(self, memory: PyTree, u: Input) -> PyTree:
+        """Return what the stages remember after the input (m,) that is delivered."""
+        pairs = zip(self.stages, memory, strict=True)
+        return tuple(stage.acted(own, u) for stage, own in pairs)

@@ -13,7 +13,9 @@ from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, JsonObject
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.step.loop import ActiveAgents, Loop
+from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.roster import ActiveAgents, roster_of
+from echelon.simulation.step.settings import Settings
 
 KINDS = {"lose": Lose, "join": Join}
 """What may happen to an agent, by the name of the request."""
@@ -44,10 +46,10 @@ class Attendance(NamedTuple):
         steps = np.array([0, self.step, self.step])
 
         def numbers(loop: Any) -> tuple[Any, ...]:
-            here = loop.presence
-            return here.rows, here.nearest, here.since, loop.switches.steps
+            here, graph = loop.roster, loop.graph.switches
+            return here.rows, here.nearest, here.times, here.switches.steps, graph.steps
 
-        rows = self.present, self.nearest, self.since, steps
+        rows = self.present, self.nearest, self.since, steps, steps
         types = (np.asarray(old).dtype for old in numbers(loop))
         return eqx.tree_at(numbers, loop, tuple(map(np.asarray, rows, types)))
 
@@ -59,9 +61,10 @@ def attendance(graph: Graph, events: Sequence[Event], leaderward: bool, dt: floa
         here = np.ones(graph.agents, bool), np.array(graph.nearest_leader()), np.zeros(graph.agents)
         return Attendance(*(np.tile(np.asarray(x), (3, 1)) for x in (weights, *here)), step=0)
     after = graph.with_events(events, graph.backups)
-    presence, weights = ActiveAgents.of(after), np.asarray(after.exchange(leaderward).weights)
-    assert presence is not None
-    rows = (weights, presence.rows, presence.nearest, presence.since)
+    roster = roster_of(after, Settings(horizon=events[-1].at + dt, dt=dt), False)
+    weights = np.asarray(after.exchange(leaderward).weights)
+    assert isinstance(roster, ActiveAgents)
+    rows = (weights, roster.rows, roster.nearest, roster.times)
     return Attendance(*(row[[*_STRETCHES]] for row in rows), step=round(events[-1].at / dt))
 
 

@@ -16,6 +16,7 @@ from echelon.agents.network.channel import NEVER, Channel
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.hearing import edges_of
 from echelon.agents.world.disturbance import Disturbance
+from echelon.agents.world.sensing import NoisySensor, Sensors
 from echelon.apps.live.attendance import attendance, room_for_events
 from echelon.apps.live.knobs import Knobs, LiveParts
 from echelon.core.compiled import cached_jit
@@ -33,8 +34,14 @@ from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.native import is_installed
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.scalars import Unsupported
-from echelon.simulation.step.loop import Loop, LoopState, Switches, assemble
+from echelon.simulation.step.assembly import assemble
+from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.nearby import all_hulls
+from echelon.simulation.step.network import LateNetwork
+from echelon.simulation.step.places import MovingPlaces
+from echelon.simulation.step.records import ComponentMemory, LawMemories, LoopState
+from echelon.simulation.step.roster import Switches
+from echelon.simulation.step.run_laws import FeedforwardFraction
 from echelon.simulation.step.sequence import begin
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain
@@ -124,7 +131,7 @@ class LiveLoop:
         assert isinstance(drive, Laws)
         with precision("float64"):
             loop = assemble(problem, drive.leader, drive.follower)
-        law = loop.follower
+        law = loop.laws.follower
         gain = panel.gain(panel.start)
         if gain is not None:
             law = eqx.tree_at(lambda law: law.gain.inner, law, _inner(gain), is_leaf=_is_none)
@@ -132,19 +139,21 @@ class LiveLoop:
             c = np.asarray(panel.start.coupling)
             law = eqx.tree_at(lambda law: law.coupling, law, c, is_leaf=_is_none)
         # The share of the feed-forward is a number of the loop, so that a knob can change it.
-        self.loop: Loop = dataclasses.replace(loop, follower=law, share=np.asarray(1.0))
+        part = FeedforwardFraction(np.asarray(1.0))
+        laws = dataclasses.replace(loop.laws, follower=law, feedforward=part)
+        self.loop: Loop = loop.replace(laws=laws)
+        self.sensing = loop.sensing
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
         self.warnings = prepared.warnings
         self.eventful = eventful
-        if loop.channel is not None:
-            self.loop = dataclasses.replace(self.loop, channel=self._roomy(loop.channel))
-        self.std = None if loop.sensors is None else loop.sensors.std
+        if isinstance(loop.network, LateNetwork):
+            self.loop = self.loop.with_medium(self._roomy(loop.network.medium))
         self.potentials: dict[Hashable, Callable[[Array], Array]] = {}
         self.states, self.first = problem.states, 0
         self.measured = list(problem.meter.measured)
         self.nearest, self.here = np.array(parts.graph.nearest_leader()), None
-        self.weights = np.asarray(loop.exchange.weights, np.float64)
-        self.place = edges_of(parts.graph, loop.exchange)
+        self.weights = np.asarray(loop.graph.exchange.weights, np.float64)
+        self.place = edges_of(parts.graph, loop.graph.exchange)
         self.edge = self.place[0]
         self.count = max(1, round(PICTURE / settings.dt))
         self.offsets = panel.offsets(panel.start)
@@ -162,13 +171,14 @@ class LiveLoop:
 
     def _adjustable(self, loop: Loop) -> tuple[PyTree, ...]:
         """Return the numbers that knobs change: the feed-forward's share, and those of the law."""
-        follower: Any = loop.follower
+        laws: Any = loop.laws
+        follower, share = laws.follower, laws.feedforward.fraction
         if self.panel.start.coupling is None:
-            return (loop.share,)
+            return (share,)
         if self.panel.parts.drive.gain is None:
-            return loop.share, follower.coupling
+            return share, follower.coupling
         gain = follower.gain
-        return loop.share, gain.coupling, gain.P, gain.R, gain.R_inverse, gain.inner
+        return share, gain.coupling, gain.P, gain.R, gain.R_inverse, gain.inner
 
     def _look_ahead(self, step: int) -> None:
         schedule, dt = self.parts.graph.schedule, self.settings.dt
@@ -177,7 +187,8 @@ class LiveLoop:
         first = max(0, int(step * dt / schedule.period) - 1)
         horizon = max(_AHEAD, 4.0 * schedule.period)
         switches = Switches(*schedule.switches(dt, horizon, first))
-        self.loop = eqx.tree_at(lambda loop: loop.switches, self.loop, switches)
+        graph = dataclasses.replace(self.loop.graph, switches=switches)
+        self.loop = self.loop.replace(graph=graph)
         # A whole period before the end: a picture that begins in this range also ends in it.
         last = int(first + horizon / schedule.period) * schedule.period
         self.ahead = range(int(switches.steps[0]), int(last / dt) - self.count)
@@ -200,7 +211,7 @@ class LiveLoop:
     def take_over(self, other: "LiveLoop") -> None:
         """Proceed from where another loop of the same laws is, with as much memory as fits."""
         self.proceed(np.asarray(other.now.states, float), other.steps)
-        mine, memory, begun = self.now, other.now, self.now.world
+        mine, memory, begun = self.now, other.now, self.now.memory
 
         def same(one: PyTree, two: PyTree) -> PyTree:
             ours, theirs = (jax.tree.structure(x) for x in (one, two))
@@ -210,17 +221,13 @@ class LiveLoop:
             return jax.tree.map(lambda x, y: jnp.asarray(y, jnp.asarray(x).dtype), one, two)
 
         with precision(self.precision):
-            world = begun._replace(
-                **{
-                    name: same(getattr(begun, name), getattr(memory.world, name))
-                    for name in begun._fields
-                }
+            kept = ComponentMemory(*map(same, begun, memory.memory))
+            kept = kept._replace(
+                laws=LawMemories(*map(same, begun.laws, memory.memory.laws)),
+                # Whoever returns begins where this loop does.
+                roster=self.loop.roster.begin(jnp.asarray(self.states, mine.states.dtype)),
             )
-            if begun.starts is not None:
-                world = world._replace(starts=jnp.asarray(self.states, mine.states.dtype))
-            names = ("leader_memory", "follower_memory", "cut")
-            parts = {name: same(getattr(mine, name), getattr(memory, name)) for name in names}
-            self.now = mine._replace(world=world, **parts)
+            self.now = mine._replace(memory=kept, cut=same(mine.cut, memory.cut))
 
     @property
     def engine(self) -> str:
@@ -235,16 +242,16 @@ class LiveLoop:
     @property
     def active(self) -> float:
         """How many others changed the rates of agents that keep apart, in the last step."""
-        active = self.loop.follower.active(self.now.follower_memory)
+        active = self.loop.laws.follower.active(self.now.memory.laws.follower)
         return 0.0 if active is None else float(np.sum(np.asarray(active)))
 
     def _apart(self) -> float:
         """Return the least scaled distance between hulls of agents that keep apart, m."""
-        safety = self.loop.follower.safety
+        safety = self.loop.laws.follower.safety
         if safety is None:
             return math.inf
         with precision(self.precision):
-            hulls = np.asarray(_hulls(self.loop, self.now), np.float64)
+            hulls = np.asarray(_hulls(self.loop, self.now.states, self.now.memory.laws), np.float64)
         hulls = hulls if self.here is None else hulls[self.here]
         gaps = separations(hulls * safety.scales(self.loop.model))
         return float((gaps + np.diag(np.full(len(gaps), np.inf))).min())
@@ -257,18 +264,25 @@ class LiveLoop:
         weights = self.weights.copy()
         weights[..., np.isin(self.edge, list(knobs.cut))] = 0.0
         loop = eqx.tree_at(
-            lambda loop: (loop.offsets, loop.exchange.weights, loop.motion.wind.constant),
+            lambda loop: (
+                loop.places.offsets,
+                loop.graph.exchange.weights,
+                loop.motion.weather[0].constant,
+            ),
             self.loop,
             (self.offsets, weights, self.panel.wind(knobs)),
         )
         self.loop = self._in_world(eqx.tree_at(self._adjustable, loop, self._numbers(knobs)), knobs)
-        moving = self.panel.motion(knobs, self.loop.moving)
-        self.loop = dataclasses.replace(self.loop, moving=moving)
+        places = self.loop.places
+        if isinstance(places, MovingPlaces):
+            moving = self.panel.motion(knobs, places.motion)
+            assert moving is not None
+            self.loop = self.loop.replace(places=MovingPlaces(places.offsets, moving))
 
     def _count(self, knobs: Knobs) -> None:
-        if self.loop.presence is None:
+        if not self.loop.roster.changes:
             return
-        law, graph = self.loop.follower, self.parts.graph
+        law, graph = self.loop.laws.follower, self.parts.graph
         now = attendance(graph, knobs.events, law.leaderward, self.settings.dt)
         self.loop, self.weights = now.put_into(self.loop), now.weights
         self.here, self.nearest = now.present[-1], now.nearest[-1]
@@ -283,10 +297,14 @@ class LiveLoop:
         network, settings = self.panel.network(knobs), self.settings
         if network is not None:
             channel = network.prepared(settings.dt, math.inf, settings.seed)
-            loop = dataclasses.replace(loop, channel=self._roomy(channel))
-        if self.std is not None:
-            loop = eqx.tree_at(lambda loop: loop.sensors.std, loop, knobs.noise * self.std)
-        return loop
+            loop = loop.with_medium(self._roomy(channel))
+        stages = tuple(
+            dataclasses.replace(stage, std=knobs.noise * first.std)
+            if isinstance(stage, NoisySensor) and isinstance(first, NoisySensor)
+            else stage
+            for stage, first in zip(loop.sensing.stages, self.sensing.stages, strict=True)
+        )
+        return loop.replace(sensing=Sensors(stages))
 
     def _numbers(self, knobs: Knobs) -> tuple[PyTree, ...]:
         share, gain = np.asarray(float(knobs.feedforward)), self.panel.gain(knobs)
@@ -333,7 +351,9 @@ class LiveLoop:
             chunk = self.stepper.advance(self.now, counts, reference)
         self.now, states, inputs = chunk.now, chunk.states[-1], chunk.inputs[-1]
         time = self.steps * self.settings.dt
-        offsets = Formation(self.offsets, self.loop.moving).offsets_at([time])[0]
+        places = self.loop.places
+        motion = places.motion if isinstance(places, MovingPlaces) else None
+        offsets = Formation(self.offsets, motion).offsets_at([time])[0]
         y, here = states - offsets, self.here
         with np.errstate(over="ignore", invalid="ignore"):
             deviation = (y - y[self.nearest])[:, self.measured]
@@ -350,11 +370,12 @@ class LiveLoop:
 
     def _shades(self, steps: int) -> Float[Array, " E"]:
         """Return how each link is drawn after some steps; nothing in the ideal network."""
-        channel, network = self.loop.channel, self.parts.world.network
-        if channel is None or network is None:
+        late, network = self.loop.network, self.parts.world.network
+        if not isinstance(late, LateNetwork) or network is None:
             return np.zeros(0)
-        posts, now, every = self.now.world.in_flight, self.steps, int(channel.every)
-        stamps, arrival = np.asarray(self.now.world.mail.stamp), np.asarray(posts.arrival)
+        channel, (posts, mail) = late.medium, self.now.memory.network
+        now, every = self.steps, int(channel.every)
+        stamps, arrival = np.asarray(mail.stamp), np.asarray(posts.arrival)
         sent = np.arange(-(-(now - steps) // every), -(-now // every))[-channel.slots :]
         gone = (arrival[sent % channel.slots] == NEVER).sum(axis=0)
         edges = len(self.parts.graph.edges)
@@ -384,7 +405,7 @@ class LiveLoop:
     def reference_at(self, times: Float[Array, " T"]) -> Float[Array, "T n"] | None:
         """Return the leaders' reference states at times (s); None if they follow nothing."""
         with precision("float64"):
-            states = _reference_states(self.loop.leader, self.loop.model, jnp.asarray(times))
+            states = _reference_states(self.loop.laws.leader, self.loop.model, jnp.asarray(times))
         return None if states is None else np.asarray(states, np.float64)
 
 

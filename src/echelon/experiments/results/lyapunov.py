@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from echelon.agents.models.heading_symmetry import state_turn
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.agents.world.disturbance import disturbed, draw
 from echelon.core.compiled import cached_jit
 from echelon.core.numerics import precision
 from echelon.core.types import Array
@@ -112,6 +111,7 @@ def _lyapunov(result: Result) -> Lyapunov | None:
         x, u = result.states, result.inputs
         steps = np.rint(result.times / result.settings.dt).astype(np.int32)
         motion = PlantStep.of(result.model, result.world, result.settings, graph.agents)
+        motion = motion.memoryless
         fields = _fields(result.drive, result.model, motion, graph.leaders[0], x, u, steps)
         now, after = (
             _in_metric_axes(result.model, field, np.asarray(field.states) - offsets)
@@ -192,11 +192,17 @@ def _fields(
     """The velocity is taken to be the same one step later."""
 
     def velocity(x: jax.Array, u: jax.Array, agent: jax.Array, step: jax.Array) -> jax.Array:
-        return disturbed(motion.plant, *draw(motion.wind, step, agent))(x, u)
+        return motion.field(((),) * len(motion.weather), step, agent)[0](x, u)
 
     moving = jax.vmap(jax.vmap(velocity, in_axes=(0, 0, 0, None)), in_axes=(0, 0, None, 0))
-    later = jax.vmap(lambda *at: motion.advance(*at)[0])(x, u, steps)
-    xdot = moving(x, u, jnp.arange(x.shape[1]), steps)
+    agents = jnp.arange(x.shape[1])
+    memory = jax.vmap(motion.begin)(x[0])
+
+    def moved(x: jax.Array, u: jax.Array, step: jax.Array) -> jax.Array:
+        return motion.advance(memory, x, u, step, agents)[0]
+
+    later = jax.vmap(moved)(x, u, steps)
+    xdot = moving(x, u, agents, steps)
 
     def heading(t: jax.Array, x: jax.Array) -> jax.Array | None:
         return drive.heading(model, t, x)

@@ -21,7 +21,8 @@ from echelon.laws.law import TrimInput
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import Loop, assemble
+from echelon.simulation.step.assembly import assemble
+from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.sequence import final_states
 from echelon.simulation.step.settings import Settings
 

@@ -24,8 +24,10 @@ from echelon.laws.law import reference_of
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import Loop, assemble, begin_forgetful
-from echelon.simulation.step.sequence import control
+from echelon.simulation.step.assembly import assemble
+from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.records import Steps
+from echelon.simulation.step.sequence import begin_forgetful, control
 from echelon.simulation.step.settings import Settings
 
 _MOST = 2000
@@ -123,8 +125,8 @@ def _check(parts: Parts) -> None:
 def _linearized(loop: Loop, parts: Parts) -> StateSpace:
     model, count = parts.model, parts.graph.agents
     x, u = (np.asarray(part, float) for part in model.trim)
-    n, led = len(x), reference_of(loop.leader) is not None
-    rest = jnp.asarray(x + loop.offsets)
+    n, led = len(x), reference_of(loop.laws.leader) is not None
+    rest = jnp.asarray(x + loop.places.offsets)
     motion = jnp.asarray(np.concatenate([x, u]) if led else np.zeros(0))
     nearest = np.array(parts.graph.nearest_leader())
 
@@ -132,15 +134,17 @@ def _linearized(loop: Loop, parts: Parts) -> StateSpace:
         now = loop
         if led:
             moment = _Momentary(w[:n], w[n:])
-            now = eqx.tree_at(lambda loop: loop.leader.reference, loop, moment)
+            now = eqx.tree_at(lambda loop: loop.laws.leader.reference, loop, moment)
         begun = jax.tree.map(jnp.asarray, begin_forgetful(now, states))
-        inputs = control(now, begun).inputs
+        inputs = control(now, begun, Steps(begun.step, now.motion.dt)).inputs
         return jax.vmap(model.velocity)(states, inputs)
 
     def errors(states: States, w: jax.Array) -> States:
-        places = states - loop.offsets
+        places = states - loop.places.offsets
         lead = jnp.tile(w[:n] if led else jnp.asarray(x), (count, 1))
-        targets = jnp.where(np.isin(np.arange(count), loop.leaders)[:, None], lead, places[nearest])
+        targets = jnp.where(
+            np.isin(np.arange(count), loop.laws.leaders)[:, None], lead, places[nearest]
+        )
         return jax.vmap(model.difference)(places, targets)
 
     drift = np.abs(np.asarray(jax.jit(velocity)(rest, motion)))

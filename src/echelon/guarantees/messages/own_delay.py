@@ -22,10 +22,10 @@ from echelon.core.types import Array
 from echelon.core.words import Estimation, Kind
 from echelon.laws.law import LocalView
 from echelon.laws.stopping_point import StoppingPoint
-from echelon.simulation.step.action import act
+from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.drive import Problem
-from echelon.simulation.step.loop import Loop, assemble
-from echelon.simulation.step.motion import PlantStep
+from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.motion import Limited, PlantStep, Unlimited, motors_of
 
 # ---- a step of one agent that knows its own state late -------------------------------------------
 # With what it hears as an input h it is s+ = A s + B y + E z, z = d o - h, o = F y + G s, where y
@@ -279,8 +279,9 @@ def late_step(problem: Problem, law: StoppingPoint, lag: float) -> LateStep | No
     """Return a step of a follower at the trim; None where it has no linearization."""
     settings, model = problem.settings, problem.model
     motors = MotorArrays(np.asarray(lag), *[None] * 5) if lag else None
-    how = settings.dt, settings.integrator, settings.limits, settings.substeps, motors
-    loop = assemble(problem._replace(motion=PlantStep(model, None, *how)), law, law)
+    limiter = Limited() if settings.limits else Unlimited()
+    how = settings.dt, settings.integrator, limiter, settings.substeps, motors_of(motors)
+    loop = assemble(problem._replace(motion=PlantStep(model, *how)), law, law)
     A, B, E, G, F = (np.asarray(part, float) for part in _slopes(loop, law))
     if not all(np.isfinite(part).all() for part in (A, B, E, G, F)):
         return None
@@ -296,7 +297,7 @@ def _slopes(loop: Loop, law: StoppingPoint) -> tuple[jax.Array, ...]:
     model = loop.model
     rest = jnp.asarray(np.asarray(model.trim[0], float))
     level = law.initial_memory(model, rest, jnp.zeros(law.ready.weights.shape))
-    start, whole = ravel_pytree((rest, level, loop.motion.begin(rest[None])))
+    start, whole = ravel_pytree((rest, level, loop.motion.begin(rest)))
     zero = jnp.zeros(len(law.ready.stiffness))
 
     def deviation(s: jax.Array, y: jax.Array) -> jax.Array:
@@ -305,10 +306,10 @@ def _slopes(loop: Loop, law: StoppingPoint) -> tuple[jax.Array, ...]:
     def moved(s: jax.Array, y: jax.Array, z: jax.Array) -> jax.Array:
         x, memory, motors = whole(s)
         view = LocalView(jnp.zeros(()), y, 0.0 * y, z, zero, loop.motion.dt)
-        action = act(loop, law, view, memory, False)
-        at = x[None], action.input[None], jnp.zeros((), jnp.int32), motors
-        states, motors = loop.motion.advance(*at)
-        return ravel_pytree((states[0], action.memory, motors))[0]
+        action = loop.laws.act(model, loop.motion, law, view, memory, False)
+        first = jnp.zeros((), jnp.int32)
+        x, motors = loop.motion.move(motors, x, action.input, first, first)
+        return ravel_pytree((x, action.memory, motors))[0]
 
     for _ in range(_STEADY):
         start = moved(start, rest, zero)

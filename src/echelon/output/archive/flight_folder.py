@@ -39,7 +39,8 @@ from echelon.simulation.onboard.law_functions import (
 )
 from echelon.simulation.onboard.source_code import c_text, header_text, python_text
 from echelon.simulation.scalars import Unsupported
-from echelon.simulation.step.knowledge import HOP_LIFE
+from echelon.simulation.step.network import HOP_LIFE, LateNetwork
+from echelon.simulation.step.places import MovingPlaces
 from echelon.simulation.step.settings import Settings
 
 _EXCLUDES = (
@@ -114,7 +115,7 @@ def _facts(
         "dt": dt,
         "network": network_facts(own, dt, functions),
         "guaranteed": sentence,
-        "excluded": [*_EXCLUDES, _CURRENT if own.loop.channel is None else _LATE],
+        "excluded": [*_EXCLUDES, _LATE if isinstance(own.loop.network, LateNetwork) else _CURRENT],
         "echelon": __version__,
         "sha256": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in files.items()},
     }
@@ -156,9 +157,10 @@ def network_facts(
     own: OwnLaw, dt: float, functions: Mapping[str, LawFunction]
 ) -> JsonObject | None:
     """Return what an agent needs for messages that are late; None in the ideal network."""
-    channel, loop = own.loop.channel, own.loop
-    if channel is None:
+    loop, network = own.loop, own.loop.network
+    if not isinstance(network, LateNetwork):
         return None
+    channel = network.medium
     expected, forget = functions.get("expected"), float(channel.forget) * dt
     size = len(own.forward_names) if expected is None else expected.inputs["content"]
     return {
@@ -168,10 +170,11 @@ def network_facts(
         "uses": str(channel.hears),
         "forget": forget,
         "forget_hops": HOP_LIFE * forget,
-        "agents": len(loop.order),
-        "leaders": loop.leaders.tolist(),
+        "agents": len(loop.laws.order),
+        "leaders": loop.laws.leaders.tolist(),
         "content": size,
-        "moves": loop.moving is not None and type(own.law).goal_offset is not Law.goal_offset,
+        "moves": isinstance(loop.places, MovingPlaces)
+        and type(own.law).goal_offset is not Law.goal_offset,
     }
 
 
@@ -315,8 +318,12 @@ def _vehicles(parts: Parts, settings: Settings) -> tuple[JsonObject, dict[str, s
         raise OutputError(f"the vehicles have no code for {error}.") from None
     names = [f"vehicle-{texts.index(text)}.py" for text in texts]
     trim_x, trim_u = (list(map(float, part)) for part in motion.plant.trim)
-    lags = motion.motors is not None and motion.motors.lag is not None
-    wind, disturbance, sensing = motion.wind, parts.world.disturbance, parts.world.sensing
+    lags, disturbance, sensing = (
+        motion.motors.remembers,
+        parts.world.disturbance,
+        parts.world.sensing,
+    )
+    wind = next(iter(motion.weather), None)
     zeros = [0.0] * len(trim_x)
     time = disturbance and (disturbance.time or disturbance.hold)
     facts = {

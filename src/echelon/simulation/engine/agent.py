@@ -1,8 +1,9 @@
 """One agent in a process of its own: what a vehicle computes from its state and messages."""
 
+import dataclasses
 import math
 import numbers
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias, final
 
 import jax
@@ -23,34 +24,32 @@ from echelon.agents.network.inbox import (
     Surroundings,
 )
 from echelon.agents.network.switching import Schedule
-from echelon.agents.world.sensing import Estimate, Estimator
+from echelon.agents.world.sensing import Sensors
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError, check_kind
 from echelon.core.numerics import precision
 from echelon.core.types import Array, PyTree, Scalar, State
-from echelon.core.words import Feedforward, MessageContent
+from echelon.core.words import Feedforward
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.action import AgentOutput, act, feedforward_of
-from echelon.simulation.step.knowledge import (
-    NOBODY,
-    Ages,
-    Letters,
-    Mail,
-    Packets,
-    Readers,
-    content_of,
-    expected_of,
-    packet_size,
-    understand,
-    write,
-)
-from echelon.simulation.step.loop import Loop, assemble, offsets_at
+from echelon.simulation.step.assembly import assemble
+from echelon.simulation.step.leadership import NOBODY, Failover, FixedLeaders
+from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.nearby import less_expected
+from echelon.simulation.step.network import (
+    Deviations,
+    LateNetwork,
+    LeaderPrediction,
+    MessageRules,
+)
+from echelon.simulation.step.places import MovingPlaces
+from echelon.simulation.step.records import AgentOutput, LeaderPackets, Messages, Own, Seconds
+from echelon.simulation.step.run_laws import feedforward_of
 from echelon.simulation.step.settings import Settings
+from echelon.simulation.step.turns import by_depth
 
 Signal: TypeAlias = Float[jax.Array, " s"]
 """What an agent sends to its neighbours."""
@@ -85,38 +84,43 @@ def beside_alone(law: Law, memory: Memory, other: Signal) -> Memory:
 
 @cached_jit
 def expected_alone(
-    loop: Loop, t: Scalar, content: Float[jax.Array, " p"], age: Scalar, s: int
+    loop: Loop,
+    prediction: LeaderPrediction,
+    t: Scalar,
+    content: Float[jax.Array, " p"],
+    age: Scalar,
+    s: int,
 ) -> Signal:
     """Return the signal (s,) at which an agent expects the leader, by its packet of an age (s)."""
-    return expected_of(loop, s, t, content, jnp.maximum(age, 0.0))[0]
+    return prediction.expected(loop, s, t, content, jnp.maximum(age, 0.0))[0]
 
 
 @cached_jit
 def offset_alone(loop: Loop, law: Law, t: Scalar, agent: jax.Array) -> tuple[State, State | None]:
     """Return what an agent takes for its offset (n,) at a time (s), and its rate, or None."""
-    offset, rate = offsets_at(loop, law, t, agent[None])
-    return offset[0], None if rate is None else rate[0]
+    return jax.tree.map(
+        lambda row: row[0], (*loop.places.of_group(loop.model, law, t, agent[None]),)
+    )
 
 
 @cached_jit
-def measured_alone(
-    estimator: Estimator, model: ControlAffine, before: Estimate, y: State, first: jax.Array
-) -> tuple[State, Estimate]:
-    """Return the state that an agent assumes at a measurement (n,), and its estimate."""
-    return estimator.measure(model, before, y, first)
+def sense_alone(
+    sensing: Sensors, model: ControlAffine, memory: PyTree, y: State, clock: Seconds
+) -> tuple[State, PyTree]:
+    """Return the state that an agent assumes at a measurement (n,), and what it remembers."""
+    return sensing.read(model, memory, y, clock, jnp.zeros((), jnp.int32))
 
 
 @cached_jit
 def signal_of(loop: Loop, law: Law, own: OwnState) -> Signal:
     """Return what the agent sends to its neighbours."""
-    signal = law.signal(loop.model, *own[:3])
-    return own.x - own.offset if signal is None else signal
+    return loop.laws.speech.of_one(law, loop.model, *own[:3])
 
 
 @cached_jit
 def hull_of(loop: Loop, law: Law, own: OwnState) -> Float[jax.Array, "r d"] | None:
     """Return the points in whose hull the agent's position stays, where agents keep apart."""
-    return None if loop.follower.safety is None else law.hull(loop.model, own.x, own.memory)
+    return None if loop.laws.follower.safety is None else law.hull(loop.model, own.x, own.memory)
 
 
 def _gaps(near: Near | None, hull: Float[jax.Array, "r d"] | None) -> Near | None:
@@ -150,7 +154,7 @@ class OwnLaw(NamedTuple):
     @property
     def law(self) -> Law:
         """The leaders' law or the others'."""
-        return self.loop.leader if self.leads else self.loop.follower
+        return self.loop.laws.leader if self.leads else self.loop.laws.follower
 
 
 class Step(NamedTuple):
@@ -162,7 +166,7 @@ class Step(NamedTuple):
     signal: jax.Array
     action: AgentOutput
     finite: jax.Array
-    letter: Letters | None = None
+    letter: Messages | None = None
     hull: jax.Array | None = None
 
 
@@ -184,15 +188,10 @@ def step_alone(
 
 def gap_of(loop: Loop, leads: bool, own: OwnState, received: Signal) -> Float[jax.Array, " k"]:
     """Return the difference of an agent's signal from another's; 0 where that one is NaN."""
-    law = loop.leader if leads else loop.follower
-    signal = signal_of(loop, law, own)
+    signal = signal_of(loop, loop.laws.leader if leads else loop.laws.follower, own)
     # The own value has no difference: a neighbour that is not heard does not act.
-    return _difference(loop, law, own)(signal, jnp.where(jnp.isnan(received), signal, received))
-
-
-def _difference(loop: Loop, law: Law, own: OwnState) -> Callable[..., jax.Array]:
-    """Return the difference of two signals: the model's, where they are states."""
-    return loop.model.difference if law.signal(loop.model, *own[:3]) is None else jnp.subtract
+    other = jnp.where(jnp.isnan(received), signal, received)
+    return loop.laws.speech.difference(loop.model)(signal[None], other[None])[0]
 
 
 def step_with(
@@ -205,15 +204,16 @@ def step_with(
     near: Near | None,
 ) -> Step:
     """Return what the agent does with a disagreement; a feed-forward is NaN if not received."""
-    law, model = loop.leader if leads else loop.follower, loop.model
+    law, model = loop.laws.leader if leads else loop.laws.follower, loop.model
     signal, hull = signal_of(loop, law, own), hull_of(loop, law, own)
-    alone = jnp.zeros_like(forward)
-    if loop.follower.turning and not leads:
-        alone = alone.at[-1].set(law.heading(model, t, own.x))
-    forward = jnp.where(jnp.isnan(forward), alone, forward)
-    forward = jnp.zeros(len(model.input_names)) if leads else forward
+    if leads:
+        forward = jnp.zeros(len(model.input_names))
+    else:
+        alone = loop.laws.axes.alone(law, model, t, own.x, len(forward))
+        forward = jnp.where(jnp.isnan(forward), alone, forward)
     rows = z, forward, loop.motion.dt, _gaps(near, hull), own.rate
-    action = act(loop, law, LocalView(t, own.x, own.offset, *rows), own.memory, leads)
+    view = LocalView(t, own.x, own.offset, *rows)
+    action = loop.laws.act(model, loop.motion, law, view, own.memory, leads)
     return Step(signal, action, is_finite((own.x, signal, action, hull)), hull=hull)
 
 
@@ -226,37 +226,33 @@ def is_finite(tree: PyTree) -> jax.Array:
 @cached_jit
 def step_over_network(
     loop: Loop,
+    rules: MessageRules,
     leads: bool,
-    reader: Readers,
-    t: Scalar,
+    number: jax.Array,
+    clock: Seconds,
     own: OwnState,
-    mail: Mail,
-    ages: Ages,
+    mail: Messages,
     weights: Float[jax.Array, " K"],
     near: Near | None,
 ) -> Step:
     """Return what the agent does and sends over a network that is late."""
-    law, model = loop.leader if leads else loop.follower, loop.model
+    law, model = loop.laws.leader if leads else loop.laws.follower, loop.model
     signal, nobody = signal_of(loop, law, own), np.zeros(len(weights), np.int32)
-    difference = jax.vmap(_difference(loop, law, own))
-    rows = loop, Exchange(nobody, nobody, weights), reader, t, mail, ages, signal[None], difference
-    knowledge = understand(*rows)
-    forward = jnp.zeros(len(model.input_names)) if leads else knowledge.feedforward[0]
-    z = knowledge.disagreement[0]
+    links, said = Exchange(nobody, nobody, weights), signal[None]
+    heard = rules.read(loop, mail, clock, Own(number, own.x[None]), said, links)
+    forward = jnp.zeros(len(model.input_names)) if leads else heard.feedforward[0]
     hull = hull_of(loop, law, own)
-    hull = None if hull is None else less_expected(loop, t, hull, knowledge.leader[0])
-    rows = z, forward, loop.motion.dt, _gaps(near, hull), own.rate
-    view = LocalView(t, own.x, own.offset, *rows)
-    action = act(loop, law, view, own.memory, leads)
+    hull = None if hull is None else less_expected(loop, clock.t, hull, heard.leader[0])
+    rows = heard.disagreement[0], forward, loop.motion.dt, _gaps(near, hull), own.rate
+    view = LocalView(clock.t, own.x, own.offset, *rows)
+    action = loop.laws.act(model, loop.motion, law, view, own.memory, leads)
     content = mail.packet.content
     if leads:
-        content = content_of(loop, t, *own[:3], signal, action.message, action.input)[None]
-    step = jnp.zeros((), jnp.int32)
-    assert loop.channel is not None
-    letter, _ = write(
-        loop.channel, reader, step, mail, knowledge, signal[None], difference, content
-    )
-    return Step(signal, action, is_finite((own.x, signal, action, letter, hull)), letter, hull)
+        rows = clock.t, *own[:3], signal, action
+        content = rules.content.prediction.content(loop, *rows)[None]
+    rows = number, clock.now, said, content, loop.laws.speech.difference(model)
+    letter, _ = rules.write(mail, heard, *rows)
+    return Step(signal, action, is_finite((own.x, signal, action, letter[:3], hull)), letter, hull)
 
 
 @final
@@ -308,59 +304,58 @@ class Agent:
         assert isinstance(drive, Laws)
         with precision("float64"):
             self._loop = assemble(prepared.problem, drive.leader, drive.follower)
-        if self._loop.succession is not None and network is None:
+        if self._loop.laws.backups and network is None:
             raise SimulationError(
                 "got `leadership` without a network, in which single agents know at once who "
                 "leads; give the parts' world a `network`."
             )
         self.number, graph = int(agent), parts.graph
         self.leads = agent in graph.leaders
-        self._law = self._loop.leader if self.leads else self._loop.follower
-        exchange = self._loop.exchange
+        self._law = self._loop.laws.leader if self.leads else self._loop.laws.follower
+        exchange = self._loop.graph.exchange
         edges = np.asarray(exchange.receivers) == agent
         self.neighbours = tuple(np.asarray(exchange.senders)[edges].tolist())
         self._weights = np.atleast_2d(np.asarray(exchange.weights))[:, edges]
         self._schedule = graph.schedule
         with precision("float64"):
             self._names = _names(self._loop, self._law)
+        late = self._loop.network
+        self._rules = late.rules if isinstance(late, LateNetwork) else None
         self._stamps = self._stamps_of(graph.leaders, graph.backups)
         self._source = self._source_in(parts)
         self._inbox = Inbox(self.neighbours, self._source, *self._names, stamps=self._stamps)
         self._others = self._surroundings(graph.agents)
-        sensors = self._loop.sensors
-        self._estimator = None if sensors is None else sensors.estimator
-        self._estimate: Estimate | None = None
+        self._sensing, self._sensed = self._loop.sensing.on_board, None
         self._memory: Memory | None = None
         self._begun, self._time, self.blind, self._since = False, -math.inf, 0, math.inf
         self._late = False
         self._last: tuple[Array, Message | None] = np.array(self._loop.model.trim[1], float), None
 
     def _stamps_of(self, leaders: Sequence[int], backups: Sequence[int]) -> Stamps | None:
-        channel = self._loop.channel
-        if channel is None:
+        if self._rules is None:
             return None
-        size = packet_size(channel, *self._sizes, bool(backups))
+        size = self._rules.content.prediction.size(*self._sizes)
         own = self.number if self.leads else None
-        deviation = channel.messages is MessageContent.DEVIATION
+        deviation = isinstance(self._rules.content, Deviations)
         return Stamps(len(self.neighbours), leaders, size, own, deviation, backups)
 
     def _succeed(self, stamps: Stamps) -> None:
         """Take the lead if nobody was heard to lead for long, or leave it to whoever has it."""
-        succession, packet = self._loop.succession, stamps.packet
-        if succession is None:
+        leadership, packet = self._loop.network.leadership, stamps.packet
+        if not isinstance(leadership, Failover):
             return
         self._since = min(self._since, self._time)
         last = -math.inf if packet is None else packet.time
         leader = self.number if stamps.leads else NOBODY if packet is None else packet.leader
         waited = min(self._time - last, self._time - self._since)
         rows = (np.array([value]) for value in (self.number, leader, waited))
-        if succession.silent(*rows)[0]:
+        if leadership.silent(*rows)[0]:
             stamps.take_lead(self.number)
         self.leads = stamps.leads
-        self._law = self._loop.leader if self.leads else self._loop.follower
+        self._law = self._loop.laws.leader if self.leads else self._loop.laws.follower
 
     def _surroundings(self, agents: int) -> Surroundings | None:
-        safety, model = self._loop.follower.safety, self._loop.model
+        safety, model = self._loop.laws.follower.safety, self._loop.model
         if safety is None:
             return None
         with precision("float64"):
@@ -384,11 +379,12 @@ class Agent:
 
     def _source_in(self, parts: Parts) -> int | None:
         """Return whose feed-forward this agent uses; None for nobody's."""
-        silent = self._loop.follower.feedforward is Feedforward.NONE
-        if self.leads or silent and not self._loop.follower.turning:
+        silent = self._loop.laws.follower.feedforward is Feedforward.NONE
+        if self.leads or silent and not self._loop.laws.follower.turning:
             return None
-        if self._loop.parents is not None:
-            return int(self._loop.parents[self.number])
+        depths = by_depth(self._loop)
+        if depths is not None:
+            return int(depths.parents[self.number])
         return parts.graph.nearest_leader()[self.number]
 
     def receive(self, message: object) -> Received:
@@ -412,10 +408,11 @@ class Agent:
         Raises:
             SimulationError: the state has another shape, or the time is needed.
         """
-        if t is None and self._loop.moving is not None:
+        if t is None and isinstance(self._loop.places, MovingPlaces):
             raise SimulationError("the formation changes with time; call `hello(x, t)`.")
         with precision("float64"):
-            own = self._own(self._measured(self._state(x))[0], jnp.asarray(float(t or 0.0)))
+            time = jnp.asarray(float(t or 0.0))
+            own = self._own(self._measured(self._state(x), time)[0], time)
             signal = signal_of(self._loop, self._law, own)
             hull = hull_of(self._loop, self._law, own)
         message = self._message(np.asarray(signal))
@@ -446,10 +443,10 @@ class Agent:
             self._succeed(self._stamps)
         row = 0 if self._schedule is None else self._schedule.row(t)
         with precision("float64"):
-            state, estimate = self._measured(self._state(x))
             time = jnp.asarray(self._time)
+            state, sensed = self._measured(self._state(x), time)
             own = self._own(state, time)
-            if self._stamps is None:
+            if self._stamps is None or self._rules is None:
                 step = step_alone(
                     self._loop,
                     self.leads,
@@ -461,14 +458,16 @@ class Agent:
                     self._hulls(),
                 )
             else:
-                mail, ages = self._mail(self._stamps)
-                rows = self._reader, time, own, mail, ages, self._weights[row], self._hulls()
-                step = step_over_network(self._loop, self.leads, *rows)
+                leadership = FixedLeaders(np.array([self.leads]))
+                rules = dataclasses.replace(self._rules, leadership=leadership)
+                number = jnp.array([self.number], jnp.int32)
+                clock = Seconds(time, self._loop.motion.dt, jnp.asarray(not self._begun))
+                rows = own, self._mail(self._stamps, rules), self._weights[row], self._hulls()
+                step = step_over_network(self._loop, rules, self.leads, number, clock, *rows)
         if step.finite:
             self._memory, self._begun = step.action.memory, True
             self._late = self._late and self._heard_at(time) is None
-            if estimate is not None and self._estimator is not None:
-                self._estimate = self._estimator.act(estimate, step.action.input)
+            self._sensed = self._sensing.acted(sensed, step.action.input)
             message = self._with_hull(self._written(step), step.hull)
             self._last = np.asarray(step.action.input), message
         else:
@@ -482,8 +481,8 @@ class Agent:
         hulls = jnp.asarray(self._others.hulls.reshape(others, -1, d))
         numbers = np.delete(np.arange(others + 1), self.number)
         known = ~jnp.isnan(hulls).any(axis=(1, 2))
-        leaders, packet = self._loop.leaders, self._stamps and self._stamps.packet
-        if self._loop.succession is not None and packet is not None:
+        leaders, packet = self._loop.laws.leaders, self._stamps and self._stamps.packet
+        if self._loop.laws.backups and packet is not None:
             leaders = [packet.leader]
         return Near(hulls, jnp.asarray(np.isin(numbers, leaders)), known)
 
@@ -492,28 +491,21 @@ class Agent:
             return message
         return message._replace(hull=NamedValues(self._others.names, np.asarray(hull).ravel()))
 
-    @property
-    def _reader(self) -> Readers:
-        return Readers(jnp.array([self.number], jnp.int32), jnp.array([self.leads]))
-
-    def _mail(self, stamps: Stamps) -> tuple[Mail, Ages]:
-        assert self._loop.channel is not None
-        size = packet_size(self._loop.channel, *self._sizes, self._loop.succession is not None)
+    def _mail(self, stamps: Stamps, rules: MessageRules) -> Messages:
+        size = rules.content.prediction.size(*self._sizes)
         packet = stamps.packet
         leader = self.number if self.leads else NOBODY
         leader = leader if packet is None else packet.leader
         content = np.zeros(size) if packet is None else np.asarray(packet.content)
-        since = math.inf if packet is None else max(0.0, self._time - packet.time)
-        # Single agents know ages in seconds, and no steps at which messages were sent.
-        stamp = jnp.zeros(len(self.neighbours), jnp.int32)
-        packets = Packets(
-            jnp.array([leader], jnp.int32), jnp.zeros(1, jnp.int32), jnp.asarray(content)[None]
+        sent = -math.inf if packet is None else packet.time
+        packets = LeaderPackets(
+            jnp.array([leader], jnp.int32), jnp.array([sent]), jnp.asarray(content)[None], ()
         )
         # Of an output that a sender does not have it is taken to be where the leader is.
         value = jnp.nan_to_num(jnp.asarray(self._inbox.signals), nan=0.0)
-        mail = Mail(stamp, value, jnp.asarray(stamps.hops, jnp.int32), packets)
-        link = jnp.asarray(np.maximum(0.0, self._time - stamps.time))
-        return mail, Ages(link, jnp.array([since]))
+        return Messages(
+            value, jnp.asarray(stamps.hops, jnp.int32), packets, jnp.asarray(stamps.time)
+        )
 
     def _written(self, step: "Step") -> Message | None:
         if self._stamps is None or step.letter is None:
@@ -542,12 +534,13 @@ class Agent:
             )
         return jnp.asarray(state, float)
 
-    def _measured(self, y: State) -> tuple[State, Estimate | None]:
-        if self._estimator is None:
-            return y, None
-        model, before = self._loop.model, self._estimate
-        before = self._estimator.begin(model, y) if before is None else before
-        return measured_alone(self._estimator, model, before, y, jnp.asarray(not self._begun))
+    def _measured(self, y: State, time: jax.Array) -> tuple[State, PyTree]:
+        if not self._sensing.stages:
+            return y, ()
+        model, before = self._loop.model, self._sensed
+        before = self._sensing.begin(model, y) if before is None else before
+        clock = Seconds(time, self._loop.motion.dt, jnp.asarray(not self._begun))
+        return sense_alone(self._sensing, model, before, y, clock)
 
     def _heard_at(self, time: jax.Array) -> Array | jax.Array | None:
         """Return the signal of another agent (s,), of the leader over a network; None before it."""
@@ -557,18 +550,20 @@ class Agent:
         if stamps.packet is None:
             return None
         content, age = jnp.asarray(stamps.packet.content), time - stamps.packet.time
-        return expected_alone(self._loop, time, content, age, self._sizes[0])
+        assert self._rules is not None, "an agent has stamps over a network that is late"
+        prediction = self._rules.content.prediction
+        return expected_alone(self._loop, prediction, time, content, age, self._sizes[0])
 
     def _own(self, state: State, time: jax.Array) -> "OwnState":
         # As in a run, where leaders may follow their backup leaders.
-        law = self._law if self._loop.succession is None else self._loop.follower
+        law = self._loop.laws.follower if self._loop.laws.backups else self._law
         memory = self._memory if self._begun else begin_alone(self._loop, law, state)
         self._late = self._late if self._begun else float(time) > 0.0
         other = self._heard_at(time) if self._late else None
         if other is not None:
             memory = beside_alone(law, memory, other)
-        if self._loop.moving is None:
-            return OwnState(state, jnp.asarray(self._loop.offsets[self.number]), memory)
+        if not isinstance(self._loop.places, MovingPlaces):
+            return OwnState(state, jnp.asarray(self._loop.places.offsets[self.number]), memory)
         number = jnp.asarray(self.number)
         offset, rate = offset_alone(self._loop, self._law, time, number)
         return OwnState(state, offset, memory, rate)
@@ -576,7 +571,7 @@ class Agent:
 
 def _names(loop: Loop, law: Law) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of what an agent sends: of its signal and of its feed-forward."""
-    model, follower = loop.model, loop.follower
+    model, follower = loop.model, loop.laws.follower
 
     def sizes(x: State, v: jax.Array) -> tuple[jax.Array, jax.Array]:
         own = OwnState(x, x, begin_alone(loop, law, x))

@@ -5,7 +5,6 @@ lane, or by JAX, where states may differ from those of a single run by rounding.
 after the other.
 """
 
-import dataclasses
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,8 +28,9 @@ from echelon.simulation.engine.simulate import result_of, sample_reference, simu
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.native.threads import processors
 from echelon.simulation.native.varying import ProgramKeys
+from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.drive import Stepper
-from echelon.simulation.step.loop import Loop, assemble
+from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.settings import Settings
 
@@ -193,12 +193,14 @@ def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _Ba
     world = prepared.parts.world
     if not world.ideal:
         # Draws of a seed of its own.
-        drawn = {
-            "motion": PlantStep.of(problem.model, world, settings, len(states)),
-            "channel": channel_of(prepared.parts, settings),
-            "sensors": sensors_of(prepared.parts, settings),
-        }
-        problem, loop = problem._replace(**drawn), dataclasses.replace(loop, **drawn)
+        motion = PlantStep.of(problem.model, world, settings, len(states))
+        channel, sensors = (
+            channel_of(prepared.parts, settings),
+            sensors_of(prepared.parts, settings),
+        )
+        problem = problem._replace(motion=motion, channel=channel, sensors=sensors)
+        loop = loop.replace(motion=motion, sensing=sensors)
+        loop = loop if channel is None else loop.with_medium(channel)
     return _BatchJob(place, prepared._replace(problem=problem), loop)
 
 

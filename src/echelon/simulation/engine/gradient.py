@@ -18,10 +18,12 @@ from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.simulate import sample_reference
+from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.distances import distance_of
 from echelon.simulation.step.drive import Controller, Problem
-from echelon.simulation.step.loop import Loop, LoopState, assemble
+from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import Sums
+from echelon.simulation.step.records import LoopState
 from echelon.simulation.step.sequence import begin, measured_step
 from echelon.simulation.step.settings import Settings
 
@@ -152,7 +154,7 @@ def _with_gain(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
         numbers["R_inverse"] = jnp.linalg.inv(numbers["R"])
 
     def places(loop: Loop) -> list[Array]:
-        law: Any = loop.follower
+        law: Any = loop.laws.follower
         return [getattr(law.gain, name) for name in numbers]
 
     return eqx.tree_at(places, loop, [*numbers.values()]) if numbers else loop
@@ -166,7 +168,7 @@ def _with_offsets(loop: Loop, values: Mapping[str, jax.Array]) -> Loop:
     spacings = distance_of(((i - j) ** 2).sum(axis=1))
 
     def places(loop: Loop) -> list[Array]:
-        return [loop.offsets, loop.meter.offsets, loop.meter.spacings]
+        return [loop.places.offsets, loop.meter.offsets, loop.meter.spacings]
 
     return eqx.tree_at(places, loop, [offsets, offsets, spacings])
 

@@ -20,8 +20,9 @@ from echelon.core.errors import SimulationError
 from echelon.core.types import Array, PyTree
 from echelon.simulation.native.varying import is_number
 from echelon.simulation.step.drive import Chunk, Stepper
-from echelon.simulation.step.loop import Loop, LoopState, WorldState
+from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import Sums, on_host
+from echelon.simulation.step.records import ComponentMemory, LoopState
 from echelon.simulation.step.sequence import Frames, advance, begin
 
 _AGENT_STEPS, _FEWEST = 100_000, 4
@@ -119,7 +120,7 @@ class JaxFormations(Stepper):
         return Chunk(now, states, inputs, on_host(sums))
 
 
-_ALL = LoopState(None, 0, 0, 0, 0, WorldState(*(0,) * len(WorldState._fields)))  # type: ignore[arg-type]
+_ALL = LoopState(None, 0, 0, ComponentMemory(*(0,) * len(ComponentMemory._fields)))  # type: ignore[arg-type]
 """All are at the same step."""
 
 
@@ -190,7 +191,7 @@ def advance_parted(
     first: jax.Array,
 ) -> tuple[LoopState, Frames, Sums]:
     """Do what `advance` does, with the agents spread over the devices of a mesh."""
-    agents = len(loop.offsets)
+    agents = len(loop.places.offsets)
 
     def part(leaf: jax.Array) -> jax.Array:
         # What has no row for each agent, such as the followers' memories, starts on all devices.

@@ -31,8 +31,8 @@ from echelon.simulation.native import is_installed
 from echelon.simulation.native.agent_step import BlockRows
 from echelon.simulation.native.stepper import NativeStepper
 from echelon.simulation.scalars import Unsupported
+from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.drive import Controller, Information, Problem, Stepper
-from echelon.simulation.step.loop import assemble
 from echelon.simulation.step.settings import Settings
 
 if TYPE_CHECKING:  # a gain is passed on to callers, and never read here

@@ -117,10 +117,12 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
 
 
-def sensors_of(parts: Parts, settings: Settings) -> Sensors | None:
-    """Return the sensors of a run; None for exact ones."""
+def sensors_of(parts: Parts, settings: Settings) -> Sensors:
+    """Return the sensors of a run."""
     sensing = parts.world.sensing
-    return sensing and sensing.prepared(parts.model, settings.dt, settings.horizon, settings.seed)
+    if sensing is None:
+        return Sensors()
+    return sensing.prepared(parts.model, settings.dt, settings.horizon, settings.seed)
 
 
 def channel_of(parts: Parts, settings: Settings) -> Channel | None:

@@ -11,36 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from echelon.agents.network.channel import NEVER, Channel, InFlight
-from echelon.agents.network.exchange import Exchange
+from echelon.agents.network.channel import NEVER, InFlight
 from echelon.agents.network.hearing import edges_of
 from echelon.core.compiled import cached_jit
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.core.words import NeighbourChoice
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import channel_of
-from echelon.simulation.step.knowledge import (
-    NOBODY,
-    Knowledge,
-    Letters,
-    Mail,
-    Readers,
-    count_hops,
-    hop_life,
-    no_mail,
-    usable_age,
-    write,
-)
-from echelon.simulation.step.leadership import Failover
-from echelon.simulation.step.loop import ActiveAgents, Switches, exchange_at
-from echelon.simulation.step.messages import (
-    age_of,
-    all_readers,
-    led_by_backups,
-    links_with,
-    take,
-)
+from echelon.simulation.step.leadership import NOBODY, leaders_of
+from echelon.simulation.step.network import LateNetwork, MessageRules, carries
+from echelon.simulation.step.records import Messages, NetworkEstimate, Steps
+from echelon.simulation.step.roster import Everybody, Links, roster_of
 from echelon.simulation.step.settings import Settings
 
 
@@ -92,14 +73,14 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
     # One step more than there are, whose messages are those of the last frame, and do not count.
     ends = np.append(frames[1:], max(steps, *frames[-1:], 0) + 1)[: len(frames)]
     with precision("float64"):
-        exchange = graph.exchange(parts.leaderward)
-        place = edges_of(graph, exchange)
+        links = Links.of(graph, settings, parts.leaderward)
+        place = edges_of(graph, links.exchange)
         receives = parts.receives[place]
-        readers = all_readers(graph.agents, np.array(graph.leaders))
-        switches = Switches.of(graph, settings)
+        leadership = leaders_of(graph, parts.leadership)
+        rules = MessageRules.of(channel, leadership, graph.agents)
+        network, roster = LateNetwork(leadership, rules, channel), roster_of(graph, settings, False)
         numbers = np.asarray(steps), np.asarray(settings.dt)
-        cast = ActiveAgents.of(graph), Failover.of(graph, parts.leadership)
-        radio = _Radio(channel, exchange, switches, readers, receives, *numbers, *cast)
+        radio = _Radio(network, links, roster, receives, *numbers)
         followed = _follow(radio, ends.astype(np.int32))
         stamps, losses, counted = jax.tree.map(np.asarray, followed)
     shape = len(times), len(graph.edges), 2
@@ -121,15 +102,12 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
 class _Radio(NamedTuple):
     """The network of a run: who `receives` (K,) what, in a run of so many steps of dt (s)."""
 
-    channel: Channel
-    exchange: Exchange
-    switches: Switches | None
-    readers: Readers
+    network: LateNetwork
+    links: Links
+    roster: Everybody
     receives: Bool[Array, " K"]
     steps: Array
     dt: Array
-    presence: ActiveAgents | None
-    succession: Failover | None
 
 
 class _Counts(NamedTuple):
@@ -153,7 +131,7 @@ class _Carry(NamedTuple):
 
     step: jax.Array
     posts: InFlight
-    mail: Mail
+    mail: Messages
     stamps: Int[jax.Array, " K"]
     losses: Int[jax.Array, " K"]
     counts: _Counts
@@ -170,12 +148,13 @@ def _follow(
         now = jax.lax.fori_loop(first, end, lambda _, now: _step(radio, first, now), now)
         return now, (now.stamps, now.losses)
 
-    agents, links = len(radio.readers.number), len(radio.receives)
-    mail = no_mail(radio.readers, links, jnp.zeros((agents, 0)), 0, radio.succession is not None)
-    letters = Letters(jnp.zeros((agents, 0)), jnp.full(agents, NOBODY, jnp.int32), mail.packet)
+    rules, links = radio.network.rules, len(radio.receives)
+    nothing = jnp.zeros((rules.agents, 0))
+    mail = rules.begin(jnp.arange(rules.agents, dtype=jnp.int32), links, nothing, 0)
+    sent = Messages(nothing, jnp.full(rules.agents, NOBODY, jnp.int32), mail.packet)
     zero, none = jnp.zeros((), int), jnp.zeros(links, int)
     counts = _Counts(zero, zero, zero, zero, jnp.zeros(()), jnp.zeros(()))
-    posts = radio.channel.begin(letters, links)
+    posts = radio.network.medium.begin(sent, links)
     start = _Carry(jnp.zeros((), jnp.int32), posts, mail, mail.stamp, none, counts)
     now, (stamps, losses) = jax.lax.scan(frame, start, jnp.asarray(ends))
     return stamps, losses, now.counts
@@ -183,25 +162,21 @@ def _follow(
 
 def _step(radio: _Radio, first: jax.Array, now: _Carry) -> _Carry:
     """Take a step of messages that say nothing; frames are stored at the step `first`."""
-    channel, readers = radio.channel, radio.readers
-    exchange = exchange_at(radio.exchange, radio.switches, now.step)
-    mail = take(channel, exchange, now.step, now.posts, now.mail)
-    if radio.succession is not None:
-        packet = led_by_backups(radio, now.step, mail.packet, radio.dt)
-        mail = mail._replace(packet=packet)
-        readers = readers._replace(leads=packet.leader == readers.number)
-    ages = age_of(now.step, mail.stamp, radio.dt)
-    lasting = ages <= hop_life(channel, radio.dt)
-    hops = count_hops(exchange, readers, mail.hops, lasting, len(readers.number))
-    used = (jnp.asarray(exchange.weights) > 0.0) & (ages <= usable_age(channel, radio.dt))
-    if channel.hears is NeighbourChoice.LEADERWARD:
-        used = used & (mail.hops < hops[jnp.asarray(exchange.receivers)])
-    nothing = jnp.zeros((len(readers.number), 0))
-    knowledge = Knowledge(nothing, nothing, nothing, hops)
-    rows = mail, knowledge, nothing, jnp.subtract, nothing
-    letters, sends = write(channel, readers, now.step, *rows)
-    sent = links_with(exchange, sends) & (now.step % channel.every == 0)
-    posts = channel.post(now.posts, now.step, letters, sent, exchange.receivers, exchange.senders)
+    network, rules, channel = radio.network, radio.network.rules, radio.network.medium
+    clock, links = Steps(now.step, radio.dt), radio.links.at(now.step)
+    number = jnp.arange(rules.agents, dtype=jnp.int32)
+    here, since = radio.roster.here(now.step), radio.roster.since(now.step)
+    mail = network.delivered(now.posts, now.mail, number, clock, since, links, here)
+    leads = network.leadership.leads(mail.packet, number)
+    ages = clock.age(mail.stamp)
+    hops = rules.hops(mail, ages, leads, links, clock.dt)
+    used = rules.used(mail, ages, hops, links, clock.dt)
+    nothing = jnp.zeros((rules.agents, 0))
+    heard = NetworkEstimate(nothing, leads, nothing, nothing, hops)
+    rows = mail, heard, number, clock.now, nothing, nothing, jnp.subtract
+    messages, sends = rules.write(*rows)
+    posts = network.posted(now.posts, now.step, messages, sends, links)
+    sent = carries(links, sends) & (now.step % channel.every == 0)
     lost = sent & (posts.arrival[(now.step // channel.every) % channel.slots] == NEVER)
     # All that arrives now but for the newest message, where it is newer than the last one.
     late = (now.posts.arrival == now.step).sum(axis=0) - (mail.stamp > now.mail.stamp)

@@ -25,8 +25,12 @@ from echelon.simulation.scalars import (
     needed,
     nodes,
 )
-from echelon.simulation.step.action import act, feedforward_of, limit_sides
 from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.nearby import NobodyNear
+from echelon.simulation.step.network import IdealNetwork
+from echelon.simulation.step.places import ConstantPlaces
+from echelon.simulation.step.run_laws import limit_sides
+from echelon.simulation.step.turns import by_depth
 
 
 class BlockRows(NamedTuple):
@@ -76,11 +80,11 @@ class BlockRows(NamedTuple):
                 "substeps, actuators that lag, correlated wind, air, or agents that differ"
             )
         n, m = len(loop.model.state_names), len(loop.model.input_names)
-        wind, q = loop.motion.wind, len(loop.model.output_names)
-        noisy = wind is not None and wind.noise is not None
-        memory = max(memory_size(law) for law in (loop.leader, loop.follower))
-        sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m]
-        sizes += [message_size(loop), m, varying]
+        weather, q = loop.motion.weather, len(loop.model.output_names)
+        noisy = any(part.noise is not None for part in weather)
+        memory = max(memory_size(law) for law in (loop.laws.leader, loop.laws.follower))
+        sizes = [n, n, n if weather else 0, m if noisy else 0, memory, m]
+        sizes += [loop.laws.message_size(loop.model, loop.laws.leader.init()), m, varying]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q, 1]
         ends = np.cumsum([0, *sizes]).tolist()
         return cls._make([*(range(a, b) for a, b in itertools.pairwise(ends)), ends[-1]])
@@ -88,22 +92,24 @@ class BlockRows(NamedTuple):
 
 def check_information(loop: Loop) -> None:
     """Raise `Unsupported` unless agents know exact states, current messages, and nothing else."""
-    if loop.moving is not None:
-        raise Unsupported("formations that change with time")
-    if loop.channel is not None:
-        raise Unsupported("a network that is not ideal")
-    if loop.sensors is not None:
-        raise Unsupported("agents that measure their states late or with noise")
+    for ideal, text in (
+        (isinstance(loop.places, ConstantPlaces), "formations that change with time"),
+        (isinstance(loop.network, IdealNetwork), "a network that is not ideal"),
+        (not loop.sensing.stages, "agents that measure their states late or with noise"),
+    ):
+        if not ideal:
+            raise Unsupported(text)
     check_distances(loop)
 
 
 def check_distances(loop: Loop) -> None:
     """Raise `Unsupported` if agents keep distances, come or go, or have backup leaders."""
-    for part, text in (
-        (loop.follower.safety, "agents that keep away from each other"),
-        (loop.presence or loop.succession, "agents that are lost, join or take the lead"),
+    changes = loop.roster.changes or loop.laws.backups
+    for ideal, text in (
+        (isinstance(loop.surroundings, NobodyNear), "agents that keep away from each other"),
+        (not changes, "agents that are lost, join or take the lead"),
     ):
-        if part is not None:
+        if not ideal:
             raise Unsupported(text)
 
 
@@ -126,28 +132,12 @@ def unflatten(like: PyTree, flat: Array | jax.Array) -> PyTree:
     )
 
 
-def message_size(loop: Loop) -> int:
-    """Return how many numbers an agent sends besides its state."""
-    n, m = len(loop.model.state_names), len(loop.model.input_names)
-    turning = loop.follower.turning
-
-    # Of the message alone: a trace of all that a leader does takes as long as its code.
-    def message(x: jax.Array, v: jax.Array) -> jax.Array:
-        follower = loop.follower.facing(x[0]) if turning else loop.follower
-        return feedforward_of(follower, loop.model, x, v, loop.leader.init())
-
-    return jax.eval_shape(message, np.zeros(n), np.zeros(m)).shape[0] + turning
-
-
 def signal_size(loop: Loop) -> int:
     """Return how many numbers neighbours receive from an agent besides its state."""
-    zero, law = jnp.zeros(len(loop.model.state_names)), loop.follower
-    return jax.eval_shape(lambda: _signal_of(loop, law, zero, zero, law.init())).shape[0]
-
-
-def _signal_of(loop: Loop, law: Law, x: jax.Array, offset: jax.Array, memory: Memory) -> jax.Array:
-    signal = law.signal(loop.model, x, offset, memory)
-    return jnp.zeros(0, x.dtype) if signal is None else signal
+    zero, law = jnp.zeros(len(loop.model.state_names)), loop.laws.follower
+    rows = law, loop.model, zero, zero
+    beyond = loop.laws.speech.beyond_state
+    return jax.eval_shape(lambda: beyond(*rows, law.init())).shape[0]
 
 
 Entries: TypeAlias = Any
@@ -194,19 +184,22 @@ class StepOutputs(NamedTuple):
 
 def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
     """Return the step of a leader, or of another agent, as a function for JAX."""
-    law = loop.leader if leads else loop.follower
-    model, motion, meter = loop.model, loop.motion, loop.meter
+    law = loop.laws.leader if leads else loop.laws.follower
+    model, motion, meter, speech = loop.model, loop.motion, loop.meter, loop.laws.speech
 
     def step(inputs: StepInputs) -> StepOutputs:
         x, offset = inputs.x, inputs.offset
         view = LocalView(inputs.t, x, offset, inputs.z, inputs.message, motion.dt)
-        desired, u, memory, message = act(loop, law, view, inputs.memory, leads)
+        rows = law, view, inputs.memory, leads
+        desired, u, memory, message = loop.laws.act(model, motion, *rows)
         limited, cut = limit_sides(model, u, desired)
         metered = meter.of_agent(inputs.step, inputs.steady, x, offset, inputs.leader, u)
         tracking, outputs = jnp.zeros(2), jnp.zeros(len(model.output_names))
         if inputs.reference is not None:
             tracking, outputs = meter.of_leader(inputs.steady, x, offset, inputs.reference)
-        state = motion.move(x, u, inputs.push, inputs.noise)
+        still = not motion.weather
+        field = motion.plant.velocity if still else motion.pushed(inputs.push, inputs.noise)
+        state, _ = motion.motors.integrate(field, (), x, u, motion)
         return StepOutputs(
             state=state,
             memory=memory,
@@ -221,8 +214,8 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
             unsettled=metered.unsettled,
             inside=metered.inside,
             chatter=jnp.where((cut * inputs.previous_cut < 0.0).any(), 1.0, 0.0),
-            signal=_signal_of(loop, law, x, offset, inputs.memory),
-            next_signal=_signal_of(loop, law, state, offset, memory),
+            signal=speech.beyond_state(law, model, x, offset, inputs.memory),
+            next_signal=speech.beyond_state(law, model, state, offset, memory),
         )
 
     return step
@@ -244,7 +237,7 @@ def body_of(
         Unsupported: the law or the model has no scalar operations.
     """
     graph, loop = ScalarGraph(bits), varying.loop
-    law = loop.leader if leads else loop.follower
+    law = loop.laws.leader if leads else loop.laws.follower
     inputs = _step_inputs(loop, graph, rows, law, leads, follows)
 
     def step(leaves: list[jax.Array], inputs: StepInputs) -> StepOutputs:
@@ -265,7 +258,7 @@ def body_of(
     pairs = zip(none, earlier, outputs.unsettled, strict=True)
     stores["unsettled"] = [graph.make("select", *each) for each in pairs]
     # Unless inputs are passed on from parents, nobody reads the message of a follower.
-    if leads or loop.levels is not None:
+    if leads or by_depth(loop):
         stores["message"] = outputs.message
     sums = {name: getattr(outputs, name) for name in ("effort", "limited", "chatter")}
     sums |= {"errors": _before_and_in_window(inputs, outputs.errors)}

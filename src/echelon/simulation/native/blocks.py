@@ -11,6 +11,7 @@ import scipy.sparse.csgraph as csgraph
 from echelon.core.types import Array
 from echelon.simulation.codegen import SHIFTED, Plan, aligned, stride
 from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.turns import by_depth
 
 
 class Neighbourhood(NamedTuple):
@@ -128,10 +129,11 @@ _SAMPLE = 1_000
 
 def _senders_of(loop: Loop) -> Array:
     """Return the sender of each agent's message, (N,)."""
-    if loop.parents is None:
+    depths = by_depth(loop)
+    if depths is None:
         return np.asarray(loop.meter.nearest)
     # A leader receives nothing; any place is valid.
-    parents = np.asarray(loop.parents)
+    parents = np.asarray(depths.parents)
     return np.where(parents < 0, np.arange(len(parents)), parents)
 
 
@@ -144,8 +146,10 @@ class SwarmBlocks(Places):
         self.loop, self.lanes, self.groups, self.batched = loop, lanes, 1, False
         near = nearby(loop)
         self._place(near, None)
-        degrees = np.bincount(np.asarray(loop.exchange.receivers), minlength=len(self.position))
-        if is_large(len(loop.offsets)) and self._is_uneven(degrees[self.agents]):
+        degrees = np.bincount(
+            np.asarray(loop.graph.exchange.receivers), minlength=len(self.position)
+        )
+        if is_large(len(loop.places.offsets)) and self._is_uneven(degrees[self.agents]):
             some = np.linspace(0, self.blocks - 1, _SAMPLE, dtype=int)
             if not self._contiguous(neighbour_slots(loop, self, blocks=some))[1]:
                 self._place(near, degrees)
@@ -245,7 +249,7 @@ class FormationBlocks(Places):
         # The last group is filled with copies.
         formation = np.minimum(np.arange(self.groups * lanes), len(loops) - 1)
         formation = formation.reshape(self.groups, 1, lanes)
-        agents = len(self.loop.offsets) * formation + self.swarm.agents[:, None]
+        agents = len(self.loop.places.offsets) * formation + self.swarm.agents[:, None]
         self.agents, self.segments = agents.reshape(-1), self.swarm.segments
         self.position = first_places(self.agents)
 
@@ -308,7 +312,7 @@ def neighbour_slots(
         The first slot of each block (blocks + 1,), and of all slots the positions (slots, lanes)
         and weights (rows, slots, lanes).
     """
-    exchange, place = loop.exchange, places.position.astype(np.int32)
+    exchange, place = loop.graph.exchange, places.position.astype(np.int32)
     # By position and not by number, so that memory is read from end to end.
     first, order = grouped(place[np.asarray(exchange.receivers)], len(places.agents))
     senders = place[np.asarray(exchange.senders)][order]
@@ -372,13 +376,15 @@ def ordered(loop: Loop, lanes: int, near: Array, degrees: Array | None) -> tuple
     if these are given. A level fills its last block with copies of its last agent, which compute
     the same and are not read.
     """
-    levels = [loop.followers]
-    if loop.levels is not None:
-        levels = [loop.followers[np.unique(row)] for row in loop.levels]
+    levels, depths = [loop.laws.followers], by_depth(loop)
+    if depths is not None:
+        levels = [loop.laws.followers[np.unique(row)] for row in depths.levels]
     levels = [_among(near, level) for level in levels]
     if degrees is not None:
         levels = [level[np.argsort(windows(degrees[level]), kind="stable")] for level in levels]
-    filled = [np.append(a, np.repeat(a[-1:], -len(a) % lanes)) for a in (loop.leaders, *levels)]
+    filled = [
+        np.append(a, np.repeat(a[-1:], -len(a) % lanes)) for a in (loop.laws.leaders, *levels)
+    ]
     segments = np.cumsum([0, *(len(a) // lanes for a in filled)]).astype(np.int64)
     return np.concatenate(filled), segments
 
@@ -400,7 +406,7 @@ def nearby(loop: Loop) -> Array:
     It is their own order if that is as good, and for few agents. The numbers of a neighbour that
     was stepped long ago come from main memory: a swarm in random order takes three times as long.
     """
-    agents = len(loop.offsets)
+    agents = len(loop.places.offsets)
     original = np.arange(agents)
     if not is_large(agents):
         return original

@@ -12,6 +12,7 @@ from echelon.simulation.native.agent_step import BlockRows, body_of, signal_size
 from echelon.simulation.native.blocks import Shifts
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.turns import by_depth
 
 LANES = {64: 8, 32: 16}
 """Vectors of 512 bits; where a processor's are shorter, LLVM takes two."""
@@ -23,7 +24,9 @@ def follows(loop: Loop) -> bool:
     """Tell whether the leaders of a loop follow a reference."""
     # In the precision in which references are sampled, so that nothing is compiled for this alone.
     with precision("float64"):
-        return loop.leader.reference_states(loop.model, jax.device_put(np.zeros(1))) is not None
+        return (
+            loop.laws.leader.reference_states(loop.model, jax.device_put(np.zeros(1))) is not None
+        )
 
 
 class Kernel(NamedTuple):
@@ -54,7 +57,7 @@ def plan_of(
 ) -> Plan:
     """Return the plan of loops; `apart` is false if all goals are one; or raise `Unsupported`."""
     loop, tracks = varying.loop, follows(varying.loop)
-    n, one_leader = len(rows.state), len(loop.leaders) == 1
+    n, one_leader = len(rows.state), len(loop.laws.leaders) == 1
     plan = Plan(
         bits=bits,
         lanes=LANES[bits],
@@ -66,9 +69,9 @@ def plan_of(
         others=body_of(varying, bits, rows, False, tracks),
         message_start=rows.message.start,
         message_size=len(rows.message),
-        one_source=one_leader and loop.parents is None,
+        one_source=one_leader and by_depth(loop) is None,
         one_leader=one_leader,
-        weighted=weighted or bool((np.asarray(loop.exchange.weights) != 1.0).any()),
+        weighted=weighted or bool((np.asarray(loop.graph.exchange.weights) != 1.0).any()),
         edges=loop.meter.measured,
         apart=apart,
         shifts=shifts[0],
@@ -79,7 +82,7 @@ def plan_of(
         tape_rows=len(loop.meter.paired),
     )
     # A leader that receives nothing waits for nobody.
-    ahead = not batched and loop.levels is None and not plan.first.reads_neighbours
+    ahead = not batched and by_depth(loop) is None and not plan.first.reads_neighbours
     return plan._replace(width=plan.width + has_flag(plan), leaders_ahead=ahead)
 
 
@@ -117,7 +120,7 @@ class Kernels:
     ) -> Kernel:
         """Return the kernel of loops, `weighted` if weights may change; as `plan_of`."""
         # Also by wind and noise, which have rows only if they exist.
-        wind, signature = jax.tree.structure(varying.loop.motion.wind), varying.signature
+        wind, signature = jax.tree.structure(varying.loop.motion.weather), varying.signature
         key = (signature, wind, bits, LANES[bits], batched, row_major, weighted, apart, shifts)
 
         def make() -> Kernel:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from echelon.agents.world.disturbance import Wind, draw
+from echelon.agents.world.disturbance import Wind
 from echelon.core.types import Array
 from echelon.simulation.codegen import aligned, stride
 from echelon.simulation.native.agent_step import signal_size, unflatten
@@ -23,9 +23,10 @@ from echelon.simulation.native.threads import ThreadPool
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import needed
 from echelon.simulation.step.drive import Chunk, Stepper
-from echelon.simulation.step.loop import Loop, LoopState, begin_forgetful, stretch_at
+from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import ALWAYS, Sums
-from echelon.simulation.step.sequence import begin, signals
+from echelon.simulation.step.records import LawMemories, LoopState
+from echelon.simulation.step.sequence import begin, begin_forgetful, said_by
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Agent steps of a chunk, which take some hundredths of a second, and its fewest steps."""
@@ -73,9 +74,9 @@ class NativeStepper(Stepper):
         )
         self.threads, self.buffers = ThreadPool(self.places, pool, threads), BufferPool()
         # Numbers of formations follow each other.
-        first = len(self.loop.offsets) * np.arange(len(loops))[:, None]
-        self.leaders = (first + self.loop.leaders).reshape(-1)
-        self.followers = (first + self.loop.followers).reshape(-1)
+        first = len(self.loop.places.offsets) * np.arange(len(loops))[:, None]
+        self.leaders = (first + self.loop.laws.leaders).reshape(-1)
+        self.followers = (first + self.loop.laws.followers).reshape(-1)
         row_major, weights_change = self.places.row_major, variant is not None
         apart = weights_change or any(np.any(loop.meter.spacings) for loop in loops)
         self.code, self.rows, self.plan, self.uniform_count = KERNELS.of(
@@ -83,7 +84,7 @@ class NativeStepper(Stepper):
         )
         self._signals = signal_size(self.loop)
         # Once, because to call a law takes as long as many small steps.
-        self.memories = self.loop.leader.init(), self.loop.follower.init()
+        self.memories = LawMemories(self.loop.laws.leader.init(), self.loop.laws.follower.init())
         self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
         # The moment in the blocks: a chunk that continues from it need not be written there.
@@ -158,8 +159,18 @@ class NativeStepper(Stepper):
             return begin_forgetful(self.loop, states)
         pairs = zip(self.loops, np.split(np.asarray(self.states), len(self.loops)), strict=True)
         moments = [jax.tree.map(np.asarray, begin(loop, jnp.asarray(x))) for loop, x in pairs]
-        many = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(m[1:] for m in moments))
-        return LoopState(moments[0].step, *many)._replace(states=states)
+        return self._moment_of(
+            0,
+            states,
+            jax.tree.map(lambda *leaves: np.concatenate(leaves), *(m.memory.laws for m in moments)),
+            np.zeros((len(states), len(self.rows.input)), np.int8),
+        )
+
+    def _moment_of(self, step: int, states: Any, laws: Any, cut: Any) -> LoopState:
+        """Return the moment of all formations: in the worlds of native code laws alone remember."""
+        now = begin_forgetful(self.loop, states)
+        stamp: Any = np.asarray(step, np.int32)
+        return now._replace(step=stamp, cut=cut, memory=now.memory._replace(laws=laws))
 
     def advance(self, now: LoopState, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; divergence is detected afterwards."""
@@ -223,16 +234,16 @@ class NativeStepper(Stepper):
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
         """Take steps, one draw and one stretch at a time; the rows then have the first inputs."""
-        wind, input_step = self.loop.motion.wind, step
+        weather, input_step = self.loop.motion.weather, step
         most = _TASKS // len(self.places.segments)
         if self.plan.leaders_ahead:
             size = self.plan.mirror + self.plan.message_size * self.plan.lanes
             most = min(most, _LEADER_NUMBERS // (self.leader_blocks * size))
         while steps:
-            row, constant = stretch_at(self.loop, step)
+            row, constant = self.loop.graph.stretch(step)
             self.neighbourhood = self.neighbourhood._replace(weights=self.edge_weights[row])
             count = min(steps, self._pairs.steps, max(1, most), constant)
-            if wind is not None:
+            for wind in weather:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
                 count = min(count, hold - step % hold)
@@ -247,8 +258,8 @@ class NativeStepper(Stepper):
         if first != self._hold - self._hold % count or self._hold < 0:
             # Numbers beyond the end of the run may wrap: they are not used.
             steps = ((first + np.arange(count)) * hold).astype(np.int32)
-            winds = [loop.motion.wind for loop in self.loops]
-            drawn = _drawn(winds, steps, np.arange(len(self.loop.offsets)))
+            winds = [loop.motion.weather[0] for loop in self.loops]
+            drawn = _drawn(winds, steps, np.arange(len(self.loop.places.offsets)))
             self._draws = [part if part is None else np.asarray(part) for part in drawn]
         self._hold = number
         for rows, part in zip((self.rows.push, self.rows.noise), self._draws, strict=True):
@@ -295,10 +306,12 @@ class NativeStepper(Stepper):
         self._write(rows.state, x)
         self._write(rows.offset, offsets)
         self._write(rows.cut, np.asarray(now.cut))
-        self._write(rows.varying, np.repeat(self.varying.values, len(self.loop.offsets), axis=0))
+        self._write(
+            rows.varying, np.repeat(self.varying.values, len(self.loop.places.offsets), axis=0)
+        )
         self._write_mirror(mirror_values(self.loops, now, x, offsets, bool(self._signals)))
         memory = np.zeros((len(x), len(rows.memory)))
-        trees = (self.leaders, now.leader_memory), (self.followers, now.follower_memory)
+        trees = zip((self.leaders, self.followers), now.memory.laws, strict=True)
         for agents, tree in trees:
             leaves = [np.asarray(leaf).reshape(len(agents), -1) for leaf in jax.tree.leaves(tree)]
             flat = np.concatenate([np.zeros((len(agents), 0)), *leaves], axis=1)
@@ -329,16 +342,16 @@ class NativeStepper(Stepper):
             for part, kind in (*parts, (sums, np.float64))
         )
         pairs = zip(self.memories, (self.leaders, self.followers), strict=True)
-        memories = [unflatten(like, memory[agents]) for like, agents in pairs]
-        fields: Any = [np.asarray(step, np.int32), x, *memories, cut.astype(np.int8)]
-        return LoopState(*fields), self._sums(first, step, agent_sums)
+        laws = LawMemories(*(unflatten(like, memory[agents]) for like, agents in pairs))
+        now = self._moment_of(step, x, laws, cut.astype(np.int8))
+        return now, self._sums(first, step, agent_sums)
 
     def _find_inexact(self) -> None:
         """Note the formations whose numbers are not what JAX computes."""
         row = self.rows.exception.start
         if self.blocks[:, row].any():
             positions = np.flatnonzero(self.blocks[:, row])
-            self._inexact[self.places.agents[positions] // len(self.loop.offsets)] = True
+            self._inexact[self.places.agents[positions] // len(self.loop.places.offsets)] = True
 
     def _clear_sums(self) -> None:
         self._inexact = np.zeros(len(self.loops), bool)
@@ -384,7 +397,7 @@ def offsets_of(loops: Sequence[Loop], dtype: np.dtype) -> Float[Array, "N n"]:
     """Return the goals' offsets of all agents, loop by loop."""
     # Runs that differ only in their initial states share one loop, and are often thousands.
     distinct = {id(loop): loop for loop in loops}
-    offsets = {k: np.asarray(loop.offsets, dtype) for k, loop in distinct.items()}
+    offsets = {k: np.asarray(loop.places.offsets, dtype) for k, loop in distinct.items()}
     if len(offsets) == 1:
         return np.tile(offsets[id(loops[0])], (len(loops), 1))
     return np.concatenate([offsets[id(loop)] for loop in loops])
@@ -409,16 +422,21 @@ def mirror_values(
     relative = x - offsets
     if not with_signals:
         return relative
-    counts = [len(loops[0].offsets), len(loops[0].leaders), len(loops[0].followers)]
+    counts = [
+        len(loops[0].places.offsets),
+        len(loops[0].laws.leaders),
+        len(loops[0].laws.followers),
+    ]
     sent = list[Array]()
     for k, loop in enumerate(loops):
         all_, leaders, others = (slice(k * count, (k + 1) * count) for count in counts)
-        mine = now._replace(
-            states=now.states[all_],
-            leader_memory=jax.tree.map(lambda leaf, some=leaders: leaf[some], now.leader_memory),
-            follower_memory=jax.tree.map(lambda leaf, some=others: leaf[some], now.follower_memory),
+        pairs = zip((leaders, others), now.memory.laws, strict=True)
+        laws = LawMemories(
+            *(jax.tree.map(lambda x, some=some: x[some], own) for some, own in pairs)
         )
-        sent.append(np.asarray(signals(loop, mine, jnp.asarray(offsets[all_]))))
+        memory = now.memory._replace(laws=laws)
+        mine = now._replace(states=now.states[all_], memory=memory)
+        sent.append(np.asarray(said_by(loop, jax.tree.map(jnp.asarray, mine))))
     return np.concatenate([relative, np.concatenate(sent)], axis=1)
 
 
@@ -428,11 +446,15 @@ _AHEAD, _AT_ONCE = 64, 50_000
 
 @jax.jit
 def _drawn(
-    winds: Sequence[Wind | None], steps: jax.Array, agents: jax.Array
-) -> tuple[jax.Array | None, jax.Array | None]:
+    winds: Sequence[Wind], steps: jax.Array, agents: jax.Array
+) -> tuple[jax.Array, jax.Array | None]:
     """Return what each wind adds to the rates (T, F, N, n) and noise to the inputs at T steps."""
     many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
-    one = jax.vmap(draw, (None, None, 0))
+
+    def draws(wind: Wind, step: jax.Array, agent: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+        return wind.on_state(step, agent), wind.on_input(step, agent)
+
+    one = jax.vmap(draws, (None, None, 0))
     return jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, None))(many, steps, agents)
 
 

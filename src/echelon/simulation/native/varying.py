@@ -21,15 +21,15 @@ from echelon.simulation.step.settings import Settings
 
 def _separate_parts(loop: Loop) -> list[PyTree]:
     """Return the parts of a loop that have their own rows or draws."""
-    return [loop.offsets, loop.meter.offsets, loop.meter.spacings, loop.motion.wind]
+    return [loop.places, loop.meter.offsets, loop.meter.spacings, loop.motion.weather]
 
 
 def bare(loop: Loop) -> Loop:
     """Return a loop without the parts that have their own rows or draws."""
     # Not by `tree_at`, which walks the whole loop several times.
     meter = dataclasses.replace(loop.meter, offsets=None, spacings=None)
-    motion = dataclasses.replace(loop.motion, wind=None)
-    return dataclasses.replace(loop, offsets=None, meter=meter, motion=motion)
+    motion = dataclasses.replace(loop.motion, weather=())
+    return dataclasses.replace(loop, places=None, meter=meter, motion=motion)
 
 
 def is_number(leaf: object) -> bool:
@@ -120,7 +120,10 @@ class VaryingNumbers:
         new = self._tree.unflatten([next(new_leaves) if m.any() else leaf for leaf, m in pairs])
         # None is an empty tree to JAX, and could not be replaced without `is_leaf`.
         return eqx.tree_at(
-            _separate_parts, new, _separate_parts(self.loop), is_leaf=lambda x: x is None
+            _separate_parts,
+            new,
+            _separate_parts(self.loop),
+            is_leaf=lambda x: x is None or isinstance(x, tuple) and not x,
         )
 
 
@@ -150,8 +153,8 @@ class ProgramKeys:
         that a reference, an initial memory, the weights or the difference of two states depend on.
         """
         leaves, tree = jax.tree.flatten(bare(loop))
-        wind = loop.motion.wind
-        draws = None if wind is None else (jax.tree.structure(wind), int(wind.window))
+        weather = loop.motion.weather
+        draws = jax.tree.structure(weather), [int(part.window) for part in weather]
         shapes = [np.shape(leaf) if is_number(leaf) else leaf for leaf in leaves]
         kind = process_key((tree.unflatten(shapes), draws, settings))
         pairs = zip(
@@ -172,11 +175,11 @@ def _fixed(leaves: Sequence[object], tree: Any) -> list[bool]:
         other: Loop = tree.unflatten(replaced)
         n = len(other.model.state_names)
         return (
-            other.leader.reference_states(other.model, jnp.zeros(1)),
+            other.laws.leader.reference_states(other.model, jnp.zeros(1)),
             other.model.difference(jnp.ones(n), jnp.zeros(n)),
-            other.leader.init(),
-            other.follower.init(),
-            other.exchange.weights,
+            other.laws.leader.init(),
+            other.laws.follower.init(),
+            other.graph.exchange.weights,
         )
 
     try:

@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 
 from echelon.agents.models.model import ControlAffine
-from echelon.agents.world.sensing import Estimate, Estimator
+from echelon.agents.world.sensing import Estimate, EstimatingSensor, Estimator
 from echelon.core.numerics import rk4
 from echelon.core.types import PyTree
-from echelon.core.words import Feedforward, MessageContent, Prediction
+from echelon.core.words import Feedforward
 from echelon.laws.consensus import Consensus
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law, carried_pieces
@@ -39,14 +39,15 @@ from echelon.simulation.native.agent_step import (
     unflatten,
 )
 from echelon.simulation.scalars import Node, ScalarGraph, lower, needed, nodes, rewritten
-from echelon.simulation.step.knowledge import (
+from echelon.simulation.step.motion import PlantStep
+from echelon.simulation.step.network import (
+    Deviations,
+    LateNetwork,
+    LeaderPrediction,
+    PacketPrediction,
     carried_time,
-    content_of,
-    expected_of,
-    packet_size,
     parts_of,
 )
-from echelon.simulation.step.motion import MotionState, PlantStep
 
 
 class LawFunction(NamedTuple):
@@ -103,12 +104,12 @@ class _Traces:
         difference = self._difference()
         yield difference
         yield self._tick(len(difference.outputs["gap"]))
-        channel = self.loop.channel
-        if channel is not None and channel.messages is MessageContent.DEVIATION:
-            yield from self._expectation(channel.prediction)
-        sensors = self.loop.sensors
-        if sensors is not None and sensors.estimator is not None:
-            yield from self._estimation(sensors.estimator)
+        late = self.loop.network
+        if isinstance(late, LateNetwork) and isinstance(late.rules.content, Deviations):
+            yield from self._expectation(late.rules.content.prediction)
+        for stage in self.loop.sensing.on_board.stages:
+            if isinstance(stage, EstimatingSensor):
+                yield from self._estimation(stage.estimator)
 
     def _state(self, t: jax.Array, x: jax.Array, flat: jax.Array) -> OwnState:
         offset, rate = offset_alone(self.loop, self.law, t, jnp.asarray(self.own.number))
@@ -174,7 +175,8 @@ class _Traces:
 
     def _tick(self, gap: int) -> LawFunction:
         loop, leads = self.loop, self.own.leads
-        sends_packets = leads and loop.channel is not None
+        late = loop.network
+        prediction = late.rules.content.prediction if isinstance(late, LateNetwork) else None
 
         def tick(
             t: jax.Array, x: jax.Array, z: jax.Array, forward: jax.Array, flat: jax.Array
@@ -185,13 +187,14 @@ class _Traces:
             results = action.input, _flat(action.memory), step.signal, action.message
             # A state less a constant is finite where the state is.
             signal = () if type(self.law).signal is Law.signal else step.signal
-            if not sends_packets:
+            if prediction is None or not leads:
                 return *results, _flat((x, signal, action))
-            content = content_of(loop, t, *own[:3], step.signal, action.message, action.input)
+            content = prediction.content(loop, t, *own[:3], step.signal, action)
             return *results, content, _flat((x, signal, action, content))
 
         words = message_meaning(self.own)
-        outputs = ("u", "memory", "signal", "message", *(("content",) if sends_packets else ()))
+        sent = () if prediction is None or not leads else ("content",)
+        outputs = ("u", "memory", "signal", "message", *sent)
         sizes = {"t": None, "x": self.n, "z": gap, "feed_forward": self.k, "memory": self.memory}
         return self._function(
             "tick",
@@ -204,19 +207,18 @@ class _Traces:
 
     # ---- where messages are late ----
 
-    def _expectation(self, prediction: Prediction) -> Iterator[LawFunction]:
-        loop, follower, s = self.loop, self.loop.follower, self.s
-        assert loop.channel is not None
-        size = packet_size(loop.channel, s, self.k, self.m)
+    def _expectation(self, prediction: LeaderPrediction) -> Iterator[LawFunction]:
+        loop, follower, s = self.loop, self.loop.laws.follower, self.s
+        size = prediction.size(s, self.k, self.m)
         # A state is carried on in a loop, each round of which is a function here.
         plain = type(follower).carried is Law.carried and type(follower).signal is Law.signal
-        in_rounds = plain and prediction is Prediction.PACKET
+        in_rounds = plain and isinstance(prediction, PacketPrediction)
 
         def expected(t: jax.Array, content: jax.Array, age: jax.Array) -> tuple[jax.Array, ...]:
             if in_rounds:
                 leader, forward, _ = parts_of(loop, s, content)
             else:
-                leader, forward = expected_of(loop, s, t, content, age)
+                leader, forward = prediction.expected(loop, s, t, content, age)
             return leader, forward, _flat((leader, forward))
 
         def pace(age: jax.Array) -> tuple[jax.Array]:
@@ -351,7 +353,7 @@ def _row(numbers: Sequence[float]) -> str:
 
 def message_meaning(own: OwnLaw) -> str:
     """Return what a message and a feed-forward are."""
-    follower, turning = own.loop.follower, own.loop.follower.turning
+    follower, turning = own.loop.laws.follower, own.loop.laws.follower.turning
     more = ", and the heading that the leader follows (rad)" if turning else ""
     return _meaning(follower) + more
 
@@ -379,7 +381,7 @@ def _is_own(follower: Law) -> bool:
 
 def message_words(own: OwnLaw) -> list[str]:
     """Return the names of the numbers of a message, none of which is that of a physical input."""
-    model, follower, names = own.loop.model, own.loop.follower, list(own.forward_names)
+    model, follower, names = own.loop.model, own.loop.laws.follower, list(own.forward_names)
     heading = names[len(names) - follower.turning :]
     names = names[: len(names) - follower.turning]
     if isinstance(follower, FlatLaw):
@@ -393,19 +395,18 @@ def message_words(own: OwnLaw) -> list[str]:
 
 def move_function(motion: PlantStep) -> LawFunction:
     """Return `move`, a step of an agent's own motion; else `Unsupported`, with the user's line."""
-    plant, lags = motion.plant, motion.motors is not None and motion.motors.lag is not None
+    plant, remembers = motion.plant, motion.motors.remembers
     n, m = len(plant.state_names), len(plant.input_names)
 
     def move(
         x: jax.Array, u: jax.Array, memory: jax.Array, push: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        u = motion.deliver(u)
-        if motion.motors is None:
-            return motion.move(x, u, push, None), memory
-        x, after = motion.follow(x, u, push, None, MotionState(memory if lags else None))
-        return x, memory if after.actuators is None else after.actuators
+        field = motion.pushed(push)
+        own = memory if remembers else ()
+        x, after = motion.motors.integrate(field, own, x, motion.deliver(u), motion)
+        return x, after if remembers else memory
 
-    sizes = {"x": n, "u": m, "memory": m if lags else 0, "push": n}
+    sizes = {"x": n, "u": m, "memory": m if remembers else 0, "push": n}
     graph = ScalarGraph()
     leaves = [leaves_of(graph, name, range(size)) for name, size in sizes.items()]
     x, memory = (nodes(graph, part) for part in lower(move, graph, leaves))
@@ -415,9 +416,6 @@ def move_function(motion: PlantStep) -> LawFunction:
 
 def motions_of(motion: PlantStep, agents: int, substeps: int) -> list[PlantStep]:
     """Return the motion of each agent in a part of a step."""
-    rows = [motion] * agents
-    if motion.rows is not None:
-        rows = [
-            motion.of_row(jax.tree.map(lambda a, k=k: a[k], motion.rows)) for k in range(agents)
-        ]
-    return [dataclasses.replace(each, dt=motion.dt / substeps) for each in rows]
+    rows = (jax.tree.map(lambda a, k=k: a[k], motion.rows) for k in range(agents))
+    each = map(motion.of_row, rows)
+    return [dataclasses.replace(one, dt=motion.dt / substeps) for one in each]

@@ -25,9 +25,10 @@ from echelon.laws.law import Law, LocalView
 from echelon.simulation.optimal.formation_plan import plan_formation
 from echelon.simulation.optimal.horizon import MPC, Answer, Course, Horizon
 from echelon.simulation.optimal.objectives import TrackingOptions, grid
+from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.drive import Chunk, Controller, Information, Problem, Stepper, Stopped
-from echelon.simulation.step.loop import LoopState, assemble
 from echelon.simulation.step.meter import Sums, on_host
+from echelon.simulation.step.records import LawMemories, LoopState
 from echelon.simulation.step.sequence import advance, begin
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats, solver_stats
@@ -355,9 +356,8 @@ class HostStepper(Stepper):
         desired = jnp.asarray(self.pilot(chunk.step, start))
         desired = desired.astype(states.dtype)
         self._queried = chunk.step
-        chunk.now = chunk.now._replace(
-            leader_memory=desired[self.loop.leaders], follower_memory=desired[self.loop.followers]
-        )
+        laws = LawMemories(*(desired[agents] for _, agents in self.loop.laws.groups))
+        chunk.now = chunk.now._replace(memory=chunk.now.memory._replace(laws=laws))
 
     def _take(self, chunk: "_HeldChunk", count: int, store: bool = False) -> None:
         # As an array, so that another count does not compile again.

@@ -3,9 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
+from echelon.simulation.step.records import Mask
 from echelon.simulation.step.settings import Settings
 
 PAIRED = 32
@@ -30,7 +31,7 @@ def finds_pairs(model: ControlAffine, agents: int, settings: Settings) -> bool:
 
 
 def closest_two(
-    step: jax.Array, places: Float[jax.Array, "N d"], here: Bool[jax.Array, " N"] | None
+    step: jax.Array, places: Float[jax.Array, "N d"], here: Mask
 ) -> dict[str, jax.Array]:
     """Return the terms `closest` and `met` of a step, of the agents that are present."""
     i, j = np.triu_indices(len(places), 1)
@@ -38,7 +39,7 @@ def closest_two(
     places = jax.lax.stop_gradient(places)
     squares = ((places[i] - places[j]) ** 2).sum(axis=1)
     known = ~jnp.isnan(squares)
-    known = known if here is None else known & here[i] & here[j]
+    known = known if here is True else known & here[i] & here[j]
     squares = jnp.where(known, squares, jnp.inf)
     k = squares.argmin()
     met = jnp.stack([step, jnp.asarray(i)[k], jnp.asarray(j)[k]])

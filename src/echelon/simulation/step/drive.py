@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # a gain is passed on to callers, and never read here
     from echelon.synthesis.gains.gain import Gain
 
 LoopState: TypeAlias = PyTree
-"""All that changes during a run, as `loop.LoopState`."""
+"""All that changes during a run, as `records.LoopState`."""
 
 
 class Problem(NamedTuple):
@@ -47,7 +47,7 @@ class Problem(NamedTuple):
         settings: horizon, step and the like.
         states: (N, n) at the beginning.
         channel: what the network does to messages; None for the ideal network.
-        sensors: of the agents' own states; None for exact ones.
+        sensors: of the agents' own states.
         leadership: who takes the lead after the leader; None for nobody.
     """
 
@@ -59,7 +59,7 @@ class Problem(NamedTuple):
     settings: Settings
     states: Array
     channel: Channel | None = None
-    sensors: Sensors | None = None
+    sensors: Sensors = Sensors()
     leadership: Leadership | None = None
 
 

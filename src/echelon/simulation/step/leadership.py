@@ -9,19 +9,22 @@ left.
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, final
+from typing import final
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from echelon.agents.network.channel import Network
+from echelon.agents.network.channel import NEVER, Network
+from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError, is_number
-from echelon.core.types import Array
+from echelon.core.types import Array, PyTree
+from echelon.simulation.step.records import Clock, LeaderPackets, Mask, as_array
 
-_NO_HEIR = -1
+_NO_BACKUP = -1
 _ROUNDED = 1e-9
 """s; what differences of times leave."""
 
@@ -64,28 +67,117 @@ class Leadership:
             )
 
 
-class Failover(NamedTuple):
-    """The backup leaders of a run.
+NOBODY = 2**30
+"""The leader of an agent that has no packet, and more hops than any agent has."""
+
+
+class FixedLeaders(eqx.Module):
+    """Who leads: the leaders, always.
+
+    Attributes:
+        first: (N,) who leads at the start.
+    """
+
+    first: Array
+    changes = False
+
+    def leads(self, packet: PyTree, number: jax.Array) -> Bool[jax.Array, " N"]:
+        """Return which of the agents lead that have these packets."""
+        return jnp.asarray(self.first)
+
+    def terms(self, agents: int) -> PyTree:
+        """Return the terms of packets before the first one; () without terms."""
+        return ()
+
+    def elect(
+        self, packet: LeaderPackets, number: jax.Array, clock: Clock, since: jax.Array, here: Mask
+    ) -> LeaderPackets:
+        """Return the packets after those who hear of no leader took the lead."""
+        return packet
+
+    def contest(
+        self, own: LeaderPackets, others: LeaderPackets, valid: jax.Array, links: Exchange
+    ) -> tuple[PyTree, jax.Array, jax.Array]:
+        """Return the terms, which of others' packets count (K,), and whom each follows so far."""
+        return (), valid, own.leader
+
+    def no_packets(self, number: jax.Array, content: Float[jax.Array, "N p"]) -> LeaderPackets:
+        """Return the packets before the first one, with an example of their content."""
+        leader = jnp.where(jnp.asarray(self.first), number, NOBODY).astype(jnp.int32)
+        never = jnp.full(len(leader), NEVER, jnp.int32)
+        return LeaderPackets(leader, never, content, self.terms(len(leader)))
+
+    def newest(
+        self, own: LeaderPackets, others: LeaderPackets, new: jax.Array, links: Exchange
+    ) -> LeaderPackets:
+        """Return the packet of each agent: of the leader with the lowest number, the newest one.
+
+        Of several terms the highest counts.
+
+        Args:
+            own: of the agents.
+            others: (K, ...) that messages contain.
+            new: (K,) which of these arrived.
+            links: along which they came.
+        """
+        count, receivers = len(own.stamp), jnp.asarray(links.receivers)
+        valid = new & (others.stamp != NEVER)
+        term, valid, current = self.contest(own, others, valid, links)
+        leaders = jnp.where(valid, others.leader, NOBODY)
+        leader = jnp.minimum(current, links.least(leaders, count))
+        of_it = valid & (leaders == leader[receivers])
+        last = jnp.where(current == leader, own.stamp, NEVER)
+        stamp = links.most(jnp.where(of_it, others.stamp, NEVER), count)
+        stamp = jnp.maximum(last, stamp)
+        latest = of_it & (others.stamp == stamp[receivers])
+        places = jnp.where(latest, jnp.arange(len(receivers)), NEVER)
+        place = links.most(places, count)
+        better = (place >= 0) & (stamp > last)
+        content = jnp.where(better[:, None], others.content[place], own.content)
+        return LeaderPackets(leader, stamp, content, term)
+
+
+@final
+class Failover(FixedLeaders):
+    """Who leads: whom the packet of the highest term names. Backup leaders take the lead in turn.
 
     Attributes:
         rank: (N,) the place of each agent among the backup leaders; -1 of no backup leader.
-        first: (N,) who leads at the start.
         timeout: s.
     """
 
-    rank: Int[np.ndarray, " N"]
-    first: Bool[np.ndarray, " N"]
+    rank: Array
     timeout: Array
+    changes = True
 
-    @classmethod
-    def of(cls, graph: Graph, leadership: Leadership | None) -> "Failover | None":
-        """Return the backup leaders of a run; None without any."""
-        if leadership is None:
-            return None
-        rank = np.full(graph.agents, _NO_HEIR, np.int32)
-        rank[list(leadership.backups)] = np.arange(len(leadership.backups))
-        first = np.isin(np.arange(graph.agents), graph.leaders)
-        return cls(rank, first, np.asarray(float(leadership.timeout)))
+    def leads(self, packet: PyTree, number: jax.Array) -> Bool[jax.Array, " N"]:
+        """Return which of the agents lead that have these packets."""
+        return packet.leader == number
+
+    def terms(self, agents: int) -> PyTree:
+        """Return the terms of packets before the first one."""
+        return jnp.zeros(agents, jnp.int32)
+
+    def elect(
+        self, packet: LeaderPackets, number: jax.Array, clock: Clock, since: jax.Array, here: Mask
+    ) -> LeaderPackets:
+        """Return the packets after those who hear of no leader took the lead."""
+        waited = jnp.minimum(clock.age(packet.stamp), clock.waited(since))
+        silent = self.silent(number, packet.leader, waited)
+        silent = silent & as_array(here, len(number))
+        leader = jnp.where(silent, number, packet.leader)
+        stamp = jnp.where(silent, clock.now, packet.stamp)
+        return packet._replace(leader=leader, stamp=stamp, term=packet.term + silent)
+
+    def contest(
+        self, own: LeaderPackets, others: LeaderPackets, valid: jax.Array, links: Exchange
+    ) -> tuple[PyTree, jax.Array, jax.Array]:
+        """Return the terms, which of others' packets count (K,), and whom each follows so far."""
+        terms = jnp.where(valid, others.term, 0)
+        term = jnp.maximum(own.term, links.most(terms, len(own.stamp)))
+        valid = valid & (others.term == term[jnp.asarray(links.receivers)])
+        # Whoever led in an earlier term does so no more.
+        return term, valid, jnp.where(own.term == term, own.leader, NOBODY)
 
     def silent(
         self,
@@ -97,4 +189,14 @@ class Failover(NamedTuple):
         rank = jnp.asarray(self.rank)[number]
         # Beyond rounding, so that all see the same step.
         late = jnp.asarray(waited) > jnp.asarray(self.timeout) * (rank + 1) + _ROUNDED
-        return (rank != _NO_HEIR) & (jnp.asarray(leader) != number) & late
+        return (rank != _NO_BACKUP) & (jnp.asarray(leader) != number) & late
+
+
+def leaders_of(graph: Graph, leadership: Leadership | None) -> FixedLeaders:
+    """Return who leads in a run."""
+    first = np.isin(np.arange(graph.agents), graph.leaders)
+    if leadership is None:
+        return FixedLeaders(first)
+    rank = np.full(graph.agents, _NO_BACKUP, np.int32)
+    rank[list(leadership.backups)] = np.arange(len(leadership.backups))
+    return Failover(first, rank, np.asarray(float(leadership.timeout)))

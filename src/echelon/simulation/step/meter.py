@@ -19,6 +19,7 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.core.types import Array, Input, Inputs, Output, PyTree, State, States
 from echelon.simulation.step.distances import finds_pairs, spacing_error
+from echelon.simulation.step.records import Mask
 from echelon.simulation.step.settings import Settings
 
 Total: TypeAlias = PyTree
@@ -282,7 +283,7 @@ class RunStatistics(eqx.Module):
         step: jax.Array,
         states: States,
         active: Float[jax.Array, " N"],
-        here: Bool[jax.Array, " N"] | None = None,
+        here: Mask = True,
     ) -> dict[str, jax.Array]:
         """Return the terms `separation` and `avoidance` of a step, where agents keep apart.
 
@@ -292,7 +293,7 @@ class RunStatistics(eqx.Module):
         places = states[:, np.array(self.measured)] * jnp.asarray(self.scales[None], states.dtype)
         squares = ((places[:, None] - places[None]) ** 2).sum(axis=2)
         others = jnp.where(jnp.eye(len(states), dtype=bool), jnp.inf, squares)
-        others = others if here is None else jnp.where(here[None], others, jnp.inf)
+        others = others if here is True else jnp.where(here[None], others, jnp.inf)
         return {
             "separation": nothing.separation.at[:, at].set(jnp.sqrt(others.min(axis=1))),
             "avoidance": nothing.avoidance.at[:, at].set(active),

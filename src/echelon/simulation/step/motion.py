@@ -1,36 +1,153 @@
-"""How agents move: the plant under held inputs, its actuators and its disturbances."""
+"""How agents move: the plant under held inputs, its motors and its weather."""
 
+import abc
 import dataclasses
-from typing import NamedTuple, Self, TypeAlias, final
+from typing import Self, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.world.actuator import MotorArrays
-from echelon.agents.world.disturbance import Wind, disturbed, draw
+from echelon.agents.world.disturbance import Wind
 from echelon.agents.world.world import World
 from echelon.core.errors import SimulationError
-from echelon.core.numerics import INTEGRATORS
+from echelon.core.numerics import INTEGRATORS, Field
 from echelon.core.types import Input, Inputs, PyTree, State, States
 from echelon.simulation.step.settings import Settings
 
-Row: TypeAlias = tuple[PyTree, PyTree]
-"""The parameters of one agent's plant and motors that differ from those of others."""
+# ---- limits --------------------------------------------------------------------------------------
 
 
-class MotionState(NamedTuple):
-    """What the plants remember besides their states; parts that they lack are None.
+class Limited(eqx.Module):
+    """Actuators with the limits of the plant."""
 
-    Attributes:
-        actuators: (N, m) the inputs that act at the beginning of a step.
-        gusts: (N, n) the correlated wind of the step before.
-    """
+    def limit(self, plant: ControlAffine, u: Input) -> Input:
+        """Return what limits leave of an input (m,)."""
+        return plant.limit(u)
 
-    actuators: Inputs | None = None
-    gusts: States | None = None
+
+@final
+class Unlimited(Limited):
+    """Actuators without limits."""
+
+    def limit(self, plant: ControlAffine, u: Input) -> Input:
+        """Return the input."""
+        return u
+
+
+# ---- motors --------------------------------------------------------------------------------------
+
+
+class Motors(eqx.Module):
+    """When an input acts."""
+
+    # Whether an input acts as it is commanded, and whether its motors remember the one before.
+    at_once, remembers = False, False
+
+    @property
+    def memoryless(self) -> "Motors":
+        """The motors that begin each step at their command."""
+        return self
+
+    @abc.abstractmethod
+    def begin(self, trim: Input) -> PyTree:
+        """Return what the motors of an agent remember that is at rest."""
+
+    @abc.abstractmethod
+    def integrate(
+        self, field: Field, memory: PyTree, x: State, u: Input, plant: "PlantStep"
+    ) -> tuple[State, PyTree]:
+        """Return the state (n,) one dt later under a field (x, u) -> xdot, and the memory."""
+
+
+@final
+class ActAtOnce(Motors):
+    """Inputs act at once, and are held."""
+
+    at_once = True
+
+    def begin(self, trim: Input) -> PyTree:
+        """Return nothing."""
+        return ()
+
+    def integrate(
+        self, field: Field, memory: PyTree, x: State, u: Input, plant: "PlantStep"
+    ) -> tuple[State, PyTree]:
+        """Return the state one dt later."""
+        # With the input held, as a digital controller holds it: the order of the method stays.
+        integrate = INTEGRATORS[plant.integrator]
+        for _ in range(plant.substeps):
+            x = integrate(field, x, u, plant.dt / plant.substeps)
+        return x, memory
+
+
+class LaggingMotors(Motors):
+    """Motors that follow their commands with a lag; they remember the input that acts."""
+
+    arrays: MotorArrays
+    remembers = True
+
+    @property
+    def memoryless(self) -> Motors:
+        """The motors that begin each step at their command."""
+        return SteppedMotors(self.arrays)
+
+    def begin(self, trim: Input) -> PyTree:
+        """Return the trim: motors begin where agents would be at rest."""
+        return trim
+
+    def integrate(
+        self, field: Field, memory: PyTree, x: State, u: Input, plant: "PlantStep"
+    ) -> tuple[State, PyTree]:
+        """Return the state one dt later, and the input that then acts."""
+        command = self.arrays.command(u)
+        start = self._start(memory, command)
+
+        # Time as a state, of which the stages of a Runge-Kutta method are exact: its order stays.
+        def timed(at: jax.Array, _: Input) -> jax.Array:
+            return jnp.append(field(at[:-1], self.arrays.after(start, command, at[-1])), 1.0)
+
+        at, integrate = jnp.append(x, 0.0), INTEGRATORS[plant.integrator]
+        for _ in range(plant.substeps):
+            at = integrate(timed, at, u, plant.dt / plant.substeps)
+        return at[:-1], self._after(start, command, plant.dt)
+
+    def _start(self, memory: PyTree, command: Input) -> Input:
+        return memory
+
+    def _after(self, start: Input, command: Input, dt: float) -> PyTree:
+        return self.arrays.after(start, command, dt)
+
+
+@final
+class SteppedMotors(LaggingMotors):
+    """Motors with levels or a least thrust, and no lag: they remember nothing."""
+
+    remembers = False
+
+    def begin(self, trim: Input) -> PyTree:
+        """Return nothing."""
+        return ()
+
+    def _start(self, memory: PyTree, command: Input) -> Input:
+        return command
+
+    def _after(self, start: Input, command: Input, dt: float) -> PyTree:
+        return ()
+
+
+def motors_of(arrays: MotorArrays | None) -> Motors:
+    """Return the member for actuators as arrays, None for ideal ones."""
+    if arrays is None:
+        return ActAtOnce()
+    return SteppedMotors(arrays) if arrays.lag is None else LaggingMotors(arrays)
+
+
+# ---- the plant -----------------------------------------------------------------------------------
 
 
 @final
@@ -39,144 +156,132 @@ class PlantStep(eqx.Module):
 
     Attributes:
         plant: what moves.
-        wind: its disturbance, ready to be drawn; None without one.
         dt: step, s.
         integrator: its name.
-        limits: whether the actuators' limits act.
+        limiter: what limits leave of an input.
         substeps: of the integrator in a step.
-        motors: the actuators; None for ideal ones.
+        motors: when an input acts.
+        weather: what acts on it besides, part after part; () in still air.
         rows: the parameters in which agents differ, as `plant` and `motors` with rows (N, ...) and
-            None for all others; None where all are alike.
+            None for all others; () where all are alike.
     """
 
     plant: ControlAffine
-    wind: Wind | None
     dt: float = eqx.field(static=True)
     integrator: str = eqx.field(static=True)
-    limits: bool = eqx.field(static=True)
+    limiter: Limited = Limited()
     substeps: int = eqx.field(static=True, default=1)
-    motors: MotorArrays | None = None
-    rows: Row | None = None
+    motors: Motors = ActAtOnce()
+    weather: tuple[Wind, ...] = ()
+    rows: PyTree = ()
 
     @classmethod
     def of(cls, model: ControlAffine, world: World, settings: Settings, agents: int = 0) -> Self:
         """Return the motion in a world; `SimulationError` if the integrator allows no lag."""
         # Limits and disturbance are the plant's: its motors may differ from those that laws know.
         plant, disturbance = world.plant_for(model), world.disturbance
-        wind = disturbance and disturbance.prepared(plant, settings.dt, settings.seed)
-        motors = world.actuator and world.actuator.prepared(plant)
-        if settings.integrator == "printed" and (settings.substeps > 1 or motors is not None):
+        motors = motors_of(world.actuator and world.actuator.prepared(plant))
+        if settings.integrator == "printed" and (settings.substeps > 1 or not motors.at_once):
             raise SimulationError(
                 "`integrator` is `printed`, which has no time: neither `substeps` nor an actuator "
                 "has a meaning; use `rk4` or `euler`."
             )
-        rows = None
+        rows: PyTree = ()
         if world.plants:
             plants = [world.plants.get(k, plant) for k in range(agents)]
-            motors_of = [world.actuator and world.actuator.prepared(x) for x in plants]
-            rows = _varied(plants), _varied(motors_of)
+            each = [motors_of(world.actuator and world.actuator.prepared(x)) for x in plants]
+            rows = _varied(plants), _varied(each)
         return cls(
             plant,
-            wind,
             settings.dt,
             settings.integrator,
-            settings.limits,
+            Limited() if settings.limits else Unlimited(),
             settings.substeps,
             motors,
+            (disturbance.prepared(plant, settings.dt, settings.seed),) if disturbance else (),
             rows,
         )
 
     @property
     def ideal(self) -> bool:
         """Whether inputs act at once, on agents that are alike, with independent draws of wind."""
-        windy = self.wind is not None and (self.wind.fade is not None or self.wind.air is not None)
-        return self.motors is None and self.rows is None and self.substeps == 1 and not windy
+        windy = any(part.remembers or part.moves for part in self.weather)
+        return self.motors.at_once and self.rows == () and self.substeps == 1 and not windy
 
-    def of_row(self, row: Row | None) -> "PlantStep":
+    def of_row(self, row: PyTree) -> "PlantStep":
         """Return the motion of one agent, of which `row` has the parameters of its own."""
-        if row is None:
+        if row == ():
             return self
         plant, motors = eqx.combine(row, (self.plant, self.motors))
-        return dataclasses.replace(self, plant=plant, motors=motors, rows=None)
+        return dataclasses.replace(self, plant=plant, motors=motors, rows=())
 
     def deliver(self, u: Input) -> Input:
         """Return what the actuators make of one agent's desired physical input (m,)."""
-        return self.plant.limit(u) if self.limits else u
+        return self.limiter.limit(self.plant, u)
 
-    def begin(self, states: States) -> MotionState:
-        """Return what the plants remember at the beginning of a run."""
-        gusty = self.wind is not None and self.wind.fade is not None
-        # Actuators begin where the agents would be at rest.
-        trim = jnp.asarray(np.asarray(self.plant.trim[1], float), states.dtype)
-        lagging = self.motors is not None and self.motors.lag is not None
-        return MotionState(
-            jnp.tile(trim, (len(states), 1)) if lagging else None,
-            jnp.zeros_like(states) if gusty else None,
-        )
+    def begin(self, x: State) -> PyTree:
+        """Return what the plant of an agent at x remembers: of its weather, and of its motors."""
+        trim = jnp.asarray(np.asarray(self.plant.trim[1], float), x.dtype)
+        return tuple(part.begin(x) for part in self.weather), self.motors.begin(trim)
 
-    def advance(
-        self, states: States, inputs: Inputs, step: jax.Array, memory: MotionState = MotionState()
-    ) -> tuple[States, MotionState]:
-        """Return states (N, n) one dt later, and memory; inputs (N, m) and disturbance are held."""
+    def field(self, memory: PyTree, step: jax.Array, number: jax.Array) -> tuple[Field, PyTree]:
+        """Return (x, u) -> xdot of an agent of a number during a step, and its weather's memory."""
+        field, after = self.plant.velocity, list[PyTree]()
+        for part, own in zip(self.weather, memory, strict=True):
+            field, own = part.on(field, own, step, number)
+            after.append(own)
+        return field, tuple(after)
 
-        # Integrated with the input held, as a digital controller holds it: the order of the method
-        # stays, since u and the wind are constant within a step.
-        def one(
-            x: State,
-            u: Input,
-            agent: jax.Array,
-            row: Row | None,
-            own: MotionState,
-        ) -> tuple[State, MotionState]:
-            motion = self.of_row(row)
-            push, noise = draw(self.wind, step, agent)
-            if own.gusts is not None and self.wind is not None:
-                gust = self.wind.gusts(own.gusts, step, agent)
-                own, push = own._replace(gusts=gust), gust if push is None else push + gust
-            if motion.motors is None:
-                return motion.move(x, u, push, noise), own
-            return motion.follow(x, u, push, noise, own)
+    def pushed(self, push: State, noise: Input | None = None) -> Field:
+        """Return the field under a push on the rate (n,) and noise on the input (m,), or None."""
+        field = self.plant.velocity
+        if not self.weather:
+            return lambda x, u: field(x, u) + push
+        for part in self.weather:
+            field = part.under(field, push, noise)
+        return field
 
-        return jax.vmap(one)(states, inputs, jnp.arange(len(states)), self.rows, memory)
-
-    def move(self, x: State, u: Input, push: State | None, noise: Input | None) -> State:
-        """Return the state of one agent one dt later, under what is held over it.
+    def move(
+        self, memory: PyTree, x: State, u: Input, step: jax.Array, number: jax.Array
+    ) -> tuple[State, PyTree]:
+        """Return the state of one agent one dt later, and what its plant then remembers.
 
         Args:
+            memory: of its plant.
             x: its state (n,).
-            u: its delivered input (m,).
-            push: what wind adds to its rate (n,), or None.
-            noise: what is added to its input (m,), or None.
+            u: its delivered input (m,), which is held, as the weather is.
+            step: the number of the step.
+            number: of the agent.
         """
-        field = disturbed(self.plant, push, noise, None if self.wind is None else self.wind.air)
-        integrate = INTEGRATORS[self.integrator]
-        for _ in range(self.substeps):
-            x = integrate(field, x, u, self.dt / self.substeps)
-        return x
+        field, weather = self.field(memory[0], step, number)
+        x, motors = self.motors.integrate(field, memory[1], x, u, self)
+        return x, (weather, motors)
 
-    def follow(
-        self, x: State, u: Input, push: State | None, noise: Input | None, own: MotionState
-    ) -> tuple[State, MotionState]:
-        """Return the state of one agent one dt later, whose actuators follow its input."""
-        motors = self.motors
-        assert motors is not None
-        command = motors.command(u)
-        start = command if own.actuators is None else own.actuators
-        field = disturbed(self.plant, push, noise, None if self.wind is None else self.wind.air)
+    def advance(
+        self,
+        memory: PyTree,
+        states: States,
+        inputs: Inputs,
+        step: jax.Array,
+        numbers: Int[jax.Array, " N"],
+    ) -> tuple[States, PyTree]:
+        """Return the states (N, n) of all agents one dt later, and what their plants remember."""
 
-        # Time as a state, of which the stages of a Runge-Kutta method are exact: its order stays.
-        def timed(at: jax.Array, _: Input) -> jax.Array:
-            return jnp.append(field(at[:-1], motors.after(start, command, at[-1])), 1.0)
+        def one(
+            own: PyTree, x: State, u: Input, number: jax.Array, row: PyTree
+        ) -> tuple[State, PyTree]:
+            return self.of_row(row).move(own, x, u, step, number)
 
-        at, integrate = jnp.append(x, 0.0), INTEGRATORS[self.integrator]
-        for _ in range(self.substeps):
-            at = integrate(timed, at, u, self.dt / self.substeps)
-        if own.actuators is not None:
-            own = own._replace(actuators=motors.after(start, command, self.dt))
-        return at[:-1], own
+        return jax.vmap(one)(memory, states, inputs, numbers, self.rows)
+
+    @property
+    def memoryless(self) -> "PlantStep":
+        """The motion without gusts, whose motors begin each step at their command."""
+        weather = tuple(part.memoryless for part in self.weather)
+        return dataclasses.replace(self, motors=self.motors.memoryless, weather=weather)
 
 
-def _varied(modules: list[ControlAffine] | list[MotorArrays | None]) -> PyTree:
+def _varied(modules: list[ControlAffine] | list[Motors]) -> PyTree:
     """Return the leaves in which modules of one structure differ, as rows; None for the others."""
     flat = [jax.tree.leaves(module) for module in modules]
     tree = jax.tree.structure(modules[0])

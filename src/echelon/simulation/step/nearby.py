@@ -4,19 +4,56 @@ Over a network each sends the points of its hull less where it expects those of 
 hardly change while a message is under way. They are used until newer ones arrive.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from echelon.agents.network.channel import NEVER, InFlight
+from echelon.agents.network.channel import NEVER, Channel, InFlight
 from echelon.agents.network.exchange import Near
-from echelon.core.types import Array, States
+from echelon.core.types import Array, PyTree, Scalar, States
 from echelon.laws.law import Law, Memory
-from echelon.simulation.step.knowledge import Knowledge, Mail
-from echelon.simulation.step.loop import Loop, LoopState, present_at
+from echelon.simulation.step.loop import Loop, Surroundings
+from echelon.simulation.step.meter import Sums
+from echelon.simulation.step.records import (
+    Clock,
+    LawMemories,
+    LoopState,
+    Mask,
+    NetworkEstimate,
+    Own,
+    as_array,
+)
+
+
+@final
+class NobodyNear(Surroundings):
+    """Agents do not keep apart."""
+
+    def begin(self, loop: Loop, states: States, laws: LawMemories) -> PyTree:
+        """Return nothing."""
+        return ()
+
+    def look(
+        self,
+        loop: Loop,
+        memory: PyTree,
+        clock: Clock,
+        own: Own,
+        laws: LawMemories,
+        heard: NetworkEstimate,
+        here: Mask,
+    ) -> tuple[Near | None, PyTree]:
+        """Return nothing."""
+        return None, memory
+
+    def measured(
+        self, loop: Loop, read: Sums, now: LoopState, laws: LawMemories, here: Mask
+    ) -> Sums:
+        """Return the sums."""
+        return read
 
 
 class NeighbourHulls(NamedTuple):
@@ -33,81 +70,121 @@ class NeighbourHulls(NamedTuple):
     points: Float[jax.Array, "K r d"]
 
 
-def begin_sightings(loop: Loop, now: LoopState) -> NeighbourHulls | None:
-    """Return the messages before the first one; None in the ideal network or without `safety`."""
-    if loop.channel is None or loop.follower.safety is None:
-        return None
-    hulls = all_hulls(loop, now)
-    links = len(_links(len(hulls))[0])
-    points = jnp.zeros((links, *hulls.shape[1:]), hulls.dtype)
-    stamp = jnp.full(links, NEVER, jnp.int32)
-    return NeighbourHulls(loop.channel.begin(hulls, links), stamp, points)
+class ExactHulls(Surroundings):
+    """All know the hulls of all others of the same instant."""
+
+    def begin(self, loop: Loop, states: States, laws: LawMemories) -> PyTree:
+        """Return nothing."""
+        return ()
+
+    def look(
+        self,
+        loop: Loop,
+        memory: PyTree,
+        clock: Clock,
+        own: Own,
+        laws: LawMemories,
+        heard: NetworkEstimate,
+        here: Mask,
+    ) -> tuple[Near | None, PyTree]:
+        """Return what each agent knows of all others."""
+        hulls, agents = all_hulls(loop, own.x, laws), loop.agents
+        receivers, senders = _pairs(agents)
+        present = as_array(here, agents)
+        rows = loop, memory, clock, hulls, heard, present
+        hulls, points, known, memory = self._exchanged(*rows)
+        near = Near(hulls[receivers] - points, heard.leads[senders], known)
+        shape = agents, agents - 1
+        return jax.tree.map(lambda part: part.reshape(*shape, *part.shape[1:]), near), memory
+
+    def _exchanged(
+        self,
+        loop: Loop,
+        memory: PyTree,
+        clock: Clock,
+        hulls: Float[jax.Array, "N r d"],
+        heard: NetworkEstimate,
+        here: Bool[jax.Array, " N"],
+    ) -> tuple[jax.Array, jax.Array, jax.Array, PyTree]:
+        """Return own points, others' (K, r, d), whose are known (K,), and the memory."""
+        senders = _pairs(loop.agents)[1]
+        return hulls, hulls[senders], here[senders], memory
+
+    def measured(
+        self, loop: Loop, read: Sums, now: LoopState, laws: LawMemories, here: Mask
+    ) -> Sums:
+        """Return the sums with distances, and with how many others held each agent back."""
+        own, active = loop.laws, jnp.zeros(loop.agents, now.states.dtype)
+        active = active.at[own.followers].set(own.follower.active(laws.follower))
+        if own.backups:
+            active = active.at[own.leaders].set(own.follower.active(laws.leader))
+        return read._replace(**loop.meter.of_slice(now.step, now.states, active, here))
 
 
-def look_around(
-    loop: Loop,
-    now: LoopState,
-    leads: Bool[jax.Array, " N"],
-    knowledge: Knowledge | None,
-    mail: Mail | None,
-) -> tuple[Near | None, NeighbourHulls | None]:
-    """Return what each agent knows of all others (N, N - 1, ..), and the messages after it."""
-    if loop.follower.safety is None:
-        return None, None
-    hulls, agents = all_hulls(loop, now), len(loop.order)
-    receivers, senders = _links(agents)
-    here = present_at(loop, now.step)
-    here = jnp.ones(agents, bool) if here is None else here
-    points, known, seen = hulls[senders], here[senders], None
-    if knowledge is not None and mail is not None:
-        t = now.step.astype(hulls.dtype) * loop.motion.dt
-        rows = hulls, knowledge.leader
-        hulls = jax.vmap(lambda hull, leader: less_expected(loop, t, hull, leader))(*rows)
-        sends = here & (leads | (mail.packet.stamp != NEVER))
-        seen = _exchanged(loop, now, hulls, sends[senders], (receivers, senders))
-        points, known = seen.points, known & (seen.stamp != NEVER)
-    near = Near(hulls[receivers] - points, leads[senders], known)
-    return jax.tree.map(lambda part: part.reshape(agents, agents - 1, *part.shape[1:]), near), seen
+@final
+class LateHulls(ExactHulls):
+    """All know them from messages, less those of the leader where each expects it.
+
+    It remembers these, as `NeighbourHulls`.
+    """
+
+    medium: Channel
+
+    def with_medium(self, medium: Channel) -> Surroundings:
+        """Return the same over another medium."""
+        return LateHulls(medium)
+
+    def begin(self, loop: Loop, states: States, laws: LawMemories) -> PyTree:
+        """Return the messages before the first one."""
+        hulls = all_hulls(loop, states, laws)
+        links = len(_pairs(loop.agents)[0])
+        points = jnp.zeros((links, *hulls.shape[1:]), hulls.dtype)
+        stamp = jnp.full(links, NEVER, jnp.int32)
+        return NeighbourHulls(self.medium.begin(hulls, links), stamp, points)
+
+    def _exchanged(
+        self,
+        loop: Loop,
+        memory: PyTree,
+        clock: Clock,
+        hulls: Float[jax.Array, "N r d"],
+        heard: NetworkEstimate,
+        here: Bool[jax.Array, " N"],
+    ) -> tuple[jax.Array, jax.Array, jax.Array, PyTree]:
+        receivers, senders = _pairs(loop.agents)
+        one = lambda hull, leader: less_expected(loop, clock.t, hull, leader)  # noqa: E731
+        hulls = jax.vmap(one)(hulls, heard.leader)
+        sends = (here & (heard.leads | (heard.packet.stamp != NEVER)))[senders]
+        arrival = self.medium.arrivals(memory.posts, clock.step, memory.stamp)
+        new = arrival.new[:, None, None]
+        points = jnp.where(new, memory.posts.content[arrival.slot, senders], memory.points)
+        posts = self.medium.post(memory.posts, clock.step, hulls, sends, receivers, senders)
+        known = here[senders] & (arrival.stamp != NEVER)
+        return hulls, points, known, NeighbourHulls(posts, arrival.stamp, points)
 
 
 def less_expected(
-    loop: Loop, t: jax.Array, hull: Float[jax.Array, "r d"], expected: Float[jax.Array, " s"]
+    loop: Loop, t: Scalar, hull: Float[jax.Array, "r d"], expected: Float[jax.Array, " s"]
 ) -> Float[jax.Array, "r d"]:
     """Return the points of a hull less those of a leader whose signal is expected somewhere."""
-    there = loop.leader.expected_hull(loop.model, t, expected)
+    there = loop.laws.leader.expected_hull(loop.model, t, expected)
     assert there is not None, "a law with `safety` follows a leader that can be expected"
     return hull - there
 
 
-def _exchanged(
-    loop: Loop,
-    now: LoopState,
-    hulls: Float[jax.Array, "N r d"],
-    sends: Bool[jax.Array, " K"],
-    links: tuple[Array, Array],
-) -> NeighbourHulls:
-    channel, seen = loop.channel, now.world.seen
-    assert channel is not None
-    arrival = channel.arrivals(seen.posts, now.step, seen.stamp)
-    new = arrival.new[:, None, None]
-    points = jnp.where(new, seen.posts.content[arrival.slot, links[1]], seen.points)
-    posts = channel.post(seen.posts, now.step, hulls, sends, *links)
-    return NeighbourHulls(posts, arrival.stamp, points)
-
-
-def all_hulls(loop: Loop, now: LoopState) -> Float[jax.Array, "N r d"]:
+def all_hulls(loop: Loop, states: States, laws: LawMemories) -> Float[jax.Array, "N r d"]:
     """Return the points in whose hulls the positions of all agents stay."""
 
-    def of(law: Law, states: States, memory: Memory) -> jax.Array | None:
-        return jax.vmap(lambda x, own: law.hull(loop.model, x, own))(states, memory)
+    def of(law: Law, states: States, memory: Memory) -> jax.Array:
+        hulls = jax.vmap(lambda x, own: law.hull(loop.model, x, own))(states, memory)
+        assert hulls is not None, "a law with `safety` has hulls"
+        return hulls
 
-    leaders = of(loop.leader, now.states[loop.leaders], now.leader_memory)
-    followers = of(loop.follower, now.states[loop.followers], now.follower_memory)
-    assert leaders is not None and followers is not None, "a law with `safety` has hulls"
-    return jnp.concatenate([leaders, followers])[loop.order]
+    pairs = zip(loop.laws.groups, laws, strict=True)
+    return loop.laws.ordered(*(of(law, states[agents], own) for (law, agents), own in pairs))
 
 
-def _links(agents: int) -> tuple[Array, Array]:
+def _pairs(agents: int) -> tuple[Array, Array]:
     """Return receivers and senders of all pairs, by receiver."""
     receivers, senders = np.nonzero(~np.eye(agents, dtype=bool))
     return receivers, senders

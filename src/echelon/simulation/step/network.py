@@ -1,0 +1,714 @@
+"""What arrives: in the ideal network what is said is heard; on a late one messages take time.
+
+A late network has two parts: the rules by which each agent reads and writes messages, which an
+agent alone has too, and the medium, which is the world's.
+
+An agent predicts the leader from the newest packet of it that reached anybody on the way, and takes
+each neighbour for the prediction plus the deviation that the neighbour last sent. So what is late
+is a deviation, which hardly changes, and never a place, which does.
+"""
+
+import abc
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from echelon.agents.network.channel import NEVER, Channel, InFlight
+from echelon.agents.network.exchange import Difference, Exchange
+from echelon.core.types import Array, PyTree, Scalar, State
+from echelon.core.words import MessageContent, NeighbourChoice, Prediction
+from echelon.laws.law import Expected, LocalView, Memory
+from echelon.simulation.step.leadership import NOBODY, FixedLeaders
+from echelon.simulation.step.loop import Loop, Network
+from echelon.simulation.step.records import (
+    AgentOutput,
+    Clock,
+    Known,
+    LeaderPackets,
+    LeaderSpeech,
+    Mask,
+    Messages,
+    NetworkEstimate,
+    Own,
+)
+
+HOP_LIFE = 10
+"""Hop counts are used for this many times `forget`, so that losses do not change them."""
+
+_CARRIED_FULLY, _SLOWING = 0.4, 2.0
+"""s, for which a leader without a plan is taken to move on as it did, and the rate, 1/s, at which
+its motion slows down afterwards."""
+
+
+# ---- the ideal network ---------------------------------------------------------------------------
+
+
+class IdealNetwork(Network):
+    """What is said is heard in the same step."""
+
+    def begin(self, loop: Loop, said: Float[jax.Array, "N s"], forward: int) -> PyTree:
+        """Return nothing."""
+        return ()
+
+    def receive(
+        self,
+        loop: Loop,
+        memory: PyTree,
+        clock: Clock,
+        own: Own,
+        said: Float[jax.Array, "N s"],
+        links: Exchange,
+        here: Mask,
+    ) -> tuple[NetworkEstimate, PyTree]:
+        """Return the disagreement of the same step."""
+        z = links(said, links.along_edges(said), loop.laws.speech.difference(loop.model))
+        return NetworkEstimate(z, self.leadership.leads((), own.number)), memory
+
+    def send(self, loop: Loop, memory: PyTree, known: Known, speech: LeaderSpeech) -> PyTree:
+        """Return the memory as it is."""
+        return memory
+
+
+@final
+class IdealWithBackups(IdealNetwork):
+    """The same, where packets of leaders reach all agents at once; it remembers each agent's."""
+
+    def begin(self, loop: Loop, said: Float[jax.Array, "N s"], forward: int) -> PyTree:
+        """Return the packets before the first one."""
+        content = jnp.zeros((len(said), forward), said.dtype)
+        return self.leadership.no_packets(jnp.asarray(loop.laws.numbers), content)
+
+    def receive(
+        self,
+        loop: Loop,
+        memory: PyTree,
+        clock: Clock,
+        own: Own,
+        said: Float[jax.Array, "N s"],
+        links: Exchange,
+        here: Mask,
+    ) -> tuple[NetworkEstimate, PyTree]:
+        """Return the disagreement of the same step, and the packets after who took the lead."""
+        since = loop.roster.since(clock.step)
+        memory = self.leadership.elect(memory, own.number, clock, since, here)
+        z = links(said, links.along_edges(said), loop.laws.speech.difference(loop.model))
+        return NetworkEstimate(z, self.leadership.leads(memory, own.number)), memory
+
+
+# ---- where a leader is expected: what it says of itself, and what others make of it --------------
+
+
+class LeaderPrediction(eqx.Module):
+    """What a leader says of itself, and where others expect it."""
+
+    @abc.abstractmethod
+    def size(self, s: int, k: int, m: int) -> int:
+        """Return how many numbers it says, for signals (s,), a feed-forward (k,), inputs (m,)."""
+
+    @abc.abstractmethod
+    def content(
+        self,
+        loop: Loop,
+        t: Scalar,
+        x: State,
+        offset: State,
+        memory: Memory,
+        signal: Float[jax.Array, " s"],
+        output: AgentOutput,
+    ) -> Float[jax.Array, " p"]:
+        """Return what a leader says of itself, with its memory before this step."""
+
+    def expected(
+        self, loop: Loop, s: int, t: Scalar, content: Float[jax.Array, " p"], age: Scalar
+    ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
+        """Return the signal (s,) and the feed-forward of a leader, by its packet of an age (s)."""
+        raise NotImplementedError
+
+
+@final
+class PlanPrediction(LeaderPrediction):
+    """All know the leader's plan; it says its deviation from it."""
+
+    def size(self, s: int, k: int, m: int) -> int:
+        """Return that of a signal."""
+        return s
+
+    def content(
+        self,
+        loop: Loop,
+        t: Scalar,
+        x: State,
+        offset: State,
+        memory: Memory,
+        signal: Float[jax.Array, " s"],
+        output: AgentOutput,
+    ) -> Float[jax.Array, " p"]:
+        """Return the deviation."""
+        return _deviation(loop, t, x, offset, memory)
+
+    def expected(
+        self, loop: Loop, s: int, t: Scalar, content: Float[jax.Array, " p"], age: Scalar
+    ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
+        """Return where the plan and the deviation put it, and what it would send there."""
+        law, model = loop.laws.leader, loop.model
+        expected = law.expected(model, t, content, age, loop.motion.dt)
+        assert isinstance(expected, Expected), "a channel with a preview has a leader with a plan"
+        x = expected.signal
+        if expected.feedforward is not None:
+            return x, expected.feedforward
+        # What the leader's law would do there, alone.
+        silence = jnp.zeros(len(model.input_names), x.dtype)
+        view = LocalView(t, x, jnp.zeros_like(x), jnp.zeros_like(x), silence, loop.motion.dt)
+        rows = model, loop.motion, law, view, law.begin(model, x), True
+        return x, loop.laws.act(*rows).message
+
+
+class PacketPrediction(LeaderPrediction):
+    """All carry on its last motion by the model; it says its signal, feed-forward and input."""
+
+    def size(self, s: int, k: int, m: int) -> int:
+        """Return that of the three."""
+        return s + k + m
+
+    def content(
+        self,
+        loop: Loop,
+        t: Scalar,
+        x: State,
+        offset: State,
+        memory: Memory,
+        signal: Float[jax.Array, " s"],
+        output: AgentOutput,
+    ) -> Float[jax.Array, " p"]:
+        """Return the three."""
+        return jnp.concatenate([signal, output.message, output.input])
+
+    def expected(
+        self, loop: Loop, s: int, t: Scalar, content: Float[jax.Array, " p"], age: Scalar
+    ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
+        """Return where its motion carries it."""
+        signal, forward, u = parts_of(loop, s, content)
+        moved = loop.laws.follower.carried(loop.model, signal, forward, u, carried_time(age))
+        return moved, forward
+
+
+@final
+class SlopedPacketPrediction(PacketPrediction):
+    """The same, and how its feed-forward changes: with backups it is carried on for longer."""
+
+    def size(self, s: int, k: int, m: int) -> int:
+        """Return that of the four."""
+        return s + 2 * k + m
+
+    def content(
+        self,
+        loop: Loop,
+        t: Scalar,
+        x: State,
+        offset: State,
+        memory: Memory,
+        signal: Float[jax.Array, " s"],
+        output: AgentOutput,
+    ) -> Float[jax.Array, " p"]:
+        """Return the four; the slope is that of the plan."""
+        deviation, dt = _deviation(loop, t, x, offset, memory), loop.motion.dt
+        rows = loop.model, t + dt, deviation, jnp.asarray(dt, t.dtype), dt
+        expected = loop.laws.leader.expected(*rows)
+        slope = jnp.zeros_like(output.message)
+        if isinstance(expected, Expected) and expected.feedforward is not None:
+            slope = (expected.feedforward - output.message) / dt
+        three = super().content(loop, t, x, offset, memory, signal, output)
+        return jnp.concatenate([three, slope])
+
+    def expected(
+        self, loop: Loop, s: int, t: Scalar, content: Float[jax.Array, " p"], age: Scalar
+    ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
+        """Return where its motion carries it, with a feed-forward that changes."""
+        time = carried_time(age)
+        k = (len(content) - s - len(loop.model.input_names)) // 2
+        content, slope = content[:-k], content[-k:]
+        signal, forward, u = parts_of(loop, s, content)
+        mean = forward + 0.5 * time * slope
+        moved = loop.laws.follower.carried(loop.model, signal, mean, u, time)
+        return moved, forward + time * slope
+
+
+@final
+class NoPrediction(LeaderPrediction):
+    """Nobody expects it anywhere; it says its feed-forward alone."""
+
+    def size(self, s: int, k: int, m: int) -> int:
+        """Return that of the feed-forward."""
+        return k
+
+    def content(
+        self,
+        loop: Loop,
+        t: Scalar,
+        x: State,
+        offset: State,
+        memory: Memory,
+        signal: Float[jax.Array, " s"],
+        output: AgentOutput,
+    ) -> Float[jax.Array, " p"]:
+        """Return it."""
+        return output.message
+
+
+def _deviation(
+    loop: Loop, t: Scalar, x: State, offset: State, memory: Memory
+) -> Float[jax.Array, " s"]:
+    deviation = loop.laws.leader.deviation(loop.model, t, x, offset, memory)
+    assert deviation is not None, "a leader that others predict by its plan has one"
+    return deviation
+
+
+def parts_of(
+    loop: Loop, s: int, content: Float[jax.Array, " p"]
+) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"], Float[jax.Array, " m"]]:
+    """Return the signal (s,), the feed-forward and the input in a packet that is carried on."""
+    m = len(loop.model.input_names)
+    return content[:s], content[s:-m], content[-m:]
+
+
+def carried_time(age: Scalar) -> Scalar:
+    """Return how long (s) a leader is taken to have moved on since a packet of an age (s)."""
+    # Nobody knows where a leader is that was not heard for long: its motion slows down.
+    late = jnp.maximum(age - _CARRIED_FULLY, 0.0)
+    return age - late + (1.0 - jnp.exp(-_SLOWING * late)) / _SLOWING
+
+
+# ---- what messages contain -----------------------------------------------------------------------
+
+
+class Content(eqx.Module):
+    """What the value of a message is.
+
+    Attributes:
+        prediction: of the leader.
+        forget: steps after which what a neighbour sent is not used.
+    """
+
+    prediction: LeaderPrediction
+    forget: Array
+
+    @abc.abstractmethod
+    def usable_age(self, dt: Array | float) -> jax.Array:
+        """Return the age (s) beyond which what a neighbour sent is not used."""
+
+    @abc.abstractmethod
+    def expect(
+        self,
+        loop: Loop,
+        t: Scalar,
+        packet: LeaderPackets,
+        since: Float[jax.Array, " N"],
+        said: Float[jax.Array, "N s"],
+    ) -> tuple[Float[jax.Array, "N s"], Float[jax.Array, "N k"]]:
+        """Return the signal at which each expects its leader, and the feed-forward."""
+
+    @abc.abstractmethod
+    def received(
+        self,
+        mail: Messages,
+        age: Float[jax.Array, " K"],
+        leader: Float[jax.Array, "N s"],
+        knows: Bool[jax.Array, " N"],
+        links: Exchange,
+        dt: Array | float,
+    ) -> tuple[Float[jax.Array, "K s"], Bool[jax.Array, " K"], Bool[jax.Array, " K"]]:
+        """Return what each link says, whether it says anything, and whether it is fresh."""
+
+    @abc.abstractmethod
+    def value(
+        self,
+        said: Float[jax.Array, "N s"],
+        leader: Float[jax.Array, "N s"],
+        itself: Bool[jax.Array, " N"],
+        packet: LeaderPackets,
+        difference: Difference,
+    ) -> tuple[Float[jax.Array, "N s"], Bool[jax.Array, " N"]]:
+        """Return the values of the messages, and who can send one."""
+
+
+@final
+class Deviations(Content):
+    """How far the sender is off where it expects the leader."""
+
+    def usable_age(self, dt: Array | float) -> jax.Array:
+        """Return the age (s) beyond which what a neighbour sent is not used."""
+        return jnp.asarray(self.forget * dt)
+
+    def expect(
+        self,
+        loop: Loop,
+        t: Scalar,
+        packet: LeaderPackets,
+        since: Float[jax.Array, " N"],
+        said: Float[jax.Array, "N s"],
+    ) -> tuple[Float[jax.Array, "N s"], Float[jax.Array, "N k"]]:
+        """Return what the prediction makes of the packets."""
+        rows = packet.content, jnp.where(since < jnp.inf, since, 0.0)
+        one = lambda *row: self.prediction.expected(loop, said.shape[1], t, *row)  # noqa: E731
+        return jax.vmap(one)(*rows)
+
+    def received(
+        self,
+        mail: Messages,
+        age: Float[jax.Array, " K"],
+        leader: Float[jax.Array, "N s"],
+        knows: Bool[jax.Array, " N"],
+        links: Exchange,
+        dt: Array | float,
+    ) -> tuple[Float[jax.Array, "K s"], Bool[jax.Array, " K"], Bool[jax.Array, " K"]]:
+        """Return the expected leader plus what is fresh of the deviations."""
+        receivers = jnp.asarray(links.receivers)
+        fresh, used = age <= self.usable_age(dt), knows[receivers]
+        value = leader[receivers] + jnp.where(fresh[:, None], mail.value, 0.0)
+        # A leader is where it is expected, and its own message says no more.
+        return value, used, fresh | ((age < jnp.inf) & (mail.hops == 0))
+
+    def value(
+        self,
+        said: Float[jax.Array, "N s"],
+        leader: Float[jax.Array, "N s"],
+        itself: Bool[jax.Array, " N"],
+        packet: LeaderPackets,
+        difference: Difference,
+    ) -> tuple[Float[jax.Array, "N s"], Bool[jax.Array, " N"]]:
+        """Return the deviations, which those send that have a packet."""
+        deviation = jnp.where(itself[:, None], 0.0, difference(said, leader))
+        return deviation, packet.stamp != NEVER
+
+
+@final
+class PlainValues(Content):
+    """What the sender says."""
+
+    def usable_age(self, dt: Array | float) -> jax.Array:
+        """Return the age (s) beyond which what a neighbour sent is not used."""
+        # Of a state there is no better guess than the last one, but never that of no message.
+        return jnp.asarray(np.finfo(np.float32).max)
+
+    def expect(
+        self,
+        loop: Loop,
+        t: Scalar,
+        packet: LeaderPackets,
+        since: Float[jax.Array, " N"],
+        said: Float[jax.Array, "N s"],
+    ) -> tuple[Float[jax.Array, "N s"], Float[jax.Array, "N k"]]:
+        """Return the own signal, and the feed-forward of the packet."""
+        return said, packet.content
+
+    def received(
+        self,
+        mail: Messages,
+        age: Float[jax.Array, " K"],
+        leader: Float[jax.Array, "N s"],
+        knows: Bool[jax.Array, " N"],
+        links: Exchange,
+        dt: Array | float,
+    ) -> tuple[Float[jax.Array, "K s"], Bool[jax.Array, " K"], Bool[jax.Array, " K"]]:
+        """Return the values."""
+        return mail.value, age < jnp.inf, age <= self.usable_age(dt)
+
+    def value(
+        self,
+        said: Float[jax.Array, "N s"],
+        leader: Float[jax.Array, "N s"],
+        itself: Bool[jax.Array, " N"],
+        packet: LeaderPackets,
+        difference: Difference,
+    ) -> tuple[Float[jax.Array, "N s"], Bool[jax.Array, " N"]]:
+        """Return the signals, which everybody sends."""
+        return said, jnp.ones(len(said), bool)
+
+
+# ---- whom agents use -----------------------------------------------------------------------------
+
+
+class AllNeighbours(eqx.Module):
+    """Whom agents use of those who send to them: all."""
+
+    def uses(
+        self, mail: Messages, hops: jax.Array, links: Exchange
+    ) -> Bool[jax.Array, " K"] | bool:
+        """Return which links an agent uses whose messages are fresh."""
+        return True
+
+    def disagreement(
+        self,
+        links: Exchange,
+        said: Float[jax.Array, "N s"],
+        received: Float[jax.Array, "K s"],
+        fresh: Bool[jax.Array, " K"],
+        alone: Float[jax.Array, "N s"],
+        difference: Difference,
+    ) -> Float[jax.Array, "N s"]:
+        """Return z (N, s), of which `alone` is that of an agent without fresh messages."""
+        return links(said, received, difference)
+
+
+@final
+class LeaderwardNeighbours(AllNeighbours):
+    """Those with fewer hops to the leader alone."""
+
+    def uses(
+        self, mail: Messages, hops: jax.Array, links: Exchange
+    ) -> Bool[jax.Array, " K"] | bool:
+        """Return which links an agent uses whose messages are fresh."""
+        return mail.hops < hops[jnp.asarray(links.receivers)]
+
+    def disagreement(
+        self,
+        links: Exchange,
+        said: Float[jax.Array, "N s"],
+        received: Float[jax.Array, "K s"],
+        fresh: Bool[jax.Array, " K"],
+        alone: Float[jax.Array, "N s"],
+        difference: Difference,
+    ) -> Float[jax.Array, "N s"]:
+        """Return the mean over the links that are used."""
+        return links.mean(said, received, fresh, alone, difference)
+
+
+# ---- the rules of messages -----------------------------------------------------------------------
+
+
+@final
+class MessageRules(eqx.Module):
+    """What agents make of messages, and what they write: N agents of a run, or one alone.
+
+    Attributes:
+        leadership: who leads.
+        content: of the messages.
+        neighbours: whom agents use.
+        agents: in the formation.
+    """
+
+    leadership: FixedLeaders
+    content: Content
+    neighbours: AllNeighbours
+    agents: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, channel: Channel, leadership: FixedLeaders, agents: int) -> "MessageRules":
+        """Return the rules of a network."""
+        content = PlainValues(NoPrediction(), channel.forget)
+        if channel.messages is MessageContent.DEVIATION:
+            by_packet = SlopedPacketPrediction() if leadership.changes else PacketPrediction()
+            preview = channel.prediction is Prediction.PREVIEW
+            content = Deviations(PlanPrediction() if preview else by_packet, channel.forget)
+        all_ = channel.hears is NeighbourChoice.ALL
+        neighbours = AllNeighbours() if all_ else LeaderwardNeighbours()
+        return cls(leadership, content, neighbours, agents)
+
+    def begin(
+        self, number: jax.Array, links: int, said: Float[jax.Array, "N s"], size: int
+    ) -> Messages:
+        """Return the mail of agents before the first message, for signals and packets (size,)."""
+        content = jnp.zeros((len(number), size), said.dtype)
+        return Messages(
+            jnp.zeros((links, said.shape[1]), said.dtype),
+            jnp.full(links, NOBODY, jnp.int32),
+            self.leadership.no_packets(number, content),
+            jnp.full(links, NEVER, jnp.int32),
+        )
+
+    def take(
+        self,
+        mail: Messages,
+        sent: Messages,
+        new: Bool[jax.Array, " K"],
+        stamp: jax.Array,
+        links: Exchange,
+    ) -> Messages:
+        """Return the mail with messages (K, ...) of which some are `new`."""
+        return Messages(
+            jnp.where(new[:, None], sent.value, mail.value),
+            jnp.where(new, sent.hops, mail.hops),
+            self.leadership.newest(mail.packet, sent.packet, new, links),
+            stamp,
+        )
+
+    def read(
+        self,
+        loop: Loop,
+        mail: Messages,
+        clock: Clock,
+        own: Own,
+        said: Float[jax.Array, "N s"],
+        links: Exchange,
+    ) -> NetworkEstimate:
+        """Return what agents know from their mail, with their own signals (N, s)."""
+        packet, difference = mail.packet, loop.laws.speech.difference(loop.model)
+        age, since = clock.age(mail.stamp), clock.age(packet.stamp)
+        leads, aware = self.leadership.leads(packet, own.number), since < jnp.inf
+        leader, forward = self.content.expect(loop, clock.t, packet, since, said)
+        itself = packet.leader == own.number
+        leader = jnp.where((itself | ~aware)[:, None], said, leader)
+        forward = jnp.where(aware[:, None], forward, 0.0)
+        hops, knows = self.hops(mail, age, leads, links, clock.dt), leads | aware
+        rows = mail, age, leader, knows, links, clock.dt
+        received, used, fresh = self.content.received(*rows)
+        received = jnp.where(used[:, None], received, said[jnp.asarray(links.receivers)])
+        fresh = fresh & used & self.neighbours.uses(mail, hops, links)
+        alone = jnp.where(knows[:, None], difference(said, leader), 0.0)
+        z = self.neighbours.disagreement(links, said, received, fresh, alone, difference)
+        return NetworkEstimate(z, leads, forward, leader, hops, packet)
+
+    def hops(
+        self,
+        mail: Messages,
+        age: Float[jax.Array, " K"],
+        leads: Bool[jax.Array, " N"],
+        links: Exchange,
+        dt: Array | float,
+    ) -> jax.Array:
+        """Return the hops to a leader (N,), as counted by the messages that are not too old."""
+        lasting = age <= self.hop_life(dt)
+        nearest = links.least(jnp.where(lasting, mail.hops, NOBODY), len(leads))
+        nearest = jnp.minimum(nearest, NOBODY)
+        # Agents that are cut off together would count each other up for ever.
+        hops = jnp.where(nearest + 1 >= self.agents, NOBODY, nearest + 1)
+        return jnp.where(leads, 0, hops).astype(jnp.int32)
+
+    def hop_life(self, dt: Array | float) -> jax.Array:
+        """Return the age (s) beyond which a hop count is not used."""
+        # Times a float: ten times the largest whole number would be negative.
+        return jnp.asarray(float(HOP_LIFE) * self.content.forget * dt)
+
+    def used(
+        self, mail: Messages, age: jax.Array, hops: jax.Array, links: Exchange, dt: Array | float
+    ) -> Bool[jax.Array, " K"]:
+        """Return which links of the graph agents use, with messages of these ages (s)."""
+        used = (jnp.asarray(links.weights) > 0.0) & (age <= self.content.usable_age(dt))
+        return used & self.neighbours.uses(mail, hops, links)
+
+    def contents(
+        self, loop: Loop, mail: Messages, known: Known, speech: LeaderSpeech
+    ) -> Float[jax.Array, "N p"]:
+        """Return what each would say of itself as a leader; zeros of those that cannot be one."""
+        numbers, one, t = loop.laws.leaders, self.content.prediction.content, known.clock.t
+        own = known.own.x[numbers], known.offsets[0].offset, speech.before, known.said[numbers]
+        content = jax.vmap(lambda *row: one(loop, t, *row))(*own, speech.output)
+        return jnp.zeros_like(mail.packet.content).at[numbers].set(content)
+
+    def write(
+        self,
+        mail: Messages,
+        heard: NetworkEstimate,
+        number: jax.Array,
+        stamp: jax.Array,
+        said: Float[jax.Array, "N s"],
+        content: Float[jax.Array, "N p"],
+        difference: Difference,
+    ) -> tuple[Messages, Bool[jax.Array, " N"]]:
+        """Return what agents send at a time, and which of them can.
+
+        `content` is what each would say of itself if it were a leader.
+        """
+        packet = mail.packet
+        itself = heard.leads & (packet.leader == number)
+        packet = packet._replace(
+            stamp=jnp.where(itself, stamp, packet.stamp),
+            content=jnp.where(itself[:, None], content, packet.content),
+        )
+        value, sends = self.content.value(said, heard.leader, itself, packet, difference)
+        return Messages(value, heard.hops, packet), sends
+
+
+# ---- the network that is late --------------------------------------------------------------------
+
+
+@final
+class LateNetwork(Network):
+    """Messages by the rules, over a medium that delays and loses them.
+
+    It remembers what is in flight, and the mail of the agents.
+
+    Attributes:
+        rules: of the messages.
+        medium: what the world does to them.
+    """
+
+    rules: MessageRules
+    medium: Channel
+
+    def begin(self, loop: Loop, said: Float[jax.Array, "N s"], forward: int) -> PyTree:
+        """Return the network before the first message."""
+        numbers, links = jnp.asarray(loop.laws.numbers), len(loop.graph.exchange.receivers)
+        sizes = said.shape[1], forward, len(loop.model.input_names)
+        size = self.rules.content.prediction.size(*sizes)
+        mail = self.rules.begin(numbers, links, said, size)
+        return self.medium.begin(Messages(said, numbers, mail.packet), links), mail
+
+    def receive(
+        self,
+        loop: Loop,
+        memory: PyTree,
+        clock: Clock,
+        own: Own,
+        said: Float[jax.Array, "N s"],
+        links: Exchange,
+        here: Mask,
+    ) -> tuple[NetworkEstimate, PyTree]:
+        """Return what agents know with what arrives now, and the mail with it."""
+        in_flight, mail = memory
+        since = loop.roster.since(clock.step)
+        mail = self.delivered(in_flight, mail, own.number, clock, since, links, here)
+        return self.rules.read(loop, mail, clock, own, said, links), (in_flight, mail)
+
+    def delivered(
+        self,
+        in_flight: InFlight,
+        mail: Messages,
+        number: jax.Array,
+        clock: Clock,
+        since: jax.Array,
+        links: Exchange,
+        here: Mask,
+    ) -> Messages:
+        """Return the mail with what arrives now, and with who takes the lead."""
+        arrival = self.medium.arrivals(in_flight, clock.step, mail.stamp)
+        places = arrival.slot, jnp.asarray(links.senders)
+        sent: Messages = jax.tree.map(lambda rows: rows[places], in_flight.content)
+        mail = self.rules.take(mail, sent, arrival.new, arrival.stamp, links)
+        packet = self.leadership.elect(mail.packet, number, clock, since, here)
+        return mail._replace(packet=packet)
+
+    def send(self, loop: Loop, memory: PyTree, known: Known, speech: LeaderSpeech) -> PyTree:
+        """Return the network after what agents send now."""
+        in_flight, mail = memory
+        content = self.rules.contents(loop, mail, known, speech)
+        clock, difference = known.clock, loop.laws.speech.difference(loop.model)
+        rows = known.own.number, clock.now, known.said, content, difference
+        sent, sends = self.rules.write(mail, known.heard, *rows)
+        return self.posted(in_flight, clock.step, sent, sends, known.links), mail
+
+    def with_medium(self, medium: Channel) -> Network:
+        """Return the network over another medium."""
+        rules = MessageRules.of(medium, self.leadership, self.rules.agents)
+        return LateNetwork(self.leadership, rules, medium)
+
+    def posted(
+        self,
+        in_flight: InFlight,
+        step: jax.Array,
+        sent: Messages,
+        sends: Bool[jax.Array, " N"],
+        links: Exchange,
+    ) -> InFlight:
+        """Return what is in flight after a step; links that the graph lacks carry nothing."""
+        carried = carries(links, sends)
+        return self.medium.post(in_flight, step, sent, carried, links.receivers, links.senders)
+
+
+def carries(links: Exchange, sends: Bool[jax.Array, " N"]) -> Bool[jax.Array, " K"]:
+    """Return the links along which messages leave."""
+    return sends[jnp.asarray(links.senders)] & (jnp.asarray(links.weights) > 0.0)

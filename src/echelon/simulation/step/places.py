@@ -1,0 +1,117 @@
+"""Where the places of agents in the formation are: at offsets that are constant, or move."""
+
+import abc
+from typing import TypeAlias, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.formation_motion import FormationMotion, OwnOffset
+from echelon.core.types import Array, Scalar
+from echelon.laws.law import Law
+from echelon.simulation.step.records import GroupOffsets
+from echelon.simulation.step.run_laws import RunLaws
+
+Agents: TypeAlias = Array | jax.Array
+"""The numbers of some agents."""
+
+
+class Places(eqx.Module):
+    """The offsets of a formation: what laws use, and where errors are measured.
+
+    Attributes:
+        offsets: (N, n) at the start.
+    """
+
+    offsets: Array
+
+    @classmethod
+    def of(cls, formation: Formation) -> "Places":
+        """Return the places of a formation."""
+        offsets, motion = np.asarray(formation.offsets), formation.motion
+        return ConstantPlaces(offsets) if motion is None else MovingPlaces(offsets, motion)
+
+    @abc.abstractmethod
+    def of_group(self, model: ControlAffine, law: Law, t: Scalar, agents: Agents) -> GroupOffsets:
+        """Return what agents under a law take for their offsets at a time (s)."""
+
+    @abc.abstractmethod
+    def of_all(
+        self, laws: RunLaws, groups: tuple[GroupOffsets, GroupOffsets]
+    ) -> Float[jax.Array, "N n"]:
+        """Return what all agents take for their offsets, of those of the two groups."""
+
+    @abc.abstractmethod
+    def goals(self, t: Scalar) -> Float[jax.Array, "N n"] | None:
+        """Return the offsets at which errors are measured; None of the meter's own."""
+
+    @abc.abstractmethod
+    def of_one(self, number: int) -> "Places":
+        """Return the places of one agent alone."""
+
+    def groups(
+        self, model: ControlAffine, laws: RunLaws, t: Scalar
+    ) -> tuple[GroupOffsets, GroupOffsets]:
+        """Return what leaders and followers take for their offsets at a time (s)."""
+        led, followed = (self.of_group(model, law, t, agents) for law, agents in laws.groups)
+        return led, followed
+
+
+@final
+class ConstantPlaces(Places):
+    """Offsets that never change."""
+
+    def of_group(self, model: ControlAffine, law: Law, t: Scalar, agents: Agents) -> GroupOffsets:
+        """Return the offsets."""
+        return GroupOffsets(jnp.asarray(self.offsets, jnp.result_type(t))[agents], None)
+
+    def of_all(
+        self, laws: RunLaws, groups: tuple[GroupOffsets, GroupOffsets]
+    ) -> Float[jax.Array, "N n"]:
+        """Return the offsets."""
+        return jnp.asarray(self.offsets, groups[0].offset.dtype)
+
+    def goals(self, t: Scalar) -> Float[jax.Array, "N n"] | None:
+        """Return None: the meter has them."""
+        return None
+
+    def of_one(self, number: int) -> "Places":
+        """Return its row."""
+        return ConstantPlaces(self.offsets[number : number + 1])
+
+
+@final
+class MovingPlaces(Places):
+    """Offsets that are functions of time."""
+
+    motion: FormationMotion
+
+    def of_group(self, model: ControlAffine, law: Law, t: Scalar, agents: Agents) -> GroupOffsets:
+        """Return what the law makes of them."""
+        kind = jnp.result_type(t)
+        rows = (jnp.asarray(x, kind)[agents] for x in (self.offsets, self.motion.places))
+        one = lambda *row: law.goal_offset(model, OwnOffset(self.motion, *row), t)  # noqa: E731
+        return GroupOffsets(*jax.vmap(one)(*rows))
+
+    def of_all(
+        self, laws: RunLaws, groups: tuple[GroupOffsets, GroupOffsets]
+    ) -> Float[jax.Array, "N n"]:
+        """Return what both groups take for them, in the agents' order."""
+        return laws.ordered(*(group.offset for group in groups))
+
+    def goals(self, t: Scalar) -> Float[jax.Array, "N n"] | None:
+        """Return the offsets themselves."""
+        kind = jnp.result_type(t)
+        rows = (jnp.asarray(x, kind) for x in (self.offsets, self.motion.places))
+        return jax.vmap(lambda *row: OwnOffset(self.motion, *row).state(t))(*rows)
+
+    def of_one(self, number: int) -> "Places":
+        """Return its row."""
+        places = self.motion.places[number : number + 1]
+        motion = eqx.tree_at(lambda motion: motion.places, self.motion, places)
+        return MovingPlaces(self.offsets[number : number + 1], motion)
