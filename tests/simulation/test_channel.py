@@ -56,7 +56,7 @@ def test_hop_counts_are_never_forgotten_where_forgetting_takes_ages(forget):
     for bits in (False, True):
         with jax.enable_x64(bits):
             rules = MessageRules.of(channel, FixedLeaders(np.ones(1, bool)), 1)
-            ages = jax.jit(rules.hop_life)(DT)
+            ages = jax.jit(lambda rules: rules.hop_life(DT))(rules)
             assert float(ages) >= 10.0 * min(forget, 1e6)
             assert ages.dtype == (np.float64 if bits else np.float32)
 

@@ -36,7 +36,7 @@ class Speech(eqx.Module):
     @abc.abstractmethod
     def of_one(
         self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
-    ) -> State:
+    ) -> Float[jax.Array, " s"]:
         """Return what an agent at x says (s,)."""
 
     @abc.abstractmethod
@@ -58,7 +58,7 @@ class Speech(eqx.Module):
     @abc.abstractmethod
     def beyond_state(
         self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
-    ) -> State:
+    ) -> Float[jax.Array, " b"]:
         """Return what neighbours are told besides x - offset, which may be nothing."""
 
 
@@ -68,7 +68,7 @@ class StateSpeech(Speech):
 
     def of_one(
         self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
-    ) -> State:
+    ) -> Float[jax.Array, " s"]:
         """Return x - offset."""
         return x - offset
 
@@ -90,7 +90,7 @@ class StateSpeech(Speech):
 
     def beyond_state(
         self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
-    ) -> State:
+    ) -> Float[jax.Array, " b"]:
         """Return nothing."""
         return jnp.zeros(0, x.dtype)
 
@@ -101,7 +101,7 @@ class SignalSpeech(Speech):
 
     def of_one(
         self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
-    ) -> State:
+    ) -> Float[jax.Array, " s"]:
         """Return the law's signal."""
         signal = law.signal(model, x, offset, memory)
         assert signal is not None, "laws that speak return a signal"
@@ -131,7 +131,7 @@ class SignalSpeech(Speech):
 
     def beyond_state(
         self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
-    ) -> State:
+    ) -> Float[jax.Array, " b"]:
         """Return the signal."""
         return self.of_one(law, model, x, offset, memory)
 
