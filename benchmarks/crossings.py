@@ -23,7 +23,7 @@ from echelon.core.types import Array
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.loop import Loop
-from echelon.simulation.step.places import ConstantPlaces
+from echelon.simulation.step.places import Places
 from echelon.simulation.step.records import LoopState
 from echelon.simulation.step.sequence import begin, step
 
@@ -125,7 +125,7 @@ def _fly(loop: Loop, states: Array, offsets: Array, frames: int) -> tuple[jax.Ar
     scales = jnp.asarray(SCALES)
 
     def one(states: jax.Array, offsets: jax.Array) -> tuple[jax.Array, jax.Array]:
-        own = loop.replace(places=ConstantPlaces(offsets))
+        own = loop.replace(places=Places(offsets))
 
         def each(_: jax.Array, carry: tuple[LoopState, jax.Array]) -> tuple[LoopState, jax.Array]:
             now = step(own, carry[0])

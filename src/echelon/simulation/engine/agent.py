@@ -40,13 +40,21 @@ from echelon.simulation.step.leadership import NOBODY, Failover, FixedLeaders
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.nearby import less_expected
 from echelon.simulation.step.network import (
-    Deviations,
     LateNetwork,
-    LeaderPrediction,
     MessageRules,
+    PlanDeviations,
+    Saying,
 )
 from echelon.simulation.step.places import MovingPlaces
-from echelon.simulation.step.records import AgentOutput, LeaderPackets, Messages, Own, Seconds
+from echelon.simulation.step.records import (
+    AgentOutput,
+    GroupOffsets,
+    Known,
+    LeaderPackets,
+    Messages,
+    Own,
+    Seconds,
+)
 from echelon.simulation.step.run_laws import feedforward_of
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.turns import by_depth
@@ -85,14 +93,14 @@ def beside_alone(law: Law, memory: Memory, other: Signal) -> Memory:
 @cached_jit
 def expected_alone(
     loop: Loop,
-    prediction: LeaderPrediction,
+    content_of: PlanDeviations,
     t: Scalar,
     content: Float[jax.Array, " p"],
     age: Scalar,
     s: int,
 ) -> Signal:
     """Return the signal (s,) at which an agent expects the leader, by its packet of an age (s)."""
-    return prediction.expected(loop, s, t, content, jnp.maximum(age, 0.0))[0]
+    return content_of.expected(loop, s, t, content, jnp.maximum(age, 0.0))[0]
 
 
 @cached_jit
@@ -239,7 +247,9 @@ def step_over_network(
     law, model = loop.laws.leader if leads else loop.laws.follower, loop.model
     signal, nobody = signal_of(loop, law, own), np.zeros(len(weights), np.int32)
     links, said = Exchange(nobody, nobody, weights), signal[None]
-    heard = rules.read(loop, mail, clock, Own(number, own.x[None]), said, links)
+    groups = (GroupOffsets(own.offset[None], None),) * 2
+    known = Known(clock, True, Own(number, own.x[None]), groups, said, links)
+    heard = rules.read(loop, mail, known)
     forward = jnp.zeros(len(model.input_names)) if leads else heard.feedforward[0]
     hull = hull_of(loop, law, own)
     hull = None if hull is None else less_expected(loop, clock.t, hull, heard.leader[0])
@@ -248,8 +258,7 @@ def step_over_network(
     action = loop.laws.act(model, loop.motion, law, view, own.memory, leads)
     content = mail.packet.content
     if leads:
-        rows = clock.t, *own[:3], signal, action
-        content = rules.content.prediction.content(loop, *rows)[None]
+        content = rules.content.content(loop, clock.t, Saying(*own[:3], signal, action))[None]
     rows = number, clock.now, said, content, loop.laws.speech.difference(model)
     letter, _ = rules.write(mail, heard, *rows)
     return Step(signal, action, is_finite((own.x, signal, action, letter[:3], hull)), letter, hull)
@@ -334,10 +343,10 @@ class Agent:
     def _stamps_of(self, leaders: Sequence[int], backups: Sequence[int]) -> Stamps | None:
         if self._rules is None:
             return None
-        size = self._rules.content.prediction.size(*self._sizes)
+        size = self._rules.content.size(*self._sizes)
         own = self.number if self.leads else None
-        deviation = isinstance(self._rules.content, Deviations)
-        return Stamps(len(self.neighbours), leaders, size, own, deviation, backups)
+        needs_packet = self._rules.content.needs_packet
+        return Stamps(len(self.neighbours), leaders, size, own, needs_packet, backups)
 
     def _succeed(self, stamps: Stamps) -> None:
         """Take the lead if nobody was heard to lead for long, or leave it to whoever has it."""
@@ -492,7 +501,7 @@ class Agent:
         return message._replace(hull=NamedValues(self._others.names, np.asarray(hull).ravel()))
 
     def _mail(self, stamps: Stamps, rules: MessageRules) -> Messages:
-        size = rules.content.prediction.size(*self._sizes)
+        size = rules.content.size(*self._sizes)
         packet = stamps.packet
         leader = self.number if self.leads else NOBODY
         leader = leader if packet is None else packet.leader
@@ -550,9 +559,9 @@ class Agent:
         if stamps.packet is None:
             return None
         content, age = jnp.asarray(stamps.packet.content), time - stamps.packet.time
-        assert self._rules is not None, "an agent has stamps over a network that is late"
-        prediction = self._rules.content.prediction
-        return expected_alone(self._loop, prediction, time, content, age, self._sizes[0])
+        deviations = self._rules and self._rules.content
+        assert isinstance(deviations, PlanDeviations), "it has packets"
+        return expected_alone(self._loop, deviations, time, content, age, self._sizes[0])
 
     def _own(self, state: State, time: jax.Array) -> "OwnState":
         # As in a run, where leaders may follow their backup leaders.

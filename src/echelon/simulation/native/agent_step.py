@@ -26,9 +26,7 @@ from echelon.simulation.scalars import (
     nodes,
 )
 from echelon.simulation.step.loop import Loop
-from echelon.simulation.step.nearby import NobodyNear
-from echelon.simulation.step.network import IdealNetwork
-from echelon.simulation.step.places import ConstantPlaces
+from echelon.simulation.step.places import MovingPlaces
 from echelon.simulation.step.run_laws import limit_sides
 from echelon.simulation.step.turns import by_depth
 
@@ -92,12 +90,12 @@ class BlockRows(NamedTuple):
 
 def check_information(loop: Loop) -> None:
     """Raise `Unsupported` unless agents know exact states, current messages, and nothing else."""
-    for ideal, text in (
-        (isinstance(loop.places, ConstantPlaces), "formations that change with time"),
-        (isinstance(loop.network, IdealNetwork), "a network that is not ideal"),
-        (not loop.sensing.stages, "agents that measure their states late or with noise"),
+    for fault, text in (
+        (isinstance(loop.places, MovingPlaces), "formations that change with time"),
+        (loop.network.late, "a network that is not ideal"),
+        (loop.sensing.stages, "agents that measure their states late or with noise"),
     ):
-        if not ideal:
+        if fault:
             raise Unsupported(text)
     check_distances(loop)
 
@@ -105,11 +103,11 @@ def check_information(loop: Loop) -> None:
 def check_distances(loop: Loop) -> None:
     """Raise `Unsupported` if agents keep distances, come or go, or have backup leaders."""
     changes = loop.roster.changes or loop.laws.backups
-    for ideal, text in (
-        (isinstance(loop.surroundings, NobodyNear), "agents that keep away from each other"),
-        (not changes, "agents that are lost, join or take the lead"),
+    for fault, text in (
+        (loop.surroundings.keeps_apart, "agents that keep away from each other"),
+        (changes, "agents that are lost, join or take the lead"),
     ):
-        if not ideal:
+        if fault:
             raise Unsupported(text)
 
 
@@ -135,9 +133,14 @@ def unflatten(like: PyTree, flat: Array | jax.Array) -> PyTree:
 def signal_size(loop: Loop) -> int:
     """Return how many numbers neighbours receive from an agent besides its state."""
     zero, law = jnp.zeros(len(loop.model.state_names)), loop.laws.follower
-    rows = law, loop.model, zero, zero
-    beyond = loop.laws.speech.beyond_state
-    return jax.eval_shape(lambda: beyond(*rows, law.init())).shape[0]
+    return jax.eval_shape(lambda: _signal_of(loop, law, zero, zero, law.init())).shape[0]
+
+
+def _signal_of(loop: Loop, law: Law, x: jax.Array, offset: jax.Array, memory: Memory) -> jax.Array:
+    speech = loop.laws.speech
+    if not speech.signals:
+        return jnp.zeros(0, x.dtype)
+    return speech.of_one(law, loop.model, x, offset, memory)
 
 
 Entries: TypeAlias = Any
@@ -185,7 +188,7 @@ class StepOutputs(NamedTuple):
 def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
     """Return the step of a leader, or of another agent, as a function for JAX."""
     law = loop.laws.leader if leads else loop.laws.follower
-    model, motion, meter, speech = loop.model, loop.motion, loop.meter, loop.laws.speech
+    model, motion, meter = loop.model, loop.motion, loop.meter
 
     def step(inputs: StepInputs) -> StepOutputs:
         x, offset = inputs.x, inputs.offset
@@ -214,8 +217,8 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
             unsettled=metered.unsettled,
             inside=metered.inside,
             chatter=jnp.where((cut * inputs.previous_cut < 0.0).any(), 1.0, 0.0),
-            signal=speech.beyond_state(law, model, x, offset, inputs.memory),
-            next_signal=speech.beyond_state(law, model, state, offset, memory),
+            signal=_signal_of(loop, law, x, offset, inputs.memory),
+            next_signal=_signal_of(loop, law, state, offset, memory),
         )
 
     return step

@@ -41,10 +41,10 @@ from echelon.simulation.native.agent_step import (
 from echelon.simulation.scalars import Node, ScalarGraph, lower, needed, nodes, rewritten
 from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.network import (
-    Deviations,
     LateNetwork,
-    LeaderPrediction,
-    PacketPrediction,
+    PacketDeviations,
+    PlanDeviations,
+    Saying,
     carried_time,
     parts_of,
 )
@@ -105,8 +105,8 @@ class _Traces:
         yield difference
         yield self._tick(len(difference.outputs["gap"]))
         late = self.loop.network
-        if isinstance(late, LateNetwork) and isinstance(late.rules.content, Deviations):
-            yield from self._expectation(late.rules.content.prediction)
+        if isinstance(late, LateNetwork) and isinstance(late.rules.content, PlanDeviations):
+            yield from self._expectation(late.rules.content)
         for stage in self.loop.sensing.on_board.stages:
             if isinstance(stage, EstimatingSensor):
                 yield from self._estimation(stage.estimator)
@@ -176,7 +176,7 @@ class _Traces:
     def _tick(self, gap: int) -> LawFunction:
         loop, leads = self.loop, self.own.leads
         late = loop.network
-        prediction = late.rules.content.prediction if isinstance(late, LateNetwork) else None
+        says = late.rules.content if isinstance(late, LateNetwork) else None
 
         def tick(
             t: jax.Array, x: jax.Array, z: jax.Array, forward: jax.Array, flat: jax.Array
@@ -187,13 +187,13 @@ class _Traces:
             results = action.input, _flat(action.memory), step.signal, action.message
             # A state less a constant is finite where the state is.
             signal = () if type(self.law).signal is Law.signal else step.signal
-            if prediction is None or not leads:
+            if says is None or not leads:
                 return *results, _flat((x, signal, action))
-            content = prediction.content(loop, t, *own[:3], step.signal, action)
+            content = says.content(loop, t, Saying(*own[:3], step.signal, action))
             return *results, content, _flat((x, signal, action, content))
 
         words = message_meaning(self.own)
-        sent = () if prediction is None or not leads else ("content",)
+        sent = () if says is None or not leads else ("content",)
         outputs = ("u", "memory", "signal", "message", *sent)
         sizes = {"t": None, "x": self.n, "z": gap, "feed_forward": self.k, "memory": self.memory}
         return self._function(
@@ -207,18 +207,18 @@ class _Traces:
 
     # ---- where messages are late ----
 
-    def _expectation(self, prediction: LeaderPrediction) -> Iterator[LawFunction]:
+    def _expectation(self, content_of: PlanDeviations) -> Iterator[LawFunction]:
         loop, follower, s = self.loop, self.loop.laws.follower, self.s
-        size = prediction.size(s, self.k, self.m)
+        size = content_of.size(s, self.k, self.m)
         # A state is carried on in a loop, each round of which is a function here.
         plain = type(follower).carried is Law.carried and type(follower).signal is Law.signal
-        in_rounds = plain and isinstance(prediction, PacketPrediction)
+        in_rounds = plain and isinstance(content_of, PacketDeviations)
 
         def expected(t: jax.Array, content: jax.Array, age: jax.Array) -> tuple[jax.Array, ...]:
             if in_rounds:
                 leader, forward, _ = parts_of(loop, s, content)
             else:
-                leader, forward = prediction.expected(loop, s, t, content, age)
+                leader, forward = content_of.expected(loop, s, t, content, age)
             return leader, forward, _flat((leader, forward))
 
         def pace(age: jax.Array) -> tuple[jax.Array]:

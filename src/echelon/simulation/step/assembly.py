@@ -5,9 +5,8 @@ from echelon.laws.law import Law
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.leadership import FixedLeaders, leaders_of
 from echelon.simulation.step.loop import Loop, Network, Surroundings, Turns
-from echelon.simulation.step.nearby import ExactHulls, LateHulls, NobodyNear
+from echelon.simulation.step.nearby import ExactHulls, LateHulls
 from echelon.simulation.step.network import (
-    IdealNetwork,
     IdealWithBackups,
     LateNetwork,
     MessageRules,
@@ -19,8 +18,8 @@ from echelon.simulation.step.turns import (
     Announced,
     BackupsToo,
     ByDepth,
-    FromMessages,
     LeadersFirst,
+    Relay,
     SameStep,
 )
 
@@ -51,20 +50,20 @@ def _network(problem: Problem, leadership: FixedLeaders) -> Network:
     if channel is not None:
         rules = MessageRules.of(channel, leadership, problem.graph.agents)
         return LateNetwork(leadership, rules, channel)
-    return IdealWithBackups(leadership) if leadership.changes else IdealNetwork(leadership)
+    return IdealWithBackups(leadership) if leadership.changes else Network(leadership)
 
 
 def _surroundings(problem: Problem, follower: Law) -> Surroundings:
     if follower.safety is None:
-        return NobodyNear()
+        return Surroundings()
     return ExactHulls() if problem.channel is None else LateHulls(problem.channel)
 
 
 def _turns(problem: Problem, laws: RunLaws) -> Turns:
     if laws.backups:
-        return BackupsToo(Announced() if problem.channel is None else FromMessages())
+        return BackupsToo(Announced() if problem.channel is None else Relay())
     if problem.channel is not None:
-        return LeadersFirst(FromMessages())
+        return LeadersFirst(Relay())
     if laws.follower.feedforward is Feedforward.PARENT:
         return LeadersFirst(ByDepth.of(problem.graph))
     # The place of each follower's leader among the leaders, whose numbers ascend.

@@ -3,17 +3,18 @@
 | component | question | ideal member |
 |---|---|---|
 | `sensing` | What does an agent know of itself? | no stages |
-| `places` | Where is its place in the formation? | `ConstantPlaces` |
+| `places` | Where is its place in the formation? | `Places` |
 | `laws` | What does it say, and what does it do? | `StateSpeech`, `WorldAxes` |
 | `graph` | Who hears whom? | `Links` |
-| `network` | What arrives, and who leads? | `IdealNetwork`, `FixedLeaders` |
-| `surroundings` | Who is near? | `NobodyNear` |
+| `network` | What arrives, and who leads? | `Network`, `FixedLeaders` |
+| `surroundings` | Who is near? | `Surroundings` |
 | `turns` | Who acts when, and with what? | `LeadersFirst(SameStep)` |
-| `motion` | How do agents move? | `Limited`, `ActAtOnce`, no weather |
+| `motion` | How do agents move? | `Limited`, `Motors`, no weather |
 | `roster` | Who is there? | `Everybody` |
 | `meter` | What is measured? | |
 
-A component has members, one of them ideal; none is optional. Each member has its own memory, `()`
+A component has members, one of them ideal; none is optional. The ideal member is the class whose
+methods the others replace. Each member has its own memory, `()`
 where it remembers nothing, of the same structure for a whole run. A feature is a new member.
 """
 
@@ -27,7 +28,7 @@ from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.channel import Channel
-from echelon.agents.network.exchange import Exchange, Near
+from echelon.agents.network.exchange import Near
 from echelon.agents.world.sensing import Sensors
 from echelon.core.types import PyTree, States
 from echelon.simulation.step.leadership import FixedLeaders
@@ -35,14 +36,12 @@ from echelon.simulation.step.meter import RunStatistics, Sums
 from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.places import Places
 from echelon.simulation.step.records import (
-    Clock,
     Known,
     LawMemories,
     LeaderSpeech,
     LoopState,
     Mask,
     NetworkEstimate,
-    Own,
     Played,
 )
 from echelon.simulation.step.roster import Everybody, Links
@@ -50,44 +49,29 @@ from echelon.simulation.step.run_laws import RunLaws
 
 
 class Network(eqx.Module):
-    """What arrives, and who leads.
+    """What arrives, and who leads: what is said is heard in the same step.
 
     Attributes:
         leadership: who leads.
     """
 
     leadership: FixedLeaders
+    # Whether messages take time.
+    late = False
 
-    @abc.abstractmethod
     def begin(self, loop: "Loop", said: Float[jax.Array, "N s"], forward: int) -> PyTree:
         """Return the memory before the first message, for a feed-forward (forward,)."""
+        return ()
 
-    @abc.abstractmethod
-    def receive(
-        self,
-        loop: "Loop",
-        memory: PyTree,
-        clock: Clock,
-        own: Own,
-        said: Float[jax.Array, "N s"],
-        links: Exchange,
-        here: Mask,
-    ) -> tuple[NetworkEstimate, PyTree]:
-        """Return what agents know from what arrived, and the memory with it.
+    def receive(self, loop: "Loop", memory: PyTree, known: Known) -> tuple[NetworkEstimate, PyTree]:
+        """Return what agents know from what arrived, and the memory with it."""
+        received = known.links.along_edges(known.said)
+        z = known.links(known.said, received, loop.laws.speech.difference(loop.model))
+        return NetworkEstimate(z, self.leadership.leads(memory, known.own.number)), memory
 
-        Args:
-            loop: of the run.
-            memory: of the network.
-            clock: of the step.
-            own: the agents as they know themselves.
-            said: (N, s) what they say in this step.
-            links: with the weights of this step.
-            here: who is there.
-        """
-
-    @abc.abstractmethod
     def send(self, loop: "Loop", memory: PyTree, known: Known, speech: LeaderSpeech) -> PyTree:
         """Return the memory after what agents send in a step."""
+        return memory
 
     def with_medium(self, medium: Channel) -> "Network":
         """Return the network over another medium; the ideal one has none."""
@@ -95,33 +79,29 @@ class Network(eqx.Module):
 
 
 class Surroundings(eqx.Module):
-    """Who is near."""
+    """Who is near: nobody, where agents do not keep apart."""
 
-    @abc.abstractmethod
+    # Whether they do.
+    keeps_apart = False
+
     def begin(self, loop: "Loop", states: States, laws: LawMemories) -> PyTree:
         """Return the memory of agents that begin at states (N, n)."""
+        return ()
 
-    @abc.abstractmethod
     def look(
-        self,
-        loop: "Loop",
-        memory: PyTree,
-        clock: Clock,
-        own: Own,
-        laws: LawMemories,
-        heard: NetworkEstimate,
-        here: Mask,
+        self, loop: "Loop", memory: PyTree, laws: LawMemories, known: Known
     ) -> tuple[Near | None, PyTree]:
         """Return what each agent knows of all others (N, N - 1, ...), and the memory after it.
 
         None where agents do not keep apart.
         """
+        return None, memory
 
-    @abc.abstractmethod
     def measured(
         self, loop: "Loop", read: Sums, now: LoopState, laws: LawMemories, here: Mask
     ) -> Sums:
         """Return the sums of a step with those of the distances that agents keep."""
+        return read
 
     def with_medium(self, medium: Channel) -> "Surroundings":
         """Return the surroundings over another medium, if messages about them take one."""

@@ -1,6 +1,5 @@
 """How agents move: the plant under held inputs, its motors and its weather."""
 
-import abc
 import dataclasses
 from typing import Self, final
 
@@ -43,41 +42,24 @@ class Unlimited(Limited):
 
 
 class Motors(eqx.Module):
-    """When an input acts."""
+    """When an input acts: at once, and it is held."""
 
     # Whether an input acts as it is commanded, and whether its motors remember the one before.
-    at_once, remembers = False, False
+    at_once, remembers = True, False
 
     @property
     def memoryless(self) -> "Motors":
         """The motors that begin each step at their command."""
         return self
 
-    @abc.abstractmethod
     def begin(self, trim: Input) -> PyTree:
         """Return what the motors of an agent remember that is at rest."""
-
-    @abc.abstractmethod
-    def integrate(
-        self, field: Field, memory: PyTree, x: State, u: Input, plant: "PlantStep"
-    ) -> tuple[State, PyTree]:
-        """Return the state (n,) one dt later under a field (x, u) -> xdot, and the memory."""
-
-
-@final
-class ActAtOnce(Motors):
-    """Inputs act at once, and are held."""
-
-    at_once = True
-
-    def begin(self, trim: Input) -> PyTree:
-        """Return nothing."""
         return ()
 
     def integrate(
         self, field: Field, memory: PyTree, x: State, u: Input, plant: "PlantStep"
     ) -> tuple[State, PyTree]:
-        """Return the state one dt later."""
+        """Return the state (n,) one dt later under a field (x, u) -> xdot, and the memory."""
         # With the input held, as a digital controller holds it: the order of the method stays.
         integrate = INTEGRATORS[plant.integrator]
         for _ in range(plant.substeps):
@@ -89,7 +71,7 @@ class LaggingMotors(Motors):
     """Motors that follow their commands with a lag; they remember the input that acts."""
 
     arrays: MotorArrays
-    remembers = True
+    at_once, remembers = False, True
 
     @property
     def memoryless(self) -> Motors:
@@ -143,7 +125,7 @@ class SteppedMotors(LaggingMotors):
 def motors_of(arrays: MotorArrays | None) -> Motors:
     """Return the member for actuators as arrays, None for ideal ones."""
     if arrays is None:
-        return ActAtOnce()
+        return Motors()
     return SteppedMotors(arrays) if arrays.lag is None else LaggingMotors(arrays)
 
 
@@ -171,7 +153,7 @@ class PlantStep(eqx.Module):
     integrator: str = eqx.field(static=True)
     limiter: Limited = Limited()
     substeps: int = eqx.field(static=True, default=1)
-    motors: Motors = ActAtOnce()
+    motors: Motors = Motors()
     weather: tuple[Wind, ...] = ()
     rows: PyTree = ()
 

@@ -9,7 +9,7 @@ from typing import NamedTuple, final
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from echelon.agents.network.channel import NEVER, Channel, InFlight
 from echelon.agents.network.exchange import Near
@@ -17,43 +17,7 @@ from echelon.core.types import Array, PyTree, Scalar, States
 from echelon.laws.law import Law, Memory
 from echelon.simulation.step.loop import Loop, Surroundings
 from echelon.simulation.step.meter import Sums
-from echelon.simulation.step.records import (
-    Clock,
-    LawMemories,
-    LoopState,
-    Mask,
-    NetworkEstimate,
-    Own,
-    as_array,
-)
-
-
-@final
-class NobodyNear(Surroundings):
-    """Agents do not keep apart."""
-
-    def begin(self, loop: Loop, states: States, laws: LawMemories) -> PyTree:
-        """Return nothing."""
-        return ()
-
-    def look(
-        self,
-        loop: Loop,
-        memory: PyTree,
-        clock: Clock,
-        own: Own,
-        laws: LawMemories,
-        heard: NetworkEstimate,
-        here: Mask,
-    ) -> tuple[Near | None, PyTree]:
-        """Return nothing."""
-        return None, memory
-
-    def measured(
-        self, loop: Loop, read: Sums, now: LoopState, laws: LawMemories, here: Mask
-    ) -> Sums:
-        """Return the sums."""
-        return read
+from echelon.simulation.step.records import Known, LawMemories, LoopState, Mask, as_array
 
 
 class NeighbourHulls(NamedTuple):
@@ -73,42 +37,25 @@ class NeighbourHulls(NamedTuple):
 class ExactHulls(Surroundings):
     """All know the hulls of all others of the same instant."""
 
-    def begin(self, loop: Loop, states: States, laws: LawMemories) -> PyTree:
-        """Return nothing."""
-        return ()
+    keeps_apart = True
 
     def look(
-        self,
-        loop: Loop,
-        memory: PyTree,
-        clock: Clock,
-        own: Own,
-        laws: LawMemories,
-        heard: NetworkEstimate,
-        here: Mask,
+        self, loop: Loop, memory: PyTree, laws: LawMemories, known: Known
     ) -> tuple[Near | None, PyTree]:
         """Return what each agent knows of all others."""
-        hulls, agents = all_hulls(loop, own.x, laws), loop.agents
+        hulls, agents = all_hulls(loop, known.own.x, laws), loop.agents
         receivers, senders = _pairs(agents)
-        present = as_array(here, agents)
-        rows = loop, memory, clock, hulls, heard, present
-        hulls, points, known, memory = self._exchanged(*rows)
-        near = Near(hulls[receivers] - points, heard.leads[senders], known)
+        hulls, points, seen, memory = self._exchanged(loop, memory, hulls, known)
+        near = Near(hulls[receivers] - points, known.heard.leads[senders], seen)
         shape = agents, agents - 1
         return jax.tree.map(lambda part: part.reshape(*shape, *part.shape[1:]), near), memory
 
     def _exchanged(
-        self,
-        loop: Loop,
-        memory: PyTree,
-        clock: Clock,
-        hulls: Float[jax.Array, "N r d"],
-        heard: NetworkEstimate,
-        here: Bool[jax.Array, " N"],
+        self, loop: Loop, memory: PyTree, hulls: Float[jax.Array, "N r d"], known: Known
     ) -> tuple[jax.Array, jax.Array, jax.Array, PyTree]:
         """Return own points, others' (K, r, d), whose are known (K,), and the memory."""
         senders = _pairs(loop.agents)[1]
-        return hulls, hulls[senders], here[senders], memory
+        return hulls, hulls[senders], as_array(known.here, loop.agents)[senders], memory
 
     def measured(
         self, loop: Loop, read: Sums, now: LoopState, laws: LawMemories, here: Mask
@@ -143,15 +90,10 @@ class LateHulls(ExactHulls):
         return NeighbourHulls(self.medium.begin(hulls, links), stamp, points)
 
     def _exchanged(
-        self,
-        loop: Loop,
-        memory: PyTree,
-        clock: Clock,
-        hulls: Float[jax.Array, "N r d"],
-        heard: NetworkEstimate,
-        here: Bool[jax.Array, " N"],
+        self, loop: Loop, memory: PyTree, hulls: Float[jax.Array, "N r d"], known: Known
     ) -> tuple[jax.Array, jax.Array, jax.Array, PyTree]:
         receivers, senders = _pairs(loop.agents)
+        clock, heard, here = known.clock, known.heard, as_array(known.here, loop.agents)
         one = lambda hull, leader: less_expected(loop, clock.t, hull, leader)  # noqa: E731
         hulls = jax.vmap(one)(hulls, heard.leader)
         sends = (here & (heard.leads | (heard.packet.stamp != NEVER)))[senders]
@@ -159,8 +101,8 @@ class LateHulls(ExactHulls):
         new = arrival.new[:, None, None]
         points = jnp.where(new, memory.posts.content[arrival.slot, senders], memory.points)
         posts = self.medium.post(memory.posts, clock.step, hulls, sends, receivers, senders)
-        known = here[senders] & (arrival.stamp != NEVER)
-        return hulls, points, known, NeighbourHulls(posts, arrival.stamp, points)
+        seen = here[senders] & (arrival.stamp != NEVER)
+        return hulls, points, seen, NeighbourHulls(posts, arrival.stamp, points)
 
 
 def less_expected(

@@ -8,8 +8,8 @@ each neighbour for the prediction plus the deviation that the neighbour last sen
 is a deviation, which hardly changes, and never a place, which does.
 """
 
-import abc
-from typing import final
+import functools
+from typing import NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -33,7 +33,6 @@ from echelon.simulation.step.records import (
     Mask,
     Messages,
     NetworkEstimate,
-    Own,
 )
 
 HOP_LIFE = 10
@@ -44,116 +43,122 @@ _CARRIED_FULLY, _SLOWING = 0.4, 2.0
 its motion slows down afterwards."""
 
 
-# ---- the ideal network ---------------------------------------------------------------------------
-
-
-class IdealNetwork(Network):
-    """What is said is heard in the same step."""
-
-    def begin(self, loop: Loop, said: Float[jax.Array, "N s"], forward: int) -> PyTree:
-        """Return nothing."""
-        return ()
-
-    def receive(
-        self,
-        loop: Loop,
-        memory: PyTree,
-        clock: Clock,
-        own: Own,
-        said: Float[jax.Array, "N s"],
-        links: Exchange,
-        here: Mask,
-    ) -> tuple[NetworkEstimate, PyTree]:
-        """Return the disagreement of the same step."""
-        z = links(said, links.along_edges(said), loop.laws.speech.difference(loop.model))
-        return NetworkEstimate(z, self.leadership.leads((), own.number)), memory
-
-    def send(self, loop: Loop, memory: PyTree, known: Known, speech: LeaderSpeech) -> PyTree:
-        """Return the memory as it is."""
-        return memory
+# ---- the ideal network with backups --------------------------------------------------------------
 
 
 @final
-class IdealWithBackups(IdealNetwork):
-    """The same, where packets of leaders reach all agents at once; it remembers each agent's."""
+class IdealWithBackups(Network):
+    """Packets of leaders reach all agents at once; it remembers each agent's."""
 
     def begin(self, loop: Loop, said: Float[jax.Array, "N s"], forward: int) -> PyTree:
         """Return the packets before the first one."""
         content = jnp.zeros((len(said), forward), said.dtype)
         return self.leadership.no_packets(jnp.asarray(loop.laws.numbers), content)
 
-    def receive(
-        self,
-        loop: Loop,
-        memory: PyTree,
-        clock: Clock,
-        own: Own,
-        said: Float[jax.Array, "N s"],
-        links: Exchange,
-        here: Mask,
-    ) -> tuple[NetworkEstimate, PyTree]:
+    def receive(self, loop: Loop, memory: PyTree, known: Known) -> tuple[NetworkEstimate, PyTree]:
         """Return the disagreement of the same step, and the packets after who took the lead."""
-        since = loop.roster.since(clock.step)
-        memory = self.leadership.elect(memory, own.number, clock, since, here)
-        z = links(said, links.along_edges(said), loop.laws.speech.difference(loop.model))
-        return NetworkEstimate(z, self.leadership.leads(memory, own.number)), memory
+        since, number = loop.roster.since(known.clock.step), known.own.number
+        memory = self.leadership.elect(memory, number, known.clock, since, known.here)
+        return super().receive(loop, memory, known)
 
 
-# ---- where a leader is expected: what it says of itself, and what others make of it --------------
+# ---- what messages contain, and where a leader is expected ---------------------------------------
 
 
-class LeaderPrediction(eqx.Module):
-    """What a leader says of itself, and where others expect it."""
+class Saying(NamedTuple):
+    """A leader in a step, or leaders with a row of each, and what it does.
 
-    @abc.abstractmethod
+    Attributes:
+        x: its state.
+        offset: of its place.
+        memory: of its law, before the step.
+        signal: what it says to neighbours.
+        output: what it does.
+    """
+
+    x: State
+    offset: State
+    memory: Memory
+    signal: Float[jax.Array, " s"]
+    output: AgentOutput
+
+
+class PlainValues(eqx.Module):
+    """What the value of a message is: what its sender says.
+
+    Nobody expects a leader anywhere; it says its feed-forward alone.
+
+    Attributes:
+        forget: steps after which what a neighbour sent is not used.
+    """
+
+    forget: Array
+    # Whether a message says nothing without a packet.
+    needs_packet = False
+
     def size(self, s: int, k: int, m: int) -> int:
-        """Return how many numbers it says, for signals (s,), a feed-forward (k,), inputs (m,)."""
+        """Return how many numbers a leader says: signals (s,), feed-forward (k,), inputs (m,)."""
+        return k
 
-    @abc.abstractmethod
-    def content(
-        self,
-        loop: Loop,
-        t: Scalar,
-        x: State,
-        offset: State,
-        memory: Memory,
-        signal: Float[jax.Array, " s"],
-        output: AgentOutput,
-    ) -> Float[jax.Array, " p"]:
-        """Return what a leader says of itself, with its memory before this step."""
+    def content(self, loop: Loop, t: Scalar, leader: Saying) -> Float[jax.Array, " p"]:
+        """Return what a leader says of itself."""
+        return leader.output.message
 
-    def expected(
-        self, loop: Loop, s: int, t: Scalar, content: Float[jax.Array, " p"], age: Scalar
-    ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
-        """Return the signal (s,) and the feed-forward of a leader, by its packet of an age (s)."""
-        raise NotImplementedError
+    def usable_age(self, dt: Array | float) -> jax.Array:
+        """Return the age (s) beyond which what a neighbour sent is not used."""
+        # Of a state there is no better guess than the last one, but never that of no message.
+        return jnp.asarray(np.finfo(np.float32).max)
+
+    def expect(
+        self, loop: Loop, known: Known, packet: LeaderPackets, since: Float[jax.Array, " N"]
+    ) -> tuple[Float[jax.Array, "N s"], Float[jax.Array, "N k"]]:
+        """Return the signal at which each expects its leader, and the feed-forward."""
+        return known.said, packet.content
+
+    def received(
+        self, mail: Messages, age: jax.Array, leader: jax.Array, knows: jax.Array, known: Known
+    ) -> tuple[Float[jax.Array, "K s"], Bool[jax.Array, " K"], Bool[jax.Array, " K"]]:
+        """Return what each link says, whether it says anything, and whether it is fresh.
+
+        Args:
+            mail: of the agents.
+            age: (K,) of each link, s.
+            leader: (N, s) the signal at which each expects its leader.
+            knows: (N,) who knows of one.
+            known: of the step.
+        """
+        return mail.value, age < jnp.inf, age <= self.usable_age(known.clock.dt)
+
+    def value(
+        self, said: jax.Array, leader: jax.Array, itself: jax.Array, difference: Difference
+    ) -> Float[jax.Array, "N s"]:
+        """Return the values of messages, of which `itself` (N,) are a leader's."""
+        return said
 
 
-@final
-class PlanPrediction(LeaderPrediction):
-    """All know the leader's plan; it says its deviation from it."""
+class PlanDeviations(PlainValues):
+    """How far the sender is off where it expects the leader, whose plan all know.
+
+    A leader says its deviation from its plan.
+    """
+
+    needs_packet = True
 
     def size(self, s: int, k: int, m: int) -> int:
         """Return that of a signal."""
         return s
 
-    def content(
-        self,
-        loop: Loop,
-        t: Scalar,
-        x: State,
-        offset: State,
-        memory: Memory,
-        signal: Float[jax.Array, " s"],
-        output: AgentOutput,
-    ) -> Float[jax.Array, " p"]:
-        """Return the deviation."""
-        return _deviation(loop, t, x, offset, memory)
+    def content(self, loop: Loop, t: Scalar, leader: Saying) -> Float[jax.Array, " p"]:
+        """Return the deviation from the plan."""
+        rows = t, leader.x, leader.offset, leader.memory
+        deviation = loop.laws.leader.deviation(loop.model, *rows)
+        assert deviation is not None, "a leader that others predict by its plan has one"
+        return deviation
 
     def expected(
         self, loop: Loop, s: int, t: Scalar, content: Float[jax.Array, " p"], age: Scalar
     ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
-        """Return where the plan and the deviation put it, and what it would send there."""
+        """Return the signal (s,) and the feed-forward of a leader, by its packet of an age (s)."""
         law, model = loop.laws.leader, loop.model
         expected = law.expected(model, t, content, age, loop.motion.dt)
         assert isinstance(expected, Expected), "a channel with a preview has a leader with a plan"
@@ -166,26 +171,48 @@ class PlanPrediction(LeaderPrediction):
         rows = model, loop.motion, law, view, law.begin(model, x), True
         return x, loop.laws.act(*rows).message
 
+    def usable_age(self, dt: Array | float) -> jax.Array:
+        """Return the age (s) beyond which what a neighbour sent is not used."""
+        return jnp.asarray(self.forget * dt)
 
-class PacketPrediction(LeaderPrediction):
-    """All carry on its last motion by the model; it says its signal, feed-forward and input."""
+    def expect(
+        self, loop: Loop, known: Known, packet: LeaderPackets, since: Float[jax.Array, " N"]
+    ) -> tuple[Float[jax.Array, "N s"], Float[jax.Array, "N k"]]:
+        """Return what is made of the packets."""
+        rows = packet.content, jnp.where(since < jnp.inf, since, 0.0)
+        one = functools.partial(self.expected, loop, known.said.shape[1], known.clock.t)
+        return jax.vmap(one)(*rows)
+
+    def received(
+        self, mail: Messages, age: jax.Array, leader: jax.Array, knows: jax.Array, known: Known
+    ) -> tuple[Float[jax.Array, "K s"], Bool[jax.Array, " K"], Bool[jax.Array, " K"]]:
+        """Return the expected leader plus what is fresh of the deviations."""
+        receivers = jnp.asarray(known.links.receivers)
+        fresh, used = age <= self.usable_age(known.clock.dt), knows[receivers]
+        value = leader[receivers] + jnp.where(fresh[:, None], mail.value, 0.0)
+        # A leader is where it is expected, and its own message says no more.
+        return value, used, fresh | ((age < jnp.inf) & (mail.hops == 0))
+
+    def value(
+        self, said: jax.Array, leader: jax.Array, itself: jax.Array, difference: Difference
+    ) -> Float[jax.Array, "N s"]:
+        """Return the deviations."""
+        return jnp.where(itself[:, None], 0.0, difference(said, leader))
+
+
+class PacketDeviations(PlanDeviations):
+    """The same, where all carry on the leader's last motion by the model.
+
+    A leader says its signal, its feed-forward and its input.
+    """
 
     def size(self, s: int, k: int, m: int) -> int:
         """Return that of the three."""
         return s + k + m
 
-    def content(
-        self,
-        loop: Loop,
-        t: Scalar,
-        x: State,
-        offset: State,
-        memory: Memory,
-        signal: Float[jax.Array, " s"],
-        output: AgentOutput,
-    ) -> Float[jax.Array, " p"]:
+    def content(self, loop: Loop, t: Scalar, leader: Saying) -> Float[jax.Array, " p"]:
         """Return the three."""
-        return jnp.concatenate([signal, output.message, output.input])
+        return jnp.concatenate([leader.signal, leader.output.message, leader.output.input])
 
     def expected(
         self, loop: Loop, s: int, t: Scalar, content: Float[jax.Array, " p"], age: Scalar
@@ -197,32 +224,22 @@ class PacketPrediction(LeaderPrediction):
 
 
 @final
-class SlopedPacketPrediction(PacketPrediction):
-    """The same, and how its feed-forward changes: with backups it is carried on for longer."""
+class SlopedPacketDeviations(PacketDeviations):
+    """The same, where it also says how its feed-forward changes: it is carried on for longer."""
 
     def size(self, s: int, k: int, m: int) -> int:
         """Return that of the four."""
         return s + 2 * k + m
 
-    def content(
-        self,
-        loop: Loop,
-        t: Scalar,
-        x: State,
-        offset: State,
-        memory: Memory,
-        signal: Float[jax.Array, " s"],
-        output: AgentOutput,
-    ) -> Float[jax.Array, " p"]:
+    def content(self, loop: Loop, t: Scalar, leader: Saying) -> Float[jax.Array, " p"]:
         """Return the four; the slope is that of the plan."""
-        deviation, dt = _deviation(loop, t, x, offset, memory), loop.motion.dt
+        deviation, dt = PlanDeviations.content(self, loop, t, leader), loop.motion.dt
         rows = loop.model, t + dt, deviation, jnp.asarray(dt, t.dtype), dt
-        expected = loop.laws.leader.expected(*rows)
-        slope = jnp.zeros_like(output.message)
+        expected, message = loop.laws.leader.expected(*rows), leader.output.message
+        slope = jnp.zeros_like(message)
         if isinstance(expected, Expected) and expected.feedforward is not None:
-            slope = (expected.feedforward - output.message) / dt
-        three = super().content(loop, t, x, offset, memory, signal, output)
-        return jnp.concatenate([three, slope])
+            slope = (expected.feedforward - message) / dt
+        return jnp.concatenate([super().content(loop, t, leader), slope])
 
     def expected(
         self, loop: Loop, s: int, t: Scalar, content: Float[jax.Array, " p"], age: Scalar
@@ -235,36 +252,6 @@ class SlopedPacketPrediction(PacketPrediction):
         mean = forward + 0.5 * time * slope
         moved = loop.laws.follower.carried(loop.model, signal, mean, u, time)
         return moved, forward + time * slope
-
-
-@final
-class NoPrediction(LeaderPrediction):
-    """Nobody expects it anywhere; it says its feed-forward alone."""
-
-    def size(self, s: int, k: int, m: int) -> int:
-        """Return that of the feed-forward."""
-        return k
-
-    def content(
-        self,
-        loop: Loop,
-        t: Scalar,
-        x: State,
-        offset: State,
-        memory: Memory,
-        signal: Float[jax.Array, " s"],
-        output: AgentOutput,
-    ) -> Float[jax.Array, " p"]:
-        """Return it."""
-        return output.message
-
-
-def _deviation(
-    loop: Loop, t: Scalar, x: State, offset: State, memory: Memory
-) -> Float[jax.Array, " s"]:
-    deviation = loop.laws.leader.deviation(loop.model, t, x, offset, memory)
-    assert deviation is not None, "a leader that others predict by its plan has one"
-    return deviation
 
 
 def parts_of(
@@ -282,199 +269,37 @@ def carried_time(age: Scalar) -> Scalar:
     return age - late + (1.0 - jnp.exp(-_SLOWING * late)) / _SLOWING
 
 
-# ---- what messages contain -----------------------------------------------------------------------
-
-
-class Content(eqx.Module):
-    """What the value of a message is.
-
-    Attributes:
-        prediction: of the leader.
-        forget: steps after which what a neighbour sent is not used.
-    """
-
-    prediction: LeaderPrediction
-    forget: Array
-
-    @abc.abstractmethod
-    def usable_age(self, dt: Array | float) -> jax.Array:
-        """Return the age (s) beyond which what a neighbour sent is not used."""
-
-    @abc.abstractmethod
-    def expect(
-        self,
-        loop: Loop,
-        t: Scalar,
-        packet: LeaderPackets,
-        since: Float[jax.Array, " N"],
-        said: Float[jax.Array, "N s"],
-    ) -> tuple[Float[jax.Array, "N s"], Float[jax.Array, "N k"]]:
-        """Return the signal at which each expects its leader, and the feed-forward."""
-
-    @abc.abstractmethod
-    def received(
-        self,
-        mail: Messages,
-        age: Float[jax.Array, " K"],
-        leader: Float[jax.Array, "N s"],
-        knows: Bool[jax.Array, " N"],
-        links: Exchange,
-        dt: Array | float,
-    ) -> tuple[Float[jax.Array, "K s"], Bool[jax.Array, " K"], Bool[jax.Array, " K"]]:
-        """Return what each link says, whether it says anything, and whether it is fresh."""
-
-    @abc.abstractmethod
-    def value(
-        self,
-        said: Float[jax.Array, "N s"],
-        leader: Float[jax.Array, "N s"],
-        itself: Bool[jax.Array, " N"],
-        packet: LeaderPackets,
-        difference: Difference,
-    ) -> tuple[Float[jax.Array, "N s"], Bool[jax.Array, " N"]]:
-        """Return the values of the messages, and who can send one."""
-
-
-@final
-class Deviations(Content):
-    """How far the sender is off where it expects the leader."""
-
-    def usable_age(self, dt: Array | float) -> jax.Array:
-        """Return the age (s) beyond which what a neighbour sent is not used."""
-        return jnp.asarray(self.forget * dt)
-
-    def expect(
-        self,
-        loop: Loop,
-        t: Scalar,
-        packet: LeaderPackets,
-        since: Float[jax.Array, " N"],
-        said: Float[jax.Array, "N s"],
-    ) -> tuple[Float[jax.Array, "N s"], Float[jax.Array, "N k"]]:
-        """Return what the prediction makes of the packets."""
-        rows = packet.content, jnp.where(since < jnp.inf, since, 0.0)
-        one = lambda *row: self.prediction.expected(loop, said.shape[1], t, *row)  # noqa: E731
-        return jax.vmap(one)(*rows)
-
-    def received(
-        self,
-        mail: Messages,
-        age: Float[jax.Array, " K"],
-        leader: Float[jax.Array, "N s"],
-        knows: Bool[jax.Array, " N"],
-        links: Exchange,
-        dt: Array | float,
-    ) -> tuple[Float[jax.Array, "K s"], Bool[jax.Array, " K"], Bool[jax.Array, " K"]]:
-        """Return the expected leader plus what is fresh of the deviations."""
-        receivers = jnp.asarray(links.receivers)
-        fresh, used = age <= self.usable_age(dt), knows[receivers]
-        value = leader[receivers] + jnp.where(fresh[:, None], mail.value, 0.0)
-        # A leader is where it is expected, and its own message says no more.
-        return value, used, fresh | ((age < jnp.inf) & (mail.hops == 0))
-
-    def value(
-        self,
-        said: Float[jax.Array, "N s"],
-        leader: Float[jax.Array, "N s"],
-        itself: Bool[jax.Array, " N"],
-        packet: LeaderPackets,
-        difference: Difference,
-    ) -> tuple[Float[jax.Array, "N s"], Bool[jax.Array, " N"]]:
-        """Return the deviations, which those send that have a packet."""
-        deviation = jnp.where(itself[:, None], 0.0, difference(said, leader))
-        return deviation, packet.stamp != NEVER
-
-
-@final
-class PlainValues(Content):
-    """What the sender says."""
-
-    def usable_age(self, dt: Array | float) -> jax.Array:
-        """Return the age (s) beyond which what a neighbour sent is not used."""
-        # Of a state there is no better guess than the last one, but never that of no message.
-        return jnp.asarray(np.finfo(np.float32).max)
-
-    def expect(
-        self,
-        loop: Loop,
-        t: Scalar,
-        packet: LeaderPackets,
-        since: Float[jax.Array, " N"],
-        said: Float[jax.Array, "N s"],
-    ) -> tuple[Float[jax.Array, "N s"], Float[jax.Array, "N k"]]:
-        """Return the own signal, and the feed-forward of the packet."""
-        return said, packet.content
-
-    def received(
-        self,
-        mail: Messages,
-        age: Float[jax.Array, " K"],
-        leader: Float[jax.Array, "N s"],
-        knows: Bool[jax.Array, " N"],
-        links: Exchange,
-        dt: Array | float,
-    ) -> tuple[Float[jax.Array, "K s"], Bool[jax.Array, " K"], Bool[jax.Array, " K"]]:
-        """Return the values."""
-        return mail.value, age < jnp.inf, age <= self.usable_age(dt)
-
-    def value(
-        self,
-        said: Float[jax.Array, "N s"],
-        leader: Float[jax.Array, "N s"],
-        itself: Bool[jax.Array, " N"],
-        packet: LeaderPackets,
-        difference: Difference,
-    ) -> tuple[Float[jax.Array, "N s"], Bool[jax.Array, " N"]]:
-        """Return the signals, which everybody sends."""
-        return said, jnp.ones(len(said), bool)
-
-
 # ---- whom agents use -----------------------------------------------------------------------------
 
 
 class AllNeighbours(eqx.Module):
     """Whom agents use of those who send to them: all."""
 
-    def uses(
-        self, mail: Messages, hops: jax.Array, links: Exchange
-    ) -> Bool[jax.Array, " K"] | bool:
-        """Return which links an agent uses whose messages are fresh."""
+    def uses(self, mail: Messages, hops: jax.Array, links: Exchange) -> jax.Array | bool:
+        """Return which links (K,) an agent uses whose messages are fresh."""
         return True
 
     def disagreement(
-        self,
-        links: Exchange,
-        said: Float[jax.Array, "N s"],
-        received: Float[jax.Array, "K s"],
-        fresh: Bool[jax.Array, " K"],
-        alone: Float[jax.Array, "N s"],
-        difference: Difference,
+        self, known: Known, received: jax.Array, fresh: jax.Array, alone: jax.Array, loop: Loop
     ) -> Float[jax.Array, "N s"]:
-        """Return z (N, s), of which `alone` is that of an agent without fresh messages."""
-        return links(said, received, difference)
+        """Return z (N, s), of which `alone` (N, s) is of an agent without fresh messages (K,)."""
+        return known.links(known.said, received, loop.laws.speech.difference(loop.model))
 
 
 @final
 class LeaderwardNeighbours(AllNeighbours):
     """Those with fewer hops to the leader alone."""
 
-    def uses(
-        self, mail: Messages, hops: jax.Array, links: Exchange
-    ) -> Bool[jax.Array, " K"] | bool:
-        """Return which links an agent uses whose messages are fresh."""
+    def uses(self, mail: Messages, hops: jax.Array, links: Exchange) -> jax.Array | bool:
+        """Return which links (K,) an agent uses whose messages are fresh."""
         return mail.hops < hops[jnp.asarray(links.receivers)]
 
     def disagreement(
-        self,
-        links: Exchange,
-        said: Float[jax.Array, "N s"],
-        received: Float[jax.Array, "K s"],
-        fresh: Bool[jax.Array, " K"],
-        alone: Float[jax.Array, "N s"],
-        difference: Difference,
+        self, known: Known, received: jax.Array, fresh: jax.Array, alone: jax.Array, loop: Loop
     ) -> Float[jax.Array, "N s"]:
         """Return the mean over the links that are used."""
-        return links.mean(said, received, fresh, alone, difference)
+        difference = loop.laws.speech.difference(loop.model)
+        return known.links.mean(known.said, received, fresh, alone, difference)
 
 
 # ---- the rules of messages -----------------------------------------------------------------------
@@ -492,21 +317,19 @@ class MessageRules(eqx.Module):
     """
 
     leadership: FixedLeaders
-    content: Content
+    content: PlainValues
     neighbours: AllNeighbours
     agents: int = eqx.field(static=True)
 
     @classmethod
     def of(cls, channel: Channel, leadership: FixedLeaders, agents: int) -> "MessageRules":
         """Return the rules of a network."""
-        content = PlainValues(NoPrediction(), channel.forget)
-        if channel.messages is MessageContent.DEVIATION:
-            by_packet = SlopedPacketPrediction() if leadership.changes else PacketPrediction()
-            preview = channel.prediction is Prediction.PREVIEW
-            content = Deviations(PlanPrediction() if preview else by_packet, channel.forget)
+        kind = SlopedPacketDeviations if leadership.changes else PacketDeviations
+        kind = PlanDeviations if channel.prediction is Prediction.PREVIEW else kind
+        kind = PlainValues if channel.messages is MessageContent.STATE else kind
         all_ = channel.hears is NeighbourChoice.ALL
         neighbours = AllNeighbours() if all_ else LeaderwardNeighbours()
-        return cls(leadership, content, neighbours, agents)
+        return cls(leadership, kind(channel.forget), neighbours, agents)
 
     def begin(
         self, number: jax.Array, links: int, said: Float[jax.Array, "N s"], size: int
@@ -536,30 +359,22 @@ class MessageRules(eqx.Module):
             stamp,
         )
 
-    def read(
-        self,
-        loop: Loop,
-        mail: Messages,
-        clock: Clock,
-        own: Own,
-        said: Float[jax.Array, "N s"],
-        links: Exchange,
-    ) -> NetworkEstimate:
-        """Return what agents know from their mail, with their own signals (N, s)."""
-        packet, difference = mail.packet, loop.laws.speech.difference(loop.model)
+    def read(self, loop: Loop, mail: Messages, known: Known) -> NetworkEstimate:
+        """Return what agents know from their mail, with what they say themselves."""
+        packet, number, links, clock = mail.packet, known.own.number, known.links, known.clock
         age, since = clock.age(mail.stamp), clock.age(packet.stamp)
-        leads, aware = self.leadership.leads(packet, own.number), since < jnp.inf
-        leader, forward = self.content.expect(loop, clock.t, packet, since, said)
-        itself = packet.leader == own.number
-        leader = jnp.where((itself | ~aware)[:, None], said, leader)
+        leads, aware = self.leadership.leads(packet, number), since < jnp.inf
+        leader, forward = self.content.expect(loop, known, packet, since)
+        itself = packet.leader == number
+        leader = jnp.where((itself | ~aware)[:, None], known.said, leader)
         forward = jnp.where(aware[:, None], forward, 0.0)
         hops, knows = self.hops(mail, age, leads, links, clock.dt), leads | aware
-        rows = mail, age, leader, knows, links, clock.dt
-        received, used, fresh = self.content.received(*rows)
-        received = jnp.where(used[:, None], received, said[jnp.asarray(links.receivers)])
+        received, used, fresh = self.content.received(mail, age, leader, knows, known)
+        received = jnp.where(used[:, None], received, known.said[jnp.asarray(links.receivers)])
         fresh = fresh & used & self.neighbours.uses(mail, hops, links)
-        alone = jnp.where(knows[:, None], difference(said, leader), 0.0)
-        z = self.neighbours.disagreement(links, said, received, fresh, alone, difference)
+        off = loop.laws.speech.difference(loop.model)(known.said, leader)
+        alone = jnp.where(knows[:, None], off, 0.0)
+        z = self.neighbours.disagreement(known, received, fresh, alone, loop)
         return NetworkEstimate(z, leads, forward, leader, hops, packet)
 
     def hops(
@@ -594,9 +409,10 @@ class MessageRules(eqx.Module):
         self, loop: Loop, mail: Messages, known: Known, speech: LeaderSpeech
     ) -> Float[jax.Array, "N p"]:
         """Return what each would say of itself as a leader; zeros of those that cannot be one."""
-        numbers, one, t = loop.laws.leaders, self.content.prediction.content, known.clock.t
+        numbers, t = loop.laws.leaders, known.clock.t
         own = known.own.x[numbers], known.offsets[0].offset, speech.before, known.said[numbers]
-        content = jax.vmap(lambda *row: one(loop, t, *row))(*own, speech.output)
+        one = functools.partial(self.content.content, loop, t)
+        content = jax.vmap(one)(Saying(*own, speech.output))
         return jnp.zeros_like(mail.packet.content).at[numbers].set(content)
 
     def write(
@@ -619,7 +435,8 @@ class MessageRules(eqx.Module):
             stamp=jnp.where(itself, stamp, packet.stamp),
             content=jnp.where(itself[:, None], content, packet.content),
         )
-        value, sends = self.content.value(said, heard.leader, itself, packet, difference)
+        value = self.content.value(said, heard.leader, itself, difference)
+        sends = packet.stamp != NEVER if self.content.needs_packet else jnp.ones(len(said), bool)
         return Messages(value, heard.hops, packet), sends
 
 
@@ -639,30 +456,23 @@ class LateNetwork(Network):
 
     rules: MessageRules
     medium: Channel
+    late = True
 
     def begin(self, loop: Loop, said: Float[jax.Array, "N s"], forward: int) -> PyTree:
         """Return the network before the first message."""
         numbers, links = jnp.asarray(loop.laws.numbers), len(loop.graph.exchange.receivers)
         sizes = said.shape[1], forward, len(loop.model.input_names)
-        size = self.rules.content.prediction.size(*sizes)
+        size = self.rules.content.size(*sizes)
         mail = self.rules.begin(numbers, links, said, size)
         return self.medium.begin(Messages(said, numbers, mail.packet), links), mail
 
-    def receive(
-        self,
-        loop: Loop,
-        memory: PyTree,
-        clock: Clock,
-        own: Own,
-        said: Float[jax.Array, "N s"],
-        links: Exchange,
-        here: Mask,
-    ) -> tuple[NetworkEstimate, PyTree]:
+    def receive(self, loop: Loop, memory: PyTree, known: Known) -> tuple[NetworkEstimate, PyTree]:
         """Return what agents know with what arrives now, and the mail with it."""
         in_flight, mail = memory
-        since = loop.roster.since(clock.step)
-        mail = self.delivered(in_flight, mail, own.number, clock, since, links, here)
-        return self.rules.read(loop, mail, clock, own, said, links), (in_flight, mail)
+        since, number = loop.roster.since(known.clock.step), known.own.number
+        rows = number, known.clock, since, known.links, known.here
+        mail = self.delivered(in_flight, mail, *rows)
+        return self.rules.read(loop, mail, known), (in_flight, mail)
 
     def delivered(
         self,

@@ -1,6 +1,5 @@
 """Where the places of agents in the formation are: at offsets that are constant, or move."""
 
-import abc
 from typing import TypeAlias, final
 
 import equinox as eqx
@@ -22,7 +21,7 @@ Agents: TypeAlias = Array | jax.Array
 
 
 class Places(eqx.Module):
-    """The offsets of a formation: what laws use, and where errors are measured.
+    """The offsets of a formation, which never change: what laws use, and where errors are measured.
 
     Attributes:
         offsets: (N, n) at the start.
@@ -34,25 +33,21 @@ class Places(eqx.Module):
     def of(cls, formation: Formation) -> "Places":
         """Return the places of a formation."""
         offsets, motion = np.asarray(formation.offsets), formation.motion
-        return ConstantPlaces(offsets) if motion is None else MovingPlaces(offsets, motion)
+        return Places(offsets) if motion is None else MovingPlaces(offsets, motion)
 
-    @abc.abstractmethod
     def of_group(self, model: ControlAffine, law: Law, t: Scalar, agents: Agents) -> GroupOffsets:
         """Return what agents under a law take for their offsets at a time (s)."""
+        return GroupOffsets(jnp.asarray(self.offsets, jnp.result_type(t))[agents], None)
 
-    @abc.abstractmethod
     def of_all(
         self, laws: RunLaws, groups: tuple[GroupOffsets, GroupOffsets]
     ) -> Float[jax.Array, "N n"]:
         """Return what all agents take for their offsets, of those of the two groups."""
+        return jnp.asarray(self.offsets, groups[0].offset.dtype)
 
-    @abc.abstractmethod
     def goals(self, t: Scalar) -> Float[jax.Array, "N n"] | None:
         """Return the offsets at which errors are measured; None of the meter's own."""
-
-    @abc.abstractmethod
-    def of_one(self, number: int) -> "Places":
-        """Return the places of one agent alone."""
+        return None
 
     def groups(
         self, model: ControlAffine, laws: RunLaws, t: Scalar
@@ -60,29 +55,6 @@ class Places(eqx.Module):
         """Return what leaders and followers take for their offsets at a time (s)."""
         led, followed = (self.of_group(model, law, t, agents) for law, agents in laws.groups)
         return led, followed
-
-
-@final
-class ConstantPlaces(Places):
-    """Offsets that never change."""
-
-    def of_group(self, model: ControlAffine, law: Law, t: Scalar, agents: Agents) -> GroupOffsets:
-        """Return the offsets."""
-        return GroupOffsets(jnp.asarray(self.offsets, jnp.result_type(t))[agents], None)
-
-    def of_all(
-        self, laws: RunLaws, groups: tuple[GroupOffsets, GroupOffsets]
-    ) -> Float[jax.Array, "N n"]:
-        """Return the offsets."""
-        return jnp.asarray(self.offsets, groups[0].offset.dtype)
-
-    def goals(self, t: Scalar) -> Float[jax.Array, "N n"] | None:
-        """Return None: the meter has them."""
-        return None
-
-    def of_one(self, number: int) -> "Places":
-        """Return its row."""
-        return ConstantPlaces(self.offsets[number : number + 1])
 
 
 @final
@@ -109,9 +81,3 @@ class MovingPlaces(Places):
         kind = jnp.result_type(t)
         rows = (jnp.asarray(x, kind) for x in (self.offsets, self.motion.places))
         return jax.vmap(lambda *row: OwnOffset(self.motion, *row).state(t))(*rows)
-
-    def of_one(self, number: int) -> "Places":
-        """Return its row."""
-        places = self.motion.places[number : number + 1]
-        motion = eqx.tree_at(lambda motion: motion.places, self.motion, places)
-        return MovingPlaces(self.offsets[number : number + 1], motion)

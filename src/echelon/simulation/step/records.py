@@ -3,7 +3,7 @@
 Every record has a row for each agent: N rows in a run, one for an agent alone.
 """
 
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -196,7 +196,7 @@ class AgentOutput(NamedTuple):
 
 
 class Known(NamedTuple):
-    """All that is known in a step before anybody acts.
+    """All that is known in a step before anybody acts; the last two after they are heard and seen.
 
     Attributes:
         clock: of the step.
@@ -205,7 +205,7 @@ class Known(NamedTuple):
         offsets: of the leaders and of the followers.
         said: (N, s) what all say.
         links: the exchange with the weights of this step.
-        heard: what they know from messages.
+        heard: what they know from messages, a `NetworkEstimate`.
         near: what each knows of others near it; None where agents do not keep apart.
     """
 
@@ -215,8 +215,8 @@ class Known(NamedTuple):
     offsets: tuple[GroupOffsets, GroupOffsets]
     said: Float[jax.Array, "N s"]
     links: Exchange
-    heard: NetworkEstimate
-    near: Near | None
+    heard: Any = None
+    near: Near | None = None
 
 
 class LeaderSpeech(NamedTuple):

@@ -1,8 +1,8 @@
 """The laws of a run: who is under which, what agents say, and what one agent does."""
 
-import abc
+import functools
 import operator
-from typing import final
+from typing import NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -30,74 +30,32 @@ from echelon.simulation.step.records import (
 # ---- what agents say: their states less their offsets, or the signals of their laws --------------
 
 
-class Speech(eqx.Module):
-    """What agents say to their neighbours."""
+class StateSpeech(eqx.Module):
+    """What agents say to their neighbours: their states less their offsets."""
 
-    @abc.abstractmethod
+    # Whether neighbours are told more than that.
+    signals = False
+
     def of_one(
         self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
     ) -> Float[jax.Array, " s"]:
         """Return what an agent at x says (s,)."""
-
-    @abc.abstractmethod
-    def of_all(
-        self,
-        laws: "RunLaws",
-        model: ControlAffine,
-        x: States,
-        offsets: States,
-        groups: tuple[GroupOffsets, GroupOffsets],
-        memory: LawMemories,
-    ) -> Float[jax.Array, "N s"]:
-        """Return what all say (N, s); offsets (N, n) of all, and those of the two groups."""
-
-    @abc.abstractmethod
-    def difference(self, model: ControlAffine) -> Difference:
-        """Return the difference of values (K, s) and (K, s)."""
-
-    @abc.abstractmethod
-    def beyond_state(
-        self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
-    ) -> Float[jax.Array, " b"]:
-        """Return what neighbours are told besides x - offset, which may be nothing."""
-
-
-@final
-class StateSpeech(Speech):
-    """Agents say their states less their offsets."""
-
-    def of_one(
-        self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
-    ) -> Float[jax.Array, " s"]:
-        """Return x - offset."""
         return x - offset
 
-    def of_all(
-        self,
-        laws: "RunLaws",
-        model: ControlAffine,
-        x: States,
-        offsets: States,
-        groups: tuple[GroupOffsets, GroupOffsets],
-        memory: LawMemories,
-    ) -> Float[jax.Array, "N s"]:
-        """Return x - offsets."""
-        return x - offsets
+    def of_all(self, laws: "RunLaws", known: "Sayings") -> Float[jax.Array, "N s"]:
+        """Return what all say (N, s)."""
+        return known.x - known.offsets
 
     def difference(self, model: ControlAffine) -> Difference:
-        """Return the model's, which may wind."""
+        """Return the difference of values (K, s) and (K, s), which may wind."""
         return jax.vmap(model.difference)
-
-    def beyond_state(
-        self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
-    ) -> Float[jax.Array, " b"]:
-        """Return nothing."""
-        return jnp.zeros(0, x.dtype)
 
 
 @final
-class SignalSpeech(Speech):
-    """Agents say the signals of their laws."""
+class SignalSpeech(StateSpeech):
+    """They say the signals of their laws."""
+
+    signals = True
 
     def of_one(
         self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
@@ -107,74 +65,51 @@ class SignalSpeech(Speech):
         assert signal is not None, "laws that speak return a signal"
         return signal
 
-    def of_all(
-        self,
-        laws: "RunLaws",
-        model: ControlAffine,
-        x: States,
-        offsets: States,
-        groups: tuple[GroupOffsets, GroupOffsets],
-        memory: LawMemories,
-    ) -> Float[jax.Array, "N s"]:
+    def of_all(self, laws: "RunLaws", known: "Sayings") -> Float[jax.Array, "N s"]:
         """Return the signals of both groups, in the agents' order."""
-        said = [
-            jax.vmap(lambda *row, law=law: self.of_one(law, model, *row))(
-                x[agents], own.offset, rows
-            )
-            for (law, agents), own, rows in zip(laws.groups, groups, memory, strict=True)
-        ]
+        said, rows = list[jax.Array](), zip(laws.groups, known.groups, known.memory, strict=True)
+        for (law, agents), own, memory in rows:
+            one = functools.partial(self.of_one, law, known.model)
+            said.append(jax.vmap(one)(known.x[agents], own.offset, memory))
         return laws.ordered(*said)
 
     def difference(self, model: ControlAffine) -> Difference:
         """Return the plain one."""
         return operator.sub
 
-    def beyond_state(
-        self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
-    ) -> Float[jax.Array, " b"]:
-        """Return the signal."""
-        return self.of_one(law, model, x, offset, memory)
+
+class Sayings(NamedTuple):
+    """What agents say is made of: states (N, n), all offsets, those of groups, and memories."""
+
+    model: ControlAffine
+    x: States
+    offsets: States
+    groups: tuple[GroupOffsets, GroupOffsets]
+    memory: LawMemories
 
 
 # ---- axes: the world's, or those of a heading that everybody receives ----------------------------
 
 
-class Axes(eqx.Module):
-    """In which axes gains are."""
+class WorldAxes(eqx.Module):
+    """In which axes gains are: in the world's."""
 
-    @abc.abstractmethod
     def facing(
         self, laws: "RunLaws", model: ControlAffine, law: Law, view: LocalView, leads: bool
     ) -> tuple[LocalView, Law, Law, Float[jax.Array, " h"]]:
         """Return view, law, followers' law, and what is sent on behind the feed-forward."""
-
-    @abc.abstractmethod
-    def alone(
-        self, law: Law, model: ControlAffine, t: Scalar, x: State, size: int
-    ) -> Float[jax.Array, " k"]:
-        """Return the feed-forward of an agent that received none."""
-
-
-@final
-class WorldAxes(Axes):
-    """Gains do not turn."""
-
-    def facing(
-        self, laws: "RunLaws", model: ControlAffine, law: Law, view: LocalView, leads: bool
-    ) -> tuple[LocalView, Law, Law, Float[jax.Array, " h"]]:
-        """Return the same; nothing is sent on."""
         return view, law, laws.follower, jnp.zeros(0, view.x.dtype)
 
     def alone(
         self, law: Law, model: ControlAffine, t: Scalar, x: State, size: int
     ) -> Float[jax.Array, " k"]:
-        """Return zeros."""
+        """Return the feed-forward of an agent that received none."""
         return jnp.zeros(size)
 
 
 @final
-class HeadingAxes(Axes):
-    """Gains turn with the heading that the leader sends behind its feed-forward."""
+class HeadingAxes(WorldAxes):
+    """In those of the heading that the leader sends behind its feed-forward."""
 
     def facing(
         self, laws: "RunLaws", model: ControlAffine, law: Law, view: LocalView, leads: bool
@@ -249,8 +184,8 @@ class RunLaws(eqx.Module):
     followers: Array
     order: Array
     numbers: Array
-    speech: Speech
-    axes: Axes
+    speech: StateSpeech
+    axes: WorldAxes
     feedforward: WholeFeedforward = WholeFeedforward()
     backups: bool = eqx.field(static=True, default=False)
 

@@ -27,7 +27,7 @@ from echelon.simulation.step.records import (
     Steps,
     choose,
 )
-from echelon.simulation.step.run_laws import limit_sides
+from echelon.simulation.step.run_laws import Sayings, limit_sides
 
 
 @cached_jit
@@ -68,8 +68,8 @@ def said_by(loop: Loop, now: LoopState) -> Float[jax.Array, "N s"]:
 def _said(loop: Loop, x: States, laws: LawMemories, clock: Clock) -> tuple[Any, jax.Array]:
     offsets = loop.places.groups(loop.model, loop.laws, clock.t)
     everywhere = loop.places.of_all(loop.laws, offsets)
-    rows = loop.laws, loop.model, x, everywhere, offsets, laws
-    return offsets, loop.laws.speech.of_all(*rows)
+    known = Sayings(loop.model, x, everywhere, offsets, laws)
+    return offsets, loop.laws.speech.of_all(loop.laws, known)
 
 
 def control(loop: Loop, now: LoopState, clock: Clock) -> Control:
@@ -86,14 +86,13 @@ def control(loop: Loop, now: LoopState, clock: Clock) -> Control:
     # 2. Say.
     offsets, said = _said(loop, x, memory.laws, clock)
     # 3. Hear.
-    links = loop.graph.at(clock.step)
-    rows = clock, own, said, links, here
-    heard, network = loop.network.receive(loop, memory.network, *rows)
+    known = Known(clock, here, own, offsets, said, loop.graph.at(clock.step))
+    heard, network = loop.network.receive(loop, memory.network, known)
     # 4. Look around.
-    rows = clock, own, memory.laws, heard, here
-    near, seen = loop.surroundings.look(loop, memory.near, *rows)
+    known = known._replace(heard=heard)
+    near, seen = loop.surroundings.look(loop, memory.near, memory.laws, known)
     # 5. Act.
-    known = Known(clock, here, own, offsets, said, links, heard, near)
+    known = known._replace(near=near)
     led, followed, speech, network = loop.turns.play(loop, known, memory.laws, network)
     # 6. Write.
     network = loop.network.send(loop, network, known, speech)

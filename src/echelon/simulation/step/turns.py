@@ -1,6 +1,5 @@
 """Who acts when in a step: leaders first, then followers with what they are sent."""
 
-import abc
 from typing import final
 
 import equinox as eqx
@@ -80,13 +79,20 @@ def follow(
 
 
 class Relay(eqx.Module):
-    """What followers are sent of others' inputs."""
+    """What followers are sent of others' inputs: what each expects of its leader, from messages."""
 
-    @abc.abstractmethod
     def followed(
         self, loop: Loop, known: Known, laws: LawMemories, led: AgentOutput
     ) -> AgentOutput:
         """Return what followers do after the leaders."""
+        forward = known.heard.feedforward[loop.laws.followers]
+        return follow(loop, known, 1, forward, laws.follower)
+
+    def sent(
+        self, loop: Loop, known: Known, network: PyTree, said: AgentOutput
+    ) -> tuple[Float[jax.Array, "N k"], PyTree]:
+        """Return what each agent is sent if leaders may follow, and the memory of the network."""
+        return known.heard.feedforward, network
 
 
 @final
@@ -156,25 +162,8 @@ class ByDepth(Relay):
         return jax.lax.scan(level, (messages, start), jnp.asarray(self.levels))[0][1]
 
 
-class FromMessages(Relay):
-    """What each expects of its leader, from messages."""
-
-    def followed(
-        self, loop: Loop, known: Known, laws: LawMemories, led: AgentOutput
-    ) -> AgentOutput:
-        """Return what followers do."""
-        forward = known.heard.feedforward[loop.laws.followers]
-        return follow(loop, known, 1, forward, laws.follower)
-
-    def sent(
-        self, loop: Loop, known: Known, network: PyTree, said: AgentOutput
-    ) -> tuple[Float[jax.Array, "N k"], PyTree]:
-        """Return what each agent is sent, and the memory of the network."""
-        return known.heard.feedforward, network
-
-
 @final
-class Announced(FromMessages):
+class Announced(Relay):
     """In the ideal network with backups all hear at once who leads, and what it does."""
 
     def sent(
@@ -220,7 +209,7 @@ def by_depth(loop: Loop) -> ByDepth | None:
 class BackupsToo(Turns):
     """Leaders and backup leaders lead or follow, as whoever leads by then."""
 
-    relay: FromMessages
+    relay: Relay
 
     def play(self, loop: Loop, known: Known, laws: LawMemories, network: PyTree) -> Played:
         """Return what leaders and followers do, what leaders say, and the network's memory."""
