@@ -4,6 +4,9 @@ Run `python benchmarks/same_steps.py BEFORE [AFTER] [--only NAME ..]`, where bot
 AFTER is that of this checkout unless given. Each world is run by JAX in a process of each version,
 on the same machine, since the last bits depend on the processor. It prints for each world whether
 states, inputs and all sums have the same bits, and the largest difference of the states.
+
+`--store` writes the last states and inputs of BEFORE to `tests/simulation/steps.npz`, with which a
+test compares later versions.
 """
 
 import argparse
@@ -15,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
+SHAPES = "formation.motion=[{reshape: {name: line, spacing: 0.7}, at: 0.3, over: 0.6}]"
 RADIO = "network={rate: 50, delay: 0.02, loss: 0.1}"
 WORLDS = {
     "paper": ("paper", 1.0, []),
@@ -31,7 +35,7 @@ WORLDS = {
     "paper-far": ("paper-far", 0.5, []),
     "paper-line": ("paper-line", 0.5, []),
     "paper-literal": ("paper-literal", 0.5, []),
-    "reshape": ("reshape", 1.0, []),
+    "reshape": ("reshape", 1.0, [SHAPES]),
     "crossing": ("crossing", 3.0, []),
     "chain-30": ("chain-30", 0.5, []),
     "line-10": ("line-10", 0.5, []),
@@ -106,6 +110,8 @@ WORLDS = {
     ),
 }
 """Name -> scenario, horizon (s), overrides."""
+PARTS, STORED = ("states", "inputs"), ROOT / "tests" / "simulation" / "steps.npz"
+"""What is stored of the last frame of each world, and where."""
 
 
 def arrays_of(name: str) -> dict[str, np.ndarray]:
@@ -127,6 +133,7 @@ def main() -> int:
     parser.add_argument("before", type=Path)
     parser.add_argument("after", type=Path, nargs="?", default=ROOT / "src")
     parser.add_argument("--only", nargs="*", default=list(WORLDS))
+    parser.add_argument("--store", action="store_true", help="write the values of the test")
     parser.add_argument("--write", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.write:
@@ -135,6 +142,11 @@ def main() -> int:
                 np.savez(given.write / f"{name}.npz", **arrays_of(name))
             except Exception as error:
                 (given.write / f"{name}.error").write_text(repr(error))
+        return 0
+    if given.store:
+        stored = {name: arrays_of(name) for name in WORLDS}
+        rows = {f"{k} {part}": x[part][-1] for k, x in stored.items() for part in PARTS}
+        np.savez_compressed(STORED, **rows)
         return 0
     differ = 0
     with tempfile.TemporaryDirectory() as folder:

@@ -1,0 +1,24 @@
+"""The steps of all worlds are those of the version that stored them, but for rounding."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+from same_steps import PARTS, STORED, WORLDS, arrays_of  # noqa: E402
+
+QUICK = {"integrators", "van-der-pol"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(k, marks=() if k in QUICK else pytest.mark.slow) for k in WORLDS]
+)
+def test_the_last_states_and_inputs_are_those_that_were_stored(name):
+    found, stored = arrays_of(name), np.load(STORED)
+    rtol, atol = (2e-4, 2e-5) if "single" in name else (1e-10, 1e-12)
+    for part in PARTS:
+        last, before = found[part][-1], stored[f"{name} {part}"]
+        # Single precision has 7 digits; what grows has rounding in proportion.
+        np.testing.assert_allclose(last, before, rtol=rtol, atol=atol)
