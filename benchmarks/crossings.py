@@ -23,7 +23,7 @@ from echelon.core.types import Array
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.loop import Loop
-from echelon.simulation.step.places import Places
+from echelon.simulation.step.places import FixedPlaces
 from echelon.simulation.step.records import LoopState
 from echelon.simulation.step.sequence import begin, step
 
@@ -38,7 +38,7 @@ _EVERY = 10  # steps between two stored distances from the goals
 
 
 class Crossing(NamedTuple):
-    """Places (N, 3) of agents at the start, and their offsets from the leader, agent 0."""
+    """FixedPlaces (N, 3) of agents at the start, and their offsets from the leader, agent 0."""
 
     starts: Array
     goals: Array
@@ -125,7 +125,7 @@ def _fly(loop: Loop, states: Array, offsets: Array, frames: int) -> tuple[jax.Ar
     scales = jnp.asarray(SCALES)
 
     def one(states: jax.Array, offsets: jax.Array) -> tuple[jax.Array, jax.Array]:
-        own = loop.replace(places=Places(offsets))
+        own = loop.replace(places=FixedPlaces(offsets))
 
         def each(_: jax.Array, carry: tuple[LoopState, jax.Array]) -> tuple[LoopState, jax.Array]:
             now = step(own, carry[0])

@@ -248,12 +248,20 @@ def test_functions_are_short():
     assert sum(size > 22 for size in sizes) <= 239
 
 
+def is_final(cls):
+    return cls.__dict__.get("__final__", False)
+
+
 def test_every_class_is_abstract_or_final():
     faults = {
         f"{cls.__module__}.{cls.__name__} inherits from {base.__name__}, which is concrete"
         for cls in classes()
         for base in cls.__bases__
-        if base in classes() and not issubclass(base, BaseException) and not is_abstract(base)
+        if base in classes()
+        and not issubclass(base, BaseException)
+        and not is_abstract(base)
+        # Members of a component of the step extend its ideal member.
+        and not (base.__module__.startswith("echelon.simulation.step.") and not is_final(base))
     }
     assert not faults, "\n".join(sorted(faults))
 

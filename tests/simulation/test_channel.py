@@ -14,7 +14,7 @@ from echelon.simulation.engine.batch import Batch
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.leadership import FixedLeaders
-from echelon.simulation.step.network import MessageRules
+from echelon.simulation.step.networks import MessageRules
 from echelon.simulation.step.sequence import begin, step
 
 DT = 0.01

@@ -7,7 +7,7 @@ import echelon as ech
 from echelon.experiments.scenario.scenario import bundled_scenarios
 from echelon.simulation.onboard.law_functions import law_functions
 from echelon.simulation.scalars import Unsupported
-from echelon.simulation.step.network import LateNetwork
+from echelon.simulation.step.networks import LateNetwork
 
 REFUSED = {
     "crossing": "agents that keep away from each other",

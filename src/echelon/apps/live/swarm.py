@@ -37,7 +37,7 @@ from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.nearby import all_hulls
-from echelon.simulation.step.network import LateNetwork
+from echelon.simulation.step.networks import LateNetwork
 from echelon.simulation.step.places import MovingPlaces
 from echelon.simulation.step.records import ComponentMemory, LawMemories, LoopState
 from echelon.simulation.step.roster import Switches

@@ -23,7 +23,7 @@ from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import Kind, MessageContent, NeighbourChoice, Prediction
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.step.network import HOP_LIFE
+from echelon.simulation.step.networks import HOP_LIFE
 from echelon.simulation.step.settings import Settings
 
 # ---- ages of messages ----------------------------------------------------------------------------

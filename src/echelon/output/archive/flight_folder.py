@@ -39,7 +39,7 @@ from echelon.simulation.onboard.law_functions import (
 )
 from echelon.simulation.onboard.source_code import c_text, header_text, python_text
 from echelon.simulation.scalars import Unsupported
-from echelon.simulation.step.network import HOP_LIFE, LateNetwork
+from echelon.simulation.step.networks import HOP_LIFE, LateNetwork
 from echelon.simulation.step.places import MovingPlaces
 from echelon.simulation.step.settings import Settings
 

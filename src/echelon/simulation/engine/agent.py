@@ -39,7 +39,7 @@ from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.leadership import NOBODY, Failover, FixedLeaders
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.nearby import less_expected
-from echelon.simulation.step.network import (
+from echelon.simulation.step.networks import (
     LateNetwork,
     MessageRules,
     PlanDeviations,

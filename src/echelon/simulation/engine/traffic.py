@@ -19,7 +19,7 @@ from echelon.core.types import Array
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import channel_of
 from echelon.simulation.step.leadership import NOBODY, leaders_of
-from echelon.simulation.step.network import LateNetwork, MessageRules, carries
+from echelon.simulation.step.networks import LateNetwork, MessageRules, carries
 from echelon.simulation.step.records import Messages, NetworkEstimate, Steps
 from echelon.simulation.step.roster import Everybody, Links, roster_of
 from echelon.simulation.step.settings import Settings

@@ -40,7 +40,7 @@ from echelon.simulation.native.agent_step import (
 )
 from echelon.simulation.scalars import Node, ScalarGraph, lower, needed, nodes, rewritten
 from echelon.simulation.step.motion import PlantStep
-from echelon.simulation.step.network import (
+from echelon.simulation.step.networks import (
     LateNetwork,
     PacketDeviations,
     PlanDeviations,

@@ -4,14 +4,14 @@ from echelon.core.words import Feedforward
 from echelon.laws.law import Law
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.leadership import FixedLeaders, leaders_of
-from echelon.simulation.step.loop import Loop, Network, Surroundings, Turns
+from echelon.simulation.step.loop import IdealNetwork, Loop, NobodyNear, Turns
 from echelon.simulation.step.nearby import ExactHulls, LateHulls
-from echelon.simulation.step.network import (
+from echelon.simulation.step.networks import (
     IdealWithBackups,
     LateNetwork,
     MessageRules,
 )
-from echelon.simulation.step.places import Places
+from echelon.simulation.step.places import FixedPlaces
 from echelon.simulation.step.roster import Links, roster_of
 from echelon.simulation.step.run_laws import RunLaws, has_angles
 from echelon.simulation.step.turns import (
@@ -34,7 +34,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         model=problem.model,
         laws=laws,
         sensing=problem.sensors,
-        places=Places.of(problem.formation),
+        places=FixedPlaces.of(problem.formation),
         graph=Links.of(graph, settings, follower.leaderward),
         network=_network(problem, leadership),
         surroundings=_surroundings(problem, follower),
@@ -45,17 +45,17 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
     )
 
 
-def _network(problem: Problem, leadership: FixedLeaders) -> Network:
+def _network(problem: Problem, leadership: FixedLeaders) -> IdealNetwork:
     channel = problem.channel
     if channel is not None:
         rules = MessageRules.of(channel, leadership, problem.graph.agents)
         return LateNetwork(leadership, rules, channel)
-    return IdealWithBackups(leadership) if leadership.changes else Network(leadership)
+    return IdealWithBackups(leadership) if leadership.changes else IdealNetwork(leadership)
 
 
-def _surroundings(problem: Problem, follower: Law) -> Surroundings:
+def _surroundings(problem: Problem, follower: Law) -> NobodyNear:
     if follower.safety is None:
-        return Surroundings()
+        return NobodyNear()
     return ExactHulls() if problem.channel is None else LateHulls(problem.channel)
 
 

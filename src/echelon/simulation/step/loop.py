@@ -3,11 +3,11 @@
 | component | question | ideal member |
 |---|---|---|
 | `sensing` | What does an agent know of itself? | no stages |
-| `places` | Where is its place in the formation? | `Places` |
+| `places` | Where is its place in the formation? | `FixedPlaces` |
 | `laws` | What does it say, and what does it do? | `StateSpeech`, `WorldAxes` |
 | `graph` | Who hears whom? | `Links` |
-| `network` | What arrives, and who leads? | `Network`, `FixedLeaders` |
-| `surroundings` | Who is near? | `Surroundings` |
+| `network` | What arrives, and who leads? | `IdealNetwork`, `FixedLeaders` |
+| `surroundings` | Who is near? | `NobodyNear` |
 | `turns` | Who acts when, and with what? | `LeadersFirst(SameStep)` |
 | `motion` | How do agents move? | `Limited`, `Motors`, no weather |
 | `roster` | Who is there? | `Everybody` |
@@ -34,7 +34,7 @@ from echelon.core.types import PyTree, States
 from echelon.simulation.step.leadership import FixedLeaders
 from echelon.simulation.step.meter import RunStatistics, Sums
 from echelon.simulation.step.motion import PlantStep
-from echelon.simulation.step.places import Places
+from echelon.simulation.step.places import FixedPlaces
 from echelon.simulation.step.records import (
     Known,
     LawMemories,
@@ -48,7 +48,7 @@ from echelon.simulation.step.roster import Everybody, Links
 from echelon.simulation.step.run_laws import RunLaws
 
 
-class Network(eqx.Module):
+class IdealNetwork(eqx.Module):
     """What arrives, and who leads: what is said is heard in the same step.
 
     Attributes:
@@ -73,12 +73,12 @@ class Network(eqx.Module):
         """Return the memory after what agents send in a step."""
         return memory
 
-    def with_medium(self, medium: Channel) -> "Network":
+    def with_medium(self, medium: Channel) -> "IdealNetwork":
         """Return the network over another medium; the ideal one has none."""
         return self
 
 
-class Surroundings(eqx.Module):
+class NobodyNear(eqx.Module):
     """Who is near: nobody, where agents do not keep apart."""
 
     # Whether they do.
@@ -103,7 +103,7 @@ class Surroundings(eqx.Module):
         """Return the sums of a step with those of the distances that agents keep."""
         return read
 
-    def with_medium(self, medium: Channel) -> "Surroundings":
+    def with_medium(self, medium: Channel) -> "NobodyNear":
         """Return the surroundings over another medium, if messages about them take one."""
         return self
 
@@ -139,10 +139,10 @@ class Loop(eqx.Module):
     model: ControlAffine
     laws: RunLaws
     sensing: Sensors
-    places: Places
+    places: FixedPlaces
     graph: Links
-    network: Network
-    surroundings: Surroundings
+    network: IdealNetwork
+    surroundings: NobodyNear
     turns: Turns
     motion: PlantStep
     roster: Everybody

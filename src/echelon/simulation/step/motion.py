@@ -41,14 +41,14 @@ class Unlimited(Limited):
 # ---- motors --------------------------------------------------------------------------------------
 
 
-class Motors(eqx.Module):
+class IdealMotors(eqx.Module):
     """When an input acts: at once, and it is held."""
 
     # Whether an input acts as it is commanded, and whether its motors remember the one before.
     at_once, remembers = True, False
 
     @property
-    def memoryless(self) -> "Motors":
+    def memoryless(self) -> "IdealMotors":
         """The motors that begin each step at their command."""
         return self
 
@@ -67,14 +67,14 @@ class Motors(eqx.Module):
         return x, memory
 
 
-class LaggingMotors(Motors):
-    """Motors that follow their commands with a lag; they remember the input that acts."""
+class LaggingMotors(IdealMotors):
+    """IdealMotors that follow their commands with a lag; they remember the input that acts."""
 
     arrays: MotorArrays
     at_once, remembers = False, True
 
     @property
-    def memoryless(self) -> Motors:
+    def memoryless(self) -> IdealMotors:
         """The motors that begin each step at their command."""
         return SteppedMotors(self.arrays)
 
@@ -107,7 +107,7 @@ class LaggingMotors(Motors):
 
 @final
 class SteppedMotors(LaggingMotors):
-    """Motors with levels or a least thrust, and no lag: they remember nothing."""
+    """IdealMotors with levels or a least thrust, and no lag: they remember nothing."""
 
     remembers = False
 
@@ -122,10 +122,10 @@ class SteppedMotors(LaggingMotors):
         return ()
 
 
-def motors_of(arrays: MotorArrays | None) -> Motors:
+def motors_of(arrays: MotorArrays | None) -> IdealMotors:
     """Return the member for actuators as arrays, None for ideal ones."""
     if arrays is None:
-        return Motors()
+        return IdealMotors()
     return SteppedMotors(arrays) if arrays.lag is None else LaggingMotors(arrays)
 
 
@@ -153,7 +153,7 @@ class PlantStep(eqx.Module):
     integrator: str = eqx.field(static=True)
     limiter: Limited = Limited()
     substeps: int = eqx.field(static=True, default=1)
-    motors: Motors = Motors()
+    motors: IdealMotors = IdealMotors()
     weather: tuple[Wind, ...] = ()
     rows: PyTree = ()
 
@@ -263,7 +263,7 @@ class PlantStep(eqx.Module):
         return dataclasses.replace(self, motors=self.motors.memoryless, weather=weather)
 
 
-def _varied(modules: list[ControlAffine] | list[Motors]) -> PyTree:
+def _varied(modules: list[ControlAffine] | list[IdealMotors]) -> PyTree:
     """Return the leaves in which modules of one structure differ, as rows; None for the others."""
     flat = [jax.tree.leaves(module) for module in modules]
     tree = jax.tree.structure(modules[0])

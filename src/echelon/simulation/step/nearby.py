@@ -15,7 +15,7 @@ from echelon.agents.network.channel import NEVER, Channel, InFlight
 from echelon.agents.network.exchange import Near
 from echelon.core.types import Array, PyTree, Scalar, States
 from echelon.laws.law import Law, Memory
-from echelon.simulation.step.loop import Loop, Surroundings
+from echelon.simulation.step.loop import Loop, NobodyNear
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.records import Known, LawMemories, LoopState, Mask, as_array
 
@@ -34,7 +34,7 @@ class NeighbourHulls(NamedTuple):
     points: Float[jax.Array, "K r d"]
 
 
-class ExactHulls(Surroundings):
+class ExactHulls(NobodyNear):
     """All know the hulls of all others of the same instant."""
 
     keeps_apart = True
@@ -77,7 +77,7 @@ class LateHulls(ExactHulls):
 
     medium: Channel
 
-    def with_medium(self, medium: Channel) -> Surroundings:
+    def with_medium(self, medium: Channel) -> NobodyNear:
         """Return the same over another medium."""
         return LateHulls(medium)
 

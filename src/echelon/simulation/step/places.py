@@ -20,7 +20,7 @@ Agents: TypeAlias = Array | jax.Array
 """The numbers of some agents."""
 
 
-class Places(eqx.Module):
+class FixedPlaces(eqx.Module):
     """The offsets of a formation, which never change: what laws use, and where errors are measured.
 
     Attributes:
@@ -30,10 +30,10 @@ class Places(eqx.Module):
     offsets: Array
 
     @classmethod
-    def of(cls, formation: Formation) -> "Places":
+    def of(cls, formation: Formation) -> "FixedPlaces":
         """Return the places of a formation."""
         offsets, motion = np.asarray(formation.offsets), formation.motion
-        return Places(offsets) if motion is None else MovingPlaces(offsets, motion)
+        return FixedPlaces(offsets) if motion is None else MovingPlaces(offsets, motion)
 
     def of_group(self, model: ControlAffine, law: Law, t: Scalar, agents: Agents) -> GroupOffsets:
         """Return what agents under a law take for their offsets at a time (s)."""
@@ -58,7 +58,7 @@ class Places(eqx.Module):
 
 
 @final
-class MovingPlaces(Places):
+class MovingPlaces(FixedPlaces):
     """Offsets that are functions of time."""
 
     motion: FormationMotion

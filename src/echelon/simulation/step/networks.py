@@ -23,7 +23,7 @@ from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 from echelon.laws.law import Expected, LocalView, Memory
 from echelon.simulation.step.leadership import NOBODY, FixedLeaders
-from echelon.simulation.step.loop import Loop, Network
+from echelon.simulation.step.loop import IdealNetwork, Loop
 from echelon.simulation.step.records import (
     AgentOutput,
     Clock,
@@ -47,7 +47,7 @@ its motion slows down afterwards."""
 
 
 @final
-class IdealWithBackups(Network):
+class IdealWithBackups(IdealNetwork):
     """Packets of leaders reach all agents at once; it remembers each agent's."""
 
     def begin(self, loop: Loop, said: Float[jax.Array, "N s"], forward: int) -> PyTree:
@@ -444,7 +444,7 @@ class MessageRules(eqx.Module):
 
 
 @final
-class LateNetwork(Network):
+class LateNetwork(IdealNetwork):
     """Messages by the rules, over a medium that delays and loses them.
 
     It remembers what is in flight, and the mail of the agents.
@@ -501,7 +501,7 @@ class LateNetwork(Network):
         sent, sends = self.rules.write(mail, known.heard, *rows)
         return self.posted(in_flight, clock.step, sent, sends, known.links), mail
 
-    def with_medium(self, medium: Channel) -> Network:
+    def with_medium(self, medium: Channel) -> IdealNetwork:
         """Return the network over another medium."""
         rules = MessageRules.of(medium, self.leadership, self.rules.agents)
         return LateNetwork(self.leadership, rules, medium)
