@@ -247,8 +247,8 @@ def step_over_network(
     law, model = loop.laws.leader if leads else loop.laws.follower, loop.model
     signal, nobody = signal_of(loop, law, own), np.zeros(len(weights), np.int32)
     links, said = Exchange(nobody, nobody, weights), signal[None]
-    groups = (GroupOffsets(own.offset[None], None),) * 2
-    known = Known(clock, True, Own(number, own.x[None]), groups, said, links)
+    offset = GroupOffsets(own.offset[None], None)
+    known = Known(clock, True, Own(number, own.x[None]), (offset, offset), said, links)
     heard = rules.read(loop, mail, known)
     forward = jnp.zeros(len(model.input_names)) if leads else heard.feedforward[0]
     hull = hull_of(loop, law, own)
