@@ -3,6 +3,7 @@
 import dataclasses
 
 import h5py
+import jax
 import numpy as np
 import pytest
 
@@ -10,6 +11,8 @@ import echelon as ech
 from echelon.core.errors import EchelonError
 from echelon.guarantees.promises.hypotheses import events_in_words
 from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.step.assembly import assemble
+from echelon.simulation.step.sequence import begin, step
 
 Cut, Join, Lose = ech.network.Cut, ech.network.Join, ech.network.Lose
 CART = ech.models.DoubleIntegrator()
@@ -100,6 +103,25 @@ def test_an_agent_that_returns_begins_anew():
     assert np.array_equal(once.states[at, 2], once.states[0, 2])
     assert once.presence[:, 2].sum() == len(once.times) - 50
     assert once.formation_errors[-1].max() < 0.02
+
+
+def test_an_agent_that_returns_measures_where_it_returns_and_not_where_it_was_lost():
+    parts = _parts(events=[Lose(2, 0.2), Join(2, 0.4)])
+    parts = parts.replace(world=ech.World(sensing=ech.Sensing(delay=0.1)))
+    prepared = prepare(parts, SETTINGS._replace(engine="jax"))
+    drive = prepared.parts.drive
+    with jax.enable_x64(True):
+        loop = assemble(prepared.problem, drive.leader, drive.follower)
+        first = now = begin(loop, prepared.problem.states)
+        forward = jax.jit(lambda now: step(loop, now))
+        for _ in range(15):
+            now = forward(now)
+        lost_at, held = np.asarray(now.states[2]), np.asarray(now.memory.sensing[0][2])
+        for _ in range(6):
+            now = forward(now)
+    # While it is absent it measures nothing; then it begins with its start, for all of the delay.
+    assert np.ptp(held, axis=0).max() > 0.0 and not np.array_equal(lost_at, first.states[2])
+    assert np.array_equal(now.memory.sensing[0][2], np.repeat(first.states[2][None], 5, axis=0))
 
 
 def of_states(graph, leader=None):
