@@ -261,7 +261,9 @@ def step_over_network(
         content = rules.content.content(loop, clock.t, Saying(*own[:3], signal, action))[None]
     rows = number, clock.now, said, content, loop.laws.speech.difference(model)
     letter, _ = rules.write(mail, heard, *rows)
-    return Step(signal, action, is_finite((own.x, signal, action, letter[:3], hull)), letter, hull)
+    # Of a letter what it says: before the first packet its stamp is -inf.
+    said = letter.value, letter.packet.content
+    return Step(signal, action, is_finite((own.x, signal, action, said, hull)), letter, hull)
 
 
 @final
