@@ -272,11 +272,19 @@ def test_every_number_of_every_bundled_model_can_be_scaled(name):
         assert differences(model, back).endswith("which equals the model")
 
 
-def test_the_rate_of_v_is_its_derivative_in_wind_and_with_another_plant():
+@pytest.mark.parametrize(
+    "disturbance",
+    [
+        Disturbance({"vy": 0.5}, {"velocity": 1.0}, {"torque": 3.0}, hold=0.05),
+        Disturbance(air=(1.0, 0.0), drag=20.0),
+    ],
+    ids=["wind", "air"],
+)
+def test_the_rate_of_v_is_its_derivative_in_wind_and_with_another_plant(disturbance):
     model = models.PlanarQuadrotor()
     world = {
         "plant": vary_parameters(model, {}, {"mass": 1.2, "inertia": 0.9}),
-        "disturbance": Disturbance({"vy": 0.5}, {"velocity": 1.0}, {"torque": 3.0}, hold=0.05),
+        "disturbance": disturbance,
     }
     law = Consensus(synthesize(model, TREE, Riccati()), "none")
     run = {"initial": {"position": 0.5}, "horizon": 0.5, "dt": 0.0005}

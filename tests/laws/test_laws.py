@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from oracles import adjacency, connected, disagreements, laplacian, quadrotor_input_map, spd
 from runs import simulate
 
+import echelon as ech
 from echelon import Formation, Graph, lyapunov, synthesize
 from echelon.agents import models
 from echelon.agents.references import Circle, Hover, Lemniscate, Line
@@ -392,3 +393,33 @@ def test_an_inner_loop_pulls_back_to_the_trim_and_is_not_told_to_others(feedforw
     assert float(u[0]) == pytest.approx(float(sent[0]) - K @ [0.3, -0.7], rel=1e-12)
     assert float(told[0]) == pytest.approx(float(sent[0]), abs=1e-15)
     assert abs(K @ [0.3, -0.7]) > 0.1
+
+
+class Pulled(Law):
+    """Toward its neighbours, by states or by a signal of a user's own."""
+
+    speaks: bool = False
+
+    def signal(self, model, x, offset, memory):
+        y = x - offset
+        return y[:1] + y[1:] if self.speaks else None
+
+    def update(self, model, view, memory):
+        return -view.disagreement.sum()[None], memory
+
+
+def test_agents_send_what_the_signal_of_a_law_returns():
+    cart, graph = models.DoubleIntegrator(1), Graph.path(3)
+    row = Formation.from_offsets(cart, graph, {})
+
+    def run(leader, follower):
+        parts = ech.Parts(cart, graph, row, ech.Laws(leader, follower), {"position": 0.5})
+        return ech.simulate(parts, ech.Settings(2.0, 0.01))
+
+    plain, said = (run(Pulled(speaks), Pulled(speaks)) for speaks in (False, True))
+    np.testing.assert_allclose(plain.states, said.states, atol=1e-12)
+    for run_, word in ((plain, "states"), (said, "signals")):
+        known = run_.drive.information_for(cart, graph)
+        assert known.follower == known.leader == (f"neighbours' {word}",)
+    with pytest.raises(LawError, match=r"send a signal of 1 number.* `TrimInput` sends none"):
+        run(TrimInput(), Pulled(True))

@@ -17,7 +17,7 @@ from echelon.core.jaxpr import used_leaves
 from echelon.core.numerics import precision
 from echelon.core.trace import check_array, checked_trace
 from echelon.core.types import PyTree
-from echelon.core.words import Feedforward
+from echelon.core.words import Feedforward, amount
 from echelon.laws.law import Law, LocalView, Memory, reference_of
 
 _ADVICE = "it must be written with `jax.numpy` and take what one agent knows"
@@ -99,10 +99,36 @@ def _memory(law: Law) -> Memory:
         ) from error
 
 
+@memoize
+def signal_size(law: Law, model: ControlAffine) -> int | None:
+    """Return how many numbers a law's signal has; None where agents send x - offset."""
+    if type(law).signal is Law.signal:
+        return None
+    x = jnp.zeros(len(model.state_names))
+    signal = jax.eval_shape(lambda: law.signal(model, x, x, _memory(law)))
+    return None if signal is None else signal.size
+
+
+def check_signals(leader: Law, follower: Law, model: ControlAffine) -> None:
+    """Check that a leader sends what its followers take differences of.
+
+    Raises:
+        LawError: followers send signals, and the leader sends none, or others.
+    """
+    sizes = signal_size(leader, model), signal_size(follower, model)
+    if sizes[1] is not None and sizes[0] != sizes[1]:
+        sent = "none" if sizes[0] is None else f"{sizes[0]}"
+        raise LawError(
+            f"followers under the law `{type(follower).__name__}` send a signal of "
+            f"{amount(sizes[1], 'number')}, and a leader under `{type(leader).__name__}` sends "
+            f"{sent}; give the leader a law with the same `signal`."
+        )
+
+
 def _view(law: Law, model: ControlAffine) -> LocalView:
     x, forward = jnp.zeros(len(model.state_names)), jnp.zeros(len(model.input_names))
-    signal = jax.eval_shape(lambda: law.signal(model, x, x, _memory(law)))
-    z = x if signal is None else jnp.zeros(signal.shape)
+    size = signal_size(law, model)
+    z = x if size is None else jnp.zeros(size)
     if law.feedforward is not Feedforward.NONE:
         message = checked_trace(
             LawError,
@@ -177,7 +203,7 @@ def information_of(law: Law, model: ControlAffine, graph: Graph) -> tuple[str, .
             return u, law.settle(model, known, u, u, after)
 
         z, sent = used_leaves(update, view.disagreement, view.feedforward)
-    signal = type(law).signal is not Law.signal
+    signal = signal_size(law, model) is not None
     reads = [f"neighbours' {'signals' if signal else 'states'}"] * z
     reads += [law.feedforward.value] * (sent and law.feedforward is not Feedforward.NONE)
     return tuple(dict.fromkeys([*reads, *law.information]))

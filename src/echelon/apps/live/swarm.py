@@ -187,8 +187,10 @@ class LiveLoop:
         first = max(0, int(step * dt / schedule.period) - 1)
         horizon = max(_AHEAD, 4.0 * schedule.period)
         switches = Switches(*schedule.switches(dt, horizon, first))
-        graph = dataclasses.replace(self.loop.graph, switches=switches)
-        self.loop = self.loop.replace(graph=graph)
+        loop = self.loop.replace(graph=dataclasses.replace(self.loop.graph, switches=switches))
+        if loop.roster.changes:
+            loop = loop.replace(roster=dataclasses.replace(loop.roster, switches=switches))
+        self.loop = loop
         # A whole period before the end: a picture that begins in this range also ends in it.
         last = int(first + horizon / schedule.period) * schedule.period
         self.ahead = range(int(switches.steps[0]), int(last / dt) - self.count)

@@ -18,12 +18,19 @@ from echelon.core.errors import (
     check_kind,
 )
 from echelon.core.identity import process_key
+from echelon.core.numerics import precision
 from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Law, gain_of
-from echelon.laws.law_check import information_of, leader_warnings, prepare_law, unknown_class
+from echelon.laws.law_check import (
+    check_signals,
+    information_of,
+    leader_warnings,
+    prepare_law,
+    unknown_class,
+)
 from echelon.laws.safety import Safety
 from echelon.laws.safety_check import check_numbers, hulls_at, separations, too_near
 from echelon.simulation.engine.jax_stepper import JaxStepper
@@ -110,6 +117,8 @@ class Laws(Controller):
         """
         leader, follower = (prepare_law(law, model, graph) for law in (self.leader, self.follower))
         follower = follower.following(leader, model)
+        with precision("float64"):
+            check_signals(leader, follower, model)
         drive = Laws(leader, follower)
         same, key = leader is self.leader and follower is self.follower, process_key(drive)
         # Caches use the identity of what is complete already.

@@ -186,7 +186,7 @@ class _Traces:
             action = step.action
             results = action.input, _flat(action.memory), step.signal, action.message
             # A state less a constant is finite where the state is.
-            signal = () if type(self.law).signal is Law.signal else step.signal
+            signal = step.signal if loop.laws.speech.signals else ()
             if says is None or not leads:
                 return *results, _flat((x, signal, action))
             content = says.content(loop, t, Saying(*own[:3], step.signal, action))
@@ -211,7 +211,7 @@ class _Traces:
         loop, follower, s = self.loop, self.loop.laws.follower, self.s
         size = content_of.size(s, self.k, self.m)
         # A state is carried on in a loop, each round of which is a function here.
-        plain = type(follower).carried is Law.carried and type(follower).signal is Law.signal
+        plain = type(follower).carried is Law.carried and not loop.laws.speech.signals
         in_rounds = plain and isinstance(content_of, PacketDeviations)
 
         def expected(t: jax.Array, content: jax.Array, age: jax.Array) -> tuple[jax.Array, ...]:

@@ -2,6 +2,7 @@
 
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law
+from echelon.laws.law_check import signal_size
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.leadership import FixedLeaders, leaders_of
 from echelon.simulation.step.loop import IdealNetwork, Loop, NobodyNear, Turns
@@ -29,7 +30,8 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
     graph, settings, channel = problem.graph, problem.settings, problem.channel
     leader = leader if channel is None else leader.predictable(problem.model)
     leadership = leaders_of(graph, problem.leadership)
-    laws = RunLaws.of(graph, leader, follower, leadership.changes)
+    signals = signal_size(follower, problem.model) is not None
+    laws = RunLaws.of(graph, leader, follower, leadership.changes, signals)
     return Loop(
         model=problem.model,
         laws=laws,

@@ -1,21 +1,8 @@
 """The closed loop as components, each of which answers one question of a step.
 
-| component | question | ideal member |
-|---|---|---|
-| `sensing` | What does an agent know of itself? | no stages |
-| `places` | Where is its place in the formation? | `FixedPlaces` |
-| `laws` | What does it say, and what does it do? | `StateSpeech`, `WorldAxes` |
-| `graph` | Who hears whom? | `Links` |
-| `network` | What arrives, and who leads? | `IdealNetwork`, `FixedLeaders` |
-| `surroundings` | Who is near? | `NobodyNear` |
-| `turns` | Who acts when, and with what? | `LeadersFirst(SameStep)` |
-| `motion` | How do agents move? | `Limited`, `Motors`, no weather |
-| `roster` | Who is there? | `Everybody` |
-| `meter` | What is measured? | |
-
 A component has members, one of them ideal; none is optional. The ideal member is the class whose
-methods the others replace. Each member has its own memory, `()`
-where it remembers nothing, of the same structure for a whole run. A feature is a new member.
+methods the others replace. Each member has its own memory, `()` where it remembers nothing, of the
+same structure for a whole run. A feature is a new member. The page on the design lists them all.
 """
 
 import abc

@@ -68,7 +68,7 @@ class IdealMotors(eqx.Module):
 
 
 class LaggingMotors(IdealMotors):
-    """IdealMotors that follow their commands with a lag; they remember the input that acts."""
+    """Motors that follow their commands with a lag; they remember the input that acts."""
 
     arrays: MotorArrays
     at_once, remembers = False, True
@@ -107,7 +107,7 @@ class LaggingMotors(IdealMotors):
 
 @final
 class SteppedMotors(LaggingMotors):
-    """IdealMotors with levels or a least thrust, and no lag: they remember nothing."""
+    """Motors with levels or a least thrust, and no lag: they remember nothing."""
 
     remembers = False
 

@@ -89,11 +89,11 @@ class Seconds(NamedTuple):
 
     @property
     def step(self) -> jax.Array:
-        """What a graph that switches, and who is there, are asked with."""
+        """What sensors count by."""
         return self.t
 
     def age(self, stamp: Float[jax.Array, " K"]) -> Float[jax.Array, " K"]:
-        """Return the age (s) of what has this stamp; -inf where nothing came."""
+        """Return the age (s) of what has this stamp; infinite for -inf, where nothing came."""
         return jnp.maximum(0.0, self.t - stamp)
 
     def waited(self, since: Float[jax.Array, " N"]) -> Float[jax.Array, " N"]:
@@ -281,13 +281,9 @@ class Control(NamedTuple):
         limited: (N,) whose desired input a limit changed.
         cut: (N, m) to which side.
         memory: of the components, afterwards.
-        said: (N, s) what all said.
-        message: (N, k) what each sends to its followers.
     """
 
     inputs: Inputs
     limited: jax.Array
     cut: jax.Array
     memory: ComponentMemory
-    said: Float[jax.Array, "N s"]
-    message: Float[jax.Array, "N k"]

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.graph import Graph
@@ -84,8 +84,8 @@ class SwitchingLinks(Links):
 
 # ---- who is there --------------------------------------------------------------------------------
 
-Held: TypeAlias = Callable[[Mask, LoopState, LoopState], LoopState]
-"""The moment in which some agents' bodies are as in the first, and others' as in the second."""
+Anew: TypeAlias = Callable[[jax.Array, States], LoopState]
+"""The moment in which some agents (N,) begin anew at states (N, n)."""
 Beside: TypeAlias = Callable[[LoopState, jax.Array, jax.Array], LoopState]
 """The moment with the headings of those who join beside those of the first that was there."""
 
@@ -108,9 +108,7 @@ class Everybody(eqx.Module):
         """Return since when each has been there, s."""
         return jnp.zeros(())
 
-    def arrived(
-        self, now: LoopState, begin: Callable[[States], LoopState], held: Held, beside: Beside
-    ) -> LoopState:
+    def arrived(self, now: LoopState, anew: Anew, beside: Beside) -> LoopState:
         """Return the moment with those who join in this step."""
         return now
 
@@ -160,24 +158,16 @@ class ActiveAgents(Everybody):
 class JoiningAgents(ActiveAgents):
     """The same, with headings that grow with every turn: who joins takes over others' turns."""
 
-    def _begun(
-        self,
-        new: Bool[jax.Array, " N"],
-        now: LoopState,
-        begin: Callable[[States], LoopState],
-        held: Held,
-    ) -> LoopState:
+    def _begun(self, new: jax.Array, now: LoopState, anew: Anew) -> LoopState:
         return now
 
-    def arrived(
-        self, now: LoopState, begin: Callable[[States], LoopState], held: Held, beside: Beside
-    ) -> LoopState:
+    def arrived(self, now: LoopState, anew: Anew, beside: Beside) -> LoopState:
         """Return the moment with those who join in this step."""
         here, before = (jnp.asarray(self.here(step)) for step in (now.step, now.step - 1))
         new = here & ~before & (now.step > 0)
 
         def joined(now: LoopState) -> LoopState:
-            return beside(self._begun(new, now, begin, held), new, here & before)
+            return beside(self._begun(new, now, anew), new, here & before)
 
         return jax.lax.cond(new.any(), joined, lambda now: now, now)
 
@@ -190,14 +180,8 @@ class ReturningAgents(JoiningAgents):
         """Return the start."""
         return states
 
-    def _begun(
-        self,
-        new: Bool[jax.Array, " N"],
-        now: LoopState,
-        begin: Callable[[States], LoopState],
-        held: Held,
-    ) -> LoopState:
-        return held(new, begin(now.memory.roster), now)
+    def _begun(self, new: jax.Array, now: LoopState, anew: Anew) -> LoopState:
+        return anew(new, now.memory.roster)
 
 
 def roster_of(graph: Graph, settings: Settings, angles: bool) -> Everybody:

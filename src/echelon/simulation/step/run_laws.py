@@ -33,7 +33,7 @@ from echelon.simulation.step.records import (
 class StateSpeech(eqx.Module):
     """What agents say to their neighbours: their states less their offsets."""
 
-    # Whether neighbours are told more than that.
+    # Whether they are signals of laws.
     signals = False
 
     def of_one(
@@ -79,7 +79,7 @@ class SignalSpeech(StateSpeech):
 
 
 class Sayings(NamedTuple):
-    """What agents say is made of: states (N, n), all offsets, those of groups, and memories."""
+    """What agents need to say something: states and offsets (N, n), also by group, and memories."""
 
     model: ControlAffine
     x: States
@@ -190,8 +190,10 @@ class RunLaws(eqx.Module):
     backups: bool = eqx.field(static=True, default=False)
 
     @classmethod
-    def of(cls, graph: Graph, leader: Law, follower: Law, backups: bool) -> "RunLaws":
-        """Return the prepared laws of a run."""
+    def of(
+        cls, graph: Graph, leader: Law, follower: Law, backups: bool, signals: bool
+    ) -> "RunLaws":
+        """Return the prepared laws of a run, in which agents may send signals."""
         leaders = np.array([*graph.leaders, *graph.backups])
         followers = np.array([k for k in graph.followers if k not in graph.backups], int)
         return cls(
@@ -202,7 +204,7 @@ class RunLaws(eqx.Module):
             # This puts what leaders and followers did back into the agents' own order.
             np.argsort(np.concatenate([leaders, followers])),
             np.arange(graph.agents, dtype=np.int32),
-            StateSpeech() if type(follower).signal is Law.signal else SignalSpeech(),
+            SignalSpeech() if signals else StateSpeech(),
             HeadingAxes() if follower.turning else WorldAxes(),
             backups=backups,
         )

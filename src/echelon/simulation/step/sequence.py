@@ -1,7 +1,4 @@
-"""The order of a step: agents sense, say, hear, look around, act, write and move.
-
-`control` is the same for N agents of a run and for one alone, whose network is an inbox.
-"""
+"""The order of a step: agents sense, say, hear, look around, act, write and move."""
 
 from typing import Any, TypeAlias
 
@@ -16,7 +13,6 @@ from echelon.simulation.step.distances import closest_two
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import Sums, reference_at
 from echelon.simulation.step.records import (
-    Clock,
     ComponentMemory,
     Control,
     Known,
@@ -65,15 +61,15 @@ def said_by(loop: Loop, now: LoopState) -> Float[jax.Array, "N s"]:
     return _said(loop, now.states, now.memory.laws, Steps(now.step, loop.motion.dt))[1]
 
 
-def _said(loop: Loop, x: States, laws: LawMemories, clock: Clock) -> tuple[Any, jax.Array]:
+def _said(loop: Loop, x: States, laws: LawMemories, clock: Steps) -> tuple[Any, jax.Array]:
     offsets = loop.places.groups(loop.model, loop.laws, clock.t)
     everywhere = loop.places.of_all(loop.laws, offsets)
     known = Sayings(loop.model, x, everywhere, offsets, laws)
     return offsets, loop.laws.speech.of_all(loop.laws, known)
 
 
-def control(loop: Loop, now: LoopState, clock: Clock) -> Control:
-    """Return what all agents do from a moment on: those of a formation, or one alone."""
+def control(loop: Loop, now: LoopState, clock: Steps) -> Control:
+    """Return what all agents do from a moment on."""
     memory, here = now.memory, loop.roster.here(clock.step)
     numbers = jnp.asarray(loop.laws.numbers)
 
@@ -108,8 +104,7 @@ def control(loop: Loop, now: LoopState, clock: Clock) -> Control:
         network=network,
         near=seen,
     )
-    message = loop.laws.ordered(led.message, followed.message)
-    return Control(u, limited.any(axis=1), cut.astype(jnp.int8), memory, said, message)
+    return Control(u, limited.any(axis=1), cut.astype(jnp.int8), memory)
 
 
 def _held(loop: Loop, mask: Mask, one: LoopState, other: LoopState) -> LoopState:
@@ -133,9 +128,10 @@ def _arrived(loop: Loop, now: LoopState) -> LoopState:
         laws = loop.laws.beside(moment.memory.laws, new & there.any(), other)
         return moment._replace(memory=moment.memory._replace(laws=laws))
 
-    return loop.roster.arrived(
-        now, lambda states: begin(loop, states), lambda *rows: _held(loop, *rows), beside
-    )
+    def anew(new: jax.Array, states: States) -> LoopState:
+        return _held(loop, new, begin(loop, states), now)
+
+    return loop.roster.arrived(now, anew, beside)
 
 
 def _moved(loop: Loop, now: LoopState, acted: Control) -> LoopState:
