@@ -53,7 +53,8 @@ def compare(agent, runs, steps, dt, size=0.1):
         x, time = trim + size * draws.normal(size=len(trim)) * (k > 0), k * dt
         signals, forward = receive(agent, draws)
         u, message = agent.step(time, x)
-        leaves = [np.ravel(leaf) for leaf in jax.tree.leaves(agent._memory)]
+        memory = agent._now.memory.laws[not own.leads]
+        leaves = [np.ravel(leaf[0]) for leaf in jax.tree.leaves(memory)]
         flat = np.concatenate([np.zeros(0), *leaves])
         expected = u, flat, message.signal.values, message.feedforward.values
         row = 0 if own.schedule is None else own.schedule.row(time)
@@ -161,7 +162,8 @@ def draw_letter(own, facts, sender, time, draws):
         units = np.abs(np.diag(own.loop.model.input_scale))
         said[-len(units) :] *= units
     said = tuple(said.tolist())
-    packet = LeaderPacket(network["leaders"][0], max(0.0, time - draws.uniform(0.0, 0.9)), said)
+    # A leader says one thing at a time: two packets of one time would be the same.
+    packet = LeaderPacket(network["leaders"][0], time - draws.uniform(0.0, 0.9), said)
     return Message(sender, time, hops, tuple(values.tolist()), packet)
 
 

@@ -57,12 +57,12 @@ class Letterbox:
             return Drop.AHEAD
         if packet.leader not in (self._backups if packet.term else self._leaders):
             return Drop.PACKET
-        if self._wins(packet):
-            self.packet = packet
-        # A late letter may yet bring a newer packet, by another way.
+        # What is older says nothing new: an agent's packet is never an older one again.
         before = self.letters[letter.sender]
         if before is not None and not letter.time > before.time:
             return Drop.OLD
+        if self._wins(packet):
+            self.packet = packet
         self.letters[letter.sender] = letter
         return None
 

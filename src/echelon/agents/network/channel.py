@@ -20,9 +20,10 @@ from echelon.core.numerics import Draw, key_of, uniforms
 from echelon.core.types import Array, PyTree
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction
 
-NEVER = -1
-"""The stamp of a message that never came, and the arrival of one that never does."""
 _MOST = 2**30
+NEVER = -_MOST
+"""The stamp of a message that never came, and the arrival of one that never does: before all steps,
+and all times in s."""
 _ROUNDING = 1e-6
 """Of a step: what divisions of times leave of whole numbers."""
 

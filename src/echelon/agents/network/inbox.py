@@ -7,6 +7,7 @@ from typing import NamedTuple, final
 import numpy as np
 from jaxtyping import Float
 
+from echelon.agents.network.channel import NEVER
 from echelon.core.types import Array
 from echelon.core.words import Word
 from echelon_flight.wire import LeaderPacket
@@ -158,56 +159,37 @@ class Surroundings:
 
 @final
 class Stamps:
-    """Times, hops and the newest packet of what an agent received over a network that is late.
+    """Times, hops and packets of the newest message of each neighbour, over a late network.
+
+    Which packet counts is decided where the messages are read.
 
     Args:
-        links: how many neighbours it hears.
-        leaders: the numbers of those whose packets count; the lowest one first.
+        links: how many neighbours the agent hears.
+        leaders: the numbers of those that lead or may.
         size: of a packet's content.
-        own: the agent's number, if it leads.
         needs_packet: whether a message says nothing without one.
-        backups: of the leader, whose packets of later terms count too.
+        terms: whether the lead is handed over, in later terms.
 
     Attributes:
-        time: (K,) when the last message of each neighbour was sent, s; -inf for none.
+        time: (K,) when each was sent, s; `NEVER` for none.
         hops: (K,) of its sender.
-        packet: the newest one; None before the first.
+        leader, said, term: (K,) of its packet: whose, of when (s; `NEVER` for none), of which term.
+        content: (K, p) of its packet.
         clock: the receiver's time, s.
     """
 
     def __init__(
-        self,
-        links: int,
-        leaders: Sequence[int],
-        size: int,
-        own: int | None,
-        needs_packet: bool,
-        backups: Sequence[int] = (),
+        self, links: int, leaders: Sequence[int], size: int, needs_packet: bool, terms: bool
     ) -> None:
-        self.needs_packet = needs_packet
-        self.time, self.hops = np.full(links, -np.inf), np.full(links, _FAR)
-        self.packet: LeaderPacket | None = None
-        self.clock = 0.0
-        self._leaders, self._size, self._own = frozenset((*leaders, *backups)), size, own
-        self._last_term, self._term = _FAR * bool(backups), 0
-
-    @property
-    def leads(self) -> bool:
-        """Whether the agent leads."""
-        return self._own is not None
-
-    @property
-    def term(self) -> int:
-        """The term of the leader that it follows, or in which it leads."""
-        return self._term if self.leads or self.packet is None else self.packet.term
-
-    def take_lead(self, own: int) -> None:
-        """Lead from now on, in the next term."""
-        self._term, self._own = self.term + 1, own
-        self.packet = LeaderPacket(own, self.clock, (0.0,) * self._size, self._term)
+        self.needs_packet, self.clock = needs_packet, 0.0
+        self.time, self.hops = np.full(links, float(NEVER)), np.full(links, _FAR, np.int32)
+        self.leader, self.said = self.hops.copy(), self.time.copy()
+        self.term, self.content = np.zeros(links, np.int32), np.zeros((links, size))
+        # Where nobody hands the lead over, a packet of a later term would win for ever.
+        self._leaders, self._last_term = frozenset(leaders), _FAR * terms
 
     def take(self, message: Message, place: int) -> Received | None:
-        """Store the time, hops and packet of a message; return why it is not used, if so."""
+        """Store all but the value of a message; return why it is not used, if so."""
         packet = message.packet
         if not (isinstance(packet, LeaderPacket) or packet is None and not self.needs_packet):
             return Received.NO_MESSAGE
@@ -216,38 +198,26 @@ class Stamps:
             return Received.NO_MESSAGE
         if max(times) > self.clock + _AHEAD:  # pyright: ignore - numbers, as just checked
             return Received.AHEAD
-        if packet is not None:
-            packet = self._read(packet)
-            if isinstance(packet, Received):
-                return packet
-            if self._wins(packet):
-                self.packet = packet
-        # A late message may yet bring a newer packet, by another way.
+        values = () if packet is None else self._content_of(packet)
+        if isinstance(values, Received):
+            return values
+        # What is older says nothing new: an agent's packet is never an older one again.
         if not message.time > self.time[place]:  # pyright: ignore
             return Received.LATE
         self.time[place] = message.time
         self.hops[place] = min(max(int(message.hops), 0), _FAR)
+        if packet is not None:
+            self.leader[place], self.said[place] = packet.leader, packet.time
+            self.term[place], self.content[place] = packet.term, values
         return None
 
-    def _read(self, packet: LeaderPacket) -> LeaderPacket | Received:
+    def _content_of(self, packet: LeaderPacket) -> tuple[float, ...] | Received:
         whole = all(isinstance(x, numbers.Integral) for x in (packet.leader, packet.term))
-        # Where nobody hands the lead over, a packet of a later term would win for ever.
-        fine = whole and packet.leader in self._leaders and 0 <= packet.term <= self._last_term
-        if not fine:
+        if not (whole and packet.leader in self._leaders and 0 <= packet.term <= self._last_term):
             return Received.NO_MESSAGE
-        values = read_values((tuple(map(str, range(self._size))), packet.content))
-        if isinstance(values, Received):
-            return values
-        return packet._replace(time=float(packet.time), content=tuple(values.values()))
-
-    def _wins(self, packet: LeaderPacket) -> bool:
-        """Tell whether a packet is of a later term, a leader with a lower number, or newer."""
-        if self._own is not None:
-            if (packet.term, -packet.leader) <= (self._term, -self._own):
-                return False
-            # One of several leaders stays one.
-            self._own = None if self._last_term else self._own
-        return self.packet is None or packet.rank > self.packet.rank
+        size = self.content.shape[1]
+        values = read_values((tuple(map(str, range(size))), packet.content))
+        return values if isinstance(values, Received) else tuple(values.values())
 
 
 _FAR = 2**30

@@ -13,6 +13,7 @@ from typing import NamedTuple, final
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.world.sensing import Estimate, EstimatingSensor, Estimator
@@ -22,15 +23,7 @@ from echelon.core.words import Feedforward
 from echelon.laws.consensus import Consensus
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.law import Law, carried_pieces
-from echelon.simulation.engine.agent import (
-    OwnLaw,
-    OwnState,
-    begin_alone,
-    gap_of,
-    offset_alone,
-    signal_of,
-    step_with,
-)
+from echelon.simulation.engine.agent import OwnLaw
 from echelon.simulation.native.agent_step import (
     check_distances,
     leaves_of,
@@ -39,6 +32,7 @@ from echelon.simulation.native.agent_step import (
     unflatten,
 )
 from echelon.simulation.scalars import Node, ScalarGraph, lower, needed, nodes, rewritten
+from echelon.simulation.step.alone import Arrived, alone, sent_or_alone
 from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.networks import (
     LateNetwork,
@@ -48,6 +42,15 @@ from echelon.simulation.step.networks import (
     carried_time,
     parts_of,
 )
+from echelon.simulation.step.records import (
+    GroupOffsets,
+    Known,
+    LawMemories,
+    NetworkEstimate,
+    Own,
+    Seconds,
+)
+from echelon.simulation.step.turns import follow, lead
 
 
 class LawFunction(NamedTuple):
@@ -89,7 +92,7 @@ def law_functions(own: OwnLaw, bits: int = 64) -> dict[str, LawFunction]:
 class _Traces:
     def __init__(self, own: OwnLaw, bits: int) -> None:
         self.own, self.bits = own, bits
-        self.loop, self.law = own.loop, own.law
+        self.loop, self.law = alone(own.loop, own.number, Arrived(*np.zeros((2, 0)))), own.law
         self.memory = memory_size(self.law)
         self.n, self.s = len(self.loop.model.state_names), len(own.signal_names)
         self.k, self.m = len(own.forward_names), len(self.loop.model.input_names)
@@ -104,16 +107,19 @@ class _Traces:
         difference = self._difference()
         yield difference
         yield self._tick(len(difference.outputs["gap"]))
-        late = self.loop.network
+        late = self.own.loop.network
         if isinstance(late, LateNetwork) and isinstance(late.rules.content, PlanDeviations):
             yield from self._expectation(late.rules.content)
         for stage in self.loop.sensing.on_board.stages:
             if isinstance(stage, EstimatingSensor):
                 yield from self._estimation(stage.estimator)
 
-    def _state(self, t: jax.Array, x: jax.Array, flat: jax.Array) -> OwnState:
-        offset, rate = offset_alone(self.loop, self.law, t, jnp.asarray(self.own.number))
-        return OwnState(x, offset, unflatten(self.law.init(), flat), rate)
+    def _offset(self, t: jax.Array) -> GroupOffsets:
+        return self.loop.places.of_group(self.loop.model, self.law, t, np.array([0]))
+
+    def _said(self, t: jax.Array, x: jax.Array, flat: jax.Array) -> jax.Array:
+        offset, memory = self._offset(t).offset[0], unflatten(self.law.init(), flat)
+        return self.loop.laws.speech.of_one(self.law, self.loop.model, x, offset, memory)
 
     # ---- in any network ----
 
@@ -121,7 +127,7 @@ class _Traces:
         return self._function(
             "begin",
             "the memory of an agent that begins at x",
-            lambda x: (_flat(begin_alone(self.loop, self.law, x)),),
+            lambda x: (_flat(self.law.begin(self.loop.model, x)),),
             ("memory",),
             {"x": self.n},
         )
@@ -156,14 +162,16 @@ class _Traces:
         return self._function(
             "signal",
             "the agent's signal at t (s), before it acts",
-            lambda t, x, flat: (signal_of(self.loop, self.law, self._state(t, x, flat)),),
+            lambda t, x, flat: (self._said(t, x, flat),),
             ("signal",),
             {"t": None, "x": self.n, "memory": self.memory},
         )
 
     def _difference(self) -> LawFunction:
         def gap(t: jax.Array, x: jax.Array, flat: jax.Array, other: jax.Array) -> tuple[jax.Array]:
-            return (gap_of(self.loop, self.own.leads, self._state(t, x, flat), other),)
+            said = self._said(t, x, flat)[None]
+            other = jnp.where(jnp.isnan(other), said[0], other)[None]
+            return (self.loop.laws.speech.difference(self.loop.model)(said, other)[0],)
 
         return self._function(
             "difference",
@@ -174,23 +182,33 @@ class _Traces:
         )
 
     def _tick(self, gap: int) -> LawFunction:
-        loop, leads = self.loop, self.own.leads
-        late = loop.network
+        loop, leads, late = self.loop, self.own.leads, self.own.loop.network
         says = late.rules.content if isinstance(late, LateNetwork) else None
 
         def tick(
             t: jax.Array, x: jax.Array, z: jax.Array, forward: jax.Array, flat: jax.Array
         ) -> tuple[jax.Array, ...]:
-            own = self._state(t, x, flat)
-            step = step_with(loop, leads, t, own, z, forward, None)
-            action = step.action
-            results = action.input, _flat(action.memory), step.signal, action.message
+            clock = Seconds(t, loop.motion.dt, t, jnp.asarray(False))
+            memory, said = unflatten(self.law.init(), flat), self._said(t, x, flat)
+            own, offset = Own(jnp.asarray(loop.laws.numbers), x[None]), self._offset(t)
+            heard = NetworkEstimate(z[None], jnp.array([leads]))
+            links = loop.graph.exchange
+            known = Known(clock, True, own, (offset, offset), said[None], links, heard)
+            rows = jax.tree.map(lambda row: row[None], memory)
+            if leads:
+                acted = lead(loop, known, LawMemories(rows, ()))
+            else:
+                forward = sent_or_alone(loop, t, x, forward)[None]
+                acted = follow(loop, known, 1, forward, rows)
+            acted = jax.tree.map(lambda row: row[0], acted)
+            results = acted.input, _flat(acted.memory), said, acted.message
             # A state less a constant is finite where the state is.
-            signal = step.signal if loop.laws.speech.signals else ()
+            signal = said if loop.laws.speech.signals else ()
             if says is None or not leads:
-                return *results, _flat((x, signal, action))
-            content = says.content(loop, t, Saying(*own[:3], step.signal, action))
-            return *results, content, _flat((x, signal, action, content))
+                return *results, _flat((x, signal, acted))
+            leader = Saying(x, offset.offset[0], memory, said, acted)
+            content = says.content(loop, t, leader)
+            return *results, content, _flat((x, signal, acted, content))
 
         words = message_meaning(self.own)
         sent = () if says is None or not leads else ("content",)

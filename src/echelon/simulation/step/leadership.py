@@ -85,6 +85,15 @@ class FixedLeaders(eqx.Module):
         """Return which of the agents lead that have these packets."""
         return jnp.asarray(self.first)
 
+    def named(
+        self, packet: PyTree, numbers: jax.Array, leading: Bool[Array, " K"]
+    ) -> Bool[jax.Array, " K"]:
+        """Return which of others lead as one agent knows it, which has the one `packet`.
+
+        `leading` are those that lead or may.
+        """
+        return jnp.asarray(leading)
+
     def terms(self, agents: int) -> PyTree:
         """Return the terms of packets before the first one; () without terms."""
         return ()
@@ -153,6 +162,12 @@ class Failover(FixedLeaders):
     def leads(self, packet: PyTree, number: jax.Array) -> Bool[jax.Array, " N"]:
         """Return which of the agents lead that have these packets."""
         return packet.leader == number
+
+    def named(
+        self, packet: PyTree, numbers: jax.Array, leading: Bool[Array, " K"]
+    ) -> Bool[jax.Array, " K"]:
+        """Return which of others lead as one agent knows it: whom its packet names."""
+        return packet.leader == numbers
 
     def terms(self, agents: int) -> PyTree:
         """Return the terms of packets before the first one."""

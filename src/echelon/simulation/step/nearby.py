@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from echelon.agents.network.channel import NEVER, Channel, InFlight
 from echelon.agents.network.exchange import Near
-from echelon.core.types import Array, PyTree, Scalar, States
+from echelon.core.types import Array, PyTree, States
 from echelon.laws.law import Law, Memory
 from echelon.simulation.step.loop import Loop, NobodyNear
 from echelon.simulation.step.meter import Sums
@@ -49,6 +49,12 @@ class ExactHulls(NobodyNear):
         near = Near(hulls[receivers] - points, known.heard.leads[senders], seen)
         shape = agents, agents - 1
         return jax.tree.map(lambda part: part.reshape(*shape, *part.shape[1:]), near), memory
+
+    def said(
+        self, loop: Loop, hulls: Float[jax.Array, "N r d"], known: Known
+    ) -> Float[jax.Array, "N r d"]:
+        """Return what agents say of their hulls."""
+        return hulls
 
     def _exchanged(
         self, loop: Loop, memory: PyTree, hulls: Float[jax.Array, "N r d"], known: Known
@@ -89,13 +95,25 @@ class LateHulls(ExactHulls):
         stamp = jnp.full(links, NEVER, jnp.int32)
         return NeighbourHulls(self.medium.begin(hulls, links), stamp, points)
 
+    def said(
+        self, loop: Loop, hulls: Float[jax.Array, "N r d"], known: Known
+    ) -> Float[jax.Array, "N r d"]:
+        """Return them less those of the leader where each expects it."""
+        t = known.clock.t
+
+        def one(hull: jax.Array, expected: jax.Array) -> jax.Array:
+            there = loop.laws.leader.expected_hull(loop.model, t, expected)
+            assert there is not None, "a law with `safety` follows a leader that can be expected"
+            return hull - there
+
+        return jax.vmap(one)(hulls, known.heard.leader)
+
     def _exchanged(
         self, loop: Loop, memory: PyTree, hulls: Float[jax.Array, "N r d"], known: Known
     ) -> tuple[jax.Array, jax.Array, jax.Array, PyTree]:
         receivers, senders = _pairs(loop.agents)
         clock, heard, here = known.clock, known.heard, as_array(known.here, loop.agents)
-        one = lambda hull, leader: less_expected(loop, clock.t, hull, leader)  # noqa: E731
-        hulls = jax.vmap(one)(hulls, heard.leader)
+        hulls = self.said(loop, hulls, known)
         sends = (here & (heard.leads | (heard.packet.stamp != NEVER)))[senders]
         arrival = self.medium.arrivals(memory.posts, clock.step, memory.stamp)
         new = arrival.new[:, None, None]
@@ -103,15 +121,6 @@ class LateHulls(ExactHulls):
         posts = self.medium.post(memory.posts, clock.step, hulls, sends, receivers, senders)
         seen = here[senders] & (arrival.stamp != NEVER)
         return hulls, points, seen, NeighbourHulls(posts, arrival.stamp, points)
-
-
-def less_expected(
-    loop: Loop, t: Scalar, hull: Float[jax.Array, "r d"], expected: Float[jax.Array, " s"]
-) -> Float[jax.Array, "r d"]:
-    """Return the points of a hull less those of a leader whose signal is expected somewhere."""
-    there = loop.laws.leader.expected_hull(loop.model, t, expected)
-    assert there is not None, "a law with `safety` follows a leader that can be expected"
-    return hull - there
 
 
 def all_hulls(loop: Loop, states: States, laws: LawMemories) -> Float[jax.Array, "N r d"]:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from echelon.agents.network.channel import NEVER, Channel, InFlight
+from echelon.agents.network.channel import NEVER, Channel
 from echelon.agents.network.exchange import Difference, Exchange
 from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction
@@ -135,6 +135,12 @@ class PlainValues(eqx.Module):
         """Return the values of messages, of which `itself` (N,) are a leader's."""
         return said
 
+    def another(self, mail: Messages, heard: NetworkEstimate) -> tuple[jax.Array, jax.Array]:
+        """Return a signal (s,) of others that one agent knows, and whether it knows any."""
+        known = jnp.append(mail.stamp != NEVER, False)
+        signals = jnp.concatenate([mail.value, jnp.zeros_like(heard.leader)])
+        return signals[jnp.argmax(known)], known.any()
+
 
 class PlanDeviations(PlainValues):
     """How far the sender is off where it expects the leader, whose plan all know.
@@ -192,6 +198,10 @@ class PlanDeviations(PlainValues):
         value = leader[receivers] + jnp.where(fresh[:, None], mail.value, 0.0)
         # A leader is where it is expected, and its own message says no more.
         return value, used, fresh | ((age < jnp.inf) & (mail.hops == 0))
+
+    def another(self, mail: Messages, heard: NetworkEstimate) -> tuple[jax.Array, jax.Array]:
+        """Return the signal at which it expects its leader, and whether it knows of one."""
+        return heard.leader[0], heard.packet.stamp[0] != NEVER
 
     def value(
         self, said: jax.Array, leader: jax.Array, itself: jax.Array, difference: Difference
@@ -443,7 +453,6 @@ class MessageRules(eqx.Module):
 # ---- the network that is late --------------------------------------------------------------------
 
 
-@final
 class LateNetwork(IdealNetwork):
     """Messages by the rules, over a medium that delays and loses them.
 
@@ -476,7 +485,7 @@ class LateNetwork(IdealNetwork):
 
     def delivered(
         self,
-        in_flight: InFlight,
+        in_flight: PyTree,
         mail: Messages,
         number: jax.Array,
         clock: Clock,
@@ -485,12 +494,18 @@ class LateNetwork(IdealNetwork):
         here: Mask,
     ) -> Messages:
         """Return the mail with what arrives now, and with who takes the lead."""
-        arrival = self.medium.arrivals(in_flight, clock.step, mail.stamp)
-        places = arrival.slot, jnp.asarray(links.senders)
-        sent: Messages = jax.tree.map(lambda rows: rows[places], in_flight.content)
-        mail = self.rules.take(mail, sent, arrival.new, arrival.stamp, links)
+        mail = self.rules.take(mail, *self.arriving(in_flight, clock.step, mail, links), links)
         packet = self.leadership.elect(mail.packet, number, clock, since, here)
         return mail._replace(packet=packet)
+
+    def arriving(
+        self, in_flight: PyTree, step: jax.Array, mail: Messages, links: Exchange
+    ) -> tuple[Messages, jax.Array, jax.Array]:
+        """Return a message of each link (K, ...), which of them arrives now, and its stamp."""
+        arrival = self.medium.arrivals(in_flight, step, mail.stamp)
+        places = arrival.slot, jnp.asarray(links.senders)
+        sent: Messages = jax.tree.map(lambda rows: rows[places], in_flight.content)
+        return sent, arrival.new, arrival.stamp
 
     def send(self, loop: Loop, memory: PyTree, known: Known, speech: LeaderSpeech) -> PyTree:
         """Return the network after what agents send now."""
@@ -508,12 +523,12 @@ class LateNetwork(IdealNetwork):
 
     def posted(
         self,
-        in_flight: InFlight,
+        in_flight: PyTree,
         step: jax.Array,
         sent: Messages,
         sends: Bool[jax.Array, " N"],
         links: Exchange,
-    ) -> InFlight:
+    ) -> PyTree:
         """Return what is in flight after a step; links that the graph lacks carry nothing."""
         carried = carries(links, sends)
         return self.medium.post(in_flight, step, sent, carried, links.receivers, links.senders)

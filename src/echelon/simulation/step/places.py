@@ -1,5 +1,6 @@
 """Where the places of agents in the formation are: at offsets that are constant, or move."""
 
+import dataclasses
 from typing import TypeAlias, final
 
 import equinox as eqx
@@ -35,6 +36,10 @@ class FixedPlaces(eqx.Module):
         offsets, motion = np.asarray(formation.offsets), formation.motion
         return FixedPlaces(offsets) if motion is None else MovingPlaces(offsets, motion)
 
+    def of_one(self, number: int) -> "FixedPlaces":
+        """Return the places of one agent alone."""
+        return FixedPlaces(self.offsets[number : number + 1])
+
     def of_group(self, model: ControlAffine, law: Law, t: Scalar, agents: Agents) -> GroupOffsets:
         """Return what agents under a law take for their offsets at a time (s)."""
         return GroupOffsets(jnp.asarray(self.offsets, jnp.result_type(t))[agents], None)
@@ -62,6 +67,11 @@ class MovingPlaces(FixedPlaces):
     """Offsets that are functions of time."""
 
     motion: FormationMotion
+
+    def of_one(self, number: int) -> FixedPlaces:
+        """Return the places of one agent alone."""
+        motion = dataclasses.replace(self.motion, places=self.motion.places[number : number + 1])
+        return MovingPlaces(self.offsets[number : number + 1], motion)
 
     def of_group(self, model: ControlAffine, law: Law, t: Scalar, agents: Agents) -> GroupOffsets:
         """Return what the law makes of them."""

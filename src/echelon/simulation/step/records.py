@@ -76,10 +76,18 @@ class Steps(NamedTuple):
 
 
 class Seconds(NamedTuple):
-    """The clock of an agent alone: time t, s, its period dt, s, and whether it acts first now."""
+    """The clock of an agent alone.
+
+    Attributes:
+        t: time, s.
+        dt: its period, s.
+        begun: when it acted first, s.
+        first: whether it does now.
+    """
 
     t: jax.Array
     dt: Array | float
+    begun: jax.Array
     first: jax.Array
 
     @property
@@ -93,12 +101,12 @@ class Seconds(NamedTuple):
         return self.t
 
     def age(self, stamp: Float[jax.Array, " K"]) -> Float[jax.Array, " K"]:
-        """Return the age (s) of what has this stamp; infinite for -inf, where nothing came."""
-        return jnp.maximum(0.0, self.t - stamp)
+        """Return the age (s) of what has this stamp; infinite where nothing came."""
+        return jnp.where(stamp == NEVER, jnp.inf, jnp.maximum(0.0, self.t - stamp))
 
     def waited(self, since: Float[jax.Array, " N"]) -> Float[jax.Array, " N"]:
         """Return for how long (s) each has been there that has been there `since` (s)."""
-        return self.t - since
+        return self.t - jnp.maximum(since, self.begun)
 
 
 Clock: TypeAlias = Steps | Seconds
@@ -281,9 +289,13 @@ class Control(NamedTuple):
         limited: (N,) whose desired input a limit changed.
         cut: (N, m) to which side.
         memory: of the components, afterwards.
+        said: (N, s) what they said.
+        message: (N, k) what they send to their followers in the same step.
     """
 
     inputs: Inputs
     limited: jax.Array
     cut: jax.Array
     memory: ComponentMemory
+    said: Float[jax.Array, "N s"]
+    message: Float[jax.Array, "N k"]

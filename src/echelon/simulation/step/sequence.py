@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from echelon.core.compiled import cached_jit
-from echelon.core.types import Array, Inputs, State, States
+from echelon.core.types import Array, Inputs, PyTree, State, States
 from echelon.simulation.step.distances import closest_two
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import Sums, reference_at
 from echelon.simulation.step.records import (
+    Clock,
     ComponentMemory,
     Control,
     Known,
@@ -33,7 +34,7 @@ def begin(loop: Loop, states: States) -> LoopState:
     laws = loop.laws.begin(model, states)
     cut = jnp.zeros((len(states), len(model.input_names)), jnp.int8)
     now = LoopState(jnp.zeros((), jnp.int32), states, cut, ComponentMemory(laws))
-    own = jax.tree.map(lambda rows: rows[0], laws.leader)
+    own = jax.eval_shape(lambda x: loop.laws.owners[0][0].begin(model, x), states[0])
     network = loop.network.begin(loop, said_by(loop, now), loop.laws.message_size(model, own))
     memory = now.memory._replace(
         sensing=jax.vmap(lambda x: loop.sensing.begin(model, x))(states),
@@ -61,15 +62,15 @@ def said_by(loop: Loop, now: LoopState) -> Float[jax.Array, "N s"]:
     return _said(loop, now.states, now.memory.laws, Steps(now.step, loop.motion.dt))[1]
 
 
-def _said(loop: Loop, x: States, laws: LawMemories, clock: Steps) -> tuple[Any, jax.Array]:
+def _said(loop: Loop, x: States, laws: LawMemories, clock: Clock) -> tuple[Any, jax.Array]:
     offsets = loop.places.groups(loop.model, loop.laws, clock.t)
     everywhere = loop.places.of_all(loop.laws, offsets)
     known = Sayings(loop.model, x, everywhere, offsets, laws)
     return offsets, loop.laws.speech.of_all(loop.laws, known)
 
 
-def control(loop: Loop, now: LoopState, clock: Steps) -> Control:
-    """Return what all agents do from a moment on."""
+def hear(loop: Loop, now: LoopState, clock: Clock) -> tuple[Known, PyTree, PyTree]:
+    """Return what all know, and what sensing and network remember after it."""
     memory, here = now.memory, loop.roster.here(clock.step)
     numbers = jnp.asarray(loop.laws.numbers)
 
@@ -84,8 +85,15 @@ def control(loop: Loop, now: LoopState, clock: Steps) -> Control:
     # 3. Hear.
     known = Known(clock, here, own, offsets, said, loop.graph.at(clock.step))
     heard, network = loop.network.receive(loop, memory.network, known)
+    return known._replace(heard=heard), sensing, network
+
+
+def control(loop: Loop, now: LoopState, clock: Clock) -> Control:
+    """Return what all agents do from a moment on."""
+    memory = now.memory
+    known, sensing, network = hear(loop, now, clock)
+    here = known.here
     # 4. Look around.
-    known = known._replace(heard=heard)
     near, seen = loop.surroundings.look(loop, memory.near, memory.laws, known)
     # 5. Act.
     known = known._replace(near=near)
@@ -104,7 +112,9 @@ def control(loop: Loop, now: LoopState, clock: Steps) -> Control:
         network=network,
         near=seen,
     )
-    return Control(u, limited.any(axis=1), cut.astype(jnp.int8), memory)
+    message = loop.laws.ordered(led.message, followed.message)
+    cuts = limited.any(axis=1), cut.astype(jnp.int8)
+    return Control(u, *cuts, memory, known.said, message)
 
 
 def _held(loop: Loop, mask: Mask, one: LoopState, other: LoopState) -> LoopState:
