@@ -36,7 +36,7 @@ def receive(agent, draws):
     return signals, forward
 
 
-def compare(agent, runs, steps, dt, size=0.1):
+def compare(agent, runs, steps, dt, size=0.1, terms=1.0):
     """Let an agent and copies of its law take the same random steps; returns their memories.
 
     Args:
@@ -45,6 +45,7 @@ def compare(agent, runs, steps, dt, size=0.1):
         steps: how many.
         dt: between two, s; the law's own, or longer to see more of its time.
         size: of the random states.
+        terms: the largest of which a number of the step is the sum.
     """
     own, draws = agent.own_law, np.random.default_rng(0)
     trim = np.array(own.loop.model.trim[0], float)
@@ -70,7 +71,8 @@ def compare(agent, runs, steps, dt, size=0.1):
             largest = max(1.0, *(np.abs(value).max(initial=0.0) for value in expected))
             scales = max(1.0, np.abs(u).max()), largest, largest, largest
             for got, value, scale in zip(results, expected, scales, strict=True):
-                np.testing.assert_allclose(got, value, rtol=0, atol=1e-14 * scale)
+                atol = max(1e-14 * scale, 4.0 * np.finfo(float).eps * terms)
+                np.testing.assert_allclose(got, value, rtol=0, atol=atol)
     return memories
 
 

@@ -28,7 +28,7 @@ from echelon.simulation.step.records import (
     NetworkEstimate,
     Played,
 )
-from echelon.simulation.step.roster import Links
+from echelon.simulation.step.roster import Everybody, Links
 from echelon.simulation.step.turns import BackupsToo, Relay, follow, lead
 
 
@@ -229,6 +229,7 @@ def alone(loop: Loop, number: int, arrived: Arrived) -> Loop:
         surroundings=near,
         turns=turns,
         motion=dataclasses.replace(loop.motion, rows=rows),
+        roster=Everybody(),
     )
 
 

@@ -130,6 +130,8 @@ class FixedLeaders(eqx.Module):
             links: along which they came.
         """
         count, receivers = len(own.stamp), jnp.asarray(links.receivers)
+        if not len(receivers):
+            return own
         valid = new & (others.stamp != NEVER)
         term, valid, current = self.contest(own, others, valid, links)
         leaders = jnp.where(valid, others.leader, NOBODY)

@@ -70,7 +70,7 @@ class Steps(NamedTuple):
         """Return the age (s) of what has this stamp; infinite where nothing came."""
         return jnp.where(stamp == NEVER, jnp.inf, (self.step - stamp) * jnp.asarray(self.dt))
 
-    def waited(self, since: Float[jax.Array, " N"]) -> Float[jax.Array, " N"]:
+    def waited(self, since: Float[jax.Array, " *N"]) -> Float[jax.Array, " *N"]:
         """Return for how long (s) each has been there that has been there `since` (s)."""
         return self.step * self.dt - since
 
@@ -104,7 +104,7 @@ class Seconds(NamedTuple):
         """Return the age (s) of what has this stamp; infinite where nothing came."""
         return jnp.where(stamp == NEVER, jnp.inf, jnp.maximum(0.0, self.t - stamp))
 
-    def waited(self, since: Float[jax.Array, " N"]) -> Float[jax.Array, " N"]:
+    def waited(self, since: Float[jax.Array, " *N"]) -> Float[jax.Array, " *N"]:
         """Return for how long (s) each has been there that has been there `since` (s)."""
         return self.t - jnp.maximum(since, self.begun)
 
