@@ -9,7 +9,7 @@ import numpy as np
 
 from echelon.agents.network.channel import NEVER, Network
 from echelon.agents.network.exchange import Exchange
-from echelon.agents.network.inbox import Inbox, Message, NamedValues, Received, Stamps
+from echelon.agents.network.inbox import LateInbox, Message, NamedValues, Received
 from echelon.simulation.step.leadership import FixedLeaders
 from echelon.simulation.step.networks import MessageRules
 from echelon.simulation.step.records import LeaderPackets, Messages
@@ -49,8 +49,8 @@ def test_both_take_and_keep_the_same():
     links = Exchange(np.zeros(3, int), np.arange(3), np.ones(3))
     for own in (None, 0, 1):
         draws, answers = random.Random(f"{own}"), set()
-        stamps = Stamps(len(HEARS), LEADERS, 2, True, False)
-        box, inbox = Letterbox(HEARS, LEADERS, own), Inbox(HEARS, 0, NAMES, NAMES, stamps)
+        box = Letterbox(HEARS, LEADERS, own)
+        inbox = LateInbox(HEARS, 0, NAMES, NAMES, LEADERS, 2, True, False)
         leaders = FixedLeaders(np.array([own is not None]))
         rules = MessageRules.of(Network().prepared(0.02, 1.0, 0), leaders, 4)
         take = jax.jit(
@@ -61,7 +61,7 @@ def test_both_take_and_keep_the_same():
             packet = mail.packet._replace(stamp=mail.packet.stamp.astype(float))
             mail = mail._replace(stamp=mail.stamp.astype(float), packet=packet)
         for k in range(1_000):
-            stamps.clock = clock = 0.01 * k
+            inbox.clock = clock = 0.01 * k
             letter = draw(draws, clock)
             why = box.receive(letter, clock)
             answers.add(why)
@@ -70,13 +70,13 @@ def test_both_take_and_keep_the_same():
                 continue
             kept = list(box.letters.values())
             times = [NEVER if x is None else x.time for x in kept]
-            assert times == stamps.time.tolist()
-            assert [x.hops for x in kept if x] == [h for h in stamps.hops.tolist() if h < 2**30]
+            assert times == inbox.time.tolist()
+            assert [x.hops for x in kept if x] == [h for h in inbox.hops.tolist() if h < 2**30]
             rows = [[math.nan] * 2 if x is None else x.value for x in kept]
             np.testing.assert_array_equal(inbox.signals, rows)
-            packets = LeaderPackets(stamps.leader, stamps.said, stamps.content, ())
+            packets = LeaderPackets(inbox.leader, inbox.said, inbox.content, ())
             with jax.enable_x64(True):
-                mail = take(mail, Messages(inbox.signals, stamps.hops, packets), stamps.time)
+                mail = take(mail, Messages(inbox.signals, inbox.hops, packets), inbox.time)
             said = jax.tree.map(lambda row: np.asarray(row)[0].tolist(), mail.packet)
             # Its own packets come back to a leader, and say nothing new.
             assert (box.packet is None) == (said.stamp == NEVER or said.leader == own)

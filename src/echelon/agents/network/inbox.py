@@ -60,20 +60,19 @@ class Message(NamedTuple):
     hull: NamedValues | None = None
 
 
-@final
 class Inbox:
-    """The last good message of each neighbour; NaN for what was not received.
+    """The last good message of each neighbour in the ideal network; NaN for what was not received.
 
     Args:
         senders: the neighbours, in the order of `signals`.
         source: whose feed-forward is used; None for nobody's.
         names: of the signal's values.
         forward_names: of the feed-forward's values.
-        stamps: over a network that is late, where times and packets of messages are stored.
 
     Attributes:
         signals: (K, s).
         feedforward: (k,).
+        clock: the receiver's time, s.
     """
 
     signals: Float[Array, "K s"]
@@ -85,10 +84,8 @@ class Inbox:
         source: int | None,
         names: tuple[str, ...],
         forward_names: tuple[str, ...],
-        stamps: "Stamps | None" = None,
     ) -> None:
-        self._stamps = stamps
-        self._senders, self._source = tuple(senders), source
+        self._senders, self._source, self.clock = tuple(senders), source, 0.0
         self._names, self._forward_names = names, forward_names
         self.signals = np.full((len(senders), len(names)), np.nan)
         self.feedforward = np.full(len(forward_names), np.nan)
@@ -97,8 +94,7 @@ class Inbox:
         """Store a message whose values are finite numbers with names that this agent uses."""
         if not isinstance(message, Message) or not isinstance(message.sender, numbers.Integral):
             return Received.NO_MESSAGE
-        heard = self._senders if self._stamps is not None else (*self._senders, self._source)
-        if message.sender not in heard:
+        if not self._hears(message.sender):
             return Received.NOT_HEARD
         # Both before either is stored, so that a message is taken as a whole.
         values = read_values(message.signal)
@@ -107,64 +103,33 @@ class Inbox:
             return next(part for part in (values, forward) if isinstance(part, Received))
         if not {*self._names} & {*values}:
             return Received.WRONG_SIZE
-        if self._stamps is not None:
-            fault = self._stamps.take(message, self._senders.index(message.sender))
-            if fault is not None:
-                return fault
-        place = [who == message.sender for who in self._senders]
-        self.signals[place] = [values.get(name, np.nan) for name in self._names]
-        if message.sender == self._source and forward:
-            self.feedforward[:] = [forward.get(name, np.nan) for name in self._forward_names]
+        taken = self._stamp(message)
+        if taken is Received.TAKEN:
+            place = [who == message.sender for who in self._senders]
+            self.signals[place] = [values.get(name, np.nan) for name in self._names]
+            if message.sender == self._source and forward:
+                self.feedforward[:] = [forward.get(name, np.nan) for name in self._forward_names]
+        return taken
+
+    def newer(self, message: Message, before: float) -> bool:
+        """Tell whether a message is newer than what came `before` (s): here all are."""
+        return True
+
+    def _hears(self, sender: object) -> bool:
+        return sender in (*self._senders, self._source)
+
+    def _stamp(self, message: Message) -> Received:
+        """Store when a message was sent, and what else comes with it."""
         return Received.TAKEN
 
 
 @final
-class Surroundings:
-    """The last good hull of every other agent, whatever the graph.
-
-    Args:
-        senders: the others.
-        names: of the numbers of a hull.
-
-    Attributes:
-        names: likewise.
-        hulls: (K, h), NaN for what was not received.
-        time: (K,) when they were sent, s; -inf for none, and in the ideal network.
-    """
-
-    hulls: Float[Array, "K h"]
-    time: Float[Array, " K"]
-
-    def __init__(self, senders: Sequence[int], names: tuple[str, ...]) -> None:
-        self._places, self.names = {who: k for k, who in enumerate(senders)}, names
-        self.hulls = np.full((len(senders), len(names)), np.nan)
-        self.time = np.full(len(senders), -np.inf)
-
-    def take(self, message: object, clock: float | None) -> bool:
-        """Store a hull, and tell whether it is of use; `clock` (s) is None in the ideal network."""
-        if not isinstance(message, Message) or not isinstance(message.sender, numbers.Integral):
-            return False
-        place = self._places.get(int(message.sender))
-        values = {} if message.hull is None else read_values(message.hull)
-        if place is None or isinstance(values, Received) or {*values} != {*self.names}:
-            return False
-        if clock is not None:
-            sent = message.time
-            if not _is_time(sent) or not self.time[place] < sent <= clock + _AHEAD:  # pyright: ignore
-                return False
-            self.time[place] = sent
-        self.hulls[place] = [values[name] for name in self.names]
-        return True
-
-
-@final
-class Stamps:
-    """Times, hops and packets of the newest message of each neighbour, over a late network.
+class LateInbox(Inbox):
+    """The same over a late network, with times, hops and packets.
 
     Which packet counts is decided where the messages are read.
 
     Args:
-        links: how many neighbours the agent hears.
         leaders: the numbers of those that lead or may.
         size: of a packet's content.
         needs_packet: whether a message says nothing without one.
@@ -175,23 +140,38 @@ class Stamps:
         hops: (K,) of its sender.
         leader, said, term: (K,) of its packet: whose, of when (s; `NEVER` for none), of which term.
         content: (K, p) of its packet.
-        clock: the receiver's time, s.
     """
 
     def __init__(
-        self, links: int, leaders: Sequence[int], size: int, needs_packet: bool, terms: bool
+        self,
+        senders: Sequence[int],
+        source: int | None,
+        names: tuple[str, ...],
+        forward_names: tuple[str, ...],
+        leaders: Sequence[int],
+        size: int,
+        needs_packet: bool,
+        terms: bool,
     ) -> None:
-        self.needs_packet, self.clock = needs_packet, 0.0
+        super().__init__(senders, source, names, forward_names)
+        links, self._needs_packet = len(senders), needs_packet
         self.time, self.hops = np.full(links, float(NEVER)), np.full(links, _FAR, np.int32)
         self.leader, self.said = self.hops.copy(), self.time.copy()
         self.term, self.content = np.zeros(links, np.int32), np.zeros((links, size))
         # Where nobody hands the lead over, a packet of a later term would win for ever.
         self._leaders, self._last_term = frozenset(leaders), _FAR * terms
 
-    def take(self, message: Message, place: int) -> Received | None:
-        """Store all but the value of a message; return why it is not used, if so."""
+    def newer(self, message: Message, before: float) -> bool:
+        """Tell whether a message is newer than what came `before` (s), and not of the future."""
+        sent = message.time
+        return _is_time(sent) and before < sent <= self.clock + _AHEAD  # pyright: ignore
+
+    def _hears(self, sender: object) -> bool:
+        return sender in self._senders
+
+    def _stamp(self, message: Message) -> Received:
         packet = message.packet
-        if not (isinstance(packet, LeaderPacket) or packet is None and not self.needs_packet):
+        if not (isinstance(packet, LeaderPacket) or packet is None and not self._needs_packet):
             return Received.NO_MESSAGE
         times = [message.time, *([] if packet is None else [packet.time])]
         if not all(map(_is_time, times)) or not isinstance(message.hops, numbers.Integral):
@@ -202,14 +182,15 @@ class Stamps:
         if isinstance(values, Received):
             return values
         # What is older says nothing new: an agent's packet is never an older one again.
-        if not message.time > self.time[place]:  # pyright: ignore
+        place = self._senders.index(message.sender)
+        if not self.newer(message, self.time[place]):
             return Received.LATE
         self.time[place] = message.time
         self.hops[place] = min(max(int(message.hops), 0), _FAR)
         if packet is not None:
             self.leader[place], self.said[place] = packet.leader, packet.time
             self.term[place], self.content[place] = packet.term, values
-        return None
+        return Received.TAKEN
 
     def _content_of(self, packet: LeaderPacket) -> tuple[float, ...] | Received:
         whole = all(isinstance(x, numbers.Integral) for x in (packet.leader, packet.term))
@@ -218,6 +199,42 @@ class Stamps:
         size = self.content.shape[1]
         values = read_values((tuple(map(str, range(size))), packet.content))
         return values if isinstance(values, Received) else tuple(values.values())
+
+
+@final
+class Surroundings:
+    """The last good hull of every other agent, whatever the graph.
+
+    Args:
+        senders: the others.
+        names: of the numbers of a hull.
+        inbox: which tells newer messages from older ones.
+
+    Attributes:
+        names: likewise.
+        hulls: (K, h), NaN for what was not received.
+    """
+
+    hulls: Float[Array, "K h"]
+
+    def __init__(self, senders: Sequence[int], names: tuple[str, ...], inbox: Inbox) -> None:
+        self._places, self.names = {who: k for k, who in enumerate(senders)}, names
+        self.hulls, self._inbox = np.full((len(senders), len(names)), np.nan), inbox
+        self._time = np.full(len(senders), float(NEVER))
+
+    def take(self, message: object) -> bool:
+        """Store a hull, and tell whether it is of use."""
+        if not isinstance(message, Message) or not isinstance(message.sender, numbers.Integral):
+            return False
+        place = self._places.get(int(message.sender))
+        values = {} if message.hull is None else read_values(message.hull)
+        if place is None or isinstance(values, Received) or {*values} != {*self.names}:
+            return False
+        if not self._inbox.newer(message, self._time[place]):
+            return False
+        self._time[place] = NEVER if message.time is None else message.time
+        self.hulls[place] = [values[name] for name in self.names]
+        return True
 
 
 _FAR = 2**30

@@ -12,11 +12,11 @@ from jax.typing import ArrayLike
 from echelon.agents.network.channel import NEVER
 from echelon.agents.network.inbox import (
     Inbox,
+    LateInbox,
     LeaderPacket,
     Message,
     NamedValues,
     Received,
-    Stamps,
     Surroundings,
 )
 from echelon.agents.network.switching import Schedule
@@ -38,7 +38,7 @@ from echelon.simulation.step.alone import (
 )
 from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.loop import Loop
-from echelon.simulation.step.networks import LateNetwork
+from echelon.simulation.step.networks import LateNetwork, MessageRules
 from echelon.simulation.step.places import MovingPlaces
 from echelon.simulation.step.records import (
     Control,
@@ -82,6 +82,10 @@ class OwnLaw(NamedTuple):
     def law(self) -> Law:
         """The leaders' law or the others'."""
         return self.loop.laws.leader if self.leads else self.loop.laws.follower
+
+    def weights_at(self, t: float) -> Array:
+        """Return the weights (K,) of the neighbours' signals at a time (s)."""
+        return self.weights[self.schedule.row(t) if self.schedule else 0]
 
 
 @cached_jit
@@ -169,7 +173,12 @@ class Agent:
         self.number, self.leads = int(agent), agent in parts.graph.leaders
         self.own_law = _own_law(loop, parts, self.number)
         self.neighbours = self.own_law.neighbours
-        self._mail = _Mail(self.own_law, [*parts.graph.leaders, *parts.graph.backups])
+        own, leaders = self.own_law, [*parts.graph.leaders, *parts.graph.backups]
+        self._mail = (
+            LateMail(own, loop.network.rules, leaders)
+            if isinstance(loop.network, LateNetwork)
+            else Mail(own, Inbox(own.neighbours, own.source, own.signal_names, own.forward_names))
+        )
         self._loop = alone(loop, self.number, self._mail.arrived)
         self._now: LoopState | None = None
         # When it first acted (s), and whether it has yet to learn how often others turned.
@@ -216,7 +225,7 @@ class Agent:
                 f"`t` is {t!r}, and must be a finite time in seconds that does not go back; the "
                 f"last step was at {self._time:g} s."
             )
-        self._time = self._mail.clock = float(t)
+        self._time = self._mail.inbox.clock = float(t)
         now, acted, finite, asks = self._act(self._time, x)
         if finite:
             self._now, self._asks = now._replace(memory=acted.memory), asks
@@ -232,10 +241,9 @@ class Agent:
         state = self._state(x)[None]
         with precision("float64"):
             states = jnp.asarray(state)
-            loop = after_mail(self._loop, self._mail.arrived, self._mail.weights(t))
-            first, asks = self._now is None, self._asks
-            now = begin(loop, states) if self._now is None else self._now
-            now = now._replace(states=states)
+            loop = after_mail(self._loop, self._mail.arrived, self.own_law.weights_at(t))
+            asks, first = self._asks, self._now is None
+            now = (self._now or begin(loop, states))._replace(states=states)
             begun = jnp.asarray(min(self._begun, t))
             clock = Seconds(jnp.asarray(t), loop.motion.dt, begun, jnp.asarray(first))
             if asks or first and t > 0.0 and has_angles(loop.laws.follower):
@@ -254,103 +262,94 @@ class Agent:
         return np.asarray(state, float)
 
 
-@final
-class _Mail:
+class Mail:
     """What an agent receives, as arrays, and what it sends, as messages with names.
 
     Args:
         own: the agent.
-        leaders: the numbers of those that lead or may.
+        inbox: of its neighbours' messages.
     """
 
-    def __init__(self, own: OwnLaw, leaders: list[int]) -> None:
-        self._own, network = own, own.loop.network
-        self._late = network.rules if isinstance(network, LateNetwork) else None
-        self._stamps: Stamps | None = None
-        if self._late is not None:
-            sizes = len(own.signal_names), len(own.forward_names), len(own.loop.model.input_names)
-            size, needs = self._late.content.size(*sizes), self._late.content.needs_packet
-            rows = len(own.neighbours), leaders, size, needs, network.leadership.changes
-            self._stamps = Stamps(*rows)
-        names = own.signal_names, own.forward_names
-        self._inbox = Inbox(own.neighbours, own.source, *names, stamps=self._stamps)
-        self._others = _surroundings(own)
-
-    @property
-    def clock(self) -> float:
-        """The time of the agent, s."""
-        return 0.0 if self._stamps is None else self._stamps.clock
-
-    @clock.setter
-    def clock(self, t: float) -> None:
-        if self._stamps is not None:
-            self._stamps.clock = t
-
-    def weights(self, t: float) -> Array:
-        """Return the weights (K,) of the neighbours' signals at a time (s)."""
-        schedule = self._own.schedule
-        return self._own.weights[0 if schedule is None else schedule.row(t)]
+    def __init__(self, own: OwnLaw, inbox: Inbox) -> None:
+        self._own, self.inbox, names = own, inbox, _hull_names(own)
+        # Of others than neighbours the place alone is used, where agents keep apart.
+        others = [k for k in range(own.loop.agents) if k != own.number] if names else []
+        self._others = Surroundings(others, names, inbox)
 
     def receive(self, message: object) -> Received:
         """Take a message, or return why it is not used."""
-        received = self._inbox.receive(message)
-        if self._others is None or received not in (Received.TAKEN, Received.NOT_HEARD):
-            return received
-        # Of others than neighbours the place alone is used.
-        clock = None if self._stamps is None else self._stamps.clock
-        return Received.TAKEN if self._others.take(message, clock) else received
+        received = self.inbox.receive(message)
+        if received in (Received.TAKEN, Received.NOT_HEARD) and self._others.take(message):
+            return Received.TAKEN
+        return received
 
     @property
     def arrived(self) -> Arrived:
         """What came so far."""
-        box, stamps, hulls = self._inbox, self._stamps, ()
-        if self._others is not None:
-            d = len(self._own.loop.model.position)
-            hulls = self._others.hulls.reshape(len(self._others.hulls), -1, d)
-        if stamps is None:
-            return Arrived(box.signals, box.feedforward, (), hulls)
-        term = stamps.term if self._own.loop.network.leadership.changes else ()
-        packets = LeaderPackets._make([stamps.leader, stamps.said, stamps.content, term])
-        # Of an output that a sender does not have it is taken to be where the leader is.
-        value = np.nan_to_num(box.signals, nan=0.0)
-        messages = Messages._make([value, stamps.hops, packets, stamps.time])
-        return Arrived(box.signals, box.feedforward, messages, hulls)
+        hulls, d = self._others.hulls, max(len(self._own.loop.model.position), 1)
+        points = hulls.reshape(len(hulls), hulls.shape[1] // d, d)
+        return Arrived(self.inbox.signals, self.inbox.feedforward, self._messages(), points)
+
+    def _messages(self) -> PyTree:
+        return ()
+
+    def leads(self, acted: Control) -> bool:
+        """Tell whether the agent took the lead."""
+        return False
 
     def hello(self, acted: Control) -> Message:
         """Return the message before an agent acts."""
-        names = self._own.signal_names
-        message = Message(self._own.number, NamedValues(names, np.asarray(acted.said[0])))
-        return self._with_hull(message, acted)
-
-    def leads(self, acted: Control) -> bool:
-        """Tell whether the agent leads, over a network in which the lead is handed over."""
-        if self._late is None or not self._late.leadership.changes:
-            return False
-        return int(acted.memory.network[1].packet.leader[0]) == self._own.number
+        signal = NamedValues(self._own.signal_names, np.asarray(acted.said[0]))
+        return self._with_hull(Message(self._own.number, signal), acted)
 
     def written(self, acted: Control) -> Message | None:
         """Return the whole message of a step; None where there is nothing to say yet."""
-        own, rules = self._own, self._late
-        if rules is None:
-            forward = NamedValues(own.forward_names, np.asarray(acted.message[0]))
-            return self.hello(acted)._replace(feedforward=forward)
-        letter: Messages = jax.tree.map(lambda row: np.asarray(row)[0], acted.memory.network[0])
-        leader, said, content, term = letter.packet
-        packet = None
-        if said != NEVER:
-            number = 0 if isinstance(term, tuple) else int(term)
-            packet = LeaderPacket(int(leader), float(said), tuple(content.tolist()), number)
-        elif rules.content.needs_packet:
-            return None
-        signal = NamedValues(own.signal_names, np.asarray(letter.value))
-        rows = None, self.clock, int(letter.hops), packet
-        return self._with_hull(Message(own.number, signal, *rows), acted)
+        forward = NamedValues(self._own.forward_names, np.asarray(acted.message[0]))
+        return self.hello(acted)._replace(feedforward=forward)
 
     def _with_hull(self, message: Message, acted: Control) -> Message:
-        if self._others is None:
-            return message
-        hull = np.asarray(acted.memory.near).ravel()
-        return message._replace(hull=NamedValues(self._others.names, hull))
+        names = self._others.names
+        hull = NamedValues(names, np.asarray(acted.memory.near).ravel())
+        return message._replace(hull=hull) if names else message
+
+
+@final
+class LateMail(Mail):
+    """The same over a late network."""
+
+    inbox: LateInbox
+
+    def __init__(self, own: OwnLaw, rules: MessageRules, leaders: list[int]) -> None:
+        sizes = len(own.signal_names), len(own.forward_names), len(own.loop.model.input_names)
+        self._changes, self._needs = rules.leadership.changes, rules.content.needs_packet
+        rows = leaders, rules.content.size(*sizes), self._needs, self._changes
+        names = own.signal_names, own.forward_names
+        super().__init__(own, LateInbox(own.neighbours, own.source, *names, *rows))
+
+    def _messages(self) -> PyTree:
+        box = self.inbox
+        packets = [box.leader, box.said, box.content, box.term if self._changes else ()]
+        # Of an output that a sender does not have it is taken to be where the leader is.
+        value = np.nan_to_num(box.signals, nan=0.0)
+        return Messages._make([value, box.hops, LeaderPackets._make(packets), box.time])
+
+    def leads(self, acted: Control) -> bool:
+        """Tell whether the agent took the lead."""
+        written: Messages = acted.memory.network[0]
+        return self._changes and int(written.packet.leader[0]) == self._own.number
+
+    def written(self, acted: Control) -> Message | None:
+        """Return the message of a step; None without a packet, where it says nothing alone."""
+        own, needs = self._own, self._needs
+        letter: Messages = jax.tree.map(lambda row: np.asarray(row)[0], acted.memory.network[0])
+        leader, said, content, term = letter.packet
+        if said == NEVER and needs:
+            return None
+        rows = int(leader), float(said), tuple(content.tolist()), int(term) if self._changes else 0
+        packet = None if said == NEVER else LeaderPacket(*rows)
+        signal = NamedValues(own.signal_names, np.asarray(letter.value))
+        message = Message(own.number, signal, None, self.inbox.clock, int(letter.hops), packet)
+        return self._with_hull(message, acted)
 
 
 def _own_law(loop: Loop, parts: Parts, number: int) -> OwnLaw:
@@ -375,16 +374,16 @@ def _source_in(loop: Loop, parts: Parts, number: int, leads: bool) -> int | None
     return parts.graph.nearest_leader()[number]
 
 
-def _surroundings(own: OwnLaw) -> Surroundings | None:
+def _hull_names(own: OwnLaw) -> tuple[str, ...]:
+    """Return the names of the numbers of an agent's hull; () where agents do not keep apart."""
     loop, model = own.loop, own.loop.model
     if not loop.surroundings.keeps_apart:
-        return None
+        return ()
     with precision("float64"):
         x = jnp.zeros(len(model.state_names))
         hull = jax.eval_shape(lambda: own.law.hull(model, x, own.law.begin(model, x)))
     assert hull is not None, "a law with `safety` has hulls"
-    names = tuple(f"{name}{k}" for k in range(len(hull)) for name in model.position)
-    return Surroundings([k for k in range(loop.agents) if k != own.number], names)
+    return tuple(f"{name}{k}" for k in range(len(hull)) for name in model.position)
 
 
 def _names(loop: Loop, law: Law) -> tuple[tuple[str, ...], tuple[str, ...]]:
