@@ -248,7 +248,12 @@ def test_functions_are_short():
     assert sum(size > 22 for size in sizes) <= 239
 
 
-IDEAL = "echelon.simulation.step.", "echelon.agents.network.inbox", "echelon.simulation.engine.agent"
+IDEAL = (
+    "echelon.simulation.step.",
+    "echelon.agents.network.inbox",
+    "echelon.simulation.engine.agent",
+    "echelon.laws.law",
+)
 
 
 def is_final(cls):

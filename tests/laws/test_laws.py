@@ -18,6 +18,7 @@ from echelon.core import numerics
 from echelon.core.errors import EchelonError, LawError
 from echelon.experiments.scenario.sections import FollowerSpec
 from echelon.laws import Agreement, Consensus, Law, LocalView, Tracking, TrimInput
+from echelon.laws.law import Proves, Travels
 from echelon.synthesis.certificates.domain import Domain
 from echelon.synthesis.gains import FixedGain, InnerLoop, Riccati
 
@@ -134,7 +135,7 @@ def test_laws_carry_the_metric_of_their_lyapunov_function():
     gain = synthesize(QUAD, LINE, Riccati())
     assert np.array_equal(Consensus(gain, "none").metric(QUAD), gain.P)
     assert np.array_equal(Agreement().metric(models.SingleIntegrator(2)), np.eye(2))
-    assert TrimInput().metric(QUAD) is None and Tracking(Hover()).metric(QUAD) is None
+    assert all(Proves.of(law).metric(QUAD) is None for law in (TrimInput(), Tracking(Hover())))
 
 
 @pytest.mark.parametrize("reacts", [False, True])
@@ -195,7 +196,7 @@ def test_headings_of_a_tracking_leader_are_compared_by_the_shorter_way():
 
 def test_a_leader_starts_where_its_law_says():
     with numerics.precision("float64"):
-        assert np.asarray(TrimInput().start(QUAD)).tolist() == [0.0] * 12
+        assert np.asarray(Travels.of(TrimInput()).start(QUAD)).tolist() == [0.0] * 12
         start = np.asarray(Tracking(Line((1, 2, 3), (0.5, 0, 0))).start(QUAD))
         rows = np.asarray(Tracking(Line()).reference_states(QUAD, jnp.array([0.0, 2.0])))
     assert start == pytest.approx([1, 2, 3, 0.5, *[0.0] * 8])

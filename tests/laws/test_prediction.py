@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import echelon as ech
+from echelon.laws.law import Speaks
 from echelon.laws.stopping_point import saturated_decay
 
 
@@ -52,7 +53,7 @@ def test_a_leader_on_its_plan_is_expected_where_it_is(name):
             there = leader.expected(
                 parts.model, jnp.asarray(t), 0.0 * deviation, jnp.asarray(age), 0.005
             )
-            signal = leader.signal(parts.model, x, zero, memory)
+            signal = Speaks.of(leader).signal(parts.model, x, zero, memory)
             if signal is None:
                 np.testing.assert_allclose(there.signal, x, atol=1e-12)
                 np.testing.assert_allclose(deviation, 0.0, atol=1e-12)

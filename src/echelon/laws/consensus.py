@@ -17,7 +17,7 @@ from echelon.agents.network.graph import Graph
 from echelon.core.errors import LawError, check_name
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward, Frame, Word
-from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
+from echelon.laws.law import Checks, Faces, Feeds, Law, LocalView, Memory, Proves, check_gain_fits
 from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.strings import string_growth
 
@@ -32,7 +32,7 @@ def _member(key: str, kind: type[_Word]) -> Callable[[object], _Word]:
     return named
 
 
-class Consensus(Law):
+class Consensus(Law, Faces, Feeds, Proves, Checks):
     """u_i = u* + S (kappa(x_i) + v_ff - c R^-1 (g(x_i) S)'P (e_i + d_i)).
 
     It is the paper's law at c = 1, R = I, v_ff = 0. kappa is the gain's inner loop, if it has one.
@@ -97,7 +97,7 @@ class Consensus(Law):
     def following(self, leader: Law, model: ControlAffine) -> "Consensus":
         """Let the gain turn if it changes with the heading, and the leader may change its own."""
         turning = self.frame is Frame.HEADING and self.gain.turns(model)
-        turning = turning and not leader.keeps_heading(model)
+        turning = turning and not Faces.of(leader).keeps_heading(model)
         return self if turning is self.turning else dataclasses.replace(self, turning=turning)
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
@@ -147,7 +147,7 @@ def _match_velocity(law: Consensus, model: ControlAffine, x: State, velocity: St
 # ---- single integrators (Mesbahi and Egerstedt; paper, Theorem 1) --------------------------------
 
 
-class Agreement(Law):
+class Agreement(Law, Proves):
     """u_i = -sum_j A_ij ((x_i - x_j) - (xi_i - xi_j)).
 
     Run by all agents alike, it drives every x_i - xi_i to one common constant, the mean of their

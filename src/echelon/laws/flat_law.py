@@ -24,7 +24,7 @@ from echelon.core.errors import LawError, ModelError, listing
 from echelon.core.limits import LARGEST
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.laws.flat_loop import FlatLoop, FlatMemory, Observer
-from echelon.laws.law import Law, LocalView
+from echelon.laws.law import Checks, Feeds, KeepsApart, Law, LocalView, Speaks
 from echelon.laws.safety import MOST_POINTS, hull_points
 
 Speed: TypeAlias = float | tuple[float, ...]
@@ -54,7 +54,7 @@ def plain_speeds(speeds: float | Sequence[float] | None) -> Speed | None:
     return tuple(map(float, speeds)) if isinstance(speeds, Sequence | np.ndarray) else speeds
 
 
-class FlatLaw(Law):
+class FlatLaw(Law, Speaks, Feeds, KeepsApart, Checks):
     """A law with its loop closed in flat coordinates, whose agents exchange zeta.
 
     Args:

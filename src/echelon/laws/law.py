@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Iterator
-from typing import ClassVar, NamedTuple, TypeAlias, cast, final
+from typing import Any, ClassVar, NamedTuple, Self, TypeAlias, cast, final
 
 import equinox as eqx
 import jax
@@ -18,16 +18,12 @@ from echelon.agents.network.formation_motion import OwnOffset
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.reference import LeaderPath
 from echelon.core.errors import LawError
-from echelon.core.numerics import rk4
 from echelon.core.types import Array, Declared, Input, PyTree, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.laws.safety import Safety
 from echelon.synthesis.gains.gain import Gain
 
 Memory: TypeAlias = PyTree
-
-_CARRIED = 0.03
-"""s; longest step of the model by which the motion of a leader is carried on."""
 
 
 @final
@@ -85,7 +81,8 @@ class Expected(NamedTuple):
 class Law(Declared):
     """A control law: a pure function of what one agent knows.
 
-    It is the same for one agent in its own process and for a million in a batch.
+    It is the same for one agent in its own process and for a million in a batch. What else a law
+    may do are the abilities below: it has those whose methods it defines.
 
     Attributes:
         feedforward: which feed-forward the law needs, none unless replaced by a field, an
@@ -108,26 +105,6 @@ class Law(Declared):
         """What the law must receive from others, in words."""
         return ()
 
-    def start(self, model: ControlAffine) -> State:
-        """Return the state (n,) in which a leader under this law begins, the trim by default."""
-        return jnp.asarray(np.asarray(model.trim[0], float))
-
-    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
-        """Return the states (T, n) that the law follows, or None where it follows nothing."""
-        return None
-
-    def own_mode(self, model: ControlAffine) -> float | None:
-        """Return the slowest mode (1/s) of a leader about what it follows; None if not known."""
-        return None
-
-    def metric(self, model: ControlAffine) -> Array | None:
-        """Return P (n, n) of the paper's Lyapunov function for this law; None if it has none."""
-        return None
-
-    def strength(self, period: Scalar | float) -> Scalar | float | None:
-        """Return the coupling c where inputs are held for a period (s); None if it has none."""
-        return None
-
     def prepared(self, model: ControlAffine, graph: Graph) -> "Law":
         """Return the law completed with what depends on the model and the graph.
 
@@ -138,35 +115,6 @@ class Law(Declared):
         """
         return self
 
-    def following(self, leader: "Law", model: ControlAffine) -> "Law":
-        """Return a follower's prepared law, completed with what it needs of its leader's.
-
-        Raises:
-            LawError: it cannot follow a leader under that law.
-        """
-        return self
-
-    def facing(self, heading: Scalar) -> "Law":
-        """Return a follower's law in the axes of a heading (rad), which it receives every step.
-
-        Called if `turning`.
-        """
-        return self
-
-    def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar:
-        """Return the heading that a leader at x follows, relative to the trim's, rad.
-
-        Without a reference it is the leader's own. Called if the model has a heading.
-        """
-        reference = reference_of(self)
-        heading = x[heading_index(model)] if reference is None else reference.heading(model, t)
-        return heading - rest_heading(model)
-
-    def keeps_heading(self, model: ControlAffine) -> bool:
-        """Tell whether `heading` is known to be 0 at all times."""
-        reference = reference_of(self)
-        return reference is not None and not reference.turns(model)
-
     def init(self) -> Memory:
         """Return one agent's memory before the first step; none unless replaced."""
         return None
@@ -174,29 +122,6 @@ class Law(Declared):
     def begin(self, model: ControlAffine, x: State) -> Memory:
         """Return the memory of an agent that begins at x, in the form of `init`."""
         return self.init()
-
-    def signal(
-        self, model: ControlAffine, x: State, offset: State, memory: Memory
-    ) -> Float[jax.Array, " s"] | None:
-        """Return what an agent sends to its neighbours, for z; None for x - offset."""
-        return None
-
-    def goal_offset(
-        self, model: ControlAffine, own: OwnOffset, t: Scalar
-    ) -> tuple[State, State | None]:
-        """Return what the law takes for an offset (n,) that moves, and its rate (n,) or None.
-
-        Unless replaced, it is the position, and the velocity where that is a state: agents lag.
-        """
-        return own.state(t), None
-
-    def signal_names(self, model: ControlAffine) -> tuple[str, ...]:
-        """Return the names of what an agent sends for z, by which unlike agents use it."""
-        return model.state_names
-
-    def message_names(self, model: ControlAffine) -> tuple[str, ...]:
-        """Return the names of what `message` sends, likewise."""
-        return model.input_names
 
     def settle(
         self,
@@ -208,6 +133,91 @@ class Law(Declared):
     ) -> Memory:
         """Return the memory after a step, given the desired and the delivered input (m,)."""
         return memory
+
+    @abc.abstractmethod
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return one agent's physical input (m,), before actuator limits, and its next memory."""
+
+
+# ---- what a law may do beside it -----------------------------------------------------------------
+
+
+class Ability:
+    """Something that a law may do beside `update`; this class is of a law that does not.
+
+    A law has it that defines one of its methods, whether it inherits from it or not.
+    """
+
+    @classmethod
+    def of(cls, law: object) -> Self:
+        """Return what a law does of this: with the methods that it defines, and the ideal ones."""
+        if isinstance(law, cls):
+            return law
+        able = cls()
+        for name in vars(cls):
+            if hasattr(type(law), name) and not name.startswith("_"):
+                setattr(able, name, getattr(law, name))
+        able.__dict__["_law"] = law
+        return able
+
+    @classmethod
+    def may(cls, law: object, name: str) -> bool:
+        """Tell whether a law defines the method of a name."""
+        own = getattr(cls, name)
+        return getattr(type(law), name, own) is not own
+
+    @property
+    def itself(self) -> Any:
+        """The law."""
+        return vars(self).get("_law", self)
+
+
+class Speaks(Ability):
+    """What a law says to neighbours: its states less their offsets, unless it has a `signal`."""
+
+    def signal(
+        self, model: ControlAffine, x: State, offset: State, memory: Memory
+    ) -> Float[jax.Array, " s"] | None:
+        """Return what an agent sends to its neighbours, for z; None for x - offset."""
+        return None
+
+    def signal_names(self, model: ControlAffine) -> tuple[str, ...]:
+        """Return the names of what an agent sends for z, by which unlike agents use it."""
+        return model.state_names
+
+    def goal_offset(
+        self, model: ControlAffine, own: OwnOffset, t: Scalar
+    ) -> tuple[State, State | None]:
+        """Return what the law takes for an offset (n,) that moves, and its rate (n,) or None.
+
+        Unless replaced, it is the position, and the velocity where that is a state: agents lag.
+        """
+        return own.state(t), None
+
+    def carried(
+        self,
+        model: ControlAffine,
+        signal: Float[jax.Array, " s"],
+        feedforward: Float[jax.Array, " k"],
+        u: Input,
+        time: Scalar,
+    ) -> Float[jax.Array, " s"]:
+        """Return the signal of a leader a time (s) after its last message, by a follower's law.
+
+        Unless replaced, it stays. A state in place of a signal moves on by the model.
+
+        Args:
+            model: the agent.
+            signal: (s,) then.
+            feedforward: (k,) that the leader sent.
+            u: the input (m,) that its actuators delivered.
+            time: how long it moves on.
+        """
+        return signal
+
+
+class Feeds(Ability):
+    """What an agent sends to its followers in the same step: its input, unless a law says more."""
 
     def message(
         self, model: ControlAffine, x: State, v: Input, memory: Memory
@@ -226,37 +236,32 @@ class Law(Declared):
         """
         return v
 
-    def hull(
-        self, model: ControlAffine, x: State, memory: Memory
-    ) -> Float[jax.Array, "r d"] | None:
-        """Return points in whose hull the agent's position stays, for others' safety, or None."""
+    def message_names(self, model: ControlAffine) -> tuple[str, ...]:
+        """Return the names of what `message` sends, likewise."""
+        return model.input_names
+
+
+class Travels(Ability):
+    """What a law knows of its own way: nothing, unless it follows a reference or has a plan."""
+
+    def start(self, model: ControlAffine) -> State:
+        """Return the state (n,) in which a leader under this law begins, the trim by default."""
+        return jnp.asarray(np.asarray(model.trim[0], float))
+
+    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
+        """Return the states (T, n) that the law follows, or None where it follows nothing."""
         return None
 
-    def expected_hull(
-        self, model: ControlAffine, t: Scalar, signal: Float[jax.Array, " s"]
-    ) -> Float[jax.Array, "r d"] | None:
-        """Return `hull` of a leader that is expected at a signal at a time (s), or None."""
+    def own_mode(self, model: ControlAffine) -> float | None:
+        """Return the slowest mode (1/s) of a leader about what it follows; None if not known."""
         return None
 
-    def active(self, memory: Memory) -> jax.Array | None:
-        """Return how many others changed what agents with memories (K, ..) do, or None."""
-        return None
-
-    def check_late(self, graph: Graph, period: float) -> None:
-        """Check that a follower's law works with late messages, with inputs held for a period (s).
-
-        Raises:
-            LawError: it does not.
-        """
-
-    @property
-    def plans(self) -> bool:
-        """Whether a leader under the law has a plan, so that others can predict it."""
-        return False
+    plans: bool = False
+    """Whether a leader under the law has a plan, so that others can predict it."""
 
     def predictable(self, model: ControlAffine) -> "Law":
         """Return a prepared leader's law, completed with what others need to predict it."""
-        return self
+        return self.itself
 
     def deviation(
         self, model: ControlAffine, t: Scalar, x: State, offset: State, memory: Memory
@@ -283,29 +288,86 @@ class Law(Declared):
         """
         return None
 
-    def carried(
-        self,
-        model: ControlAffine,
-        signal: Float[jax.Array, " s"],
-        feedforward: Float[jax.Array, " k"],
-        u: Input,
-        time: Scalar,
-    ) -> Float[jax.Array, " s"]:
-        """Return the signal of a leader a time (s) after its last message, by a follower's law.
 
-        Unless replaced, a state moves on by the model under the same input, and a signal stays.
+class KeepsApart(Ability):
+    """Where an agent may be before it rests, for others' safety: not known."""
 
-        Args:
-            model: the agent.
-            signal: (s,) then; the state less the offset where the law has no signal.
-            feedforward: (k,) that the leader sent.
-            u: the input (m,) that its actuators delivered.
-            time: how long it moves on.
+    def hull(
+        self, model: ControlAffine, x: State, memory: Memory
+    ) -> Float[jax.Array, "r d"] | None:
+        """Return points in whose hull the agent's position stays, for others' safety, or None."""
+        return None
+
+    def expected_hull(
+        self, model: ControlAffine, t: Scalar, signal: Float[jax.Array, " s"]
+    ) -> Float[jax.Array, "r d"] | None:
+        """Return `hull` of a leader that is expected at a signal at a time (s), or None."""
+        return None
+
+    def active(self, memory: Memory) -> jax.Array | None:
+        """Return how many others changed what agents with memories (K, ..) do, or None."""
+        return None
+
+
+class Faces(Ability):
+    """In the axes of which heading a law works."""
+
+    def facing(self, heading: Scalar) -> "Law":
+        """Return a follower's law in the axes of a heading (rad), which it receives every step.
+
+        Called if `turning`.
         """
-        if type(self).signal is not Law.signal:
-            return signal
-        count, piece = carried_pieces(time)
-        return jax.lax.fori_loop(0, count, lambda _, x: rk4(model.velocity, x, u, piece), signal)
+        return self.itself
+
+    def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar:
+        """Return the heading that a leader at x follows, relative to the trim's, rad.
+
+        Without a reference it is the leader's own. Called if the model has a heading.
+        """
+        reference = reference_of(self.itself)
+        heading = x[heading_index(model)] if reference is None else reference.heading(model, t)
+        return heading - rest_heading(model)
+
+    def keeps_heading(self, model: ControlAffine) -> bool:
+        """Tell whether `heading` is known to be 0 at all times."""
+        reference = reference_of(self.itself)
+        return reference is not None and not reference.turns(model)
+
+
+class Proves(Ability):
+    """What the theory knows of a law: that it drifts without feedback."""
+
+    def metric(self, model: ControlAffine) -> Array | None:
+        """Return P (n, n) of the paper's Lyapunov function for this law; None if it has none."""
+        return None
+
+    def drift(self, model: ControlAffine, x: State) -> State:
+        """Return xdot (n,) when the disagreement and the feed-forward are zero."""
+        # The trim input is no feedback: about the trim the drift f + g u* remains.
+        return model.normalized_drift(x)
+
+    def strength(self, period: Scalar | float) -> Scalar | float | None:
+        """Return the coupling c where inputs are held for a period (s); None if it has none."""
+        return None
+
+
+class Checks(Ability):
+    """What a law asks of its leader, its network and its starts: nothing."""
+
+    def following(self, leader: "Law", model: ControlAffine) -> "Law":
+        """Return a follower's prepared law, completed with what it needs of its leader's.
+
+        Raises:
+            LawError: it cannot follow a leader under that law.
+        """
+        return self.itself
+
+    def check_late(self, graph: Graph, period: float) -> None:
+        """Check that a follower's law works with late messages, with inputs held for a period (s).
+
+        Raises:
+            LawError: it does not.
+        """
 
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
         """Yield the rows of starts (K, n) that the law cannot take, and why in words."""
@@ -314,24 +376,6 @@ class Law(Declared):
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
         """Return what is allowed but probably not meant, a sentence each."""
         return ()
-
-    def drift(self, model: ControlAffine, x: State) -> State:
-        """Return xdot (n,) when the disagreement and the feed-forward are zero."""
-        # The trim input is no feedback: about the trim the drift f + g u* remains.
-        return model.normalized_drift(x)
-
-    @abc.abstractmethod
-    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
-        """Return one agent's physical input (m,), before actuator limits, and its next memory."""
-
-
-def carried_pieces(time: Scalar) -> tuple[jax.Array, jax.Array]:
-    """Return in how many steps of the model a leader is carried on, and their length (s).
-
-    The time is in s.
-    """
-    count = jnp.ceil(time / _CARRIED).astype(int)
-    return count, time / jnp.maximum(count, 1)
 
 
 def check_gain_fits(

@@ -18,7 +18,7 @@ from echelon.core.numerics import precision
 from echelon.core.trace import check_array, checked_trace
 from echelon.core.types import PyTree
 from echelon.core.words import Feedforward, amount
-from echelon.laws.law import Law, LocalView, Memory, reference_of
+from echelon.laws.law import Feeds, Law, LocalView, Memory, Speaks, reference_of
 
 _ADVICE = "it must be written with `jax.numpy` and take what one agent knows"
 
@@ -102,10 +102,10 @@ def _memory(law: Law) -> Memory:
 @memoize
 def signal_size(law: Law, model: ControlAffine) -> int | None:
     """Return how many numbers a law's signal has; None where agents send x - offset."""
-    if type(law).signal is Law.signal:
+    if not Speaks.may(law, "signal"):
         return None
     x = jnp.zeros(len(model.state_names))
-    signal = jax.eval_shape(lambda: law.signal(model, x, x, _memory(law)))
+    signal = jax.eval_shape(lambda: Speaks.of(law).signal(model, x, x, _memory(law)))
     return None if signal is None else signal.size
 
 
@@ -133,7 +133,7 @@ def _view(law: Law, model: ControlAffine) -> LocalView:
         message = checked_trace(
             LawError,
             f"`broadcast` of `{type(law).__name__}`",
-            lambda x, v: law.message(model, x, v, _memory(law)),
+            lambda x, v: Feeds.of(law).message(model, x, v, _memory(law)),
             x,
             forward,
             advice=_ADVICE,

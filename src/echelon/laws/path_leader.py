@@ -26,14 +26,14 @@ from echelon.core.identity import process_key
 from echelon.core.linear import symmetric_part
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
-from echelon.laws.law import Expected, Law, LocalView, Memory, check_gain_fits
+from echelon.laws.law import Expected, Faces, Law, LocalView, Memory, Travels, check_gain_fits
 from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.riccati import Riccati
 
 # ---- the path, and how others predict it ---------------------------------------------------------
 
 
-class PathLeader(Law):
+class PathLeader(Law, Travels, Faces):
     """A leader that follows the states of a reference.
 
     Args:

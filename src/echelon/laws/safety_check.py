@@ -14,7 +14,7 @@ from echelon.core.digits import at_least, at_most
 from echelon.core.errors import LawError
 from echelon.core.types import Array, States
 from echelon.laws.flat_law import FlatLaw
-from echelon.laws.law import Law
+from echelon.laws.law import KeepsApart, Law
 from echelon.laws.safety import Safety, nearest_point
 
 _MOST_AGENTS = 1000
@@ -100,7 +100,7 @@ def hulls_at(
 
 @cached_jit
 def _hulls(law: Law, model: ControlAffine, states: States) -> Float[jax.Array, "K r d"] | None:
-    return jax.vmap(lambda x: law.hull(model, x, law.begin(model, x)))(states)
+    return jax.vmap(lambda x: KeepsApart.of(law).hull(model, x, law.begin(model, x)))(states)
 
 
 def separations(hulls: Float[Array, "N r d"]) -> Float[Array, "N N"]:

@@ -22,7 +22,7 @@ from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward, NeighbourChoice
 from echelon.laws.flat_law import CHAIN_SHARE, LEAD_SHARE, LEAD_SPEED, SHARE, SPEED, FlatLaw
 from echelon.laws.flat_loop import FlatMemory
-from echelon.laws.law import Expected, Law, LocalView
+from echelon.laws.law import Expected, Law, LocalView, Proves, Travels
 from echelon.laws.safety import Safety
 
 # ---- the decay of a stopping point whose speed is bounded ----------------------------------------
@@ -116,7 +116,7 @@ class GraphDemand(eqx.Module):
 
 
 @final
-class StoppingPoint(FlatLaw):
+class StoppingPoint(FlatLaw, Proves):
     """zeta_i' = zeta_0' - sigma(c z_i), z_i = sum_j A_ij ((zeta_i - xi_i) - (zeta_j - xi_j)).
 
     zeta = q(D) y / q(0) is where an agent's flat outputs y would come to rest without messages, and
@@ -270,7 +270,7 @@ class StoppingPoint(FlatLaw):
 
 
 @final
-class StoppingLeader(FlatLaw):
+class StoppingLeader(FlatLaw, Travels, Proves):
     """The same law led by the reference: zeta_0' = zeta_r' - sigma(c (zeta_0 - zeta_r)).
 
     Where `coupling` is left out, c is the slowest root doubled, or what the step holds.

@@ -23,6 +23,7 @@ from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.guarantees.promises.closed_loop import LinearLoop, loop_of
+from echelon.laws.law import Proves
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.synthesis.gains.gain import FixedGain, Gain
@@ -250,7 +251,7 @@ def _start(experiment: Experiment) -> Knobs:
     drive, network = experiment.parts.drive, experiment.parts.world.network
     coupling = None if drive.gain is None else drive.gain.coupling
     if drive.gain is None and isinstance(drive, Laws):
-        own = drive.follower.strength(experiment.settings.dt)
+        own = Proves.of(drive.follower).strength(experiment.settings.dt)
         coupling = None if own is None else float(own)
     knobs = Knobs(coupling)
     if network is None:

@@ -24,7 +24,7 @@ from echelon.core.errors import GraphError, MissingExtraError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, PyTree
 from echelon.experiments.results.lyapunov import fixed_metric, potential
-from echelon.laws.law import Law
+from echelon.laws.law import KeepsApart, Law, Travels
 from echelon.laws.safety_check import separations
 from echelon.output.viewer.replay import link_shades
 from echelon.simulation.engine.jax_stepper import JaxStepper
@@ -244,7 +244,7 @@ class LiveLoop:
     @property
     def active(self) -> float:
         """How many others changed the rates of agents that keep apart, in the last step."""
-        active = self.loop.laws.follower.active(self.now.memory.laws.follower)
+        active = KeepsApart.of(self.loop.laws.follower).active(self.now.memory.laws.follower)
         return 0.0 if active is None else float(np.sum(np.asarray(active)))
 
     def _apart(self) -> float:
@@ -413,7 +413,7 @@ class LiveLoop:
 
 @cached_jit
 def _reference_states(leader: Law, model: ControlAffine, times: jax.Array) -> jax.Array | None:
-    return leader.reference_states(model, times)
+    return Travels.of(leader).reference_states(model, times)
 
 
 _hulls = cached_jit(all_hulls)

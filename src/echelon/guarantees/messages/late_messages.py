@@ -22,6 +22,7 @@ from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import Kind, MessageContent, NeighbourChoice, Prediction
+from echelon.laws.law import Travels
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.networks import HOP_LIFE
 from echelon.simulation.step.settings import Settings
@@ -463,7 +464,7 @@ def bias_of(parts: Parts, settings: Settings) -> Bias | None:
         return None
     times = np.linspace(0.0, settings.horizon, _TIMES)
     with precision("float64"):
-        path = leader.reference_states(parts.model, jnp.asarray(times))
+        path = Travels.of(leader).reference_states(parts.model, jnp.asarray(times))
     if path is None:
         return None
     moved = np.linalg.norm(np.diff(np.asarray(path)[:, position], axis=0), axis=1).sum()

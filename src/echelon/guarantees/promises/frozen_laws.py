@@ -27,7 +27,7 @@ from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
 from echelon.guarantees.promises.closed_loop import LinearLoop, telling
 from echelon.guarantees.promises.leaders import Leaders, own_paths
-from echelon.laws.law import Law, LocalView, gain_of, without_certificates
+from echelon.laws.law import Faces, Feeds, Law, LocalView, gain_of, without_certificates
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
@@ -405,11 +405,11 @@ def _about(
 ) -> tuple[jax.Array, ...]:
     """Return A, B, and what the law feeds back of the state and of the disagreement (K, m, n)."""
     # Rows stand in the axes of the heading already.
-    law = law.facing(jnp.zeros((), x.dtype)) if law.turning else law
+    law = Faces.of(law).facing(jnp.zeros((), x.dtype)) if law.turning else law
 
     def one(t: jax.Array, x: State, v: Input, y: State) -> tuple[jax.Array, ...]:
         silent, sent = law.feedforward is Feedforward.NONE, jnp.zeros_like(v)
-        sent = sent if silent else law.broadcast(model, x, v)
+        sent = sent if silent else Feeds.of(law).broadcast(model, x, v)
 
         def act(s: State, strength: jax.Array) -> tuple[Input, Input]:
             view = LocalView(t, s, jnp.zeros_like(y), strength * model.difference(s, y), sent)

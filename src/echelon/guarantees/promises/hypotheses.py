@@ -29,7 +29,7 @@ from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.leaders import apart
 from echelon.guarantees.promises.modes import modes
 from echelon.guarantees.promises.promise import Guarantee
-from echelon.laws.law import Law
+from echelon.laws.law import Law, Proves
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
@@ -85,7 +85,7 @@ def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Controller | No
 def _drifts(model: ControlAffine, law: Law | Controller | None, states: States) -> jax.Array:
     if law is None:
         return jax.vmap(model.normalized_drift)(states)
-    return jax.vmap(lambda x: law.drift(model, x))(states)
+    return jax.vmap(lambda x: Proves.of(law).drift(model, x))(states)
 
 
 def trim_line(parts: Parts, settings: Settings) -> Statement:

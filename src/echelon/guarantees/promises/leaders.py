@@ -13,7 +13,7 @@ from echelon.agents.network.graph import Graph
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, States
 from echelon.guarantees.promises.closed_loop import all_alike
-from echelon.laws.law import Law, TrimInput, gain_of
+from echelon.laws.law import Law, Proves, Travels, TrimInput, gain_of
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import simulate
@@ -66,7 +66,7 @@ def leaders_of(parts: Parts, states: Array) -> Leaders:
     """Return what is known of the leaders of prepared parts that start in `states` (N, n)."""
     model, drive, leads = parts.model, parts.drive, list(parts.graph.leaders)
     law = getattr(drive, "leader", None)
-    answer = drive.reacts or law is not None and law.metric(model) is not None
+    answer = drive.reacts or law is not None and Proves.of(law).metric(model) is not None
     return Leaders(
         starts=(states - parts.formation.offsets_at([0.0])[0])[leads],
         rest=isinstance(law, TrimInput),
@@ -78,13 +78,13 @@ def leaders_of(parts: Parts, states: Array) -> Leaders:
 
 def _slowest(model: ControlAffine, law: object) -> float | None:
     A, B = linearize(model)
-    if not isinstance(law, Law) or law.metric(model) is not None:
+    if not isinstance(law, Law) or Proves.of(law).metric(model) is not None:
         return None
     gain = gain_of(law)
     if gain is not None:
         A = A - gain.coupling * B @ np.linalg.solve(gain.R, B.T @ gain.P)
     elif not isinstance(law, TrimInput):
-        return law.own_mode(model)
+        return Travels.of(law).own_mode(model)
     return float(np.linalg.eigvals(A).real.max())
 
 

@@ -22,7 +22,7 @@ from echelon.core.trace import shared_traces
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import MessageContent
 from echelon.guarantees.promises.promise import guaranteed
-from echelon.laws.law import Law
+from echelon.laws.law import Speaks, Travels
 from echelon.output.archive.folder import write_errors
 from echelon.simulation.engine.agent import Agent, OwnLaw
 from echelon.simulation.engine.law_drive import Laws
@@ -173,8 +173,7 @@ def network_facts(
         "agents": len(loop.laws.order),
         "leaders": loop.laws.leaders.tolist(),
         "content": size,
-        "moves": isinstance(loop.places, MovingPlaces)
-        and type(own.law).goal_offset is not Law.goal_offset,
+        "moves": isinstance(loop.places, MovingPlaces) and Speaks.may(own.law, "goal_offset"),
     }
 
 
@@ -286,7 +285,7 @@ def _fence(parts: Parts, settings: Settings) -> JsonObject:
     corners, fastest = [prepared.problem.states[:, places]], 0.0
     times = np.linspace(0.0, settings.horizon, 400)
     with precision("float64"):
-        plan = drive.leader.reference_states(model, jnp.asarray(times))
+        plan = Travels.of(drive.leader).reference_states(model, jnp.asarray(times))
     if plan is not None:
         path = np.asarray(plan)[:, places]
         goals = path[:, None] + parts.formation.offsets_at(times)[:, :, places]

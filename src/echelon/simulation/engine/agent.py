@@ -25,7 +25,7 @@ from echelon.core.errors import SimulationError, check_kind
 from echelon.core.numerics import precision
 from echelon.core.types import Array, PyTree, State
 from echelon.core.words import Feedforward
-from echelon.laws.law import Law
+from echelon.laws.law import Feeds, KeepsApart, Law, Speaks
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
@@ -381,7 +381,9 @@ def _hull_names(own: OwnLaw) -> tuple[str, ...]:
         return ()
     with precision("float64"):
         x = jnp.zeros(len(model.state_names))
-        hull = jax.eval_shape(lambda: own.law.hull(model, x, own.law.begin(model, x)))
+        hull = jax.eval_shape(
+            lambda: KeepsApart.of(own.law).hull(model, x, own.law.begin(model, x))
+        )
     assert hull is not None, "a law with `safety` has hulls"
     return tuple(f"{name}{k}" for k in range(len(hull)) for name in model.position)
 
@@ -399,8 +401,8 @@ def _names(loop: Loop, law: Law) -> tuple[tuple[str, ...], tuple[str, ...]]:
     signal, forward = jax.eval_shape(sizes, x, v)
     heading = ("heading",) * follower.turning
     return (
-        _fitting(law.signal_names(model), signal.size),
-        (*_fitting(follower.message_names(model), forward.size), *heading),
+        _fitting(Speaks.of(law).signal_names(model), signal.size),
+        (*_fitting(Feeds.of(follower).message_names(model), forward.size), *heading),
     )
 
 

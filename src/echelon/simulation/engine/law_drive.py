@@ -23,7 +23,7 @@ from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame, MessageContent, Prediction
 from echelon.laws.flat_law import FlatLaw
 from echelon.laws.flat_loop import FlatMemory
-from echelon.laws.law import Law, gain_of
+from echelon.laws.law import Checks, Faces, Law, Proves, Speaks, Travels, gain_of
 from echelon.laws.law_check import (
     check_signals,
     information_of,
@@ -116,7 +116,7 @@ class Laws(Controller):
             LawError: one does not fit the model or the graph.
         """
         leader, follower = (prepare_law(law, model, graph) for law in (self.leader, self.follower))
-        follower = follower.following(leader, model)
+        follower = Checks.of(follower).following(leader, model)
         with precision("float64"):
             check_signals(leader, follower, model)
         drive = Laws(leader, follower)
@@ -147,24 +147,24 @@ class Laws(Controller):
                 "`safety` over a network needs the messages `deviation` and the prediction "
                 f"`preview`, and got `{network.messages}` and `{network.prediction}`."
             )
-        if deviations and preview and not self.leader.plans:
+        if deviations and preview and not Travels.of(self.leader).plans:
             raise SimulationError(
                 f"`prediction` of the network is `preview`, and a leader under the law "
                 f"`{type(self.leader).__name__}` has no plan; use `packet`."
             )
-        states, leader = (type(x).signal is Law.signal for x in (self.follower, self.leader))
-        if deviations and preview and states is not leader:
+        follower, leader = (Speaks.may(x, "signal") for x in (self.follower, self.leader))
+        if deviations and preview and follower is not leader:
             raise SimulationError(
                 f"`prediction` of the network is `preview`, and followers under the law "
                 f"`{type(self.follower).__name__}` do not send what the plan of a leader under "
                 f"`{type(self.leader).__name__}` is about; use `packet`."
             )
-        self.follower.check_late(graph, dt)
+        Checks.of(self.follower).check_late(graph, dt)
 
     @property
     def lags(self) -> bool:
         """Whether followers lag behind offsets that change with time."""
-        return type(self.follower).goal_offset is Law.goal_offset
+        return not Speaks.may(self.follower, "goal_offset")
 
     def check_motion(self, formation: Formation, graph: Graph) -> tuple[str, ...]:
         """Return that a law of states lags behind, and which reshapes lead agents together.
@@ -196,7 +196,7 @@ class Laws(Controller):
         if not graph.backups:
             return
         name = f"`{type(self.leader).__name__}`"
-        if not self.leader.plans:
+        if not Travels.of(self.leader).plans:
             raise SimulationError(
                 f"got `backups`, but a leader under the law {name} has no plan that they could "
                 "carry on; give it a `reference`."
@@ -239,7 +239,7 @@ class Laws(Controller):
         """Yield the starts (K, N, n) that a law cannot take: their numbers, the agent, and why."""
         for law, agents in ((self.leader, graph.leaders), (self.follower, graph.followers)):
             starts = states[:, list(agents)].reshape(-1, states.shape[2])
-            for place, text in law.refusals(model, starts):
+            for place, text in Checks.of(law).refusals(model, starts):
                 yield place // len(agents), agents[place % len(agents)], text
         if isinstance(self.follower, FlatLaw) and self.safety is not None:
             for place, start in enumerate(states):
@@ -261,7 +261,8 @@ class Laws(Controller):
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws, and of what they cannot follow or do not hear."""
-        warnings = self.leader.warnings(model, graph) + self.follower.warnings(model, graph)
+        laws = map(Checks.of, (self.leader, self.follower))
+        warnings = sum((law.warnings(model, graph) for law in laws), start=())
         lost = lost_at_times(graph) if graph.events and self.lags else ""
         if lost and self.unknown:
             warnings += (f"{lost}, and receives nothing then.",)
@@ -274,11 +275,11 @@ class Laws(Controller):
 
     def start(self, model: ControlAffine) -> State:
         """Return the start state of the leaders' law."""
-        return self.leader.start(model)
+        return Travels.of(self.leader).start(model)
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
         """Return the reference states of the leaders' law."""
-        return self.leader.reference_states(model, times)
+        return Travels.of(self.leader).reference_states(model, times)
 
     def with_follower(self, law: Law) -> "Laws":
         """Return the same law for the leaders, and another one for all others."""
@@ -286,16 +287,16 @@ class Laws(Controller):
 
     def metric(self, model: ControlAffine) -> Array | None:
         """Return the metric of the followers' law."""
-        return self.follower.metric(model)
+        return Proves.of(self.follower).metric(model)
 
     def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar | None:
         """Return the heading that a leader at x sends."""
-        return self.leader.heading(model, t, x) if self.follower.turning else None
+        return Faces.of(self.leader).heading(model, t, x) if self.follower.turning else None
 
     def drift(self, model: ControlAffine, x: State, heading: Scalar | None = None) -> State:
         """Return the drift under the followers' law."""
-        law = self.follower if heading is None else self.follower.facing(heading)
-        return law.drift(model, x)
+        law = self.follower if heading is None else Faces.of(self.follower).facing(heading)
+        return Proves.of(law).drift(model, x)
 
     def stepper(self, problem: Problem) -> Stepper:
         """Return the stepper of the closed loop, by JAX or by native code.

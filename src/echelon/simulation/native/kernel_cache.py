@@ -7,6 +7,7 @@ import numpy as np
 
 from echelon.core.cache import BoundedCache
 from echelon.core.numerics import precision
+from echelon.laws.law import Travels
 from echelon.simulation.codegen import Code, Plan, has_flag, program, shared
 from echelon.simulation.native.agent_step import BlockRows, body_of, signal_size
 from echelon.simulation.native.blocks import Shifts
@@ -25,7 +26,8 @@ def follows(loop: Loop) -> bool:
     # In the precision in which references are sampled, so that nothing is compiled for this alone.
     with precision("float64"):
         return (
-            loop.laws.leader.reference_states(loop.model, jax.device_put(np.zeros(1))) is not None
+            Travels.of(loop.laws.leader).reference_states(loop.model, jax.device_put(np.zeros(1)))
+            is not None
         )
 
 

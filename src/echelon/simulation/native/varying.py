@@ -15,6 +15,7 @@ import numpy as np
 from echelon.core.cache import BoundedCache
 from echelon.core.identity import digest, process_key
 from echelon.core.types import Array, PyTree
+from echelon.laws.law import Travels
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.settings import Settings
 
@@ -175,7 +176,7 @@ def _fixed(leaves: Sequence[object], tree: Any) -> list[bool]:
         other: Loop = tree.unflatten(replaced)
         n = len(other.model.state_names)
         return (
-            other.laws.leader.reference_states(other.model, jnp.zeros(1)),
+            Travels.of(other.laws.leader).reference_states(other.model, jnp.zeros(1)),
             other.model.difference(jnp.ones(n), jnp.zeros(n)),
             other.laws.leader.init(),
             other.laws.follower.init(),

@@ -22,7 +22,7 @@ from echelon.core.types import PyTree
 from echelon.core.words import Feedforward
 from echelon.laws.consensus import Consensus
 from echelon.laws.flat_law import FlatLaw
-from echelon.laws.law import Law, carried_pieces
+from echelon.laws.law import Feeds, Law
 from echelon.simulation.engine.agent import OwnLaw
 from echelon.simulation.native.agent_step import (
     check_distances,
@@ -50,6 +50,7 @@ from echelon.simulation.step.records import (
     Own,
     Seconds,
 )
+from echelon.simulation.step.run_laws import carried_pieces
 from echelon.simulation.step.turns import follow, lead
 
 
@@ -226,10 +227,10 @@ class _Traces:
     # ---- where messages are late ----
 
     def _expectation(self, content_of: PlanDeviations) -> Iterator[LawFunction]:
-        loop, follower, s = self.loop, self.loop.laws.follower, self.s
+        loop, s = self.loop, self.s
         size = content_of.size(s, self.k, self.m)
         # A state is carried on in a loop, each round of which is a function here.
-        plain = type(follower).carried is Law.carried and not loop.laws.speech.signals
+        plain = not loop.laws.speech.signals
         in_rounds = plain and isinstance(content_of, PacketDeviations)
 
         def expected(t: jax.Array, content: jax.Array, age: jax.Array) -> tuple[jax.Array, ...]:
@@ -392,9 +393,9 @@ def _meaning(follower: Law) -> str:
 
 def _is_own(follower: Law) -> bool:
     """Tell whether a law sends something that echelon does not know."""
-    kind = type(follower)
-    known = kind.message is Law.message and kind.broadcast in (Law.broadcast, Consensus.broadcast)
-    return not known
+    broadcast = getattr(type(follower), "broadcast", Feeds.broadcast)
+    others = broadcast not in (Feeds.broadcast, Consensus.broadcast)
+    return others or Feeds.may(follower, "message")
 
 
 def message_words(own: OwnLaw) -> list[str]:

@@ -24,7 +24,7 @@ from echelon.core.errors import LawError
 from echelon.core.identity import process_key
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, Scalar, State
-from echelon.laws.law import Law, LocalView, Memory
+from echelon.laws.law import Checks, Faces, Law, LocalView, Memory, Travels
 from echelon.laws.path_leader import tracking_gain
 from echelon.simulation.optimal.formation_plan import plan_tracking
 from echelon.simulation.optimal.objectives import TrackingOptions, grid
@@ -38,7 +38,7 @@ _BETWEEN = 4
 _PLANS = BoundedCache[Trajectory](8)
 
 
-class OptimalTracking(Law):
+class OptimalTracking(Law, Travels, Faces, Checks):
     """u_L = u_p(t) - S R^-1 (g S)'P (x - x_p(t)), with (x_p, u_p) a plan of least tracking error.
 
     The plan minimizes the integral of the squared error of the outputs, plus a little of the

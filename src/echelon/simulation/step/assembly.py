@@ -1,7 +1,7 @@
 """The loop of a run: which member of each component its parts ask for."""
 
 from echelon.core.words import Feedforward
-from echelon.laws.law import Law
+from echelon.laws.law import Law, Travels
 from echelon.laws.law_check import signal_size
 from echelon.simulation.step.drive import Problem
 from echelon.simulation.step.leadership import FixedLeaders, leaders_of
@@ -28,7 +28,7 @@ from echelon.simulation.step.turns import (
 def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
     """Return the loop of prepared laws."""
     graph, settings, channel = problem.graph, problem.settings, problem.channel
-    leader = leader if channel is None else leader.predictable(problem.model)
+    leader = leader if channel is None else Travels.of(leader).predictable(problem.model)
     leadership = leaders_of(graph, problem.leadership)
     signals = signal_size(follower, problem.model) is not None
     laws = RunLaws.of(graph, leader, follower, leadership.changes, signals)

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from echelon.agents.network.channel import NEVER, Channel, InFlight
 from echelon.agents.network.exchange import Near
 from echelon.core.types import Array, PyTree, States
-from echelon.laws.law import Law, Memory
+from echelon.laws.law import KeepsApart, Law, Memory
 from echelon.simulation.step.loop import Loop, NobodyNear
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.records import Known, LawMemories, LoopState, Mask, as_array
@@ -68,9 +68,9 @@ class ExactHulls(NobodyNear):
     ) -> Sums:
         """Return the sums with distances, and with how many others held each agent back."""
         own, active = loop.laws, jnp.zeros(loop.agents, now.states.dtype)
-        active = active.at[own.followers].set(own.follower.active(laws.follower))
+        active = active.at[own.followers].set(KeepsApart.of(own.follower).active(laws.follower))
         if own.backups:
-            active = active.at[own.leaders].set(own.follower.active(laws.leader))
+            active = active.at[own.leaders].set(KeepsApart.of(own.follower).active(laws.leader))
         return read._replace(**loop.meter.of_slice(now.step, now.states, active, here))
 
 
@@ -102,7 +102,7 @@ class LateHulls(ExactHulls):
         t = known.clock.t
 
         def one(hull: jax.Array, expected: jax.Array) -> jax.Array:
-            there = loop.laws.leader.expected_hull(loop.model, t, expected)
+            there = KeepsApart.of(loop.laws.leader).expected_hull(loop.model, t, expected)
             assert there is not None, "a law with `safety` follows a leader that can be expected"
             return hull - there
 
@@ -127,7 +127,7 @@ def all_hulls(loop: Loop, states: States, laws: LawMemories) -> Float[jax.Array,
     """Return the points in whose hulls the positions of all agents stay."""
 
     def of(law: Law, states: States, memory: Memory) -> jax.Array:
-        hulls = jax.vmap(lambda x, own: law.hull(loop.model, x, own))(states, memory)
+        hulls = jax.vmap(lambda x, own: KeepsApart.of(law).hull(loop.model, x, own))(states, memory)
         assert hulls is not None, "a law with `safety` has hulls"
         return hulls
 

@@ -21,7 +21,7 @@ from echelon.agents.network.channel import NEVER, Channel
 from echelon.agents.network.exchange import Difference, Exchange
 from echelon.core.types import Array, PyTree, Scalar, State
 from echelon.core.words import MessageContent, NeighbourChoice, Prediction
-from echelon.laws.law import Expected, LocalView, Memory
+from echelon.laws.law import Expected, LocalView, Memory, Travels
 from echelon.simulation.step.leadership import NOBODY, FixedLeaders
 from echelon.simulation.step.loop import IdealNetwork, Loop
 from echelon.simulation.step.records import (
@@ -157,7 +157,7 @@ class PlanDeviations(PlainValues):
     def content(self, loop: Loop, t: Scalar, leader: Saying) -> Float[jax.Array, " p"]:
         """Return the deviation from the plan."""
         rows = t, leader.x, leader.offset, leader.memory
-        deviation = loop.laws.leader.deviation(loop.model, *rows)
+        deviation = Travels.of(loop.laws.leader).deviation(loop.model, *rows)
         assert deviation is not None, "a leader that others predict by its plan has one"
         return deviation
 
@@ -166,7 +166,7 @@ class PlanDeviations(PlainValues):
     ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
         """Return the signal (s,) and the feed-forward of a leader, by its packet of an age (s)."""
         law, model = loop.laws.leader, loop.model
-        expected = law.expected(model, t, content, age, loop.motion.dt)
+        expected = Travels.of(law).expected(model, t, content, age, loop.motion.dt)
         assert isinstance(expected, Expected), "a channel with a preview has a leader with a plan"
         x = expected.signal
         if expected.feedforward is not None:
@@ -229,7 +229,8 @@ class PacketDeviations(PlanDeviations):
     ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
         """Return where its motion carries it."""
         signal, forward, u = parts_of(loop, s, content)
-        moved = loop.laws.follower.carried(loop.model, signal, forward, u, carried_time(age))
+        rows = loop.laws.follower, loop.model, signal, forward, u
+        moved = loop.laws.speech.carried(*rows, carried_time(age))
         return moved, forward
 
 
@@ -245,7 +246,7 @@ class SlopedPacketDeviations(PacketDeviations):
         """Return the four; the slope is that of the plan."""
         deviation, dt = PlanDeviations.content(self, loop, t, leader), loop.motion.dt
         rows = loop.model, t + dt, deviation, jnp.asarray(dt, t.dtype), dt
-        expected, message = loop.laws.leader.expected(*rows), leader.output.message
+        expected, message = Travels.of(loop.laws.leader).expected(*rows), leader.output.message
         slope = jnp.zeros_like(message)
         if isinstance(expected, Expected) and expected.feedforward is not None:
             slope = (expected.feedforward - message) / dt
@@ -260,7 +261,7 @@ class SlopedPacketDeviations(PacketDeviations):
         content, slope = content[:-k], content[-k:]
         signal, forward, u = parts_of(loop, s, content)
         mean = forward + 0.5 * time * slope
-        moved = loop.laws.follower.carried(loop.model, signal, mean, u, time)
+        moved = loop.laws.speech.carried(loop.laws.follower, loop.model, signal, mean, u, time)
         return moved, forward + time * slope
 
 

@@ -13,7 +13,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import FormationMotion, OwnOffset
 from echelon.core.types import Array, Scalar
-from echelon.laws.law import Law
+from echelon.laws.law import Law, Speaks
 from echelon.simulation.step.records import GroupOffsets
 from echelon.simulation.step.run_laws import RunLaws
 
@@ -77,7 +77,7 @@ class MovingPlaces(FixedPlaces):
         """Return what the law makes of them."""
         kind = jnp.result_type(t)
         rows = (jnp.asarray(x, kind)[agents] for x in (self.offsets, self.motion.places))
-        one = lambda *row: law.goal_offset(model, OwnOffset(self.motion, *row), t)  # noqa: E731
+        one = lambda *row: Speaks.of(law).goal_offset(model, OwnOffset(self.motion, *row), t)  # noqa: E731
         return GroupOffsets(*jax.vmap(one)(*rows))
 
     def of_all(

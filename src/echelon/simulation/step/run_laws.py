@@ -13,10 +13,11 @@ from jaxtyping import Bool, Float
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.exchange import Difference
 from echelon.agents.network.graph import Graph
+from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, Scalar, State, States
 from echelon.core.words import Feedforward
 from echelon.laws.flat_law import FlatLaw
-from echelon.laws.law import Law, LocalView, Memory, without_certificates
+from echelon.laws.law import Faces, Feeds, Law, LocalView, Memory, Speaks, without_certificates
 from echelon.simulation.step.motion import PlantStep
 from echelon.simulation.step.records import (
     AgentOutput,
@@ -50,6 +51,19 @@ class StateSpeech(eqx.Module):
         """Return the difference of values (K, s) and (K, s), which may wind."""
         return jax.vmap(model.difference)
 
+    def carried(
+        self,
+        follower: Law,
+        model: ControlAffine,
+        said: Float[jax.Array, " s"],
+        feedforward: Float[jax.Array, " k"],
+        u: Input,
+        time: Scalar,
+    ) -> Float[jax.Array, " s"]:
+        """Return what a leader says a time (s) later that sent all this: its state moves on."""
+        count, piece = carried_pieces(time)
+        return jax.lax.fori_loop(0, count, lambda _, x: rk4(model.velocity, x, u, piece), said)
+
 
 @final
 class SignalSpeech(StateSpeech):
@@ -61,7 +75,7 @@ class SignalSpeech(StateSpeech):
         self, law: Law, model: ControlAffine, x: State, offset: State, memory: Memory
     ) -> Float[jax.Array, " s"]:
         """Return the law's signal."""
-        signal = law.signal(model, x, offset, memory)
+        signal = Speaks.of(law).signal(model, x, offset, memory)
         assert signal is not None, "laws that speak return a signal"
         return signal
 
@@ -76,6 +90,31 @@ class SignalSpeech(StateSpeech):
     def difference(self, model: ControlAffine) -> Difference:
         """Return the plain one."""
         return operator.sub
+
+    def carried(
+        self,
+        follower: Law,
+        model: ControlAffine,
+        said: Float[jax.Array, " s"],
+        feedforward: Float[jax.Array, " k"],
+        u: Input,
+        time: Scalar,
+    ) -> Float[jax.Array, " s"]:
+        """Return what the follower's law makes of the signal."""
+        return Speaks.of(follower).carried(model, said, feedforward, u, time)
+
+
+_CARRIED = 0.03
+"""s; longest step of the model by which the motion of a leader is carried on."""
+
+
+def carried_pieces(time: Scalar) -> tuple[jax.Array, jax.Array]:
+    """Return in how many steps of the model a leader is carried on, and their length (s).
+
+    The time is in s.
+    """
+    count = jnp.ceil(time / _CARRIED).astype(int)
+    return count, time / jnp.maximum(count, 1)
 
 
 class Sayings(NamedTuple):
@@ -116,18 +155,18 @@ class HeadingAxes(WorldAxes):
     ) -> tuple[LocalView, Law, Law, Float[jax.Array, " h"]]:
         """Return laws in the axes of the heading, which a leader has and a follower receives."""
         if leads:
-            angle = law.heading(model, view.t, view.x)
+            angle = Faces.of(law).heading(model, view.t, view.x)
         else:
             received = view.feedforward
             view = eqx.tree_at(lambda view: view.feedforward, view, received[:-1])
             angle = received[-1]
-        return view, law.facing(angle), laws.follower.facing(angle), angle[None]
+        return view, Faces.of(law).facing(angle), Faces.of(laws.follower).facing(angle), angle[None]
 
     def alone(
         self, law: Law, model: ControlAffine, t: Scalar, x: State, size: int
     ) -> Float[jax.Array, " k"]:
         """Return zeros, and the agent's own heading."""
-        return jnp.zeros(size).at[-1].set(law.heading(model, t, x))
+        return jnp.zeros(size).at[-1].set(Faces.of(law).heading(model, t, x))
 
 
 # ---- how much of the feed-forward followers use --------------------------------------------------
@@ -285,7 +324,7 @@ class RunLaws(eqx.Module):
 
         # Of the message alone: a trace of all that a leader does takes as long as its code.
         def message(x: jax.Array, v: jax.Array, memory: Memory) -> jax.Array:
-            follower = self.follower.facing(x[0]) if turning else self.follower
+            follower = Faces.of(self.follower).facing(x[0]) if turning else self.follower
             return feedforward_of(follower, model, x, v, memory)
 
         return jax.eval_shape(message, np.zeros(n), np.zeros(m), memory).shape[0] + turning
@@ -297,7 +336,7 @@ def feedforward_of(
     """Return the feed-forward of an agent at x with normalized input v and its next memory."""
     if follower.feedforward is Feedforward.NONE:
         return jnp.zeros_like(v)
-    return follower.message(model, x, v, memory)
+    return Feeds.of(follower).message(model, x, v, memory)
 
 
 def limit_sides(
