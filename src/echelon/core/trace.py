@@ -5,8 +5,10 @@ Tracing somebody's model takes much of the time before a run, so one public call
 
 import contextlib
 import hashlib
+import inspect
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextvars import ContextVar
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -170,3 +172,24 @@ def error_summary(error: BaseException) -> str:
     """Return the class and the first line of somebody else's error, without a full stop."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return f"{type(error).__name__}: {lines[0].rstrip('.:') if lines else 'no message'}"
+
+
+def form_of(tree: PyTree) -> tuple[object, ...]:
+    """Return the structure of a tree, and the shapes and types of its arrays."""
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, [(leaf.shape, leaf.dtype) for leaf in leaves]
+
+
+def form_in_words(tree: PyTree) -> str:
+    """Return the types and shapes of a tree, such as `float64 (3,), float64 ()`."""
+    leaves = jax.tree.leaves(tree)
+    return ", ".join(f"{leaf.dtype} {leaf.shape}" for leaf in leaves) or "nothing"
+
+
+def place_of(code: Any) -> str:
+    """Return the file and the line where a class or a function begins."""
+    try:
+        line = inspect.getsourcelines(code)[1]
+        return f"{Path(inspect.getsourcefile(code) or '').name}:{line}"
+    except (OSError, TypeError):  # its source is not there, as in a session of Python
+        return str(getattr(code, "__module__", type(code).__module__))

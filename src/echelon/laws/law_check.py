@@ -15,7 +15,7 @@ from echelon.core.cache import memoize
 from echelon.core.errors import LawError
 from echelon.core.jaxpr import used_leaves
 from echelon.core.numerics import precision
-from echelon.core.trace import check_array, checked_trace
+from echelon.core.trace import check_array, checked_trace, form_in_words, form_of, place_of
 from echelon.core.types import PyTree
 from echelon.core.words import Feedforward, amount
 from echelon.laws.law import Feeds, Law, LocalView, Memory, Speaks, reference_of
@@ -76,10 +76,10 @@ def _check_law(law: Law, model: ControlAffine) -> None:
         )
     check_array(LawError, f"the input of `{name}`", output[0], (m,))
     # A compiled loop carries the memory, whose shapes and types cannot change.
-    if _form(memory) != _form(output[1]):
+    if form_of(memory) != form_of(output[1]):
         raise LawError(
-            f"the memory of `{name}` is {_in_words(memory)} at first and {_in_words(output[1])} "
-            "after a step, and must keep its form."
+            f"{place_of(type(law))}: the memory of `{name}` is {form_in_words(memory)} at first "
+            f"and {form_in_words(output[1])} after a step, and must keep its form."
         )
 
 
@@ -140,17 +140,6 @@ def _view(law: Law, model: ControlAffine) -> LocalView:
         )
         forward = jnp.zeros(message.shape)
     return LocalView(jnp.zeros(()), x, x, z, forward)
-
-
-def _form(memory: Memory) -> tuple[object, ...]:
-    leaves, structure = jax.tree.flatten(memory)
-    return structure, [(leaf.shape, leaf.dtype) for leaf in leaves]
-
-
-def _in_words(memory: Memory) -> str:
-    """Return the types and shapes of a memory, such as `float64 (3,), float64 ()`."""
-    leaves = jax.tree.leaves(memory)
-    return ", ".join(f"{leaf.dtype} {leaf.shape}" for leaf in leaves) or "nothing"
 
 
 # ---- known laws ----------------------------------------------------------------------------------

@@ -218,7 +218,6 @@ class Arrival(NamedTuple):
     new: Bool[jax.Array, " K"]
 
 
-@final
 class Channel(eqx.Module):
     """The network of a run, in control steps; K links lead from `senders` to `receivers`.
 

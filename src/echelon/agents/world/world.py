@@ -2,7 +2,7 @@
 
 import dataclasses
 import numbers
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, final
 
 import numpy as np
@@ -121,6 +121,9 @@ class World:
         actuator: lag and levels of all agents' actuators; left out, inputs act at once.
         sensing: delay and noise of what agents measure of themselves; left out, it is exact.
         plants: of single agents, by number, where they differ from the others.
+        members: a function that returns the loop of a run with other members of its components, a
+            sensor or a medium of your own, for example (page on extending). Nothing is guaranteed
+            of them.
     """
 
     plant: ControlAffine | None = None
@@ -129,6 +132,7 @@ class World:
     actuator: Actuator | None = None
     sensing: Sensing | None = None
     plants: Mapping[int, ControlAffine] = dataclasses.field(default_factory=dict)
+    members: Callable[[Any], Any] | None = None
 
     @property
     def ideal(self) -> bool:
@@ -144,6 +148,7 @@ class World:
             LATE: self.network is not None,
             "the actuators lag or have levels": self.actuator not in (None, Actuator()),
             "agents measure their states late or with noise": self.sensing not in (None, Sensing()),
+            "the step has members of your own": self.members is not None,
         }
 
     def plant_for(self, model: ControlAffine) -> ControlAffine:
@@ -169,6 +174,10 @@ class World:
                 raise SimulationError(
                     f"`{name}` is a `{type(part).__name__}`, and must be a `{kind.__name__}`."
                 )
+        if not (self.members is None or callable(self.members)):
+            raise SimulationError(
+                f"`members` is a `{type(self.members).__name__}`, and must be a function of a loop."
+            )
         warnings = tuple[str, ...]()
         for plant in (self.plant, *self.plants.values()):
             if plant is not None:

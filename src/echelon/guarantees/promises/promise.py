@@ -31,7 +31,6 @@ from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.prepare import Prepared, prepare
 from echelon.simulation.engine.result import Result
-from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate
 
@@ -306,14 +305,22 @@ _cache: WeakKeyDictionary[Parts, dict[Hashable, dict[Settings, Guarantee]]] = We
 """By parts, by what foreign code in them reads now, and by settings."""
 
 
-def prover_of(drive: Controller) -> type[Guarantee]:
-    """Return what proves the guarantees of a drive: of laws, what the followers' law names."""
+def prover_of(parts: Parts) -> type[Guarantee]:
+    """Return what proves the guarantees of parts: of laws, what the followers' law names."""
+    drive = parts.drive
     law = drive.follower if isinstance(drive, Laws) else Law
     # By name, since a law is below all that is proved of it.
     module, _, name = law.prover.partition(":")
-    if drive.unknown and module.partition(".")[0] == "echelon":
+    if unknown_in(parts) and module.partition(".")[0] == "echelon":
         module, name = "echelon.guarantees.promises.unknown_law", "UnknownLaw"
     return getattr(importlib.import_module(module), name)
+
+
+def unknown_in(parts: Parts) -> str:
+    """Return what of the parts echelon does not know, in words; empty without anything."""
+    if parts.drive.unknown:
+        return f"the law `{parts.drive.unknown}`"
+    return "" if parts.world.members is None else "all members of the step"
 
 
 @shared_traces()
@@ -367,7 +374,7 @@ def _computed(
     prepared: Prepared, parts: Parts, settings: Settings, brief: bool = False
 ) -> Guarantee:
     with precision("float64"):
-        computed = prover_of(prepared.parts.drive).of(prepared, settings, brief)
+        computed = prover_of(prepared.parts).of(prepared, settings, brief)
     if not brief:
         computed = dataclasses.replace(computed, prefix=_prefix_of(computed, parts, settings))
     # A result holds the prepared parts, and asks again.

@@ -8,11 +8,13 @@ from echelon.core.statement import Cause, Hypothesis, fails, unneeded
 from echelon.core.words import Kind
 from echelon.guarantees.promises.closed_loop import loop_of
 from echelon.guarantees.promises.hypotheses import trim_line
-from echelon.guarantees.promises.promise import REQUIRED, Guarantee
+from echelon.guarantees.promises.promise import REQUIRED, Guarantee, unknown_in
 from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.settings import Settings
 
 _REASON = "echelon does not know this law; no guarantee is computed"
+_REASON_MEMBERS = "echelon does not know all members of the step; no guarantee is computed"
+_REMEDY_MEMBERS = "leave out `members` of the world"
 _ASKED = (
     Hypothesis.TRIM_APPLIED,
     Hypothesis.TRIM_WITHIN_LIMITS,
@@ -39,11 +41,12 @@ class UnknownLaw(Guarantee):
     def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "UnknownLaw":
         """Return that nothing is guaranteed, and what of the agents and the world is known."""
         parts = prepared.parts
-        text = f"echelon does not know the law `{parts.drive.unknown}`"
+        text = f"echelon does not know {unknown_in(parts)}"
         lines = {each: unneeded(each, Kind.LINEARIZATION, text) for each in _ASKED}
         lines[Hypothesis.TRIM_WITHIN_LIMITS] = trim_line(parts, settings)
-        name = Hypothesis.DISAGREEMENT_DECAY
-        lines[name] = fails(name, Kind.LINEARIZATION, text, remedy=_REMEDY, reason=_REASON)
+        name, own = Hypothesis.DISAGREEMENT_DECAY, parts.drive.unknown
+        rows = (_REMEDY, _REASON) if own else (_REMEDY_MEMBERS, _REASON_MEMBERS)
+        lines[name] = fails(name, Kind.LINEARIZATION, text, remedy=rows[0], reason=rows[1])
         return cls(
             loop=loop_of(parts), hypotheses=MappingProxyType(lines), without="", leader_mode=None
         )

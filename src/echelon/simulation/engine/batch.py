@@ -8,7 +8,7 @@ after the other.
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple, TypeAlias, final
+from typing import Any, NamedTuple, TypeAlias, final
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -201,6 +201,9 @@ def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _Ba
         problem = problem._replace(motion=motion, channel=channel, sensors=sensors)
         loop = loop.replace(motion=motion, sensing=sensors)
         loop = loop if channel is None else loop.with_medium(channel)
+        if world.members is not None:
+            drive: Any = prepared.parts.drive
+            loop = assemble(problem, drive.leader, drive.follower)
     return _BatchJob(place, prepared._replace(problem=problem), loop)
 
 

@@ -107,6 +107,7 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
             channel,
             sensors_of(parts, settings),
             parts.leadership,
+            parts.world.members,
         )
         parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)

@@ -4,7 +4,7 @@ All that a network does depends on the seed, the graph and the times alone, and 
 is computed after a run, from its parts, and the steps of the run count nothing.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,8 @@ from echelon.core.compiled import cached_jit
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.engine.prepare import channel_of
+from echelon.simulation.engine.prepare import channel_of, prepare
+from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.leadership import NOBODY, leaders_of
 from echelon.simulation.step.networks import LateNetwork, MessageRules, carries
 from echelon.simulation.step.records import Messages, NetworkEstimate, Steps
@@ -79,6 +80,10 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
         leadership = leaders_of(graph, parts.leadership)
         rules = MessageRules.of(channel, leadership, graph.agents)
         network, roster = LateNetwork(leadership, rules, channel), roster_of(graph, settings, False)
+        if parts.world.members is not None:
+            drive: Any = parts.drive
+            problem = prepare(parts, settings).problem
+            network: Any = assemble(problem, drive.leader, drive.follower).network
         numbers = np.asarray(steps), np.asarray(settings.dt)
         radio = _Radio(network, links, roster, receives, *numbers)
         followed = _follow(radio, ends.astype(np.int32))

@@ -26,6 +26,7 @@ from echelon.simulation.scalars import (
     nodes,
 )
 from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.own_members import own_members
 from echelon.simulation.step.places import MovingPlaces
 from echelon.simulation.step.run_laws import limit_sides
 from echelon.simulation.step.turns import by_depth
@@ -92,6 +93,7 @@ def check_information(loop: Loop) -> None:
     """Raise `Unsupported` unless agents know exact states, current messages, and nothing else."""
     for fault, text in (
         (isinstance(loop.places, MovingPlaces), "formations that change with time"),
+        (own_members(loop), f"the member `{own_members(loop)}` of your own"),
         (loop.network.late, "a network that is not ideal"),
         (loop.sensing.stages, "agents that measure their states late or with noise"),
     ):

@@ -12,6 +12,7 @@ from echelon.simulation.step.networks import (
     LateNetwork,
     MessageRules,
 )
+from echelon.simulation.step.own_members import with_own_members
 from echelon.simulation.step.places import FixedPlaces
 from echelon.simulation.step.roster import Links, roster_of
 from echelon.simulation.step.run_laws import RunLaws, has_angles
@@ -32,7 +33,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
     leadership = leaders_of(graph, problem.leadership)
     signals = signal_size(follower, problem.model) is not None
     laws = RunLaws.of(graph, leader, follower, leadership.changes, signals)
-    return Loop(
+    loop = Loop(
         model=problem.model,
         laws=laws,
         sensing=problem.sensors,
@@ -45,6 +46,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         roster=roster_of(graph, settings, has_angles(follower)),
         meter=problem.meter,
     )
+    return with_own_members(loop, problem)
 
 
 def _network(problem: Problem, leadership: FixedLeaders) -> IdealNetwork:

@@ -4,8 +4,8 @@
 """
 
 import abc
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +49,7 @@ class Problem(NamedTuple):
         channel: what the network does to messages; None for the ideal network.
         sensors: of the agents' own states.
         leadership: who takes the lead after the leader; None for nobody.
+        members: what replaces members of the loop; None for nothing.
     """
 
     model: ControlAffine
@@ -61,6 +62,7 @@ class Problem(NamedTuple):
     channel: Channel | None = None
     sensors: Sensors = Sensors()
     leadership: Leadership | None = None
+    members: Callable[[Any], Any] | None = None
 
 
 class Chunk(NamedTuple):

@@ -229,8 +229,8 @@ class PacketDeviations(PlanDeviations):
     ) -> tuple[Float[jax.Array, " s"], Float[jax.Array, " k"]]:
         """Return where its motion carries it."""
         signal, forward, u = parts_of(loop, s, content)
-        rows = loop.laws.follower, loop.model, signal, forward, u
-        moved = loop.laws.speech.carried(*rows, carried_time(age))
+        rows = loop.laws.follower, loop.model, (signal, forward, u), carried_time(age)
+        moved = loop.laws.speech.carried(*rows)
         return moved, forward
 
 
@@ -261,7 +261,8 @@ class SlopedPacketDeviations(PacketDeviations):
         content, slope = content[:-k], content[-k:]
         signal, forward, u = parts_of(loop, s, content)
         mean = forward + 0.5 * time * slope
-        moved = loop.laws.speech.carried(loop.laws.follower, loop.model, signal, mean, u, time)
+        rows = loop.laws.follower, loop.model, (signal, mean, u), time
+        moved = loop.laws.speech.carried(*rows)
         return moved, forward + time * slope
 
 

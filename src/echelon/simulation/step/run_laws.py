@@ -52,16 +52,13 @@ class StateSpeech(eqx.Module):
         return jax.vmap(model.difference)
 
     def carried(
-        self,
-        follower: Law,
-        model: ControlAffine,
-        said: Float[jax.Array, " s"],
-        feedforward: Float[jax.Array, " k"],
-        u: Input,
-        time: Scalar,
+        self, law: Law, model: ControlAffine, packet: tuple[jax.Array, ...], time: Scalar
     ) -> Float[jax.Array, " s"]:
-        """Return what a leader says a time (s) later that sent all this: its state moves on."""
-        count, piece = carried_pieces(time)
+        """Return what a leader says a time (s) after it sent signal, feed-forward and input.
+
+        Its state moves on.
+        """
+        (said, _, u), (count, piece) = packet, carried_pieces(time)
         return jax.lax.fori_loop(0, count, lambda _, x: rk4(model.velocity, x, u, piece), said)
 
 
@@ -92,16 +89,11 @@ class SignalSpeech(StateSpeech):
         return operator.sub
 
     def carried(
-        self,
-        follower: Law,
-        model: ControlAffine,
-        said: Float[jax.Array, " s"],
-        feedforward: Float[jax.Array, " k"],
-        u: Input,
-        time: Scalar,
+        self, law: Law, model: ControlAffine, packet: tuple[jax.Array, ...], time: Scalar
     ) -> Float[jax.Array, " s"]:
         """Return what the follower's law makes of the signal."""
-        return Speaks.of(follower).carried(model, said, feedforward, u, time)
+        said, feedforward, u = packet
+        return Speaks.of(law).carried(model, said, feedforward, u, time)
 
 
 _CARRIED = 0.03

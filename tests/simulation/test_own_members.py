@@ -1,0 +1,161 @@
+"""Members of a user's own: a sensor, a medium and motors that echelon does not know."""
+
+import dataclasses
+import pathlib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from carts import carts
+
+import echelon as ech
+from echelon.agents.network.channel import Channel
+from echelon.agents.world.sensing import Sensors, SensorStage
+from echelon.core.errors import EchelonError
+from echelon.simulation.step.motion import IdealMotors
+
+DT, STEPS = 0.02, 60
+PLANT = ech.models.SingleIntegrator(dimension=1)
+
+
+class SlowSensor(SensorStage):
+    """Measures every third step, and holds in between."""
+
+    every: int = eqx.field(default=3, static=True)
+
+    def begin(self, model, x):
+        return x
+
+    def read(self, model, memory, x, clock, number):
+        held = jnp.where(clock.step % self.every == 0, x, memory)
+        return held, held
+
+
+class WeakeningMotors(IdealMotors):
+    """Lose a part of their input in every step."""
+
+    left: float = 0.98
+
+    def begin(self, trim):
+        return jnp.ones(())
+
+    def integrate(self, field, memory, x, u, plant):
+        x, _ = super().integrate(field, (), x, memory * u, plant)
+        return x, memory * self.left
+
+
+class JammedMedium(Channel):
+    """Nothing leaves from one step to another."""
+
+    silent: jax.Array
+    speaks: jax.Array
+
+    def post(self, posts, step, content, sends, receivers, senders):
+        quiet = (step >= self.silent) & (step < self.speaks)
+        return super().post(posts, step, content, sends & ~quiet, receivers, senders)
+
+
+class GrowingSensor(SensorStage):
+    """Remembers more in every step, which no loop can."""
+
+    def begin(self, model, x):
+        return x
+
+    def read(self, model, memory, x, clock, number):
+        return x, jnp.append(memory, 0.0)
+
+
+def sensed_by(stage):
+    return lambda loop: loop.replace(sensing=Sensors((*loop.sensing.stages, stage)))
+
+
+def driven_by(motors):
+    return lambda loop: loop.replace(motion=dataclasses.replace(loop.motion, motors=motors))
+
+
+def jammed(begins, ends):
+    def members(loop):
+        medium = loop.network.medium
+        rows = jnp.asarray(begins), jnp.asarray(ends)
+        return loop.with_medium(JammedMedium(**vars(medium), silent=rows[0], speaks=rows[1]))
+
+    return members
+
+
+def agreeing(**world):
+    graph = ech.Graph.path(3)
+    formation = ech.Formation.from_offsets(PLANT, graph, {0: (0.0,), 1: (1.0,), 2: (2.0,)})
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Agreement())
+    initial = np.array([[0.0], [3.0], [-1.0]])
+    return ech.Parts(PLANT, graph, formation, laws, initial=initial, world=ech.World(**world))
+
+
+def flown(parts):
+    settings = ech.Settings(horizon=DT * STEPS, dt=DT, integrator="euler")
+    return ech.simulate(parts, settings)
+
+
+def by_hand(sensed, strength):
+    """u = -z of three agents on a path, whose leader stays, in plain Python."""
+    x, held, rows, places = np.array([0.0, 3.0, -1.0]), None, [], np.array([0.0, 1.0, 2.0])
+    for k in range(STEPS + 1):
+        rows.append(x)
+        held = x if sensed(k) else held
+        e = held - places
+        u = -np.array([0.0, 2 * e[1] - e[0] - e[2], e[2] - e[1]])
+        x = x + DT * strength(k) * u
+    return np.array(rows)
+
+
+def test_a_sensor_that_measures_every_third_step():
+    run = flown(agreeing(members=sensed_by(SlowSensor())))
+    expected = by_hand(lambda k: k % 3 == 0, lambda k: 1.0)
+    np.testing.assert_allclose(run.states[:, :, 0], expected, atol=1e-12)
+
+
+def test_motors_that_weaken():
+    run = flown(agreeing(members=driven_by(WeakeningMotors())))
+    expected = by_hand(lambda k: True, lambda k: 0.98**k)
+    np.testing.assert_allclose(run.states[:, :, 0], expected, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ends", [20, 60])
+def test_a_medium_that_is_jammed_for_a_time(ends):
+    """While it is jammed no message leaves, and what arrives grows old; before, nothing differs."""
+    radio = ech.Network(rate=50.0, messages="state", hears="leaderward")
+    parts, settings = (
+        carts("stopping-point", radio),
+        ech.Settings(horizon=STEPS * DT, dt=DT, engine="jax"),
+    )
+    free = ech.simulate(parts, settings)
+    world = dataclasses.replace(parts.world, members=jammed(20, ends))
+    run = ech.simulate(parts.replace(world=world), settings)
+    same = np.array_equal(run.states, free.states)
+    assert same == (ends == 20) and np.array_equal(run.states[:21], free.states[:21])
+    assert run.traffic.lost == (ends - 20) * free.traffic.sent // STEPS
+    age = np.nanmax(run.traffic.ages[min(ends, 59)])
+    assert age == pytest.approx(DT if ends == 20 else DT * (ends - 20), abs=1.5 * DT)
+
+
+def test_nothing_is_guaranteed_of_members_and_machine_code_says_which_it_lacks():
+    parts = agreeing(members=sensed_by(SlowSensor()))
+    settings = ech.Settings(horizon=1.0, dt=DT)
+    promised = ech.guarantee(parts, settings)
+    assert str(promised.verdict) == "none"
+    assert "does not know all members of the step" in promised.sentence()
+    with pytest.raises(EchelonError, match="member `SlowSensor` of your own"):
+        ech.simulate(parts, settings._replace(engine="native"))
+
+
+def test_a_member_whose_memory_changes_its_form_is_told_with_its_line():
+    line = 1 + pathlib.Path(__file__).read_text().split("class GrowingSensor")[0].count("\n")
+    where = rf"test_own_members.py:{line}: the memory of `GrowingSensor` is .*\(3, 1\) at first"
+    with pytest.raises(EchelonError, match=where):
+        flown(agreeing(members=sensed_by(GrowingSensor())))
+    with pytest.raises(EchelonError, match=r"test_own_members.py:\d+: `members` .* a `NoneType`"):
+        flown(agreeing(members=lambda loop: None))
+    with pytest.raises(EchelonError, match="`members` is a `int`"):
+        flown(agreeing(members=3))
