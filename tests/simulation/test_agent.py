@@ -1,5 +1,6 @@
 """A single `Agent` computes what it computes in `simulate`, from the messages it receives alone."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -43,6 +44,24 @@ def test_agents_by_themselves_do_what_simulate_does(law, world):
             expected = result.inputs[k, agent.number]
             np.testing.assert_allclose(u, expected, atol=1e-12, err_msg=f"{t}")
             assert u.dtype == np.float64
+
+
+def test_an_agent_with_weaker_motors_is_cut_at_its_own_limits():
+    model, graph = ech.models.PlanarQuadrotor(), ech.Graph.path(2)
+    formation = ech.Formation.line(model, graph)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati())
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="none"))
+    world = ech.World(plants={1: dataclasses.replace(model, motor_thrust=0.7 * model.motor_thrust)})
+    parts = ech.Parts(model, graph, formation, laws, initial={"position": 3.0}, world=world)
+    run = ech.simulate(parts, ech.Settings(horizon=0.1, dt=0.01, seed=2))
+    agents = [ech.Agent(parts, k, dt=0.01) for k in (0, 1)]
+    plain = ech.Agent(parts.replace(world=ech.World()), 1, dt=0.01)
+    x = run.states[0]
+    for agent in agents:
+        broadcast([*agents, plain], agent.hello(x[agent.number]))
+    broadcast([*agents, plain], agents[0].step(0.0, x[0])[1])
+    np.testing.assert_allclose(agents[1].step(0.0, x[1])[0], run.inputs[0, 1], atol=1e-12)
+    assert np.abs(plain.step(0.0, x[1])[0] - run.inputs[0, 1]).max() > 0.01
 
 
 def broadcast(agents, message):
