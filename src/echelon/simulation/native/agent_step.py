@@ -93,8 +93,8 @@ def check_information(loop: Loop) -> None:
     """Raise `Unsupported` unless agents know exact states, current messages, and nothing else."""
     for fault, text in (
         (isinstance(loop.places, MovingPlaces), "formations that change with time"),
-        (own_members(loop), f"the member `{own_members(loop)}` of your own"),
         (loop.network.late, "a network that is not ideal"),
+        (own_members(loop), f"the member `{own_members(loop)}` of your own"),
         (loop.sensing.stages, "agents that measure their states late or with noise"),
     ):
         if fault:

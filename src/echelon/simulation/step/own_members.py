@@ -6,6 +6,8 @@ from collections.abc import Iterator
 import equinox as eqx
 import jax
 
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation_motion import FormationMotion
 from echelon.core.errors import SimulationError
 from echelon.core.trace import form_in_words, form_of, place_of
 from echelon.simulation.step.drive import Problem
@@ -55,7 +57,9 @@ def own_members(loop: Loop) -> str:
 
 
 def own_classes(member: object) -> Iterator[type]:
-    """Yield the classes in a member that are not echelon's."""
+    """Yield the classes in a member that are not echelon's, but for models and paths of places."""
+    if isinstance(member, ControlAffine | FormationMotion):
+        return
     if isinstance(member, tuple):
         for part in member:
             yield from own_classes(part)
