@@ -247,7 +247,8 @@ PICKS = {
 
 @pytest.mark.parametrize("name", PICKS)
 def test_what_agents_pick_is_what_jax_picks(name):
-    columns = rng.normal(size=(3, 41))
+    # Of its own: rounding of an exponential grows with the matrix, so no other test may choose it.
+    columns = np.random.default_rng(0).normal(size=(3, 41))
     found, wanted = run(PICKS[name], columns), by_jax(PICKS[name], columns)
     np.testing.assert_allclose(found, wanted, rtol=1e-13, atol=1e-13)
 
