@@ -14,6 +14,7 @@ import numpy as np
 
 from echelon.core.types import Array, PyTree
 from echelon.laws.law import Law, LocalView, Memory
+from echelon.laws.law_check import signal_size as numbers_said
 from echelon.simulation.codegen import Body, factored
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import (
@@ -83,7 +84,11 @@ class BlockRows(NamedTuple):
         noisy = any(part.noise is not None for part in weather)
         memory = max(memory_size(law) for law in (loop.laws.leader, loop.laws.follower))
         sizes = [n, n, n if weather else 0, m if noisy else 0, memory, m]
-        sizes += [loop.laws.message_size(loop.model, loop.laws.leader.init()), m, varying]
+        sizes += [
+            loop.laws.message_size(loop.model, jax.eval_shape(loop.laws.leader.init)),
+            m,
+            varying,
+        ]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q, 1]
         ends = np.cumsum([0, *sizes]).tolist()
         return cls._make([*(range(a, b) for a, b in itertools.pairwise(ends)), ends[-1]])
@@ -134,8 +139,8 @@ def unflatten(like: PyTree, flat: Array | jax.Array) -> PyTree:
 
 def signal_size(loop: Loop) -> int:
     """Return how many numbers neighbours receive from an agent besides its state."""
-    zero, law = jnp.zeros(len(loop.model.state_names)), loop.laws.follower
-    return jax.eval_shape(lambda: _signal_of(loop, law, zero, zero, law.init())).shape[0]
+    size = numbers_said(loop.laws.follower, loop.model) if loop.laws.speech.signals else 0
+    return size or 0
 
 
 def _signal_of(loop: Loop, law: Law, x: jax.Array, offset: jax.Array, memory: Memory) -> jax.Array:
