@@ -157,5 +157,10 @@ def test_a_member_whose_memory_changes_its_form_is_told_with_its_line():
         flown(agreeing(members=sensed_by(GrowingSensor())))
     with pytest.raises(EchelonError, match=r"test_own_members.py:\d+: `members` .* a `NoneType`"):
         flown(agreeing(members=lambda loop: None))
+    broken = driven_by(None)
+    with pytest.raises(
+        EchelonError, match=r"test_own_members.py:\d+: the loop .* cannot take a step"
+    ):
+        flown(agreeing(members=broken))
     with pytest.raises(EchelonError, match="`members` is a `int`"):
         flown(agreeing(members=3))

@@ -45,8 +45,8 @@ class UnknownLaw(Guarantee):
         lines = {each: unneeded(each, Kind.LINEARIZATION, text) for each in _ASKED}
         lines[Hypothesis.TRIM_WITHIN_LIMITS] = trim_line(parts, settings)
         name, own = Hypothesis.DISAGREEMENT_DECAY, parts.drive.unknown
-        rows = (_REMEDY, _REASON) if own else (_REMEDY_MEMBERS, _REASON_MEMBERS)
-        lines[name] = fails(name, Kind.LINEARIZATION, text, remedy=rows[0], reason=rows[1])
+        remedy, reason = (_REMEDY, _REASON) if own else (_REMEDY_MEMBERS, _REASON_MEMBERS)
+        lines[name] = fails(name, Kind.LINEARIZATION, text, remedy=remedy, reason=reason)
         return cls(
             loop=loop_of(parts), hypotheses=MappingProxyType(lines), without="", leader_mode=None
         )

@@ -83,7 +83,10 @@ def traffic(parts: Parts, settings: Settings, times: Array, steps: int) -> Traff
         if parts.world.members is not None:
             drive: Any = parts.drive
             problem = prepare(parts, settings).problem
-            network: Any = assemble(problem, drive.leader, drive.follower).network
+            own = assemble(problem, drive.leader, drive.follower).network
+            if not isinstance(own, LateNetwork):
+                return None  # nothing is known of its messages
+            network = own
         numbers = np.asarray(steps), np.asarray(settings.dt)
         radio = _Radio(network, links, roster, receives, *numbers)
         followed = _follow(radio, ends.astype(np.int32))

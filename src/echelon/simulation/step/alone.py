@@ -1,7 +1,7 @@
 """An agent alone: the loop with one row, in which what really arrives replaces a simulated network.
 
-It runs the same `control`. Its members differ from those of a formation in three answers: its links
-are its own, messages come from outside, and its clock counts seconds.
+It runs the same `control`. Its links and its turn are its own, messages come from outside, and its
+clock counts seconds.
 """
 
 import dataclasses
@@ -10,7 +10,7 @@ from typing import NamedTuple, final
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from echelon.agents.network.channel import NEVER
 from echelon.agents.network.exchange import Exchange, Near
@@ -39,7 +39,7 @@ class Arrived(NamedTuple):
         signals: (K, s) of the neighbours.
         forward: (k,) the feed-forward.
         messages: of the neighbours over a late network, with stamps in s; () in the ideal one.
-        hulls: (L, r, d) of all others; () where agents do not keep apart.
+        hulls: (L, r, d) of all others; no rows where agents do not keep apart.
     """
 
     signals: Float[Array, "K s"]
@@ -93,9 +93,7 @@ class ReceivingLate(LateNetwork):
 
     def begin(self, loop: Loop, said: Float[jax.Array, "N s"], forward: int) -> PyTree:
         """Return the mail before the first message, with stamps in s."""
-        numbers, links = jnp.asarray(loop.laws.numbers), len(loop.graph.exchange.receivers)
-        sizes = said.shape[1], forward, len(loop.model.input_names)
-        mail = self.rules.begin(numbers, links, said, self.rules.content.size(*sizes))
+        mail = super().begin(loop, said, forward)[1]
         packet = mail.packet._replace(stamp=mail.packet.stamp.astype(float))
         mail = mail._replace(stamp=mail.stamp.astype(float), packet=packet)
         return Messages(said, jnp.zeros(1, jnp.int32), packet), mail
@@ -108,12 +106,7 @@ class ReceivingLate(LateNetwork):
         return received, received.stamp != NEVER, received.stamp
 
     def posted(
-        self,
-        in_flight: PyTree,
-        step: jax.Array,
-        sent: Messages,
-        sends: Bool[jax.Array, " N"],
-        links: Exchange,
+        self, in_flight: PyTree, step: jax.Array, sent: Messages, sends: jax.Array, links: Exchange
     ) -> PyTree:
         """Return what the agent writes."""
         return sent

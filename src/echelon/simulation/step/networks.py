@@ -524,12 +524,7 @@ class LateNetwork(IdealNetwork):
         return LateNetwork(self.leadership, rules, medium)
 
     def posted(
-        self,
-        in_flight: PyTree,
-        step: jax.Array,
-        sent: Messages,
-        sends: Bool[jax.Array, " N"],
-        links: Exchange,
+        self, in_flight: PyTree, step: jax.Array, sent: Messages, sends: jax.Array, links: Exchange
     ) -> PyTree:
         """Return what is in flight after a step; links that the graph lacks carry nothing."""
         carried = carries(links, sends)

@@ -25,7 +25,8 @@ def with_own_members(loop: Loop, problem: Problem) -> Loop:
     """Return a loop with the members that a world replaces.
 
     Raises:
-        SimulationError: its function returns no loop, or a member's memory changes its form.
+        SimulationError: its function returns no loop, or one whose members fail or change the form
+            of their memory.
     """
     if problem.members is None:
         return loop
@@ -35,8 +36,16 @@ def with_own_members(loop: Loop, problem: Problem) -> Loop:
             f"{place_of(problem.members)}: `members` of the world returns a "
             f"`{type(changed).__name__}`, and must return the loop: `return loop.replace(..)`."
         )
-    begun = jax.eval_shape(lambda states: begin(changed, states), problem.states)
-    moved = jax.eval_shape(lambda now: step(changed, now), begun)
+    try:
+        begun = jax.eval_shape(lambda states: begin(changed, states), problem.states)
+        moved = jax.eval_shape(lambda now: step(changed, now), begun)
+    # It is anyone's code: whatever it raises is its own fault, and stays attached as the cause.
+    except Exception as error:
+        words = (str(error).splitlines() or ["no message"])[0].rstrip(".")
+        raise SimulationError(
+            f"{place_of(problem.members)}: the loop that `members` of the world returns cannot "
+            f"take a step ({type(error).__name__}: {words})."
+        ) from error
     names = ComponentMemory._fields
     for name, first, last in zip(names, begun.memory, moved.memory, strict=True):
         if form_of(first) != form_of(last):
