@@ -247,6 +247,18 @@ class Channel(eqx.Module):
     prediction: Prediction = eqx.field(static=True)
     hears: NeighbourChoice = eqx.field(static=True)
 
+    @property
+    def still(self) -> "Channel":
+        """The network that delays every message alike, and loses none."""
+        none = np.zeros_like(self.loss)
+        steady = dict(loss=none, jitter=np.zeros_like(self.jitter), share=none, begins=none)
+        return dataclasses.replace(self, bursty=False, **steady)
+
+    @property
+    def steady(self) -> bool:
+        """Whether it delays every message alike, and loses none."""
+        return not (self.bursty or self.loss > 0.0 or self.jitter > 0)
+
     def begin(self, content: PyTree, links: int) -> InFlight:
         """Return posts before the first message, of which `content` (N, ...) is an example."""
         rows = jax.tree.map(lambda x: jnp.zeros((self.slots, *x.shape), x.dtype), content)

@@ -204,6 +204,8 @@ class SensorStage(eqx.Module):
 
     on_board: ClassVar[bool] = False
     """Whether it is part of the agent; what a real sensor does is left to it."""
+    random: ClassVar[bool] = False
+    """Whether it adds noise, which a guarantee leaves out."""
 
     def begin(self, model: ControlAffine, x: State) -> PyTree:
         """Return what it remembers of an agent that begins at x; () of nothing."""
@@ -244,6 +246,7 @@ class NoisySensor(SensorStage):
 
     std: Array
     key: Array
+    random = True
 
     def read(
         self, model: ControlAffine, memory: PyTree, x: State, clock: SensorClock, number: jax.Array
@@ -285,6 +288,11 @@ class Sensors(eqx.Module):
     def on_board(self) -> "Sensors":
         """The stages that are part of the agent."""
         return Sensors(tuple(stage for stage in self.stages if stage.on_board))
+
+    @property
+    def still(self) -> "Sensors":
+        """The stages without noise."""
+        return Sensors(tuple(stage for stage in self.stages if not stage.random))
 
     def begin(self, model: ControlAffine, x: State) -> PyTree:
         """Return what the stages remember of an agent that begins at x."""

@@ -52,6 +52,11 @@ class IdealMotors(eqx.Module):
         """The motors that begin each step at their command."""
         return self
 
+    @property
+    def still(self) -> "IdealMotors":
+        """The motors without levels, between which a command would jump."""
+        return self
+
     def begin(self, trim: Input) -> PyTree:
         """Return what the motors of an agent remember that is at rest."""
         return ()
@@ -77,6 +82,11 @@ class LaggingMotors(IdealMotors):
     def memoryless(self) -> IdealMotors:
         """The motors that begin each step at their command."""
         return SteppedMotors(self.arrays)
+
+    @property
+    def still(self) -> IdealMotors:
+        """The motors without levels, between which a command would jump."""
+        return dataclasses.replace(self, arrays=dataclasses.replace(self.arrays, step=None))
 
     def begin(self, trim: Input) -> PyTree:
         """Return the trim: motors begin where agents would be at rest."""
@@ -255,6 +265,11 @@ class PlantStep(eqx.Module):
             return self.of_row(row).move(own, x, u, step, number)
 
         return jax.vmap(one)(memory, states, inputs, numbers, self.rows)
+
+    @property
+    def still(self) -> "PlantStep":
+        """The motion without weather, and with motors without levels."""
+        return dataclasses.replace(self, motors=self.motors.still, weather=())
 
     @property
     def memoryless(self) -> "PlantStep":

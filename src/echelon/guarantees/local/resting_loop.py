@@ -1,0 +1,335 @@
+"""The loop of a run with everybody at rest, and the derivative of the steps that run there.
+
+The leaders rest at their trim, unless they react; nothing pushes, measures or loses at random. All
+else is what runs: laws, their memories, limits, motors, estimators, the ages of messages, plants.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.references.reference import LeaderPath
+from echelon.core.compiled import cached_jit
+from echelon.core.numerics import Field
+from echelon.core.types import Array, Input, PyTree, Scalar, State
+from echelon.laws.law import Expected, Law, LocalView, Memory, Speaks, Travels, reference_of
+from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.prepare import Prepared
+from echelon.simulation.step.assembly import assemble
+from echelon.simulation.step.drive import Problem
+from echelon.simulation.step.loop import Loop
+from echelon.simulation.step.motion import IdealMotors, LaggingMotors, PlantStep
+from echelon.simulation.step.records import LoopState
+from echelon.simulation.step.roster import Everybody, Links, SwitchingLinks
+from echelon.simulation.step.sequence import begin, step
+
+# ---- leaders at rest -----------------------------------------------------------------------------
+
+
+@final
+class RestingLeader(Law, Travels, Speaks):
+    """A leader that rests at its trim, as everybody expects, and says what a follower would."""
+
+    follower: Law
+    plans = True
+
+    def init(self) -> Memory:
+        """Return a follower's memory."""
+        return self.follower.init()
+
+    def begin(self, model: ControlAffine, x: State) -> Memory:
+        """Return a follower's memory at x."""
+        return self.follower.begin(model, x)
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return the trim input."""
+        return model.physical(jnp.zeros(len(model.input_names))), memory
+
+    def signal(
+        self, model: ControlAffine, x: State, offset: State, memory: Memory
+    ) -> Float[jax.Array, " s"] | None:
+        """Return what a follower says."""
+        return Speaks.of(self.follower).signal(model, x, offset, memory)
+
+    def deviation(
+        self, model: ControlAffine, t: Scalar, x: State, offset: State, memory: Memory
+    ) -> Float[jax.Array, " s"]:
+        """Return that it keeps to its plan."""
+        return jnp.zeros_like(self._said(model, x, offset, memory))
+
+    def expected(
+        self,
+        model: ControlAffine,
+        t: Scalar,
+        deviation: Float[jax.Array, " s"],
+        age: Scalar,
+        period: Scalar | float,
+    ) -> Expected:
+        """Return what it says at its trim, with the deviation."""
+        x = jnp.asarray(np.asarray(model.trim[0], float))
+        return Expected(deviation + self._said(model, x, jnp.zeros_like(x), self.begin(model, x)))
+
+    def _said(self, model: ControlAffine, x: State, offset: State, memory: Memory) -> jax.Array:
+        said = self.signal(model, x, offset, memory)
+        return x - offset if said is None else said
+
+
+@final
+class RestingPath(LeaderPath):
+    """A path that stays at the trim of the model."""
+
+    def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
+        """Return the trim."""
+        x, u = (jnp.asarray(np.asarray(part, float)) for part in model.trim)
+        return x, u
+
+    def turns(self, model: ControlAffine) -> bool:
+        """Tell that the heading stays."""
+        return False
+
+    def check(self) -> None:
+        """Accept it."""
+
+    def fit(self, model: ControlAffine) -> None:
+        """Accept every model."""
+
+
+def resting_leader(drive: Laws) -> Law:
+    """Return the leaders' law with its path at rest; at the trim where it does not react."""
+    leader = drive.leader
+    if not reacts(drive):
+        return RestingLeader(drive.follower)
+    if reference_of(leader) is None:
+        return leader
+    return dataclasses.replace(leader, reference=RestingPath())  # pyright: ignore
+
+
+def reacts(drive: Laws) -> bool:
+    """Tell whether what leaders do depends on others."""
+    return drive.reacts or "neighbours' states" in drive.leader.information
+
+
+# ---- the loop ------------------------------------------------------------------------------------
+
+
+def resting_loop(prepared: Prepared, graph_row: int | None, steps: int) -> Loop:
+    """Return the loop of a run at rest, for so many steps.
+
+    Of a graph that switches it has one of its rows alone, unless that is None.
+    """
+    parts, problem = prepared.parts, prepared.problem
+    assert isinstance(parts.drive, Laws)
+    still = problem._replace(
+        settings=problem.settings._replace(horizon=steps * problem.settings.dt),
+        motion=problem.motion.still,
+        sensors=problem.sensors.still,
+        channel=None if problem.channel is None else problem.channel.still,
+    )
+    loop = assemble(still, resting_leader(parts.drive), parts.drive.follower)
+    loop = loop.replace(roster=Everybody())
+    if graph_row is not None and isinstance(loop.graph, SwitchingLinks):
+        loop = loop.replace(graph=Links(loop.graph.exchange.during(graph_row)))
+    return loop
+
+
+def period_of(problem: Problem, graph_steps: int) -> int:
+    """Return after how many steps the network and the graph are the same again."""
+    channel = problem.channel
+    if channel is None:
+        return graph_steps
+    return math.lcm(graph_steps, int(channel.every) * channel.slots)
+
+
+# ---- inputs that are held, exactly ---------------------------------------------------------------
+
+_MOST_FLOW = 700.0
+"""Of |A dt|: beyond, the exact flow of a step overflows or says nothing."""
+_TERMS, _HALVINGS = 18, 12  # of Taylor's series at norm 1, and of the norm before it
+
+
+@final
+class HeldExactly(IdealMotors):
+    """Motors whose plant moves by the exact flow of its slopes where it is, in place of a method.
+
+    Only its derivative says something, and only where the plant rests.
+    """
+
+    inner: IdealMotors
+    at_once, remembers = False, True
+
+    def begin(self, trim: Input) -> PyTree:
+        """Return what the motors remember."""
+        return self.inner.begin(trim)
+
+    def integrate(
+        self, field: Field, memory: PyTree, x: State, u: Input, plant: PlantStep
+    ) -> tuple[State, PyTree]:
+        """Return the state one dt later by the flow about x, and the memory."""
+        n, m = len(x), len(u)
+        lags = isinstance(self.inner, LaggingMotors) and self.inner.remembers
+        command = self.inner.arrays.command(u) if isinstance(self.inner, LaggingMotors) else u
+        start = memory if lags else command
+        at = jnp.concatenate([x, start, command])
+        rest = jax.lax.stop_gradient(at)
+
+        def moving(at: jax.Array) -> jax.Array:
+            x, acts, command = at[:n], at[n : n + m], at[n + m :]
+            rates = jnp.zeros(m)
+            if lags:
+                rates = jax.jvp(
+                    lambda t: self.inner.arrays.after(acts, command, t), (0.0,), (1.0,)
+                )[1]
+            return jnp.concatenate([field(x, acts), rates, jnp.zeros(m)])
+
+        flow = jax.lax.stop_gradient(_flow(plant.dt * jax.jacfwd(moving)(rest)))
+        after = rest + flow @ (at - rest)
+        return after[:n], after[n : n + m] if lags else memory
+
+
+def _flow(X: jax.Array) -> jax.Array:
+    """Return exp(X), (n, n); NaN where |X| is too large for one."""
+    # No function of LAPACK, since compiled code with one cannot be stored.
+    size = jnp.abs(X).sum(axis=1).max()
+    X, one = X * 0.5**_HALVINGS, jnp.eye(len(X))
+    flow = one + X / _TERMS
+    for k in range(_TERMS - 1, 0, -1):
+        flow = one + X @ flow / k
+    flow = jax.lax.fori_loop(0, _HALVINGS, lambda _, flow: flow @ flow, flow)
+    return jnp.where(size <= _MOST_FLOW, flow, jnp.nan)
+
+
+def held_exactly(loop: Loop) -> Loop | None:
+    """Return the loop whose plants move by the exact flow; None where they have a step of their own."""
+    motion = loop.motion
+    if type(motion) is not PlantStep or motion.integrator == "printed":
+        return None
+    rows = motion.rows if motion.rows == () else (motion.rows[0], HeldExactly(motion.rows[1]))
+    return loop.replace(
+        motion=dataclasses.replace(motion, motors=HeldExactly(motion.motors), rows=rows)
+    )
+
+
+# ---- which numbers of a moment may move ----------------------------------------------------------
+
+
+class Body(NamedTuple):
+    """Where each number of a moment belongs.
+
+    Attributes:
+        agent: (D,) whose it is; -1 of the network and of what surrounds agents.
+        entry: (D,) its place in the agent's body; -1 likewise.
+        state: (D,) which state of the model it is; -1 of a memory.
+    """
+
+    agent: Array
+    entry: Array
+    state: Array
+
+
+def body_of(loop: Loop, now: LoopState) -> Body:
+    """Return where each real number of a moment belongs."""
+    numbers = np.arange(loop.agents)
+    nobody = LoopState(*(jax.tree.map(lambda x: _rows(x, None), part) for part in now))
+    memory, laws = nobody.memory, loop.laws
+    own = now.memory
+
+    def of(part: PyTree, agents: Array) -> PyTree:
+        return jax.tree.map(lambda x: _rows(x, agents), part)
+
+    memory = memory._replace(
+        laws=type(own.laws)(
+            of(own.laws.leader, laws.leaders), of(own.laws.follower, laws.followers)
+        ),
+        sensing=of(own.sensing, numbers),
+        plant=of(own.plant, numbers),
+    )
+    marked = nobody._replace(states=_rows(now.states, numbers), memory=memory)
+    agent = _flat(marked, now).astype(int)
+    states = nobody._replace(
+        states=np.broadcast_to(np.arange(now.states.shape[1]), now.states.shape)
+    )
+    state, entry = _flat(states, now).astype(int), np.full(len(agent), -1)
+    for k in numbers:
+        mine = np.flatnonzero(agent == k)
+        entry[mine] = np.arange(len(mine))
+    return Body(agent, entry, state)
+
+
+def _rows(leaf: jax.Array, agents: Array | None) -> Array:
+    """Return an array of a shape in which each row is the number of its agent; -1 of nobody."""
+    shape = np.shape(leaf)
+    if agents is None or not shape or shape[0] != len(agents):
+        return np.full(shape, -1)
+    return np.broadcast_to(agents.reshape(-1, *[1] * (len(shape) - 1)), shape)
+
+
+def _flat(tree: PyTree, like: PyTree) -> Array:
+    """Return the entries of a tree whose leaves in `like` are real numbers."""
+    pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(like), strict=True)
+    flat = [np.ravel(a) for a, b in pairs if is_real(b)]
+    return np.concatenate(flat)
+
+
+def is_real(leaf: object) -> bool:
+    """Tell whether a leaf of a moment has real numbers, which may move."""
+    return bool(jnp.issubdtype(jnp.result_type(leaf), jnp.floating))
+
+
+# ---- steps as a function of real numbers ---------------------------------------------------------
+
+
+def reals(now: LoopState) -> Array:
+    """Return all real numbers of a moment, (D,)."""
+    return _flat(now, now)
+
+
+def with_reals(now: LoopState, values: jax.Array) -> LoopState:
+    """Return a moment with other real numbers (D,)."""
+    leaves, tree = jax.tree.flatten(now)
+    real = [leaf for leaf in leaves if is_real(leaf)]
+    _, back = ravel_pytree(real)
+    moved = iter(back(values))
+    return tree.unflatten([next(moved) if is_real(leaf) else leaf for leaf in leaves])
+
+
+@cached_jit
+def begun(loop: Loop, states: Array, steps: Array) -> LoopState:
+    """Return the moment so many steps after a beginning at states (N, n)."""
+    return jax.lax.fori_loop(0, steps, lambda _, now: step(loop, now), begin(loop, states))
+
+
+@cached_jit
+def later(loop: Loop, now: LoopState, steps: Array) -> LoopState:
+    """Return the moment so many steps later."""
+    return jax.lax.fori_loop(0, steps, lambda _, now: step(loop, now), now)
+
+
+@cached_jit
+def responses(
+    loop: Loop, now: LoopState, free: Array, bases: Array, directions: Array, steps: Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return where numbers are after some steps, and the derivative along directions, (K, d).
+
+    Args:
+        loop: what runs.
+        now: the moment from which.
+        free: (d,) the places of the numbers that may move.
+        bases: (K, d) their values.
+        directions: (K, d).
+        steps: how many.
+    """
+    rest = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(now) if is_real(x)])
+
+    def moved(values: jax.Array) -> jax.Array:
+        start = with_reals(now, rest.at[free].set(values))
+        end = jax.lax.fori_loop(0, steps, lambda _, now: step(loop, now), start)
+        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(end) if is_real(x)])[free]
+
+    return jax.vmap(lambda base, along: jax.jvp(moved, (base,), (along,)))(bases, directions)

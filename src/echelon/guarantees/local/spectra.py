@@ -1,0 +1,156 @@
+"""Spectra of the deviations from rest: which of them end, and how fast."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
+
+from echelon.core.types import Array
+
+_EPS = float(np.finfo(float).eps)
+_CONDITIONED = 600
+"""Size up to which the condition of each eigenvalue is computed."""
+_ROUGH = 1e-9
+"""How far eigenvalues of larger matrices may be off, relative to the matrix."""
+
+
+class Split(NamedTuple):
+    """The map I kron F + C kron K of deviations, by each eigenvalue of C that counts.
+
+    One map W of everything is F = W, K = 0 and one eigenvalue.
+
+    Attributes:
+        F: (s, s) of an agent whose neighbours are where it is.
+        K: (s, s) of what it makes of a disagreement.
+        eigenvalues: (L,) of C, what agents hear of each other.
+        between: whether all between the least and the largest count.
+    """
+
+    F: Array
+    K: Array
+    eigenvalues: Array
+    between: bool = False
+
+    @classmethod
+    def whole(cls, W: Array) -> "Split":
+        """Return the map of everything."""
+        return cls(W, np.zeros_like(W), np.zeros(1))
+
+    def of(self, places: Array) -> Array:
+        """Return the maps (L, k, k) of some entries of the body."""
+        at = np.ix_(places, places)
+        return self.F[at] + self.eigenvalues[:, None, None] * self.K[at]
+
+
+class Modes(NamedTuple):
+    """The eigenvalues of a map that count, and how far each may be off by rounding.
+
+    Attributes:
+        values: (K,).
+        unsure: (K,).
+        lasting: places of numbers that nothing changes, and somebody reads.
+        adrift: places of states that stay as they are, and nobody reads.
+    """
+
+    values: Array
+    unsure: Array
+    lasting: tuple[int, ...] = ()
+    adrift: tuple[int, ...] = ()
+
+    @property
+    def radius(self) -> float:
+        """The largest modulus; 0 without any."""
+        return float(np.abs(self.values).max(initial=0.0))
+
+    @property
+    def worst(self) -> float:
+        """The largest modulus that rounding leaves possible."""
+        return float((np.abs(self.values) + self.unsure).max(initial=0.0))
+
+
+def modes_of(split: Split, is_state: Array) -> Modes:
+    """Return the modes of a map on states and memories, block by block.
+
+    What reaches no state is left out: it is only written down. `is_state` (s,) says which of the
+    numbers are states.
+    """
+    pattern = (split.F != 0.0) | (split.K != 0.0)
+    values, unsure, lasting, adrift = [np.zeros(0)], [np.zeros(0)], list[int](), list[int]()
+    for places in _blocks(pattern, is_state):
+        first = int(places[0])
+        if len(places) == 1 and split.F[first, first] == 1.0 and split.K[first, first] == 0.0:
+            read = np.count_nonzero(pattern[:, first]) > 1
+            (lasting if read else adrift).append(first)
+            continue
+        found, rounding = _eigenvalues(split.of(places))
+        values.append(found.reshape(-1))
+        unsure.append(np.full(found.size, rounding))
+    return Modes(np.concatenate(values), np.concatenate(unsure), (*lasting,), (*adrift,))
+
+
+def _blocks(pattern: Array, is_state: Array) -> Iterator[Array]:
+    """Yield the strongly connected parts of a map, (D, D) of who acts, that reach a state."""
+    count, block = csgraph.connected_components(sp.csr_array(pattern), connection="strong")
+    to, of = block[np.argwhere(pattern).T]
+    back = sp.csr_array((np.ones(len(to)), (to, of)), (count, count))
+    reaches = np.isin(np.arange(count), block[is_state])
+    todo = [*np.flatnonzero(reaches)]
+    while todo:
+        k = todo.pop()
+        new = [j for j in back.indices[back.indptr[k] : back.indptr[k + 1]] if not reaches[j]]
+        reaches[new] = True
+        todo += new
+    order = np.argsort(block, kind="stable")
+    parts = np.split(order, np.searchsorted(block[order], np.arange(1, count)))
+    yield from (part for k, part in enumerate(parts) if reaches[k])
+
+
+def _eigenvalues(maps: Array) -> tuple[Array, float]:
+    """Return the eigenvalues (L, k) of maps (L, k, k), and how far the largest may be off."""
+    if maps.shape[1] == 1:
+        values = maps[:, 0]
+        return values, 2.0 * _EPS * float(np.abs(values).max())
+    _, (scale, _) = scipy.linalg.matrix_balance(
+        np.abs(maps).sum(axis=0), permute=False, separate=True
+    )
+    maps = maps * (scale / scale[:, None])
+    values = np.linalg.eigvals(maps)
+    worst = maps[np.abs(values).max(axis=1).argmax()]
+    size = float(np.linalg.norm(worst))
+    if len(worst) > _CONDITIONED:
+        return values, _ROUGH * size
+    found, left, right = scipy.linalg.eig(worst, left=True, right=True)
+    k = np.abs(found).argmax()
+    along = float(np.abs(left[:, k].conj() @ right[:, k]))
+    # A multiple eigenvalue without its vectors moves by a root of what is rounded.
+    rounding = _EPS * len(worst) * size
+    return values, min(rounding / max(along, _EPS), rounding ** (1.0 / len(worst)))
+
+
+# ---- how much errors may grow before they end ----------------------------------------------------
+
+_TRANSIENT = 400
+"""Size up to which powers of a map are taken."""
+_DOUBLINGS = 24
+
+
+def amplification(split: Split, is_state: Array) -> float | None:
+    """Return how often the states' errors are multiplied at most, at powers of 2 of steps.
+
+    None where the map is too large to say.
+    """
+    if len(split.F) > _TRANSIENT or len(split.eigenvalues) > _TRANSIENT:
+        return None
+    power, most = split.of(np.arange(len(split.F))), 1.0
+    for _ in range(_DOUBLINGS):
+        norms = np.linalg.norm(power[:, is_state][:, :, is_state], 2, (1, 2))
+        if not np.isfinite(norms).all():
+            return np.inf
+        most = max(most, float(norms.max()))
+        if norms.max() < 1e-3:
+            break
+        power = power @ power
+    return most
