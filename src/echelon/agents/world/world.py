@@ -151,6 +151,17 @@ class World:
             "the step has members of your own": self.members is not None,
         }
 
+    @property
+    def random(self) -> dict[str, bool]:
+        """What is left out of the steps at rest, in words, and whether it is there."""
+        levels = self.actuator is not None and self.actuator.levels > 0
+        noisy = self.sensing is not None and any(self.sensing.noise.values())
+        return {
+            "wind or noise acts on the agents": self.disturbance is not None,
+            "the actuators have levels": levels,
+            "agents measure their states with noise": noisy,
+        }
+
     def plant_for(self, model: ControlAffine) -> ControlAffine:
         """Return the plant, or the model if there is none."""
         return model if self.plant is None else self.plant

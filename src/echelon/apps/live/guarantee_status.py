@@ -202,7 +202,7 @@ def first_look(panel: Panel, knobs: Knobs) -> JsonObject:
         return pending_badge() | {"state": "lost", "short": growth}
     if loop is None:
         return pending_badge()
-    slowest = at_least(-loop.held_rate(settings))
+    slowest = at_least(np.log(loop.radius(settings)) / settings.dt)
     return pending_badge(f"slowest mode {slowest} 1/s; guarantee \u2026")
 
 

@@ -15,7 +15,6 @@ import scipy.sparse.csgraph as csgraph
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.jaxpr import used_leaves
-from echelon.core.linear import radius_between
 from echelon.core.types import Array, PyTree
 from echelon.guarantees.local.resting_loop import (
     Body,
@@ -34,6 +33,7 @@ from echelon.guarantees.local.spectra import Split, amplification, modes_of
 from echelon.laws.law import Law, LocalView, Memory, Speaks
 from echelon.laws.law_check import traced_arguments, unknown_class
 from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.own_members import own_members
@@ -49,7 +49,7 @@ _AGREES = 1e-9
 """Relative; what rounding may leave between the derivative and the map made of it."""
 _AT_REST = 1e-9
 _NEWTON, _WARM = 6, 2000
-_FAR = 1e6
+FAR = 1e6
 """Growth before errors end, beyond which the linearization says nothing of any start."""
 
 
@@ -79,6 +79,7 @@ class LocalCertificate(NamedTuple):
         modes: how many were computed.
         split: whether by the eigenvalues of what agents hear.
         growth: how often errors may be multiplied before they end; None where that is not known.
+        before: the same until the last switch of a graph; None of one that does not switch.
         period: steps after which the network and the graph are the same again.
         off: how far agents rest off their goals at most, in units of a state.
         adrift: states that nothing drives to zero, by name.
@@ -92,6 +93,7 @@ class LocalCertificate(NamedTuple):
     modes: int = 0
     split: bool = False
     growth: float | None = None
+    before: float | None = None
     period: int = 1
     off: float = 0.0
     adrift: tuple[str, ...] = ()
@@ -118,16 +120,44 @@ def local_certificate(prepared: Prepared) -> LocalCertificate:
     period = period_of(problem, repeats)
     settled = _settled_after(prepared, period)
     loop = resting_loop(prepared, row, settled + 3 * period)
-    goals = np.asarray(parts.model.trim[0], float) + parts.formation.offsets
-    timed = _timed(parts.drive.follower, loop, parts.model, goals)
-    if timed is not None:
-        return LocalCertificate((timed[0],), culprit=timed[1])
+    goals, answer = np.asarray(parts.model.trim[0], float) + parts.formation.offsets, reacts(parts)
+    for law in (parts.drive.follower, *[parts.drive.leader] * answer):
+        timed = _timed(law, loop, parts.model, goals)
+        if timed is not None:
+            return LocalCertificate((timed[0],), culprit=timed[1])
     now = begun(loop, goals, np.asarray(settled))
-    movers = np.arange(loop.agents) if reacts(parts.drive) else np.array(parts.graph.followers)
-    rest = _rest_of(loop, now, movers, period)
+    rest = _rest_of(loop, now, _movers(parts, answer), period)
     found = _judged(rest, goals, period, parts.model.state_names)
+    if row and rest.whole is not None and found.radius is not None:
+        found = _until_last(prepared, rest, goals, found)
     steady = problem.channel is None or problem.channel.steady
     return found._replace(period=period, steady=steady)
+
+
+def _movers(parts: Parts, answer: bool) -> Array:
+    """Return the agents (A,) whose deviations count: those that are led, and leaders that react."""
+    agents = np.arange(parts.graph.agents) if answer else np.array(parts.graph.followers)
+    schedule = parts.graph.schedule
+    if schedule is None or schedule.present is None:
+        return agents
+    return agents[schedule.present[-1][agents]]
+
+
+def _until_last(
+    prepared: Prepared, rest: "_Rest", goals: Array, found: LocalCertificate
+) -> LocalCertificate:
+    """Return what is found with the growth of errors until the last switch of the graph."""
+    schedule, dt = prepared.parts.graph.schedule, prepared.problem.settings.dt
+    assert schedule is not None
+    steps = int(schedule.switches(dt, 2.0 * float(schedule.starts[-1]))[0][-1])
+    loop = resting_loop(prepared, None, steps + 1)
+    early = rest._replace(loop=loop, now=begun(loop, goals, np.asarray(0)))
+    after, slopes = _maps(early, np.eye(len(rest.value)), steps)
+    if not np.abs(after - rest.value).max(initial=0.0) <= _AT_REST * _size(rest):
+        return found._replace(faults=(Fault.NO_REST,), radius=None)
+    at = rest.body.state[rest.free] >= 0
+    before = np.linalg.norm(slopes.T[at][:, at], 2) if np.isfinite(slopes).all() else np.inf
+    return found._replace(before=max(1.0, float(before)))
 
 
 def _graph_of(prepared: Prepared) -> tuple[int | None, int]:
@@ -221,6 +251,13 @@ class _Rest(NamedTuple):
     whole: Array | None
 
     @property
+    def map(self) -> Split | None:
+        """The map by what agents hear, or of everything; None of one that is too large."""
+        if self.split is not None or self.whole is None:
+            return self.split
+        return Split.whole(self.whole)
+
+    @property
     def is_state(self) -> Array:
         """Which numbers of a body, or of everything, are states."""
         states = self.body.state[self.free] >= 0
@@ -301,7 +338,7 @@ def _split_at(rest: _Rest, period: int) -> _Rest:
     assert C is not None
     own, apart = C.diagonal(), sp.csc_array(C - sp.diags_array(C.diagonal()))
     # Who is heard most; of agents that hear nobody here, the two that differ most.
-    k = int(np.abs(apart).sum(axis=0).argmax())
+    k = int(abs(apart).sum(axis=0).argmax())
     a, b = (k, k) if apart.nnz else (int(own.argmin()), int(own.argmax()))
     units = np.zeros((2, size, count, size))
     units[[0, 1], :, [a, b]] = np.eye(size)
@@ -349,20 +386,25 @@ def _eigenvalues(C: sp.csr_array, grounded: bool) -> tuple[Array, bool] | None:
 # ---- the verdict ---------------------------------------------------------------------------------
 
 
+def _size(rest: _Rest) -> float:
+    return 1.0 + float(np.abs(rest.value).max(initial=0.0))
+
+
 def _judged(rest: _Rest, goals: Array, period: int, names: tuple[str, ...]) -> LocalCertificate:
-    if not rest.residual <= _AT_REST * (1.0 + np.abs(rest.value).max(initial=0.0)):
+    if not rest.residual <= _AT_REST * _size(rest):
         return LocalCertificate((Fault.NO_REST,))
     states, agents = rest.body.state[rest.free], rest.body.agent[rest.free]
     at = states >= 0
-    off = float(np.abs(rest.value[at] - goals[agents[at], states[at]]).max(initial=0.0))
-    if off > _AT_REST * (1.0 + np.abs(goals).max()):
-        return LocalCertificate((Fault.OFF_GOALS,), off=off)
-    if rest.split is None and rest.whole is None:
+    gaps = np.abs(rest.value[at] - goals[agents[at], states[at]])
+    off = float(gaps.max(initial=0.0))
+    if off > _AT_REST * _size(rest):
+        culprit = names[states[at][gaps.argmax()]]
+        return LocalCertificate((Fault.OFF_GOALS,), off=off, culprit=culprit)
+    split = rest.map
+    if split is None:
         return LocalCertificate((Fault.LARGE,))
-    kink = _kink(rest, period)
-    if kink:
+    if _kink(rest, period):
         return LocalCertificate((Fault.KINK,))
-    split = rest.split or Split.whole(rest.whole)
     modes = modes_of(split, rest.is_state)
     exact = _exactly(rest, period)
     radius = modes.radius ** (1.0 / period)
@@ -394,10 +436,8 @@ def _exactly(rest: _Rest, period: int) -> float | None:
         there = there._replace(whole=_maps(there, np.eye(len(rest.value)), period)[1].T)
     if rest.split is not None:
         there = _split_at(there, period)
-    if there.split is None and there.whole is None:
-        return None
-    split = there.split or Split.whole(there.whole)
-    if not np.isfinite(split.F).all():
+    split = there.map
+    if split is None or not np.isfinite(split.F).all():
         return None
     return modes_of(split, there.is_state).radius ** (1.0 / period)
 

@@ -5,6 +5,7 @@ else is what runs: laws, their memories, limits, motors, estimators, the ages of
 """
 
 import dataclasses
+import functools
 import math
 from typing import NamedTuple, final
 
@@ -21,6 +22,7 @@ from echelon.core.numerics import Field
 from echelon.core.types import Array, Input, PyTree, Scalar, State
 from echelon.laws.law import Expected, Law, LocalView, Memory, Speaks, Travels, reference_of
 from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.assembly import assemble
 from echelon.simulation.step.drive import Problem
@@ -101,19 +103,21 @@ class RestingPath(LeaderPath):
         """Accept every model."""
 
 
-def resting_leader(drive: Laws) -> Law:
+def resting_leader(parts: Parts) -> Law:
     """Return the leaders' law with its path at rest; at the trim where it does not react."""
-    leader = drive.leader
-    if not reacts(drive):
-        return RestingLeader(drive.follower)
+    assert isinstance(parts.drive, Laws)
+    leader = parts.drive.leader
+    if not reacts(parts):
+        return RestingLeader(parts.drive.follower)
     if reference_of(leader) is None:
         return leader
     return dataclasses.replace(leader, reference=RestingPath())  # pyright: ignore
 
 
-def reacts(drive: Laws) -> bool:
+def reacts(parts: Parts) -> bool:
     """Tell whether what leaders do depends on others."""
-    return drive.reacts or "neighbours' states" in drive.leader.information
+    words = parts.drive.information_for(parts.model, parts.graph).leader
+    return parts.drive.reacts or any(word.startswith("neighbours") for word in words)
 
 
 # ---- the loop ------------------------------------------------------------------------------------
@@ -132,7 +136,7 @@ def resting_loop(prepared: Prepared, graph_row: int | None, steps: int) -> Loop:
         sensors=problem.sensors.still,
         channel=None if problem.channel is None else problem.channel.still,
     )
-    loop = assemble(still, resting_leader(parts.drive), parts.drive.follower)
+    loop = assemble(still, resting_leader(parts), parts.drive.follower)
     loop = loop.replace(roster=Everybody())
     if graph_row is not None and isinstance(loop.graph, SwitchingLinks):
         loop = loop.replace(graph=Links(loop.graph.exchange.during(graph_row)))
@@ -172,25 +176,24 @@ class HeldExactly(IdealMotors):
         self, field: Field, memory: PyTree, x: State, u: Input, plant: PlantStep
     ) -> tuple[State, PyTree]:
         """Return the state one dt later by the flow about x, and the memory."""
-        n, m = len(x), len(u)
-        lags = isinstance(self.inner, LaggingMotors) and self.inner.remembers
-        command = self.inner.arrays.command(u) if isinstance(self.inner, LaggingMotors) else u
-        start = memory if lags else command
+        n, m, motors = len(x), len(u), self.inner
+        command = motors.arrays.command(u) if isinstance(motors, LaggingMotors) else u
+        lags = motors if isinstance(motors, LaggingMotors) and motors.remembers else None
+        start = command if lags is None else memory
         at = jnp.concatenate([x, start, command])
         rest = jax.lax.stop_gradient(at)
 
         def moving(at: jax.Array) -> jax.Array:
             x, acts, command = at[:n], at[n : n + m], at[n + m :]
             rates = jnp.zeros(m)
-            if lags:
-                rates = jax.jvp(
-                    lambda t: self.inner.arrays.after(acts, command, t), (0.0,), (1.0,)
-                )[1]
+            if lags is not None:
+                later = functools.partial(lags.arrays.after, acts, command)
+                rates = jax.jvp(later, (0.0,), (1.0,))[1]
             return jnp.concatenate([field(x, acts), rates, jnp.zeros(m)])
 
         flow = jax.lax.stop_gradient(_flow(plant.dt * jax.jacfwd(moving)(rest)))
         after = rest + flow @ (at - rest)
-        return after[:n], after[n : n + m] if lags else memory
+        return after[:n], memory if lags is None else after[n : n + m]
 
 
 def _flow(X: jax.Array) -> jax.Array:
@@ -206,7 +209,7 @@ def _flow(X: jax.Array) -> jax.Array:
 
 
 def held_exactly(loop: Loop) -> Loop | None:
-    """Return the loop whose plants move by the exact flow; None where they have a step of their own."""
+    """Return the loop whose plants move by the exact flow; None where they have another step."""
     motion = loop.motion
     if type(motion) is not PlantStep or motion.integrator == "printed":
         return None

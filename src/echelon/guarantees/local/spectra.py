@@ -1,7 +1,7 @@
 """Spectra of the deviations from rest: which of them end, and how fast."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -113,9 +113,9 @@ def _eigenvalues(maps: Array) -> tuple[Array, float]:
     if maps.shape[1] == 1:
         values = maps[:, 0]
         return values, 2.0 * _EPS * float(np.abs(values).max())
-    _, (scale, _) = scipy.linalg.matrix_balance(
-        np.abs(maps).sum(axis=0), permute=False, separate=True
-    )
+    pattern = np.abs(maps).sum(axis=0)
+    balance: Any = scipy.linalg.matrix_balance
+    scale = balance(pattern, permute=False, separate=True)[1][0]
     maps = maps * (scale / scale[:, None])
     values = np.linalg.eigvals(maps)
     worst = maps[np.abs(values).max(axis=1).argmax()]
@@ -134,7 +134,7 @@ def _eigenvalues(maps: Array) -> tuple[Array, float]:
 
 _TRANSIENT = 400
 """Size up to which powers of a map are taken."""
-_DOUBLINGS = 24
+_DOUBLINGS, _ENDED = 24, 1e-3
 
 
 def amplification(split: Split, is_state: Array) -> float | None:
@@ -144,13 +144,18 @@ def amplification(split: Split, is_state: Array) -> float | None:
     """
     if len(split.F) > _TRANSIENT or len(split.eigenvalues) > _TRANSIENT:
         return None
-    power, most = split.of(np.arange(len(split.F))), 1.0
+    with np.errstate(all="ignore"):
+        return _largest_power(split.of(np.arange(len(split.F))), is_state)
+
+
+def _largest_power(power: Array, is_state: Array) -> float:
+    most = 1.0
     for _ in range(_DOUBLINGS):
         norms = np.linalg.norm(power[:, is_state][:, :, is_state], 2, (1, 2))
-        if not np.isfinite(norms).all():
-            return np.inf
         most = max(most, float(norms.max()))
-        if norms.max() < 1e-3:
-            break
+        if norms.max() < _ENDED:
+            return most
         power = power @ power
+        if not np.isfinite(power).all():
+            return np.inf
     return most

@@ -8,6 +8,7 @@ from echelon.agents.models.straight_range import is_straight
 from echelon.agents.world.world import LATE
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
+from echelon.guarantees.local.local_certificate import LocalCertificate
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.frozen_laws import FrozenLaws
 from echelon.guarantees.promises.leaders import Leaders
@@ -26,6 +27,8 @@ class GuaranteeInputs(NamedTuple):
             they are known; else None.
         frozen: the law along the leader's path and at the starts; None where it is not needed.
         over_network: whether what is guaranteed covers late messages.
+        local: what the steps that run do to small errors; None of a drive that is no law.
+        known: whether echelon knows the laws and all members of the step.
     """
 
     parts: Parts
@@ -36,6 +39,8 @@ class GuaranteeInputs(NamedTuple):
     slopes: Array | None = None
     frozen: FrozenLaws | None = None
     over_network: bool = False
+    local: LocalCertificate | None = None
+    known: bool = True
 
     @property
     def domain(self) -> Domain | None:
@@ -51,7 +56,7 @@ class GuaranteeInputs(NamedTuple):
     def governed(self) -> bool:
         """Whether the followers run a law that a theorem speaks of, u = u_ff - c R^-1 g'P z."""
         model = self.parts.model
-        return self.parts.drive.metric(model) is not None and is_straight(model)
+        return self.known and self.parts.drive.metric(model) is not None and is_straight(model)
 
     @property
     def fed_by_parents(self) -> bool:
@@ -79,7 +84,9 @@ class GuaranteeInputs(NamedTuple):
     @property
     def disturbed(self) -> str:
         """What acts that no promise covers, in words; empty without any."""
-        acting = [text for text, acts in self.parts.world.differences.items() if acts]
+        world = self.parts.world
+        acts = world.differences if self.local is None else world.random
+        acting = [text for text, there in acts.items() if there]
         acting = [x for x in acting if not (self.over_network and x == LATE)]
         # Far from 0 its numbers are centimetres apart, whatever a law does.
         acting += ["numbers have single precision"] * (self.settings.precision == "float32")

@@ -17,76 +17,9 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import Certificate, certify
-from echelon.synthesis.certificates.lmi import falls, rate_of
+from echelon.synthesis.certificates.lmi import falls
 from echelon.synthesis.certificates.margins import ClosedLoop, slowest_between
 from echelon.synthesis.gains.gain import Gain
-
-# ---- one P for graphs that take turns (theory page, T8) ------------------------------------------
-# With M_g = I kron F - L_g kron c G K the step of all followers on graph g, the sum of all
-# delta_i'P delta_i falls in any order of the graphs where M_g'(I kron P) M_g < I kron P for each.
-
-_DENSE_STATES = 1500
-"""States of all followers up to which the norm of a step on a directed graph is computed."""
-_ROUNDING = 16 * float(np.finfo(float).eps)  # of a norm, times a condition number
-_SHARE = 1e-3  # of what the feedback takes from the sum in a step
-
-
-class CommonMetric(NamedTuple):
-    """The sum of all delta_i'P delta_i on graphs that take turns.
-
-    Attributes:
-        laplacians: (F, F) of each graph, grounded; of one that is symmetric its extreme
-            eigenvalues alone, (2,).
-        weakest: s > 0 with L + L' >= 2 s for each of them; 0 where there is none.
-        rate: at which the sum's root falls in continuous time, 1/s, below 0 where it may rise;
-            minus infinity where `weakest` is 0.
-    """
-
-    gain: Gain
-    laplacians: tuple[Array, ...]
-    weakest: float
-    rate: float
-
-    @classmethod
-    def of(cls, graph: Graph, gain: Gain, A: Array, B: Array) -> "CommonMetric":
-        """Return that of a graph that switches; A (n, n) and B (n, m) are of agents at the trim."""
-        weakest = graph.spectrum().proved
-        felt = 2.0 * gain.coupling * weakest
-        rate = rate_of(gain.P, A[None], B, gain.R, felt) if weakest > 0.0 else -np.inf
-        dense = (L.toarray() for L in graph.stretches())
-        # (F - k G K)'P (F - k G K) is convex in k, so that the extremes speak for all.
-        ends = (np.linalg.eigvalsh(L)[[0, -1]] if np.array_equal(L, L.T) else L for L in dense)
-        return cls(gain, tuple(ends), weakest, rate)
-
-    def growth(self, F: Array, G: Array, K: Array, dt: float) -> float:
-        """Return by what the sum's root is multiplied at most in a step x+ = F x + G u of dt (s).
-
-        Less than 1 also where the sum may stay, if it falls for as long as any z = K delta (m, n)
-        is felt: z then ends, and with it what decays by itself or shows in z.
-        """
-        root, c = np.linalg.cholesky(self.gain.P).T, self.gain.coupling
-        back = np.linalg.inv(root)
-        step, fed = root @ F @ back, c * root @ G @ K @ back
-        most = max(_norm(L, step, fed, np.zeros((0, len(F)))) for L in self.laplacians)
-        rounding = _ROUNDING * len(F) * float(np.linalg.cond(root))
-        if abs(most - 1.0) > rounding:
-            return most
-        felt = np.linalg.cholesky(2.0 * _SHARE * c * self.weakest * dt * self.gain.R).T @ K @ back
-        ends = max(_norm(L, step, fed, felt) for L in self.laplacians) <= 1.0 + rounding
-        return 1.0 - rounding if ends else 1.0 + rounding
-
-
-def _norm(L: Array, step: Array, fed: Array, felt: Array) -> float:
-    """Return the norm of I kron step - L kron fed above I kron felt; infinite of too large ones."""
-    if L.ndim == 1:
-        parts = np.stack([np.concatenate([step - k * fed, felt]) for k in L])
-        return float(np.linalg.norm(parts, 2, (1, 2)).max())
-    if len(L) * len(step) > _DENSE_STATES:
-        return np.inf
-    one = np.eye(len(L))
-    whole = np.concatenate([np.kron(one, step) - np.kron(L, fed), np.kron(one, felt)])
-    return float(np.sqrt(np.linalg.eigvalsh(whole.T @ whole)[-1]))
-
 
 # ---- the loop and its modes ----------------------------------------------------------------------
 
@@ -110,8 +43,6 @@ class LinearLoop(NamedTuple):
         symmetric: whether they are of a symmetric matrix between followers' errors.
         every: whether the modes of all eigenvalues of the graph decay.
         slowest: real part of the slowest mode, 1/s; of an interval, of the modes looked at.
-        common: the sum of all delta_i'P delta_i near the trim on graphs that take turns (T8); None
-            where the graph does not switch.
     """
 
     linear: Linearization
@@ -122,7 +53,6 @@ class LinearLoop(NamedTuple):
     every: bool
     slowest: float
     certificate: Certificate
-    common: CommonMetric | None = None
 
     @property
     def gains(self) -> Array:
@@ -153,30 +83,14 @@ class LinearLoop(NamedTuple):
         real = np.real(self.closed.strengths[np.imag(self.closed.strengths) == 0.0])
         return max(radius, radius_between(F - G @ self.inner, G @ self.closed.K, *real[[0, -1]]))
 
-    def growth(self, settings: Settings) -> float:
-        """Return the most by which a step multiplies errors, on any graph, in the norm of P.
-
-        Below 1 errors decay in any order of the graphs; without `common` it is 0.
-        """
-        if self.common is None or not self.common.weakest > 0.0:
-            return 0.0
-        F, G = discretize(*self.open, *settings.held)
-        return self.common.growth(F - G @ self.inner, G, self.closed.K, settings.dt)
-
-    def held_rate(self, settings: Settings) -> float:
-        """Return the rate (1/s) at which errors decay in held steps."""
-        growth = self.growth(settings) or self.radius(settings)
-        return -float(np.log(growth)) / settings.dt if growth > 0.0 else np.inf
-
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) of that integrator with which every mode decays."""
         step = longest_step(*self.open, self.gains, *settings.held[1:])
-        if not (self.closed.between or self.common) or not np.isfinite(step):
+        if not self.closed.between or not np.isfinite(step):
             return step
 
         def decays(dt: float) -> bool:
-            then = settings._replace(dt=dt)
-            return self.radius(then) < 1.0 and self.growth(then) < 1.0
+            return self.radius(settings._replace(dt=dt)) < 1.0
 
         # No smaller number is stated than need be: rounding alone lies between this and the step.
         near = (1.0 - 1e-6) * step
@@ -219,14 +133,8 @@ def loop_of(parts: Parts) -> LinearLoop:
     if between:
         slowest = max(slowest, slowest_between(closed))
     inner = np.zeros((m, n)) if inner is None else inner
-    common = None
-    alike = all_alike(parts.drive, parts.model)
-    if parts.graph.schedule is not None and gain is not None and not alike:
-        common = CommonMetric.of(parts.graph, gain, *linear)
     every = slowest < 0.0
-    return LinearLoop(
-        linear, inner, closed, where, modes.symmetric, every, slowest, certificate, common
-    )
+    return LinearLoop(linear, inner, closed, where, modes.symmetric, every, slowest, certificate)
 
 
 def modes_of(parts: Parts) -> NetworkModes:

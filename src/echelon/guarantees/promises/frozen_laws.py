@@ -19,10 +19,9 @@ from echelon.agents.models.heading_symmetry import (
     state_turn,
 )
 from echelon.agents.models.model import ControlAffine
-from echelon.core import linear
 from echelon.core.compiled import cached_jit
 from echelon.core.digits import about
-from echelon.core.linear import discretize, matrix_exponential, sampled_radius
+from echelon.core.linear import matrix_exponential
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
 from echelon.guarantees.promises.closed_loop import LinearLoop, telling
@@ -73,17 +72,6 @@ class LeaderRun(NamedTuple):
         if not turns or self.headings.any():
             return np.zeros(len(self.times))
         return self.states[:, heading_index(parts.model)] - rest_heading(parts.model)
-
-    def at_start(self, model: ControlAffine, states: Array) -> PathSamples:
-        """Return what followers in states (K, n) are asked with at the beginning."""
-        count = len(states)
-        if not len(self.times):
-            still, sent = np.zeros(count), np.zeros((count, self.inputs.shape[1]))
-            return PathSamples(still, np.tile(self.trim, (count, 1)), sent, states, still)
-        first = PathSamples(*(np.repeat(part[:1], count, axis=0) for part in self.rows))
-        away = np.repeat(self.headings[:1], count)
-        seen = _in_axes(model, states, away) if away.any() else states
-        return first._replace(times=np.zeros(count), states=np.asarray(seen))
 
 
 def leader_run_of(parts: Parts, settings: Settings, leaders: Leaders) -> LeaderRun:
@@ -206,10 +194,6 @@ class ModeMatrices(NamedTuple):
         modes = np.linalg.eigvals(np.where(finite[..., None, None], loops, 0.0))
         return np.where(finite[..., None], modes, np.inf)
 
-    def stable(self) -> "ModeMatrices":
-        """Return those that decay if the input is not held: no step helps the others."""
-        return ModeMatrices(*(part[self.growth() < 0.0] for part in self))
-
     def growth(self) -> Array:
         """Return the slowest mode about each state, (K,), 1/s."""
         return np.real(self.modes()).max(axis=(1, 2))
@@ -244,33 +228,6 @@ class ModeMatrices(NamedTuple):
         radii = np.maximum(radii, np.finfo(float).tiny)
         return float((logs + np.log(radii)).max() / (span * len(J)))
 
-    def hardest(self) -> "ModeMatrices":
-        """Return the few states about which modes are fastest."""
-        fastest = np.abs(self.modes()).max(axis=(1, 2))
-        few = np.argsort(fastest)[-_HARDEST:]
-        return ModeMatrices(*(part[few] for part in self))
-
-    def radius(self, settings: Settings) -> float:
-        """Return the largest spectral radius of a step of the integrator that runs; 0 of none."""
-        if not len(self.A):
-            return 0.0
-        A, B, gains = self.A[:, None], self.B[:, None], self.gains
-        return sampled_radius(A, B, gains, *settings.held)
-
-    def decaying(self, settings: Settings) -> Array:
-        """Return about which states, (K,), held steps decay wherever the loops themselves do."""
-        A, B, gains = self.A[:, None], self.B[:, None], self.gains
-        F, G = discretize(A, B, *settings.held)
-        radii = np.abs(np.linalg.eigvals(F - G @ gains)).max(axis=(1, 2))
-        return (self.growth() >= 0.0) | (radii < 1.0)
-
-    def longest_step(self, settings: Settings) -> float:
-        """Return the longest step (s) with which every loop decays; infinite of none."""
-        if not len(self.A):
-            return float("inf")
-        A, B, gains = self.hardest()
-        return linear.longest_step(A[:, None], B[:, None], gains, *settings.held[1:])
-
 
 class FrozenLaws(NamedTuple):
     """The laws frozen away from the trim.
@@ -285,7 +242,6 @@ class FrozenLaws(NamedTuple):
     path: LeaderRun
     along: ModeMatrices
     leader: ModeMatrices | None
-    starts: ModeMatrices
     culprit: str = ""
 
     @property
@@ -310,11 +266,6 @@ class FrozenLaws(NamedTuple):
         both = (self.along, self.leader)
         return tuple(each for each in both if each is not None) if len(self.times) else ()
 
-    def radii(self, settings: Settings) -> tuple[float, float]:
-        """Return the largest spectral radius of a step along the path, and where agents start."""
-        along = (each.stable().radius(settings) for each in self.on_path)
-        return max(along, default=0.0), self.starts.stable().radius(settings)
-
     def growth(self) -> Growth:
         """Return what errors do along the path, of those who do worse."""
         growths = (
@@ -323,59 +274,19 @@ class FrozenLaws(NamedTuple):
         )
         return max(growths, key=lambda one: (one.lost, one.rate))
 
-    def longest_step(self, settings: Settings) -> float:
-        """Return the longest step (s) with which the laws decay wherever they are frozen."""
-        all_ = (*self.on_path, self.starts)
-        return min(each.stable().longest_step(settings) for each in all_)
-
-
-def longest_step(loop: LinearLoop, frozen: FrozenLaws | None, settings: Settings) -> float:
-    """Return the longest step (s) with which modes decay at the trim and wherever agents go."""
-    steps = [loop.longest_step(settings)]
-    # The printed step is of Algorithm 1 as it stands, and never made shorter.
-    if frozen is not None and settings.integrator != "printed":
-        steps.append(frozen.longest_step(settings))
-    return min(steps)
-
 
 def frozen_of(
-    parts: Parts, settings: Settings, loop: LinearLoop, leaders: Leaders, states: Array
+    parts: Parts, settings: Settings, loop: LinearLoop, leaders: Leaders
 ) -> FrozenLaws | None:
-    """Return the laws of prepared parts frozen where they go, agents starting in states (N, n).
-
-    None where nobody leaves the trim, or the agents obey no law that is known.
-    """
-    trim, starts = np.asarray(parts.model.trim[0], float), states - parts.formation.offsets
-    if not isinstance(parts.drive, Laws):
-        return None
+    """Return the laws of prepared parts frozen along the leader's path; None without a path."""
     path = leader_run_of(parts, settings, leaders)
-    if not len(path.times) and (starts == trim).all():
-        return None
-    starts_there = frozen_starts(parts, loop, path, states[None])
     if not len(path.times):
-        none = ModeMatrices(*(part[:0] for part in starts_there))
-        return FrozenLaws(path, none, None, starts_there)
+        return None
     along = _followers(parts, loop, path.rows)
-    leader = _leader(parts, path.own_headings(parts), along)
-    frozen = FrozenLaws(path, along, leader, starts_there)
+    frozen = FrozenLaws(path, along, _leader(parts, path.own_headings(parts), along))
     if not frozen.growth().lost:
         return frozen
     return frozen._replace(culprit=_culprit(parts, loop, path, frozen))
-
-
-def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderRun, states: Array) -> ModeMatrices:
-    """Return the laws of prepared parts frozen where agents start, in many runs (S, N, n).
-
-    It is the same number of each run after the other.
-    """
-    starts = states - parts.formation.offsets
-    few = np.unique(np.linspace(0, starts.shape[1] - 1, _STARTS).astype(int))
-    starts = starts[:, few]
-    rows = path.at_start(parts.model, starts.reshape(-1, starts.shape[2]))
-    size = MOMENTS + _STARTS
-    slices = (slice(k, k + size) for k in range(0, len(rows.times), size))
-    parts_of = [_followers(parts, loop, PathSamples(*(x[each] for x in rows))) for each in slices]
-    return ModeMatrices._make(map(np.concatenate, zip(*parts_of, strict=True)))
 
 
 # ---- the laws there -----------------------------------------------------------------------------
@@ -385,7 +296,7 @@ def _followers(parts: Parts, loop: LinearLoop, rows: PathSamples) -> ModeMatrice
     """Return the followers' law about each agent's state, in a few modes of the graph."""
     assert isinstance(parts.drive, Laws)
     count = len(rows.times)
-    more = MOMENTS + _STARTS - count
+    more = MOMENTS - count
     # Rows of one number, so that every path and every swarm is compiled once.
     full = (np.concatenate([part, np.repeat(part[-1:], more, axis=0)]) for part in rows)
     law = without_certificates(parts.drive.follower)

@@ -12,20 +12,15 @@ from echelon.agents.models.linearization import at_trim
 from echelon.core.digits import about, at_most
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
-from echelon.core.types import Array
-from echelon.core.words import Kind, Theorem, Verdict
+from echelon.core.words import Kind, Theorem
+from echelon.guarantees.local.local_certificate import local_certificate
 from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.closed_loop import LinearLoop, grounded_slowest, loop_of
-from echelon.guarantees.promises.frozen_laws import (
-    ModeMatrices,
-    frozen_of,
-    frozen_starts,
-    longest_step,
-)
+from echelon.guarantees.promises.frozen_laws import frozen_of
 from echelon.guarantees.promises.hypotheses import hypotheses, limits_line
 from echelon.guarantees.promises.leaders import leaders_of
-from echelon.guarantees.promises.modes import sampling_line, slowest_in_turns, turns_in_words
-from echelon.guarantees.promises.promise import Guarantee, Promises
+from echelon.guarantees.promises.modes import slowest_in_turns, turns_in_words
+from echelon.guarantees.promises.promise import Guarantee, Promises, unknown_in
 from echelon.guarantees.promises.region import (
     adjacent_slopes,
     certified_set,
@@ -35,6 +30,7 @@ from echelon.guarantees.promises.region import (
     starts_line,
     weaken,
 )
+from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.prepare import Prepared
 from echelon.simulation.step.settings import Settings
@@ -111,7 +107,7 @@ class MetricPromise(Guarantee):
     def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "MetricPromise":
         """Return what is guaranteed of prepared parts."""
         parts, states = prepared.parts, prepared.problem.states
-        leaders, loop = leaders_of(parts, states), loop_of(parts)
+        leaders, loop, known = leaders_of(parts, states), loop_of(parts), not unknown_in(parts)
         region = region_of(parts, settings, leaders)
         case = GuaranteeInputs(
             parts,
@@ -120,10 +116,12 @@ class MetricPromise(Guarantee):
             leaders,
             region.certificate,
             adjacent_slopes(parts) if at_trim(parts.model).kinks.any() else None,
+            local=local_certificate(prepared) if isinstance(parts.drive, Laws) else None,
+            known=known,
         )
         # What does not decay at the trim has nothing to lose elsewhere.
-        if loop.every and case.governed:
-            case = case._replace(frozen=frozen_of(parts, settings, loop, leaders, states))
+        if case.governed and case.local is not None and case.local.holds:
+            case = case._replace(frozen=frozen_of(parts, settings, loop, leaders))
         lines = list(hypotheses(case))
         region = weaken(parts, region, lines)
         certificate = region.certificate
@@ -147,34 +145,14 @@ class MetricPromise(Guarantee):
 
     def at(self, prepared: Prepared, settings: Sequence[Settings], brief: bool) -> Promises:
         """Yield the same from other starts: only what says something of these changes."""
-        case = self.case
-        if case.loop.every and case.governed and case.frozen is None:
-            # Nobody left the trim, and another seed may be what does.
-            yield from Guarantee.at(self, prepared, settings, brief)
-            return
         with precision("float64"):
             states = Starts(prepared.parts).of([each.seed for each in settings])
-            starts, decays = None, np.ones((len(states), 1), bool)
-            if case.frozen is not None:
-                starts = frozen_starts(prepared.parts, case.loop, case.frozen.path, states)
-                decays = starts.decaying(settings[0]).reshape(len(states), -1)
         for k, each in enumerate(settings):
-            there = case._replace(settings=each)
-            if case.frozen is not None and starts is not None:
-                size = len(starts.A) // len(states)
-                own = ModeMatrices(*(part[k * size : (k + 1) * size] for part in starts))
-                there = there._replace(frozen=case.frozen._replace(starts=own))
-            yield self._from(there, states[k], bool(decays[k].all()))
-
-    def _from(self, case: GuaranteeInputs, states: Array, decays: bool) -> "MetricPromise":
-        """Return the same from states (N, n), about which held steps decay or may not."""
-        lines = dict(self.hypotheses)
-        # The line tells of where they start only if steps grow there.
-        same = decays and lines[Hypothesis.SAMPLING].verdict is Verdict.HOLDS
-        if case.frozen is not None and case.smooth and not same:
-            lines[Hypothesis.SAMPLING] = sampling_line(case)
-        lines[Hypothesis.STARTS] = starts_line(case.parts, states, self.region, self.certified)
-        return dataclasses.replace(self, hypotheses=MappingProxyType(lines), case=case)
+            lines = dict(self.hypotheses)
+            parts = self.case.parts
+            lines[Hypothesis.STARTS] = starts_line(parts, states[k], self.region, self.certified)
+            case = self.case._replace(settings=each)
+            yield dataclasses.replace(self, hypotheses=MappingProxyType(lines), case=case)
 
     @property
     def governed(self) -> bool:
@@ -193,18 +171,26 @@ class MetricPromise(Guarantee):
             return None
         if self.region is not None:
             return self.region.rate
-        common, held = self.loop.common, self.loop.held_rate(self.case.settings)
-        rate = -self.loop.slowest if common is None else common.rate
-        return max(0.0, min(rate, held, -self.slowest_turn, -self.case.leaders_share))
+        return max(0.0, min(-self._slowest, -self.slowest_turn))
 
     @property
     def slowest(self) -> float | None:
         """The slowest mode near the trim, 1/s; None where the model bends there and has none."""
-        return max(self.loop.slowest, self.case.leaders_share) if self.linear else None
+        local = self.case.local
+        known = local is not None and local.radius is not None
+        return self._slowest if known and not self.hypotheses[Hypothesis.SMOOTH].fails else None
+
+    @property
+    def _slowest(self) -> float:
+        """The slowest mode of the steps that run, and of leaders that followers inherit, 1/s."""
+        local = self.case.local
+        rate = None if local is None else local.rate(self.case.settings.dt)
+        own = -math.inf if rate is None else -rate
+        return max(own, self.case.leaders_share)
 
     def longest_step(self, settings: Settings) -> float:
-        """Return the longest step (s) with which modes decay at the trim and wherever agents go."""
-        return longest_step(self.loop, self.case.frozen, settings)
+        """Return the longest step (s) with which modes decay at the trim."""
+        return self.loop.longest_step(settings)
 
     @property
     def condition(self) -> str:
@@ -213,7 +199,7 @@ class MetricPromise(Guarantee):
 
     def guarantee(self) -> str:
         """Return what is guaranteed near the trim, and what the region adds."""
-        if self.linear:
+        if self.region is None or self.case.smooth:
             text = "Local guarantee (linearization)" if self.promised else "By linearization"
             text += ": followers converge to their goals from "
             text += "sufficiently close starts, with the leader sufficiently close to the trim"

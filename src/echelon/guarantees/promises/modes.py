@@ -20,12 +20,11 @@ from echelon.core.rational import bisect
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded, vacuous
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem, amount
+from echelon.guarantees.local.local_certificate import LocalCertificate
+from echelon.guarantees.local.local_lines import local_lines
 from echelon.guarantees.promises.case import GuaranteeInputs
-from echelon.guarantees.promises.closed_loop import LinearLoop
-from echelon.guarantees.promises.frozen_laws import longest_step
 from echelon.laws.law import gain_of
 from echelon.simulation.engine.law_drive import Laws
-from echelon.synthesis.certificates.lmi import rate_of
 from echelon.synthesis.certificates.margins import detectability
 from echelon.synthesis.gains.gain import Gain
 
@@ -83,10 +82,7 @@ def turns_in_words(case: GuaranteeInputs) -> str:
 
 
 def slowest_in_turns(case: GuaranteeInputs) -> dict[float, float]:
-    """Return the slowest mode (1/s) in steady turns at the least and largest rate of the path.
-
-    Of graphs that take turns it is what the sum of all delta'P delta promises, halved (T8).
-    """
+    """Return the slowest mode (1/s) in steady turns at the least and largest rate of the path."""
     if not turns_with_heading(case):
         return {}
     rates = case.frozen.turns if case.frozen else ()
@@ -107,12 +103,7 @@ def slowest_in_turn(case: GuaranteeInputs, rate: float) -> float | None:
     gains = [loop.inner + strength * K for strength in loop.closed.strengths]
     own = gain_of(case.parts.drive.leader)
     gains += [] if own is None else [own.coupling * own.R_inverse @ B.T @ own.P]
-    slowest = float(np.linalg.eigvals(A - B @ np.array(gains)).real.max())
-    if case.parts.graph.schedule is None:
-        return slowest
-    # Decaying modes of each graph do not suffice; one sum that falls on all of them does.
-    felt = 2.0 * gain.coupling * case.parts.graph.spectrum().proved
-    return max(slowest, -rate_of(gain.P, (A - B @ loop.inner)[None], B, gain.R, felt))
+    return float(np.linalg.eigvals(A - B @ np.array(gains)).real.max())
 
 
 def steady_turn(model: ControlAffine, rate: float) -> tuple[Array, Array] | None:
@@ -169,31 +160,34 @@ def _fastest(case: GuaranteeInputs, rate: float) -> float:
 
 _LINEAR = Kind.LINEARIZATION
 _GROWS = "with the input held over the step `dt` the disagreement grows"
-_IN_TURNS = "on one of the graphs errors are multiplied by {} a step in the norm of P"
-_INTEGRATOR = "errors grow in steps of the integrator"
-_NO_SUM = "no sum of squares is known that decreases in held steps on all graphs"
-_UNDECIDED = "not every mode is shown to decay"
-_SUBSTEPS = (2, 5, 10, 20, 50, 100, 200, 500, 1000)
-_ON_PATH = "spectral radius {} a step along the leader's path"
-_AT_STARTS = "spectral radius {} a step where agents start"
 _NOT_STABLE = "the disagreement does not decay at the trim"
 _BENT = "the model is not differentiable at the trim and has no modes there"
 
 
 def modes(case: GuaranteeInputs) -> Iterator[Statement]:
     """Yield what a promise rests on near the trim, as the model has modes there or bends."""
-    yield from _linear(case) if case.smooth or not case.governed else _bent(case)
+    if case.local is None:
+        yield _no_law(case)
+    elif case.governed and not case.smooth:
+        yield from _bent(case)
+    else:
+        yield from _linear(case, case.local)
 
 
-def _linear(case: GuaranteeInputs) -> Iterator[Statement]:
-    yield _detectable(case)
-    yield _coupled(case)
-    yield _decaying(case)
+def _no_law(case: GuaranteeInputs) -> Statement:
+    text = f"no theorem covers `{type(case.parts.drive).__name__}`"
+    remedy = "use laws that a theorem covers"
+    name = Hypothesis.DISAGREEMENT_DECAY
+    return fails(name, _LINEAR, text, remedy=remedy, reason=text)
+
+
+def _linear(case: GuaranteeInputs, local: LocalCertificate) -> Iterator[Statement]:
+    if case.governed:
+        yield _detectable(case)
+        yield _coupled(case)
+    yield from local_lines(case.parts, case.settings, local)
     yield _along(case)
     yield from turning(case)
-    yield sampling_line(case)
-    if case.parts.graph.schedule is not None:
-        yield _taking_turns(case)
 
 
 # ---- where the model bends ----------------------------------------------------------------------
@@ -235,8 +229,6 @@ def _sampled_bend(case: GuaranteeInputs) -> Statement:
 
 def _detectable(case: GuaranteeInputs) -> Statement:
     model, loop, name = case.parts.model, case.loop, Hypothesis.DETECTABLE
-    if not case.governed:
-        return unneeded(name, _LINEAR, "the law has no P")
     rank, n = loop.certificate.observable, len(model.state_names)
     hidden = detectability(loop.linear.A, loop.linear.B.T @ loop.closed.P)
     number = rank, f"rank {rank} of {n}"
@@ -263,65 +255,10 @@ def _coupled(case: GuaranteeInputs) -> Statement:
     return fails(Hypothesis.COUPLING, Kind.PROOF, text, *number, remedy=remedy)
 
 
-def _decaying(case: GuaranteeInputs) -> Statement:
-    """Whether every mode of the network decays; `every` covers what lies between extremes."""
-    name, loop = Hypothesis.DISAGREEMENT_DECAY, case.loop
-    if not case.governed:
-        drive = case.parts.drive
-        text = f"no theorem covers `{type(drive).__name__}`"
-        remedy = "use laws that a theorem covers"
-        if isinstance(drive, Laws) and drive.metric(case.parts.model) is not None:
-            text = "the model's `difference` of two states that are close is not x - y"
-            remedy = "let `difference` wrap angles, and be x - y else"
-        elif isinstance(drive, Laws):
-            text, remedy = "the followers' law does not act on the disagreement", "use `consensus`"
-        return fails(name, _LINEAR, text, remedy=remedy, reason=text)
-    text = f"over {amount(loop.certificate.modes, 'eigenvalue')} of the graph"
-    if case.fed_by_parents:
-        text = "over the edges' weights, as parents' inputs are fed forward"
-    elif len(loop.closed.eigenvalues) > loop.certificate.modes:
-        text = f"at lambda_min and lambda_max{'; all between decay' if loop.every else ''}"
-    number = loop.slowest, f"{at_least(loop.slowest)} 1/s"
-    if loop.every:
-        return holds(name, _LINEAR, text, *number)
-    text = f"not every mode decays, {text}"
-    edge = loop.certificate.edge
-    remedy = "another gain, coupling or model"
-    remedy = remedy if edge is None else f"a coupling of {at_least(edge, 4)} or more"
-    reason = "the disagreement does not decay"
-    return fails(name, _LINEAR, text, *number, remedy=remedy, reason=reason)
-
-
-def _taking_turns(case: GuaranteeInputs) -> Statement:
-    """Stable modes of each do not say so; a sum of squares that falls on all of them does (T8)."""
-    name, loop = Hypothesis.SWITCHING, case.loop
-    edge, c, common = loop.certificate.edge, loop.closed.coupling, loop.common
-    if not case.governed:
-        text = "no theorem covers this law on switching graphs"
-        return fails(name, _LINEAR, text, remedy="use `consensus`", reason=text)
-    if _has_sum(loop) and common is not None:
-        text = "sum_i delta_i'P delta_i increases on no graph, whenever they switch"
-        rate = max(0.0, common.rate)
-        return holds(name, _LINEAR, text, rate, f"{at_most(rate)} 1/s")
-    text = "no one P is known that serves all graphs of the schedule"
-    remedy = "use the law `stopping-point`"
-    if edge is not None and not c >= edge:
-        remedy = f"raise `coupling` to {at_least(edge, 4)} or more, or {remedy}"
-    return fails(name, _LINEAR, text, remedy=remedy, reason=text)
-
-
-def _has_sum(loop: LinearLoop) -> bool:
-    """Tell whether a sum of squares is known that increases on no graph of a schedule."""
-    edge, common = loop.certificate.edge, loop.common
-    # At the edge the sum may only stay; what feels nothing then decays by detectability.
-    enough = edge is not None and loop.closed.coupling >= edge
-    return enough and common is not None and common.weakest > 0.0
-
-
 def _along(case: GuaranteeInputs) -> Statement:
     """Whether the laws are stable where the reference takes them, frozen there: no proof."""
     name, frozen = Hypothesis.ALONG_PATH, case.frozen
-    if not (case.loop.every and case.governed):
+    if frozen is None and not (case.governed and case.local and case.local.holds):
         return unneeded(name, Kind.SAMPLES, _NOT_STABLE)
     if frozen is None or not frozen.on_path:
         text = "the leader rests at the trim, or follows no path of its own"
@@ -337,59 +274,3 @@ def _along(case: GuaranteeInputs) -> Statement:
     text += f"{about(growth.when)} s, where {frozen.culprit} takes the law farthest from its trim"
     remedy = f"keep {frozen.culprit.partition(' ')[0]} nearer to the trim there"
     return fails(name, Kind.SAMPLES, text, *number, remedy=remedy, reason=text)
-
-
-def sampling_line(case: GuaranteeInputs) -> Statement:
-    """Whether it still decays in steps of the integrator that runs, with the input held."""
-    name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
-    if not (loop.every and case.governed):
-        return unneeded(name, _LINEAR, _NOT_STABLE, None, f"dt {settings.dt:g} s")
-    radius, printed = loop.radius(settings), settings.integrator == "printed"
-    goals = np.asarray(case.parts.model.trim[0], float) + case.parts.formation.offsets
-    if printed and goals.any():
-        text = "`printed` takes f + g u as the next state, which ignores the goals"
-        return _step_line(case, np.inf, text, "use `simulation.integrator: rk4`")
-    where = f"spectral radius {{}} a step, {loop.where}"
-    radii = {where: radius} | ({_IN_TURNS: loop.growth(settings)} if _has_sum(loop) else {})
-    if case.frozen and not printed:
-        radii |= zip((_ON_PATH, _AT_STARTS), case.frozen.radii(settings))
-    where = next((x for x, one in radii.items() if not one < 1.0), where)
-    text, reasons = where.format(at_least(radii[where], 4)), {_AT_STARTS: "", _IN_TURNS: _NO_SUM}
-    if printed:
-        return _step_line(case, radii[where], text, "use `simulation.integrator: rk4`")
-    exact = loop.radius(settings, exact=True)
-    if radii[where] < 1.0 <= exact:
-        # Exactly 1 stands for an interval of eigenvalues that are not all shown to decay.
-        what = f"the spectral radius is {at_least(exact, 4)} a step" if exact > 1.0 else _UNDECIDED
-        text = f"the integrator damps what the exact flow may not: there {what}"
-        reason = _GROWS if exact > 1.0 else f"in the exact flow {_UNDECIDED}"
-        return _step_line(case, exact, text, "shorten `simulation.dt`", reason)
-    if not radius < 1.0 and exact < 1.0:
-        text = f"the integrator, but not the exact flow, grows in such steps: {text}"
-        return _step_line(case, radius, text, _by_substeps(case), _INTEGRATOR)
-    # At the starts it lasts a moment, and a guarantee is for starts near the goals.
-    return _step_line(case, radii[where], text, "", reasons.get(where, _GROWS))
-
-
-def _by_substeps(case: GuaranteeInputs) -> str:
-    settings = case.settings
-    tried = (settings._replace(substeps=k) for k in _SUBSTEPS if k > settings.substeps)
-    enough = next((x.substeps for x in tried if case.loop.radius(x) < 1.0), None)
-    if enough is None:
-        return "shorten `simulation.dt`"
-    return f"set `simulation.substeps: {enough}`, or shorten `simulation.dt`"
-
-
-def _step_line(
-    case: GuaranteeInputs, radius: float, text: str, remedy: str, reason: str = _GROWS
-) -> Statement:
-    dt = case.settings.dt
-    number = radius, f"dt {dt:g} s"
-    if radius < 1.0:
-        return holds(Hypothesis.SAMPLING, _LINEAR, text, *number)
-    longest = 0.0 if remedy else longest_step(case.loop, case.frozen, case.settings)
-    if 0.0 < longest < dt:
-        text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
-        remedy = f"shorten `simulation.dt` below {at_most(longest)} s"
-    remedy = remedy or "another gain; no shorter `simulation.dt` is known to suffice"
-    return fails(Hypothesis.SAMPLING, _LINEAR, text, *number, remedy=remedy, reason=reason)

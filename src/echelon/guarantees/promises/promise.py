@@ -312,7 +312,7 @@ def prover_of(parts: Parts) -> type[Guarantee]:
     # By name, since a law is below all that is proved of it.
     module, _, name = law.prover.partition(":")
     if unknown_in(parts) and module.partition(".")[0] == "echelon":
-        module, name = "echelon.guarantees.promises.unknown_law", "UnknownLaw"
+        module, _, name = Law.prover.partition(":")
     return getattr(importlib.import_module(module), name)
 
 
