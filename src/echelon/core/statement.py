@@ -34,6 +34,7 @@ class Hypothesis(Word):
     STARTS = "starts in the certified set"
     SEPARATION = "distance between agents"
     LIMITS = "inputs within limits"
+    HELD = "set, inputs held"
     CLAIMS = "claims of the gain"
 
 
@@ -176,3 +177,22 @@ def vacuous(
 ) -> Statement:
     """Return the line of what has no meaning here."""
     return Statement(statement, Verdict.VACUOUS, kind, number, number_text, text)
+
+
+NO_LIMIT = "no input of any agent is at a limit"
+"""The condition of a claim that limits may break."""
+_WITHOUT_LIMITS = "see whether a run is covered, or set `simulation.limits: false`"
+
+
+def left_to_run(
+    statement: Line,
+    condition: str,
+    text: str,
+    number: float | None = None,
+    number_text: str = "",
+    remedy: str = _WITHOUT_LIMITS,
+    kind: Kind = Kind.PROOF,
+) -> Statement:
+    """Return the line of a claim that holds only under a condition that a run shows, and why."""
+    line = fails(statement, kind, text, number, number_text, remedy=remedy)
+    return dataclasses.replace(line, condition=condition)

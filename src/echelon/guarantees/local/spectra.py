@@ -122,7 +122,8 @@ def _eigenvalues(maps: Array) -> tuple[Array, float]:
     size = float(np.linalg.norm(worst))
     if len(worst) > _CONDITIONED:
         return values, _ROUGH * size
-    found, left, right = scipy.linalg.eig(worst, left=True, right=True)
+    eig: Any = scipy.linalg.eig
+    found, left, right = eig(worst, left=True, right=True)
     k = np.abs(found).argmax()
     along = float(np.abs(left[:, k].conj() @ right[:, k]))
     # A multiple eigenvalue without its vectors moves by a root of what is rounded.

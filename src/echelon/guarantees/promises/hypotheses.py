@@ -332,10 +332,6 @@ def _through(graph: Graph, event: Event, guarantee: Guarantee) -> JsonObject:
 
 # ---- limits of the inputs ------------------------------------------------------------------------
 
-UNBOUNDED = "nothing bounds the inputs of this law within their limits"
-_CONDITION = "no input of any agent is at a limit"
-_WITHOUT_LIMITS = "see whether a run is covered, or set `simulation.limits: false`"
-
 
 def limits_act(parts: Parts, settings: Settings) -> bool:
     """Tell whether an input of an agent may be at a limit, or at the least thrust of a motor."""
@@ -355,22 +351,3 @@ def other_limits(parts: Parts) -> bool:
     plants = {id(x): x for x in (world.plant_for(model), *world.plants.values())}
     own = type(model).limit, digest(model.input_limits)
     return any((type(x).limit, digest(x.input_limits)) != own for x in plants.values())
-
-
-def limits_line(parts: Parts, settings: Settings) -> Iterator[Statement]:
-    """Yield that nothing bounds the inputs, where they have limits."""
-    if limits_act(parts, settings):
-        yield left_to_run(UNBOUNDED)
-
-
-def left_to_run(
-    text: str,
-    number: float | None = None,
-    number_text: str = "",
-    remedy: str = _WITHOUT_LIMITS,
-    kind: Kind = Kind.PROOF,
-) -> Statement:
-    """Return the line of a claim that holds only while no input is at a limit, and why."""
-    shown = number, number_text
-    line = fails(Hypothesis.LIMITS, kind, text, *shown, remedy=remedy)
-    return dataclasses.replace(line, condition=_CONDITION)

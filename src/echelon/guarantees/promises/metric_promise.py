@@ -17,8 +17,9 @@ from echelon.guarantees.local.local_certificate import local_certificate
 from echelon.guarantees.promises.case import GuaranteeInputs
 from echelon.guarantees.promises.closed_loop import LinearLoop, grounded_slowest, loop_of
 from echelon.guarantees.promises.frozen_laws import frozen_of
-from echelon.guarantees.promises.hypotheses import hypotheses, limits_line
+from echelon.guarantees.promises.hypotheses import hypotheses
 from echelon.guarantees.promises.leaders import leaders_of
+from echelon.guarantees.promises.limits_in_set import held_line, limit_room
 from echelon.guarantees.promises.modes import slowest_in_turns, turns_in_words
 from echelon.guarantees.promises.promise import Guarantee, Promises, unknown_in
 from echelon.guarantees.promises.region import (
@@ -29,6 +30,7 @@ from echelon.guarantees.promises.region import (
     set_line,
     starts_line,
     weaken,
+    within,
 )
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts, Starts
@@ -126,10 +128,14 @@ class MetricPromise(Guarantee):
         region = weaken(parts, region, lines)
         certificate = region.certificate
         certified = certified_set(parts, settings, leaders, certificate)
+        if certificate is not None:
+            held = held_line(parts, settings, certificate)
+            room = limit_room(parts, settings, leaders, certificate)
+            lines += [room.line, *([] if held is None else [held])]
+            certified = within(certified, room.radius)
         lines += [region.line, set_line(certificate, certified)]
         lines += [starts_line(parts, states, certificate, certified)]
         lines += [claims_line(parts, loop, region.relayed)]
-        lines += limits_line(parts, settings) if certificate is not None else ()
         return cls(
             loop=loop,
             hypotheses=MappingProxyType({cast(Hypothesis, x.statement): x for x in lines}),

@@ -19,7 +19,7 @@ from echelon.core.digits import about, at_least, at_most
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
-from echelon.core.words import Feedforward, Kind, Theorem, Verdict
+from echelon.core.words import Estimation, Feedforward, Kind, Theorem, Verdict
 from echelon.guarantees.promises.leaders import Leaders, excursion, own_paths, own_run
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
@@ -82,7 +82,35 @@ def region_of(parts: Parts, settings: Settings, leaders: Leaders) -> Region:
     why = _INNER if gain.inner is not None else _not_the_law(parts, settings, leaders, certificate)
     if why[0]:
         return Region(None, certificate, _lost(*why))
+    other = _other_agents(parts)
+    if other:
+        return Region(
+            None, certificate, _lost(f"{certificate.theorem} is about {other}", _LEAVE_OUT)
+        )
+    if certificate.kind is Kind.PROOF and len(certificate.hull) > 1:
+        why_not = "the slopes of a corner are held over each step"
+        certificate = dataclasses.replace(certificate, kind=Kind.VERTICES, why=why_not)
     return Region(certificate, certificate, _line(parts, certificate))
+
+
+_LEAVE_OUT = "leave out of the world what differs from that"
+
+
+def _other_agents(parts: Parts) -> str:
+    """Return what a theorem is about, where the agents that run are others; empty where not."""
+    world = parts.world
+    if parts.drive.unknown or world.members is not None:
+        return "echelon's own laws and members of a step"
+    if world.plant is not None or world.plants:
+        return "agents that move as the model says"
+    if world.network is not None:
+        return "messages that arrive at once"
+    if world.actuator is not None and (world.actuator.lag or world.actuator.levels):
+        return "inputs that act at once"
+    sensing = world.sensing
+    if sensing is not None and (sensing.delay or sensing.estimator is not Estimation.NONE):
+        return "agents that know their states now"
+    return ""
 
 
 def _region_at_bend(parts: Parts, settings: Settings, leaders: Leaders, gain: Gain) -> Region:
@@ -318,6 +346,15 @@ def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> C
     text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {at_most(wide)}"
     text += f" less {at_least(away[j])} of the leader" if away.any() else ", leader at the trim"
     return CertifiedSet(float(shrink * radii[j]), kind, text)
+
+
+def within(certified: CertifiedSet | None, radius: float) -> CertifiedSet | None:
+    """Return a certified set that is no larger than one in which no limit of an input acts."""
+    if certified is None or certified.radius <= radius:
+        return certified
+    return certified._replace(
+        radius=radius, why="of sum_i delta_i'P delta_i <= r^2, limited by inputs"
+    )
 
 
 def _constant(parts: Parts, region: RegionCertificate) -> bool:

@@ -1,5 +1,6 @@
 """Whether the agents' motors suffice for the law, from the starts of a run (T5)."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -20,10 +21,17 @@ from echelon.core.rational import (
     root_bounds,
     round_up,
 )
-from echelon.core.statement import Hypothesis, Statement, holds, unneeded
+from echelon.core.statement import (
+    NO_LIMIT,
+    Hypothesis,
+    Statement,
+    holds,
+    left_to_run,
+    unneeded,
+)
 from echelon.core.types import Array
 from echelon.core.words import Kind
-from echelon.guarantees.promises.hypotheses import left_to_run, limits_act, other_limits
+from echelon.guarantees.promises.hypotheses import limits_act, other_limits
 from echelon.guarantees.stopping.chain_response import Chain, TimeSlice, slices_of
 from echelon.guarantees.stopping.flat_everywhere import airframe_fault
 from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
@@ -269,6 +277,9 @@ class _MotorCase(NamedTuple):
         return cls(frame, chain, demands, leader, speeds, base, starts)
 
 
+_at_limits = functools.partial(left_to_run, Hypothesis.LIMITS, NO_LIMIT)
+
+
 def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | None, Statement]:
     """Return the load of the motors of a run's agents, if they suffice, and its line.
 
@@ -277,13 +288,13 @@ def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | No
     frame, reason = _airframe(run)
     if frame is None:
         free = not limits_act(run.parts, run.settings)
-        return None, unneeded(Hypothesis.LIMITS, _PROOF, reason) if free else left_to_run(reason)
+        return None, unneeded(Hypothesis.LIMITS, _PROOF, reason) if free else _at_limits(reason)
     if other_limits(run.parts):
-        return None, left_to_run("the motors of an agent have other limits than the model's")
+        return None, _at_limits("the motors of an agent have other limits than the model's")
     kind = Kind.SAMPLES if is_by_user(run.parts.model, "airframe") else Kind.PROOF
     case = _MotorCase.of(run, frame)
     if brief and not _suffice_at_rest(frame, case.chain, case.base):
-        return None, left_to_run("the motors are not proved to suffice from any start", kind=kind)
+        return None, _at_limits("the motors are not proved to suffice from any start", kind=kind)
     motors, starts = _from(case)
     most = Fraction(frame.motor_thrust)
     number = None if motors.slope is None else float(motors.least), _thrust_text(motors)
@@ -292,7 +303,7 @@ def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | No
         text += f": {number[1]}" if number[1] else ", and the thrust is not proved to stay positive"
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
         remedy += "to the leader's velocity and attitude"
-        return None, left_to_run(text, *number, remedy, kind)
+        return None, _at_limits(text, *number, remedy, kind)
     ahead = _ahead(frame, run.ahead)
     load = MotorLoad(
         float_below(motors.least),
