@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from held_loops import growth
+from held_loops import radii
 from zoo_linear import Family, Finding, against, consensus_parts, feedback, silent
 
 import echelon as ech
@@ -84,7 +84,8 @@ def _before_and_after(rng: np.random.Generator) -> Finding:
         return silent(str(error))
     assert isinstance(parts.drive, ech.Laws) and parts.drive.gain is not None
     A, K = _slope_now(reader, closed), feedback(parts.drive.gain, B)
-    return against(answer, float(growth(A, B, K, lam).max()))
+    slowest = np.log(radii(A, B, K, lam, settings.dt).max()) / settings.dt
+    return against(answer, float(slowest))
 
 
 CHANGED: dict[str, Family] = {"changed numbers": changed_numbers}

@@ -1,7 +1,5 @@
 """Laws linearized along the leader's path: whether a gain of the trim works away from it."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -34,41 +32,6 @@ def test_a_yaw_that_loses_the_formation_is_not_promised_unless_the_law_turns(yaw
 @pytest.mark.parametrize("scenario", ["paper", "van-der-pol"])
 def test_no_bundled_scenario_that_flies_is_taken_its_promise(scenario):
     assert not line_of(ech.guarantee(*built(scenario))).fails
-
-
-def poles_at_the_steepest(parts, settings):
-    """The poles of the stiffest mode about the state of the path that is tilted most."""
-    model, gain = parts.model, parts.drive.gain
-    with jax.enable_x64(True):
-        times = jnp.linspace(0.0, settings.horizon, 2000)
-        path = np.asarray(parts.drive.reference_states(model, times))
-        x = jnp.asarray(path[np.abs(path[:, 6:8]).max(axis=1).argmax()])
-        thrust = model.mass * model.gravity / (jnp.cos(x[6]) * jnp.cos(x[7]))
-        u = jnp.zeros(4).at[0].set(thrust)
-        A = np.asarray(jax.jacfwd(lambda s: model.velocity(s, u))(x))
-        B = np.asarray(model.normalized_input_map(x))
-    felt = gain.coupling * np.linalg.solve(gain.R, B.T @ gain.P)
-    return np.linalg.eigvals(A - B @ (gain.inner + parts.graph.spectrum().high * felt))
-
-
-@pytest.mark.slow
-def test_the_longest_step_is_that_of_the_steepest_tilt():
-    parts, settings = built("paper", "follower.gain={method: inner-loop}")
-    steep = 2.0 / np.abs(poles_at_the_steepest(parts, settings)).max()
-    found = ech.guarantee(parts, settings)
-    assert found.longest_step(settings) == pytest.approx(steep, rel=0.1)
-    assert found.longest_step(settings) < 0.6 * found.loop.longest_step(settings)
-    too_long = settings._replace(dt=0.02)
-    line = line_of(ech.guarantee(parts, too_long), Hypothesis.SAMPLING)
-    assert line.fails and "along the leader's path" in line.text and "dt" in line.remedy
-
-
-def test_a_step_too_long_for_the_starts_alone_takes_no_promise_away():
-    changes = ["follower.gain={method: inner-loop}", "simulation.dt=0.01"]
-    changes += ["initial={states: {2: [1, 0.8, 1, 0, 0, 0, 0.9, 0, 0, 0, 0, 0]}}"]
-    found = ech.guarantee(*built("paper", *changes))
-    line = line_of(found, Hypothesis.SAMPLING)
-    assert found.promised and line.fails and "where agents start" in line.text
 
 
 @pytest.mark.parametrize("horizon", [0.1, 60.0, 6e4, 1e6, 1e9])

@@ -170,7 +170,8 @@ def test_a_gain_of_another_graph_or_coupling_is_promised_what_it_does():
     assert note in found.sentence()
     report = " ".join(ech.report(ech.simulate(parts, settings(horizon=0.02))).split())
     assert found.sentence() in report
-    assert f"slowest mode decays at {at_most(-slowest)} 1/s" in report
+    assert found.slowest == pytest.approx(slowest, rel=0.01)
+    assert f"slowest mode decays at {at_most(-found.slowest)} 1/s" in report
     # An edited coupling, too weak for a model that grows.
     model = ech.models.Linear(A=[[0.0, 1.0], [1.0, 0.0]], B=[[0.0], [1.0]])
     gain = ech.synthesize(model, PATH, ech.gains.Riccati())
@@ -194,7 +195,7 @@ def test_one_step_of_the_integrator_that_runs_decides():
         with np.errstate(over="ignore"):
             sizes = np.linalg.norm(result.errors, axis=(1, 2))
         assert bool(sizes[-40:].max() < sizes[:40].max()) is holds
-    assert found.hypotheses[Hypothesis.SAMPLING].number > 1.0
+    assert found.hypotheses[Hypothesis.DISAGREEMENT_DECAY].number > 0.0
     # The printed step keeps no offset.
     model, printed = (
         ech.models.Linear(A=[[-0.5]], B=[[1.0]]),
@@ -205,8 +206,7 @@ def test_one_step_of_the_integrator_that_runs_decides():
     parts = parts_of(model, pair, gain)
     assert ech.guarantee(parts, printed).promised
     away = parts.replace(formation=ech.Formation([[0.0], [1.0]]))
-    step = ech.guarantee(away, printed).hypotheses[Hypothesis.SAMPLING]
-    assert step.fails and "ignores the goals" in step.text
+    assert ech.guarantee(away, printed).hypotheses[Hypothesis.REST].fails
 
 
 @pytest.mark.slow
@@ -329,11 +329,11 @@ def test_the_relayed_velocity_has_no_local_theorem_where_g_varies():
 def test_agents_that_are_all_alike_agree_at_the_rate_of_the_whole_graph():
     built = ech.build(ech.load_scenario("integrators", ["simulation.horizon=30"]))
     found, L = ech.guarantee(*built), built.parts.graph.laplacian().toarray()
-    assert found.rate == pytest.approx(np.linalg.eigvalsh(L)[1])
+    # The input is held over steps of 0.01 s.
+    assert found.rate == pytest.approx(-np.log1p(-0.01 * np.linalg.eigvalsh(L)[1]) / 0.01)
     errors = np.linalg.norm(ech.simulate(*built).errors, axis=(1, 2))
     seen = -np.log(errors[-1] / errors[-200]) / (199 * 0.1)
-    # The input is held over steps of 0.01 s.
-    assert seen == pytest.approx(-np.log1p(-0.01 * found.rate) / 0.01, rel=1e-5)
+    assert seen == pytest.approx(found.rate, rel=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -392,6 +392,7 @@ def test_the_data_of_a_run_hold_the_whole_promise():
     assert told == ech.guarantee(parts, settings(horizon=0.1)).as_mapping()
     # These lines are there only for laws that turn, graphs that switch, motors, networks, ...
     apart = {Hypothesis.HEADING_FRAME, Hypothesis.SWITCHING, Hypothesis.LIMITS}
+    apart |= {Hypothesis.AGES, Hypothesis.HELD}
     apart |= {Hypothesis.MESSAGES, Hypothesis.OWN_STATE, Hypothesis.SEPARATION, Hypothesis.EVENTS}
     always = {h.value for h in Hypothesis if h not in apart}
     assert {each["statement"] for each in told["hypotheses"]} == always
@@ -676,8 +677,8 @@ def test_no_remedy_asks_for_a_step_of_zero_or_less(dt):
     for line in promise.hypotheses.values():
         for number in re.findall(r"(?:below|than|to) (-?[\d.e+-]*\d|inf|nan)", line.remedy):
             assert 0.0 < float(number) < np.inf, line.remedy
-    assert not promise.promised and "no one P is known" in promise.sentence()
-    assert "grows" not in promise.sentence()
+    # Nothing grows on either graph, and the last one decides.
+    assert promise.promised
 
 
 class Reversed(ech.models.DoubleIntegrator):
@@ -694,5 +695,4 @@ def test_a_difference_that_is_not_x_minus_y_leaves_nothing_guaranteed():
     result = ech.simulate(parts, settings())
     assert np.abs(result.errors[-1]).max() > 10.0 * np.abs(result.errors[0]).max()
     found = ech.guarantee(parts, settings())
-    assert not found.promised and found.slowest is None
-    assert "is not x - y" in found.sentence()
+    assert not found.promised and found.slowest > 1.0

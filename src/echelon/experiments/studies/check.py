@@ -10,7 +10,7 @@ from echelon.agents.models.linearization import trim_slopes
 from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import about, at_least, at_most
 from echelon.core.numerics import precision
-from echelon.core.statement import Hypothesis, Statement, Topic, fails, holds, unneeded, vacuous
+from echelon.core.statement import Statement, Topic, fails, holds, unneeded, vacuous
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import Feedforward, Kind, amount
 from echelon.experiments.studies.assumptions import drift_lines, graph_lines
@@ -49,7 +49,7 @@ def margin_lines(parts: Parts, promise: Guarantee) -> Iterator[Statement]:
         text = "the model is not smooth at the trim, and has no modes there"
         yield vacuous(Topic.MARGINS, _KIND, text)
         return
-    if promise.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails:
+    if not loop.every:
         yield unneeded(Topic.MARGINS, _KIND, "the loop is not stable")
         return
     stiffness = margins.stiffness(loop.closed)
@@ -75,15 +75,8 @@ def margin_lines(parts: Parts, promise: Guarantee) -> Iterator[Statement]:
 
 
 def _switching_lines(promise: Guarantee) -> Iterator[Statement]:
-    """Yield the margins for switching graphs: the smallest factor on the coupling (T8)."""
-    edge, lines = promise.edge, promise.hypotheses
-    anywhere = promise.agreement is not None
-    if not anywhere and edge is not None and not lines[Hypothesis.DISAGREEMENT_DECAY].fails:
-        low = edge / promise.loop.closed.coupling
-        what = "factors on the coupling for which one P serves all graphs, however they switch, in "
-        what += "continuous time"
-        yield holds(Topic.GAIN, _KIND, what, low, f"{at_least(low)} to inf")
-    text = "any coupling; " if anywhere else ""
+    """Yield that no margins are known of graphs that switch."""
+    text = "any coupling; " if promise.agreement is not None else ""
     text += "delay margins are known for one graph only, not for switching graphs"
     yield unneeded(Topic.MARGINS, _KIND, text)
 

@@ -62,6 +62,7 @@ class Fault(enum.StrEnum):
     WHOLE = "the step depends on whole numbers that it remembers"
     KINK = "the step is not differentiable where agents rest"
     LASTING = "the law reads a memory that nothing changes"
+    ADRIFT = "nothing drives a state to its goal"
     SWITCHES = "the graph has no period of whole steps"
     LARGE = "the formation is too large, and its agents are not alike"
     UNDECIDED = "rounding hides whether the slowest mode decays"
@@ -408,11 +409,14 @@ def _judged(rest: _Rest, goals: Array, period: int, names: tuple[str, ...]) -> L
     modes = modes_of(split, rest.is_state)
     exact = _exactly(rest, period)
     radius = modes.radius ** (1.0 / period)
-    faults = [Fault.LASTING] * bool(modes.lasting)
+    # A state that others read and nobody changes is not driven either.
+    still = [k for k in modes.lasting if rest.is_state[k]]
+    faults = [Fault.LASTING] * (len(modes.lasting) > len(still))
+    faults += [Fault.ADRIFT] * bool(still or modes.adrift)
     faults += [Fault.GROWS] * (radius >= 1.0)
     faults += [Fault.UNDECIDED] * (radius < 1.0 <= modes.worst)
     faults += [Fault.GROWS_EXACTLY] * (exact is not None and not exact < 1.0)
-    adrift = tuple(dict.fromkeys(names[states[k]] for k in modes.adrift))
+    adrift = tuple(dict.fromkeys(names[states[k]] for k in (*still, *modes.adrift)))
     growth = amplification(split, rest.is_state)
     return LocalCertificate(
         (*faults,),

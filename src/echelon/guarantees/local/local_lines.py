@@ -100,6 +100,11 @@ def _decays(parts: Parts, settings: Settings, local: LocalCertificate) -> Statem
         text = "the law acts by a memory that nothing changes"
         remedy = "let the law forget it, or act without it"
         return fails(name, _LINEAR, text, *number, remedy=remedy, reason=text)
+    if Fault.ADRIFT in local.faults:
+        names = ", ".join(f"`{each}`" for each in local.adrift)
+        text = f"nothing drives {names} to the goal"
+        remedy = "let the law act on them; of `consensus`, choose another P"
+        return fails(name, _LINEAR, text, *number, remedy=remedy, reason=text)
     if Fault.UNDECIDED in local.faults:
         text = f"rounding hides whether the slowest mode decays, {over}"
         remedy = "bring the units of states and inputs nearer to each other"
@@ -114,9 +119,6 @@ def _decays(parts: Parts, settings: Settings, local: LocalCertificate) -> Statem
     text = f"spectral radius {at_least(radius, 7)} a step, {over}"
     if local.growth is not None and local.growth > 1.0 + 1e-9:
         text += f"; before, they may grow {at_least(local.growth)} times"
-    if local.adrift:
-        names = ", ".join(f"`{each}`" for each in local.adrift)
-        text += f"; but nothing drives {names} to the goal"
     return holds(name, _LINEAR, text, *number)
 
 

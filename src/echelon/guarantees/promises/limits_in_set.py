@@ -189,7 +189,7 @@ def _held_flow(A: Array, dt: float) -> tuple[Array, Array]:
 
 
 def held_line(parts: Parts, settings: Settings, region: RegionCertificate) -> Statement | None:
-    """Return that a sum is known to fall without held inputs alone; None where it falls with them."""
+    """Return that a sum falls for inputs that are not held alone; None where it always does."""
     stays = stays_when_held(parts, settings, region)
     if stays:
         return None

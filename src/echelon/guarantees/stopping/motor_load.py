@@ -34,6 +34,7 @@ from echelon.core.words import Kind
 from echelon.guarantees.promises.hypotheses import limits_act, other_limits
 from echelon.guarantees.stopping.chain_response import Chain, TimeSlice, slices_of
 from echelon.guarantees.stopping.flat_everywhere import airframe_fault
+from echelon.guarantees.stopping.linear_load import linear_limits
 from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 from echelon.laws.stopping_point import StoppingLeader
@@ -287,8 +288,10 @@ def motor_load_of(run: StoppingRun, brief: bool = False) -> tuple[MotorLoad | No
     """
     frame, reason = _airframe(run)
     if frame is None:
-        free = not limits_act(run.parts, run.settings)
-        return None, unneeded(Hypothesis.LIMITS, _PROOF, reason) if free else _at_limits(reason)
+        if not limits_act(run.parts, run.settings):
+            return None, unneeded(Hypothesis.LIMITS, _PROOF, reason)
+        bounded = None if other_limits(run.parts) else linear_limits(run)
+        return None, bounded or _at_limits(reason)
     if other_limits(run.parts):
         return None, _at_limits("the motors of an agent have other limits than the model's")
     kind = Kind.SAMPLES if is_by_user(run.parts.model, "airframe") else Kind.PROOF

@@ -1,0 +1,105 @@
+"""What is asked of the inputs of agents that are linear in their flat coordinates (T5, T10).
+
+Such an input is u = u_0 + sum_k T_k y^(k), of motion and no place: a row of its limits is bounded
+by the tube of y', .., y^(r), term by term.
+"""
+
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.core.digits import about
+from echelon.core.jaxpr import used_leaves
+from echelon.core.numerics import precision
+from echelon.core.rational import float_above
+from echelon.core.statement import Hypothesis, Statement, holds
+from echelon.core.types import Array
+from echelon.core.words import Kind
+from echelon.guarantees.stopping.chain_response import slices_of
+from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
+from echelon.guarantees.stopping.stopping_run import StoppingRun
+
+_ROUNDED = Fraction(1, 10**6)
+"""Of a start in flat coordinates: a thousand times what floats leave of it."""
+_ZERO = Fraction(0)
+
+
+def linear_limits(run: StoppingRun) -> Statement | None:
+    """Return that no limit acts from the starts of a run; None where that is not shown."""
+    model = run.parts.model
+    limits, slopes = model.input_limits, _input_slopes(model)
+    own = type(model).limit is not ControlAffine.limit
+    if limits is None or slopes is None or own or run.parts.formation.motion is not None:
+        return None
+    trim, T = slopes
+    chains = run.law.ready.chains
+    pieces = pieces_of(run.leader, model, run.settings.horizon, chains.outputs, max(chains.degrees))
+    if T[0].any() or np.isinf([run.speed(k) for k in range(len(chains.outputs))]).any():
+        return None
+    G, low, high = (np.asarray(part, float) for part in limits)
+    worst, name = np.inf, ""
+    for row, least, most in zip(G, low, high, strict=True):
+        bottom, top = _range_of(run, pieces, trim @ row, np.einsum("kmi,m->ki", T, row))
+        room = min(float(most) - top, bottom - float(least))
+        if room < worst:
+            worst, name = room, model.input_names[int(np.abs(row).argmax())]
+    if not worst > 0.0:
+        return None
+    text = f"no limit acts from these starts; `{name}` keeps {about(worst)} of its unit"
+    return holds(Hypothesis.LIMITS, Kind.PROOF, text, worst, f"{about(worst)} left")
+
+
+def _input_slopes(model: ControlAffine) -> tuple[Array, Array] | None:
+    """Return u_0 (m,) and T (r + 1, m, outputs); None of an input that is not linear in them."""
+    if not model.flat_outputs:
+        return None
+    shape = model.flat_order + 1, len(model.flat_outputs)
+
+    def asked(derivatives: jax.Array) -> jax.Array:
+        return model.flat(derivatives)[1]
+
+    with precision("float64"):
+        slope = jax.jacfwd(asked)
+        if any(used_leaves(slope, jnp.zeros(shape))):
+            return None
+        T, u = np.asarray(slope(jnp.zeros(shape))), np.asarray(asked(jnp.zeros(shape)))
+    return u, np.moveaxis(T, 0, 1)
+
+
+def _range_of(run: StoppingRun, pieces: Pieces, at_rest: float, T: Array) -> tuple[float, float]:
+    """Return between what a row of limits stays, given its slopes T (r + 1, outputs)."""
+    chains, low, high = run.law.ready.chains, Fraction(float(at_rest)), Fraction(float(at_rest))
+    rows = pieces.between(_ZERO, None)
+    for k, degree in enumerate(chains.degrees):
+        pushes = _pushes(run, k, degree)
+        for order in range(1, degree + 1):
+            slope = Fraction(float(T[order, k])) if order < len(T) else _ZERO
+            if not slope:
+                continue
+            ends = [slope * end for row in rows for end in (row[order][k].lo, row[order][k].hi)]
+            low += min(ends) - abs(slope) * pushes[order - 1]
+            high += max(ends) + abs(slope) * pushes[order - 1]
+    return -float_above(-low), float_above(high)
+
+
+def _pushes(run: StoppingRun, output: int, degree: int) -> list[Fraction]:
+    """Return bounds of how far y', .., y^(r) of an output are off the path, in all time."""
+    graph, chain = run.parts.graph, run.chain(output)
+    leaders, followers = list(graph.leaders), list(graph.followers)
+    off = run.flat[leaders] - run.ahead
+    away = (run.flat - run.flat[list(graph.nearest_leader())])[followers]
+    total = [_ZERO] * degree
+    for starts, speed in ((off, run.own_speed(output)), (away, run.speed(output))):
+        sizes = [
+            Fraction(float(np.abs(starts[:, j, output]).max())) + _ROUNDED for j in range(1, degree)
+        ]
+        most = Fraction(speed)
+        for order in range(degree):
+            if not chain.powers:
+                total[order] += most
+                continue
+            total[order] += max(p.whole.of(order, sizes, most) for p in slices_of(chain))
+    return total

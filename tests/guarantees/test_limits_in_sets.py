@@ -1,0 +1,131 @@
+"""Limits of inputs inside certified sets: no input passes its limit from inside, and none is wasted."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import echelon as ech
+from echelon.core.statement import Hypothesis
+from echelon.core.words import GuaranteeVerdict
+
+SETTINGS = ech.Settings(horizon=4.0, dt=0.01)
+
+
+class Cart(ech.models.DoubleIntegrator):
+    """A double integrator whose inputs have limits."""
+
+    most: float = 1.0
+
+    @property
+    def input_limits(self):
+        m = len(self.input_names)
+        return ech.models.Limits(np.eye(m), (-self.most,) * m, (self.most,) * m)
+
+
+WIDE = {"position": 90.0, "velocity": 90.0}
+
+
+def parts_of(model, graph, **more):
+    gain = ech.synthesize(model, graph, ech.gains.RobustLQR(domain=WIDE))
+    laws = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    return ech.Parts(model, graph, ech.Formation.line(model, graph), laws, **more), gain
+
+
+def on_the_border(parts, gain, radius, seed):
+    """Starts (N, n) with sum of delta'P delta = radius^2, all in one direction or at random."""
+    graph, rng = parts.graph, np.random.default_rng(seed)
+    delta = rng.standard_normal(parts.formation.offsets.shape)
+    delta[list(graph.leaders)] = 0.0
+    size = np.sqrt(np.einsum("ia,ab,ib->", delta, gain.P, delta))
+    return parts.formation.offsets + radius / size * delta
+
+
+@pytest.mark.parametrize("directed", [False, True])
+def test_no_input_passes_its_limit_from_the_border_of_the_set(directed):
+    model, graph = Cart(dimension=2), ech.Graph.path(4, directed=directed)
+    parts, gain = parts_of(model, graph)
+    found = ech.guarantee(parts, SETTINGS)
+    assert found.verdict is GuaranteeVerdict.GUARANTEED, found.sentence()
+    radius = found.certified.radius
+    assert not found.hypotheses[Hypothesis.LIMITS].fails and 0.0 < radius < np.inf
+    # The worst start of one follower's input, by hand: delta = r Omega^-1 a / |a|.
+    L = np.asarray(graph.laplacian().toarray())[1:, 1:]
+    B = np.kron(np.array([[0.0], [1.0]]), np.eye(2))
+    K = gain.coupling * gain.R_inverse @ B.T @ gain.P
+    back = np.linalg.inv(np.kron(np.eye(3), gain.P))
+    most = 0.0
+    for j in range(3):
+        for row in np.kron(L[j], K):
+            worst = back @ row * radius / np.sqrt(row @ back @ row)
+            most = max(most, abs(row @ worst))
+            starts = parts.formation.offsets.copy()
+            starts[1:] += worst.reshape(3, 4)
+            result = ech.simulate(parts.replace(initial=starts), SETTINGS)
+            assert result.saturated.max() == 0.0
+    assert most <= 1.0 + 1e-9
+    # On an undirected graph the border is where the first input reaches its limit.
+    assert directed or most == pytest.approx(1.0, rel=1e-6)
+
+
+def test_a_leader_at_its_limit_leaves_no_set_and_a_limit_of_ones_own_no_guarantee():
+    class Own(Cart):
+        def limit(self, u):
+            return jnp.clip(u, -self.most, self.most)
+
+    graph = ech.Graph.path(3)
+    found = ech.guarantee(parts_of(Own(dimension=2), graph)[0], SETTINGS)
+    assert found.verdict is GuaranteeVerdict.CONDITIONAL
+    parts, gain = parts_of(Cart(dimension=2, most=0.3), graph)
+    circle = ech.references.Circle(radius=1.0, rate=1.0)
+    leader = ech.laws.Tracking(reference=circle)
+    parts = parts.replace(drive=ech.Laws(leader, parts.drive.follower))
+    found = ech.guarantee(parts, SETTINGS)
+    assert found.verdict is GuaranteeVerdict.CONDITIONAL
+    assert "limit" in found.hypotheses[Hypothesis.LIMITS].text
+
+
+def test_held_inputs_may_raise_what_falls_in_continuous_time():
+    parts, gain = parts_of(ech.models.DoubleIntegrator(dimension=1), ech.Graph.path(3))
+    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    L = np.asarray(parts.graph.laplacian().toarray())[1:, 1:]
+    root = np.linalg.cholesky(np.kron(np.eye(2), gain.P)).T
+
+    def norm_and_radius(dt):
+        block = np.zeros((3, 3))
+        block[:2, :2], block[:2, 2:] = A, B
+        flow = scipy.linalg.expm(block * dt)
+        K = gain.coupling * gain.R_inverse @ B.T @ gain.P
+        M = np.kron(np.eye(2), flow[:2, :2]) - np.kron(L, flow[:2, 2:] @ K)
+        return np.linalg.norm(root @ M @ np.linalg.inv(root), 2), np.abs(np.linalg.eigvals(M)).max()
+
+    low, high = 0.1, 0.3
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if norm_and_radius(middle)[0] < 1.0 else (low, middle)
+    # Just beyond, errors still end, and the sum that is proved to fall rises at first.
+    for dt, falls in ((0.9 * low, True), (low * (1.0 + 1e-4), False)):
+        norm, radius = norm_and_radius(dt)
+        assert radius < 1.0 and (norm <= 1.0) is falls
+        found = ech.guarantee(parts, ech.Settings(horizon=10 * dt, dt=dt))
+        assert found.claimed and (found.verdict is GuaranteeVerdict.GUARANTEED) is falls
+        assert falls or found.conditions == ("inputs act at every instant",)
+
+
+def test_a_linear_chain_keeps_its_limits_in_the_tube():
+    graph = ech.Graph.path(3)
+    circle = ech.references.Circle(radius=0.5, rate=0.2)
+    laws = ech.Laws(ech.laws.StoppingLeader(reference=circle), ech.laws.StoppingPoint())
+    said = dict[float, bool]()
+    for most in (0.05, 50.0):
+        model = Cart(dimension=2, most=most)
+        formation = ech.Formation.line(model, graph)
+        parts = ech.Parts(model, graph, formation, laws, initial={"position": 1.0})
+        found = ech.guarantee(parts, SETTINGS)
+        said[most] = found.verdict is GuaranteeVerdict.GUARANTEED
+        result = ech.simulate(parts, SETTINGS)
+        assert not said[most] or result.saturated.max() == 0.0
+        largest = float(np.abs(result.inputs).max())
+        number = found.hypotheses[Hypothesis.LIMITS].number
+        assert not said[most] or (number is not None and largest <= most - number + 1e-9)
+    assert said == {0.05: False, 50.0: True}
