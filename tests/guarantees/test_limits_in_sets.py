@@ -1,4 +1,4 @@
-"""Limits of inputs inside certified sets: no input passes its limit from inside, and none is wasted."""
+"""Limits of inputs inside certified sets: from inside no input passes its limit."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -106,7 +106,7 @@ def test_held_inputs_may_raise_what_falls_in_continuous_time():
     # Just beyond, errors still end, and the sum that is proved to fall rises at first.
     for dt, falls in ((0.9 * low, True), (low * (1.0 + 1e-4), False)):
         norm, radius = norm_and_radius(dt)
-        assert radius < 1.0 and (norm <= 1.0) is falls
+        assert radius < 1.0 and bool(norm <= 1.0) is falls
         found = ech.guarantee(parts, ech.Settings(horizon=10 * dt, dt=dt))
         assert found.claimed and (found.verdict is GuaranteeVerdict.GUARANTEED) is falls
         assert falls or found.conditions == ("inputs act at every instant",)

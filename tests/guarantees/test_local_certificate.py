@@ -164,7 +164,7 @@ def test_what_a_law_remembers_and_how_it_bends_decides(kind, fault):
 def test_an_integral_is_part_of_the_loop(rate):
     dt, L = SETTINGS.dt, grounded(ech.Graph.path(3))
     # s = (x, area): area+ = area + dt z, x+ = x - dt (z + rate area+).
-    one, none = np.eye(2), np.zeros((2, 2))
+    one = np.eye(2)
     W = np.block([[one - dt * (1.0 + rate * dt) * L, -dt * rate * one], [dt * L, one]])
     found = certificate(POINT, ech.Graph.path(3), Remembering("integral", rate))
     assert found.radius == pytest.approx(radius(W), rel=1e-12)

@@ -88,7 +88,7 @@ def test_what_is_said_of_a_law_of_ones_own_is_what_it_does(name):
     longer = SETTINGS._replace(horizon=20.0)
     result = ech.simulate(parts, longer)
     errors = np.abs(result.errors[[0, -1]]).max(axis=(1, 2))
-    assert bool(errors[1] < 1e-3 * errors[0]) is HELD[name]
+    assert bool(errors[1] < 0.05 * errors[0]) is HELD[name]
     if HELD[name]:
         late = np.abs(result.errors[[-100, -1]]).max(axis=(1, 2))
         seen = np.log(late[0] / late[1]) / (99 * SETTINGS.dt)

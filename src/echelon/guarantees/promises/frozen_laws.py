@@ -278,7 +278,13 @@ class FrozenLaws(NamedTuple):
 def frozen_of(
     parts: Parts, settings: Settings, loop: LinearLoop, leaders: Leaders
 ) -> FrozenLaws | None:
-    """Return the laws of prepared parts frozen along the leader's path; None without a path."""
+    """Return the laws of prepared parts frozen along the leader's path.
+
+    None without a path, and of a law that remembers something.
+    """
+    assert isinstance(parts.drive, Laws)
+    if jax.tree.leaves(parts.drive.follower.init()):
+        return None
     path = leader_run_of(parts, settings, leaders)
     if not len(path.times):
         return None

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 
+from echelon.agents.models.declarations import is_by_user
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import about, at_least
@@ -46,17 +47,16 @@ def limit_room(
 ) -> LimitRoom:
     """Return in how large a set of a region's metric no input of a follower is at a limit."""
     name, kind = Hypothesis.LIMITS, Kind.PROOF
-    plants = [parts.world.plants.get(k) or parts.world.plant_for(parts.model) for k in _led(parts)]
-    if not (settings.limits and any(plant.input_limits is not None for plant in plants)):
+    if not settings.limits or parts.model.input_limits is None:
         return LimitRoom(np.inf, unneeded(name, kind, "the inputs have no limits"))
-    unbounded = _unbounded(parts, plants, leaders, region)
+    unbounded = _unbounded(parts, leaders, region)
     if unbounded:
         return LimitRoom(np.inf, _at_limits(unbounded))
     led = _leaders_inputs(parts, settings, leaders)
     if led is None:
         return LimitRoom(0.0, _at_limits("the leader alone diverges"))
-    rows = {id(plant): _rooms(plant, parts, led) for plant in plants}
-    least, what = min((room, row) for found in rows.values() for room, row in found)
+    rooms = _rooms(parts.model, led)
+    least, what = min(rooms)
     kind = kind if leaders.rest else Kind.SAMPLES
     if not least > 0.0:
         text = f"the leader itself takes {what} to a limit"
@@ -65,7 +65,7 @@ def limit_room(
     if region.theorem is Theorem.T2:
         text = f"{what} has {about(least)} of its unit left where the leader is"
         return LimitRoom(np.inf, holds(name, kind, text, least, f"{about(least)} left"))
-    radius = min(_radius(parts, plant, led, j) for j, plant in enumerate(plants))
+    radius = _radius(parts, np.array([room for room, _ in rooms]))
     text = f"no limit acts within {about(radius)} of the goals, in the metric of P"
     return LimitRoom(radius, holds(name, kind, text, radius, f"radius {about(radius)}"))
 
@@ -73,18 +73,11 @@ def limit_room(
 _at_limits = functools.partial(left_to_run, Hypothesis.LIMITS, NO_LIMIT)
 
 
-def _led(parts: Parts) -> list[int]:
-    return list(parts.graph.followers)
-
-
-def _unbounded(
-    parts: Parts, plants: list[ControlAffine], leaders: Leaders, region: RegionCertificate
-) -> str:
+def _unbounded(parts: Parts, leaders: Leaders, region: RegionCertificate) -> str:
     """Return why rows of limits say nothing of a set; empty where they do."""
-    own = next((x for x in plants if type(x).limit is not ControlAffine.limit), None)
     actuator = parts.world.actuator
-    if own is not None:
-        return f"`{type(own).__name__}` has a `limit` of its own, which no rows describe"
+    if is_by_user(parts.model, "limit"):
+        return f"`{type(parts.model).__name__}` has a `limit` of its own, which no rows describe"
     if actuator is not None and actuator.minimum is not None:
         return "the motors have a least thrust"
     if leaders.answer:
@@ -104,35 +97,29 @@ def _leaders_inputs(parts: Parts, settings: Settings, leaders: Leaders) -> Array
     return run.inputs[:, : len(leaders.starts)].reshape(-1, run.inputs.shape[2])
 
 
-def _rooms(plant: ControlAffine, parts: Parts, led: Array) -> list[tuple[float, str]]:
-    """Return how far each row of a plant's limits is from what leaders do, and its input."""
-    assert plant.input_limits is not None
-    G, low, high = (np.asarray(part, float) for part in plant.input_limits)
+def _rooms(model: ControlAffine, led: Array) -> list[tuple[float, str]]:
+    """Return how far each row of the limits is from what leaders do, and its input."""
+    assert model.input_limits is not None
+    G, low, high = (np.asarray(part, float) for part in model.input_limits)
     rows = led @ G.T
     room = np.minimum((high - rows).min(axis=0), (rows - low).min(axis=0))
-    names = [f"`{parts.model.input_names[int(np.abs(row).argmax())]}`" for row in G]
+    names = [f"`{model.input_names[int(np.abs(row).argmax())]}`" for row in G]
     return [*zip(room.tolist(), names, strict=True)]
 
 
-def _radius(parts: Parts, plant: ControlAffine, led: Array, follower: int) -> float:
-    """Return r of the set in which no limit of one follower's plant acts."""
-    if plant.input_limits is None:
-        return np.inf
-    gain = parts.drive.gain
-    assert isinstance(gain, Gain)
-    model, spectrum, c = parts.model, parts.graph.spectrum(), gain.coupling
-    w = np.ones(len(parts.graph.followers)) if spectrum.sums is None else spectrum.sums
-    L = sp.csr_array(parts.graph.grounded_laplacian())[[follower]].toarray()[0]
-    S, B = np.asarray(model.input_scale, float), linearize(model).B
-    h = np.asarray(plant.input_limits.matrix, float) @ S
-    q = gain.P @ B @ gain.R_inverse @ h.T
-    inner = np.zeros((B.shape[1], len(B))) if gain.inner is None else gain.inner
-    p, back = -inner.T @ h.T, np.linalg.inv(gain.P)
-    felt = float((L**2 / w).sum())
-    size = c**2 * felt * _form(q, back, q) - 2.0 * c * L[follower] / w[follower] * _form(q, back, p)
-    size = size + _form(p, back, p) / w[follower]
-    rooms = np.array([room for room, _ in _rooms(plant, parts, led)])
-    size = np.sqrt(np.maximum(size, 0.0) * w.max())
+def _radius(parts: Parts, rooms: Array) -> float:
+    """Return r of the set in which no limit of a follower acts, with rooms (R,) of the rows."""
+    gain, model, spectrum = parts.drive.gain, parts.model, parts.graph.spectrum()
+    assert isinstance(gain, Gain) and model.input_limits is not None
+    L, B = sp.csr_array(parts.graph.grounded_laplacian()), linearize(model).B
+    w = np.ones(L.shape[0]) if spectrum.sums is None else spectrum.sums
+    h = np.asarray(model.input_limits.matrix, float) @ np.asarray(model.input_scale, float)
+    back, q = np.linalg.inv(gain.P), gain.coupling * gain.P @ B @ gain.R_inverse @ h.T
+    p = np.zeros_like(q) if gain.inner is None else -gain.inner.T @ h.T
+    # |a|^2 of each follower (rows) and each row of the limits (columns).
+    felt, own = L.power(2) @ (1.0 / w), L.diagonal() / w
+    size = felt[:, None] * _form(q, back, q) - 2.0 * own[:, None] * _form(q, back, p)
+    size = np.sqrt(np.maximum(size + _form(p, back, p) / w[:, None], 0.0) * w.max())
     with np.errstate(divide="ignore"):
         return float(np.where(size > 0.0, rooms / size, np.inf).min()) * (1.0 - 1e-9)
 
@@ -188,13 +175,13 @@ def _held_flow(A: Array, dt: float) -> tuple[Array, Array]:
     return flow[:, :n, :n], flow[:, :n, n:]
 
 
-def held_line(parts: Parts, settings: Settings, region: RegionCertificate) -> Statement | None:
-    """Return that a sum falls for inputs that are not held alone; None where it always does."""
+def held_line(parts: Parts, settings: Settings, region: RegionCertificate) -> Statement:
+    """Return whether the sum of a theorem, which is of continuous time, falls in held steps too."""
+    name, kind, dt = Hypothesis.HELD, Kind.VERTICES, f"{at_least(1e3 * settings.dt)} ms"
     stays = stays_when_held(parts, settings, region)
     if stays:
-        return None
-    text = "the sum of delta'P delta is known to fall if inputs act at every instant"
-    text += f", and not if they are held for {at_least(1e3 * settings.dt)} ms"
-    remedy = "shorten `simulation.dt`, or lower the gain"
-    condition = "inputs act at every instant"
-    return left_to_run(Hypothesis.HELD, condition, text, remedy=remedy, kind=Kind.VERTICES)
+        text = "the sum of delta'P delta falls in held steps too, at each corner of the slopes"
+        return holds(name, kind, text, settings.dt, dt)
+    text = f"the sum of delta'P delta is not known to fall if inputs are held for {dt}"
+    remedy, condition = "shorten `simulation.dt`, or lower the gain", "inputs act at every instant"
+    return left_to_run(name, condition, text, settings.dt, dt, remedy, kind)

@@ -122,16 +122,15 @@ class MetricPromise(Guarantee):
             known=known,
         )
         # What does not decay at the trim has nothing to lose elsewhere.
-        if case.governed and case.local is not None and case.local.holds:
+        if case.local is not None and case.local.holds:
             case = case._replace(frozen=frozen_of(parts, settings, loop, leaders))
         lines = list(hypotheses(case))
         region = weaken(parts, region, lines)
         certificate = region.certificate
         certified = certified_set(parts, settings, leaders, certificate)
         if certificate is not None:
-            held = held_line(parts, settings, certificate)
             room = limit_room(parts, settings, leaders, certificate)
-            lines += [room.line, *([] if held is None else [held])]
+            lines += [room.line, held_line(parts, settings, certificate)]
             certified = within(certified, room.radius)
         lines += [region.line, set_line(certificate, certified)]
         lines += [starts_line(parts, states, certificate, certified)]

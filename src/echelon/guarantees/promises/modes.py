@@ -258,10 +258,10 @@ def _coupled(case: GuaranteeInputs) -> Statement:
 def _along(case: GuaranteeInputs) -> Statement:
     """Whether the laws are stable where the reference takes them, frozen there: no proof."""
     name, frozen = Hypothesis.ALONG_PATH, case.frozen
-    if frozen is None and not (case.governed and case.local and case.local.holds):
+    if case.local is None or not case.local.holds:
         return unneeded(name, Kind.SAMPLES, _NOT_STABLE)
     if frozen is None or not frozen.on_path:
-        text = "the leader rests at the trim, or follows no path of its own"
+        text = "the leader rests at the trim or follows no path, or the law remembers something"
         return unneeded(name, Kind.SAMPLES, text)
     growth, states = frozen.growth(), len(frozen.times)
     number = growth.rate, f"{at_least(growth.rate)} 1/s"

@@ -87,9 +87,6 @@ def region_of(parts: Parts, settings: Settings, leaders: Leaders) -> Region:
         return Region(
             None, certificate, _lost(f"{certificate.theorem} is about {other}", _LEAVE_OUT)
         )
-    if certificate.kind is Kind.PROOF and len(certificate.hull) > 1:
-        why_not = "the slopes of a corner are held over each step"
-        certificate = dataclasses.replace(certificate, kind=Kind.VERTICES, why=why_not)
     return Region(certificate, certificate, _line(parts, certificate))
 
 

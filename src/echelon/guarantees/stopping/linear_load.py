@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.agents.models.declarations import is_by_user
 from echelon.agents.models.model import ControlAffine
 from echelon.core.digits import about
 from echelon.core.jaxpr import used_leaves
@@ -31,7 +32,7 @@ def linear_limits(run: StoppingRun) -> Statement | None:
     """Return that no limit acts from the starts of a run; None where that is not shown."""
     model = run.parts.model
     limits, slopes = model.input_limits, _input_slopes(model)
-    own = type(model).limit is not ControlAffine.limit
+    own = is_by_user(model, "limit")
     if limits is None or slopes is None or own or run.parts.formation.motion is not None:
         return None
     trim, T = slopes
