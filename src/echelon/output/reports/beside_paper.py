@@ -1,0 +1,95 @@
+"""The errors of runs beside the paper's Table II, over its 10 s and by its measure."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from echelon.experiments.results.table_two import (
+    HORIZON,
+    PRINTED,
+    SAMPLES,
+    TableTwo,
+    missing,
+    table_two,
+)
+from echelon.simulation.engine.result import Result
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+ROUNDING = (
+    "The paper's followers' errors of 1e-17 m are rounding of constant offsets, not errors of a "
+    "closed loop: all its samples are multiples of 2^-53."
+)
+_MEASURES = (
+    "The paper's followers have errors of distances between agents, ours stand above them. Vectors, "
+    "from each follower to its goal, are the stricter measure, which the paper does not print."
+)
+
+
+def print_beside_paper(console: "Console", runs: Mapping[str, Result], name: str) -> None:
+    """Print the errors of some runs over the paper's 10 s above the paper's, a row each.
+
+    Args:
+        console: of rich.
+        runs: by their labels.
+        name: of the scenario.
+    """
+    from rich import box
+    from rich.table import Table
+
+    found = {label: table_two(run) for label, run in runs.items()}
+    known = [errors for errors in found.values() if errors is not None]
+    if not known:
+        return
+    title = f"{name} beside the paper's Table II: RMSE of the first {HORIZON:g} s, m"
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    width = max(len(f"printed, {method}") for method in PRINTED)
+    table.add_column("", no_wrap=True, min_width=width)
+    for column in _columns(known[0]):
+        table.add_column(column, justify="right", overflow="fold")
+    for label, errors in found.items():
+        table.add_row(label, *_cells(errors))
+    table.add_section()
+    for method, values in PRINTED.items():
+        table.add_row(f"printed, {method}", *(f"{value:.4g}" for value in values))
+    console.print(table)
+
+
+def remarks(runs: Sequence[Result]) -> Iterator[str]:
+    """Yield how the errors of runs compare with the paper's, in sentences."""
+    found = [errors for errors in map(table_two, runs) if errors is not None]
+    if not found:
+        for reason in [reason for reason in map(missing, runs) if reason][:1]:
+            yield f"Nothing stands beside the paper's Table II, which is of {HORIZON:g} s: {reason}."
+        return
+    yield _over(found[0])
+    yield _MEASURES
+    yield ROUNDING
+
+
+def _over(errors: TableTwo) -> str:
+    if errors.every:
+        text = f"The errors beside the paper's are over all {errors.frames} steps"
+    else:
+        text = (
+            f"The errors beside the paper's are over {errors.frames} stored frames, not over all "
+            "steps (`simulation.store_every: 1`)"
+        )
+    if errors.sampled is None:
+        return f"{text}."
+    return f"{text}; at the paper's {SAMPLES} samples the leader's is {errors.sampled:.3g} m."
+
+
+def _columns(errors: TableTwo) -> Iterator[str]:
+    yield "leader"
+    followers = range(1, len(errors.distances) + 1)
+    for k, other in zip(followers, errors.measured, strict=True):
+        yield f"distance\nF{k} to {f'F{other}' if other else 'L'}"
+    yield from (f"vector\nF{k}" for k in followers)
+
+
+def _cells(errors: TableTwo | None) -> Iterator[str]:
+    if errors is None:
+        return
+    for value in (errors.leader, *errors.distances, *errors.vectors):
+        yield "-" if value is None else f"{value:.4g}"
