@@ -17,12 +17,17 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 ROUNDING = (
-    "The paper's followers' errors of 1e-17 m are rounding of constant offsets, not errors of a "
-    "closed loop: all its samples are multiples of 2^-53."
+    "The paper's 1e-17 m is the rounding of constant offsets, not an error of a closed loop: all its "
+    "samples are multiples of 2^-53."
 )
 _MEASURES = (
-    "The paper's followers have errors of distances between agents, ours stand above them. Vectors, "
-    "from each follower to its goal, are the stricter measure, which the paper does not print."
+    "The paper's errors of followers are of distances between agents, and stand below ours. The "
+    "vector from each follower to its goal is stricter, and not in the paper."
+)
+_PLANS = "OptimalTracking"
+_LEADER = (
+    "The paper's leader follows a plan of least tracking error: `leader.law: optimal-tracking` does "
+    "the same, also in `echelon compare paper`."
 )
 
 
@@ -62,22 +67,24 @@ def remarks(runs: Sequence[Result]) -> Iterator[str]:
         for reason in [reason for reason in map(missing, runs) if reason][:1]:
             yield f"Nothing stands beside the paper's Table II, which is of {HORIZON:g} s: {reason}."
         return
-    yield _over(found[0])
+    yield _over(found)
+    if not any(getattr(run.drive, "leader", None).__class__.__name__ == _PLANS for run in runs):
+        yield _LEADER
     yield _MEASURES
     yield ROUNDING
 
 
-def _over(errors: TableTwo) -> str:
-    if errors.every:
-        text = f"The errors beside the paper's are over all {errors.frames} steps"
-    else:
+def _over(found: Sequence[TableTwo]) -> str:
+    errors = found[0]
+    text = f"The errors beside the paper's are over all {errors.frames} steps"
+    if not errors.every:
         text = (
-            f"The errors beside the paper's are over {errors.frames} stored frames, not over all "
-            "steps (`simulation.store_every: 1`)"
+            f"The errors beside the paper's are over {errors.frames} stored frames; "
+            "`simulation.store_every: 1` stores all steps"
         )
-    if errors.sampled is None:
+    if len(found) > 1 or errors.sampled is None:
         return f"{text}."
-    return f"{text}; at the paper's {SAMPLES} samples the leader's is {errors.sampled:.3g} m."
+    return f"{text}. At the paper's {SAMPLES} samples the leader's is {errors.sampled:.3g} m."
 
 
 def _columns(errors: TableTwo) -> Iterator[str]:
