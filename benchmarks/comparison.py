@@ -61,7 +61,9 @@ def compared(title: str, changes: Sequence[str]) -> Iterator[str]:
     found = ech.compare(scenario)
     rows = [cells(row) for row in found.rows]
     for name, values in PRINTED.items():
-        rows.append([f"printed, {name}", *(number(value) for value in values), *[""] * (len(HEADS) - 5)])
+        rows.append(
+            [f"printed, {name}", *(number(value) for value in values), *[""] * (len(HEADS) - 5)]
+        )
     yield f"### {title.capitalize()}"
     yield table(HEADS, rows)
     yield " ".join(verdict(found))

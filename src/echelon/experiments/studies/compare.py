@@ -196,7 +196,9 @@ def _row(
     label: str, drive: DriveOf, parts: Parts, settings: Settings, part: Callable[[float], None]
 ) -> ComparisonRow:
     try:
-        return ComparisonRow(label, _fly(parts.replace(drive=drive(parts, settings)), settings, part))
+        return ComparisonRow(
+            label, _fly(parts.replace(drive=drive(parts, settings)), settings, part)
+        )
     except EchelonError as error:
         return ComparisonRow(label, None, str(error))
 

@@ -12,6 +12,7 @@ from echelon.experiments.results.recording import LoopPoles
 from echelon.experiments.results.run_numbers import RUN_NUMBERS, settling_bound
 from echelon.experiments.results.table_two import (
     HORIZON,
+    PRINTED,
     distance_errors,
     is_papers_experiment,
     table_two,
@@ -38,6 +39,7 @@ from echelon.output.plots.network import poles
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.settings import Settings
+from echelon.synthesis.gains.riccati import Riccati
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -168,8 +170,8 @@ def _approach(runs: _Runs) -> "Figure | None":
     return draw.finish(figure, cut)
 
 
-_PAPERS_METHODS = {"consensus": (PLANNED_LEADER, "riccati-relay"), "optimization": (PLANNED,)}
-"""The paper's two methods with the labels of ours, the first that ran."""
+_PAPERS_METHODS = ((PLANNED_LEADER, f"{Riccati.name}-relay"), (PLANNED,))
+"""Our labels of the paper's two methods, of which the first that ran is drawn."""
 
 
 def _paper_figure(scenario: str, runs: _Runs) -> "Figure | None":
@@ -179,7 +181,7 @@ def _paper_figure(scenario: str, runs: _Runs) -> "Figure | None":
         return None
     found = {
         method: next((by_label[label] for label in labels if label in by_label), None)
-        for method, labels in _PAPERS_METHODS.items()
+        for method, labels in zip(PRINTED, _PAPERS_METHODS, strict=True)
     }
     if any(run is None or table_two(run) is None for run in found.values()):
         return None

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 ROUNDING = (
-    "The paper's 1e-17 m is the rounding of constant offsets, not an error of a closed loop: all its "
-    "samples are multiples of 2^-53."
+    "The paper's 1e-17 m is the rounding of constant offsets, not an error of a closed loop: all "
+    "its samples are multiples of 2^-53."
 )
 _MEASURES = (
     "The paper's errors of followers are of distances between agents, and stand below ours. The "
@@ -26,8 +26,8 @@ _MEASURES = (
 )
 _PLANS = "OptimalTracking"
 _LEADER = (
-    "The paper's leader follows a plan of least tracking error: `leader.law: optimal-tracking` does "
-    "the same, also in `echelon compare paper`."
+    "The paper's leader follows a plan of least tracking error, as under `optimal-tracking` in "
+    "`echelon compare paper`."
 )
 
 
@@ -64,12 +64,12 @@ def remarks(runs: Sequence[Result]) -> Iterator[str]:
     """Yield how the errors of runs compare with the paper's, in sentences."""
     found = [errors for errors in map(table_two, runs) if errors is not None]
     if not found:
-        for reason in [reason for reason in map(missing, runs) if reason][:1]:
-            yield f"Nothing stands beside the paper's Table II, which is of {HORIZON:g} s: {reason}."
+        reason = next(filter(None, map(missing, runs)))
+        yield f"Nothing is beside the paper's Table II, which is of {HORIZON:g} s: {reason}."
         return
     yield _over(found)
-    if not any(getattr(run.drive, "leader", None).__class__.__name__ == _PLANS for run in runs):
-        yield _LEADER
+    leaders = {type(getattr(run.drive, "leader", None)).__name__ for run in runs}
+    yield from () if _PLANS in leaders else (_LEADER,)
     yield _MEASURES
     yield ROUNDING
 
