@@ -104,9 +104,10 @@ def main() -> None:
         "## The two halves compared",
         "`echelon compare paper`: the same starts (seed 0), motor limits and wind for all methods, "
         "10 s, RMSE in m. Distances are the paper's measure, beside its rows; vectors, from each "
-        "follower to its goal, are stricter. `optimal-leader` is `riccati-relay` behind the paper's "
-        "leader, which plans its path; `optimization` is planned once and flown open loop; `mpc` "
-        "plans 1 s ahead 50 times a second. Computing is on one shared machine, compilation "
+        "follower to its goal, are stricter. `optimal-leader` is `riccati-relay` behind the "
+        "paper's leader, which plans its path; `optimization` is planned once and flown open "
+        "loop; `mpc` plans 1 s ahead 50 times a second. Computing is on one shared machine, "
+        "compilation "
         f"apart. Versions: {', '.join(f'{name} {text}' for name, text in told.items())}.",
     ]
     for title, changes in CONDITIONS.items():

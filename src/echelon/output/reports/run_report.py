@@ -17,7 +17,7 @@ from echelon.core.digits import at_least, at_most
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
-from echelon.core.words import amount
+from echelon.core.words import MessageContent, Prediction, amount
 from echelon.experiments.results.event_outcomes import event_outcomes
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import avoidance, metrics
@@ -250,11 +250,26 @@ def _world(result: Result) -> Iterator[str]:
         yield f"Disturbance: {world['disturbance']}; unknown to the laws."
     if world["network"]:
         yield f"Network: {world['network']}."
+        if _is_known(result):
+            yield (
+                "Every agent knows the leader's whole plan before the start. Messages only carry "
+                "deviations from it, so few are needed."
+            )
         yield from _messages(result)
     if world["actuator"]:
         yield f"Actuators: {world['actuator']}; unknown to the laws."
     if world["sensing"]:
         yield f"Sensing of own states: {world['sensing']}."
+
+
+def _is_known(result: Result) -> bool:
+    """Return whether everybody knows where the leader will be, whatever messages are lost."""
+    network = result.world.network
+    return (
+        network is not None
+        and network.prediction is Prediction.PREVIEW
+        and network.messages is MessageContent.DEVIATION
+    )
 
 
 def _messages(result: Result) -> Iterator[str]:
