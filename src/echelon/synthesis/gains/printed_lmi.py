@@ -16,7 +16,7 @@ from echelon.core.types import Array
 from echelon.synthesis.gains.gain import Feedback, Method
 
 
-class Violation(NamedTuple):
+class Witness(NamedTuple):
     """A unit vector w with w'K w > 0, which K <= 0 excludes; `value` is w'K w."""
 
     vector: Float[np.ndarray, " k"]
@@ -41,7 +41,7 @@ def printed_lmi(
     return np.block([[0.0 * X, X], [X, 0.5 * (Y + Y.T)]])
 
 
-def violation(K: Float[np.ndarray, "K K"]) -> Violation:
+def violation(K: Float[np.ndarray, "K K"]) -> Witness:
     """Return how [[0, X], [X, Y]] with X > 0 fails to be <= 0; there is one for every X and Y.
 
     Where X v = x v, K on the plane of (v, 0) and (0, v) is [[0, x], [x, y]], with y = v'Y v and
@@ -51,7 +51,7 @@ def violation(K: Float[np.ndarray, "K K"]) -> Violation:
     x, v = (part[..., -1] for part in np.linalg.eigh(K[:half, half:]))
     y = v @ K[half:, half:] @ v
     values, vectors = np.linalg.eigh(np.array([[0.0, x], [x, y]]))
-    return Violation(np.concatenate([vectors[0, -1] * v, vectors[1, -1] * v]), float(values[-1]))
+    return Witness(np.concatenate([vectors[0, -1] * v, vectors[1, -1] * v]), float(values[-1]))
 
 
 class PrintedLMI(Method):
