@@ -7,6 +7,7 @@ versions are those of constraints.txt. Arguments after the command are passed on
 import hashlib
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -35,7 +36,8 @@ HELP = """usage: python3 dev.py COMMAND [ARGUMENT ...]
   browser    find or install Chromium
   lint       check style, layout and imports between packages: ruff, import-linter
   types      check types: pyright
-  docs       build the documentation into site/, with warnings as errors: zensical
+  docs       build the documentation into site/, with warnings as errors: zensical; refuses
+             measured numbers of another version
   sentences  write the messages of errors again: tests/sentences.txt
   fuzz       run the command line with random input for [SECONDS] and report what fails
   mutate     change the code in small ways and report the changes that no test notices
@@ -206,11 +208,34 @@ def results(rest: list[str]) -> list[list[str]]:
     return [[python, f"benchmarks/{name}.py", *PAGES[name]] for name in rest or PAGES]
 
 
+MEASURED = {"results.md": 2, "certificates.md": 1}
+"""Pages of docs/ with measured numbers, each with how many scripts write a part of it."""
+
+
+def outdated(folder: Path = ROOT / "docs") -> list[str]:
+    """Return which pages of docs/ have numbers of another version of echelon, in sentences."""
+    [now] = VERSION.findall((ROOT / "src" / "echelon" / "__init__.py").read_text("utf-8"))
+    faults = []
+    for name, parts in MEASURED.items():
+        text = (folder / name).read_text("utf-8")
+        found = re.findall(r"^.*Versions: .*\bechelon (\d[\w.]*?),", text, re.MULTILINE)
+        if len(found) != parts:
+            faults.append(f"docs/{name} has {len(found)} lines of versions, and needs {parts}.")
+        old = sorted({version for version in found if version != now})
+        faults += [f"docs/{name} has numbers of echelon {each}, and this is {now}." for each in old]
+    return faults
+
+
+VERSION = re.compile(r'^__version__ = "(.+)"$', re.MULTILINE)
+
+
 def documentation(rest: list[str]) -> list[list[str]]:
     """Get what pages load and draw the replay that they show; return the command that builds them.
 
     It is built as a module, so that Python finds docs/formulas.py.
     """
+    if faults := outdated():
+        raise SetupError(" ".join([*faults, "`python3 dev.py results` measures them again."]))
     echelon, folder, page = str(program("echelon")), str(BUILD / "replay"), "docs/assets/paper.html"
     short = ["--set", "simulation.horizon=20", "--set", "simulation.store_every=4"]
     for command in (

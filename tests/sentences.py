@@ -38,8 +38,7 @@ LINES = {
     "leader": "leader: {law: tracking, reacts: false, start_error: {x: -1.344, y: 0.530}}",
     "follower": "follower: {law: consensus, gain: {method: riccati}, feedforward: relay}",
     "initial": "initial: {spread: {position: 1.0, attitude: 0.3}}",
-    "simulation": "simulation: {horizon: 60.0, dt: 0.005, integrator: rk4, limits: true,"
-    " store_every: 10}",
+    "simulation": "simulation: {horizon: 60.0, dt: 0.005, integrator: rk4, limits: true}",
     "report": "report: {steady_window: 10.0}",
     "seed": "seed: 0",
 }

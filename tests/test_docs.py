@@ -1,6 +1,7 @@
 """The documentation: its code prints what the page shows; names, links and numbers are right."""
 
 import contextlib
+import importlib.util
 import io
 import json
 import operator
@@ -20,8 +21,8 @@ import pytest
 
 import echelon as ech
 from echelon.apps.cli.app import main
+from echelon.experiments.results.table_two import PRINTED
 from echelon.experiments.scenario.registry import METHODS
-from echelon.output.reports.run_report import PRINTED
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -217,7 +218,7 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
     assert done.returncode == 0, done.stderr
     (code, designs, _), taken, unknown = json.loads(done.stdout)
     rows = {row["method"]: row for row in json.loads(designs)["methods"]}
-    assert code == 0 and {*rows} == {*METHODS, "decay"} - {"given"}
+    assert code == 0 and {*rows} == {*METHODS, "decay"} - {"given", "printed-lmi"}
     assert (rows["decay"]["coupling"], rows["decay"]["edge"]) == (1.0, 0.0)
     assert rows["decay"]["slowest_mode"] < 0.0
     assert rows["contraction"]["reason"] == (
@@ -277,6 +278,24 @@ def test_the_first_page_quotes_the_measured_numbers():
     known |= {abs(value) for values in PRINTED.values() for value in values}
     cells = "\n".join(" ".join(row[1:]) for row in rows(part) if row[0][:6] in ("leader", "follow"))
     assert numbers(cells) - known - {10.0} == set()  # "over the first 10 s"
+
+
+def test_measured_numbers_are_of_this_version(tmp_path):
+    """The build refuses others: a number that nobody measured again says nothing of this code."""
+    spec = importlib.util.spec_from_file_location("dev", ROOT / "dev.py")
+    dev = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(dev)
+    assert dev.outdated() == []
+    for name in dev.MEASURED:
+        text = (
+            page(name).read_text("utf-8").replace(f"echelon {ech.__version__},", "echelon 0.0.1,")
+        )
+        (tmp_path / name).write_text(text, "utf-8")
+    faults = dev.outdated(tmp_path)
+    assert len(faults) == 2 and all("has numbers of echelon 0.0.1, and this" in x for x in faults)
+    with pytest.raises(dev.SetupError, match="measures them again"):
+        dev.outdated = lambda: faults
+        dev.documentation([])
 
 
 def rows(text):

@@ -115,11 +115,13 @@ def combinations():
     nothing of its own under this one.
     """
     words, every = list(map(str, Feedforward)), sorted(ech.bundled_scenarios())
-    light = [method for method in METHODS if method not in ("robust-lqr", "contraction")]
+    # What is refused as printed has no gain.
+    able = [method for method in METHODS if not resolve(METHODS[method]).literal]
+    light = [method for method in able if method not in ("robust-lqr", "contraction")]
     laws = {name: str(ech.load_scenario(name).follower.law) for name in every}
     for i, scenario in enumerate(name for name in every if laws[name] != "stopping-point"):
         variant = scenario.startswith("paper-") or scenario == "yaw-turn"
-        for j, method in enumerate(METHODS):
+        for j, method in enumerate(able):
             chosen = method == light[i % len(light)] if variant else True
             k = (i + 2 * j) % (4 * len(words))
             if chosen and k < len(words) and (scenario, method) != ("paper", "contraction"):

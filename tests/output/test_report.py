@@ -18,16 +18,30 @@ def run(scenario, *changes):
 
 @pytest.fixture(scope="module")
 def literal():
-    return run("paper-literal")
+    law = "{law: consensus, gain: {method: given, P: identity}, feedforward: none, trim: false}"
+    free = ["simulation.horizon=10", "simulation.limits=false", "report.steady_window=2"]
+    return run("paper", *free, f"follower={law}")
 
 
 @pytest.mark.slow
-def test_the_table_stands_beside_the_papers():
-    text = ech.report(run("paper", "simulation.horizon=6", "report.steady_window=1"))
+def test_the_table_stands_beside_the_papers(literal):
+    text = ech.report(literal)
     for printed in ("0.186", "9.289e-17", "7.692e-17", "5.207e-17", "0.0302", "0.018"):
         assert printed in text
-    assert "multiples of 2^-53" in text
+    assert "multiples of 2^-53" in text and "over all 2000 steps" in text
     assert text.count("follower ") >= 3 and "within 1 cm" in text
+    # Of the 10 s nothing is said from a shorter run.
+    text = ech.report(run("paper", "simulation.horizon=0.1", "report.steady_window=0.1"))
+    assert "0.186" not in text and "which is of 10 s: the run ends at 0.1 s." in text
+
+
+@pytest.mark.slow
+def test_of_the_printed_example_as_a_whole_the_report_says_when_it_leaves_floats():
+    text = " ".join(ech.report(run("paper-literal")).split())
+    assert "The state of follower 1 stopped being finite by t = 0.6 s." in text
+    assert (
+        "Nothing is beside the paper's Table II, which is of 10 s: the run ends at 0.5 s." in text
+    )
 
 
 def test_the_literal_law_grows_and_no_cause_is_guessed(literal):

@@ -76,6 +76,7 @@ METHODS = _family(
     monotone=("Monotone", "the paper's Assumption 5 on a domain, as an SDP"),
     robust_lqr=("RobustLQR", "one P for all Jacobians of a domain, as an SDP"),
     contraction=("Contraction", "weakest gain of a given rate on a domain"),
+    printed_lmi=("PrintedLMI", 'literal: Algorithm 1\'s "solve (LMI)", which has no solution'),
 )
 DEFAULT_METHOD = "riccati"
 

@@ -29,6 +29,7 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.lmi import obstacle
+from echelon.synthesis.gains.printed_lmi import printed_lmi
 
 # ---- the finite condition on P -------------------------------------------------------------------
 # At the goals alone it reads P >= I and (xi_i - xi_j)'P (f(xi_i) - f(xi_j)) <= 0 for all pairs of
@@ -259,24 +260,12 @@ def _monotone_line(parts: Parts, promise: Guarantee) -> Statement:
 
 def _printed_line(parts: Parts, promise: Guarantee) -> Statement:
     """Return the largest eigenvalue of the paper's LMI at this P, for up to four followers."""
-    # It fails at any size: on (v, s X v) with a small s > 0, [[0, X], [X, Z]] is
-    # 2 s |X v|^2 + O(s^2) > 0. Four followers suffice to show it, and the cost of eigenvalues grows
-    # with the cube of their number.
+    # It fails at any size. Four followers suffice to show it, and the cost grows with the cube of
+    # their number.
     some = list(parts.graph.followers[:4])
     goals = np.asarray(parts.model.trim[0]) + parts.formation.offsets[some]
     drifts = goal_drifts(parts.model, parts.formation.offsets, parts.drive)[some]
-    count, n = goals.shape
-    values, vectors = np.linalg.eigh(promise.loop.closed.P)
-    # Of a P that rounding makes indefinite the eigenvalues are those that it may have.
-    values = np.maximum(values, np.finfo(float).eps * np.abs(values).max())
-    X = np.kron(np.eye(count), vectors @ np.diag(values**-0.5) @ vectors.T)
-    D, F = np.zeros((count * n, count)), np.zeros((count * n, count))
-    for i in range(count):
-        for j in range(count):
-            D[i * n : (i + 1) * n, j] = goals[j] - goals[i]
-            F[i * n : (i + 1) * n, j] = drifts[i] - drifts[j]
-    Y = -F @ D.T
-    largest = float(np.linalg.eigvalsh(np.block([[0.0 * X, X], [X, 0.5 * (Y + Y.T)]]))[-1])
+    largest = float(np.linalg.eigvalsh(printed_lmi(promise.loop.closed.P, goals, drifts))[-1])
     text = "infeasible for every P > 0: its upper left block is zero"
     number, remedy = (largest, f"eigenvalue {about(largest)} > 0"), "use the finite condition"
     return fails(Topic.LMI_AS_PRINTED, _PROOF, text, *number, remedy=remedy)

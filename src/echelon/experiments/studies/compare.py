@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import numpy as np
 
 from echelon.core.errors import EchelonError, LawError, check_name
 from echelon.core.numerics import precision
@@ -20,6 +21,7 @@ from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts, initial_states
 from echelon.simulation.engine.simulate import RunSoFar, simulate
 from echelon.simulation.optimal.drives import Plans, RecedingHorizon
+from echelon.simulation.optimal.leader import OptimalTracking
 from echelon.simulation.step.drive import Controller
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import FixedGain, Gain, Method, synthesize
@@ -27,6 +29,8 @@ from echelon.synthesis.gains.riccati import InnerLoop, Riccati
 
 OWN = "own"
 """Label of the scenario's drive."""
+PLANNED_LEADER, PLANNED = "optimal-leader", "optimization"
+"""Labels of the paper's two methods: consensus behind a planned leader, and plans alone."""
 
 
 class ComparisonRow(NamedTuple):
@@ -63,14 +67,14 @@ _LAW_NAMES = {
     entry.target.rpartition(":")[2]: name for name, entry in registry.FOLLOWER_LAWS.items()
 }
 
-DriveOf = Callable[[Parts], Controller]
-"""Returns the drive of a method for the parts of a scenario."""
+DriveOf = Callable[[Parts, Settings], Controller]
+"""Returns the drive of a method for the parts and the settings of a scenario."""
 
 
 def _consensus(
     gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bool = True
 ) -> DriveOf:
-    return lambda parts: parts.drive.with_follower(
+    return lambda parts, settings: parts.drive.with_follower(
         Consensus(gain(parts), feedforward, trim, parts.drive.frame)
     )
 
@@ -91,17 +95,33 @@ def _reference(parts: Parts) -> Any:
     return getattr(getattr(parts.drive, "leader", None), "reference", None)
 
 
+def _behind_a_plan(parts: Parts, settings: Settings) -> Controller:
+    """Return the law of `riccati-relay` behind the paper's leader, which plans its whole path."""
+    reference, first = _reference(parts), parts.graph.leaders[0]
+    if reference is None:
+        raise LawError("`optimal-leader` plans along a reference, and there is none.")
+    # The plan begins where the leader does: `_with_starts` has drawn all starts.
+    start = np.asarray(parts.initial)[first] - parts.formation.offsets[first]
+    with precision("float64"):
+        error = start - np.asarray(OptimalTracking(reference).start(parts.model))
+    off = dict(zip(parts.model.state_names, error.tolist(), strict=True))
+    leader = OptimalTracking(reference, settings.horizon, off, settings.limits)
+    law = Consensus(_riccati(parts), Feedforward.RELAY, frame=parts.drive.frame)
+    return Laws(leader, law)
+
+
 _DRIVES: Mapping[str, DriveOf] = {
     # The printed law has neither the leader's input nor a trim input.
     "literal": _consensus(_synthesized(FixedGain()), Feedforward.NONE, trim=False),
     f"{Riccati.name}-relay": _consensus(_riccati, Feedforward.RELAY),
     Riccati.name: _consensus(_riccati, Feedforward.NONE),
     InnerLoop.name: _consensus(_synthesized(InnerLoop()), Feedforward.RELAY),
-    _LAW_NAMES[StoppingPoint.__name__]: lambda parts: Laws(
+    _LAW_NAMES[StoppingPoint.__name__]: lambda parts, settings: Laws(
         StoppingLeader(reference=_reference(parts)), StoppingPoint()
     ),
-    "optimization": lambda parts: Plans(_reference(parts)),
-    "mpc": lambda parts: RecedingHorizon(_reference(parts)),
+    PLANNED_LEADER: _behind_a_plan,
+    PLANNED: lambda parts, settings: Plans(_reference(parts)),
+    "mpc": lambda parts, settings: RecedingHorizon(_reference(parts)),
 }
 
 LABELS = tuple(_DRIVES)
@@ -166,7 +186,7 @@ def compare(
         fly(label, _DRIVES[label])
     own = _own_label(parts, rows) if OWN in only else None
     if own is not None:
-        fly(own, lambda parts: parts.drive)
+        fly(own, lambda parts, settings: parts.drive)
     described = parts.world.describe(parts.model)
     conditions = tuple(f"{name}: {text}" for name, text in described.items() if text)
     return Comparison(scenario.name, tuple(rows), settings.horizon, settings.window, conditions)
@@ -176,7 +196,9 @@ def _row(
     label: str, drive: DriveOf, parts: Parts, settings: Settings, part: Callable[[float], None]
 ) -> ComparisonRow:
     try:
-        return ComparisonRow(label, _fly(parts.replace(drive=drive(parts)), settings, part))
+        return ComparisonRow(
+            label, _fly(parts.replace(drive=drive(parts, settings)), settings, part)
+        )
     except EchelonError as error:
         return ComparisonRow(label, None, str(error))
 

@@ -112,7 +112,7 @@ def design(
     names = registry.METHODS if method is None else [method]
     methods = [resolve(registry.METHODS[name]) for name in names]
     # A method that needs a P, for example, does not compute a gain by itself.
-    able = [cls for cls in methods if method or {*cls.needs} <= {"domain", *cls.defaults}]
+    able = [cls for cls in methods if method or _computes(cls)]
     designs = list[Design]()
     for cls in able:
         progress(len(designs), len(able))
@@ -121,6 +121,10 @@ def design(
     best, dt = recommended(designs, built.settings.dt), built.settings.dt
     reason = "No method gives a stable loop here." if best is None else because(best, designs, dt)
     return Designs(designs, best, reason, built.settings)
+
+
+def _computes(cls: type[Method]) -> bool:
+    return not cls.literal and {*cls.needs} <= {"domain", *cls.defaults}
 
 
 _SIMPLE_GAIN = GainSpec(method=FixedGain.name, P="identity")

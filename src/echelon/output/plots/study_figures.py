@@ -10,6 +10,13 @@ from echelon.core.types import Array
 from echelon.experiments.results.metrics import SETTLED, output_errors
 from echelon.experiments.results.recording import LoopPoles
 from echelon.experiments.results.run_numbers import RUN_NUMBERS, settling_bound
+from echelon.experiments.results.table_two import (
+    HORIZON,
+    PRINTED,
+    distance_errors,
+    is_papers_experiment,
+    table_two,
+)
 from echelon.experiments.studies.basin import (
     Radii,
     StateSlice,
@@ -22,7 +29,7 @@ from echelon.experiments.studies.basin import (
     slice_of,
     trial,
 )
-from echelon.experiments.studies.compare import Comparison
+from echelon.experiments.studies.compare import PLANNED, PLANNED_LEADER, Comparison
 from echelon.experiments.sweeps.plan import SEED, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 from echelon.guarantees.promises.promise import guarantee
@@ -32,6 +39,7 @@ from echelon.output.plots.network import poles
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.settings import Settings
+from echelon.synthesis.gains.riccati import Riccati
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -49,7 +57,8 @@ def comparison_figures(comparison: Comparison) -> "dict[str, Figure]":
     """Return the figures of a comparison, by name.
 
     `formation_error` is the worst follower's distance from its goal, `tracking_error` the leader's
-    from its reference, and `approach` the path of one follower to its goal.
+    from its reference, and `approach` the path of one follower to its goal. `paper_fig_3b` is the
+    paper's figure of that number, of its experiment.
     """
     runs = [
         (k, row.label, row.flight.result)
@@ -63,6 +72,7 @@ def comparison_figures(comparison: Comparison) -> "dict[str, Figure]":
             "formation_error": _formation_error(runs),
             "tracking_error": _tracking_error(runs),
             "approach": _approach(runs),
+            "paper_fig_3b": _paper_figure(comparison.scenario, runs),
         }
     return {name: figure for name, figure in drawings.items() if figure is not None}
 
@@ -158,6 +168,35 @@ def _approach(runs: _Runs) -> "Figure | None":
     draw.plot(ax, goal, label="goal", **draw.dots("s", draw.LEADER))
     draw.frame(ax, np.concatenate(drawn))
     return draw.finish(figure, cut)
+
+
+_PAPERS_METHODS = ((PLANNED_LEADER, f"{Riccati.name}-relay"), (PLANNED,))
+"""Our labels of the paper's two methods, of which the first that ran is drawn."""
+
+
+def _paper_figure(scenario: str, runs: _Runs) -> "Figure | None":
+    """Return the errors of the followers' distances over the paper's 10 s, of its two methods."""
+    first, by_label = runs[0][2], {label: run for _, label, run in runs}
+    if not is_papers_experiment(scenario, type(first.model).__name__, first.graph.agents):
+        return None
+    found = {
+        method: next((by_label[label] for label in labels if label in by_label), None)
+        for method, labels in zip(PRINTED, _PAPERS_METHODS, strict=True)
+    }
+    if any(run is None or table_two(run) is None for run in found.values()):
+        return None
+    figure, [[ax]] = draw.sheet(3.4)
+    ax.axhline(0.0, **draw.MARK)
+    for (method, run), dash in zip(found.items(), ("-", (0, (3.0, 1.2))), strict=True):
+        assert run is not None
+        errors, keep = distance_errors(run), draw.thin(len(run.times))
+        for k, colour in enumerate(draw.COLOURS[: errors.shape[1]]):
+            name = f"$e_{{F{k + 1}}}$ {method}"
+            line = errors[keep, k]
+            draw.plot(ax, run.times[keep], line, label=name, color=colour, linestyle=dash)
+    ax.set(xlim=(0.0, HORIZON), xlabel="time (s)")
+    ax.set_ylabel(draw.label("distance, actual less desired", first.length_unit))
+    return draw.finish(figure)
 
 
 # ---- sweeps -----------------------------------------------------------------------------------

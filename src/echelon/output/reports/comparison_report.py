@@ -17,9 +17,12 @@ from echelon.experiments.results.run_numbers import (
     settling_bound,
     shown_in,
 )
-from echelon.experiments.studies.compare import Comparison, ComparisonRow
+from echelon.experiments.results.table_two import PRINTED, is_papers_experiment, table_two
+from echelon.experiments.studies.compare import LABELS, Comparison, ComparisonRow
 from echelon.guarantees.promises.promise import Guarantee
-from echelon.output.reports.run_report import PRINTED, ROUNDING, is_papers_experiment, say
+from echelon.output.reports.beside_paper import print_beside_paper, remarks
+from echelon.output.reports.run_report import say
+from echelon.simulation.engine.result import Result
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -46,29 +49,34 @@ def comparison_report(comparison: Comparison, width: int = 200) -> str:
 
 def print_comparison(console: "Console", comparison: Comparison) -> None:
     """Print a comparison on a rich console: two tables, remarks, and the verdict."""
-    printed = _is_papers(comparison)
-    console.print(_errors_table(comparison, printed))
+    runs = _papers_runs(comparison)
+    if runs:
+        print_beside_paper(console, runs, comparison.scenario)
+    console.print(_errors_table(comparison))
     console.print(_costs_table(comparison))
     for row in comparison.rows:
         for sentence in _remarks(row):
             say(console, f"{row.label}: {sentence}")
     say(console, " ".join(verdict(comparison)))
-    if printed:
-        say(console, ROUNDING)
+    for sentence in remarks([*runs.values()]) if runs else ():
+        say(console, sentence)
 
 
-def _is_papers(comparison: Comparison) -> bool:
-    runs = [row.flight.result for row in comparison.rows if row.flight is not None]
-    return bool(runs) and is_papers_experiment(
-        comparison.scenario, type(runs[0].model).__name__, runs[0].graph.agents
-    )
+def _papers_runs(comparison: Comparison) -> dict[str, Result]:
+    """Return the runs of each method where they are of the paper's experiment."""
+    runs = {row.label: row.flight.result for row in comparison.rows if row.flight is not None}
+    some = next(iter(runs.values()), None)
+    if some is None:
+        return {}
+    model, agents = type(some.model).__name__, some.graph.agents
+    return runs if is_papers_experiment(comparison.scenario, model, agents) else {}
 
 
 # ---- tables -------------------------------------------------------------------------------------
 
 
-def _errors_table(comparison: Comparison, printed: bool) -> "Table":
-    """Return the errors, one row per method: the paper's Table II and the steady errors."""
+def _errors_table(comparison: Comparison) -> "Table":
+    """Return the errors, one row per method: over the whole run and the steady ones."""
     graphs = [row.flight.result.graph for row in comparison.rows if row.flight is not None]
     followers = graphs[0].followers if graphs and len(graphs[0].followers) <= _NAMED else ()
     whole, last = f"{comparison.horizon:.3g} s", f"last {comparison.steady_window:.3g} s"
@@ -80,11 +88,6 @@ def _errors_table(comparison: Comparison, printed: bool) -> "Table":
     table = _table(title, [*columns, within])
     for row in comparison.rows:
         table.add_row(row.label, *_errors(row, bool(followers)))
-    if printed:
-        table.add_section()
-        for method, values in PRINTED.items():
-            cells = [f"{value:.3g}" for value in values]
-            table.add_row(f"printed, {method}", *cells, *[""] * (len(columns) - len(cells) + 1))
     return table
 
 
@@ -141,8 +144,7 @@ def _table(title: str, columns: Sequence[str]) -> "Table":
     from rich.table import Table
 
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
-    width = max(len(f"printed, {method}") for method in PRINTED)
-    table.add_column("method", no_wrap=True, min_width=width)
+    table.add_column("method", no_wrap=True, min_width=max(map(len, LABELS)))
     for column in columns:
         table.add_column(column, justify="right", overflow="fold")
     return table
@@ -278,15 +280,19 @@ def _listed(labels: Sequence[str]) -> str:
 
 def comparison_mapping(comparison: Comparison) -> JsonObject:
     """Return a comparison ready for JSON; missing numbers are None."""
+    papers = _papers_runs(comparison)
     return {
         "scenario": comparison.scenario,
         "horizon_s": comparison.horizon,
         "steady_window_s": comparison.steady_window,
         "conditions": list(comparison.conditions),
         "methods": {row.label: _row_mapping(row) for row in comparison.rows},
-        "printed": {name: list(values) for name, values in PRINTED.items()}
-        if _is_papers(comparison)
-        else None,
+        "printed": {name: list(values) for name, values in PRINTED.items()} if papers else None,
+        "beside_printed": {
+            label: None if errors is None else errors.as_mapping()
+            for label, errors in ((label, table_two(run)) for label, run in papers.items())
+        }
+        or None,
         "verdict": " ".join(verdict(comparison)),
     }
 

@@ -1,11 +1,11 @@
-"""The report of a run: a table like the paper's Table II, and sentences that explain it.
+"""The report of a run: a table of its errors, and sentences that explain it.
 
 The whole report adds the conditions of the guarantee, the scenario, versions, and how to cite.
 """
 
 import io
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -17,7 +17,7 @@ from echelon.core.digits import at_least, at_most
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
 from echelon.core.types import JsonObject
-from echelon.core.words import amount
+from echelon.core.words import MessageContent, Prediction, amount
 from echelon.experiments.results.event_outcomes import event_outcomes
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import avoidance, metrics
@@ -31,35 +31,15 @@ from echelon.experiments.results.run_numbers import (
     settling_bound,
     steady_error,
 )
+from echelon.experiments.results.table_two import is_of_the_paper
 from echelon.guarantees.promises.promise import Guarantee, coverage, guarantee
+from echelon.output.reports.beside_paper import print_beside_paper, remarks
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
-
-PRINTED: Mapping[str, tuple[float, ...]] = {
-    "consensus": (0.186, 9.289e-17, 7.692e-17, 5.207e-17),
-    "optimization": (0.186, 0.0302, 7.692e-17, 0.018),
-}
-"""RMSE in m of leader and followers 1, 2, 3, per method, over 10 s."""
-
-ROUNDING = (
-    "The printed values are the paper's Table II (10 s). Its followers' errors of 1e-17 m are "
-    "rounding errors of constant offsets (all its samples are multiples of 2^-53), not errors of a "
-    "closed loop; compare them with the steady RMSE from random starts above."
-)
-
-
-def is_papers_experiment(scenario: str, model: str, agents: int) -> bool:
-    """Return whether a scenario is comparable: `paper` or a variant, with 4 quadrotors."""
-    return (
-        model == "Quadrotor"
-        and agents == 4
-        and (scenario == "paper" or scenario.startswith("paper-"))
-    )
-
 
 _WIDTH = 100
 _CITATION = f"""@software{{echelon,
@@ -126,11 +106,12 @@ def _condition(line: JsonObject) -> str:
 
 def print_report(console: "Console", result: Result, numbers: Metrics) -> None:
     """Print the report of a run on a rich console."""
-    scenario, model = result.provenance.get("scenario", ""), type(result.model).__name__
-    printed = is_papers_experiment(scenario, model, result.graph.agents)
-    console.print(_table(result, numbers, printed))
+    printed = is_of_the_paper(result)
+    if printed:
+        print_beside_paper(console, {"this run": result}, result.provenance["scenario"])
+    console.print(_table(result, numbers))
     sentences = [*explain(result, numbers), *(f"Warning: {text}" for text in result.warnings)]
-    for sentence in [*sentences, ROUNDING] if printed else sentences:
+    for sentence in [*sentences, *remarks([result])] if printed else sentences:
         say(console, sentence)
 
 
@@ -141,7 +122,7 @@ def say(console: "Console", sentence: str) -> None:
     console.print(f"- {sentence}", style=look, highlight=False, markup=False, soft_wrap=wrap)
 
 
-def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
+def _table(result: Result, numbers: Metrics) -> "Table":
     from rich import box
     from rich.table import Table
 
@@ -151,7 +132,6 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
         "settled": settling_bound(result.length_unit),
     }
     columns = ["agent", *(quantity.column.format(**texts) for quantity in _COLUMNS.values())]
-    columns += ["printed,\nconsensus", "printed,\noptimiz."] * printed
     agents = f"{result.graph.agents} x {type(result.model).__name__}"
     name = result.provenance.get("scenario") or agents
     end = result.times[-1] if len(result.times) else 0.0
@@ -160,21 +140,17 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
     for column in columns:
         table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
-    for row in _rows(result, numbers, printed):
+    for row in _rows(numbers):
         table.add_row(*row)
     return table
 
 
-def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
+def _rows(numbers: Metrics) -> list[list[str]]:
     leaders, followers = numbers.leaders, numbers.followers
     # A single leader needs no number, as in the paper's table.
     names = ["leader"] if len(leaders) == 1 else None
     agents = [*labelled("leader", leaders, names), *labelled("follower", followers)]
-    rows = [[label, *(_cell(numbers, name) for name in _COLUMNS)] for label, numbers in agents]
-    if printed:
-        for k, row in enumerate(rows):
-            row += [f"{PRINTED[method][k]:.4g}" for method in ("consensus", "optimization")]
-    return rows
+    return [[label, *(_cell(numbers, name) for name in _COLUMNS)] for label, numbers in agents]
 
 
 _Row = TypeVar("_Row", LeaderMetrics, FollowerMetrics)
@@ -274,11 +250,26 @@ def _world(result: Result) -> Iterator[str]:
         yield f"Disturbance: {world['disturbance']}; unknown to the laws."
     if world["network"]:
         yield f"Network: {world['network']}."
+        if _is_known(result):
+            yield (
+                "Every agent knows the leader's whole plan before the start. Messages only carry "
+                "deviations from it, so few are needed."
+            )
         yield from _messages(result)
     if world["actuator"]:
         yield f"Actuators: {world['actuator']}; unknown to the laws."
     if world["sensing"]:
         yield f"Sensing of own states: {world['sensing']}."
+
+
+def _is_known(result: Result) -> bool:
+    """Return whether everybody knows where the leader will be, whatever messages are lost."""
+    network = result.world.network
+    return (
+        network is not None
+        and network.prediction is Prediction.PREVIEW
+        and network.messages is MessageContent.DEVIATION
+    )
 
 
 def _messages(result: Result) -> Iterator[str]:

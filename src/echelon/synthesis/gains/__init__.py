@@ -2,6 +2,7 @@
 
 from echelon.synthesis.gains.domain_methods import Contraction, Monotone, RobustLQR
 from echelon.synthesis.gains.gain import Feedback, FixedGain, Gain, Method
+from echelon.synthesis.gains.printed_lmi import PrintedLMI
 from echelon.synthesis.gains.riccati import InnerLoop, Riccati
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "InnerLoop",
     "Method",
     "Monotone",
+    "PrintedLMI",
     "Riccati",
     "RobustLQR",
 ]

@@ -170,6 +170,9 @@ class Method(Declared):
     free_coupling: ClassVar[float] = 1.0
     """Default coupling where any one suffices, or where no bound is known."""
 
+    literal: ClassVar[bool] = False
+    """Whether it is a line of the paper that cannot work, which `design` leaves out."""
+
     coupling: float | None = eqx.field(default=None, kw_only=True)
 
     @abc.abstractmethod
