@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from echelon.experiments.scenario.build import Experiment
     from echelon.experiments.scenario.scenario import Scenario
     from echelon.experiments.studies.compare import Comparison
+    from echelon.experiments.studies.observed_region import ObservedRegion
     from echelon.simulation.engine.parts import Parts
     from echelon.simulation.step.settings import Settings
 
@@ -26,6 +27,12 @@ def check(
     every: Annotated[
         bool, typer.Option("--all", help="Print every line, with its reason, as a table.")
     ] = False,
+    region: Annotated[
+        bool, typer.Option("--region", help="Also simulate random starts at several scales.")
+    ] = False,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Random starts at each scale, with `--region`.")
+    ] = 200,
     as_json: JsonOption = False,
 ) -> None:
     """State what is guaranteed of a scenario, and why; exit code 0 if anything is."""
@@ -37,17 +44,30 @@ def check(
     from echelon.experiments.scenario.build import build
     from echelon.experiments.studies.check import check as examine
 
-    checked = examine(*build(loaded))
+    experiment = build(loaded, to_run=region)
+    checked = examine(*experiment)
+    if region:
+        checked = checked._replace(region=_region(*experiment, seeds))
     if as_json:
         print(json.dumps(checked.as_mapping(), indent=2))
     else:
         from echelon.output.reports.check_report import check_report, check_sentences, grouped
+        from echelon.output.reports.region_report import region_report
 
         if every:
             tables.print_statements(grouped(checked.lines), check_sentences(checked))
+            if checked.region is not None:
+                print("\n" + region_report(checked.region))
         else:
             print(check_report(checked))
     raise typer.Exit(0 if checked.promised else 1)
+
+
+def _region(parts: "Parts", settings: "Settings", seeds: int = 200) -> "ObservedRegion":
+    from echelon.experiments.studies.observed_region import observed_region
+
+    STATUS.begin("simulating random starts", log=False)
+    return observed_region(parts, settings, seeds=seeds, progress=STATUS.counter("runs"))
 
 
 def design(
@@ -59,6 +79,10 @@ def design(
         Path | None, typer.Option(help="Draw modes and certified set into this folder.")
     ] = None,
     force: options.OverwriteOption = False,
+    region: Annotated[
+        bool,
+        typer.Option("--region", help="Draw also how many random starts fail at several scales."),
+    ] = False,
     slice_: Annotated[
         str | None,
         typer.Option("--slice", metavar="STATE,STATE", help="Draw the set in these two states."),
@@ -85,9 +109,15 @@ def design(
         if out is not None:
             save_gain(best.gain, best.parts.model, best.parts.graph, out)
         if figures is not None:
-            radii = _draw(best.parts, report.settings, figures, slice_)
+            seen = _region(best.parts, report.settings) if region else None
+            radii = _draw(best.parts, report.settings, figures, slice_, seen)
             sentence += f"\n{radii}" if radii else ""
             summary["radii"] = radii
+            if seen is not None:
+                from echelon.output.reports.region_report import region_report
+
+                sentence += f"\n\n{region_report(seen)}"
+                summary["region"] = seen.as_mapping()
     summary["methods"] = [tables.design_row(row) for row in report.designs]
     if as_json:
         print(json.dumps(summary, indent=2))
@@ -96,11 +126,17 @@ def design(
     raise typer.Exit(1 if best is None else 0)
 
 
-def _draw(parts: "Parts", settings: "Settings", folder: Path, states: str | None) -> str | None:
+def _draw(
+    parts: "Parts",
+    settings: "Settings",
+    folder: Path,
+    states: str | None,
+    region: "ObservedRegion | None",
+) -> str | None:
     from echelon.output.plots.study_figures import save_design_figures
 
     with write_errors(folder):
-        _, radii = save_design_figures(parts, settings, folder, states)
+        _, radii = save_design_figures(parts, settings, folder, states, region)
     return None if radii is None else radii.sentence()
 
 

@@ -9,22 +9,22 @@ from echelon.core.types import JsonObject
 from echelon.guarantees.promises.hypotheses import events_in_words
 from echelon.guarantees.promises.promise import guarantee
 from echelon.simulation.engine.result import Result, finite_or_none
-from echelon.simulation.step.meter import SETTLED
+from echelon.simulation.step.meter import SETTLED, event_steps
 
 
 class EventOutcome(NamedTuple):
-    """What followed an event, until the next one, in the stored frames.
+    """What followed an event, until the next one, over all steps.
 
     Attributes:
         at: when it happened, s.
-        peak: the largest error of a follower that is there; None without a frame.
+        peak: the largest error of a follower that is there; None if it is not finite.
         restored: from when on all of these stayed below 1 cm, s; None if they did not.
-        until: of the last frame before the next event, s.
-        leader: who leads from then on, and its largest distance from the path; None where that does
-            not change, or nobody follows a path.
+        until: of the last step before the next event, s.
+        leader: who leads from then on, and its largest distance from the path in the stored frames;
+            None where that does not change, or nobody follows a path.
         near: the scaled distance to another agent at which one joins that keeps apart, m, where it
             is less than what they keep; else None.
-        sampled: whether there are steps between the frames.
+        sampled: whether there are steps between these frames.
     """
 
     at: float
@@ -47,7 +47,7 @@ class EventOutcome(NamedTuple):
         """Return it in a sentence or two."""
         text = f"{self.text[0].upper()}{self.text[1:]} at {self.at:g} s"
         if self.peak is None:
-            return f"{text}, after which no frame is stored. {self.guarantee}"
+            return f"{text}, after which a state is not finite. {self.guarantee}"
         limit = f"{SETTLED:g} {self.unit}".rstrip()
         size = f"{self.peak:.3g} {self.unit}".rstrip()
         if self.peak <= SETTLED:
@@ -56,11 +56,11 @@ class EventOutcome(NamedTuple):
             seen = f"errors reach {size}, and are not below {limit} by {self.until:.4g} s"
         else:
             seen = f"errors reach {size}, and stay below {limit} from {self.restored:.4g} s on"
-        seen = f"in the stored frames {seen}" if self.sampled else seen
         if self.leader is not None:
             agent, off = self.leader
             away = f"{off:.3g} {self.unit}".rstrip()
-            seen += f"; agent {agent} leads, {away} off the path at most"
+            frames = " in the stored frames" * self.sampled
+            seen += f"; agent {agent} leads, {away} off the path at most{frames}"
         if self.near is not None:
             seen += f"; it joins {self.near:.3g} m from another agent, nearer than hulls keep"
         return f"{text}: {seen}. {self.guarantee}"
@@ -69,29 +69,37 @@ class EventOutcome(NamedTuple):
 def event_outcomes(result: Result) -> tuple[EventOutcome, ...]:
     """Return what followed each event of a run that it reached, by time."""
     listed = events_in_words(result.parts, guarantee(result.parts, result.settings))
-    ends = [*(event["at"] for event in listed), np.inf][1:]
+    starts = event_steps(result.graph, result.settings)
+    steps, dt = int(result.sums.steps[0]), result.settings.dt
+    ends = np.minimum([*starts[1:], steps], steps)
+    # Events of one step have one span.
+    spans = [int(np.searchsorted(starts, event["at"] / dt - 1e-6)) for event in listed]
     return tuple(
-        _outcome(result, event, end)
-        for event, end in zip(listed, ends, strict=True)
-        if len(result.times) and event["at"] <= result.times[-1]
+        _outcome(result, event, span, (int(starts[span]), int(ends[span])))
+        for event, span in zip(listed, spans, strict=True)
+        if starts[span] < steps
     )
 
 
-def _outcome(result: Result, event: JsonObject, end: float) -> EventOutcome:
-    late, times = 0.5 * result.settings.dt, result.times
-    # A change acts from the first step on that does not begin before it.
-    frames = np.flatnonzero((times >= event["at"] - late) & (times < end - late))
-    errors = result.goal_distances(frames)[:, list(result.graph.followers)]
-    worst = errors.max(axis=1, initial=0.0)
-    large = np.flatnonzero(~(worst <= SETTLED))
-    first = int(large[-1]) + 1 if len(large) else 0
-    restored = float(times[frames[first]]) if first < len(frames) else None
+def _outcome(result: Result, event: JsonObject, span: int, steps: tuple[int, int]) -> EventOutcome:
+    """Return what followed an event from the first of two steps on, until before the other."""
+    (first, end), dt, sums = steps, result.settings.dt, result.sums
+    followers = list(result.graph.followers)
+    peak = float(np.sqrt(sums.peaks[followers, span]).max(initial=0.0))
+    late = int(sums.late[followers, span].max(initial=-1.0))
+    settled = late < end - 1
+    if end == sums.steps[0]:
+        # The last state begins no step, and is a frame.
+        last = result.goal_distances([-1])[0, followers].max(initial=0.0)
+        peak, settled = max(peak, float(last)), bool(last <= SETTLED)
+    until = (end if end == sums.steps[0] else end - 1) * dt
+    frames = np.flatnonzero((result.times >= (first - 0.5) * dt) & (result.times <= until + 1e-9))
     return EventOutcome(
         at=event["at"],
         text=event["text"],
-        peak=finite_or_none(worst.max()) if len(frames) else None,
-        restored=restored,
-        until=float(times[frames[-1]]) if len(frames) else event["at"],
+        peak=finite_or_none(peak),
+        restored=max(late + 1, first) * dt if settled else None,
+        until=until,
         unit=result.length_unit,
         leader=_new_leader(result, frames),
         near=_too_near(result, event, frames),

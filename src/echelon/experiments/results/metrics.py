@@ -5,8 +5,9 @@ Of agents that keep apart also how near they came, and when they held each other
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, TypeVar, final
 
 import jax
 import numpy as np
@@ -130,6 +131,21 @@ def _settling_time(result: Result, agent: int, last: float) -> float | None:
             return None
         first = max(first, float(steps[0]))
     return first * settings.dt
+
+
+_Truth = TypeVar("_Truth")
+
+
+def arrived(completed: _Truth, settled_from: Any, by: float = math.inf) -> _Truth:
+    """Return whether runs reached their horizon, and all followers settled by a time.
+
+    Args:
+        completed: whether each run reached its horizon: a truth, or an array of them.
+        settled_from: its `worst_settling_time`, s; NaN if a follower never settled.
+        by: the time, s.
+    """
+    settled: Any = settled_from <= by  # false of NaN
+    return completed & settled
 
 
 def _edges(result: Result, exists: bool) -> tuple[EdgeMetrics, ...]:

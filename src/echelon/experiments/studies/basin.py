@@ -148,7 +148,9 @@ def observed_radius(run: Trial, plane: StateSlice) -> float:
 
 def grid(plane: StateSlice, half: Array, side: int) -> tuple[Array, Array]:
     """Return the two axes of a grid of starts, symmetric about the goal."""
-    return np.linspace(-half[0], half[0], side), np.linspace(-half[1], half[1], side)
+    # From whole numbers, so that the centre is the goal to the bit.
+    places = np.arange(-(side // 2), side // 2 + 1) / (side // 2)
+    return half[0] * places, half[1] * places
 
 
 def converged(run: Trial, plane: StateSlice, starts: Float[Array, "S 2"]) -> Bool[Array, " S"]:

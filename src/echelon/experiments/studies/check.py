@@ -14,6 +14,7 @@ from echelon.core.statement import Statement, Topic, fails, holds, unneeded, vac
 from echelon.core.types import Array, JsonObject
 from echelon.core.words import Feedforward, Kind, amount
 from echelon.experiments.studies.assumptions import drift_lines, graph_lines
+from echelon.experiments.studies.observed_region import ObservedRegion
 from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.promise import AgreementModes, Guarantee, guarantee
 from echelon.simulation.engine.parts import Parts
@@ -184,11 +185,15 @@ __all__ = ["CheckResult", "check"]
 
 
 class CheckResult(NamedTuple):
-    """All lines, including the hypotheses of the promise; the promise; warnings of the parts."""
+    """All lines, including the hypotheses of the promise; the promise; warnings of the parts.
+
+    `region` is what was observed of random starts; None if none were simulated.
+    """
 
     lines: tuple[Statement, ...]
     promise: Guarantee
     warnings: tuple[str, ...] = ()
+    region: ObservedRegion | None = None
 
     @property
     def promised(self) -> bool:
@@ -199,7 +204,9 @@ class CheckResult(NamedTuple):
         """Return it ready for JSON."""
         lines = [line.as_mapping() for line in self.lines]
         warnings = list(self.warnings)
-        return {"promise": self.promise.as_mapping(), "lines": lines, "warnings": warnings}
+        stated = {"promise": self.promise.as_mapping(), "lines": lines, "warnings": warnings}
+        region = {} if self.region is None else {"region": self.region.as_mapping()}
+        return stated | region
 
 
 def check(parts: Parts, settings: Settings) -> CheckResult:

@@ -11,7 +11,7 @@ from echelon.core.files import versions
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.dataset import labelled_parts
 from echelon.experiments.results.labelled import Labelled, Variables
-from echelon.experiments.results.metrics import RunNumbers, metrics
+from echelon.experiments.results.metrics import RunNumbers, arrived, metrics
 from echelon.experiments.results.run_numbers import AGENT_NUMBERS, ERROR, RUN_NUMBERS, Quantity
 from echelon.experiments.scenario.scenario import key_label
 from echelon.experiments.scenario.yaml import inline_yaml
@@ -222,7 +222,7 @@ def succeeded(dataset: "xr.Dataset", error: float | None = None) -> "xr.DataArra
     """
     reached = dataset["outcome"] == OUTCOMES[Outcome.COMPLETED]
     if error is None:
-        return reached & dataset["worst_settling_time"].notnull()
+        return arrived(reached, dataset["worst_settling_time"])
     return reached & (dataset["worst_final_error"] < error)
 
 

@@ -204,7 +204,7 @@ def _result(
 
 
 def _sums(file: Path, arrays: Mapping[str, Array]) -> Sums:
-    if SUM + "steps" not in arrays:
+    if any(SUM + name not in arrays for name in Sums._fields):
         raise OutputError(
             f"`{file}` has no sums over all steps, which metrics and the report are computed from; "
             "`echelon run FOLDER --out OTHER` computes the run again."

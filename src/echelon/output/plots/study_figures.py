@@ -30,6 +30,7 @@ from echelon.experiments.studies.basin import (
     trial,
 )
 from echelon.experiments.studies.compare import PLANNED, PLANNED_LEADER, Comparison
+from echelon.experiments.studies.observed_region import ObservedRegion
 from echelon.experiments.sweeps.plan import SEED, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 from echelon.guarantees.promises.promise import guarantee
@@ -342,12 +343,17 @@ def _cell_ends(values: Array) -> Array:
 
 
 def save_design_figures(
-    parts: Parts, settings: Settings, folder: Path, axes: str | None = None
+    parts: Parts,
+    settings: Settings,
+    folder: Path,
+    axes: str | None = None,
+    region: ObservedRegion | None = None,
 ) -> tuple[list[Path], Radii | None]:
     """Write `modes` and `certified_set` of a gain as PNG and PDF; return paths and both radii.
 
     The second figure and the radii are missing for a model of one state, for a loop that does not
-    decay, and for more than 500 followers.
+    decay, and for more than 500 followers. An observed region is drawn beside the certified set,
+    or, where that figure is missing, as `observed_region`.
 
     Raises:
         GainError: `axes` names no two states of the model.
@@ -360,12 +366,16 @@ def save_design_figures(
     with draw.style():
         figures["modes"] = poles(LoopPoles(loop.poles, loop.eigenvalues))
         if states is not None and loop.every and len(parts.graph.followers) <= _MOST:
-            figures["certified_set"], radii = _certified_set(parts, settings, states)
+            figures["certified_set"], radii = _certified_set(parts, settings, states, region)
+        elif region is not None:
+            figures["observed_region"], ((ax,),) = draw.sheet(3.0)
+            _failing(ax, region, None)
+            figures["observed_region"] = draw.finish(figures["observed_region"])
     return save(figures, folder), radii
 
 
 def _certified_set(
-    parts: Parts, settings: Settings, states: tuple[int, int]
+    parts: Parts, settings: Settings, states: tuple[int, int], seen: ObservedRegion | None
 ) -> "tuple[Figure, Radii]":
     """A certified set much smaller than the observed one has a second panel."""
     run, plane = trial(parts, settings), slice_of(parts, states)
@@ -377,8 +387,8 @@ def _certified_set(
     panels = [wide]
     if certified and certified < np.inf and (plane.extents(certified) < 0.3 * wide).all():
         panels.append(plane.extents(1.5 * certified))
-    figure, (axes,) = draw.sheet(4.0, 1, len(panels))
-    for ax, half in zip(axes, panels, strict=True):
+    figure, (axes,) = draw.sheet(4.0, 1, len(panels) + (seen is not None))
+    for ax, half in zip(axes, panels, strict=False):
         _starts(ax, run, plane, half)
         _ellipses(ax, plane, radii, half)
         for name, k in zip("xy", states, strict=True):
@@ -387,8 +397,37 @@ def _certified_set(
     if len(panels) > 1:
         axes[0].set_title("observed")
         axes[1].set_title("certified")
+    if seen is not None:
+        _failing(axes[-1], seen, certified_scale(parts, certified or 0.0, seen))
     _legend(figure, axes[0], radii, run)
     return figure, radii
+
+
+def certified_scale(parts: Parts, radius: float, region: ObservedRegion) -> float:
+    """Return a scale up to which all starts of a region are in sum_i delta_i'P delta_i <= r^2."""
+    gain, names = parts.drive.gain, parts.model.state_names
+    assert gain is not None
+    widths = np.array([region.spreads.get(name, 0.0) for name in names])
+    # |d'P d| <= w'|P| w for all |d| <= w, entry by entry.
+    largest = len(parts.graph.followers) * float(widths @ np.abs(gain.P) @ widths)
+    return radius / np.sqrt(largest)
+
+
+def _failing(ax: "Axes", region: ObservedRegion, certified: float | None) -> None:
+    """Draw the share of random starts that fail over the scale, and its bound at 95 %."""
+    scales, runs = [x.scale for x in region.trials], [x.runs for x in region.trials]
+    share = np.array([x.failed for x in region.trials]) / runs
+    above = np.array([x.bound for x in region.trials]) - share
+    bars = np.stack([np.zeros(len(share)), above])
+    look: draw.Style = {"color": _OBSERVED, "fmt": "o:", "markersize": 3, "capsize": 2}
+    label = f"failed, of {runs[0]} random starts, and bound (95 %)"
+    ax.errorbar(scales, share, bars, label=label, **look)
+    if certified and certified < np.inf:
+        ax.axvline(certified, color=_CERTIFIED, label="certified up to here, leader at rest")
+    _name_values(ax, "x", np.array(scales))
+    ax.set(xlabel="scale of the starts' spreads", ylabel="share of runs that fail")
+    ax.set_ylim(-0.03, 1.03)
+    ax.legend(loc="best", fontsize="x-small")
 
 
 def _starts(ax: "Axes", run: Trial, plane: StateSlice, half: Array) -> None:

@@ -8,6 +8,7 @@ from typing import final
 from echelon.core.statement import Hypothesis, Statement, Topic
 from echelon.core.words import Verdict, amount
 from echelon.experiments.studies.check import CheckResult
+from echelon.output.reports.region_report import region_report
 
 WIDTH, HEIGHT = 80, 40
 """Columns and lines of a terminal."""
@@ -43,10 +44,11 @@ def check_report(check: CheckResult) -> str:
     """Return a check in at most 80 columns, and 40 lines unless more than that fails.
 
     What fails stands with its remedy, and what holds with its number as far as there is room, else
-    by its name, or as a count; of what is not needed the names alone.
+    by its name, or as a count; of what is not needed the names alone. An observed region follows.
     """
     texts = ["\n".join(_text(check, detail)) for detail in _Detail]
-    return next((text for text in texts if text.count("\n") < HEIGHT), texts[-1])
+    text = next((text for text in texts if text.count("\n") < HEIGHT), texts[-1])
+    return text if check.region is None else f"{text}\n\n{region_report(check.region)}"
 
 
 def check_sentences(check: CheckResult) -> list[str]:

@@ -47,6 +47,7 @@ class BlockRows(NamedTuple):
         varying: numbers of its law and model that differ between formations.
         errors, tracking: as in `Sums`, but of the steps before the steady window and in it.
         effort, limited, unsettled, inside, chatter, outputs: as in `Sums`.
+        peak: minus the largest squared error since the last event; empty without events.
         exception: 1 where the numbers are not what JAX computes.
         total: how many rows there are.
     """
@@ -66,6 +67,7 @@ class BlockRows(NamedTuple):
     unsettled: range
     inside: range
     chatter: range
+    peak: range
     tracking: range
     outputs: range
     exception: range
@@ -89,7 +91,8 @@ class BlockRows(NamedTuple):
             m,
             varying,
         ]
-        sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q, 1]
+        sizes += [2, 1, 1, 1, len(loop.meter.charted), 1]
+        sizes += [min(1, len(loop.meter.events)), 2, q, 1]
         ends = np.cumsum([0, *sizes]).tolist()
         return cls._make([*(range(a, b) for a, b in itertools.pairwise(ends)), ends[-1]])
 
@@ -275,11 +278,13 @@ def body_of(
     if leads and follows:
         tracking = _before_and_in_window(inputs, outputs.tracking)
         sums |= {"tracking": tracking, "outputs": outputs.outputs}
+    # One row of the smallest numbers serves for the largest too.
+    peak = [graph.make("sub", 0.0, outputs.errors[0])] if len(rows.peak) else []
     subtract = functools.partial(map, functools.partial(graph.make, "unfused_sub"))
     body = Body(
         stores=_placed(rows, stores),
         sums=_placed(rows, sums),
-        minima=_placed(rows, {"inside": outputs.inside}),
+        minima=_placed(rows, {"inside": outputs.inside, "peak": peak}),
         on_request=_placed(rows, {"input": outputs.input}),
         tape=dict(enumerate(inputs.x[list(loop.meter.paired)].tolist())),
         mirror_before=[*subtract(inputs.x, inputs.offset), *outputs.signal],

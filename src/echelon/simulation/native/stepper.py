@@ -102,6 +102,8 @@ class NativeStepper(Stepper):
         # Whole vectors, because to repeat single numbers takes as long as many steps.
         initial = np.zeros((rows.total, self.plan.lanes), self.dtype)
         initial[rows.unsettled.start], initial[rows.inside.start : rows.inside.stop] = -1.0, ALWAYS
+        # No minimum yet, as in a kernel.
+        initial[rows.peak.start : rows.peak.stop] = ALWAYS
         return initial[rows.errors.start :]
 
     def _reserve(self) -> None:
@@ -241,8 +243,11 @@ class NativeStepper(Stepper):
             most = min(most, _LEADER_NUMBERS // (self.leader_blocks * size))
         while steps:
             row, constant = self.loop.graph.stretch(step)
+            self._begin_span(step)
             self.neighbourhood = self.neighbourhood._replace(weights=self.edge_weights[row])
             count = min(steps, self._pairs.steps, max(1, most), constant)
+            later = self._events[self._events > step]
+            count = min(count, int(later[0]) - step) if len(later) else count
             for wind in weather:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
@@ -297,6 +302,28 @@ class NativeStepper(Stepper):
         if self.plan.row_major:
             return self.mirrors[0][:, : self.leader_blocks * self.plan.lanes]
         return self.mirrors[0][: self.leader_blocks]
+
+    # ---- spans between events ----
+
+    def _begin_span(self, step: int) -> None:
+        """Keep what was measured before an event, if there is one at a step, and begin anew."""
+        if step not in self._events:
+            return
+        rows, size = self.rows, (len(self.places.position), 1)
+        late, peak = (self._read(part, np.empty(size)) for part in (rows.unsettled, rows.peak))
+        self._end_span(step, late, peak)
+        first = rows.errors.start
+        for part in (rows.unsettled.start, rows.peak.start):
+            self.blocks[:, part] = self._no_sums[part - first]
+
+    def _end_span(self, step: int, late: Array, peak: Array) -> None:
+        """Keep the last steps above the bound and the largest errors until a step, each (N, 1)."""
+        at = int(np.searchsorted(self._events, step - 1, side="right")) - 1
+        self._unsettled = np.maximum(self._unsettled, late)
+        if at >= 0:
+            self._late[:, at] = np.maximum(self._late, late)[:, at]
+            # NaN of a state that is not finite stays, as in JAX.
+            self._peaks[:, at] = np.maximum(self._peaks, np.maximum(-peak, 0.0))[:, at]
 
     # ---- moments and sums ----
 
@@ -358,6 +385,10 @@ class NativeStepper(Stepper):
         self._pairs.clear()
         self.blocks[:, self.rows.errors.start :] = self._no_sums
         self.edges[..., -1, :] = 0.0
+        self._events = np.asarray(self.loop.meter.events)
+        size = len(self.places.position), len(self._events)
+        self._peaks, self._late = np.zeros(size), np.full(size, -1.0)
+        self._unsettled = np.full((size[0], 1), -1.0)
 
     def _sums(self, first: int, end: int, agent_sums: Array) -> Sums:
         rows, leaders, meter = self.rows, self.leaders, self.loop.meter
@@ -371,6 +402,8 @@ class NativeStepper(Stepper):
             block, lane = np.divmod(self.places.position[leaders], self.plan.lanes)
             return self.blocks[block, places.start : places.stop, lane].astype(np.float64)
 
+        peak = of(rows.peak) if len(self._events) else np.zeros((len(agent_sums), 1))
+        self._end_span(end, of(rows.unsettled), peak)
         sums = Sums(
             steps=np.array([end - first, steady]),
             errors=_total_and_window(of(rows.errors)),
@@ -379,11 +412,13 @@ class NativeStepper(Stepper):
             effort=of(rows.effort)[:, 0],
             spacing=self.places.spacing(self.edges),
             limited=of(rows.limited)[:, 0],
-            unsettled=of(rows.unsettled)[:, 0],
+            unsettled=self._unsettled[:, 0],
             inside=np.minimum(of(rows.inside), ALWAYS),
             chatter=of(rows.chatter)[:, 0],
             **dict.fromkeys(("separation", "avoidance"), np.zeros((len(agent_sums), 0))),
             **self._pairs.terms(),
+            peaks=self._peaks,
+            late=self._late,
         )
         return Sums(*(np.asarray(part, np.float64) for part in sums)).split(len(self.loops))
 

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
@@ -59,6 +59,10 @@ class Sums(NamedTuple):
         avoidance: (N, B) how many others changed the agent's rate, summed over the steps of each.
         closest: (1,) the smallest distance between two agents at the beginning of a step, and `met`
             (1, 3) that step and the two; (0,) and (0, 3) where `RunStatistics.paired` is empty.
+        peaks: (N, J) the largest squared deviation from the goal from each of J events on, until
+            the next one.
+        late: (N, J) the last step in the same span at which the error was above `SETTLED`; -1 if
+            there is none.
     """
 
     steps: Total
@@ -75,6 +79,8 @@ class Sums(NamedTuple):
     avoidance: Total
     closest: Total
     met: Total
+    peaks: Total
+    late: Total
 
     def plus(self, more: "Sums") -> "Sums":
         """Return the sums of two stretches of a run."""
@@ -83,10 +89,12 @@ class Sums(NamedTuple):
         # The maximum, and below the minimum; written so that NumPy on the host and JAX within a
         # chunk both have it.
         last = self.unsettled + (more.unsettled - self.unsettled).clip(0)
+        since = self.late + (more.late - self.late).clip(0)
         first = self.inside - (self.inside - more.inside).clip(0)
         closer = more.closest < self.closest
         met = self.met + closer[..., None] * (more.met - self.met)
         closest = self.closest.clip(None, more.closest)
+        total = total._replace(peaks=self.peaks.clip(more.peaks), late=since)
         return total._replace(unsettled=last, inside=first, closest=closest, met=met)
 
     # ---- sums of formations: an axis F in front of each part ----
@@ -151,6 +159,7 @@ class RunStatistics(eqx.Module):
     charted: Array
     chart: Array
     per_slice: Array
+    events: Array
     scales: Array
     # Static, since they decide shapes.
     measured: tuple[int, ...] = eqx.field(static=True)
@@ -184,6 +193,7 @@ class RunStatistics(eqx.Module):
             charted=np.array([model.state_names.index(name) for name in model.chart], int),
             chart=np.array([*model.chart.values()], float).reshape(-1, 2),
             per_slice=np.asarray(per_slice, np.int32),
+            events=event_steps(graph, settings),
             scales=np.zeros(0) if scales is None else scales,
             measured=measured,
             slices=0 if scales is None else -(-settings.steps // per_slice),
@@ -210,6 +220,8 @@ class RunStatistics(eqx.Module):
             avoidance=xp.zeros((agents, self.slices), dtype),
             closest=xp.full(min(1, len(self.paired)), jnp.inf, dtype),
             met=xp.zeros((min(1, len(self.paired)), 3), np.int32),
+            peaks=xp.zeros((agents, len(self.events)), dtype),
+            late=xp.full((agents, len(self.events)), -1, np.int32),
         )
 
     def read(
@@ -242,6 +254,7 @@ class RunStatistics(eqx.Module):
 
         rows = jax.vmap(one)(states, offsets, y[self.nearest], inputs)
         led = states[self.leaders], offsets[self.leaders]
+        since = self._since(step)
         tracking, outputs = self._tracking(steady, led, reference)
         return Sums(
             steps=jnp.stack([jnp.asarray(True), steady]).astype(jnp.int32),
@@ -258,7 +271,14 @@ class RunStatistics(eqx.Module):
             avoidance=jnp.zeros((len(states), self.slices), states.dtype),
             closest=jnp.full(min(1, len(self.paired)), jnp.inf, states.dtype),
             met=jnp.zeros((min(1, len(self.paired)), 3), jnp.int32),
+            peaks=jnp.where(since, rows.errors[:, :1], 0.0),
+            late=jnp.where(since, rows.unsettled[:, None], -1).astype(jnp.int32),
         )
+
+    def _since(self, step: jax.Array) -> Bool[jax.Array, " J"]:
+        """Return which event is the last one before or at a step."""
+        events = jnp.asarray(self.events)
+        return jnp.arange(len(events)) == jnp.searchsorted(events, step, side="right") - 1
 
     def following(self, nearest: jax.Array) -> "RunStatistics":
         """Return a meter of errors relative to these leaders (N,)."""
@@ -268,7 +288,8 @@ class RunStatistics(eqx.Module):
         """Return the sums of a step without the agents, leaders and edges that are absent."""
         nothing, leads = self.zero_sums(), here[self.leaders]
         masks = dict.fromkeys(("effort", "limited", "unsettled", "chatter"), here)
-        masks |= dict.fromkeys(("inside", "separation", "avoidance"), here[:, None])
+        spans = "inside", "separation", "avoidance", "peaks", "late"
+        masks |= dict.fromkeys(spans, here[:, None])
         masks |= {"errors": here[None], "tracking": leads[None], "outputs": leads[:, None]}
         masks["spacing"] = here[self.edges].all(axis=1)
         return read._replace(
@@ -371,6 +392,12 @@ def outside(bounded: _Numbers, low: _Numbers, high: _Numbers) -> _Numbers:
 def reference_at(reference: Array | None, k: jax.Array, states: States) -> jax.Array | None:
     """Return row k of a reference (S, n) in the precision of the states; None without one."""
     return None if reference is None else jnp.asarray(reference, states.dtype)[k]
+
+
+def event_steps(graph: Graph, settings: Settings) -> Int[np.ndarray, " J"]:
+    """Return the first steps that do not begin before an event, ascending, each once."""
+    times = np.array([event.at for event in graph.events], float)
+    return np.unique(np.ceil(times / settings.dt - 1e-6)).astype(np.int32)
 
 
 def steps_per_slice(settings: Settings) -> int:
