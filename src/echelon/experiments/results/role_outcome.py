@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterable
 from typing import NamedTuple, final
 
+import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import Outcome
@@ -93,7 +94,7 @@ def _leaders(result: Result, steady: Iterable[float | None]) -> RoleOutcome | No
     with precision("float64"):
         away = [
             # A model's own difference, since an angle may have wound up.
-            result.model.difference(x, row + offset)
+            result.model.difference(jnp.asarray(x), jnp.asarray(row + offset))
             for x, row, offset in (
                 (result.states[k, agent], path[k], result.offsets_in([k])[..., agent, :].ravel())
                 for k in (0, -1)

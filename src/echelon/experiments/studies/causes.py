@@ -16,6 +16,7 @@ from echelon.core.errors import EchelonError, Outcome
 from echelon.core.types import JsonObject
 from echelon.experiments.results.role_outcome import Grade, RoleOutcome, RunOutcome, run_outcome
 from echelon.experiments.scenario.build import build
+from echelon.experiments.scenario.named_class import modules_kept
 from echelon.experiments.scenario.scenario import Scenario, ScenarioLike, as_scenario
 from echelon.experiments.studies.scenario_changes import (
     Change,
@@ -166,7 +167,8 @@ def causes(
         result = _finished(simulate(*build(scenario, to_run=True)))
     study = CauseStudy(scenario.name, result.length_unit, run_outcome(result), seconds=seconds)
     # Counted from here: it is the run itself that was asked for.
-    return study if not study.poor else _Search(scenario, result, study, progress).study()
+    with modules_kept():
+        return study if not study.poor else _Search(scenario, result, study, progress).study()
 
 
 def effect_of(after: RoleOutcome | None, spread: Sequence[RoleOutcome | None]) -> Effect:
@@ -265,8 +267,6 @@ class _Search:
         )
 
     def _try(self, changes: tuple[Change, ...]) -> None:
-        if self._needless(changes):
-            return
         keys = tuple(dict.fromkeys(key for change in changes for key in change.keys))
         try:
             outcome = self._outcome(keys)
@@ -288,15 +288,6 @@ class _Search:
         effect = effect_of(getattr(outcome, role), spread)
         # What arrives in every run needs no explanation.
         return effect if effect is not Effect.EXPLAINS or role in self.base.poor else Effect.NONE
-
-    def _needless(self, changes: tuple[Change, ...]) -> bool:
-        """Tell whether more substeps cannot explain more: fewer did, or nobody was lost."""
-        if len(changes) > 1 or changes[0].family != "substeps":
-            return False
-        before = [trial for trial in self.trials if trial.changes[0].family == "substeps"]
-        helped = any(Effect.EXPLAINS in trial.effects.values() for trial in before)
-        lost = any(x is not None and x.grade is Grade.LOST for x in self.base.outcome)
-        return bool(before) and (helped or not lost)
 
     def _try_pairs(self, role: str) -> None:
         """Try pairs until one explains, those first that leave out parts and helped most alone."""

@@ -10,7 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from echelon.agents.models.linearization import linearize
+from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.reference import Reference
+from echelon.core.digits import about
 from echelon.core.words import Feedforward
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.yaml import part_at
@@ -20,8 +23,12 @@ from echelon.simulation.engine.result import Result
 
 _MORE = 2.0
 """The factor of gains, of the path's time and of the horizon."""
-SUBSTEPS = (4, 32, 256)
-"""Factors on the substeps, each tried only where fewer did not help."""
+_DIGITS = 4
+"""Of a coupling: what is printed is what was simulated."""
+_FEW = 4
+"""Factor on the substeps that is always tried; more are where the model is faster than a step."""
+_REACH = 2.5
+"""Speed times step up to which Runge-Kutta is stable, on the real axis 2.785."""
 
 
 class Change(NamedTuple):
@@ -103,7 +110,7 @@ def candidate_changes(scenario: Scenario, result: Result) -> list[Change]:
     if not isinstance(shorter, str):
         found.append(Change("half the step `dt`", shorter, "step"))
     if simulation.integrator != "printed":
-        found += [_substeps(scenario, factor) for factor in SUBSTEPS]
+        found += _substeps(scenario, result.model)
     return found
 
 
@@ -153,9 +160,14 @@ def shorter_step(scenario: Scenario) -> tuple[str, ...] | str:
     return tuple(keys)
 
 
-def _substeps(scenario: Scenario, factor: int) -> Change:
-    count = factor * scenario.simulation.substeps
-    return Change(f"{count} substeps", (f"simulation.substeps={count}",), "substeps")
+def _substeps(scenario: Scenario, model: ControlAffine) -> list[Change]:
+    simulation = scenario.simulation
+    fastest = float(np.abs(np.linalg.eigvals(linearize(model)[0])).max())
+    needed = fastest * simulation.dt / (simulation.substeps * _REACH)
+    # As many as the fastest mode of the model alone needs, which is no statement but a guess.
+    factors = {_FEW, max(_FEW, 2 ** math.ceil(math.log2(max(needed, 1.0))))}
+    counts = [factor * simulation.substeps for factor in sorted(factors)]
+    return [Change(f"{k} substeps", (f"simulation.substeps={k}",), "substeps") for k in counts]
 
 
 def _network(scenario: Scenario) -> Iterator[Change]:
@@ -200,9 +212,9 @@ def _stronger(law: Any, role: str, factor: float, dt: float) -> str | None:
     gain = gain_of(law)
     if gain is None:
         strength = getattr(law, "strength", None)
-        return strength and f"{role}.coupling={factor * float(strength(dt))!r}"
+        return strength and f"{role}.coupling={about(factor * float(strength(dt)), _DIGITS)}"
     if role == "follower":
-        return f"follower.gain.coupling={factor * gain.coupling!r}"
+        return f"follower.gain.coupling={about(factor * gain.coupling, _DIGITS)}"
     if gain.inner is not None:
         return None
     # A leader's gain has the coupling 1; it is proportional to the inverse of R.
