@@ -3,8 +3,8 @@
 Each family takes a scenario whose agents arrive, plants one cause of a poor run, and draws its size
 or the starts, and the seed; what would be compiled anew is the same in a family. Named are the
 changes of `echelon causes` under "would not have happened": a name is right if it is the planted
-one, and false if it is none of the family's. Run it with `python benchmarks/causes.py [FAMILY ...]`;
-all 60 runs take half an hour of a processor.
+one, and false if it is none of the family's. All 60 runs take half an hour of a processor.
+Run it with `python benchmarks/causes.py [FAMILY ...]`.
 """
 
 import sys

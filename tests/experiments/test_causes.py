@@ -1,4 +1,4 @@
-"""Causes of poor runs: the rules by which one is stated, on outcomes made up, and planted causes."""
+"""Causes of poor runs: the rules by which one is stated, and causes that were planted."""
 
 import dataclasses
 import itertools
@@ -23,7 +23,11 @@ from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import scenario_from_mapping
 from echelon.experiments.studies import causes as study_of
 from echelon.experiments.studies.causes import Effect, causes, effect_of, moved_starts
-from echelon.experiments.studies.scenario_changes import other_seed, shorter_step
+from echelon.experiments.studies.scenario_changes import (
+    other_seed,
+    shorter_step,
+    without_sections,
+)
 from echelon.output.reports.causes_report import causes_report
 from echelon.simulation.engine.parts import initial_states
 from echelon.simulation.engine.prepare import prepare
@@ -243,6 +247,12 @@ def test_another_seed_is_one_of_all_sections():
         seed=3, disturbance={"rms": {"velocity": 1.0}, "seed": 4}, sensing={"delay": 0.1}
     )
     assert other_seed(loaded, 5) == ("seed=1008", "disturbance.seed=1009")
+
+
+def test_a_key_does_not_restore_the_section_that_another_change_leaves_out():
+    keys = ("simulation.dt=0.1", "sensing.delay=0.5", "sensing=null", "sensing.seed=3", "seed=4")
+    assert without_sections(keys) == ("simulation.dt=0.1", "sensing=null", "seed=4")
+    assert without_sections(("seed=4", "network.seed=4")) == ("seed=4", "network.seed=4")
 
 
 def test_starts_are_moved_by_a_billionth_those_of_leaders_with_an_error_too():

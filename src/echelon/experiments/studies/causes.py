@@ -21,8 +21,10 @@ from echelon.experiments.scenario.scenario import Scenario, ScenarioLike, as_sce
 from echelon.experiments.studies.scenario_changes import (
     Change,
     candidate_changes,
+    keys_of,
     left_out,
     other_seed,
+    without_sections,
 )
 from echelon.simulation.engine.parts import Parts, Starts
 from echelon.simulation.engine.result import Result
@@ -71,7 +73,7 @@ class Trial(NamedTuple):
     @property
     def keys(self) -> tuple[str, ...]:
         """The keys of the scenario, as `--set` changes them."""
-        return tuple(dict.fromkeys(key for change in self.changes for key in change.keys))
+        return keys_of(self.changes)
 
     @property
     def removes(self) -> bool:
@@ -91,6 +93,7 @@ class Trial(NamedTuple):
         return {**keys, "outcome": outcomes, "effect": effects, "remedy": self.remedy}
 
 
+@final
 @dataclasses.dataclass(frozen=True)
 class CauseStudy:
     """What was found about the outcome of a run.
@@ -221,10 +224,12 @@ def moved_starts(parts: Parts, seed: int, draw: int, single: bool) -> Parts:
     return parts.replace(initial=dict(enumerate(states)))
 
 
+@final
 class _TimeOver(Exception):
     """The time that was allowed is over."""
 
 
+@final
 class _Search:
     """Simulates changes one after the other, until the time is over."""
 
@@ -267,7 +272,7 @@ class _Search:
         )
 
     def _try(self, changes: tuple[Change, ...]) -> None:
-        keys = tuple(dict.fromkeys(key for change in changes for key in change.keys))
+        keys = keys_of(changes)
         try:
             outcome = self._outcome(keys)
         except EchelonError as error:
@@ -294,6 +299,9 @@ class _Search:
         alone = [x for x in self.trials if len(x.changes) == 1]
         if any(trial.effects[role] is Effect.EXPLAINS for trial in self.trials):
             return
+        if any(_rank(outcome, role)[0] == Grade.ARRIVED for outcome in self.spread):
+            # Nothing counts where another seed does as much.
+            return
         able = [trial for trial in alone if trial.effects[role] is Effect.NONE]
         ordered = sorted(able, key=lambda x: (not x.removes, _rank(x.outcome, role)))
         for one, other in _by_sum(ordered):
@@ -307,7 +315,7 @@ class _Search:
         """Return the outcome with changed keys, and with the start or the seed of a placebo."""
         self._check_time()
         seed = () if placebo is None or placebo < _MOVES else other_seed(self.scenario, placebo)
-        scenario = self.scenario.with_(*keys, *seed)
+        scenario = self.scenario.with_(*without_sections(keys + seed))
         parts, settings = build(scenario, to_run=True)
         if placebo is not None and placebo < _MOVES:
             single = settings.precision == "float32"

@@ -5,7 +5,7 @@ number alone, so that leaving out a part shifts no other draw.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,6 +58,7 @@ class _Removal(NamedTuple):
     value: str
     words: str
     remedy: bool = True
+    part: bool = True
 
 
 _REMOVALS = (
@@ -70,7 +71,7 @@ _REMOVALS = (
     _Removal(("events",), "[]", "no events", remedy=False),
     _Removal(("safety",), "null", "no collision avoidance"),
     _Removal(("formation", "motion"), "[]", "a formation that does not move"),
-    _Removal(("leader", "start_error"), "{}", "a leader that starts on its path"),
+    _Removal(("leader", "start_error"), "{}", "a leader that starts on its path", part=False),
     _Removal(("leader", "observer"), "null", "no observer of the leader"),
     _Removal(("follower", "observer"), "null", "no observer of the followers"),
     _Removal(("leader", "speed"), "null", "no bound on the leader's speed"),
@@ -78,7 +79,8 @@ _REMOVALS = (
     _Removal(("leader", "reacts"), "false", "a leader that does not react"),
     _Removal(("follower", "trim"), "true", "the trim input"),
     _Removal(("follower", "frame"), "heading", "gains in axes that turn with the heading"),
-    _Removal(("initial",), "null", "starts at the goals"),
+    # A start is no part: without one, whatever is slow is not seen.
+    _Removal(("initial",), "null", "starts at the goals", part=False),
     _Removal(("simulation", "integrator"), "rk4", "the integrator `rk4`"),
     _Removal(("simulation", "precision"), "float64", "float64", remedy=False),
 )
@@ -99,10 +101,12 @@ def candidate_changes(scenario: Scenario, result: Result) -> list[Change]:
         found.append(Change(words, ("simulation.limits=false",), "limits", remedy=False))
     for removal in _REMOVALS:
         held = part_at(data, removal.path)
-        # An empty section, `false` and zero do nothing already.
-        if held and str(held) != removal.value:
+        # An empty section and zero do nothing already.
+        acts = removal.value == "true" if held is False else held and str(held) != removal.value
+        if acts:
             key = f"{'.'.join(removal.path)}={removal.value}"
-            found.append(Change(removal.words, (key,), removal.path[0], removal.remedy))
+            of = removal.path[0], removal.remedy, removal.part
+            found.append(Change(removal.words, (key,), *of))
     found += [*_network(scenario), *_graph(scenario), *_relay(scenario)]
     # These are compiled already.
     found += [*_couplings(result), *_times(scenario, result)]
@@ -112,6 +116,17 @@ def candidate_changes(scenario: Scenario, result: Result) -> list[Change]:
     if simulation.integrator != "printed":
         found += _substeps(scenario, result.model)
     return found
+
+
+def keys_of(changes: Sequence[Change]) -> tuple[str, ...]:
+    """Return the keys of several changes, as `--set` changes them."""
+    return without_sections([key for change in changes for key in change.keys])
+
+
+def without_sections(keys: Sequence[str]) -> tuple[str, ...]:
+    """Return keys without those of a section that is left out, which they would restore."""
+    gone = tuple(f"{key.removesuffix('=null')}." for key in keys if key.endswith("=null"))
+    return tuple(key for key in dict.fromkeys(keys) if not key.startswith(gone or "="))
 
 
 def left_out(scenario: Scenario, result: Result) -> list[tuple[str, str]]:

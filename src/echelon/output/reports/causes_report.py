@@ -127,7 +127,8 @@ def _placebos(study: CauseStudy) -> Iterator[str]:
         texts.append(f"{role} {' or '.join(parts)}")
     yield f"{count} reruns from starts moved by 1e-9 or with other seeds: {'; '.join(texts)}."
     for role in study.poor:
-        arrived = sum(getattr(x, role).grade is Grade.ARRIVED for x in study.placebos)
+        outcomes = (getattr(x, role) for x in study.placebos)
+        arrived = sum(x is not None and x.grade is Grade.ARRIVED for x in outcomes)
         if arrived:
             verb = "arrives" if role == "leader" else "arrive"
             text = f"The {role} {verb} in {arrived} of these reruns"
