@@ -54,7 +54,7 @@ class Effect(enum.StrEnum):
     NONE = "none"
 
 
-class Trial(NamedTuple):
+class TriedChange(NamedTuple):
     """One change, or two at once, and the outcome of the run with them.
 
     Attributes:
@@ -112,7 +112,7 @@ class CauseStudy:
     unit: str
     outcome: RunOutcome
     placebos: tuple[RunOutcome, ...] = ()
-    trials: tuple[Trial, ...] = ()
+    trials: tuple[TriedChange, ...] = ()
     untried: tuple[tuple[str, str], ...] = ()
     seconds: float = SECONDS
 
@@ -122,7 +122,7 @@ class CauseStudy:
         outcomes = self.outcome._asdict()
         return tuple(x for x in ROLES if outcomes[x] and outcomes[x].grade is not Grade.ARRIVED)
 
-    def causes(self, role: str) -> list[Trial]:
+    def causes(self, role: str) -> list[TriedChange]:
         """Return the changes without which a role's outcome would be another, best first.
 
         Smaller gains and slower paths are causes only where no part can be left out instead.
@@ -243,7 +243,7 @@ class _Search:
         self.scenario, self.base, self.progress = scenario, study, progress
         self.changes = candidate_changes(scenario, result)
         self.end = time.monotonic() + study.seconds
-        self.trials, self.done = list[Trial](), 0
+        self.trials, self.done = list[TriedChange](), 0
         self.untried = left_out(scenario, result)
         self.placebos, self.spread = list[RunOutcome](), [study.outcome]
 
@@ -284,7 +284,7 @@ class _Search:
             for role, effect in effects.items():
                 same = effect is self._effect(role, again, changes)
                 effects[role] = effect if same or effect is not Effect.EXPLAINS else Effect.NONE
-        self.trials.append(Trial(changes, outcome, effects))
+        self.trials.append(TriedChange(changes, outcome, effects))
 
     def _effect(self, role: str, outcome: RunOutcome, changes: tuple[Change, ...]) -> Effect:
         inside = {change.beside for change in changes if change.beside}
@@ -339,7 +339,7 @@ def _words(changes: tuple[Change, ...]) -> str:
     return " and ".join(change.words for change in changes)
 
 
-def _by_sum(ordered: Sequence[Trial]) -> Iterator[tuple[Trial, Trial]]:
+def _by_sum(ordered: Sequence[TriedChange]) -> Iterator[tuple[TriedChange, TriedChange]]:
     """Yield all pairs, those of the first ones first."""
     places = itertools.combinations(range(len(ordered)), 2)
     for i, j in sorted(places, key=lambda pair: (sum(pair), pair)):

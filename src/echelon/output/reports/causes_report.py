@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from echelon.core.digits import about
 from echelon.core.words import amount
 from echelon.experiments.results.role_outcome import Grade, RoleOutcome, RunOutcome
-from echelon.experiments.studies.causes import CauseStudy, Effect, Trial
+from echelon.experiments.studies.causes import CauseStudy, Effect, TriedChange
 
 _WHOSE = {"leader": "leader's", "followers": "followers'"}
 _SHORT = 60
@@ -62,7 +62,7 @@ def causes_sentences(study: CauseStudy) -> Iterator[str]:
     yield from _rest(study)
 
 
-def _cause(study: CauseStudy, trial: Trial, roles: Sequence[str]) -> Iterator[str]:
+def _cause(study: CauseStudy, trial: TriedChange, roles: Sequence[str]) -> Iterator[str]:
     """Yield what a change explains, of the roles that it explains in the same way."""
     kinds: dict[str, list[str]] = {}
     for role in roles:
@@ -76,7 +76,7 @@ def _cause(study: CauseStudy, trial: Trial, roles: Sequence[str]) -> Iterator[st
         yield f"{kind} with {trial.words}: {_instead(study, trial, of)}."
 
 
-def _instead(study: CauseStudy, trial: Trial, roles: Sequence[str]) -> str:
+def _instead(study: CauseStudy, trial: TriedChange, roles: Sequence[str]) -> str:
     pairs = []
     for role in roles:
         after = _number(getattr(trial.outcome, role), study.unit)
@@ -96,7 +96,7 @@ def _none(study: CauseStudy, roles: Sequence[str]) -> Iterator[str]:
     yield f"{text}; and {amount(pairs, 'pair')} of them." if pairs else f"{text}."
 
 
-def _remedies(trials: Sequence[Trial]) -> Iterator[str]:
+def _remedies(trials: Sequence[TriedChange]) -> Iterator[str]:
     texts = []
     for trial in (trial for trial in trials if trial.remedy):
         keys = " ".join(f"--set {_quoted(key)}" for key in trial.keys)
