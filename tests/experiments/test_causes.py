@@ -345,3 +345,20 @@ def test_single_precision_far_away_is_a_cause():
 def test_a_formation_without_the_leaders_input_lags_and_its_leader_does_not():
     found = causes(scenario(**LONG, follower={"feedforward": "none"}), 600.0)
     assert named(found) == {"followers": ["the leader's input relayed"]}
+
+
+@pytest.mark.slow
+def test_late_sensors_and_slow_actuators_are_a_pair_where_neither_alone_is_the_cause():
+    # By the characteristic equation s^2 (1 + 4 s) + 6.85 (1.732 s + 1) exp(-0.5 s) = 0 errors grow
+    # at 0.64 1/s; at 0.15 1/s with the lag alone, at 2.1 1/s with the delay alone.
+    found = causes(
+        scenario(
+            simulation={"horizon": 60.0, "dt": 0.05, "store_every": 20},
+            initial={"spread": {"position": 0.3}},
+            sensing={"delay": 0.5},
+            actuator={"lag": 4.0},
+        ),
+        600.0,
+    )
+    pair = "exact sensors and no actuator lag"
+    assert [trial.words for trial in found.causes("followers")] == [pair]
