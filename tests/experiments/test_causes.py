@@ -164,6 +164,20 @@ def test_where_no_single_change_helps_a_pair_may(monkeypatch):
     assert pairs and all(one.family != other.family for one, other in pairs)
 
 
+def test_a_pair_with_a_change_that_explains_alone_explains_no_more(monkeypatch):
+    # Leaders are explained by exact sensors, followers by nothing but the pair.
+    def outcome(search, keys, placebo=None):
+        text = " ".join(keys)
+        leader = ARRIVED if "sensing=null" in text else BOUNDED
+        return RunOutcome(leader, ARRIVED if leader is ARRIVED and "actuator" in text else BOUNDED)
+
+    monkeypatch.setattr(study_of._Search, "_outcome", outcome)
+    monkeypatch.setattr(study_of, "run_outcome", lambda result: RunOutcome(BOUNDED, BOUNDED))
+    found = causes(scenario(**WORLD), 60.0, not_simulated(scenario(**WORLD)))
+    pair = ["exact sensors and no actuator lag"]
+    assert named(found) == {"leader": ["exact sensors"], "followers": pair}
+
+
 def test_what_makes_it_worse_is_told_and_no_remedy(monkeypatch):
     found = searched(monkeypatch, {"sensing=null": LOST}, **WORLD)
     text = causes_report(found)

@@ -291,8 +291,14 @@ class _Search:
         before = [x.outcome for x in self.trials if x.words in inside]
         spread = [getattr(each, role) for each in (*self.spread, *before)]
         effect = effect_of(getattr(outcome, role), spread)
-        # What arrives in every run needs no explanation.
-        return effect if effect is not Effect.EXPLAINS or role in self.base.poor else Effect.NONE
+        if effect is not Effect.EXPLAINS:
+            return effect
+        # A pair of which one change explains alone says no more; what arrives needs no explanation.
+        alone = any(
+            trial.effects[role] is Effect.EXPLAINS and {*trial.changes} < {*changes}
+            for trial in self.trials
+        )
+        return Effect.NONE if alone or role not in self.base.poor else effect
 
     def _try_pairs(self, role: str) -> None:
         """Try pairs until one explains, those first that leave out parts and helped most alone."""
