@@ -181,6 +181,25 @@ def test_a_diverging_run_is_a_result(here, echelon):
         assert len(data.time) > 10 and bool(np.isfinite(data.states).all())
 
 
+@pytest.mark.slow
+def test_after_a_poor_run_its_outcome_and_the_command_that_looks_for_the_cause_are_told(
+    here, echelon
+):
+    short = ["--set", "simulation.horizon=1", "--no-figures", "--out", "o"]
+    code, out, _ = echelon("run", "mine.yaml", *short)
+    last = out.splitlines()[-1]
+    assert code == 0 and last.startswith("- Outcome: followers bounded, error ")
+    assert last.endswith("`echelon causes o` looks for the cause.")
+    # No time for any change: that is told, and no cause.
+    code, out, _ = echelon("causes", "o", "--seconds", "0")
+    lines = out.splitlines()
+    assert code == 0 and lines[1] == "- No single cause found for the followers; tried: nothing."
+    assert lines[2] == "- Not tried, since 0 s were over: changes."
+    more = ["--force", "--json", "--causes", "--seconds", "0"]
+    code, out, _ = echelon("run", "mine.yaml", *short, *more)
+    assert json.loads(out)["causes"]["outcome"]["followers"]["class"] == "bounded"
+
+
 def test_list_has_every_family_for_programs(echelon):
     code, out, _ = echelon("list", "--json")
     assert code == 0 and set(json.loads(out)) >= {"scenarios", "models", "follower laws"}

@@ -48,7 +48,7 @@ def test_every_command_says_what_it_does_before_heavy_libraries_are_loaded(here)
     (here / "run.nc").write_bytes(b"")
     lines = {
         **{name: f"{name} paper" for name in ("run", "path", "sweep", "live", "check", "design")},
-        "compare": "compare paper",
+        **{name: f"{name} paper" for name in ("causes", "compare")},
         "doctor": "doctor",
         "fly": "fly paper --all",
         "verify": "verify run.nc",

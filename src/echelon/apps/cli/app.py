@@ -26,7 +26,7 @@ from echelon.apps.cli.list_command import doctor, explain, init, list_, schema
 from echelon.apps.cli.options import EchelonCommand, EchelonGroup
 from echelon.apps.cli.run_command import run, sweep
 from echelon.apps.cli.show_command import live, plot, video, view
-from echelon.apps.cli.study_command import check, compare, design
+from echelon.apps.cli.study_command import causes, check, compare, design
 from echelon.apps.cli.terminal import STATUS, on_signal, outlive_readers
 from echelon.apps.cli.verify_command import verify
 from echelon.core import cache
@@ -146,7 +146,7 @@ def _guarded(command: Callable[..., None]) -> Callable[..., None]:
 # Listed here instead of decorated in their files, so that the order is that of `--help`.
 COMMANDS: tuple[Callable[..., None], ...] = (
     *(init, run, sweep, view, live, fly, plot, video, report, export, path),
-    *(check, design, compare, verify, list_, explain, doctor, schema),
+    *(check, causes, design, compare, verify, list_, explain, doctor, schema),
 )
 for _command in COMMANDS:
     app.command(_command.__name__.rstrip("_"), cls=EchelonCommand)(_guarded(_command))

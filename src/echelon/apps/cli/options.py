@@ -53,6 +53,12 @@ RunArgument = Annotated[
 ScenarioArgument = Annotated[
     str, typer.Argument(help="The name of a bundled scenario, or a YAML file.")
 ]
+SecondsOption = Annotated[
+    float,
+    typer.Option(
+        "--seconds", metavar="S", min=0.0, help="Try no further change after so many seconds."
+    ),
+]
 SetOption = Annotated[
     list[str] | None,
     typer.Option(

@@ -14,6 +14,7 @@ import typer
 
 from echelon.apps.cli import options, tables
 from echelon.apps.cli.show_command import show_address, wait
+from echelon.apps.cli.study_command import look_for_causes
 from echelon.apps.cli.terminal import STATUS, STOP
 from echelon.core.errors import Outcome, OutputError
 from echelon.core.words import amount
@@ -101,6 +102,10 @@ def run(
     view: Annotated[
         bool, typer.Option("--view", help="Show the run in the browser while it is computed.")
     ] = False,
+    causes: Annotated[
+        bool, typer.Option("--causes", help="Look for the cause if not everybody arrives.")
+    ] = False,
+    seconds: options.SecondsOption = 60.0,
     as_json: options.JsonOption = False,
 ) -> None:
     """Simulate a scenario; write its report, figures and dataset."""
@@ -124,8 +129,12 @@ def run(
         stack.enter_context(writing(job.folder))
         with STOP.hold():
             result = _simulate(specification, experiment, job, watched, as_json)
-            _print(result, as_json)
+            if not (as_json and causes):
+                _print(result, as_json)
             _write(job, result, figures, as_json)
+            # Afterwards, so that nothing of the run is lost if the search is ended.
+            if causes or not as_json:
+                _explain(specification, result, job, seconds if causes else None, as_json)
         if watched is not None and STOP.number is None and len(result.times):
             watched.show_all(job.folder)
     if result.outcome is Outcome.INTERRUPTED and STOP.number is None:
@@ -226,6 +235,32 @@ def _write(job: Job, result: "Result", figures: bool, quiet: bool) -> None:
         job.chunks.remove()
     if not quiet:
         tables.print_folder(job.folder)
+
+
+def _explain(
+    scenario: "Scenario", result: "Result", job: Job, seconds: float | None, as_json: bool
+) -> None:
+    """Print the outcome of a poor run, with its causes if they are to be looked for."""
+    from echelon.experiments.results.role_outcome import run_outcome
+    from echelon.experiments.results.summary import summary
+    from echelon.output.reports.causes_report import outcome_sentence
+
+    complete = result.outcome.reached or result.outcome is Outcome.DIVERGED
+    outcome = run_outcome(result)
+    if seconds is None or not complete:
+        if complete and outcome.poor:
+            where = f"`echelon causes {job.folder}` looks for the cause."
+            print(f"- {outcome_sentence(outcome, result.length_unit)} {where}")
+        return
+    try:
+        study = look_for_causes(scenario, seconds, as_json, result)
+    except KeyboardInterrupt:
+        print("echelon: stopped looking for causes.", file=sys.stderr)
+        return
+    if as_json:
+        print(json.dumps({**summary(result), "causes": study.as_mapping()}, indent=2), flush=True)
+    else:
+        tables.print_causes(study)
 
 
 # ---- `echelon run --view` ------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""`echelon check`, `design` and `compare`: guarantees, gains and methods for a scenario."""
+"""`echelon check`, `causes`, `design` and `compare`: studies of a scenario."""
 
 import json
 from pathlib import Path
@@ -15,9 +15,11 @@ if TYPE_CHECKING:
     from echelon.core.types import JsonObject
     from echelon.experiments.scenario.build import Experiment
     from echelon.experiments.scenario.scenario import Scenario
+    from echelon.experiments.studies.causes import CauseStudy
     from echelon.experiments.studies.compare import Comparison
     from echelon.experiments.studies.observed_region import ObservedRegion
     from echelon.simulation.engine.parts import Parts
+    from echelon.simulation.engine.result import Result
     from echelon.simulation.step.settings import Settings
 
 
@@ -68,6 +70,40 @@ def _region(parts: "Parts", settings: "Settings", seeds: int = 200) -> "Observed
 
     STATUS.begin("simulating random starts", log=False)
     return observed_region(parts, settings, seeds=seeds, progress=STATUS.counter("runs"))
+
+
+def causes(
+    run: Annotated[
+        str, typer.Argument(metavar="RUN", help="The folder of a run, a scenario's name or file.")
+    ],
+    set_: SetOption = None,
+    seconds: options.SecondsOption = 60.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Look for the cause of a poor run by simulating changes of its scenario."""
+    from echelon.experiments.scenario.scenario import load_scenario
+
+    folder = Path(run).parent if Path(run).name == "run.nc" else run
+    loaded = load_scenario(folder, set_ or [])
+    study = look_for_causes(loaded, seconds, as_json)
+    if as_json:
+        print(json.dumps(study.as_mapping(), indent=2))
+    else:
+        tables.print_causes(study)
+
+
+def look_for_causes(
+    scenario: "Scenario", seconds: float, quiet: bool, result: "Result | None" = None
+) -> "CauseStudy":
+    """Return the causes of a run's outcome, with a line of progress on standard error."""
+    STATUS.begin(f"looking for the causes of {scenario.name}", not quiet)
+    from echelon.experiments.studies.causes import causes as study
+
+    def progress(done: int, runs: int) -> None:
+        STATUS.count(done, runs, "runs")
+        STOP.check()
+
+    return study(scenario, seconds, result, progress)
 
 
 def design(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from echelon.core.statement import Statement
     from echelon.core.types import JsonObject
     from echelon.experiments.scenario.build import Experiment
+    from echelon.experiments.studies.causes import CauseStudy
     from echelon.experiments.studies.design import Design
     from echelon.synthesis.gains.gain import Gain
 
@@ -189,6 +190,16 @@ def warn(warnings: Iterable[str], quiet: bool = False) -> None:
     if not (quiet or STATUS.silent):
         for text in warnings:
             print(f"echelon: Warning: {text}", file=sys.stderr, flush=True)
+
+
+def print_causes(study: "CauseStudy") -> None:
+    """Print what was found about the outcome of a run, a sentence each."""
+    from echelon.output.reports.causes_report import causes_sentences
+    from echelon.output.reports.run_report import say
+
+    out = console()
+    for sentence in causes_sentences(study):
+        say(out, sentence)
 
 
 def print_folder(folder: Path) -> None:

@@ -14,6 +14,7 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.formation_motion import OffsetMotion, Reshape, Rotate, Scale
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.reference import LeaderPath, Reference, check_reference
+from echelon.agents.references.slowed_path import slowed
 from echelon.agents.world.actuator import Actuator
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.sensing import Sensing
@@ -279,7 +280,7 @@ class _Builder:
         file = None if spec.file is None else self.scenario.folder / spec.file
         reference = part.create() if file is None else _read(part, file, model=self.model)
         check_reference(reference)
-        return reference
+        return slowed(reference, spec.slowdown)
 
     def _formation(self) -> Formation:
         spec, starts = self.scenario.formation, self.scenario.initial.states

@@ -1,6 +1,7 @@
 """A class that a scenario names: by a name of the registry, or in a file of the user."""
 
 import contextlib
+import contextvars
 import importlib
 import importlib.util
 import inspect
@@ -114,8 +115,28 @@ def user_class(folder: Path, target: str, kind: type[_T]) -> type[_T]:
     return classes[name]
 
 
+_KEPT = contextvars.ContextVar[dict[Path, Any] | None]("modules that are kept", default=None)
+
+
+@contextlib.contextmanager
+def modules_kept() -> Iterator[None]:
+    """Execute each file of the user once: of a class that is made anew, all is compiled anew."""
+    token = _KEPT.set({})
+    try:
+        yield
+    finally:
+        _KEPT.reset(token)
+
+
 def _imported(file: Path) -> Any:
-    """Return the module in a file, executed anew."""
+    """Return the module in a file, executed anew unless modules are kept."""
+    kept = _KEPT.get()
+    if kept is None:
+        return _executed(file)
+    return kept[file] if file in kept else kept.setdefault(file, _executed(file))
+
+
+def _executed(file: Path) -> Any:
     # By its path and not by `import`: the folder need not be on `sys.path`, and a file that was
     # changed since must be read again.
     spec = importlib.util.spec_from_file_location(f"echelon_user_{file.stem}", file)

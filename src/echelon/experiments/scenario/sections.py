@@ -254,6 +254,8 @@ class ReferenceSpec(Section):
     `polynomials` has `duration`, `x^0` to `x^7`, and likewise for `y`, `z`, `yaw`."""
     degrees: bool = False
     """Whether the yaw of `waypoints` is in degrees."""
+    slowdown: Annotated[Positive, Unit("1")] = 1.0
+    """Factor on the time that the path takes: 2 for half of its speed; not for `states`."""
 
     @property
     def parameters(self) -> Mapping[str, object]:

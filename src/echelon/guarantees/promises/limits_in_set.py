@@ -117,7 +117,7 @@ def _radius(parts: Parts, rooms: Array) -> float:
     back, q = np.linalg.inv(gain.P), gain.coupling * gain.P @ B @ gain.R_inverse @ h.T
     p = np.zeros_like(q) if gain.inner is None else -gain.inner.T @ h.T
     # |a|^2 of each follower (rows) and each row of the limits (columns).
-    felt, own = L.power(2) @ (1.0 / w), L.diagonal() / w
+    felt, own = np.asarray((L * L) @ (1.0 / w)), L.diagonal() / w
     size = felt[:, None] * _form(q, back, q) - 2.0 * own[:, None] * _form(q, back, p)
     size = np.sqrt(np.maximum(size + _form(p, back, p) / w[:, None], 0.0) * w.max())
     with np.errstate(divide="ignore"):

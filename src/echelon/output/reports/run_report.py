@@ -237,8 +237,7 @@ def _lag(result: Result) -> Iterator[str]:
     frames = "in the stored frames " * (result.settings.store_every > 1)
     yield (
         f"Followers lag behind places that change with time: observed {largest:.3g} "
-        f"{result.unit} at most {frames}from {result.times[late[0]]:.4g} s on; under "
-        "`stopping-point` they do not."
+        f"{result.unit} at most {frames}from {result.times[late[0]]:.4g} s on."
     )
 
 
