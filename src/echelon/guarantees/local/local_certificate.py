@@ -6,9 +6,11 @@ seen by the derivative of the whole step along directions drawn at random, and i
 """
 
 import enum
+import functools
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
@@ -16,8 +18,9 @@ import scipy.sparse.csgraph as csgraph
 from echelon.agents.models.model import ControlAffine
 from echelon.core.jaxpr import used_leaves
 from echelon.core.types import Array, PyTree
+from echelon.core.words import Feedforward
 from echelon.guarantees.local.resting_loop import (
-    Body,
+    BodyPlaces,
     begun,
     body_of,
     held_exactly,
@@ -30,7 +33,7 @@ from echelon.guarantees.local.resting_loop import (
     resting_loop,
 )
 from echelon.guarantees.local.spectra import Split, amplification, modes_of
-from echelon.laws.law import Law, LocalView, Memory, Speaks
+from echelon.laws.law import Feeds, Law, LocalView, Memory, Speaks
 from echelon.laws.law_check import traced_arguments, unknown_class
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
@@ -48,7 +51,8 @@ _PROBES = 6
 _AGREES = 1e-9
 """Relative; what rounding may leave between the derivative and the map made of it."""
 _AT_REST = 1e-9
-_NEWTON, _WARM = 6, 2000
+_NEWTON, _WARM, _NEARER = 6, 2000, 0.9
+_ELSEWHERE = 1e-3, -1e-3, 0.1
 FAR = 1e6
 """Growth before errors end, beyond which the linearization says nothing of any start."""
 
@@ -154,7 +158,7 @@ def _until_last(
     loop = resting_loop(prepared, None, steps + 1)
     early = rest._replace(loop=loop, now=begun(loop, goals, np.asarray(0)))
     after, slopes = _maps(early, np.eye(len(rest.value)), steps)
-    if not np.abs(after - rest.value).max(initial=0.0) <= _AT_REST * _size(rest):
+    if not (np.abs(after - rest.value) <= _AT_REST * _scale(rest.value)).all():
         return found._replace(faults=(Fault.NO_REST,), radius=None)
     at = rest.body.state[rest.free] >= 0
     before = np.linalg.norm(slopes.T[at][:, at], 2) if np.isfinite(slopes).all() else np.inf
@@ -179,7 +183,9 @@ def _graph_of(prepared: Prepared) -> tuple[int | None, int]:
 
 def _settled_after(prepared: Prepared, period: int) -> int:
     """Return after how many steps everybody has heard of a leader at rest, in whole periods."""
-    channel, hops = prepared.problem.channel, int(prepared.parts.graph.depths().max())
+    channel, graph = prepared.problem.channel, prepared.parts.graph
+    # Of graphs that take turns each may be deeper than all of them together.
+    hops = graph.agents if graph.schedule is not None else int(graph.depths().max())
     late = 1 if channel is None else (hops + 2) * int(channel.delay + channel.every)
     return period * -(-late // period)
 
@@ -201,17 +207,40 @@ def _timed(law: Law, loop: Loop, model: ControlAffine, goals: Array) -> tuple[Fa
     if not name:
         return None
     view, memory = traced_arguments(law, model)
-
-    def acts(view: LocalView, memory: Memory) -> object:
-        u, after = law.update(model, view, memory)
-        after = law.settle(model, view, u, u, after)
-        return u, _reals_of(after), Speaks.of(law).signal(model, view.x, view.offset, memory)
-
-    used = used_leaves(acts, view, memory)
+    used = used_leaves(functools.partial(_all_that, law, model), view, memory)
     places = len(jax.tree.leaves(view))
     if used[[leaf is view.t for leaf in jax.tree.leaves(view)].index(True)]:
         return Fault.TIME, name
-    return (Fault.WHOLE, name) if _whole(memory, used[places:]) else None
+    if _whole(memory, used[places:]):
+        return Fault.WHOLE, name
+    return (Fault.KINK, name) if _begins_with_a_jump(law, model, goals) else None
+
+
+def _all_that(law: Law, model: ControlAffine, view: LocalView, memory: Memory) -> PyTree:
+    """Return all real numbers that an agent makes of what it knows."""
+    u, after = law.update(model, view, memory)
+    after = law.settle(model, view, u, u, after)
+    said = Speaks.of(law).signal(model, view.x, view.offset, memory)
+    sent = (
+        ()
+        if law.feedforward is Feedforward.NONE
+        else Feeds.of(law).message(model, view.x, u, after)
+    )
+    return u, _reals_of(after), said, sent
+
+
+_NEAR, _STEEP = 1e-6, 1e3
+"""A change of a start, and how much more a memory may change with it."""
+
+
+def _begins_with_a_jump(law: Law, model: ControlAffine, goals: Array) -> bool:
+    """Tell whether starts near a goal begin with memories that are far apart."""
+    n = goals.shape[1]
+    starts = np.concatenate([goals[0] + _NEAR * np.eye(n), goals[0] - _NEAR * np.eye(n)])
+    begins = jax.vmap(lambda x: _reals_of(law.begin(model, x)))
+    here, there = begins(jnp.asarray(goals[:1])), begins(jnp.asarray(starts))
+    gaps = [np.abs(np.asarray(b) - np.asarray(a)) for a, b in zip(here, there, strict=True)]
+    return any((gap > _STEEP * _NEAR).any() for gap in gaps)
 
 
 def _reals_of(tree: PyTree) -> list[jax.Array]:
@@ -233,16 +262,17 @@ class _Rest(NamedTuple):
     Attributes:
         free: (d,) the places of the numbers that may move, agent by agent; what no agent has last.
         value: (d,) theirs.
-        residual: what a period changes at most.
+        residual: what a period changes at most, in `_scale` of each number.
         movers: (A,) the agents that may move.
         size: s of a body; 0 where agents have bodies of different sizes.
         split: the map, by what agents hear; None where they are not alike.
         whole: (d, d) the map of everything; None of one that is split, or too large.
+        common: the radius of what all do alike, where nobody is led.
     """
 
     loop: Loop
     now: LoopState
-    body: Body
+    body: BodyPlaces
     free: Array
     value: Array
     residual: float
@@ -250,6 +280,13 @@ class _Rest(NamedTuple):
     size: int
     split: Split | None
     whole: Array | None
+    common: float = 0.0
+
+    @property
+    def rows(self) -> Array:
+        """Directions (K, d) of as many rows as one compiled program takes."""
+        count = 2 * self.size + _PROBES if self.whole is None else len(self.value)
+        return np.zeros((count, len(self.value)))
 
     @property
     def map(self) -> Split | None:
@@ -295,7 +332,7 @@ def _by_newton(rest: _Rest, period: int) -> _Rest:
     for _ in range(_NEWTON):
         after, slopes = _maps(rest, one, period)
         gap = after - rest.value
-        residual = float(np.abs(gap).max(initial=0.0))
+        residual = float((np.abs(gap) / _scale(rest.value)).max(initial=0.0))
         if not np.isfinite(slopes).all() or not np.isfinite(residual):
             break
         here = rest._replace(residual=residual, whole=slopes.T)
@@ -313,7 +350,8 @@ def _settled(rest: _Rest) -> _Rest:
     now = later(rest.loop, rest.now, np.asarray(_WARM))
     after = later(rest.loop, now, np.asarray(1))
     value, then = reals(now)[rest.free], reals(after)[rest.free]
-    return rest._replace(now=now, value=value, residual=float(np.abs(then - value).max()))
+    residual = float((np.abs(then - value) / _scale(value)).max())
+    return rest._replace(now=now, value=value, residual=residual)
 
 
 # ---- agents that are alike -----------------------------------------------------------------------
@@ -356,12 +394,18 @@ def _split_at(rest: _Rest, period: int) -> _Rest:
     F = first - own[a] * K
     deviations = random.reshape(_PROBES, count, size)
     expected = deviations @ F.T + np.stack([C @ each for each in deviations]) @ K.T
-    gap = np.abs(expected.reshape(_PROBES, -1) - slopes[2 * size :]).max(initial=0.0)
-    if not gap <= _AGREES * (1.0 + np.abs(slopes[2 * size :]).max()):
+    gap = np.abs(expected.reshape(_PROBES, -1) - slopes[2 * size :])
+    felt = np.stack([abs(C) @ np.abs(each) for each in deviations])
+    scale = np.abs(deviations) @ np.abs(F.T) + felt @ np.abs(K.T)
+    if not (gap <= _AGREES * scale.reshape(_PROBES, -1)).all():
         return rest
     grounded = len(rest.movers) < rest.loop.agents
     values = _eigenvalues(C, grounded)
-    return rest if values is None else rest._replace(split=Split(F, K, *values))
+    if values is None:
+        return rest
+    # Where nobody is led all move alike with F alone, which must not carry them away.
+    common = 0.0 if grounded else modes_of(Split.whole(F)).radius
+    return rest._replace(split=Split(F, K, *values), common=common)
 
 
 def _eigenvalues(C: sp.csr_array, grounded: bool) -> tuple[Array, bool] | None:
@@ -387,46 +431,77 @@ def _eigenvalues(C: sp.csr_array, grounded: bool) -> tuple[Array, bool] | None:
 # ---- the verdict ---------------------------------------------------------------------------------
 
 
-def _size(rest: _Rest) -> float:
-    return 1.0 + float(np.abs(rest.value).max(initial=0.0))
+def _scale(values: Array) -> Array:
+    """Return what a change of each number counts against: 1, and of numbers beyond 1e4 more."""
+    return np.maximum(1.0, 1e-4 * np.abs(values))
+
+
+def _arrives(rest: _Rest, period: int) -> bool:
+    """Tell whether memories that begin elsewhere come to where they rest."""
+    start = reals(rest.now)[rest.free]
+    before = np.abs(start - rest.value) / _scale(rest.value)
+    if not (before > _AT_REST).any():
+        return True
+    then = reals(later(rest.loop, rest.now, np.asarray(period * -(-_WARM // period))))[rest.free]
+    after = np.abs(then - rest.value) / _scale(rest.value)
+    return bool(((after <= _AT_REST) | (after < _NEARER * before)).all())
+
+
+def _stays_elsewhere(rest: _Rest, places: tuple[int, ...], period: int) -> bool:
+    """Tell whether numbers that nothing changes stay as they are, to the bit, at other values too.
+
+    Then rest is not one point but a family, in which these numbers choose.
+    """
+    if rest.split is not None:
+        spread = (np.array(places)[:, None] + rest.size * np.arange(len(rest.movers))).reshape(-1)
+    else:
+        spread = np.array(places)
+    for size in _ELSEWHERE:
+        value = rest.value.copy()
+        value[spread] += size * _scale(value[spread])
+        after, _ = _maps(rest._replace(value=value), rest.rows, period)
+        if not np.array_equal(after[spread], value[spread]):
+            return False
+    return True
 
 
 def _judged(rest: _Rest, goals: Array, period: int, names: tuple[str, ...]) -> LocalCertificate:
-    if not rest.residual <= _AT_REST * _size(rest):
+    if not (rest.residual <= _AT_REST and _arrives(rest, period)):
         return LocalCertificate((Fault.NO_REST,))
     states, agents = rest.body.state[rest.free], rest.body.agent[rest.free]
     at = states >= 0
-    gaps = np.abs(rest.value[at] - goals[agents[at], states[at]])
-    off = float(gaps.max(initial=0.0))
-    if off > _AT_REST * _size(rest):
-        culprit = names[states[at][gaps.argmax()]]
+    there = goals[agents[at], states[at]]
+    gaps = np.abs(rest.value[at] - there) / _scale(there)
+    if not (gaps <= _AT_REST).all():
+        off, culprit = float(gaps.max()), names[states[at][gaps.argmax()]]
         return LocalCertificate((Fault.OFF_GOALS,), off=off, culprit=culprit)
     split = rest.map
     if split is None:
         return LocalCertificate((Fault.LARGE,))
-    if _kink(rest, period):
-        return LocalCertificate((Fault.KINK,))
-    modes = modes_of(split, rest.is_state)
-    exact = _exactly(rest, period)
+    modes = modes_of(split)
     radius = modes.radius ** (1.0 / period)
-    # A state that others read and nobody changes is not driven either.
-    still = [k for k in modes.lasting if rest.is_state[k]]
-    faults = [Fault.LASTING] * (len(modes.lasting) > len(still))
-    faults += [Fault.ADRIFT] * bool(still or modes.adrift)
-    faults += [Fault.GROWS] * (radius >= 1.0)
+    sides = _sides(rest, period, 1.0 - modes.radius)
+    if sides is not None:
+        return LocalCertificate((sides,))
+    exact = _exactly(rest, period)
+    still = [k for k in (*modes.lasting, *modes.loose) if rest.is_state[k]]
+    loose = tuple(k for k in modes.loose if not rest.is_state[k])
+    faults = [Fault.ADRIFT] * bool(still)
+    last = len(still) < len(modes.lasting) + len(modes.loose) - len(loose)
+    last = last or bool(loose) and not _stays_elsewhere(rest, loose, period)
+    faults += [Fault.LASTING] * last
+    faults += [Fault.GROWS] * (radius >= 1.0 or rest.common > 1.0 + _AGREES)
     faults += [Fault.UNDECIDED] * (radius < 1.0 <= modes.worst)
     faults += [Fault.GROWS_EXACTLY] * (exact is not None and not exact < 1.0)
-    adrift = tuple(dict.fromkeys(names[states[k]] for k in (*still, *modes.adrift)))
-    growth = amplification(split, rest.is_state)
     return LocalCertificate(
         (*faults,),
         radius,
         exact,
         len(modes.values),
         rest.split is not None,
-        growth,
-        off=off,
-        adrift=adrift,
+        amplification(split, rest.is_state),
+        off=float(gaps.max(initial=0.0)),
+        adrift=tuple(dict.fromkeys(names[states[k]] for k in still)),
     )
 
 
@@ -443,25 +518,28 @@ def _exactly(rest: _Rest, period: int) -> float | None:
     split = there.map
     if split is None or not np.isfinite(split.F).all():
         return None
-    return modes_of(split, there.is_state).radius ** (1.0 / period)
+    return modes_of(split).radius ** (1.0 / period)
 
 
 _SIZES = 1e-4, 1e-6
 """Of changes along which values are compared with the derivative."""
+_LEAST = 1e-2
+"""Of how far the slowest mode is from the unit circle: no smaller kink can matter."""
 
 
-def _kink(rest: _Rest, period: int) -> bool:
-    """Tell whether values on some side are not those of the derivative.
+def _sides(rest: _Rest, period: int, margin: float) -> Fault | None:
+    """Return that values on some side are not those of the derivative, or that rounding hides it.
 
     What the derivative leaves of a smooth function shrinks faster than the change.
     """
-    count = 2 * rest.size + _PROBES if rest.whole is None else len(rest.value)
-    random = np.random.default_rng(1).standard_normal((count, len(rest.value)))
+    random = np.random.default_rng(1).standard_normal(rest.rows.shape)
     sets = [random] if rest.whole is None else [random, np.eye(len(rest.value))]
-    rounding = np.finfo(float).eps * (1.0 + np.abs(rest.value).max())
+    matters = _LEAST * min(max(margin, 1e-9), 1.0)
+    rounding = 1e2 * np.finfo(float).eps * np.maximum(1.0, np.abs(rest.value)) / _SIZES[1]
+    if rest.split is None and rest.whole is not None:
+        rounding = np.maximum(rounding, np.abs(rest.whole) @ rounding)
     for along in sets:
-        _, slopes = _maps(rest, along, period)
-        left = []
+        slopes, left = _maps(rest, along, period)[1], []
         for size in _SIZES:
             for side in (size, -size):
                 bases = rest.value + side * along
@@ -469,8 +547,10 @@ def _kink(rest: _Rest, period: int) -> bool:
                 there = np.asarray(responses(rest.loop, rest.now, *rows)[0])
                 left.append(np.abs((there - rest.value) / side - slopes))
         large, small = np.maximum(*left[:2]), np.maximum(*left[2:])
-        size = np.abs(slopes).max(axis=1, keepdims=True)
-        seen = small > 1e-6 * (1.0 + size) + 1e3 * rounding / _SIZES[1]
-        if (seen & (small > 0.3 * large)).any() or not np.isfinite(small).all():
-            return True
-    return False
+        if not np.isfinite(small).all():
+            return Fault.KINK
+        # Beside a steep function a kink counts by its share.
+        least = np.maximum(rounding, matters * np.maximum(1.0, np.abs(slopes)))
+        if ((small > least) & (small > 0.3 * large)).any():
+            return Fault.KINK
+    return None

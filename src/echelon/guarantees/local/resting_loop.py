@@ -222,7 +222,7 @@ def held_exactly(loop: Loop) -> Loop | None:
 # ---- which numbers of a moment may move ----------------------------------------------------------
 
 
-class Body(NamedTuple):
+class BodyPlaces(NamedTuple):
     """Where each number of a moment belongs.
 
     Attributes:
@@ -236,7 +236,7 @@ class Body(NamedTuple):
     state: Array
 
 
-def body_of(loop: Loop, now: LoopState) -> Body:
+def body_of(loop: Loop, now: LoopState) -> BodyPlaces:
     """Return where each real number of a moment belongs."""
     numbers = np.arange(loop.agents)
     nobody = LoopState(*(jax.tree.map(lambda x: _rows(x, None), part) for part in now))
@@ -262,7 +262,7 @@ def body_of(loop: Loop, now: LoopState) -> Body:
     for k in numbers:
         mine = np.flatnonzero(agent == k)
         entry[mine] = np.arange(len(mine))
-    return Body(agent, entry, state)
+    return BodyPlaces(agent, entry, state)
 
 
 def _rows(leaf: jax.Array, agents: Array | None) -> Array:

@@ -1,6 +1,5 @@
 """Spectra of the deviations from rest: which of them end, and how fast."""
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,14 +50,14 @@ class Modes(NamedTuple):
     Attributes:
         values: (K,).
         unsure: (K,).
-        lasting: places of numbers that nothing changes, and somebody reads.
-        adrift: places of states that stay as they are, and nobody reads.
+        lasting: places of numbers that nothing changes, and others read.
+        loose: places of numbers that nothing changes, and no other reads at rest.
     """
 
     values: Array
     unsure: Array
     lasting: tuple[int, ...] = ()
-    adrift: tuple[int, ...] = ()
+    loose: tuple[int, ...] = ()
 
     @property
     def radius(self) -> float:
@@ -71,41 +70,31 @@ class Modes(NamedTuple):
         return float((np.abs(self.values) + self.unsure).max(initial=0.0))
 
 
-def modes_of(split: Split, is_state: Array) -> Modes:
-    """Return the modes of a map on states and memories, block by block.
+def modes_of(split: Split) -> Modes:
+    """Return the modes of a map, block by block.
 
-    What reaches no state is left out: it is only written down. `is_state` (s,) says which of the
-    numbers are states.
+    What acts on no state counts too: a memory may multiply what is zero at rest, and its slope
+    says nothing of that.
     """
     pattern = (split.F != 0.0) | (split.K != 0.0)
-    values, unsure, lasting, adrift = [np.zeros(0)], [np.zeros(0)], list[int](), list[int]()
-    for places in _blocks(pattern, is_state):
+    values, unsure, lasting, loose = [np.zeros(0)], [np.zeros(0)], list[int](), list[int]()
+    for places in _blocks(pattern):
         first = int(places[0])
         if len(places) == 1 and split.F[first, first] == 1.0 and split.K[first, first] == 0.0:
             read = np.count_nonzero(pattern[:, first]) > 1
-            (lasting if read else adrift).append(first)
+            (lasting if read else loose).append(first)
             continue
         found, rounding = _eigenvalues(split.of(places))
         values.append(found.reshape(-1))
         unsure.append(np.full(found.size, rounding))
-    return Modes(np.concatenate(values), np.concatenate(unsure), (*lasting,), (*adrift,))
+    return Modes(np.concatenate(values), np.concatenate(unsure), (*lasting,), (*loose,))
 
 
-def _blocks(pattern: Array, is_state: Array) -> Iterator[Array]:
-    """Yield the strongly connected parts of a map, (D, D) of who acts, that reach a state."""
+def _blocks(pattern: Array) -> list[Array]:
+    """Return the strongly connected parts of a map, (D, D) of who acts on whom."""
     count, block = csgraph.connected_components(sp.csr_array(pattern), connection="strong")
-    to, of = block[np.argwhere(pattern).T]
-    back = sp.csr_array((np.ones(len(to)), (to, of)), (count, count))
-    reaches = np.isin(np.arange(count), block[is_state])
-    todo = [*np.flatnonzero(reaches)]
-    while todo:
-        k = todo.pop()
-        new = [j for j in back.indices[back.indptr[k] : back.indptr[k + 1]] if not reaches[j]]
-        reaches[new] = True
-        todo += new
     order = np.argsort(block, kind="stable")
-    parts = np.split(order, np.searchsorted(block[order], np.arange(1, count)))
-    yield from (part for k, part in enumerate(parts) if reaches[k])
+    return np.split(order, np.searchsorted(block[order], np.arange(1, count)))
 
 
 def _eigenvalues(maps: Array) -> tuple[Array, float]:
@@ -152,11 +141,11 @@ def amplification(split: Split, is_state: Array) -> float | None:
 def _largest_power(power: Array, is_state: Array) -> float:
     most = 1.0
     for _ in range(_DOUBLINGS):
+        if not np.isfinite(power).all():
+            return np.inf
         norms = np.linalg.norm(power[:, is_state][:, :, is_state], 2, (1, 2))
         most = max(most, float(norms.max()))
         if norms.max() < _ENDED:
             return most
         power = power @ power
-        if not np.isfinite(power).all():
-            return np.inf
     return most

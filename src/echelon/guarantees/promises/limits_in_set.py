@@ -112,7 +112,7 @@ def _radius(parts: Parts, rooms: Array) -> float:
     gain, model, spectrum = parts.drive.gain, parts.model, parts.graph.spectrum()
     assert isinstance(gain, Gain) and model.input_limits is not None
     L, B = sp.csr_array(parts.graph.grounded_laplacian()), linearize(model).B
-    w = np.ones(L.shape[0]) if spectrum.sums is None else spectrum.sums
+    w = np.ones(len(parts.graph.followers)) if spectrum.sums is None else spectrum.sums
     h = np.asarray(model.input_limits.matrix, float) @ np.asarray(model.input_scale, float)
     back, q = np.linalg.inv(gain.P), gain.coupling * gain.P @ B @ gain.R_inverse @ h.T
     p = np.zeros_like(q) if gain.inner is None else -gain.inner.T @ h.T
