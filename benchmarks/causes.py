@@ -132,7 +132,7 @@ FAMILIES: dict[str, Planted] = {
             "initial": spread(r),
         },
     ),
-    "fast path": Planted("no limits of the inputs", (SLOWER,), fast_path),
+    "fast path": Planted(SLOWER, ("no limits of the inputs",), fast_path),
     "a late agent": Planted(
         "no events",
         ("starts at the goals",),
