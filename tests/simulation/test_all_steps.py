@@ -1,4 +1,4 @@
-"""Numbers over all steps: the same whatever frames are stored, and equal to what all frames give."""
+"""Numbers over all steps: the same whatever frames are stored, and what all frames give."""
 
 import numpy as np
 import pytest
