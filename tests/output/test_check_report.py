@@ -37,7 +37,7 @@ def found_of(make):
     """A check with a long sentence and all lines that there are, each made by a function."""
     promise = SimpleNamespace(sentence=lambda: "Local guarantee: " + "word " * 60)
     lines = tuple(map(make, (*Hypothesis, *Topic)))
-    return SimpleNamespace(promise=promise, lines=lines, warnings=())
+    return SimpleNamespace(promise=promise, lines=lines, warnings=(), region=None)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Numbers over all steps: the same whatever frames are stored, and those of all frames."""
+"""Numbers over all steps: the same whatever frames are stored, and what all frames give."""
 
 import numpy as np
 import pytest

@@ -420,10 +420,10 @@ def _failing(ax: "Axes", region: ObservedRegion, certified: float | None) -> Non
     above = np.array([x.bound for x in region.trials]) - share
     bars = np.stack([np.zeros(len(share)), above])
     look: draw.Style = {"color": _OBSERVED, "fmt": "o:", "markersize": 3, "capsize": 2}
-    label = f"failed, of {runs[0]} random starts, and bound (95 %)"
+    label = f"of {runs[0]} starts, bound 95 %"
     ax.errorbar(scales, share, bars, label=label, **look)
     if certified and certified < np.inf:
-        ax.axvline(certified, color=_CERTIFIED, label="certified up to here, leader at rest")
+        ax.axvline(certified, color=_CERTIFIED, label="certified (leader at rest)")
     _name_values(ax, "x", np.array(scales))
     ax.set(xlabel="scale of the starts' spreads", ylabel="share of runs that fail")
     ax.set_ylim(-0.03, 1.03)
