@@ -1,0 +1,615 @@
+"""Check local certificates against whole loops that are written a second time, without JAX.
+
+    python benchmarks/local_certificates.py whole  --cases 300 --seed 1
+    python benchmarks/local_certificates.py laws   --cases 400 --seed 2
+    python benchmarks/local_certificates.py breaks
+
+`whole` draws small formations of linear and nonlinear agents and compares the radius of a step, and
+that of exact hold, with the eigenvalues of a matrix of everything: states, memories, motors, what
+sensors and messages hold. Its columns are derivatives of a loop in NumPy by complex steps. `laws`
+draws laws of a user's own. `breaks` runs small scripts in which a loop does not converge.
+"""
+
+import argparse
+import dataclasses
+import os
+import sys
+import time
+
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
+)
+
+import equinox as eqx  # noqa: E402
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+import scipy.linalg  # noqa: E402
+import scipy.sparse.csgraph as csgraph  # noqa: E402
+
+import echelon as ech  # noqa: E402
+from echelon.core.numerics import precision  # noqa: E402
+from echelon.core.words import Feedforward  # noqa: E402
+from echelon.guarantees.local.local_certificate import local_certificate  # noqa: E402
+from echelon.simulation.engine.prepare import prepare  # noqa: E402
+
+CLEAR = 1e-6
+"""A radius that is further from 1 than this is clear."""
+
+
+def certificate(parts, settings):
+    """Return the certificate of parts."""
+    with precision("float64"):
+        return local_certificate(prepare(parts, settings._replace(precision="float64")))
+
+
+# ---- agents, which echelon needs -----------------------------------------------------------------
+
+
+def trim_of(n, m):
+    """x0 and u0, which shapes alone give: they are read as plain numbers."""
+    return tuple(0.3 * (k + 1) for k in range(n)), tuple(0.4 - 0.3 * k for k in range(m))
+
+
+class Agent(ech.ControlAffine):
+    """d' = A d + c d^3 + q d d_next - B u0 + (B + d_0 E) u, with d = x - x0."""
+
+    A: np.ndarray
+    B: np.ndarray
+    E: np.ndarray
+    c: float = 0.0
+    q: float = 0.0
+
+    @property
+    def state_names(self):
+        return tuple(f"x{k}" for k in range(len(self.A)))
+
+    @property
+    def input_names(self):
+        return tuple(f"u{k}" for k in range(self.B.shape[1]))
+
+    @property
+    def trim(self):
+        return trim_of(*self.B.shape)
+
+    def drift(self, x):
+        d = x - jnp.asarray(self.trim[0])
+        f = jnp.asarray(self.A) @ d + self.c * d**3 + self.q * d * jnp.roll(d, 1)
+        return f - jnp.asarray(self.B) @ jnp.asarray(self.trim[1])
+
+    def input_map(self, x):
+        return jnp.asarray(self.B) + (x[0] - self.trim[0][0]) * jnp.asarray(self.E)
+
+
+class Linear(ech.Law):
+    """v = v_ff - K z - Ks e - Km y, y+ = a y + bz z + be e, with e = x - x0 - xi."""
+
+    K: np.ndarray
+    Ks: np.ndarray
+    Km: np.ndarray
+    a: np.ndarray
+    bz: np.ndarray
+    be: np.ndarray
+    feedforward: Feedforward = eqx.field(default=Feedforward.NONE, static=True)
+
+    def init(self):
+        return jnp.zeros(len(self.a))
+
+    def update(self, model, view, y):
+        e, z = view.x - jnp.asarray(np.asarray(model.trim[0])) - view.offset, view.disagreement
+        v = -self.K @ z - self.Ks @ e - self.Km @ y
+        if self.feedforward is not Feedforward.NONE:
+            v = v + view.feedforward
+        return model.physical(v), self.a @ y + self.bz @ z + self.be @ e
+
+
+class Reacting(Linear):
+    """The same, of a leader that hears its neighbours."""
+
+    @property
+    def information(self):
+        return ("neighbours' states",)
+
+
+# ---- the whole loop in NumPy ---------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Case:
+    """What a loop is made of: numbers alone."""
+
+    kind: str
+    dt: float
+    substeps: int
+    plants: list  # (A, B, E, c, q) of each agent
+    u0: np.ndarray
+    laws: list  # (K, Ks, Km, a, bz, be) of each agent
+    weights: list  # of (from step, W): W[i, j] > 0 where i hears j
+    repeats: int  # steps after which the weights repeat; 0 for never
+    movers: np.ndarray
+    parents: np.ndarray | None = None
+    lag: float = 0.0
+    sensed: int = 0  # steps
+    delay: int = 0  # of messages, steps; 0 for none
+    every: int = 1
+
+    @property
+    def period(self):
+        return int(np.lcm(self.every, max(self.repeats, 1)))
+
+
+def field(plant, u0, d, u):
+    """d' at a deviation d and an input u."""
+    A, B, E, c, q = plant
+    return A @ d + c * d**3 + q * d * np.roll(d, 1) - B @ u0 + (B + d[0] * E) @ u
+
+
+def slopes(plant, u0):
+    """A, B at rest by complex steps."""
+    n, m, h = len(plant[0]), plant[1].shape[1], 1e-30
+    A = [field(plant, u0, 1j * h * e, u0 + 0j).imag / h for e in np.eye(n)]
+    B = [field(plant, u0, np.zeros(n, complex), u0 + 1j * h * e).imag / h for e in np.eye(m)]
+    return np.array(A).T, np.array(B).T
+
+
+def moved(case, i, d, motor, u):
+    """The state and the motor of agent i one dt later, by Runge and Kutta."""
+    h = case.dt / case.substeps
+    for s in range(case.substeps):
+
+        def rate(d, at, s=s):
+            acts = u if not case.lag else u + (motor - u) * np.exp(-(s * h + at) / case.lag)
+            return field(case.plants[i], case.u0, d, acts)
+
+        a = rate(d, 0.0)
+        b = rate(d + 0.5 * h * a, 0.5 * h)
+        c = rate(d + 0.5 * h * b, 0.5 * h)
+        e = rate(d + h * c, h)
+        d = d + h / 6.0 * (a + 2.0 * b + 2.0 * c + e)
+    return d, u + (motor - u) * np.exp(-case.dt / case.lag) if case.lag else motor
+
+
+def flow(case, i):
+    """The matrix that maps (d, motor, u) to (d, motor) exactly, u held."""
+    A, B = slopes(case.plants[i], case.u0)
+    n, m = B.shape
+    if not case.lag:
+        X = np.block([[A, B], [np.zeros((m, n + m))]])
+        Y = scipy.linalg.expm(X * case.dt)
+        return np.block([[Y[:n, :n], np.zeros((n, m)), Y[:n, n:]], [np.zeros((m, n + 2 * m))]])
+    one = np.eye(m) / case.lag
+    X = np.zeros((n + 2 * m,) * 2)
+    X[:n, :n], X[:n, n : n + m] = A, B
+    X[n : n + m, n : n + m], X[n : n + m, n + m :] = -one, one
+    return scipy.linalg.expm(X * case.dt)[: n + m]
+
+
+def places(case):
+    """The owner (an agent) of each number of the loop, and where each part begins."""
+    n, m = case.plants[0][1].shape
+    k, N = len(case.laws[0][3]), len(case.plants)
+    held = case.delay + case.every - 1 if case.delay else 0
+    sizes = n, m * bool(case.lag), k, n * case.sensed, n * held
+    return N, n, m, k, held, sizes
+
+
+def one_step(case, flat, step, exact=None):
+    """All numbers (N * s,) one step later, agent by agent."""
+    N, n, m, k, held, sizes = places(case)
+    at = np.cumsum([0, *sizes])
+    rows = flat.reshape(N, at[-1])
+    d, motor, y = rows[:, at[0] : at[1]], rows[:, at[1] : at[2]], rows[:, at[2] : at[3]]
+    sensed = rows[:, at[3] : at[4]].reshape(N, case.sensed, n)
+    said = rows[:, at[4] : at[5]].reshape(N, held, n)  # one step ago first
+    known = sensed[:, 0] if case.sensed else d
+    W = case.weights[0][1]
+    when = step % case.repeats if case.repeats else step
+    for begins, each in case.weights:
+        W = each if begins <= when else W
+    if case.delay:
+        last = (step - case.delay) // case.every * case.every
+        heard = said[:, step - last - 1]
+    else:
+        heard = known
+    z = W.sum(1)[:, None] * known - W @ heard
+    v, after = np.zeros((N, m), flat.dtype), np.zeros_like(rows)
+    order = range(N)
+    if case.parents is not None:
+        depth = [0] * N
+        for i in range(N):
+            j = i
+            while j not in LEADERS(case):
+                j, depth[i] = case.parents[j], depth[i] + 1
+        order = np.argsort(depth, kind="stable")
+    for i in order:
+        K, Ks, Km, a, bz, be = case.laws[i]
+        v[i] = -K @ z[i] - Ks @ known[i] - Km @ y[i]
+        if case.parents is not None and i in case.movers:
+            v[i] += v[case.parents[i]] if case.parents[i] in case.movers else 0.0
+        if exact is None:
+            start = case.u0 + motor[i] if case.lag else None
+            new, acts = moved(case, i, d[i], start, case.u0 + v[i])
+            acts = acts - case.u0 if case.lag else motor[i]
+        else:
+            own = motor[i] if case.lag else np.zeros(m, flat.dtype)
+            both = exact[i] @ np.concatenate([d[i], own, v[i]])
+            new, acts = both[:n], both[n:] if case.lag else motor[i]
+        past = np.concatenate([sensed[i], d[i][None]])[1:] if case.sensed else sensed[i]
+        words = np.concatenate([known[i][None], said[i]])[:held]
+        parts = new, acts, a @ y[i] + bz @ z[i] + be @ known[i], past.ravel(), words.ravel()
+        after[i] = np.concatenate(parts)
+    return after.reshape(-1)
+
+
+def LEADERS(case):
+    return [i for i in range(len(case.plants)) if i not in case.movers]
+
+
+def whole_matrix(case, exact=False):
+    """The matrix of a period, of those who move."""
+    N, *_, sizes = places(case)
+    s = sum(sizes)
+    free = np.concatenate([np.arange(i * s, (i + 1) * s) for i in case.movers])
+    flows = [flow(case, i) for i in range(N)] if exact else None
+    total, h = np.eye(len(free)), 1e-30
+    # A whole number of periods after a time at which everything has begun.
+    first = case.period * 50 if case.repeats or case.every > 1 else 100
+    for step in range(first, first + case.period):
+        W = np.zeros((len(free), len(free)))
+        for c, place in enumerate(free):
+            start = np.zeros(N * s, complex)
+            start[place] = 1j * h
+            W[:, c] = one_step(case, start, step, flows).imag[free] / h
+        total = W @ total
+    return total, s
+
+
+def radius_of(case, exact=False):
+    """The radius of a step, of each strongly connected group of agents alone."""
+    total, s = whole_matrix(case, exact)
+    M = case.movers
+    hears = sum((W[np.ix_(M, M)] > 0).astype(int) for _, W in case.weights)
+    if case.parents is not None:
+        for r, i in enumerate(M):
+            if case.parents[i] in M:
+                hears[r, list(M).index(case.parents[i])] = 1
+    count, group = csgraph.connected_components(hears, connection="strong")
+    most = 0.0
+    for g in range(count):
+        at = np.concatenate([np.arange(r * s, (r + 1) * s) for r in np.flatnonzero(group == g)])
+        most = max(most, np.abs(np.linalg.eigvals(total[np.ix_(at, at)])).max())
+    return most ** (1.0 / case.period)
+
+
+# ---- the formulas of one agent, a third time -----------------------------------------------------
+
+
+def agent_maps(case):
+    """F, G, H and what a feed-forward does (s, m), of an agent without late measurements."""
+    n, m, k = *case.plants[0][1].shape, len(case.laws[0][3])
+    i, h = case.movers[0], 1e-30
+    K, Ks, Km, a, bz, be = case.laws[i]
+    lag = m * bool(case.lag)
+    s = n + lag + k
+
+    def agent(body, z, ff):
+        d, motor, y = body[:n], body[n : n + lag], body[n + lag :]
+        v = ff - K @ z - Ks @ d - Km @ y
+        start = case.u0 + motor if lag else None
+        new, acts = moved(case, i, d, start, case.u0 + v)
+        acts = acts - case.u0 if lag else motor
+        return np.concatenate([new, acts, a @ y + bz @ z + be @ d]), v
+
+    def by(k_, size, which):
+        cols = []
+        for e in np.eye(size):
+            arguments = [np.zeros(s, complex), np.zeros(n, complex), np.zeros(m, complex)]
+            arguments[k_] = 1j * h * e
+            cols.append(agent(*arguments)[which].imag / h)
+        return np.array(cols).T
+
+    F, G, Em = by(0, s, 0), by(1, n, 0), by(2, m, 0)
+    C, Dz, Df = by(0, s, 1), by(1, n, 1), by(2, m, 1)
+    return F, G, np.eye(n, s), Em, C, Dz, Df
+
+
+def by_formula(case):
+    """Sections 2 and 3.2 of the note on the certificate; None where they do not apply."""
+    alike = all(np.array_equal(case.plants[i][0], case.plants[case.movers[0]][0]) for i in case.movers)
+    if not alike or case.sensed or len(case.weights) > 1 or case.kind == "reacting":
+        return None
+    F, G, H, Em, C, Dz, Df = agent_maps(case)
+    M, W = case.movers, case.weights[0][1]
+    Dg, Af = np.diag(W.sum(1)[M]), W[np.ix_(M, M)]
+    one, N = np.eye(len(M)), len(M)
+    L = Dg - Af
+    if case.parents is not None:
+        Pi = np.zeros((N, N))
+        for r, i in enumerate(M):
+            if case.parents[i] in M:
+                Pi[r, list(M).index(case.parents[i])] = 1.0
+        fed = np.kron(one, C) + np.kron(L, Dz @ H)
+        inner = np.linalg.solve(np.eye(N * len(Df)) - np.kron(Pi, Df), fed)
+        return np.abs(np.linalg.eigvals(
+            np.kron(one, F) + np.kron(L, G @ H) + np.kron(Pi, Em) @ inner)).max()
+    if not case.delay:
+        return max(np.abs(np.linalg.eigvals(F + lam * G @ H)).max() for lam in np.linalg.eigvals(L))
+    total, s, n, held = None, len(F), len(H), case.delay + case.every - 1
+    for step in range(case.every):
+        big = np.zeros((N * s + held * N * n,) * 2)
+        big[: N * s, : N * s] = np.kron(one, F) + np.kron(Dg, G @ H)
+        age = step + 100 * case.every - (step + 100 * case.every - case.delay) // case.every * case.every
+        at = N * s + (age - 1) * N * n
+        big[: N * s, at : at + N * n] = -np.kron(Af, G)
+        big[N * s : N * s + N * n, : N * s] = np.kron(one, H)
+        for k in range(1, held):
+            to, of = N * s + k * N * n, N * s + (k - 1) * N * n
+            big[to : to + N * n, of : of + N * n] = np.eye(N * n)
+        total = big if total is None else big @ total
+    return np.abs(np.linalg.eigvals(total)).max() ** (1.0 / case.every)
+
+
+# ---- drawn formations ----------------------------------------------------------------------------
+
+KINDS = (
+    "ideal", "memory", "parent", "late", "slow messages", "deviation preview", "deviation packet",
+    "reacting", "leaders", "directed", "chain", "switching", "odd switching", "switched",
+    "unlike", "lag", "sensed", "lag and sensed", "late and memory", "switching messages",
+)  # fmt: skip
+PER_SHAPE = 5
+"""Cases with the same shapes, whose steps are compiled once."""
+
+
+def feedback(rng, A, B):
+    """K of a Riccati equation with random weights."""
+    Q = np.diag(rng.uniform(0.3, 3.0, len(A)))
+    P = scipy.linalg.solve_continuous_are(A, B, Q, np.eye(B.shape[1]))
+    return B.T @ P
+
+
+def tree_of(rng, N, directed=False):
+    return [(int(rng.integers(0, i)), i) for i in range(1, N)]
+
+
+def edges_of(rng, N, kind):
+    """Edges (j, i): i hears j, and j hears i unless directed; all are reached from 0."""
+    if kind == "parent":
+        return tree_of(rng, N), False
+    if kind == "chain":
+        return [(i - 1, i) for i in range(1, N)], True
+    edges = tree_of(rng, N)
+    for _ in range(int(rng.integers(0, N))):
+        i, j = sorted(rng.choice(N, 2, replace=False).tolist())
+        if (i, j) not in edges:
+            edges.append((i, j))
+    directed = kind == "directed"
+    if directed:
+        back = [(j, i) for i, j in edges if i > 0 and rng.uniform() < 0.3]
+        edges = edges + [e for e in back if e not in edges]
+    return edges, directed
+
+
+def weights_of(N, edges, heavy, directed):
+    W = np.zeros((N, N))
+    for (j, i), w in zip(edges, heavy, strict=True):
+        W[i, j] = w
+        if not directed:
+            W[j, i] = w
+    return W
+
+
+def rows_of_time(starts, period, dt):
+    """The first steps of the rows of weights, and after how many steps they repeat (0: never)."""
+    if period is None:
+        return [(int(np.ceil(t / dt - 1e-9)), r) for r, t in enumerate(starts)], 0
+    for count in range(1, 21):
+        steps = count * period / dt
+        if abs(steps - round(steps)) < 1e-9:
+            break
+    pairs = [
+        (int(np.ceil((k * period + t) / dt - 1e-9)), r)
+        for k in range(count)
+        for r, t in enumerate(starts)
+    ]
+    return pairs, round(steps)
+
+
+def drawn_case(kind, shape, rng):
+    """A case, and the parts and settings that echelon is given."""
+    N, n, m, k, dt, substeps, edges, directed, leaders = shape
+    for _ in range(20):
+        A = rng.normal(0.0, 0.8, (n, n)) - rng.uniform(-0.3, 0.8) * np.eye(n)
+        B = rng.normal(0.0, 1.0, (n, m)) + np.eye(n, m)
+        if abs(scipy.linalg.eigvals(A)).max() < 3.0:
+            break
+    E, nonlinear = rng.normal(0.0, 0.5, (n, m)), rng.uniform() < 0.6
+    E = E * nonlinear
+    c, q = (rng.normal(0.0, 1.0, 2) * nonlinear).tolist()
+    u0 = np.array(trim_of(n, m)[1])
+    movers = np.array([i for i in range(N) if i not in leaders])
+    if kind == "reacting":
+        movers = np.arange(N)
+    plant = (A, B, E, c, q)
+    plants = [plant] * N
+    if kind == "unlike":
+        plants = [
+            (A + rng.normal(0.0, 0.15, (n, n)) * (i in movers), B, E, c, q) for i in range(N)
+        ]
+    lin = slopes(plant, u0)
+    heavy = rng.uniform(0.4, 2.0, len(edges))
+    W = weights_of(N, edges, heavy, directed)
+    followers = np.array([i for i in range(N) if i not in leaders])
+    L = np.diag(W.sum(1)) - W
+    least = np.linalg.eigvals(L[np.ix_(followers, followers)]).real.min()
+    most = np.linalg.eigvals(L[np.ix_(followers, followers)]).real.max()
+    try:
+        K = feedback(rng, *lin)
+    except np.linalg.LinAlgError:
+        return None
+    strong = rng.choice([0.5, 1.0, 1.0, 1.5]) / least
+    K = K * min(strong, 20.0 / most) * (1.0 + rng.normal(0.0, 0.1, K.shape))
+    Ks = feedback(rng, *lin) * (rng.uniform() < 0.5) * rng.uniform(0.2, 1.0)
+    a = np.diag(rng.uniform(0.5, 0.98, k))
+    bz, be = dt * rng.normal(0.0, 0.5, (k, n)), dt * rng.normal(0.0, 0.5, (k, n))
+    law = (K, Ks, rng.normal(0.0, 0.5, (m, k)), a, bz, be)
+    laws = [law] * N
+    if kind == "reacting":
+        own = (0.5 * K, feedback(rng, *lin), 0.0 * law[2], *law[3:])
+        laws = [own if i in leaders else law for i in range(N)]
+    lag = {"lag": 0.1, "lag and sensed": 0.05}.get(kind, 0.0) * rng.uniform(0.5, 2.0)
+    sensed = shape_sensed(kind)
+    network, delay, every = None, 0, 1
+    if kind in ("late", "late and memory", "slow messages", "switching messages"):
+        delay = 3 if kind != "switching messages" else 2
+        every = {"slow messages": 3, "switching messages": 2}.get(kind, 1)
+        network = ech.Network(1 / (every * dt), (delay - 0.5) * dt, messages="state", forget=9.0)
+    if kind.startswith("deviation"):
+        delay, every = 2, 2
+        words = dict(messages="deviation", prediction=kind.split()[1], forget=9.0)
+        network = ech.Network(1 / (every * dt), (delay - 0.5) * dt, **words)
+    repeats, rows, parents = 0, [(0, W)], None
+    triples = [(j, i, w) for (j, i), w in zip(edges, heavy, strict=True)]
+    if kind in ("switching", "odd switching", "switched", "switching messages"):
+        parts_of_edges = [triples[::2] or triples, triples[1::2] or triples]
+        starts = [0.0, 2 * dt] if kind != "odd switching" else [0.0, 1.7 * dt]
+        period = {"switching": 5 * dt, "odd switching": 3.5 * dt, "switching messages": 3 * dt}.get(kind)
+        if kind == "switched":
+            parts_of_edges[1] = triples
+        stretches = list(zip(starts, parts_of_edges, strict=True))
+        graph = ech.Graph.switching(stretches, leaders, N, directed, period)
+        pairs, repeats = rows_of_time(starts, period, dt)
+        each = [weights_of(N, [t[:2] for t in p], [t[2] for t in p], directed) for p in parts_of_edges]
+        rows = [(at, each[r]) for at, r in pairs]
+        if kind == "switched":
+            rows = [(0, each[1])]
+    else:
+        graph = ech.Graph(edges, leaders, N, directed, heavy.tolist())
+    if kind == "parent":
+        parents = np.arange(N)
+        for j, i in edges:
+            parents[i] = j
+    case = Case(kind, dt, substeps, plants, u0, laws, rows, repeats, movers, parents, lag, sensed,
+                delay, every)  # fmt: skip
+    forward = Feedforward.PARENT if kind == "parent" else Feedforward.NONE
+    model = Agent(A, B, E, c, q)
+    others = {i: Agent(p[0], B, E, c, q) for i, p in enumerate(plants)}
+    world = ech.World(
+        network=network,
+        actuator=ech.Actuator(lag=lag) if lag else None,
+        sensing=ech.Sensing(delay=sensed * dt) if sensed else None,
+        plants=others if kind == "unlike" else {},
+    )
+    leader = Reacting(*laws[leaders[0]]) if kind == "reacting" else ech.laws.TrimInput()
+    drive = ech.Laws(leader, Linear(*law, feedforward=forward))
+    if kind.startswith("deviation"):
+        drive = ech.Laws(Planned(), Linear(*law, feedforward=forward))
+    formation = ech.Formation(np.zeros((N, n)))
+    parts = ech.Parts(model, graph, formation, drive, world=world)
+    return case, parts, ech.Settings(horizon=100 * dt, dt=dt, substeps=substeps)
+
+
+class Planned(ech.laws.TrimInput, ech.laws.Travels):
+    """A leader at its trim, as everybody knows."""
+
+    plans = True
+
+    def deviation(self, model, t, x, offset, memory):
+        return x - offset - jnp.asarray(np.asarray(model.trim[0]))
+
+    def expected(self, model, t, deviation, age, period):
+        from echelon.laws.law import Expected
+
+        return Expected(deviation + jnp.asarray(np.asarray(model.trim[0])))
+
+
+def shape_sensed(kind):
+    return 2 if "sensed" in kind else 0
+
+
+def shape_of(kind, rng):
+    N, n, m = int(rng.integers(3, 8)), int(rng.integers(1, 5)), int(rng.integers(1, 3))
+    m = min(m, n)
+    k = int(rng.integers(1, 3)) if "memory" in kind or kind == "parent" and rng.uniform() < 0.5 else 0
+    edges, directed = edges_of(rng, N, kind)
+    leaders = (0,)
+    if kind == "leaders" or kind == "reacting" and rng.uniform() < 0.4:
+        leaders = (0, N - 1)
+    dt = float(rng.choice([0.01, 0.02, 0.05]))
+    return N, n, m, k, dt, int(rng.integers(1, 4)), edges, directed, leaders
+
+
+def check_whole(cases, seed):
+    """Compare drawn formations, and print counts."""
+    counts = dict.fromkeys(
+        "drawn stable unstable refused-though-stable kept-though-unstable radius-differs "
+        "exact-differs formula-differs exact-kept-though-unstable failed".split(), 0
+    )
+    rng, worst, worst_exact, by_fault = np.random.default_rng(seed), 0.0, 0.0, {}
+    done, begun = 0, time.time()
+    while done < cases:
+        kind = KINDS[(done // PER_SHAPE) % len(KINDS)]
+        shape = shape_of(kind, rng)
+        for _ in range(PER_SHAPE):
+            made = drawn_case(kind, shape, rng)
+            while made is None:
+                made = drawn_case(kind, shape, rng)
+            case, parts, settings = made
+            done += 1
+            counts["drawn"] += 1
+            told = f"case {done} ({kind}, N {shape[0]}, n {shape[1]}, m {shape[2]}, dt {shape[4]})"
+            true, exactly = radius_of(case), radius_of(case, exact=True)
+            formula = by_formula(case)
+            if formula is not None and abs(formula - true) > 1e-6:
+                counts["formula-differs"] += 1
+                print(f"{told}: own matrix {true!r}, formula {formula!r}")
+            try:
+                found = certificate(parts, settings)
+            except Exception as error:
+                counts["failed"] += 1
+                print(f"{told}: {type(error).__name__}: {str(error)[:300]}")
+                continue
+            stable = max(true, exactly) < 1.0 - CLEAR
+            counts["stable" if stable else "unstable"] += 1
+            if found.radius is not None:
+                worst = max(worst, abs(found.radius - true))
+                if abs(found.radius - true) > 1e-9:
+                    counts["radius-differs"] += 1
+                    print(f"{told}: radius {found.radius!r}, own {true!r}, {found.faults}")
+            if found.exact is not None:
+                worst_exact = max(worst_exact, abs(found.exact - exactly))
+                if abs(found.exact - exactly) > 1e-9:
+                    counts["exact-differs"] += 1
+                    print(f"{told}: exact {found.exact!r}, own {exactly!r}")
+            if stable and found.faults:
+                counts["refused-though-stable"] += 1
+                print(f"{told}: refused, own {true:.9f} {exactly:.9f}: {found}")
+            if found.holds and true >= 1.0:
+                counts["kept-though-unstable"] += 1
+                print(f"{told}: KEPT, own {true:.9f}: {found}")
+            if found.holds and exactly >= 1.0:
+                counts["exact-kept-though-unstable"] += 1
+                print(f"{told}: KEPT, own exact {exactly:.9f}: {found}")
+            for fault in found.faults:
+                key = (str(fault), kind)
+                by_fault[key] = by_fault.get(key, 0) + 1
+        print(f"[{time.time() - begun:.0f} s] {done} {kind}: worst {worst:.1e} {worst_exact:.1e}",
+              flush=True)  # fmt: skip
+    print(counts)
+    print("worst difference of the radius", worst, "and of exact hold", worst_exact)
+    for key, count in sorted(by_fault.items()):
+        print(count, *key)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("what", choices=("whole", "laws", "breaks"))
+    parser.add_argument("--cases", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="")
+    chosen = parser.parse_args()
+    if chosen.what == "whole":
+        check_whole(chosen.cases, chosen.seed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
