@@ -17,7 +17,10 @@ import sys
 import time
 
 os.environ.setdefault(
-    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+    " --xla_cpu_parallel_codegen_split_count=1"
+    " --xla_disable_hlo_passes=simplification,post_scatter_expansion_simplification",
 )
 
 import equinox as eqx  # noqa: E402
@@ -57,8 +60,8 @@ class Agent(ech.ControlAffine):
     A: np.ndarray
     B: np.ndarray
     E: np.ndarray
-    c: float = 0.0
-    q: float = 0.0
+    c: np.ndarray  # arrays, since a number would be compiled in
+    q: np.ndarray
 
     @property
     def state_names(self):
@@ -356,7 +359,7 @@ KINDS = (
     "reacting", "leaders", "directed", "chain", "switching", "odd switching", "switched",
     "unlike", "lag", "sensed", "lag and sensed", "late and memory", "switching messages",
 )  # fmt: skip
-PER_SHAPE = 5
+PER_SHAPE = 15
 """Cases with the same shapes, whose steps are compiled once."""
 
 
@@ -491,8 +494,8 @@ def drawn_case(kind, shape, rng):
     case = Case(kind, dt, substeps, plants, u0, laws, rows, repeats, movers, parents, lag, sensed,
                 delay, every)  # fmt: skip
     forward = Feedforward.PARENT if kind == "parent" else Feedforward.NONE
-    model = Agent(A, B, E, c, q)
-    others = {i: Agent(p[0], B, E, c, q) for i, p in enumerate(plants)}
+    model = Agent(A, B, E, np.array(c), np.array(q))
+    others = {i: Agent(p[0], B, E, np.array(c), np.array(q)) for i, p in enumerate(plants)}
     world = ech.World(
         network=network,
         actuator=ech.Actuator(lag=lag) if lag else None,
