@@ -603,6 +603,364 @@ def check_whole(cases, seed):
         print(count, *key)
 
 
+# ---- what might be taken for a loop that comes to rest ------------------------------------------
+
+
+def scalar(a=0.0, b=1.0):
+    """x' = a (x - x0) + b (u - u0), alone."""
+    zero = np.zeros(())
+    return Agent(np.array([[a]]), np.array([[b]]), np.zeros((1, 1)), zero, zero)
+
+
+def flown(parts, settings, off=1e-6):
+    """How much larger errors are at the end of a run than at its start, which is `off`."""
+    goals = np.asarray(parts.model.trim[0], float) + parts.formation.offsets
+    start = goals + off * np.random.default_rng(5).uniform(0.5, 1.0, goals.shape)
+    result = ech.simulate(
+        parts.replace(initial=start), settings._replace(precision="float64", engine="jax")
+    )
+    error = np.abs(np.asarray(result.states) - goals).max(axis=(1, 2))
+    return float(error[-1] / error[0]) if np.isfinite(error[-1]) else np.inf
+
+
+class Own(ech.Law):
+    """A law of one state and one input, in few lines."""
+
+    def physical(self, model, v):
+        return model.physical(jnp.reshape(v, (1,)))
+
+
+class Grows(Own):
+    """u = -(1 - m) z, m' = 2 m + z^2: m is unstable, and multiplies z."""
+
+    def init(self):
+        return jnp.zeros(1)
+
+    def update(self, model, view, m):
+        z = view.disagreement
+        return self.physical(model, -(1.0 - m) * z), m + view.period * (2.0 * m + z**2)
+
+
+class Toggles(Own):
+    """u = -(1 + 400 (c - 1/2)) z, c+ = 1 - c, c(0) = 0: c = 1/2 never comes."""
+
+    def init(self):
+        return jnp.zeros(1)
+
+    def update(self, model, view, c):
+        return self.physical(model, -(1.0 + 400.0 * (c - 0.5)) * view.disagreement), 1.0 - c
+
+
+class RunsAway(Own):
+    """u = -c z, c' = c - 1, c(0) = 0: c = 1 is where it would rest."""
+
+    def init(self):
+        return jnp.zeros(1)
+
+    def update(self, model, view, c):
+        return self.physical(model, -c * view.disagreement), c + view.period * (c - 1.0)
+
+
+class Swings(Own):
+    """u = -(1 - 4 c^2) z, with c of an oscillator that begins at c = 1: -1 in the mean."""
+
+    def init(self):
+        return jnp.array([1.0, 0.0])
+
+    def update(self, model, view, y):
+        turn = jnp.array([[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]])
+        return self.physical(model, -(1.0 - 4.0 * y[0] ** 2) * view.disagreement), turn @ y
+
+
+class SmallClock(Own):
+    """u = -(1 - t) z, with t counted in units of 1e9 s."""
+
+    def init(self):
+        return jnp.zeros(1)
+
+    def update(self, model, view, c):
+        after = c + 1e-9 * view.period
+        return self.physical(model, -(1.0 - 1e9 * c) * view.disagreement), after
+
+
+class Epoch(Own):
+    """u = -(1 - k / 100) z counts steps k, and keeps the time of day at which it began."""
+
+    def init(self):
+        return jnp.array([1.7e9, 0.0])
+
+    def update(self, model, view, y):
+        return self.physical(model, -(1.0 - 0.01 * y[1]) * view.disagreement), y.at[1].add(1.0)
+
+
+class Kink(Own):
+    """u = -z + 3 |z|."""
+
+    slow: float = 1.0
+
+    def update(self, model, view, memory):
+        z = view.disagreement
+        return self.physical(model, self.slow * (-z + 3.0 * jnp.abs(z))), memory
+
+
+class EpochKink(Kink):
+    """The same, which keeps the time of day at which it began."""
+
+    def init(self):
+        return jnp.array(1.7e9)
+
+
+class CurvedKink(Own):
+    """u = -z + 3 |z| + 1e6 z^2."""
+
+    def update(self, model, view, memory):
+        z = view.disagreement
+        return self.physical(model, -z + 3.0 * jnp.abs(z) + 1e6 * z**2), memory
+
+
+class Plain(Own):
+    """u = -gain z."""
+
+    gain: float = 1.0
+
+    def update(self, model, view, memory):
+        return self.physical(model, -self.gain * view.disagreement), memory
+
+
+class Quiet(Plain):
+    """A leader that hears others, and does not say so: u = 3 z."""
+
+    gain: float = -3.0
+
+
+class TimedLeader(Own):
+    """A leader that reacts by u = -(1 - t) z."""
+
+    @property
+    def information(self):
+        return ("neighbours' states",)
+
+    def update(self, model, view, memory):
+        return self.physical(model, -(1.0 - view.t) * view.disagreement), memory
+
+
+class CountingLeader(TimedLeader):
+    """The same with whole numbers."""
+
+    def init(self):
+        return jnp.zeros((), jnp.int32)
+
+    def update(self, model, view, k):
+        return self.physical(model, -(1.0 - 0.02 * k) * view.disagreement), k + 1
+
+
+class CountingMessage(Own):
+    """u = v_ff - z; what it sends is multiplied by 1 - k / 10 after k steps."""
+
+    feedforward = Feedforward.PARENT
+
+    def init(self):
+        return jnp.zeros((), jnp.int32)
+
+    def update(self, model, view, k):
+        return self.physical(model, view.feedforward - view.disagreement), k + 1
+
+    def message(self, model, x, v, k):
+        return v * (1.0 - 0.1 * k)
+
+
+class Idle(Own):
+    """u = u*."""
+
+    def update(self, model, view, memory):
+        return self.physical(model, 0.0 * view.disagreement), memory
+
+
+class ReactsAlike(Plain):
+    """A leader under the law of the others."""
+
+    @property
+    def information(self):
+        return ("neighbours' states",)
+
+
+class Remembers(Own):
+    """u = -g z with g = 1 if it began on its goal, and -1 otherwise."""
+
+    def init(self):
+        return jnp.ones(1)
+
+    def begin(self, model, x):
+        there = jnp.all(x == jnp.asarray(np.asarray(model.trim[0])))
+        return jnp.where(there, 1.0, -1.0)[None]
+
+    def update(self, model, view, g):
+        return self.physical(model, -g * view.disagreement), g
+
+
+class Traced(Own):
+    """u = -z while a program is traced for the first times, u = z afterwards."""
+
+    def update(self, model, view, memory):
+        COUNT[0] += 1
+        sign = -1.0 if COUNT[0] < 60 else 1.0
+        return self.physical(model, sign * view.disagreement), memory
+
+
+COUNT = [0]
+
+
+class TwoStates(Own):
+    """u = -k z_2 - 3 k |z_2|, of an agent whose first state is in small units."""
+
+    k: float = 0.3
+    kink: float = 0.0
+
+    def update(self, model, view, memory):
+        z = view.disagreement[1]
+        return model.physical((-self.k * z + self.kink * jnp.abs(z))[None]), memory
+
+
+def small_units(a=-1.0):
+    zero, A = np.zeros(()), np.array([[-1.0, 1e12], [0.0, a]])
+    return Agent(A, np.array([[0.0], [1.0]]), np.zeros((2, 1)), zero, zero)
+
+
+LINE = [(0, 1), (1, 2)]
+
+
+def parts_with(law, model=None, leader=None, graph=None, offsets=None, **world):
+    model = model or scalar()
+    graph = graph or ech.Graph(LINE)
+    offsets = np.zeros((graph.agents, len(model.state_names))) if offsets is None else offsets
+    drive = ech.Laws(leader or ech.laws.TrimInput(), law)
+    return ech.Parts(model, graph, ech.Formation(offsets), drive, world=ech.World(**world))
+
+
+def far():
+    return np.array([[0.0], [1e6], [2e6]])
+
+
+def star_then_chain():
+    """A star that becomes a chain, at whose end two agents hear each other 300 times too loud."""
+    star = [(0, i, 1.0) for i in range(1, 7)]
+    chain = [(i - 1, i, 1.0) for i in range(1, 6)] + [(5, 6, 300.0)]
+    return ech.Graph.switching([(0.0, star), (0.1, chain)], agents=7)
+
+
+def loud_then_well():
+    """A graph that is 300 times too loud for 20 s, and fine afterwards."""
+    loud = [(i, j, 300.0) for i, j in LINE]
+    return ech.Graph.switching([(0.0, loud), (20.0, [(i, j, 1.0) for i, j in LINE])])
+
+
+class Motored(Agent):
+    """The same with limits of its input."""
+
+    @property
+    def input_limits(self):
+        return ech.models.Limits(((1.0,),), (-1.0,), (2.0,))
+
+
+def motored(a):
+    zero = np.zeros(())
+    return Motored(np.array([[a]]), np.eye(1), np.zeros((1, 1)), zero, zero)
+
+
+def moving():
+    from echelon import network
+
+    graph, model = ech.Graph.path(3), ech.models.SingleIntegrator()
+    formation = ech.Formation.line(model, graph).moving(network.Rotate(rate=0.3))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Agreement())
+    return ech.Parts(model, graph, formation, drive)
+
+
+def lost(**more):
+    graph = ech.Graph([(0, 1), (1, 2), (0, 2)])
+    return dataclasses.replace(parts_with(Plain(), graph=graph), **more)
+
+
+S = ech.Settings(40.0, 0.02)
+BREAKS = {
+    "a memory that grows multiplies z": lambda: (parts_with(Grows()), S),
+    "a memory of 0 and 1 by turns": lambda: (parts_with(Toggles()), S),
+    "a memory that leaves where it would rest": lambda: (parts_with(RunsAway()), S),
+    "an oscillator multiplies z": lambda: (parts_with(Swings()), S),
+    "a clock in units of 1e9 s": lambda: (parts_with(SmallClock()), S),
+    "a counter beside a large number": lambda: (parts_with(Epoch()), S),
+    "a kink": lambda: (parts_with(Kink()), S),
+    "a kink beside a large number": lambda: (parts_with(EpochKink()), S),
+    "a kink of agents 1000 km apart": lambda: (parts_with(Kink(), offsets=far()), S),
+    "a kink beside curvature": lambda: (parts_with(CurvedKink()), S),
+    "a slow kink": lambda: (parts_with(Kink(1e-5)), ech.Settings(6000.0, 0.02, store_every=1000)),
+    "a leader hears and does not say so": lambda: (parts_with(Plain(), leader=Quiet()), S),
+    "a leader reads a clock": lambda: (parts_with(Plain(), leader=TimedLeader()), S),
+    "a leader counts": lambda: (parts_with(Plain(), leader=CountingLeader()), S),
+    "a message counts": lambda: (
+        parts_with(CountingMessage(), graph=ech.Graph.path(4)), S),
+    "a law that does nothing": lambda: (parts_with(Idle()), S),
+    "a leader alone that falls": lambda: (parts_with(Plain(5.0), scalar(0.5)), S),
+    "leaders under the same law that fall": lambda: (
+        parts_with(Plain(5.0), scalar(0.5), ReactsAlike(5.0)), S),
+    "a law that remembers how it began": lambda: (parts_with(Remembers()), S),
+    "a law that changes with each trace": lambda: (parts_with(Traced()), S),
+    "a kink beside small units": lambda: (
+        parts_with(TwoStates(0.3, 3.0), small_units(0.0)), S),
+    "one plant unlike the others beside small units": lambda: (
+        parts_with(TwoStates(), small_units(), plants={2: small_units(0.5)}), S),
+    "far agents hear late": lambda: (
+        parts_with(Planful(), leader=Planned(), graph=star_then_chain(), network=ech.Network(
+            50.0, 0.1, forget=9.0)), S),
+    "a graph that is loud at first": lambda: (parts_with(Plain(), graph=loud_then_well()), S),
+    "motors of few levels": lambda: (
+        parts_with(Plain(5.0), motored(0.5), actuator=ech.Actuator(levels=4)), S),
+    "a formation that turns": lambda: (moving(), S),
+    "a plant that drifts by 5e-4, agents far apart": lambda: (
+        parts_with(Plain(), offsets=far(), plant=Drifting(
+            np.zeros((1, 1)), np.eye(1), np.zeros((1, 1)), np.zeros(()), np.zeros(()))), S),
+    "the leader is lost": lambda: (lost(
+        events=[ech.network.Lose(0, 10.0)],
+        graph=ech.Graph([(0, 1), (1, 2), (0, 2)]),
+        leadership=None), S),
+}  # fmt: skip
+
+
+class Planful(Plain):
+    """The same law; only its leader matters."""
+
+
+class Drifting(Agent):
+    """A plant that is pushed."""
+
+    def drift(self, x):
+        return super().drift(x) + 5e-4
+
+
+def check_breaks(only):
+    """Print what is said of loops that do not come to rest, and what they do."""
+    false = 0
+    for name, made in BREAKS.items():
+        if only not in name:
+            continue
+        COUNT[0], began = 0, time.time()
+        try:
+            parts, settings = made()
+            found = certificate(parts, settings)
+            ratio = flown(parts, settings)
+        except Exception as error:
+            print(f"{name}: {type(error).__name__}: {str(error)[:400]}", flush=True)
+            continue
+        wrong = found.holds and not ratio < 0.9
+        false += wrong
+        told = ", ".join(found.faults) or "no faults"
+        print(f"{'FALSE' if wrong else 'well '} {name}: {told}; radius {found.radius}, exact "
+              f"{found.exact}, adrift {found.adrift}, off {found.off:.1e}, growth {found.growth}; "
+              f"errors are {ratio:.3g} times as large at the end  [{time.time() - began:.0f} s]",
+              flush=True)  # fmt: skip
+    print(f"{false} false")
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=("whole", "laws", "breaks"))
@@ -612,6 +970,8 @@ def main():
     chosen = parser.parse_args()
     if chosen.what == "whole":
         check_whole(chosen.cases, chosen.seed)
+    if chosen.what == "breaks":
+        check_breaks(chosen.only)
 
 
 if __name__ == "__main__":
