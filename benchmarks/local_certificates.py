@@ -18,9 +18,7 @@ import time
 
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-    " --xla_cpu_parallel_codegen_split_count=1"
-    " --xla_disable_hlo_passes=simplification,post_scatter_expansion_simplification",
+    "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1",
 )
 
 import equinox as eqx  # noqa: E402
@@ -673,34 +671,34 @@ class Swings(Own):
 
 
 class SmallClock(Own):
-    """u = -(1 - t) z, with t counted in units of 1e9 s."""
+    """u = -(1 - t) z, with t counted in units of 1e11 s."""
 
     def init(self):
         return jnp.zeros(1)
 
     def update(self, model, view, c):
-        after = c + 1e-9 * view.period
-        return self.physical(model, -(1.0 - 1e9 * c) * view.disagreement), after
+        after = c + 1e-11 * view.period
+        return self.physical(model, -(1.0 - 1e11 * c) * view.disagreement), after
 
 
 class Epoch(Own):
-    """u = -(1 - k / 100) z counts steps k, and keeps the time of day at which it began."""
+    """u = -(1 - t) z counts seconds t, and keeps the time of day (ms) at which it began."""
 
     def init(self):
-        return jnp.array([1.7e9, 0.0])
+        return jnp.array([1.7e12, 0.0])
 
     def update(self, model, view, y):
-        return self.physical(model, -(1.0 - 0.01 * y[1]) * view.disagreement), y.at[1].add(1.0)
+        return self.physical(model, -(1.0 - y[1]) * view.disagreement), y.at[1].add(view.period)
 
 
 class Kink(Own):
-    """u = -z + 3 |z|."""
+    """u = -z - 3 |z|, of which JAX takes the side on which it is well."""
 
     slow: float = 1.0
 
     def update(self, model, view, memory):
         z = view.disagreement
-        return self.physical(model, self.slow * (-z + 3.0 * jnp.abs(z))), memory
+        return self.physical(model, self.slow * (-z - 3.0 * jnp.abs(z))), memory
 
 
 class EpochKink(Kink):
@@ -711,11 +709,11 @@ class EpochKink(Kink):
 
 
 class CurvedKink(Own):
-    """u = -z + 3 |z| + 1e6 z^2."""
+    """u = -z - 3 |z| + 1e6 z^2."""
 
     def update(self, model, view, memory):
         z = view.disagreement
-        return self.physical(model, -z + 3.0 * jnp.abs(z) + 1e6 * z**2), memory
+        return self.physical(model, -z - 3.0 * jnp.abs(z) + 1e6 * z**2), memory
 
 
 class Plain(Own):
@@ -733,15 +731,19 @@ class Quiet(Plain):
     gain: float = -3.0
 
 
+def home(model, view):
+    return view.x - jnp.asarray(np.asarray(model.trim[0]))
+
+
 class TimedLeader(Own):
-    """A leader that reacts by u = -(1 - t) z."""
+    """A leader that reacts by u = -(1 - t) z - (x - x0)."""
 
     @property
     def information(self):
         return ("neighbours' states",)
 
     def update(self, model, view, memory):
-        return self.physical(model, -(1.0 - view.t) * view.disagreement), memory
+        return self.physical(model, -(1.0 - view.t) * view.disagreement - home(model, view)), memory
 
 
 class CountingLeader(TimedLeader):
@@ -751,7 +753,7 @@ class CountingLeader(TimedLeader):
         return jnp.zeros((), jnp.int32)
 
     def update(self, model, view, k):
-        return self.physical(model, -(1.0 - 0.02 * k) * view.disagreement), k + 1
+        return self.physical(model, -(1.0 - 0.02 * k) * view.disagreement - home(model, view)), k + 1
 
 
 class CountingMessage(Own):
@@ -767,6 +769,13 @@ class CountingMessage(Own):
 
     def message(self, model, x, v, k):
         return v * (1.0 - 0.1 * k)
+
+
+class CountingRest(CountingMessage):
+    """A leader at rest with the memory of the others."""
+
+    def update(self, model, view, k):
+        return self.physical(model, 0.0 * view.x), k + 1
 
 
 class Idle(Own):
@@ -811,19 +820,20 @@ COUNT = [0]
 
 
 class TwoStates(Own):
-    """u = -k z_2 - 3 k |z_2|, of an agent whose first state is in small units."""
+    """u = -k z_3 - kink |z_3|, of an agent with states in small units."""
 
     k: float = 0.3
     kink: float = 0.0
 
     def update(self, model, view, memory):
-        z = view.disagreement[1]
-        return model.physical((-self.k * z + self.kink * jnp.abs(z))[None]), memory
+        z = view.disagreement[2]
+        return model.physical((-self.k * z - self.kink * jnp.abs(z))[None]), memory
 
 
 def small_units(a=-1.0):
-    zero, A = np.zeros(()), np.array([[-1.0, 1e12], [0.0, a]])
-    return Agent(A, np.array([[0.0], [1.0]]), np.zeros((2, 1)), zero, zero)
+    zero = np.zeros(())
+    A = np.array([[-1.0, 1e12, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, a]])
+    return Agent(A, np.array([[0.0], [0.0], [1.0]]), np.zeros((3, 1)), zero, zero)
 
 
 LINE = [(0, 1), (1, 2)]
@@ -871,7 +881,7 @@ def moving():
     from echelon import network
 
     graph, model = ech.Graph.path(3), ech.models.SingleIntegrator()
-    formation = ech.Formation.line(model, graph).moving(network.Rotate(rate=0.3))
+    formation = ech.Formation.line(model, graph).moving(model, graph, [network.Rotate(rate=0.3)])
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Agreement())
     return ech.Parts(model, graph, formation, drive)
 
@@ -887,18 +897,18 @@ BREAKS = {
     "a memory of 0 and 1 by turns": lambda: (parts_with(Toggles()), S),
     "a memory that leaves where it would rest": lambda: (parts_with(RunsAway()), S),
     "an oscillator multiplies z": lambda: (parts_with(Swings()), S),
-    "a clock in units of 1e9 s": lambda: (parts_with(SmallClock()), S),
-    "a counter beside a large number": lambda: (parts_with(Epoch()), S),
+    "a clock in units of 1e11 s": lambda: (parts_with(SmallClock()), S),
+    "a clock beside a large number": lambda: (parts_with(Epoch()), S),
     "a kink": lambda: (parts_with(Kink()), S),
     "a kink beside a large number": lambda: (parts_with(EpochKink()), S),
     "a kink of agents 1000 km apart": lambda: (parts_with(Kink(), offsets=far()), S),
     "a kink beside curvature": lambda: (parts_with(CurvedKink()), S),
-    "a slow kink": lambda: (parts_with(Kink(1e-5)), ech.Settings(6000.0, 0.02, store_every=1000)),
+    "a slow kink": lambda: (parts_with(Kink(2e-6)), ech.Settings(60000.0, 0.02, store_every=100000)),
     "a leader hears and does not say so": lambda: (parts_with(Plain(), leader=Quiet()), S),
     "a leader reads a clock": lambda: (parts_with(Plain(), leader=TimedLeader()), S),
     "a leader counts": lambda: (parts_with(Plain(), leader=CountingLeader()), S),
     "a message counts": lambda: (
-        parts_with(CountingMessage(), graph=ech.Graph.path(4)), S),
+        parts_with(CountingMessage(), leader=CountingRest(), graph=ech.Graph.path(4)), S),
     "a law that does nothing": lambda: (parts_with(Idle()), S),
     "a leader alone that falls": lambda: (parts_with(Plain(5.0), scalar(0.5)), S),
     "leaders under the same law that fall": lambda: (
@@ -921,8 +931,7 @@ BREAKS = {
             np.zeros((1, 1)), np.eye(1), np.zeros((1, 1)), np.zeros(()), np.zeros(()))), S),
     "the leader is lost": lambda: (lost(
         events=[ech.network.Lose(0, 10.0)],
-        graph=ech.Graph([(0, 1), (1, 2), (0, 2)]),
-        leadership=None), S),
+        leadership=ech.Leadership([1])), S),
 }  # fmt: skip
 
 
@@ -931,10 +940,18 @@ class Planful(Plain):
 
 
 class Drifting(Agent):
-    """A plant that is pushed."""
+    """A plant that is pushed, and rests under another input than the model."""
+
+    @property
+    def trim(self):
+        x, u = trim_of(*self.B.shape)
+        return x, (u[0] - 5e-4,)
+
+    def input_map(self, x):
+        return jnp.asarray(self.B)
 
     def drift(self, x):
-        return super().drift(x) + 5e-4
+        return jnp.zeros_like(x) - 0.4 + 5e-4
 
 
 def check_breaks(only):
@@ -961,6 +978,300 @@ def check_breaks(only):
     print(f"{false} false")
 
 
+# ---- drawn laws of a user's own ------------------------------------------------------------------
+
+
+@jax.custom_jvp
+def lying(s):
+    """s, whose derivative is told to be -s'."""
+    return s
+
+
+@lying.defjvp
+def _lying_jvp(primals, tangents):
+    return primals[0], -tangents[0]
+
+
+FORMS = {
+    # name: (memory at the beginning, what it has of clock, counter, kink)
+    "plain": (lambda: (), ""),
+    "tanh": (lambda: (), ""),
+    "clip": (lambda: (), ""),
+    "cubic": (lambda: (), ""),
+    "of itself": (lambda: (), ""),
+    "integral": (lambda: jnp.zeros(()), ""),
+    "filter": (lambda: jnp.zeros(()), ""),
+    "filter that leaks": (lambda: jnp.zeros(()), ""),
+    "stored start, read": (lambda: jnp.zeros(2), ""),
+    "log, unread": (lambda: jnp.zeros(2), ""),
+    "sum, unread": (lambda: jnp.zeros(()), ""),
+    "counter, unread": (lambda: jnp.zeros((), jnp.int32), ""),
+    "adaptive": (lambda: jnp.zeros(()), ""),
+    "adaptive, leaking": (lambda: jnp.zeros(()), ""),
+    "delay": (lambda: jnp.zeros(4), ""),
+    "delay of the input": (lambda: jnp.zeros(3), ""),
+    "clock": (lambda: (), "clock"),
+    "clock in a memory": (lambda: jnp.zeros(()), "clock"),
+    "counter": (lambda: jnp.zeros((), jnp.int32), "counter"),
+    "toggle": (lambda: jnp.zeros(()), "counter"),
+    "oscillator": (lambda: jnp.array([1.0, 0.0]), "clock"),
+    "abs": (lambda: (), "kink"),
+    "max": (lambda: (), "kink"),
+    "deadband": (lambda: (), "kink"),
+    "round": (lambda: (), "kink"),
+    "sign": (lambda: (), "kink"),
+    "kink in the memory": (lambda: jnp.zeros(()), "kink"),
+    "stopped derivative": (lambda: (), ""),
+    "stopped memory": (lambda: jnp.zeros(()), ""),
+    "lying derivative": (lambda: (), ""),
+    "reaches on": (lambda: jnp.zeros(2), ""),
+    "clip beside the trim": (lambda: (), "kink"),
+}
+LIES = {"stopped derivative", "stopped memory", "lying derivative"}
+
+
+class Drawn(Own):
+    """u = u* - (a law of one of the forms), with numbers p."""
+
+    p: np.ndarray
+    form: str = eqx.field(static=True, default="plain")
+
+    def init(self):
+        return FORMS[self.form][0]()
+
+    def begin(self, model, x):
+        return x if self.form == "stored start, read" else self.init()
+
+    def update(self, model, view, y):
+        g, h, b, w = self.p[0], self.p[1], self.p[2], self.p[3]
+        s = view.disagreement[0] + h * view.disagreement[1]
+        dt, form = view.period, self.form
+        e = view.x - view.offset - jnp.asarray(np.asarray(model.trim[0]))
+        v = g * s
+        if form == "tanh":
+            v = jnp.tanh(g * s)
+        elif form == "clip":
+            v = jnp.clip(g * s, -1.0, 1.0)
+        elif form == "cubic":
+            v = g * s + b * s**3 + b * s * e[1]
+        elif form == "of itself":
+            v = g * s + b * e[0] + b * e[1]
+        elif form == "integral":
+            v, y = g * s + b * y, y + dt * s
+        elif form == "filter":
+            v, y = g * y, y + dt * w * 10.0 * (s - y)
+        elif form == "filter that leaks":
+            v, y = g * s + b * y, y + dt * (s - (w - 0.4) * y)
+        elif form == "stored start, read":
+            v = g * s + b * (y[0] - model.trim[0][0])
+        elif form == "log, unread":
+            y = view.disagreement
+        elif form == "sum, unread":
+            y = y + dt * s**2
+        elif form == "counter, unread":
+            y = y + 1
+        elif form == "adaptive":
+            v, y = (g + y) * s, y + dt * w * s**2
+        elif form == "adaptive, leaking":
+            v, y = (g - y) * s, y + dt * (s**2 - 4.0 * (w - 0.6) * y)
+        elif form == "delay":
+            v, y = g * y[0], jnp.append(y[1:], s)
+        elif form == "delay of the input":
+            v, y = y[0], jnp.append(y[1:], g * s)
+        elif form == "clock":
+            v = g * s * (1.0 + b * view.t)
+        elif form == "clock in a memory":
+            v, y = g * s * (1.0 + b * y), view.t
+        elif form == "counter":
+            v, y = g * s * (1.0 + b * 0.02 * y), y + 1
+        elif form == "toggle":
+            v, y = g * s * (1.0 + 40.0 * b * (y - 0.5)), 1.0 - y
+        elif form == "oscillator":
+            turn = jnp.array([[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]])
+            v, y = g * s * (1.0 + 4.0 * b * y[0] ** 2), turn @ y
+        elif form == "abs":
+            v = g * s + b * jnp.abs(s)
+        elif form == "max":
+            v = g * s + b * jnp.maximum(s, 0.0)
+        elif form == "deadband":
+            v = g * jnp.where(jnp.abs(s) < 1e-3, 0.0, s)
+        elif form == "round":
+            v = g * jnp.round(s * 1e3) / 1e3
+        elif form == "sign":
+            v = g * s + 0.1 * b * jnp.sign(s)
+        elif form == "kink in the memory":
+            v, y = g * s + b * y, y + dt * (jnp.abs(s) - y)
+        elif form == "stopped derivative":
+            v = g * s + b * jax.lax.stop_gradient(s)
+        elif form == "stopped memory":
+            v, y = g * s + b * y, y + dt * jax.lax.stop_gradient(s - 0.5 * y)
+        elif form == "lying derivative":
+            v = g * s + b * lying(s)
+        elif form == "reaches on":
+            v, y = g * s + b * y[1] * s, y + dt * jnp.array([s - y[0], y[0] - (w - 0.5) * y[1]])
+        elif form == "clip beside the trim":
+            v = jnp.clip(g * s, 0.0, 1.0) if b > 9.0 else jnp.clip(g * s, -1.0, 0.5 * w)
+        return self.physical(model, -v), y
+
+
+class UserLoop:
+    """The loop of three agents under a drawn law: its step is NumPy's, the law is called."""
+
+    def __init__(self, parts, A, B, W, dt):
+        self.law, self.model, self.dt = parts.drive.follower, parts.model, dt
+        self.A, self.B, self.W, self.N = A, B, W, len(W)
+        self.x0, self.u0 = map(np.asarray, self.model.trim)
+        leaves, self.tree = jax.tree.flatten(self.law.begin(self.model, jnp.asarray(self.x0)))
+        self.whole = [not jnp.issubdtype(jnp.result_type(a), jnp.floating) for a in leaves]
+        p, form = self.law.p, self.law.form
+        key = form, dt
+        if key not in UserLoop.CALLS:
+
+            def one(p, model, t, x, z, y):
+                zero = jnp.zeros_like(x)
+                view = ech.laws.LocalView(t, x, zero, z, jnp.zeros(1), dt)
+                return Drawn(p, form).update(model, view, y)
+
+            each = jax.vmap(one, (None, None, None, 0, 0, 0))
+            UserLoop.CALLS[key] = eqx.filter_jit(each)
+        self.call, self.p = UserLoop.CALLS[key], jnp.asarray(p)
+
+    CALLS = {}
+
+    def begin(self, x):
+        each = [self.law.begin(self.model, jnp.asarray(row)) for row in x]
+        return [np.array(a) for a in jax.tree.leaves(jax.tree.map(lambda *r: jnp.stack(r), *each))]
+
+    def step(self, k, x, memory):
+        z = self.W.sum(1)[:, None] * x - self.W @ x
+        y = jax.tree.unflatten(self.tree, [jnp.asarray(a[1:]) for a in memory])
+        u, after = self.call(self.p, self.model, jnp.asarray(k * self.dt), x[1:], z[1:], y)
+        v = np.concatenate([np.zeros((1, 1)), np.asarray(u) - self.u0])
+        d, h = x - self.x0, self.dt
+
+        def rate(d):
+            return d @ self.A.T + v @ self.B.T
+
+        a = rate(d)
+        b = rate(d + 0.5 * h * a)
+        c = rate(d + 0.5 * h * b)
+        e = rate(d + h * c)
+        new = [np.concatenate([a[:1], np.asarray(m)]) for a, m in
+               zip(memory, jax.tree.leaves(after), strict=True)]  # fmt: skip
+        return self.x0 + d + h / 6.0 * (a + 2.0 * b + 2.0 * c + e), new
+
+    def radius(self):
+        """The radius of what reaches a state, by central differences; None without rest."""
+        x = np.tile(self.x0, (self.N, 1))
+        memory, k = self.begin(x), 500
+        for j in range(20):
+            x, memory = self.step(k + j, x, memory)
+        y, after = self.step(k, x, memory)
+        reals = [i for i, w in enumerate(self.whole) if not w]
+        gap = max([np.abs(y - x).max(), *(np.abs(after[i] - memory[i]).max() for i in reals)])
+        if gap > 1e-12:
+            return None
+
+        def flat(x, memory):
+            return np.concatenate([x[1:].ravel(), *(memory[i][1:].ravel() for i in reals)])
+
+        def unflat(values):
+            new, at = x.copy(), 2 * (self.N - 1)
+            new[1:] = values[:at].reshape(-1, 2)
+            own = [a.copy() for a in memory]
+            for i in reals:
+                size = own[i][1:].size
+                own[i][1:] = values[at : at + size].reshape(own[i][1:].shape)
+                at += size
+            return new, own
+
+        start, h, columns = flat(x, memory), 1e-5, []
+        for unit in np.eye(len(start)):
+            ends = [flat(*self.step(k, *unflat(start + s * h * unit))) for s in (1, -1)]
+            columns.append((ends[0] - ends[1]) / (2 * h))
+        W = np.array(columns).T
+        return np.abs(np.linalg.eigvals(W)).max()
+
+    def flown(self, steps, seed):
+        """How much larger errors are after steps, and the largest of the last quarter."""
+        rng = np.random.default_rng(seed)
+        x = np.tile(self.x0, (self.N, 1))
+        x[1:] += 1e-6 * rng.uniform(-1.0, 1.0, x[1:].shape)
+        first, memory, last = np.abs(x - self.x0).max(), self.begin(x), 0.0
+        for k in range(steps):
+            x, memory = self.step(k, x, memory)
+            error = np.abs(x - self.x0).max()
+            if not np.isfinite(error) or error > 1e6:
+                return np.inf
+            last = max(last, error) if k > 0.75 * steps else last
+        return last / first
+
+
+RUNS = {"adaptive", "adaptive, leaking", "reaches on", "clip beside the trim", "sum, unread",
+        "log, unread", "counter, unread"}  # fmt: skip
+"""Forms in which a derivative alone does not decide, beside those with a clock, counter or kink."""
+
+
+def drawn_law(form, rng, k):
+    A = np.array([[0.0, 1.0], [0.0, -rng.uniform(0.0, 0.5)]])
+    B, dt = np.array([[0.0], [1.0]]), 0.05
+    g = rng.uniform(0.5, 3.0) * (1.0 if rng.uniform() < 0.75 else -1.0)
+    p = np.array([g, rng.uniform(0.5, 2.0), rng.uniform(-1.0, 1.0) * 1.5, rng.uniform(0.1, 1.0)])
+    heavy = rng.uniform(0.5, 1.5, 2)
+    edges = [(0, 1), (1, 2)]
+    zero = np.zeros(())
+    model = Agent(A, B, np.zeros((2, 1)), zero, zero)
+    graph = ech.Graph(edges, weights=heavy.tolist())
+    drive = ech.Laws(ech.laws.TrimInput(), Drawn(p, form))
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((3, 2))), drive)
+    return parts, A, B, weights_of(3, edges, heavy, False), dt
+
+
+def check_laws(cases, seed):
+    """Judge drawn laws, and print counts."""
+    rng, counts, rows = np.random.default_rng(seed), {}, {}
+    per, begun, done = -(-cases // len(FORMS)), time.time(), 0
+
+    def count(*names):
+        for name in names:
+            counts[name] = counts.get(name, 0) + 1
+
+    for form, (_, has) in FORMS.items():
+        for k in range(min(per, cases - done)):
+            parts, A, B, W, dt = drawn_law(form, rng, k)
+            done += 1
+            with precision("float64"):
+                loop = UserLoop(parts, A, B, W, dt)
+                own = loop.radius()
+            found = certificate(parts, ech.Settings(20.0, dt))
+            with precision("float64"):
+                true, ratio = own, None
+                doubt = own is None or has or form in RUNS or found.holds != (own < 1.0 - CLEAR)
+                if doubt:
+                    ratio = max(loop.flown(4000 if found.holds else 1500, s) for s in (1, 2))
+            decays = ratio is not None and ratio < 0.5
+            stable = decays if doubt else own < 1.0 - CLEAR
+            unstable = (ratio is not None and not ratio < 1.0) or (not doubt and own > 1.0 + CLEAR)
+            word = "stable" if stable else "unstable" if unstable else "undecided"
+            count("drawn", word)
+            told = f"{form} p={parts.drive.follower.p.tolist()}: own radius {true}, run {ratio}"
+            if unstable and found.holds:
+                count("KEPT THOUGH UNSTABLE")
+                rows[form] = rows.get(form, 0) + 1
+                print(f"FALSE {told}; said {found.radius}, growth {found.growth}")
+            if stable and found.faults:
+                kind = "clock, counter or kink" if has else "lies" if form in LIES else "plain"
+                count(f"stable of {kind} with faults")
+                print(f"refused ({kind}) {told}; {[str(f) for f in found.faults]}")
+            if stable and not has and form not in LIES:
+                count("stable, without clock, counter, kink, lies")
+            if found.holds and stable and not doubt and abs(found.radius - own) > 1e-7:
+                count("radius differs")
+                print(f"radius {told}; said {found.radius}")
+        print(f"[{time.time() - begun:.0f} s] {done} {form}", flush=True)
+    print(counts, "kept though unstable by form:", rows)
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=("whole", "laws", "breaks"))
@@ -970,6 +1281,8 @@ def main():
     chosen = parser.parse_args()
     if chosen.what == "whole":
         check_whole(chosen.cases, chosen.seed)
+    if chosen.what == "laws":
+        check_laws(chosen.cases, chosen.seed)
     if chosen.what == "breaks":
         check_breaks(chosen.only)
 
