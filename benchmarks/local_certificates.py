@@ -1238,7 +1238,8 @@ def judged(form, has, drawn, count, rows):
         doubt = own is None or has or form in RUNS or found.holds != (own < 1.0 - CLEAR)
         if doubt:
             ratio = max(loop.flown(4000 if found.holds else 1500, s) for s in (1, 2))
-    decays = ratio is not None and ratio < 0.5
+    # What grows at first, until a memory has adapted, is not stable about rest.
+    decays = ratio is not None and ratio < 0.5 and not (own is not None and own > 1.0 + CLEAR)
     stable = decays if doubt else own < 1.0 - CLEAR
     unstable = (ratio is not None and not ratio < 1.0) or (not doubt and own > 1.0 + CLEAR)
     word = "stable" if stable else "unstable" if unstable else "undecided"
