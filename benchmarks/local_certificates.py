@@ -610,10 +610,11 @@ def scalar(a=0.0, b=1.0):
     return Agent(np.array([[a]]), np.array([[b]]), np.zeros((1, 1)), zero, zero)
 
 
-def flown(parts, settings, off=1e-6):
+def flown(parts, settings, along=None, off=1e-6):
     """How much larger errors are at the end of a run than at its start, which is `off`."""
     goals = np.asarray(parts.model.trim[0], float) + parts.formation.offsets
-    start = goals + off * np.random.default_rng(5).uniform(0.5, 1.0, goals.shape)
+    drawn = np.random.default_rng(5).uniform(0.5, 1.0, goals.shape)
+    start = goals + off * (drawn if along is None else along)
     result = ech.simulate(
         parts.replace(initial=start), settings._replace(precision="float64", engine="jax")
     )
@@ -886,9 +887,12 @@ def moving():
     return ech.Parts(model, graph, formation, drive)
 
 
-def lost(**more):
-    graph = ech.Graph([(0, 1), (1, 2), (0, 2)])
-    return dataclasses.replace(parts_with(Plain(), graph=graph), **more)
+def with_events(events, leadership=None):
+    graph, model = ech.Graph([(0, 1), (1, 2), (0, 2)]), ech.models.SingleIntegrator()
+    formation = ech.Formation.line(model, graph)
+    leader = ech.laws.Tracking(ech.references.Hover())
+    drive = ech.Laws(leader, ech.laws.Agreement())
+    return ech.Parts(model, graph, formation, drive, events=events, leadership=leadership)
 
 
 S = ech.Settings(40.0, 0.02)
@@ -928,9 +932,10 @@ BREAKS = {
     "a plant that drifts by 5e-4, agents far apart": lambda: (
         parts_with(Plain(), offsets=far(), plant=Drifting(
             np.zeros((1, 1)), np.eye(1), np.zeros((1, 1)), np.zeros(()), np.zeros(()))), S),
-    "the leader is lost": lambda: (lost(
-        events=[ech.network.Lose(0, 10.0)],
-        leadership=ech.Leadership([1])), S),
+    "the leader is lost": lambda: (
+        with_events([ech.network.Lose(0, 10.0)], ech.Leadership([1])), S),
+    "a follower is lost": lambda: (with_events([ech.network.Lose(2, 10.0)]), S),
+    "a link is cut for good": lambda: (with_events([ech.network.Cut((0, 2), 10.0)]), S),
 }  # fmt: skip
 
 
@@ -953,6 +958,10 @@ class Drifting(Agent):
         return jnp.zeros_like(x) - 0.4 + 5e-4
 
 
+ALONG = {"a slow kink": np.array([[0.0], [(1.0 - 5.0**0.5) / 2.0], [-1.0]])}
+"""Where a run begins: here on a ray on which all z are negative, and stay so."""
+
+
 def check_breaks(only):
     """Print what is said of loops that do not come to rest, and what they do."""
     false = 0
@@ -963,7 +972,7 @@ def check_breaks(only):
         try:
             parts, settings = made()
             found = certificate(parts, settings)
-            ratio = flown(parts, settings)
+            ratio = flown(parts, settings, ALONG.get(name))
         except Exception as error:
             print(f"{name}: {type(error).__name__}: {str(error)[:400]}", flush=True)
             continue
