@@ -324,7 +324,9 @@ def agent_maps(case):
 
 def by_formula(case):
     """Sections 2 and 3.2 of the note on the certificate; None where they do not apply."""
-    alike = all(np.array_equal(case.plants[i][0], case.plants[case.movers[0]][0]) for i in case.movers)
+    alike = all(
+        np.array_equal(case.plants[i][0], case.plants[case.movers[0]][0]) for i in case.movers
+    )
     if not alike or case.sensed or len(case.weights) > 1 or case.kind == "reacting":
         return None
     F, G, H, Em, C, Dz, Df = agent_maps(case)
@@ -339,15 +341,20 @@ def by_formula(case):
                 Pi[r, list(M).index(case.parents[i])] = 1.0
         fed = np.kron(one, C) + np.kron(L, Dz @ H)
         inner = np.linalg.solve(np.eye(N * len(Df)) - np.kron(Pi, Df), fed)
-        return np.abs(np.linalg.eigvals(
-            np.kron(one, F) + np.kron(L, G @ H) + np.kron(Pi, Em) @ inner)).max()
+        return np.abs(
+            np.linalg.eigvals(np.kron(one, F) + np.kron(L, G @ H) + np.kron(Pi, Em) @ inner)
+        ).max()
     if not case.delay:
         return max(np.abs(np.linalg.eigvals(F + lam * G @ H)).max() for lam in np.linalg.eigvals(L))
     total, s, n, held = None, len(F), len(H), case.delay + case.every - 1
     for step in range(case.every):
         big = np.zeros((N * s + held * N * n,) * 2)
         big[: N * s, : N * s] = np.kron(one, F) + np.kron(Dg, G @ H)
-        age = step + 100 * case.every - (step + 100 * case.every - case.delay) // case.every * case.every
+        age = (
+            step
+            + 100 * case.every
+            - (step + 100 * case.every - case.delay) // case.every * case.every
+        )
         at = N * s + (age - 1) * N * n
         big[: N * s, at : at + N * n] = -np.kron(Af, G)
         big[N * s : N * s + N * n, : N * s] = np.kron(one, H)
@@ -441,9 +448,7 @@ def drawn_case(kind, shape, rng):
     plant = (A, B, E, c, q)
     plants = [plant] * N
     if kind == "unlike":
-        plants = [
-            (A + rng.normal(0.0, 0.15, (n, n)) * (i in movers), B, E, c, q) for i in range(N)
-        ]
+        plants = [(A + rng.normal(0.0, 0.15, (n, n)) * (i in movers), B, E, c, q) for i in range(N)]
     lin = slopes(plant, u0)
     heavy = rng.uniform(0.4, 2.0, len(edges))
     W = weights_of(N, edges, heavy, directed)
@@ -481,13 +486,17 @@ def drawn_case(kind, shape, rng):
     if kind in ("switching", "odd switching", "switched", "switching messages"):
         parts_of_edges = [triples[::2] or triples, triples[1::2] or triples]
         starts = [0.0, 2 * dt] if kind != "odd switching" else [0.0, 1.7 * dt]
-        period = {"switching": 5 * dt, "odd switching": 3.5 * dt, "switching messages": 3 * dt}.get(kind)
+        period = {"switching": 5 * dt, "odd switching": 3.5 * dt, "switching messages": 3 * dt}.get(
+            kind
+        )
         if kind == "switched":
             parts_of_edges[1] = triples
         stretches = list(zip(starts, parts_of_edges, strict=True))
         graph = ech.Graph.switching(stretches, leaders, N, directed, period)
         pairs, repeats = rows_of_time(starts, period, dt)
-        each = [weights_of(N, [t[:2] for t in p], [t[2] for t in p], directed) for p in parts_of_edges]
+        each = [
+            weights_of(N, [t[:2] for t in p], [t[2] for t in p], directed) for p in parts_of_edges
+        ]
         rows = [(at, each[r]) for at, r in pairs]
         if kind == "switched":
             rows = [(0, each[1])]
@@ -538,7 +547,11 @@ def shape_sensed(kind):
 def shape_of(kind, rng):
     N, n, m = int(rng.integers(3, 8)), int(rng.integers(1, 5)), int(rng.integers(1, 3))
     m = min(m, n)
-    k = int(rng.integers(1, 3)) if "memory" in kind or kind == "parent" and rng.uniform() < 0.5 else 0
+    k = (
+        int(rng.integers(1, 3))
+        if "memory" in kind or kind == "parent" and rng.uniform() < 0.5
+        else 0
+    )
     edges, directed = edges_of(rng, N, kind)
     leaders = (0,)
     if kind == "leaders" or kind == "reacting" and rng.uniform() < 0.4:
@@ -551,7 +564,8 @@ def check_whole(cases, seed, only):
     """Compare drawn formations, and print counts."""
     counts = dict.fromkeys(
         "drawn stable unstable refused-though-stable kept-though-unstable radius-differs "
-        "exact-differs formula-differs exact-kept-though-unstable failed".split(), 0
+        "exact-differs formula-differs exact-kept-though-unstable failed".split(),
+        0,
     )
     rng, worst, worst_exact, by_fault = np.random.default_rng(seed), 0.0, 0.0, {}
     done, begun = 0, time.time()
@@ -763,7 +777,9 @@ class CountingLeader(TimedLeader):
         return jnp.zeros((), jnp.int32)
 
     def update(self, model, view, k):
-        return self.physical(model, -(1.0 - 0.02 * k) * view.disagreement - home(model, view)), k + 1
+        return self.physical(
+            model, -(1.0 - 0.02 * k) * view.disagreement - home(model, view)
+        ), k + 1
 
 
 class CountingMessage(Own):
