@@ -1,3 +1,4 @@
+# ruff: noqa: ANN001, ANN002, ANN003, ANN201, ANN202, ANN204, D102, D103
 """Check local certificates against whole loops that are written a second time, without JAX.
 
     python benchmarks/local_certificates.py whole  --cases 300 --seed 1
@@ -140,7 +141,7 @@ class Case:
 
 
 def field(plant, u0, d, u):
-    """d' at a deviation d and an input u."""
+    """D' at a deviation d and an input u."""
     A, B, E, c, q = plant
     return A @ d + c * d**3 + q * d * np.roll(d, 1) - B @ u0 + (B + d[0] * E) @ u
 
@@ -628,7 +629,7 @@ def check_whole(cases, seed, only):
 
 
 def scalar(a=0.0, b=1.0):
-    """x' = a (x - x0) + b (u - u0), alone."""
+    """X' = a (x - x0) + b (u - u0), alone."""
     zero = np.zeros(())
     return Agent(np.array([[a]]), np.array([[b]]), np.zeros((1, 1)), zero, zero)
 

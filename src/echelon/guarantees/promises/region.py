@@ -349,9 +349,9 @@ def within(certified: CertifiedSet | None, radius: float) -> CertifiedSet | None
     """Return a certified set that is no larger than one in which no limit of an input acts."""
     if certified is None or certified.radius <= radius:
         return certified
-    return certified._replace(
-        radius=radius, why="of sum_i delta_i'P delta_i <= r^2, limited by inputs"
-    )
+    text = "of sum_i delta_i'P delta_i <= r^2, limited by the inputs"
+    remedy = "slow the reference, or strengthen the actuators"
+    return certified._replace(radius=radius, why=text, remedy=remedy)
 
 
 def _constant(parts: Parts, region: RegionCertificate) -> bool:
