@@ -933,7 +933,10 @@ BREAKS = {
     "a kink beside a large number": lambda: (parts_with(EpochKink()), S),
     "a kink of agents 1000 km apart": lambda: (parts_with(Kink(), offsets=far()), S),
     "a kink beside curvature": lambda: (parts_with(CurvedKink()), S),
-    "a slow kink": lambda: (parts_with(Kink(2e-6)), ech.Settings(60000.0, 0.02, store_every=100000)),
+    "a slow kink": lambda: (
+        parts_with(Kink(2e-6)),
+        ech.Settings(60000.0, 0.02, store_every=100000),
+    ),
     "a leader hears and does not say so": lambda: (parts_with(Plain(), leader=Quiet()), S),
     "a leader reads a clock": lambda: (parts_with(Plain(), leader=TimedLeader()), S),
     "a leader counts": lambda: (parts_with(Plain(), leader=CountingLeader()), S),
