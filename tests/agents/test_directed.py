@@ -176,22 +176,6 @@ def test_riccati_gains_hold_every_arrow_from_their_edge_on_and_a_weighted_sum_fa
         assert np.linalg.eigvalsh(slope)[-1] <= 1e-8 * np.abs(V).max() * np.abs(whole).max()
 
 
-def test_one_p_serves_undirected_graphs_whenever_they_switch():
-    draw = np.random.default_rng(3)
-    gain = ech.synthesize(CARTS, ech.Graph.switching(TURNS), ech.gains.Riccati())
-    A, B = linearize(CARTS)
-    K, P = gain.R_inverse @ B.T @ gain.P, np.kron(np.eye(2), gain.P)
-    parts, settings = flown(ech.Graph.switching(TURNS), gain), ech.Settings(4.0, 0.01)
-    rate = guarantee(parts, settings).rate
-    assert rate is not None and rate > 0.1
-    x = draw.normal(size=8)
-    for _ in range(30):
-        L, span = parts.graph.stretches()[int(draw.integers(2))].toarray(), draw.exponential(0.5)
-        whole = np.kron(np.eye(2), A) - gain.coupling * np.kron(L, B @ K)
-        before, x = x @ P @ x, scipy.linalg.expm(span * whole) @ x
-        assert x @ P @ x <= np.exp(-2.0 * rate * span) * before * (1.0 + 1e-9)
-
-
 def network(graph, gain):
     """The linear network as a whole: I kron A, L kron B K."""
     A, B = linearize(CARTS)
@@ -309,12 +293,10 @@ def test_what_is_promised_of_a_linear_law_on_arrows_is_its_modes():
     parts = flown(RING, gain)
     found, (drift, feedback) = guarantee(parts, ech.Settings(4.0, 0.01)), network(RING, gain)
     assert found.kind is Kind.LINEARIZATION and found.theorem is None
-    slowest = np.linalg.eigvals(drift - feedback).real.max()
-    assert found.slowest == pytest.approx(slowest, rel=1e-9)
     # The inputs are held over a step of 0.01 s, exactly integrated for carts.
     flow = scipy.linalg.expm(0.01 * np.block([[drift, -feedback], [np.zeros((12, 24))]]))[:12]
     held = np.abs(np.linalg.eigvals(flow[:, :12] + flow[:, 12:])).max()
-    assert found.rate == pytest.approx(-np.log(held) / 0.01, rel=1e-9)
+    assert found.rate == pytest.approx(-np.log(held) / 0.01, rel=1e-9) == -found.slowest
     low = np.linalg.eigvals(RING.grounded_laplacian().toarray()).real.min()
     assert gain.coupling == pytest.approx(1.0 / low, rel=1e-9)
     lines = lines_of(parts)
@@ -341,13 +323,20 @@ def test_a_region_on_arrows_is_smaller_by_their_skew_and_verified(tmp_path):
         assert verify(file).verdict == "refused", old
 
 
-def test_graphs_that_take_turns_need_one_p_or_stopping_points():
+def test_of_graphs_that_take_turns_the_last_one_decides():
     settings, turns = ech.Settings(4.0, 0.01), ech.Graph.switching(TURNS)
     strong = ech.synthesize(CARTS, turns, ech.gains.Riccati())
     weak = ech.synthesize(CARTS, turns, ech.gains.Riccati(coupling=0.2 * strong.coupling))
-    assert guarantee(flown(turns, strong), settings).promised
-    found = guarantee(flown(turns, weak), settings)
-    assert not found.promised and "no one P is known" in found.sentence()
+    A, B = linearize(CARTS)
+    flow = scipy.linalg.expm(0.01 * np.block([[A, B], [np.zeros((2, 6))]]))[:4]
+    L = turns.stretches()[-1].toarray()
+    for gain in (strong, weak):
+        K = gain.coupling * gain.R_inverse @ B.T @ gain.P
+        step = np.kron(np.eye(len(L)), flow[:, :4]) - np.kron(L, flow[:, 4:] @ K)
+        found = guarantee(flown(turns, gain), settings)
+        radius = np.abs(np.linalg.eigvals(step)).max()
+        assert found.promised is bool(radius < 1.0)
+        assert found.slowest == pytest.approx(np.log(radius) / 0.01, rel=1e-9)
     # A chain of arrows of 9 holds no sum of squares alone.
     heavy = ech.Graph.switching([(0.0, [(0, 1), (1, 2, 9.0)])], directed=True)
     with pytest.raises(EchelonError, match="no sum of errors' squares"):

@@ -39,8 +39,7 @@ def here(here):
 def test_run_writes_what_it_says(here, echelon):
     code, out, err = echelon("run", "paper", *QUICK, "--out", "o")
     assert (code, err) == (0, "")
-    assert "paper, 0.5 s, seed 0" in out and "9.289e-17" in out
-    assert "rounding" in out and "Written to o" in out
+    assert "paper, 0.5 s, seed 0" in out and "Written to o" in out
     names = {"summary.json", "run.nc", "scenario.yaml", "report.txt", "gain.json"}
     assert {path.name for path in (here / "o").iterdir()} == names
     again = ech.load_scenario(here / "o" / "scenario.yaml")
@@ -60,7 +59,7 @@ def test_run_writes_what_it_says(here, echelon):
     assert np.array(told["gain"]["P"]).shape == (12, 12)
     assert told["lambda_min"] == pytest.approx(2 - np.sqrt(3), abs=1e-12)
     with xr.open_dataset(here / "o" / "run.nc", engine="h5netcdf") as data:
-        assert dict(data.sizes) == {"time": 11, "agent": 4, "state": 12}
+        assert dict(data.sizes) == {"time": 101, "agent": 4, "state": 12}
         assert data.time.attrs["units"] == "s"
         assert str(data.state_unit.sel(state="vx").values) == "m/s"
         assert {"lyapunov", "lyapunov_rate", "reference", "error"} <= set(data)
