@@ -49,14 +49,14 @@ def test_every_column_of_a_design_is_explained():
 def test_every_column_of_a_report_is_explained():
     for model in (ech.models.DoubleIntegrator(2), ech.models.VanDerPol()):
         result = made_up(np.zeros((4, 3, len(model.state_names))), model, ech.Graph.path(3))
-        names = heads(run_report._table(result, ech.metrics(result), printed=False))
+        names = heads(run_report._table(result, ech.metrics(result)))
         assert set(names) <= set(ENTRIES), set(names) - set(ENTRIES)
         assert len(names) == 6
 
 
 def test_every_column_of_a_comparison_is_explained():
     compared = Comparison("x", (), 10.0, 2.0, ())
-    names = {*heads(comparison_report._errors_table(compared, False))}
+    names = {*heads(comparison_report._errors_table(compared))}
     names |= {*heads(comparison_report._costs_table(compared))}
     assert names <= set(ENTRIES), names - set(ENTRIES)
 
