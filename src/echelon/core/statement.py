@@ -13,6 +13,7 @@ class Hypothesis(Word):
     TRIM_WITHIN_LIMITS = "trim within the limits"
     EXACT_STATES = "Assumption 3, exact states"
     LEADERS_AGREE = "leaders agree"
+    LEADER = "leader stays at its trim"
     SYMMETRY = "offsets are symmetries"
     REPEATS = "a step repeats"
     REST = "rest at the goals"

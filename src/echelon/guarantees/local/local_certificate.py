@@ -16,6 +16,7 @@ import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
 from echelon.core.jaxpr import used_leaves
 from echelon.core.types import Array, PyTree
 from echelon.core.words import Feedforward
@@ -47,6 +48,8 @@ _DENSE = 1500
 """Numbers of a formation up to which one map of all of them is made."""
 _ALL = 2000
 """Agents of an undirected graph up to which all eigenvalues are computed."""
+_SHOWN = 32
+"""Eigenvalues that stand for an interval of them."""
 _PROBES = 6
 _AGREES = 1e-9
 """Relative; what rounding may leave between the derivative and the map made of it."""
@@ -131,9 +134,10 @@ def local_certificate(prepared: Prepared) -> LocalCertificate:
         if timed is not None:
             return LocalCertificate((timed[0],), culprit=timed[1])
     now = begun(loop, goals, np.asarray(settled))
-    rest = _rest_of(loop, now, _movers(parts, answer), period)
-    found = _judged(rest, goals, period, parts.model.state_names)
-    if row and rest.whole is not None and found.radius is not None:
+    rest = _rest_of(loop, now, _movers(parts, answer), period, parts.graph)
+    foreign = bool(parts.drive.unknown or own_members(loop))
+    found = _judged(rest, goals, period, parts.model.state_names, foreign)
+    if row and found.radius is not None:
         found = _until_last(prepared, rest, goals, found)
     steady = problem.channel is None or problem.channel.steady
     return found._replace(period=period, steady=steady)
@@ -157,9 +161,12 @@ def _until_last(
     steps = int(schedule.switches(dt, 2.0 * float(schedule.starts[-1]))[0][-1])
     loop = resting_loop(prepared, None, steps + 1)
     early = rest._replace(loop=loop, now=begun(loop, goals, np.asarray(0)))
-    after, slopes = _maps(early, np.eye(len(rest.value)), steps)
+    directions = rest.rows if rest.whole is None else np.eye(len(rest.value))
+    after, slopes = _maps(early, directions, steps)
     if not (np.abs(after - rest.value) <= _AT_REST * _scale(rest.value)).all():
         return found._replace(faults=(Fault.NO_REST,), radius=None)
+    if rest.whole is None:
+        return found
     at = rest.body.state[rest.free] >= 0
     before = np.linalg.norm(slopes.T[at][:, at], 2) if np.isfinite(slopes).all() else np.inf
     return found._replace(before=max(1.0, float(before)))
@@ -221,12 +228,9 @@ def _all_that(law: Law, model: ControlAffine, view: LocalView, memory: Memory) -
     u, after = law.update(model, view, memory)
     after = law.settle(model, view, u, u, after)
     said = Speaks.of(law).signal(model, view.x, view.offset, memory)
-    sent = (
-        ()
-        if law.feedforward is Feedforward.NONE
-        else Feeds.of(law).message(model, view.x, u, after)
-    )
-    return u, _reals_of(after), said, sent
+    if law.feedforward is Feedforward.NONE:
+        return u, _reals_of(after), said
+    return u, _reals_of(after), said, Feeds.of(law).message(model, view.x, u, after)
 
 
 _NEAR, _STEEP = 1e-6, 1e3
@@ -271,6 +275,7 @@ class _Rest(NamedTuple):
     """
 
     loop: Loop
+    graph: Graph
     now: LoopState
     body: BodyPlaces
     free: Array
@@ -302,7 +307,7 @@ class _Rest(NamedTuple):
         return states[: self.size] if self.split is not None else states
 
 
-def _rest_of(loop: Loop, now: LoopState, movers: Array, period: int) -> _Rest:
+def _rest_of(loop: Loop, now: LoopState, movers: Array, period: int, graph: Graph) -> _Rest:
     """Return where everybody rests, looked for from a moment on, and the map about it."""
     body = body_of(loop, now)
     mine = [np.flatnonzero(body.agent == k) for k in movers]
@@ -310,7 +315,7 @@ def _rest_of(loop: Loop, now: LoopState, movers: Array, period: int) -> _Rest:
     free = np.concatenate([*mine, shared])
     sizes = {len(each) for each in mine}
     size = sizes.pop() if len(sizes) == 1 else 0
-    rest = _Rest(loop, now, body, free, reals(now)[free], np.inf, movers, size, None, None)
+    rest = _Rest(loop, graph, now, body, free, reals(now)[free], np.inf, movers, size, None, None)
     alike = size and not len(shared) and period == 1 and _links_of(rest) is not None
     if len(free) > _DENSE:
         return _split_at(_settled(rest), period) if alike else rest
@@ -346,12 +351,16 @@ def _by_newton(rest: _Rest, period: int) -> _Rest:
 
 
 def _settled(rest: _Rest) -> _Rest:
-    """Return a moment of agents that are left to themselves for long."""
-    now = later(rest.loop, rest.now, np.asarray(_WARM))
-    after = later(rest.loop, now, np.asarray(1))
-    value, then = reals(now)[rest.free], reals(after)[rest.free]
-    residual = float((np.abs(then - value) / _scale(value)).max())
-    return rest._replace(now=now, value=value, residual=residual)
+    """Return a moment that a step leaves as it is, or that of agents left alone for long."""
+    for steps in (0, _WARM):
+        now = later(rest.loop, rest.now, np.asarray(steps))
+        after = later(rest.loop, now, np.asarray(1))
+        value, then = reals(now)[rest.free], reals(after)[rest.free]
+        residual = float((np.abs(then - value) / _scale(value)).max())
+        rest = rest._replace(now=now, value=value, residual=residual)
+        if residual <= _AT_REST:
+            break
+    return rest
 
 
 # ---- agents that are alike -----------------------------------------------------------------------
@@ -400,7 +409,7 @@ def _split_at(rest: _Rest, period: int) -> _Rest:
     if not (gap <= _AGREES * scale.reshape(_PROBES, -1)).all():
         return rest
     grounded = len(rest.movers) < rest.loop.agents
-    values = _eigenvalues(C, grounded)
+    values = _eigenvalues(C, grounded, rest.graph)
     if values is None:
         return rest
     # Where nobody is led all move alike with F alone, which must not carry them away.
@@ -408,15 +417,19 @@ def _split_at(rest: _Rest, period: int) -> _Rest:
     return rest._replace(split=Split(F, K, *values), common=common)
 
 
-def _eigenvalues(C: sp.csr_array, grounded: bool) -> tuple[Array, bool] | None:
+def _eigenvalues(C: sp.csr_array, grounded: bool, graph: Graph) -> tuple[Array, bool] | None:
     """Return the eigenvalues of what agents hear, and whether all between them count too.
 
-    Without anybody who is led one of them is 0: all move alike, which is no disagreement.
+    Without anybody who is led one of them is 0: all move alike, which is no disagreement. Of a
+    large undirected graph the extreme ones are known; None where they are not.
     """
     count, block = csgraph.connected_components(C, connection="strong")
-    sizes = np.bincount(block)
-    if sizes.max() > _ALL:
-        return None
+    if np.bincount(block).max() > _ALL:
+        whole = graph.schedule is None and not graph.directed and grounded
+        if not whole or abs(C - graph.grounded_laplacian()).max() > 0.0:
+            return None
+        spectrum = graph.spectrum()
+        return np.geomspace(spectrum.low, spectrum.high, _SHOWN), True
     values = list[Array]()
     for k in range(count):
         part = C[np.ix_(block == k, block == k)].toarray()
@@ -465,7 +478,10 @@ def _stays_elsewhere(rest: _Rest, places: tuple[int, ...], period: int) -> bool:
     return True
 
 
-def _judged(rest: _Rest, goals: Array, period: int, names: tuple[str, ...]) -> LocalCertificate:
+def _judged(
+    rest: _Rest, goals: Array, period: int, names: tuple[str, ...], foreign: bool
+) -> LocalCertificate:
+    """Return the certificate of what rests; `foreign`: whether a user's own code takes part."""
     if not (rest.residual <= _AT_REST and _arrives(rest, period)):
         return LocalCertificate((Fault.NO_REST,))
     states, agents = rest.body.state[rest.free], rest.body.agent[rest.free]
@@ -479,8 +495,10 @@ def _judged(rest: _Rest, goals: Array, period: int, names: tuple[str, ...]) -> L
     if split is None:
         return LocalCertificate((Fault.LARGE,))
     modes = modes_of(split)
-    radius = modes.radius ** (1.0 / period)
-    sides = _sides(rest, period, 1.0 - modes.radius)
+    # What all do alike does not end, and must not carry them away either.
+    away = rest.common if rest.common > 1.0 + _AGREES else 0.0
+    radius = max(modes.radius, away) ** (1.0 / period)
+    sides = _sides(rest, period, 1.0 - modes.radius, foreign)
     if sides is not None:
         return LocalCertificate((sides,))
     exact = _exactly(rest, period)
@@ -490,7 +508,7 @@ def _judged(rest: _Rest, goals: Array, period: int, names: tuple[str, ...]) -> L
     last = len(still) < len(modes.lasting) + len(modes.loose) - len(loose)
     last = last or bool(loose) and not _stays_elsewhere(rest, loose, period)
     faults += [Fault.LASTING] * last
-    faults += [Fault.GROWS] * (radius >= 1.0 or rest.common > 1.0 + _AGREES)
+    faults += [Fault.GROWS] * (radius >= 1.0)
     faults += [Fault.UNDECIDED] * (radius < 1.0 <= modes.worst)
     faults += [Fault.GROWS_EXACTLY] * (exact is not None and not exact < 1.0)
     return LocalCertificate(
@@ -527,10 +545,11 @@ _LEAST = 1e-2
 """Of how far the slowest mode is from the unit circle: no smaller kink can matter."""
 
 
-def _sides(rest: _Rest, period: int, margin: float) -> Fault | None:
+def _sides(rest: _Rest, period: int, margin: float, foreign: bool) -> Fault | None:
     """Return that values on some side are not those of the derivative, or that rounding hides it.
 
-    What the derivative leaves of a smooth function shrinks faster than the change.
+    What the derivative leaves of a smooth function shrinks faster than the change. Rounding hides
+    nothing in echelon's own code, and a model's kinks are looked for where it is checked.
     """
     random = np.random.default_rng(1).standard_normal(rest.rows.shape)
     sets = [random] if rest.whole is None else [random, np.eye(len(rest.value))]
@@ -538,6 +557,8 @@ def _sides(rest: _Rest, period: int, margin: float) -> Fault | None:
     rounding = 1e2 * np.finfo(float).eps * np.maximum(1.0, np.abs(rest.value)) / _SIZES[1]
     if rest.split is None and rest.whole is not None:
         rounding = np.maximum(rounding, np.abs(rest.whole) @ rounding)
+    if foreign and 0.0 < margin and not (rounding <= matters).all():
+        return Fault.UNDECIDED
     for along in sets:
         slopes, left = _maps(rest, along, period)[1], []
         for size in _SIZES:

@@ -314,6 +314,10 @@ def later(loop: Loop, now: LoopState, steps: Array) -> LoopState:
     return jax.lax.fori_loop(0, steps, lambda _, now: step(loop, now), now)
 
 
+_NUMBERS = 2_000_000
+"""Of all rows that are computed at a time."""
+
+
 @cached_jit
 def responses(
     loop: Loop, now: LoopState, free: Array, bases: Array, directions: Array, steps: Array
@@ -335,4 +339,8 @@ def responses(
         end = jax.lax.fori_loop(0, steps, lambda _, now: step(loop, now), start)
         return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(end) if is_real(x)])[free]
 
-    return jax.vmap(lambda base, along: jax.jvp(moved, (base,), (along,)))(bases, directions)
+    def one(row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        return jax.jvp(moved, row[:1], row[1:])
+
+    # As many rows at a time as memory takes.
+    return jax.lax.map(one, (bases, directions), batch_size=max(1, _NUMBERS // len(rest)))

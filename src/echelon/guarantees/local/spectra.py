@@ -7,6 +7,7 @@ import scipy.linalg
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
+from echelon.core.linear import radius_between
 from echelon.core.types import Array
 
 _EPS = float(np.finfo(float).eps)
@@ -85,6 +86,11 @@ def modes_of(split: Split) -> Modes:
             (lasting if read else loose).append(first)
             continue
         found, rounding = _eigenvalues(split.of(places))
+        if split.between:
+            ends = np.real(split.eigenvalues[[0, -1]])
+            F, K = (part[np.ix_(places, places)] for part in (split.F, split.K))
+            # At least 1 unless all between are shown to decay.
+            found = np.append(found, radius_between(F, -K, *ends))
         values.append(found.reshape(-1))
         unsure.append(np.full(found.size, rounding))
     return Modes(np.concatenate(values), np.concatenate(unsure), (*lasting,), (*loose,))

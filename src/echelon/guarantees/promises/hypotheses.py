@@ -21,7 +21,14 @@ from echelon.core.digits import about, at_least
 from echelon.core.errors import listing
 from echelon.core.identity import digest
 from echelon.core.numerics import precision
-from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
+from echelon.core.statement import (
+    Hypothesis,
+    Statement,
+    fails,
+    holds,
+    left_to_run,
+    unneeded,
+)
 from echelon.core.types import Array, JsonObject, States
 from echelon.core.words import Kind
 from echelon.guarantees.messages.late_messages import bias_line
@@ -36,6 +43,9 @@ from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.jacobians import offsets_are_symmetries
 
 _LINEAR = Kind.LINEARIZATION
+_NEAR_TRIM = "the leader stays close to its trim"
+_LEAVES = 1e-9
+"""1/s; a slower mode is that of rounding."""
 
 
 def hypotheses(case: GuaranteeInputs) -> Iterator[Statement]:
@@ -44,6 +54,7 @@ def hypotheses(case: GuaranteeInputs) -> Iterator[Statement]:
     yield _symmetric(case)
     yield from () if case.smooth or not case.governed else (_smooth(case),)
     yield _matched(case)
+    yield from _leaving(case)
     yield from modes(case)
     bias = bias_line(case.parts, case.settings)
     yield from () if bias is None else (bias,)
@@ -244,6 +255,16 @@ def _matched(case: GuaranteeInputs) -> Statement:
         text = "every follower receives the leader's input, "
         text += "which the paper's network does not provide"
     return holds(name, Kind.PROOF, text)
+
+
+def _leaving(case: GuaranteeInputs) -> Iterator[Statement]:
+    """Yield that a leader that is left to itself leaves its trim; nothing where it stays."""
+    slowest = case.leaders.slowest
+    if slowest is None or slowest <= _LEAVES:
+        return
+    text, shown = "a leader alone leaves its trim", f"{at_least(slowest)} 1/s"
+    remedy = "give the leader a law that holds it there"
+    yield left_to_run(Hypothesis.LEADER, _NEAR_TRIM, text, slowest, shown, remedy, _LINEAR)
 
 
 # ---- events of a run -----------------------------------------------------------------------------
