@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
+import scipy.sparse.linalg as spla
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
@@ -43,6 +44,7 @@ from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.own_members import own_members
 from echelon.simulation.step.records import LoopState
 from echelon.simulation.step.sequence import begin, step
+from echelon.simulation.step.turns import by_depth
 
 _DENSE = 1500
 """Numbers of a formation up to which one map of all of them is made."""
@@ -377,7 +379,15 @@ def _links_of(rest: _Rest) -> sp.csr_array | None:
     to, of = place[np.asarray(exchange.receivers)], place[np.asarray(exchange.senders)]
     heard, inside, count = to >= 0, (to >= 0) & (of >= 0), len(rest.movers)
     rows = np.concatenate([to[heard], to[inside]]), np.concatenate([to[heard], of[inside]])
-    return sp.csr_array((np.concatenate([weights[heard], -weights[inside]]), rows), (count, count))
+    C = sp.csr_array((np.concatenate([weights[heard], -weights[inside]]), rows), (count, count))
+    told = by_depth(rest.loop)
+    if told is None or count > _ALL:
+        return C
+    # What each is sent by its parent adds up along the tree (theory page, T4).
+    parent, own = place[np.asarray(told.parents)[rest.movers]], np.arange(count)
+    below = own[parent >= 0]
+    tree = sp.csc_array((np.ones(len(below)), (below, parent[below])), (count, count))
+    return sp.csr_array(spla.spsolve(sp.csc_array(sp.eye_array(count) - tree), sp.csc_array(C)))
 
 
 def _split_at(rest: _Rest, period: int) -> _Rest:
@@ -410,6 +420,8 @@ def _split_at(rest: _Rest, period: int) -> _Rest:
         return rest
     grounded = len(rest.movers) < rest.loop.agents
     values = _eigenvalues(C, grounded, rest.graph)
+    if by_depth(rest.loop) is not None:
+        values = rest.graph.parent_spectrum().eigenvalues, False
     if values is None:
         return rest
     # Where nobody is led all move alike with F alone, which must not carry them away.

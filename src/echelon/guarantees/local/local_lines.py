@@ -7,7 +7,7 @@ import numpy as np
 
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
-from echelon.core.digits import at_least
+from echelon.core.digits import at_least, at_most
 from echelon.core.linear import discretize
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.words import Kind, amount
@@ -20,12 +20,17 @@ _UNKNOWN = "it is not known what small errors do"
 _CLOCK = "leave time out of it; `view.period` is how long an input is held"
 
 
-def local_lines(parts: Parts, settings: Settings, local: LocalCertificate) -> Iterator[Statement]:
-    """Yield what a guarantee near the goals rests on."""
+def local_lines(
+    parts: Parts, settings: Settings, local: LocalCertificate, shorter: float
+) -> Iterator[Statement]:
+    """Yield what a guarantee near the goals rests on.
+
+    `shorter` is a step (s) with which errors are known to end; 0 for none.
+    """
     yield _repeats(parts, local)
     yield _rests(parts, local)
     yield _smooth(parts, local)
-    yield _decays(parts, settings, local)
+    yield _decays(parts, settings, local, shorter)
     yield _held(parts, settings, local)
     yield from _switches(parts, local)
     yield from _messages(parts, local)
@@ -85,7 +90,7 @@ def _smooth(parts: Parts, local: LocalCertificate) -> Statement:
     return holds(name, Kind.SAMPLES, text)
 
 
-def _decays(parts: Parts, settings: Settings, local: LocalCertificate) -> Statement:
+def _decays(parts: Parts, settings: Settings, local: LocalCertificate, shorter: float) -> Statement:
     name, radius = Hypothesis.DISAGREEMENT_DECAY, local.radius
     if radius is None and Fault.LARGE not in local.faults:
         return unneeded(name, _LINEAR, _UNKNOWN)
@@ -112,6 +117,9 @@ def _decays(parts: Parts, settings: Settings, local: LocalCertificate) -> Statem
     if Fault.GROWS in local.faults:
         text = f"the spectral radius is {at_least(radius, 5)} a step of {dt:g} s, {over}"
         reason, remedy = "errors do not shrink in the steps that run", _against_growth(parts)
+        if 0.0 < shorter < dt:
+            reason = f"the step `dt` = {dt:g} s is too long for this gain"
+            remedy = f"shorten `simulation.dt` below {at_most(shorter)} s"
         if local.exact is not None and local.exact < 1.0:
             reason = "errors grow in steps of the integrator, and not if agents move exactly"
             remedy = _by_substeps(parts, settings)

@@ -185,7 +185,9 @@ def _linear(case: GuaranteeInputs, local: LocalCertificate) -> Iterator[Statemen
     if case.governed:
         yield _detectable(case)
         yield _coupled(case)
-    yield from local_lines(case.parts, case.settings, local)
+    known = case.governed and case.loop.every and not local.holds
+    shorter = case.loop.longest_step(case.settings) if known else 0.0
+    yield from local_lines(case.parts, case.settings, local, shorter)
     yield _along(case)
     yield from turning(case)
 

@@ -311,6 +311,7 @@ def _lyapunov_trend(result: Result, guarantee: Guarantee) -> Iterator[str]:
     increases, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
     # V' <= 0 is proved for the undisturbed loop that decays only.
     unstable = guarantee.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails
+    unstable = unstable and not (guarantee.governed and guarantee.loop.every)
     if forbidden and not (unstable or not result.world.ideal):
         when = result.times[int(np.argmax(v.forbidden()))]
         yield (
