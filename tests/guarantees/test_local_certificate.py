@@ -9,6 +9,7 @@ import scipy.linalg
 import echelon as ech
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
+from echelon.core.words import Verdict
 from echelon.guarantees.local.local_certificate import Fault, local_certificate
 from echelon.simulation.engine.prepare import prepare
 
@@ -226,4 +227,4 @@ def test_the_bundled_formation_has_the_rate_of_its_own_matrix():
     parts, settings = ech.build(ech.load_scenario("paper"))
     found = ech.guarantee(parts, settings)
     assert found.rate == pytest.approx(1.2689394572, rel=1e-9)
-    assert found.hypotheses[Hypothesis.DISAGREEMENT_DECAY].verdict == "holds"
+    assert found.hypotheses[Hypothesis.DISAGREEMENT_DECAY].verdict is Verdict.HOLDS

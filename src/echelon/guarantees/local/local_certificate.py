@@ -394,6 +394,7 @@ def _split_at(rest: _Rest, period: int) -> _Rest:
     """Return the map by what agents hear, if the whole one is that; else the rest as it is."""
     C, size, count = _links_of(rest), rest.size, len(rest.movers)
     assert C is not None
+    known, rest = rest.split, rest._replace(split=None)
     own, apart = C.diagonal(), sp.csc_array(C - sp.diags_array(C.diagonal()))
     # Who is heard most; of agents that hear nobody here, the two that differ most.
     k = int(abs(apart).sum(axis=0).argmax())
@@ -419,9 +420,12 @@ def _split_at(rest: _Rest, period: int) -> _Rest:
     if not (gap <= _AGREES * scale.reshape(_PROBES, -1)).all():
         return rest
     grounded = len(rest.movers) < rest.loop.agents
-    values = _eigenvalues(C, grounded, rest.graph)
-    if by_depth(rest.loop) is not None:
+    if known is not None:
+        values = known.eigenvalues, known.between
+    elif by_depth(rest.loop) is not None:
         values = rest.graph.parent_spectrum().eigenvalues, False
+    else:
+        values = _eigenvalues(C, grounded, rest.graph)
     if values is None:
         return rest
     # Where nobody is led all move alike with F alone, which must not carry them away.
@@ -540,7 +544,7 @@ def _exactly(rest: _Rest, period: int) -> float | None:
     loop = held_exactly(rest.loop)
     if loop is None:
         return None
-    there = rest._replace(loop=loop, split=None, whole=None)
+    there = rest._replace(loop=loop, whole=None)
     if rest.whole is not None:
         there = there._replace(whole=_maps(there, np.eye(len(rest.value)), period)[1].T)
     if rest.split is not None:

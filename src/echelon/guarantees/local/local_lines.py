@@ -131,11 +131,11 @@ def _decays(parts: Parts, settings: Settings, local: LocalCertificate, shorter: 
 
 
 def _against_growth(parts: Parts) -> str:
-    gain, lag = parts.drive.gain, parts.world.ideal
-    remedy = "let the law act against the disagreement, more or less strongly"
-    if gain is not None:
-        remedy = "another gain, coupling or model"
-    return remedy if lag else f"{remedy}; or shorten delays and lags"
+    if not parts.world.ideal:
+        return "try changes of the scenario by `echelon causes`"
+    if parts.drive.gain is not None:
+        return "another gain, coupling or model"
+    return "let the law act against the disagreement, more or less strongly"
 
 
 _SUBSTEPS = (2, 5, 10, 20, 50, 100, 200, 500, 1000)

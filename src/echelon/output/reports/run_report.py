@@ -294,7 +294,8 @@ def _guarantee(result: Result, guarantee: Guarantee) -> Iterator[str]:
         # Rounding of a mode at 0 is no growth.
         text = "a mode does not decay" if 0.0 <= slowest < 1e-9 else text
         text = f"{text} (coupling {coupling:.4g})"
-        if guarantee.edge is not None:
+        # The edge is one of current states and quick actuators.
+        if guarantee.edge is not None and result.world.ideal:
             text += f". Couplings above {at_least(guarantee.edge, 4)} are sufficient for stability"
         yield f"Linearized at the trim, {text}."
     yield from coverage(result, guarantee)
