@@ -11,6 +11,7 @@ from runs import simulate
 from echelon import Formation, Graph, build, load_scenario, report, synthesize
 from echelon.agents import models
 from echelon.agents.references import Circle, Hover, Lemniscate
+from echelon.core.digits import at_most
 from echelon.core.errors import EchelonError, ScenarioError
 from echelon.core.words import Feedforward
 from echelon.laws import Consensus, Law, Tracking, TrimInput
@@ -220,9 +221,13 @@ def test_the_law_says_what_it_needs_and_by_how_much_a_branch_amplifies():
     assert "too weak: a mode of the formation does not decay." in weak.warnings(model, graph)[0]
     assert Consensus(law.gain, "none").warnings(model, graph) == ()
     # The report promises the modes that parents leave: s^2 + sqrt 3 s + 1 has its roots at
-    # -sqrt 3 / 2 +- i / 2.
+    # -sqrt 3 / 2 +- i / 2, and a step in which inputs are held has them a little farther left.
+    dt = run.settings.dt
+    step = np.array([[1.0, dt], [0.0, 1.0]]) - np.outer([0.5 * dt**2, dt], [1.0, 3.0**0.5])
+    rate = -np.log(np.abs(np.linalg.eigvals(step)).max()) / dt
     text = " ".join(report(run).split())
-    assert "decays at 0.866 1/s (coupling 1). Couplings above 0.5 are sufficient" in text
+    said = f"decays at {at_most(rate)} 1/s (coupling 1). Couplings above 0.5 are sufficient"
+    assert said in text and rate == pytest.approx(3.0**0.5 / 2.0, rel=0.02)
     assert "follower: neighbours' states; its parent's input of the same step." in text
 
 

@@ -140,12 +140,12 @@ def test_a_medium_that_is_jammed_for_a_time(ends):
     assert age == pytest.approx(DT if ends == 20 else DT * (ends - 20), abs=1.5 * DT)
 
 
-def test_nothing_is_guaranteed_of_members_and_machine_code_says_which_it_lacks():
+def test_of_a_member_that_counts_steps_nothing_is_guaranteed_and_machine_code_lacks_it():
     parts = agreeing(members=sensed_by(SlowSensor()))
     settings = ech.Settings(horizon=1.0, dt=DT)
     promised = ech.guarantee(parts, settings)
     assert str(promised.verdict) == "none"
-    assert "does not know all members of the step" in promised.sentence()
+    assert "what `SlowSensor` does depends on time" in promised.sentence()
     with pytest.raises(EchelonError, match="member `SlowSensor` of your own"):
         ech.simulate(parts, settings._replace(engine="native"))
 

@@ -17,7 +17,7 @@ from echelon.simulation.step.settings import Settings
 
 _LINEAR = Kind.LINEARIZATION
 _UNKNOWN = "it is not known what small errors do"
-_CLOCK = "leave time out of it; `view.period` is how long an input is held"
+_CLOCK = "leave time and counts of steps out of it; a law reads `view.period` instead"
 
 
 def local_lines(
