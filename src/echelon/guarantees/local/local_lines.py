@@ -40,7 +40,7 @@ def _repeats(parts: Parts, local: LocalCertificate) -> Statement:
     """Return whether a step does the same from the same numbers, whenever it is taken."""
     name, what = Hypothesis.REPEATS, local.culprit
     if Fault.TIME in local.faults:
-        text = f"what `{what}` does depends on time, so that no one matrix has its modes"
+        text = f"`{what}` depends on time, so no one linearization holds for all steps"
         return fails(name, _LINEAR, text, remedy=_CLOCK, reason=text)
     if Fault.WHOLE in local.faults:
         text = f"`{what}` remembers whole numbers and acts by them"
@@ -102,7 +102,7 @@ def _decays(parts: Parts, settings: Settings, local: LocalCertificate, shorter: 
     number = None if rate is None else -rate, shown
     over = f"over {amount(local.modes, 'mode')} of the steps that run"
     if Fault.LASTING in local.faults:
-        text = "the law acts by a memory that nothing changes"
+        text = "the law uses a remembered number that never changes, so errors may stay"
         remedy = "let the law forget it, or act without it"
         return fails(name, _LINEAR, text, *number, remedy=remedy, reason=text)
     if Fault.ADRIFT in local.faults:
