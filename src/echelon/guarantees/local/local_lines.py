@@ -164,11 +164,11 @@ def _held(parts: Parts, settings: Settings, local: LocalCertificate) -> Statemen
     text = f"spectral radius {at_least(exact, 7)} a step if agents move exactly under held inputs"
     if exact < 1.0:
         return holds(name, _LINEAR, text, exact, dt)
-    reason = ""
+    reason, remedy = "", _against_growth(parts)
     if local.radius < 1.0:
         text += "; the integrator damps what grows"
         reason = "if inputs are held and agents move exactly, errors grow"
-    remedy = "shorten `simulation.dt`, or lower the gain"
+        remedy = "shorten `simulation.dt`, or lower the gain"
     return fails(name, _LINEAR, text, exact, dt, remedy=remedy, reason=reason)
 
 
