@@ -144,7 +144,7 @@ def any_difference(rng: np.random.Generator) -> Finding:
     first, last = (float(np.abs(near[k]).max()) for k in (0, -1))
     decays = last < 1e-2 * first
     if not answer.promised:
-        return silent(answer.reasons[0], bool(decays))
+        return silent((*answer.reasons, *answer.conditions)[0], bool(decays))
     stated, false = answer.rate or 0.0, list[str]()
     if not last <= first * (1e3 * np.exp(-0.5 * stated * horizon) + 1e-9):
         false.append(f"near: {first} became {last} in {horizon} s at {stated}")

@@ -33,5 +33,8 @@ def test_the_product_over_a_period_decides(seed):
         maps = whole_steps(A, B, K, laplacians, dt)
         radius = np.abs(np.linalg.eigvals(np.linalg.multi_dot([*maps[::-1], np.eye(len(maps[0]))])))
         step = float(radius.max() ** (1.0 / len(maps)))
-        assert found.promised is (step < 1.0), (dt, step, found.sentence())
+        assert found.claimed is (step < 1.0), (dt, step, found.sentence())
+        # A leader that falls by itself does not stay at its trim, and only the run can show it.
+        falls = np.linalg.eigvals(A).real.max() > 0.0
+        assert not (found.promised and falls), (dt, found.sentence())
         assert found.slowest == pytest.approx(np.log(step) / dt, rel=1e-6, abs=1e-9 / dt)
