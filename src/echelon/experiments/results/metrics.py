@@ -29,7 +29,8 @@ from echelon.experiments.results.run_numbers import (
     LeaderMetrics,
     Metrics,
 )
-from echelon.guarantees.promises.promise import Guarantee, covered
+from echelon.guarantees.promises.coverage import covered
+from echelon.guarantees.promises.promise import Guarantee
 from echelon.simulation.engine.result import Result, finite_or_none
 from echelon.simulation.step.meter import SETTLED, output_error, steps_per_slice
 

@@ -32,7 +32,8 @@ from echelon.experiments.results.run_numbers import (
     steady_error,
 )
 from echelon.experiments.results.table_two import is_of_the_paper
-from echelon.guarantees.promises.promise import Guarantee, coverage, guarantee
+from echelon.guarantees.promises.coverage import coverage
+from echelon.guarantees.promises.promise import Guarantee, guarantee
 from echelon.output.reports.beside_paper import print_beside_paper, remarks
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.meter import SETTLED
